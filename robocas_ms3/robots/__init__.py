@@ -1,1 +1,1 @@
-"""The robot: URDF generation, the ManiSkill agent, its controllers. Importing this package alone imports no SAPIEN."""
+"""Robots: descriptions, generated URDF files, ManiSkill agents and controllers; importing it does not import SAPIEN."""

@@ -1,4 +1,4 @@
-"""An arm on a mobile base as a ManiSkill agent: controllers, cameras, what it feels."""
+"""ManiSkill agents for an arm on a mobile base: controllers, cameras and proprioception."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from robocas_ms3.robots.quantities import QUANTITIES
 from robocas_ms3.robots.registry import PANDA, STOCK_FINGERS, RobotSpec
 
 Drive = dict[str, Any]
-"""Stiffness, damping and force limit of joints, in ManiSkill's units."""
+"""Stiffness, damping and force limit of joint drives, in ManiSkill's units."""
 
 
 class _GeneratedUrdf:
-    """The URDF's path, on the class and on its instances; the file is generated when it is first asked for."""
+    """Descriptor that returns the path of the URDF; the file is generated at the first access."""
 
     def __get__(self, instance: object, owner: type[MobileManipulator]) -> str:
         return str(owner.spec.files().urdf)
@@ -48,25 +48,25 @@ def _keyframe(robot: RobotDescription, arm: tuple[float, ...]) -> Keyframe:
 
 
 class MobileManipulator(BaseAgent):
-    """A robot of the table. ``qpos``: base x, y, yaw, 7 arm joints, 2 fingers. The root link stands on the floor.
+    """Base class of the agents. ``qpos``: base x, y, yaw, 7 arm joints, 2 fingers; the root link is on the floor.
 
-    Every control mode holds the base, except those ending in ``_base``, which take 3 numbers more for x, y, yaw.
-    A robot's agent is a class of its own, derived with its row as ``spec``, and so known to ManiSkill.
+    Control modes ending in ``_base`` have 3 more action dimensions for base x, y and yaw; all others hold the base.
+    Each robot is a subclass with its `RobotSpec` as class argument ``spec``, which registers it with ManiSkill.
     """
 
     spec: ClassVar[RobotSpec]
     description: ClassVar[RobotDescription]
     urdf_path: Any = _GeneratedUrdf()
 
-    # Arm: twice as stiff as ManiSkill's Panda, damped so that no direction overshoots. Damping / stiffness is the lag.
-    # Stiffer gains would track no better (targets are smooth) and press harder on what is touched.
+    # Arm: twice as stiff as ManiSkill's Panda, with enough damping not to overshoot. Stiffer gains do not track better,
+    # since targets are smooth, and press harder on touched objects.
     arm_drive: ClassVar[Drive] = dict(stiffness=2e3, damping=1.5e2, force_limit=100.0)
     gripper_drive: ClassVar[Drive] = dict(stiffness=1e3, damping=1e2, force_limit=100.0)
     base_drive: ClassVar[Drive] = dict(stiffness=4e5, damping=2e4, force_limit=4e3)
     base_max_speed = 0.5  # m/s and rad/s
 
     cameras: tuple[CameraSpec, ...]
-    """Those of the description, until the environment sets those of its task."""
+    """Cameras of the description; the environment replaces them by those of its task configuration."""
 
     def __init_subclass__(cls, spec: RobotSpec | None = None, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -83,8 +83,8 @@ class MobileManipulator(BaseAgent):
 
     @property
     def _controller_configs(self) -> dict[str, dict[str, Any]]:
-        """Controllers of each control mode: of the arm, the gripper, and the base, which is held or moved."""
-        # ManiSkill's replay tool asks for the exact class of its own controller
+        """Controllers of arm, gripper and base for each control mode."""
+        # ManiSkill's replay tool checks for the exact class of its own controller
         joint_deltas = JointDeltaControllerConfig if self.scene.gpu_sim_enabled else PDJointPosControllerConfig
         robot, arm, base = self.description, self.arm_drive, self.base_drive
         arm_joints, base_joints, fingers = list(robot.arm_joints), list(robot.base_joints), list(robot.finger_joints)
@@ -116,14 +116,16 @@ class MobileManipulator(BaseAgent):
         hand = FingersControllerConfig(fingers, lower=low, upper=high, mimic=mimic, **self.gripper_drive)
         held = HeldJointsControllerConfig(base_joints, **base)
         moving: dict[str, Any] = {**base, "max_speed": self.base_max_speed}
-        moved = SmoothJointPosControllerConfig(base_joints, None, None, **moving)
-        least, most = [-scale for scale in BASE_SCALE], list(BASE_SCALE)
-        moved_by = SmoothJointPosControllerConfig(
-            base_joints, least, most, use_delta=True, normalize_action=True, **moving
+        base_targets = SmoothJointPosControllerConfig(base_joints, None, None, **moving)
+        low_base, high_base = [-scale for scale in BASE_SCALE], list(BASE_SCALE)
+        base_deltas = SmoothJointPosControllerConfig(
+            base_joints, low_base, high_base, use_delta=True, normalize_action=True, **moving
         )
         modes = {name: dict(arm=controller, gripper=hand, base=held) for name, controller in arms.items()}
         for name, controller in arms.items():
-            modes[f"{name}_base"] = dict(arm=controller, gripper=hand, base=moved_by if "delta" in name else moved)
+            modes[f"{name}_base"] = dict(
+                arm=controller, gripper=hand, base=base_deltas if "delta" in name else base_targets
+            )
         return deepcopy_dict(modes)
 
     @property
@@ -131,7 +133,7 @@ class MobileManipulator(BaseAgent):
         return [self.camera_config(camera) for camera in self.cameras]
 
     def camera_config(self, camera: CameraSpec) -> CameraConfig:
-        """Return a camera in ManiSkill's form, with the cheapest shader; ``sensor_configs`` of ``gym.make`` wins."""
+        """Return a ManiSkill configuration with the fastest shader; ``sensor_configs`` of ``gym.make`` has priority."""
         links = {"world": None, "base": self.description.base_link, "hand": self.description.hand_link}
         if camera.look_at is None:
             pose = sapien.Pose(camera.position)
@@ -160,11 +162,11 @@ class MobileManipulator(BaseAgent):
         self.base_link: Link = links[robot.base_link]
 
     def reset(self, init_qpos: Any = None) -> None:
-        """Stop the robot and, given a configuration (12,) or (N, 12), put it there, drive targets included."""
+        """Stop the robot; with a configuration (12,) or (N, 12), set joint positions and drive targets to it."""
         super().reset(init_qpos)
-        self._still()
+        self._clear_velocity_targets()
         if init_qpos is not None:
-            # Otherwise steps taken before the first action would pull the robot to its former targets.
+            # Otherwise steps before the first action would move the robot to its old targets.
             joints = self.robot.active_joints
             targets = torch.as_tensor(init_qpos, dtype=torch.float32, device=self.device).reshape(-1, len(joints))
             self.robot.set_joint_drive_targets(targets, joints)
@@ -175,25 +177,25 @@ class MobileManipulator(BaseAgent):
         self.controller.set_action(action)
 
     def before_simulation_step(self) -> None:
-        for controller in self._within_a_step:
+        for controller in self._interpolated:
             controller.before_simulation_step()
 
     def set_control_mode(self, control_mode: str | None = None) -> None:
-        """Change the control mode; what the last one told the arm about its velocity is forgotten."""
+        """Change the control mode and clear the velocity targets of the previous one."""
         mode = control_mode or self._default_control_mode
         if mode in self.supported_control_modes and mode not in self.controllers:
             made = RobotController(self._controller_configs[mode], self.robot, self._control_freq, scene=self.scene)
             made.set_drive_property()
             self.controllers[mode] = made
             if not self.scene._gpu_sim_initialized:
-                for link in self.robot.links:  # as ManiSkill does for those that it makes
+                for link in self.robot.links:  # as ManiSkill does for its own controllers
                     link.disable_gravity = True
         super().set_control_mode(mode)
-        self._within_a_step = [
+        self._interpolated = [
             part for part in self.controller.controllers.values() if isinstance(part, InterpolatedDrives)
         ]
-        if hasattr(self, "tcp"):  # not while the robot is being made
-            self._still()
+        if hasattr(self, "tcp"):  # not during construction
+            self._clear_velocity_targets()
             if self.scene.gpu_sim_enabled and self.scene._gpu_sim_initialized:
                 cast("Any", self.scene.px).gpu_apply_articulation_target_velocity()
 
@@ -201,14 +203,14 @@ class MobileManipulator(BaseAgent):
     def controller(self) -> RobotController:
         return cast("RobotController", super().controller)
 
-    def _still(self) -> None:
-        """Take back the velocities that the drives were told, of the envs being reset."""
+    def _clear_velocity_targets(self) -> None:
+        """Set the velocity targets of the drives to zero in the envs that are being reset."""
         joints = self.robot.active_joints
         self.robot.set_joint_drive_velocity_targets(torch.zeros(1, len(joints), device=self.device), joints)
 
     def get_proprioception(self) -> dict[str, Any]:
-        """Return the observed quantities, (N, D) each, and the controller's state."""
-        obs: dict[str, Any] = {one.name: one.observe(self) for one in QUANTITIES if one.observe}
+        """Return the observed quantities (N, D) by name, and the state of the controller."""
+        obs: dict[str, Any] = {quantity.name: quantity.observe(self) for quantity in QUANTITIES if quantity.observe}
         state = self.controller.get_state()
         if state:
             obs["controller"] = state
@@ -216,7 +218,7 @@ class MobileManipulator(BaseAgent):
 
     @property
     def tcp_pose(self) -> Pose:
-        """TCP in the world: z approach, y closing direction."""
+        """Pose of the TCP in the world frame: z approach, y closing direction."""
         return self.tcp.pose
 
     @property
@@ -225,16 +227,19 @@ class MobileManipulator(BaseAgent):
 
     @property
     def tcp_in_arm_base(self) -> Pose:
-        """TCP in the frame of the arm's base."""
+        """Pose of the TCP in the frame of the arm's base."""
         return relative_pose(self.arm_base_link, self.tcp)
 
     @property
     def gripper_width(self) -> torch.Tensor:
-        """(N,) m, distance between the pads: the sum of both finger joints."""
+        """Distance (N,) in m between the finger pads: the sum of both finger joints."""
         return self.robot.get_qpos()[:, self.description.finger_slice].sum(dim=1)
 
     def is_grasping(self, object: Actor, min_force: float = 0.5, max_angle: float = 85) -> torch.Tensor:
-        """Return whether (N,) both fingers press on an object, by N and degrees from the way they open."""
+        """Return whether both fingers press on an object (N,).
+
+        Each contact force is at least ``min_force`` N, within ``max_angle`` degrees of the finger's opening direction.
+        """
         grasping = None
         for link, side in ((self.finger1_link, 1.0), (self.finger2_link, -1.0)):
             force = self.scene.get_pairwise_contact_forces(link, object)
@@ -246,14 +251,14 @@ class MobileManipulator(BaseAgent):
         return grasping
 
     def is_static(self, threshold: float = 0.2) -> torch.Tensor:
-        """(N,) bool: no joint but the fingers moves faster than ``threshold`` (m/s, rad/s)."""
+        """Return whether all joints except the fingers move at most at ``threshold`` m/s or rad/s (N,)."""
         qvel = self.robot.get_qvel()[:, : self.description.finger_slice.start]
         return qvel.abs().max(dim=1).values <= threshold
 
 
 class RoboCASMobilePanda(MobileManipulator, spec=PANDA):
-    """A Franka Panda with lengthened finger tips on a mobile base."""
+    """A Franka Panda with extended finger tips on a mobile base."""
 
 
 class RoboCASMobilePandaStockFingers(MobileManipulator, spec=STOCK_FINGERS):
-    """The same robot with ManiSkill's own fingers, for comparison."""
+    """A Franka Panda with ManiSkill's standard fingers on a mobile base, for comparison."""

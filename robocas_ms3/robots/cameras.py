@@ -1,4 +1,4 @@
-"""The cameras of a robot. Agents, task configurations, datasets, policies and documentation read this list."""
+"""Camera specifications of the robots, used by agents, task configurations, datasets, policies and documentation."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ Vec3 = tuple[float, float, float]
 Mount = Literal["world", "base", "hand"]
 Parent = Literal["world", "arm_base", "ee"]
 PARENTS: Mapping[Mount, Parent] = {"world": "world", "base": "arm_base", "hand": "ee"}
-"""Mount of a camera -> frame in which datasets hold its pose, which is constant there."""
+"""Mount of a camera -> frame of its constant pose in datasets."""
 PARENT_FRAMES: Mapping[Parent, str] = {
     "arm_base": "arm base (panda_link0)",
     "ee": "EEF: ManiSkill's TCP, z approach, y closing",
     "world": "world",
 }
 CAMERA_NAME = "[a-z][a-z0-9_]{0,40}_camera"
-"""Regular expression of names, which become folders and keys of datasets."""
+"""Regular expression for camera names, which are folders and keys of datasets."""
 
 
 @dataclass(frozen=True)
 class CameraSpec:
-    """A camera. Its frame is SAPIEN's: x forward, y left, z up.
+    """Specification of a camera. Camera frame as in SAPIEN: x forward, y left, z up.
 
     Attributes:
         name: matches `CAMERA_NAME`.
-        mount: what it is fixed to: the world, the base link or the hand link of the robot.
-        position: in the frame of the mount, m.
-        rpy: roll, pitch and yaw in that frame, rad.
-        look_at: point in that frame that it looks at, m; None: it looks along ``rpy``.
-        overview: whether the task places it, where it sees the whole scene.
+        mount: body that carries the camera: the world, the base link or the hand link of the robot.
+        position: position in the frame of the mount, m.
+        rpy: roll, pitch and yaw (fixed axes) in the frame of the mount, rad; used if ``look_at`` is None.
+        look_at: target point of the view in the frame of the mount, m, or None.
+        overview: whether the task places the camera so that it sees the whole scene.
         fov: vertical field of view, rad.
         width, height: pixels.
-        near, far: range of the depth, m.
+        near, far: limits of the depth, m.
 
     Raises:
-        ExtensionError: the name is another one; datasets know camera folders by their names.
+        ExtensionError: the name does not match; datasets recognize camera folders by their names.
     """
 
     name: str
@@ -57,11 +57,11 @@ class CameraSpec:
 
     def __post_init__(self) -> None:
         if not re.fullmatch(CAMERA_NAME, self.name):
-            raise ExtensionError("invalid camera name", expected="a name like side_camera", found=self.name)
+            raise ExtensionError("invalid camera name", expected="a name such as side_camera", found=self.name)
 
     @property
     def parent(self) -> Parent:
-        """Frame in which datasets hold its pose."""
+        """Frame of the camera's pose in datasets."""
         return PARENTS[self.mount]
 
 
@@ -73,11 +73,11 @@ STANDARD_CAMERAS = (
 """Cameras of RoboCAS-v0. The static camera looks at a table in front of the robot."""
 STANDARD_CAMERA_NAMES = tuple(camera.name for camera in STANDARD_CAMERAS)
 EE_CAMERA = next(camera.name for camera in STANDARD_CAMERAS if camera.mount == "hand")
-"""Camera whose pose tells how the EEF frame of a dataset is turned."""
+"""Camera whose pose shows the orientation of a dataset's EEF frame."""
 
 
 def standard_camera_parent(camera: str) -> Parent:
-    """Return the parent of a camera by the names of the standard cameras; others are fixed in the world."""
+    """Return the parent frame of a standard camera by name; ``world`` for all other names."""
     for spec in STANDARD_CAMERAS:
         if spec.name == camera:
             return spec.parent

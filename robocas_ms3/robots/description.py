@@ -1,6 +1,6 @@
-"""What a robot is to planners, controllers, recordings and datasets: names, limits and numbers.
+"""Robot descriptions for planners, controllers, recordings and datasets: names, limits and dimensions.
 
-Metres, radians, seconds. Another arm is another description, beside its URDF and its agent.
+Units: metres, radians, seconds. A new robot needs a description, URDF files and an agent.
 """
 
 from __future__ import annotations
@@ -14,19 +14,18 @@ from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.robots.cameras import STANDARD_CAMERAS, CameraSpec
 
 Limits = tuple[tuple[float, float], ...]
-_OF_EACH_JOINT = ("joints", "limits")
+_PER_JOINT_FIELDS = ("joints", "limits")
 
 
 @dataclass(frozen=True)
 class Envelope:
-    """The room that a robot takes as it starts, and how far it gets: what scenes are checked for, without a simulator.
+    """Volume of a robot in its start configurations, and its reach; scenes are checked against it without a simulator.
 
     Attributes:
-        body_boxes: what turns with the base, the arm's lowest link included: half sizes in x and y, and height up to
-            which it goes from the floor, of each box, m, with room to spare.
-        arm_at_start: start -> points along the arm's links from its base to the TCP, in the robot's root frame, m.
-        shoulder: height above the arm's base of the joint that reach is counted from, m.
-        reach: from there to the TCP of the stretched arm, m.
+        body_boxes: boxes around base and lowest arm link, with margin: half sizes in x and y, height over the floor, m.
+        arm_at_start: start configuration -> points along the arm from its base to the TCP, in the root frame, m.
+        shoulder: height of the shoulder joint above the arm's base, m.
+        reach: distance from the shoulder joint to the TCP of the stretched arm, m.
     """
 
     body_boxes: tuple[tuple[float, float, float], ...]
@@ -39,34 +38,34 @@ class Envelope:
 class RobotDescription:
     """A mobile base with an arm of seven joints and a gripper of two fingers. ``qpos`` is base, arm, fingers.
 
-    How many joints there are is RoboCAS' format, not a robot's own: recordings, datasets and policies count on it.
+    The numbers of joints are fixed: recordings, datasets and policies depend on them.
 
     Attributes:
-        base_slice, arm_slice, finger_slice: where the joints of each are in ``qpos``, of every robot.
-        uid: the robot's name: ManiSkill's of the agent, that of its row, and that of its states in recordings.
+        base_slice, arm_slice, finger_slice: indices in ``qpos``, the same for every robot.
+        uid: name of the robot in ManiSkill, in `ROBOTS` and in recordings.
         base_joints, arm_joints, finger_joints: active joints in the order of ``qpos``.
-        base_limits, arm_limits, finger_limits: least and greatest position of each.
-        root_link: stands on the floor.
-        base_link: what the base's joints move; upright, no arm joint moves it.
+        base_limits, arm_limits, finger_limits: lower and upper limit of each joint.
+        root_link: fixed link on the floor.
+        base_link: upright link moved by the base's joints.
         arm_base_link: root of the arm; planners plan in its frame.
-        arm_links: those after the arm's joints.
-        hand_link, tcp_link, finger_links: of the gripper. TCP: z approach, y closing direction.
+        arm_links: child links of the arm's joints.
+        hand_link, tcp_link, finger_links: links of the gripper. TCP: z approach, y closing direction.
         open_finger: joint position of a finger of the open gripper, m.
         finger_targets: target of a finger at the gripper actions -1 and +1, m.
         arm_rest, arm_evaluation_start: configurations of the arm.
-        arm_velocity_limit, arm_acceleration_limit: of every arm joint, for planned motion, rad/s and rad/s^2.
-        base_link_height: of the base link above the floor, m.
-        arm_base_above_base_link: height of the arm's base above it, m.
-        pedestal_size, pedestal_above_base_link: of the box that carries the arm, and of its centre, m.
-        stock_tcp_in_hand: z of the TCP in the hand with the maker's fingers, m.
-        finger_extension: how much longer the fingers are, m.
-        finger_friction: of the finger tips.
-        inverse_kinematics: import path of the arm's closed form (`planning.analytic`).
-        envelope: the room it takes; None: scenes are not checked for it.
-        cameras: that it has, or that stand by it; the task configuration may change them and add others.
+        arm_velocity_limit, arm_acceleration_limit: limits of every arm joint in planned motions, rad/s and rad/s^2.
+        base_link_height: height of the base link above the floor, m.
+        arm_base_above_base_link: height of the arm's base above the base link, m.
+        pedestal_size, pedestal_above_base_link: size of the box under the arm, and height of its centre, m.
+        stock_tcp_in_hand: z of the TCP in the hand frame with standard fingers, m.
+        finger_extension: extra length of the fingers, m.
+        finger_friction: friction coefficient of the finger tips.
+        inverse_kinematics: import path of a closed-form solver for the arm (`planning.analytic`).
+        envelope: occupied volume; None: scenes are not checked.
+        cameras: default cameras; a task configuration may change them and add others.
 
     Raises:
-        RobocasError: it has another number of joints.
+        RobocasError: the number of joints is wrong.
     """
 
     base_slice: ClassVar[slice] = slice(0, 3)
@@ -106,12 +105,14 @@ class RobotDescription:
 
     def __post_init__(self) -> None:
         parts = {"base": self.base_slice, "arm": self.arm_slice, "finger": self.finger_slice}
-        sizes = {f"{part}_{what}": where.stop - where.start for part, where in parts.items() for what in _OF_EACH_JOINT}
+        sizes = {
+            f"{part}_{what}": where.stop - where.start for part, where in parts.items() for what in _PER_JOINT_FIELDS
+        }
         sizes |= dict.fromkeys(("arm_links", "arm_rest", "arm_evaluation_start"), 7) | {"finger_links": 2}
         for name, size in sizes.items():
             if len(getattr(self, name)) != size:
                 where, found = f"{self.uid}, {name}", len(getattr(self, name))
-                raise RobocasError("this robot does not fit RoboCAS' format", where=where, expected=size, found=found)
+                raise RobocasError("unsupported number of joints", where=where, expected=size, found=found)
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -120,7 +121,7 @@ class RobotDescription:
 
     @property
     def arm_base_height(self) -> float:
-        """Of the arm's base above the floor, m."""
+        """Height of the arm's base above the floor, m."""
         return self.base_link_height + self.arm_base_above_base_link
 
     @property
@@ -168,14 +169,14 @@ MOBILE_PANDA = RobotDescription(
     tcp_link="panda_hand_tcp",
     finger_links=("panda_leftfinger", "panda_rightfinger"),
     open_finger=0.04,
-    finger_targets=(-0.01, 0.04),  # beyond closed, so that thin objects are pressed too
+    finger_targets=(-0.01, 0.04),  # below 0, so that thin objects are gripped firmly too
     arm_rest=(0.0, -1.02, 0.0, -2.51, 0.0, 1.35, 0.78),
     arm_evaluation_start=(-0.0276, 0.1581, 0.0, -1.8899, -0.0688, 2.7705, 0.7514),
     arm_velocity_limit=0.5,
     arm_acceleration_limit=0.5,
-    # The base body hangs 0.26 m below the base link: read as "the body stands on the floor", so the base link is 0.26 m
-    # above it and the arm's base 0.49 m. (At 0.23 m the evaluation start would put the TCP 3 cm above the 0.61 m table,
-    # among the objects; at 0.49 m it is 0.29 m above it.)
+    # RoboCAS-v0's base body is 0.26 m below the base link. Here the body is on the floor, so the base link is 0.26 m
+    # and the arm's base 0.49 m above the floor. With 0.23 m the evaluation start would put the TCP 3 cm above the 0.61
+    # m table, among the objects; with 0.49 m it is 0.29 m above the table.
     base_link_height=0.26,
     arm_base_above_base_link=0.23,
     pedestal_size=(0.25, 0.2, 0.2),

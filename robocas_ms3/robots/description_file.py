@@ -1,4 +1,4 @@
-"""Read URDF and SRDF files, with errors that name the file; poses of links from a URDF, without a simulator."""
+"""Read URDF and SRDF files, and compute link poses from a URDF without a simulator."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class Joint:
 
     Attributes:
         name, kind: its ``name`` and ``type``.
-        parent, child: names of the links that it connects.
+        parent, child: names of the connected links.
         origin: (4, 4) pose of the joint's frame in the parent link's frame, m.
-        axis: (3,) of length 1 in the joint's frame; x where the file names none.
-        limits: lower and upper limit, rad or m; None where the file does not name both.
+        axis: (3,) unit vector in the joint's frame; default: x.
+        limits: lower and upper limit, rad or m; None if the file does not have both.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Joint:
 class RobotXml:
     """A parsed URDF or SRDF file.
 
-    Every method raises ``RobotDescriptionError`` where an element, an attribute or a number is missing or malformed.
+    Every method raises ``RobotDescriptionError`` for a missing or invalid element, attribute or number.
 
     Args:
         path: the file.
@@ -77,7 +77,7 @@ class RobotXml:
         return element.attrib[key]
 
     def numbers(self, element: Element, key: str, count: int, default: str | None = None) -> list[float]:
-        """Return an attribute that consists of ``count`` finite numbers, or those of ``default`` where it is absent."""
+        """Return the ``count`` finite numbers of an attribute, or of ``default`` if the attribute is missing."""
         text = self.attribute(element, key) if default is None else element.attrib.get(key, default)
         try:
             numbers = [float(word) for word in text.split()]
@@ -89,7 +89,7 @@ class RobotXml:
         return numbers
 
     def origin(self, element: Element) -> Array:
-        """Return the pose (4, 4) of an element's ``origin``, the identity where it has none."""
+        """Return the pose (4, 4) of an element's ``origin``; the identity without one."""
         pose, origin = np.eye(4), element.find("origin")
         if origin is not None:
             pose[:3, :3] = Rotation.from_euler("xyz", self.numbers(origin, "rpy", 3, "0 0 0")).as_matrix()
@@ -97,15 +97,17 @@ class RobotXml:
         return pose
 
     def joints(self) -> list[Joint]:
-        """Return all joints, in the order of the file."""
+        """Return all joints in file order."""
         return [self._joint(element) for element in self.root.iterfind("joint")]
 
     def joints_between(self, root: str, tip: str) -> list[Joint]:
-        """Return the joints from one link down to another, fixed ones included, in this order."""
+        """Return the joints from link ``root`` to link ``tip`` in this order, including fixed joints."""
         by_child, found, link = {joint.child: joint for joint in self.joints()}, [], tip
         while link != root:
             if link not in by_child:
-                raise self.error("no joints between two links", f"{root} above {tip}", f"no joint above {link}")
+                raise self.error(
+                    "no chain of joints between two links", f"joints from {root} to {tip}", f"no joint above {link}"
+                )
             joint = by_child.pop(link)
             found.append(joint)
             link = joint.parent
@@ -138,14 +140,14 @@ class RobotXml:
 
 
 def tcp_and_base_poses(spec: RobotSpec, root_in_world: Array, qpos: Array) -> tuple[Array, Array]:
-    """Return poses of the TCP and of the arm's base in the world, (T, 4, 4) each.
+    """Return the poses of the TCP and of the arm's base in the world frame, (T, 4, 4) each.
 
-    Whatever makes dataset actions of recorded states goes this way: equal states give equal numbers to the last bit,
-    with and without a renderer, which the links' poses of a simulator do not.
+    Dataset actions are computed from recorded states with this function, since equal states give bitwise equal poses.
+    Link poses of the simulator differ with and without a renderer.
 
     Args:
         spec: the robot.
-        root_in_world: (T, 4, 4) of its root.
+        root_in_world: (T, 4, 4) pose of the root link.
         qpos: (T, 12) m, rad.
     """
     urdf, robot = spec.files().urdf, spec.description
@@ -154,7 +156,7 @@ def tcp_and_base_poses(spec: RobotSpec, root_in_world: Array, qpos: Array) -> tu
 
 
 def chain_poses(urdf: Path, root: str, tip: str, positions: Array) -> Array:
-    """Return poses (T, 4, 4) of a link in another one, at positions (T, n) of the moving joints between."""
+    """Return poses (T, 4, 4) of link ``tip`` in the frame of ``root`` at positions (T, n) of the movable joints."""
     pose = np.tile(np.eye(4), (len(positions), 1, 1))
     columns = iter(np.asarray(positions, np.float64).T)
     for joint in read_joints(urdf, root, tip):
@@ -173,5 +175,5 @@ def chain_poses(urdf: Path, root: str, tip: str, positions: Array) -> Array:
 
 @lru_cache(maxsize=8)
 def read_joints(urdf: Path, root: str, tip: str) -> tuple[Joint, ...]:
-    """Read the joints from one link of a URDF down to another, fixed ones included, in this order."""
+    """Read the joints from link ``root`` to link ``tip`` of a URDF in this order, including fixed joints."""
     return tuple(RobotXml(urdf).joints_between(root, tip))

@@ -1,4 +1,4 @@
-"""Joint drives without ManiSkill's detours, on tensors or, on a CPU, on SAPIEN's joints themselves."""
+"""Fast joint drives: write drive targets to GPU buffers, or directly to SAPIEN joints on a CPU."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from sapien.physx import PhysxArticulationJoint
 
 from robocas_ms3.core.arrays import as_tensor, clamp, to_native
 
-# Distances of a joint from its drive target (rad, m) that no motion explains: the state was set from outside.
+# rad, m; a joint farther from its drive target was moved by setting the simulation state, not by the drive
 ARM_RESET_DISTANCE, BASE_RESET_DISTANCE = 0.3, 0.02
 
 
 class BatchedDrives(PDJointPosController):
-    """ManiSkill's joint positions, whose drive targets are written on a GPU without waiting for it."""
+    """Joint position controller that writes drive targets on a GPU without synchronizing with the device."""
 
     def set_drive_targets(self, targets: torch.Tensor) -> None:
-        """Set the targets (N, joints), rad or m, of all joints in all envs."""
+        """Set the drive targets (N, joints) in rad or m of all joints in all envs."""
         if self.scene.gpu_sim_enabled:
             self._write(cast("Any", self.scene.px).cuda_articulation_target_qpos, targets)
         else:
             super().set_drive_targets(targets)
 
     def _write(self, buffer: Any, values: torch.Tensor) -> None:
-        """Write values (N, joints) to a buffer of the GPU; ManiSkill indexes with a mask, for which the host waits."""
+        """Write values (N, joints) to a GPU buffer; ManiSkill's index by a mask would synchronize with the device."""
         buffer.torch()[self.articulation.get_joint_target_indices(self.joints)] = values
 
 
 class DirectDrives(BatchedDrives):
-    """Works on native arrays (`arrays`), and on a CPU without ManiSkill's wrapper of each joint.
+    """Controller that works on native arrays (`core.arrays`), and on a CPU without ManiSkill's joint wrappers.
 
-    These would take longer than the physics.
+    These wrappers would take longer than the physics.
     """
 
     action_space_low: Any
@@ -51,18 +51,18 @@ class DirectDrives(BatchedDrives):
     def _clip_and_scale_action(self, action: Any) -> Any:
         return self._middle + self._half * clamp(action, -1, 1)
 
-    def _taken(self, action: Any) -> Any:
-        """An action (N, size) tensor, native and scaled."""
+    def _scale_action(self, action: Any) -> Any:
+        """Convert an action tensor (N, size) to a scaled native array."""
         return self._preprocess_action(to_native(action))
 
-    def _now(self) -> Any:
-        """(N, joints) present positions, rad or m, native."""
+    def _current_qpos(self) -> Any:
+        """Return the current joint positions (N, joints) in rad or m as a native array."""
         if self.scene.gpu_sim_enabled:
             return self.qpos
         return self.articulation._objs[0].qpos[None, self._columns]
 
     def set_drive_targets(self, targets: torch.Tensor) -> None:
-        """Set the targets (N, joints), rad or m, of all joints in all envs."""
+        """Set the drive targets (N, joints) in rad or m of all joints in all envs."""
         if self.scene.gpu_sim_enabled:
             super().set_drive_targets(targets)
         else:
@@ -73,7 +73,7 @@ class DirectDrives(BatchedDrives):
             drive.set_drive_target(target)
 
     def set_drive_velocities(self, velocities: torch.Tensor) -> None:
-        """Set the velocities (N, joints), rad/s or m/s, that the drives of all joints aim at in all envs."""
+        """Set the velocity targets (N, joints) in rad/s or m/s of all joints in all envs."""
         if self.scene.gpu_sim_enabled:
             self._write(cast("Any", self.scene.px).cuda_articulation_target_qvel, velocities)
             return
@@ -82,25 +82,25 @@ class DirectDrives(BatchedDrives):
 
 
 class InterpolatedDrives(DirectDrives):
-    """Moves the drive targets evenly from one to the next within a control step."""
+    """Controller that interpolates drive targets linearly within a control step."""
 
     def _initialize_joints(self) -> None:
         super()._initialize_joints()
-        shares = torch.arange(1, self._sim_steps + 1, device=self.device) / self._sim_steps
-        self._shares = shares[:, None, None]
-        self._ahead: list[Any] = []
+        fractions = torch.arange(1, self._sim_steps + 1, device=self.device) / self._sim_steps
+        self._fractions = fractions[:, None, None]
+        self._remaining_targets: list[Any] = []
         self._step = 0
 
-    def _move_evenly(self, start: Any, end: Any) -> None:
-        """Plan the control step's drive targets, from after ``start`` (N, joints) to ``end``, native."""
-        targets = torch.lerp(as_tensor(start), as_tensor(end), self._shares)  # (steps, N, joints)
-        self._ahead = list(targets) if self.scene.gpu_sim_enabled else targets[:, 0].tolist()
+    def _interpolate(self, start: Any, end: Any) -> None:
+        """Compute the drive targets of a control step, after ``start`` (N, joints) up to ``end``; native arrays."""
+        targets = torch.lerp(as_tensor(start), as_tensor(end), self._fractions)  # (steps, N, joints)
+        self._remaining_targets = list(targets) if self.scene.gpu_sim_enabled else targets[:, 0].tolist()
         self._step = 0
 
     def before_simulation_step(self) -> None:
-        if self._step >= len(self._ahead):
+        if self._step >= len(self._remaining_targets):
             return
-        targets = self._ahead[self._step]
+        targets = self._remaining_targets[self._step]
         self._step += 1
         if self.scene.gpu_sim_enabled:
             self.set_drive_targets(targets)
@@ -110,4 +110,4 @@ class InterpolatedDrives(DirectDrives):
 
     def reset(self) -> None:
         super().reset()
-        self._ahead = []
+        self._remaining_targets = []

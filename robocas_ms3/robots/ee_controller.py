@@ -1,7 +1,7 @@
-"""Controller of the end effector: deltas in its own frame (`ee_deltas`), or absolute poses.
+"""End-effector controller: deltas in the end-effector frame (`ee_deltas`), or absolute poses.
 
-Deltas start from the pose that the last action asked for, not from where the arm is: what it falls short of a target
-would add up over the steps of recorded poses, to centimetres within seconds.
+Deltas are added to the last target pose, not to the current pose: otherwise the tracking errors of recorded motions
+would add up to centimetres within seconds.
 """
 
 from __future__ import annotations
@@ -33,36 +33,38 @@ from robocas_ms3.robots.ee_deltas import ee_delta_target
 from robocas_ms3.robots.kinematics import SerialChain
 
 BODY_FRAME = "body_translation:body_aligned_body_rotation"
-# m and rad between the TCP and the pose it was asked for: beyond, something holds the arm back, or set it elsewhere.
+# m and rad between the TCP and its target pose; beyond, the arm is blocked or its state was set
 EE_MAX_LAG = (0.1, 0.5)
 
 
 def relative_pose(frame: Link, link: Link) -> Pose:
-    """(N,) poses of a link in the frame of another; on a CPU by SAPIEN, ten times faster than by tensors."""
+    """Return the poses (N,) of a link in the frame of another; SAPIEN is ten times faster than tensors on a CPU."""
     return Pose(raw_pose=as_tensor(_relative_pose(frame, link)))
 
 
 def _relative_pose(frame: Link, link: Link) -> Any:
-    """(N, 7) native (`arrays`) poses of a link in the frame of another."""
+    """Return the poses (N, 7) of a link in the frame of another as native arrays."""
     if frame.scene.gpu_sim_enabled:
-        base, pose = frame.pose, link.pose  # ManiSkill's own product waits for the GPU
+        base, pose = frame.pose, link.pose  # ManiSkill's pose product synchronizes with the GPU
         inverse = torch.cat([base.q[:, :1], -base.q[:, 1:]], dim=1)
         return concatenate([rotations.rotate_float64(inverse, pose.p - base.p), rotations.multiply(inverse, pose.q)])
     pose = frame._bodies[0].entity_pose.inv() * link._bodies[0].entity_pose
     position, quaternion = pose.p, pose.q
-    if quaternion[0] < 0:  # as ManiSkill's products
+    if quaternion[0] < 0:  # as in ManiSkill's products
         quaternion = np.negative(quaternion)
     return np.concatenate([position, quaternion])[None]
 
 
 class _ArmChainController(PDEEPoseController):
-    """ManiSkill's controller with a `SerialChain` in place of its kinematics.
+    """ManiSkill's end-effector controller with a `SerialChain` for inverse kinematics.
 
-    ManiSkill's solver knows no joint limits on a CPU; on a GPU it waits for the device and takes a single step.
+    ManiSkill's solver ignores joint limits on a CPU. On a GPU it synchronizes with the device and does one iteration.
     """
 
     def _initialize_joints(self) -> None:
-        super(PDEEPosController, self)._initialize_joints()  # not that class' own, which builds the kinematics
+        super(
+            PDEEPosController, self
+        )._initialize_joints()  # skips the method of PDEEPosController, which builds ManiSkill's kinematics
         self.initial_qpos = None
         links = self.articulation.links_map
         self.ee_link, self.root_link = links[self.config.ee_link], links[cast("str", self.config.root_link_name)]
@@ -70,13 +72,13 @@ class _ArmChainController(PDEEPoseController):
         self._chain = SerialChain(self.config.urdf_path, self.root_link.name, self.ee_link.name, device)
         names = tuple(joint.name for joint in self.joints)
         if names != self._chain.joint_names:
-            what, expected = "the controlled joints are not those of the arm", ", ".join(self._chain.joint_names)
+            what, expected = "the controlled joints differ from the arm's joints", ", ".join(self._chain.joint_names)
             raise RobocasError(what, where=self.config.urdf_path, expected=expected, found=", ".join(names))
         limits = as_double(to_native(self.articulation.get_qlimits()[0, self.active_joint_indices]))
         self._lower, self._upper = limits[:, 0], limits[:, 1]
 
     def _solve(self, target: Any, qpos: Any) -> tuple[Any, Any]:
-        """Return arm positions (N, joints) near ``qpos`` for targets (N, 7), and whether (N,) they reach them."""
+        """Return joint positions (N, joints) near ``qpos`` for targets (N, 7), and whether each is reached (N,)."""
         target = as_double(target)
         qpos, solved = self._chain.inverse(target[:, :3], target[:, 3:], as_double(qpos), self._lower, self._upper)
         return as_float(qpos), solved
@@ -85,11 +87,13 @@ class _ArmChainController(PDEEPoseController):
 class RoboCASEEPoseController(InterpolatedDrives, _ArmChainController):
     """End-effector pose control: deltas in the end effector's frame, or absolute poses in the arm's base frame.
 
-    Differs from ManiSkill's: rotations have their natural sign; body-frame deltas work on a GPU too, since the target
-    pose in the base frame is computed before inverse kinematics; and a target that the arm does not come near to is
-    given up, so that deltas don't pile up while something is in the way. Within a control step the drive target of
-    deltas moves evenly, with its velocity, so that the TCP goes evenly from pose to pose, as it did when these poses
-    were recorded, and is there when the step ends.
+    Differences to ManiSkill's controller:
+
+    - A positive angle is a positive rotation.
+    - Body-frame deltas also work on a GPU: the target pose in the base frame is computed before inverse kinematics.
+    - If the arm is blocked, the target is reset to the current pose, so that deltas do not accumulate.
+    - For deltas, position and velocity targets of the drives are interpolated within a control step, so that the TCP
+      moves uniformly and reaches the target at the end of the step.
     """
 
     def _clip_and_scale_action(self, action: Any) -> Any:
@@ -97,8 +101,11 @@ class RoboCASEEPoseController(InterpolatedDrives, _ArmChainController):
         rotation = rotation / clamp(norm(rotation)[:, None], 1.0, np.inf)
         return self._middle + self._half * concatenate([position, rotation])
 
-    def _wanted_pose(self, reference: Any, action: Any) -> Any:
-        """Return targets (N, 7) in the arm's base frame of actions (N, 6), m and rad, relative to a pose or not."""
+    def _target_from_action(self, reference: Any, action: Any) -> Any:
+        """Convert actions (N, 6) in m and rad to target poses (N, 7) in the arm's base frame.
+
+        Actions are deltas to the pose ``reference`` (N, 7), or absolute poses if it is None.
+        """
         if reference is not None:
             return concatenate([*ee_delta_target(reference[:, :3], reference[:, 3:], action)])
         return concatenate([action[:, :3], rotations.from_euler(action[:, 3:6])])
@@ -106,43 +113,43 @@ class RoboCASEEPoseController(InterpolatedDrives, _ArmChainController):
     sets_target_qvel = True
 
     def set_action(self, action: Any) -> None:
-        """Drive the arm towards the pose; where no inverse kinematics is found it stays where it is."""
-        action = self._taken(action)
+        """Set drive targets for the target pose; hold the current position if inverse kinematics fails."""
+        action = self._scale_action(action)
         reference = self._reference_pose() if self.config.use_delta else None
-        last = now = self._now()
+        last = now = self._current_qpos()
         if self._target_qpos is not None:
             last = to_native(self._target_qpos)
         start = where(abs(last - now) > ARM_RESET_DISTANCE, now, last)
-        wanted = self._wanted_pose(reference, action)
+        wanted = self._target_from_action(reference, action)
         target, solved = self._solve(wanted, now)
         if not known_all_true(solved):
             stay = self._reference_pose() if reference is None else reference
             target, wanted = where(solved[:, None], target, now), where(solved[:, None], wanted, stay)
         self._target_pose, self._target_qpos = Pose(raw_pose=as_tensor(wanted)), as_tensor(target)
         if self.config.use_delta:
-            self._drive_with(start, (target - start) * self._control_freq)
-            self._move_evenly(start, target)
+            self._set_targets(start, (target - start) * self._control_freq)
+            self._interpolate(start, target)
         else:
-            self._drive_with(target, torch.zeros_like(as_tensor(target)))
+            self._set_targets(target, torch.zeros_like(as_tensor(target)))
 
-    def _drive_with(self, targets: Any, velocities: Any) -> None:
-        """Set drive targets and their velocities: an arm that is told its velocity does not lag."""
+    def _set_targets(self, targets: Any, velocities: Any) -> None:
+        """Set position and velocity targets of the drives; velocity targets avoid a tracking lag."""
         self.set_drive_targets(targets)
         self.set_drive_velocities(velocities)
 
     def reference_pose(self) -> Pose:
-        """(N,) poses in the arm's base frame that the next deltas start from."""
+        """Return the poses (N,) in the arm's base frame to which the next deltas are added."""
         return Pose(raw_pose=as_tensor(self._reference_pose()))
 
     def _reference_pose(self) -> Any:
         now = _relative_pose(cast("Link", self.root_link), self.ee_link)
         if not self.config.use_target or self._target_pose is None:
             return now
-        far, turned = EE_MAX_LAG
+        max_distance, max_angle = EE_MAX_LAG
         target = to_native(self._target_pose.raw_pose)
         distance = norm(target[:, :3] - now[:, :3])
-        cosine = abs((target[:, 3:] * now[:, 3:]).sum(1))  # of half the angle between them
-        lost = (distance > far) | (cosine < np.cos(turned / 2))
+        cosine = abs((target[:, 3:] * now[:, 3:]).sum(1))  # cosine of half the angle between the poses
+        lost = (distance > max_distance) | (cosine < np.cos(max_angle / 2))
         if known_all_false(lost):
             return target
         return where(lost[:, None], now, target)
@@ -150,6 +157,6 @@ class RoboCASEEPoseController(InterpolatedDrives, _ArmChainController):
 
 @dataclass
 class RoboCASEEPoseControllerConfig(PDEEPoseControllerConfig):
-    """Configuration of a ``RoboCASEEPoseController``. Rotation bounds must be symmetric."""
+    """Configuration of a ``RoboCASEEPoseController``; rotation bounds must be symmetric."""
 
     controller_cls = RoboCASEEPoseController

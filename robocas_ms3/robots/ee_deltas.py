@@ -1,8 +1,9 @@
-"""Motions of the end effector as actions: what `pd_ee_delta_pose` takes.
+"""Convert end-effector motions to and from actions of `pd_ee_delta_pose`.
 
-Its actions are (x, y, z, rx, ry, rz) in [-1, 1], all in the current TCP frame. Translation is metres / 0.1. Rotation is
-Euler angles in radians / 0.5, in the convention of ManiSkill's controllers (intrinsic XYZ: R = Rx Ry Rz), its norm
-clipped to 1. A positive angle turns positively about the TCP's axis (ManiSkill's own controller turns the other way).
+Actions are (x, y, z, rx, ry, rz) in [-1, 1] in the current TCP frame. Translation is in metres / 0.1. Rotation is
+intrinsic XYZ Euler angles in radians / 0.5, as in ManiSkill (R = Rx Ry Rz), with its norm clipped to 1. Actions of
+RoboCAS datasets have Euler angles about fixed axes instead. A positive angle is a positive rotation about the TCP's
+axis; in ManiSkill's own controller it is a negative rotation.
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ POSITION_SCALE, ROTATION_SCALE = 0.1, 0.5  # m and rad at |action| = 1
 def to_ee_delta_action(
     translation: np.ndarray, rotation: np.ndarray | Rotation, *, euler: str | None = None
 ) -> np.ndarray:
-    """Turn a relative motion of the TCP, in its own frame, into the arm's part of a ``pd_ee_delta_pose`` action.
+    """Convert a TCP motion in the TCP frame to the arm's part of a ``pd_ee_delta_pose`` action.
 
     Args:
         translation: (..., 3) m.
         rotation: (..., 3) rotation vectors, rad; or Euler angles with ``euler``; or a scipy ``Rotation``.
-        euler: scipy's name of the convention when ``rotation`` holds Euler angles: ``"XYZ"`` intrinsic (ManiSkill's),
-            ``"xyz"`` extrinsic (RoboCAS datasets read with scipy).
+        euler: scipy's name of the Euler convention if ``rotation`` has Euler angles: ``"XYZ"`` intrinsic (ManiSkill),
+            ``"xyz"`` fixed axes (RoboCAS datasets).
 
     Returns:
-        (..., 6) float32, not clipped: beyond +-1 the motion does not fit into one step.
+        Actions (..., 6) float32, not clipped; a motion beyond +-1 exceeds one step.
     """
     translation = np.asarray(translation, dtype=np.float64)
     if not isinstance(rotation, Rotation):
@@ -39,7 +40,7 @@ def to_ee_delta_action(
 
 
 def ee_delta_target(position: Array, quaternion: Array, delta: Array) -> tuple[Array, Array]:
-    """Apply a motion given in the end effector's frame to its pose in any parent frame.
+    """Apply a motion in the end-effector frame to a pose of the end effector in a parent frame.
 
     Args:
         position: (N, 3) m, of the end effector in the parent frame.

@@ -1,4 +1,4 @@
-"""Controllers of joints: the arm's, moved evenly; fingers that do the same; a base that is held; all of a robot."""
+"""Joint controllers: interpolated arm joints, mimicking fingers, a held base, and the combined robot controller."""
 
 from __future__ import annotations
 
@@ -32,33 +32,33 @@ BASE_SCALE = (0.025, 0.025, 0.025)  # m, m, rad, base joints: 0.5 m/s at 20 Hz
 
 @dataclass
 class JointDeltaControllerConfig(PDJointPosControllerConfig):
-    """Configuration of ManiSkill's joint deltas on a GPU; see ``BatchedDrives``."""
+    """Configuration of joint delta control on a GPU; see ``BatchedDrives``."""
 
     controller_cls = BatchedDrives
 
 
 class FingersController(DirectDrives, PDJointPosMimicController):
-    """Absolute positions of fingers that all do the same; ManiSkill's, without its detours."""
+    """Faster version of ManiSkill's mimic controller: the same absolute position for all fingers."""
 
     def set_action(self, action: Any) -> None:
-        """Take the position (N, 1) of every finger."""
-        action = self._taken(action)
+        """Set the target position (N, 1) of all fingers."""
+        action = self._scale_action(action)
         self._target_qpos = as_tensor(concatenate([action] * len(self.joints)))
         self.set_drive_targets(self._target_qpos)
 
 
 @dataclass
 class FingersControllerConfig(PDJointPosMimicControllerConfig):
-    """Configuration of a ``FingersController``: what mimics does so one to one."""
+    """Configuration of a ``FingersController``; joints mimic with factor 1."""
 
     controller_cls = FingersController
 
 
 class SmoothJointPosController(InterpolatedDrives):
-    """Joint positions, absolute or relative to the last target, whose drive target moves evenly within a control step.
+    """Joint position controller with interpolated targets; positions are absolute or relative to the last target.
 
-    A target that jumps at 5 Hz makes the arm start and stop with every step, at twice the planned velocity. ManiSkill's
-    ``interpolate`` starts from where the arm is instead of from the last target, and jerks more than jumps do.
+    Without interpolation, targets at 5 Hz would start and stop the arm in every step at twice the planned velocity.
+    ManiSkill's ``interpolate`` starts from the current position instead of the last target, which causes more jerk.
     """
 
     config: SmoothJointPosControllerConfig
@@ -69,18 +69,18 @@ class SmoothJointPosController(InterpolatedDrives):
         self._low, self._high = limits[:, 0], limits[:, 1]
 
     def set_action(self, action: Any) -> None:
-        """Take the positions (N, joints), rad or m, to command at the end of the control step."""
-        action = self._taken(action)
+        """Set the target positions (N, joints) in rad or m for the end of the control step."""
+        action = self._scale_action(action)
         assert self._target_qpos is not None, "the controller has not been reset"
-        now, last = self._now(), to_native(self._target_qpos)
+        now, last = self._current_qpos(), to_native(self._target_qpos)
         start = where(abs(last - now) > ARM_RESET_DISTANCE, now, last)
         travel = action if self.config.use_delta else action - start
         if self.config.max_speed is not None:
-            furthest = self.config.max_speed / self._control_freq
-            travel = clamp(travel, -furthest, furthest)
+            max_travel = self.config.max_speed / self._control_freq
+            travel = clamp(travel, -max_travel, max_travel)
         target = clamp(start + travel, self._low, self._high)
         self._target_qpos = as_tensor(target)
-        self._move_evenly(start, target)
+        self._interpolate(start, target)
 
 
 @dataclass
@@ -89,18 +89,18 @@ class SmoothJointPosControllerConfig(PDJointPosControllerConfig):
 
     normalize_action: bool = False
     max_speed: float | None = None
-    """rad/s or m/s that the target moves at most; a command further away takes several steps."""
+    """Limit of the target's speed in rad/s or m/s; a more distant command needs several steps."""
     controller_cls = SmoothJointPosController
 
 
 class HeldJointsController(DirectDrives):
-    """Holds joints where they are at reset; takes no action (0 dimensions)."""
+    """Controller that holds joints at their positions after a reset; its action has 0 dimensions."""
 
     def _initialize_action_space(self) -> None:
         self.single_action_space = spaces.Box(np.empty(0, np.float32), np.empty(0, np.float32))
 
     def reset(self) -> None:
-        """Take the present configuration as the one to hold, in the envs that are being reset."""
+        """Hold the current joint positions in the envs that are being reset."""
         super().reset()
         held = self._target_qpos[self.scene._reset_mask]
         if self.scene.gpu_sim_enabled:
@@ -109,16 +109,16 @@ class HeldJointsController(DirectDrives):
             self.set_drive_targets(held)
 
     def set_action(self, action: Any) -> None:
-        """Keep the drive targets, unless the state was set from outside: then hold the joints where they are now."""
+        """Keep the drive targets; if the simulation state was set since, hold the current positions."""
         assert self._target_qpos is not None, "the controller has not been reset"
-        now, held = self._now(), to_native(self._target_qpos)
+        now, held = self._current_qpos(), to_native(self._target_qpos)
         self._target_qpos = as_tensor(where(abs(held - now) > BASE_RESET_DISTANCE, now, held))
         self.set_drive_targets(self._target_qpos)
 
 
 @dataclass
 class HeldJointsControllerConfig(PDJointPosControllerConfig):
-    """Configuration of a ``HeldJointsController``; bounds are not used."""
+    """Configuration of a ``HeldJointsController`` without bounds."""
 
     lower: None = None
     upper: None = None
@@ -129,31 +129,31 @@ class HeldJointsControllerConfig(PDJointPosControllerConfig):
 
 
 State = Mapping[str, Mapping[str, Any]]
-"""By controller: ``target_qpos`` (N, joints), rad or m; ``target_pose`` (N, 7) of the TCP in the arm's base frame."""
+"""Controller -> ``target_qpos`` (N, joints) in rad or m, ``target_pose`` (N, 7) of the TCP in the arm's base frame."""
 
 
 class RobotController(CombinedController):
-    """ManiSkill's, whose reset leaves the other envs alone.
+    """Combined controller that can reset a subset of the envs.
 
-    ManiSkill resets controllers after it has forgotten which envs are reset: all would start from where they are.
+    ManiSkill clears its reset mask before it resets the controllers, which would reset all envs.
     """
 
     reset_only: torch.Tensor | None = None
     """Indices of the envs of the next reset; None: all."""
 
     def reset(self) -> None:
-        """Start from where the joints are, in the envs that are being reset."""
-        every = self.scene._reset_mask
+        """Set the targets to the current joint positions in the envs that are being reset."""
+        mask = self.scene._reset_mask
         if self.reset_only is not None:
-            self.scene._reset_mask = torch.zeros_like(every)
+            self.scene._reset_mask = torch.zeros_like(mask)
             self.scene._reset_mask[self.reset_only] = True
         try:
             super().reset()
         finally:
-            self.scene._reset_mask, self.reset_only = every, None
+            self.scene._reset_mask, self.reset_only = mask, None
 
     def targets(self) -> dict[str, dict[str, torch.Tensor]]:
-        """Return a copy of what the next actions start from besides the joints, as `State`."""
+        """Return a copy of the targets to which the next actions are relative, as `State`."""
         found: dict[str, dict[str, torch.Tensor]] = {}
         for name, controller in self.controllers.items():
             part, kept = cast("Any", controller), found.setdefault(name, {})
@@ -164,7 +164,7 @@ class RobotController(CombinedController):
         return found
 
     def set_targets(self, state: State | None = None, env_idx: torch.Tensor | None = None) -> None:
-        """Let the next actions of envs start from targets (`targets`), and without these from where the joints are."""
+        """Set the targets (`targets`) of envs; missing targets are set to the current positions."""
         envs = slice(None) if env_idx is None else env_idx
         for name, controller in self.controllers.items():
             part, given = cast("Any", controller), (state or {}).get(name, {})

@@ -1,6 +1,6 @@
-"""Inverse kinematics of an arm near given configurations, for batches.
+"""Batched iterative inverse kinematics of a serial arm.
 
-The same code runs on tensors, where it never waits for the device, and on NumPy's arrays, which are faster on a CPU.
+The code runs on tensors without synchronizing with the device, and on NumPy arrays, which are faster on a CPU.
 """
 
 from __future__ import annotations
@@ -20,27 +20,25 @@ from robocas_ms3.core.rotations import left_product_matrix, standardize
 from robocas_ms3.robots.description_file import read_joints
 
 IK_ITERATIONS = 8
-IK_DAMPING, IK_LEAST_DAMPING = 0.1, 1e-6  # times the squared error, and added to it
-IK_MAX_ERROR = 0.5  # m and rad together that one iteration corrects: linear steps diverge beyond
-IK_TOLERANCE = 1e-4  # m and rad together between a target and a pose that reaches it
-IK_CONVERGED = 1e-5  # m and rad together below which a configuration is not improved
+IK_DAMPING, IK_MIN_DAMPING = 0.1, 1e-6  # factor of the squared error, and constant term
+IK_MAX_ERROR = 0.5  # limit of the error (m and rad combined) per iteration; larger linear steps diverge
+IK_TOLERANCE = 1e-4  # error (m and rad combined) of a reached target
+IK_CONVERGED = 1e-5  # error (m and rad combined) at which the iteration stops
 
 
 class SerialChain:
-    """Revolute joints between two links of a robot, with constants read from its URDF.
+    """Chain of revolute joints between two links of a robot, read from its URDF.
 
-    Controllers use this class, on either array type; the planner uses `planning.kinematics.ArmChain`, datasets use
-    `description_file.tcp_and_base_poses`.
-
-    All arrays are float64: float32 leaves errors near the tolerance, and TF32 of a GPU's products would exceed it.
+    Controllers use this class with tensors or NumPy arrays. The planner uses `planning.kinematics.ArmChain`, datasets
+    use `description_file.tcp_and_base_poses`. All arrays are float64: float32 and TF32 errors exceed the tolerance.
 
     Args:
         urdf: the robot.
-        root, tip: names of the links. Poses are those of the tip in the root's frame.
-        device: where the tensors are that the chain is used with; None: it is used with NumPy's arrays.
+        root, tip: names of the links. Poses are of the tip in the root's frame.
+        device: device of the tensors; None: NumPy arrays are used.
 
     Attributes:
-        joint_names: the n joints, from the root to the tip.
+        joint_names: names of the n joints from root to tip.
 
     Raises:
         RobotDescriptionError: the URDF is missing or malformed, or no joints lead from the root to the tip.
@@ -70,20 +68,20 @@ class SerialChain:
     def inverse(
         self, position: Array, quaternion: Array, qpos: Array, lower: Array, upper: Array
     ) -> tuple[Array, Array]:
-        """Find joint positions within limits that reach poses, near given ones.
+        """Solve inverse kinematics within joint limits, near given joint positions.
 
-        Levenberg-Marquardt with a damping proportional to the squared error (Sugihara, IEEE T-RO 27(5), 2011). A joint
-        at a limit takes no part in a step that would push it beyond. Each row's result is independent of the others.
+        Levenberg-Marquardt with damping proportional to the squared error (Sugihara, IEEE T-RO 27(5), 2011). A joint at
+        a limit is excluded from steps that would exceed the limit. Rows are independent of each other.
 
         Args:
-            position: (N, 3) m, targets of the tip in the root's frame.
-            quaternion: (N, 4) wxyz, of norm 1 and either sign. The norm is not checked; it scales the rotation error,
-                and so the result of any other norm is wrong.
-            qpos: (N, n) rad, where the search starts.
-            lower, upper: (n,) rad, limits.
+            position: (N, 3) m, target positions of the tip in the root's frame.
+            quaternion: (N, 4) wxyz unit quaternions of either sign. The norm is not checked; another norm gives wrong
+                results, since it scales the rotation error.
+            qpos: (N, n) rad, initial joint positions.
+            lower, upper: (n,) rad, joint limits.
 
         Returns:
-            Joint positions (N, n) within the limits, and (N,) whether they reach the targets to ``IK_TOLERANCE``.
+            Joint positions (N, n) within the limits, and whether each reaches its target within ``IK_TOLERANCE`` (N,).
         """
         to_target = (quaternion @ self._quotient).reshape(-1, 4, 4)
         position, qpos, lower, upper = position[..., None], qpos[..., None], lower[:, None], upper[:, None]
@@ -102,7 +100,7 @@ class SerialChain:
             twists = _twists(frames)
             room = where(matmul(twists, error) < 0, qpos - lower, upper - qpos)
             twists = twists * (room > 0)
-            damping = (IK_DAMPING * square + IK_LEAST_DAMPING) * self._identity
+            damping = (IK_DAMPING * square + IK_MIN_DAMPING) * self._identity
             step = matmul(twists, _solve(matmul(twists.swapaxes(1, 2), twists) + damping, error))
             qpos = clamp(qpos + step, lower, upper)
             iteration += 1
@@ -114,7 +112,7 @@ class SerialChain:
         sines = torch.sin(angles) if isinstance(angles, Tensor) else np.sin(angles)
         local = sines @ self._weights + self._constant
         frames = local.reshape(rows, -1, 4, 4).swapaxes(0, 1).reshape(-1, 4, 4)
-        # A prefix product: each matrix becomes that over the last 2, 4, 8, ... joints.
+        # prefix product by doubling: each matrix covers the last 2, 4, 8, ... joints
         joined = 1
         while joined < count:
             skipped = 2 * rows * joined
@@ -125,10 +123,10 @@ class SerialChain:
 
 
 def _joint_constants(fixed: list[NDArray[np.float64]]) -> tuple[NDArray[np.float64], ...]:
-    """Return constants A, b, W, c with which sin(q A + b) W + c is what `SerialChain._frames` multiplies.
+    """Return constants A, b, W, c; `SerialChain._frames` multiplies the matrices sin(q A + b) W + c.
 
-    Four columns of A for each joint: sines of its angle q and of q + 90 deg turn poses about z, those of q / 2 and
-    q / 2 + 90 deg turn quaternions.
+    A has four columns per joint: the sines of q and q + 90 deg rotate poses about z, the sines of q / 2 and
+    q / 2 + 90 deg rotate quaternions.
     """
     count = len(fixed) - 1
     angles = np.asarray(np.kron(np.eye(count), [1, 1, 0.5, 0.5]), dtype=np.float64)
@@ -149,7 +147,7 @@ def _joint_constants(fixed: list[NDArray[np.float64]]) -> tuple[NDArray[np.float
 
 
 def _frame_about(z: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a rotation (4, 4) that turns z into an axis."""
+    """Return a transform (4, 4) that rotates the z axis onto the unit vector ``z``."""
     x = np.cross([1, 0, 0] if abs(z[1]) > 0.9 else [0, 1, 0], z)
     x /= np.linalg.norm(x)
     pose = np.eye(4)
@@ -158,11 +156,11 @@ def _frame_about(z: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 _QUOTIENT = (left_product_matrix(np.eye(4)) @ np.diag([1, -1, -1, -1])).reshape(4, 16)
-"""Turns quaternions a (N, 4) into matrices (N, 16) that multiply quaternions b to a times the conjugate of b."""
+"""Constant that converts quaternions a (N, 4) to matrices (N, 16) of the map b -> a * conjugate(b)."""
 
 
 def _twists(frames: Array) -> Array:
-    """Return the motions (N, n, 6) of the tip, m and rad, per rad of each joint."""
+    """Return the motions (N, n, 6) of the tip in m and rad per rad of each joint (transposed Jacobian)."""
     poses = frames[:, 0, :, :3]
     axes, points = poses[:-1, ..., 2], poses[..., 3]
     return concatenate([_cross(axes, points[-1:] - points[:-1]), axes]).swapaxes(0, 1)
@@ -171,11 +169,11 @@ def _twists(frames: Array) -> Array:
 def _cross(first: Array, second: Array) -> Array:
     if isinstance(first, Tensor):
         return torch.linalg.cross(first, second)
-    products = first[..., None] * second[..., None, :]  # `np.cross` takes five times as long
+    products = first[..., None] * second[..., None, :]  # `np.cross` is five times slower
     return (products - products.swapaxes(-1, -2)).reshape(*first.shape[:-1], 9)[..., [5, 6, 1]]
 
 
 def _solve(matrices: Array, columns: Array) -> Array:
     if isinstance(matrices, Tensor):
-        return torch.linalg.solve_ex(matrices, columns)[0]  # `solve` waits for the device, to report singular matrices
+        return torch.linalg.solve_ex(matrices, columns)[0]  # `solve` synchronizes to report singular matrices
     return np.linalg.solve(matrices, columns)

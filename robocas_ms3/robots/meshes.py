@@ -1,4 +1,4 @@
-"""Light visual meshes: decimated copies of shipped GLBs, coloured boxes. Software rendering pays per triangle."""
+"""Write low-polygon visual meshes: decimated GLB files and coloured boxes, which render fast in software."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 SMOOTH_ANGLE = np.radians(40.0)
-"""Edges sharper than this stay sharp in the shading."""
+"""Angle in rad; edges with a larger angle stay sharp in the shading."""
 
 Box = tuple[Sequence[float], Sequence[float], Sequence[float]]
-"""(size (3,), centre (3,), RGB in 0..1)."""
+"""Size (3,) and centre (3,) in m, and RGB colour in 0..1."""
 
 
 def decimate_glb(source: Path, target: Path, triangles: int) -> int:
-    """Write a copy of a GLB with about so many triangles, each submesh with its material; return their number."""
+    """Write a decimated copy of a GLB file with its materials; return the resulting number of triangles."""
     scene = trimesh.load(source, force="scene")
     assert isinstance(scene, trimesh.Scene)
     total = sum(len(g.faces) for g in scene.geometry.values())
@@ -40,7 +40,7 @@ def decimate_glb(source: Path, target: Path, triangles: int) -> int:
             mesh = trimesh.Trimesh(simplified[0], simplified[1])
         part = trimesh.graph.smooth_shade(mesh, angle=SMOOTH_ANGLE)
         part.visual = TextureVisuals(material=material)
-        part.vertex_normals  # noqa: B018 - computed here, so that they are exported
+        part.vertex_normals  # noqa: B018 - computed here to be exported
         written.add_geometry(part, geom_name=f"part{len(written.geometry)}")
         count += len(part.faces)
     target.write_bytes(_glb(written))
@@ -48,10 +48,10 @@ def decimate_glb(source: Path, target: Path, triangles: int) -> int:
 
 
 def write_boxes_glb(target: Path, boxes: Sequence[Box]) -> None:
-    """Write coloured boxes as one GLB.
+    """Write coloured boxes as one GLB file.
 
-    A URDF ``<box>`` with a material would make SAPIEN's loader construct a render material, which fails on a machine
-    without a renderer; a mesh file is only read where there is one.
+    For a URDF ``<box>`` with a material, SAPIEN's loader creates a render material, which fails without a renderer. A
+    mesh file is only read if a renderer exists.
     """
     scene = trimesh.Scene()
     for i, (size, centre, colour) in enumerate(boxes):
@@ -60,7 +60,7 @@ def write_boxes_glb(target: Path, boxes: Sequence[Box]) -> None:
         mesh.unmerge_vertices()
         material = PBRMaterial(baseColorFactor=[*colour, 1.0], metallicFactor=0.0, roughnessFactor=0.6)
         mesh.visual = TextureVisuals(material=material)
-        mesh.vertex_normals  # noqa: B018 - computed here, so that they are exported
+        mesh.vertex_normals  # noqa: B018 - computed here to be exported
         scene.add_geometry(mesh, geom_name=f"box{i}")
     target.write_bytes(_glb(scene))
 

@@ -1,4 +1,4 @@
-"""The quantities that are observed of a robot and recorded of it, one entry each.
+"""Observed and recorded quantities of a robot.
 
 Environments, policies, remote messages, both dataset formats, checks and documentation read `QUANTITIES`.
 """
@@ -21,18 +21,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ArraySpec:
-    """An array of an episode.
+    """Specification of an array of an episode.
 
     Attributes:
-        name: its key.
-        dtype: its type; ``str`` is numpy's fixed-width unicode.
-        shape: lengths; ``"T"`` is the number of steps.
-        unit: of its numbers.
-        meaning: for people.
-        quaternion: rows are unit quaternions xyzw.
-        embedding: rows are sentence embeddings; absent from datasets converted without.
-        limits: least and greatest value; None: any.
-        optional: a dataset may lack it: one that was written before the entry was added, or of a format without it.
+        name: key of the array.
+        dtype: data type; ``str`` is numpy's fixed-width unicode.
+        shape: shape; ``"T"`` is the number of steps.
+        unit: unit of the values.
+        meaning: description for users.
+        quaternion: whether rows are unit quaternions xyzw.
+        embedding: whether rows are sentence embeddings, which a dataset may omit.
+        limits: smallest and largest valid value; None: unlimited.
+        optional: whether a dataset may omit the array because of its version or format.
     """
 
     name: str
@@ -57,17 +57,17 @@ class ArraySpec:
 
 @dataclass(frozen=True)
 class Quantity(ArraySpec):
-    """A quantity of each step.
+    """Specification of a quantity of the robot per step.
 
     Attributes:
-        observed: computes it (N, ...) of an agent (`agent.MobileManipulator`), for ``obs["agent"]`` of environments;
-            None: it is not observed.
-        policy: its name in the observations and remote messages of policies; empty: they do not get it.
-        recorded: computes it (T, ...) of a motion (`demos.recordings.motion.Motion`), for ``episode_info.npz``; None:
-            it is not recorded.
-        feature: LeRobot feature that holds it, next to the others of that feature; empty: none does. An optional
-            quantity has none: LeRobot datasets hold every feature in every episode.
-        components: names of its numbers there; default: its own, numbered where it has several.
+        observe: returns the quantity (N, ...) of an agent (`agent.MobileManipulator`), for ``obs["agent"]``; None: not
+            observed.
+        policy_key: name in the observations and remote messages of policies; empty: not available to policies.
+        record: returns the quantity (T, ...) of a motion (`demos.recordings.motion.Motion`), for
+            ``episode_info.npz``; None: not recorded.
+        lerobot_feature: LeRobot feature that contains the quantity, possibly with others; empty: none. An optional
+            quantity must have none, since LeRobot datasets have every feature in every episode.
+        components: names of the values in the LeRobot feature; default: the name, numbered if there are several.
     """
 
     observe: Callable[[Any], Any] | None = None
@@ -78,7 +78,9 @@ class Quantity(ArraySpec):
 
     def __post_init__(self) -> None:
         if self.optional and self.lerobot_feature:
-            raise ValueError(f"an optional quantity has no LeRobot feature: {self.name}, {self.lerobot_feature}")
+            raise ValueError(
+                f"optional quantity {self.name!r} must not have a LeRobot feature, found {self.lerobot_feature!r}"
+            )
 
     @property
     def width(self) -> int:
@@ -91,7 +93,7 @@ class Quantity(ArraySpec):
 
 
 def continuous_xyzw(poses: Array) -> Array:
-    """Return the orientations of poses (T, 4, 4) as (T, 4) xyzw: w >= 0 in the first row, no sign flips after it."""
+    """Return the orientations of poses (T, 4, 4) as quaternions xyzw (T, 4), without sign flips; w >= 0 in row 0."""
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
     flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
     quaternions[1:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
@@ -101,9 +103,9 @@ def continuous_xyzw(poses: Array) -> Array:
 _JOINTS = tuple(f"joint_{number}" for number in range(1, 8))
 _XYZ, _XYZW = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
 GRIPPER_WIDTH = "gripper_width"
-"""Key of the distance between the finger pads, in observations, remote messages and recordings."""
+"""Key of the finger distance in observations, remote messages and recordings."""
 STATE, ARM_BASE = "observation.state", "observation.arm_base"
-"""LeRobot features that hold several quantities."""
+"""LeRobot features that contain several quantities."""
 _EE = "EEF (TCP) in the arm base frame (panda_link0)"
 _BASE = "arm base in the world"
 
@@ -147,7 +149,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "float32",
         ("T", 4),
         "xyzw",
-        "the same turn; last row the identity",
+        "rotation of the same motion; last row the identity",
         quaternion=True,
         record=lambda motion: motion.tcp_motion[1],
     ),
@@ -257,7 +259,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "float32",
         ("T", 3),
         "m, m, rad",
-        "mobile base in the world: x, y, yaw, which never jumps",
+        "mobile base in the world: x, y, yaw (yaw is continuous)",
         record=lambda motion: motion.agv_pose,
         lerobot_feature=STATE,
         components=("agv_x", "agv_y", "agv_yaw"),
@@ -274,7 +276,7 @@ QUANTITIES: tuple[Quantity, ...] = (
 
 
 def lerobot_features() -> dict[str, list[Quantity]]:
-    """Return the quantities that each LeRobot feature of observations holds, in their order."""
+    """Return LeRobot feature -> its quantities in order."""
     found: dict[str, list[Quantity]] = {}
     for quantity in QUANTITIES:
         if quantity.lerobot_feature:
@@ -283,7 +285,7 @@ def lerobot_features() -> dict[str, list[Quantity]]:
 
 
 def feature_columns(feature: str) -> dict[str, slice]:
-    """Return the columns of each quantity in a LeRobot feature (T, D), by its name."""
+    """Return quantity name -> columns in a LeRobot feature (T, D)."""
     columns, first = {}, 0
     for quantity in lerobot_features()[feature]:
         columns[quantity.name] = slice(first, first := first + quantity.width)

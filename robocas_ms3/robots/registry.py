@@ -1,4 +1,4 @@
-"""The robots: a row each, and those of other packages (entry points ``robocas_ms3.robots``)."""
+"""Registry of robots: builtin robots and those of other packages (entry points ``robocas_ms3.robots``)."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from robocas_ms3.robots.urdf import RobotFiles, make_robot_files
 
 @dataclass(frozen=True)
 class RobotSpec:
-    """A robot, declared without a simulator.
+    """Registry entry of a robot; importing it does not import a simulator.
 
     Attributes:
-        description: its names, limits and numbers; its ``uid`` is the row's name.
-        files: gives its URDF files, made where they are missing.
-        agent: import path of its ManiSkill agent, a `robots.agent.MobileManipulator`.
+        description: names, limits and dimensions; its ``uid`` is the name in the registry.
+        files: function that returns the URDF files and generates missing ones.
+        agent: import path of the ManiSkill agent, a subclass of `robots.agent.MobileManipulator`.
     """
 
     description: RobotDescription
@@ -35,14 +35,20 @@ STOCK_FINGERS = RobotSpec(
 )
 DEFAULT_ROBOT = MOBILE_PANDA.uid
 ROBOTS = Registry(
-    "robot", "robocas_ms3.robots", RobotSpec, {row.description.uid: row for row in (PANDA, STOCK_FINGERS)}
+    "robot", "robocas_ms3.robots", RobotSpec, {spec.description.uid: spec for spec in (PANDA, STOCK_FINGERS)}
 )
 
 
 def find_robot(name: str | None, *, where: object = "robot") -> RobotSpec:
-    """The robot of a name; None: the default one."""
+    """Return the registered robot of this name, or the default robot for None."""
     spec = ROBOTS.find(name or DEFAULT_ROBOT, where=where)
     if spec.description.uid != (name or DEFAULT_ROBOT):
-        fix = "Name its entry point as its description's uid."
-        raise ExtensionError("a robot by another name", where=where, expected=spec.description.uid, found=name, fix=fix)
+        fix = "Name the entry point as the uid of its description."
+        raise ExtensionError(
+            "the entry point's name differs from the robot's uid",
+            where=where,
+            expected=spec.description.uid,
+            found=name,
+            fix=fix,
+        )
     return spec

@@ -1,4 +1,4 @@
-"""Robot description files, generated from the installed mani_skill's Panda into the cache. Needs no SAPIEN."""
+"""Generate robot description files in the cache from mani_skill's Panda; SAPIEN is not needed."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ from robocas_ms3.robots.description import MOBILE_PANDA as c
 LINK_TRIANGLES = 1000
 _INSTALL = "Install it: pip install 'mani_skill>=3.0.1,<3.1'."
 
-# The AGV: a body on the floor (1 cm of air below, so that it never rubs), a deck that carries the pedestal.
+# The mobile base: a body 1 cm above the floor, and a deck that carries the pedestal.
 _BODY = ((0.5, 0.4, 0.24), (0.0, 0.0, 0.13 - c.base_link_height), (0.16, 0.17, 0.19))
 _DECK = ((0.36, 0.3, 0.04), (0.0, 0.0, 0.27 - c.base_link_height), (0.85, 0.86, 0.88))
 _PEDESTAL = (c.pedestal_size, (0.0, 0.0, c.pedestal_above_base_link), (0.85, 0.86, 0.88))
 _BASE_MASS = 60.0  # kg
 
-# Tip pads in the finger's frame; y is the closing direction. Upstream's 55 mm pad starts 28 mm up the finger, over the
+# Tip pads in the finger's frame; y is the closing direction. RoboCAS-v0's 55 mm pad starts at z = 28 mm, covers the
 # stock rubber tip, whose inner face is at y = 0 too, and ends 8 mm beyond the TCP.
 _TIP_WIDTH, _TIP_THICKNESS, _TIP_START, _TIP_STOCK_END = 0.018, 0.004, 0.028, 0.053
-# Stock fingers weigh 15 g; PhysX then lets a 33 N grip sink 2 mm into the object from each side (0.35 mm at 0.1 kg).
+# Stock fingers weigh 15 g; with a 33 N grip PhysX then lets them penetrate objects by 2 mm (0.35 mm at 0.1 kg).
 _FINGER_MASS, _FINGER_INERTIA = 0.1, (6e-5, 6e-5, 6e-6)  # kg, kg m^2
 _TIP_COLOUR = (0.05, 0.05, 0.05)
 
 
 @dataclass(frozen=True)
 class RobotFiles:
-    """Where the generated files lie.
+    """Paths of the generated files.
 
     Attributes:
-        urdf: mobile base, arm, hand. Its SRDF has the same stem, where SAPIEN's loader looks for it.
-        arm_urdf: rooted at the arm's base, for planners and inverse kinematics: arm, hand, and the base's body as a
-            fixed link, so that the arm is kept off it. No visuals.
-        arm_srdf: pairs of links of ``arm_urdf`` whose collisions are not to be checked.
-        folder: holds all of them.
+        urdf: mobile base, arm and hand. SAPIEN loads the SRDF with the same stem.
+        arm_urdf: arm and hand, rooted at the arm's base, for planners and inverse kinematics. The base is a fixed link,
+            so that the arm avoids it. No visual meshes.
+        arm_srdf: pairs of links of ``arm_urdf`` without collision checks.
+        folder: folder of all files.
     """
 
     urdf: Path
@@ -58,15 +58,15 @@ class RobotFiles:
 
 
 def make_robot_files(finger_extension: float = c.finger_extension) -> RobotFiles:
-    """Return the robot's files, generating them where they are missing.
+    """Return the robot's files; generate missing files.
 
-    The folder's name is a hash of all they are made from, this generator's code included.
+    The name of the folder is a hash of all inputs, including the code of this generator.
 
     Args:
-        finger_extension: how much longer than stock the fingers are, m; 0 gives ManiSkill's own fingers.
+        finger_extension: extra length of the fingers in m; 0: ManiSkill's standard fingers.
 
     Raises:
-        RobocasError: the installed mani_skill has no such Panda, or the cache can't be written to.
+        RobocasError: mani_skill or its Panda is missing, or the cache is not writable.
     """
     source = _panda_folder()
     folder = cache_dir() / "robots" / _fingerprint(source, finger_extension)
@@ -81,7 +81,7 @@ def make_robot_files(finger_extension: float = c.finger_extension) -> RobotFiles
 
 
 def _panda_folder() -> Path:
-    """Return mani_skill's Panda assets, without importing mani_skill."""
+    """Return the folder of mani_skill's Panda without importing mani_skill."""
     spec = importlib.util.find_spec("mani_skill")
     if spec is None or not spec.submodule_search_locations:
         raise RobocasError("mani_skill is not installed", fix=_INSTALL)
@@ -105,7 +105,7 @@ def _fingerprint(source: Path, finger_extension: float) -> str:
 
 
 def _generate(folder: Path, source: Path, finger_extension: float) -> None:
-    from robocas_ms3.robots.meshes import decimate_glb, write_boxes_glb  # seconds, where nothing is to be made
+    from robocas_ms3.robots.meshes import decimate_glb, write_boxes_glb  # slow to import
 
     visual, collision = folder / "visual", folder / "collision"
     visual.mkdir()
@@ -113,7 +113,7 @@ def _generate(folder: Path, source: Path, finger_extension: float) -> None:
     panda = _parse(source / "panda_v2.urdf")
     tips = _adapt_fingers(panda, finger_extension)
     for mesh in panda.iterfind(".//collision/geometry/mesh"):
-        # The planner reads the convex hull next to each mesh.
+        # the planner reads the convex hull next to each mesh
         path = source / mesh.attrib["filename"]
         for name in (path.name, f"{path.name}.convex.stl"):
             shutil.copyfile(path.with_name(name), collision / name)
@@ -134,7 +134,7 @@ def _generate(folder: Path, source: Path, finger_extension: float) -> None:
 
     for link, (size, centre) in tips.items():
         name = f"visual/tip_{link}.glb"
-        shown = (centre[0], centre[1] * 0.95, centre[2])  # 0.1 mm inwards, before the rubber in the same plane
+        shown = (centre[0], centre[1] * 0.95, centre[2])  # 0.1 mm inwards, in front of the rubber in the same plane
         write_boxes_glb(folder / name, [(size, shown, _TIP_COLOUR)])
         _find(panda, "link", link).insert(1, _visual(name))
     _write(_with_base(panda), folder / f"{c.uid}.urdf")
@@ -142,7 +142,7 @@ def _generate(folder: Path, source: Path, finger_extension: float) -> None:
     srdf = _parse(source / "panda_v2.srdf")
     for pair in srdf.findall("disable_collisions"):
         if {pair.attrib["link1"], pair.attrib["link2"]} == {"panda_link2", "panda_link6"}:
-            srdf.remove(pair)  # listed as "Never", but they meet in 0.1 % of all configurations
+            srdf.remove(pair)  # listed as "Never", but they collide in 0.1 % of all configurations
     for link, reason in ((c.arm_base_link, "Adjacent"), ("panda_link1", "Never")):
         SubElement(srdf, "disable_collisions", link1=c.base_link, link2=link, reason=reason)
     _write(srdf, folder / "panda_arm.srdf")
@@ -170,7 +170,7 @@ def _adapt_fingers(panda: Element, extension: float) -> dict[str, tuple[tuple[fl
 def _with_base(panda: Element) -> Element:
     """Put the arm on the mobile base: root, three virtual joints, base link, fixed arm base."""
     robot = Element("robot", name=c.uid)
-    # Small but not tiny: reduced-coordinate solvers dislike mass ratios beyond a few hundred along a chain.
+    # reduced-coordinate solvers become unstable for mass ratios over a few hundred along a chain
     for link in ("root", "base_x_link", "base_y_link"):
         SubElement(robot, "link", name=link).append(_inertial(1.0, (0.01, 0.01, 0.01), (0, 0, 0)))
     base = _base_link()
@@ -247,14 +247,14 @@ def _parse(path: Path) -> Element:
 def _find(root: Element, tag: str, name: str) -> Element:
     element = root.find(f"{tag}[@name='{name}']")
     if element is None:
-        raise RobocasError(f"mani_skill's Panda has no such {tag}", where=name, fix=_INSTALL)
+        raise RobocasError(f"mani_skill's Panda has no {tag} with this name", where=name, fix=_INSTALL)
     return element
 
 
 def _origin(root: Element, joint: str) -> Element:
     element = _find(root, "joint", joint).find("origin")
     if element is None:
-        raise RobocasError("mani_skill's Panda has no such origin", where=joint, fix=_INSTALL)
+        raise RobocasError("mani_skill's Panda has no origin for this joint", where=joint, fix=_INSTALL)
     return element
 
 
@@ -264,7 +264,7 @@ def _write(root: Element, path: Path) -> None:
 
 
 def make_once(folder: Path, make: Callable[[Path], None]) -> None:
-    """Make a folder, named by all that it is made from, unless it is complete; other processes wait."""
+    """Make a folder if it is not complete, while other processes wait; its name must be a hash of its inputs."""
     if _is_complete(folder):
         return
     make_folder(folder.parent)
