@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 ObjectIds = tuple[str, ...]
 """Objects of a scene: one id of the object pack per slot."""
 
-_FILE_KEYS = {"visible_fractions": "visible_fractions"}  # keys of files where they differ from the fields' names
+_FILE_KEYS = {"visible_fractions": "visible_shares"}  # keys of files where they differ from the fields' names
 _ROTATION_ERROR = 1e-3  # tolerance of rotation matrices, for single precision
 PARKING_HEIGHT = -5.0  # z in m of the plane on which the objects of unused slots are placed
 

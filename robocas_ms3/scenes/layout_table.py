@@ -223,7 +223,7 @@ def _layout(record: Any, names: Sequence[str]) -> Layout:
             target=int(record["target"]),
             relation=str(record["relation"]),
             present=record["present"].copy(),
-            visible_fractions=record["visible_fractions"].astype(np.float64),
+            visible_fractions=record["visible_shares"].astype(np.float64),
         )
         layout.check(names)
     except (ValueError, IndexError) as error:
@@ -261,6 +261,6 @@ def _record_type(slots: int, words: int) -> np.dtype:
             ("target", "i2"),
             ("relation", f"U{words}"),
             ("present", "?", (slots,)),
-            ("visible_fractions", "f4", (slots,)),  # visible fractions; frozen protocols have this name
+            ("visible_shares", "f4", (slots,)),  # visible fractions; frozen protocols have this name
         ]
     )
