@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from made_up_assets import furniture_asset
+from asset_entries import furniture_asset
 
 from asset_tools import pipeline
 from asset_tools.pipeline import Job, content_hash, made_of, make_assets, write_pack

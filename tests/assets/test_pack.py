@@ -3,7 +3,7 @@ import os
 
 import numpy as np
 import pytest
-from made_up_assets import furniture_asset, object_asset
+from asset_entries import furniture_asset, object_asset
 from pydantic import ValidationError
 
 from robocas_ms3.assets.annotations import Annotations, compute_footprints

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import sapien
 import torch
-from made_up_assets import furniture_asset
+from asset_entries import furniture_asset
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.envs.utils.system.backend import parse_sim_and_render_backend
 from mani_skill.utils.structs import Actor, Articulation

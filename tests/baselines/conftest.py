@@ -4,10 +4,10 @@ import os
 from dataclasses import replace
 
 import pytest
-from made_up_baseline import MADE_UP
-from made_up_dataset import made_up_dataset
-from made_up_runs import train
 from short_protocols import shorten
+from stub_baseline import MADE_UP
+from synthetic_dataset import synthetic_dataset
+from training_runs import train
 
 from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.cli.train import COMMANDS, Other, command
@@ -54,4 +54,4 @@ def whole(usual_umask, made_up, data, tmp_path):
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
     """A dataset of six episodes of seven steps, 64 x 48 images, that nobody may change; five are to train on."""
-    return made_up_dataset(tmp_path_factory.mktemp("baselines"))
+    return synthetic_dataset(tmp_path_factory.mktemp("baselines"))

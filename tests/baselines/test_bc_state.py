@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from made_up_observations import observe, start
-from made_up_runs import fit
 from synthetic import write_trajectory
+from synthetic_observations import observe, start
+from training_runs import fit
 
 from robocas_ms3.baselines import bc_state
 from robocas_ms3.baselines.bc_state import BASELINE, BcStateConfig

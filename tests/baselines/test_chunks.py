@@ -7,8 +7,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from made_up_observations import observe, start
 from scipy.spatial.transform import Rotation
+from synthetic_observations import observe, start
 
 from robocas_ms3.baselines.chunks import (
     ChunkPolicy,

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from made_up_baseline import MADE_UP
+from stub_baseline import MADE_UP
 
 from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.cli.main import run

@@ -3,8 +3,8 @@
 import shutil
 from pathlib import Path
 
-import made_up_results
 import pytest
+import synthetic_results
 from irregular import KINDS, replace_file
 
 from robocas_ms3.assets.hulls import read_hulls
@@ -27,7 +27,7 @@ def copy_protocol(root):
 
 
 def write_result(root):
-    made_up_results.write(root, [made_up_results.outcome(0)])
+    synthetic_results.write(root, [synthetic_results.outcome(0)])
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -1,7 +1,7 @@
 import shutil
 
 import pytest
-from synthetic import RayCaster, made_up_vectors, write_trajectory
+from synthetic import RayCaster, stub_embeddings, write_trajectory
 
 from robocas_ms3.datasets.conversion.convert import convert
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
@@ -17,7 +17,7 @@ def made(trajectory, tmp_path_factory):
     """A dataset of two episodes that nobody may change."""
     out = tmp_path_factory.mktemp("made") / "dataset"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("robocas_ms3.datasets.conversion.convert.embed_texts", made_up_vectors)
+        patch.setattr("robocas_ms3.datasets.conversion.convert.embed_texts", stub_embeddings)
         convert(ConversionSettings(trajectory, out, video=False, open_renderer=RayCaster))
     return out
 

@@ -14,7 +14,7 @@ from synthetic import RayCaster, render_by
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.conversion import convert as conversion
 
-DYING = Path(__file__).parents[1] / "support" / "dying.py"
+KILL_DURING = Path(__file__).parents[1] / "support" / "kill_during.py"
 CONVERT = ("convert", "F.h5", "--no-embeddings")
 LEROBOT = ("convert", "F.h5", "--to", "lerobot")
 MERGE = ("merge", "a", "b")
@@ -33,7 +33,7 @@ def inputs(trajectory, tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def made_up_images(monkeypatch):
+def stub_images(monkeypatch):
     monkeypatch.setattr(conversion, "convert", render_by(RayCaster, conversion.convert))
     if importlib.util.find_spec("av") and importlib.util.find_spec("pyarrow"):
         from robocas_ms3.datasets.lerobot import convert as lerobot
@@ -62,7 +62,7 @@ def test_the_same_command_again_makes_the_same(inputs, tmp_path, monkeypatch, wo
     overwrite = ["--overwrite"] if moment == "rmtree" else []
     if overwrite:
         shutil.copytree(whole, out)
-    command = [sys.executable, str(DYING), moment, *words, "--out", str(out), *overwrite]
+    command = [sys.executable, str(KILL_DURING), moment, *words, "--out", str(out), *overwrite]
     done = subprocess.run(command, check=False, capture_output=True, text=True)
     assert done.returncode == -signal.SIGKILL, done.stderr
     assert overwrite or not (out / "data_info.json").exists()

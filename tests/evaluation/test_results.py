@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from made_up_results import RUN_OF, outcome, write
+from synthetic_results import RUN_OF, outcome, write
 
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.evaluation.outcomes import failure_stage

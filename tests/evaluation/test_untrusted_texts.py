@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from made_up_results import outcome, write
+from synthetic_results import outcome, write
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import results

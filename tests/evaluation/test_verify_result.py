@@ -6,7 +6,7 @@ import shutil
 from dataclasses import replace
 
 import pytest
-from made_up_results import of_protocol
+from synthetic_results import of_protocol
 
 from robocas_ms3.cli.eval_results import Verify, verify
 from robocas_ms3.core.errors import EvaluationError

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 from forkserver import ForkServer
-from made_up_dataset import made_up_dataset
-from made_up_results import of_protocol
 from pages import PAGES, ROOT, blocks, is_quoted, normalize, printed_outputs, shell_commands, text_commands
+from synthetic_dataset import synthetic_dataset
+from synthetic_results import of_protocol
 
 from robocas_ms3 import __version__
 from robocas_ms3.evaluation import load_protocol
@@ -58,7 +58,7 @@ def server() -> ForkServer:
 def folder(tmp_path_factory) -> Path:
     """Return a folder with the files that the commands read: a dataset and two results."""
     folder = tmp_path_factory.mktemp("pages")
-    dataset = made_up_dataset(folder)
+    dataset = synthetic_dataset(folder)
     for name in ("DIR", "ROBOCAS_DATASET"):
         shutil.copytree(dataset, folder / name)
     for policy in ("scripted", "random"):

@@ -6,9 +6,9 @@ import warnings
 from dataclasses import asdict
 from pathlib import Path
 
-import made_up_results
 import numpy as np
 import pytest
+import synthetic_results
 from fuzzing import damaged, flipped
 from synthetic import RayCaster, write_trajectory
 
@@ -101,7 +101,7 @@ def write_protocol(root):
 
 
 def write_result(root):
-    made_up_results.write(root, [made_up_results.outcome(i, came_to=7 - i) for i in range(3)])
+    synthetic_results.write(root, [synthetic_results.outcome(i, came_to=7 - i) for i in range(3)])
 
 
 COMPLETE, STARTED = WorkUnit(0, 0), WorkUnit(0, 1)

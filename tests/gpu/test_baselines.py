@@ -4,7 +4,7 @@ import devices
 import pytest
 import torch
 from gpu_emulation import emulated_envs
-from made_up_dataset import made_up_dataset
+from synthetic_dataset import synthetic_dataset
 
 pytestmark = [
     pytest.mark.gpu,
@@ -15,7 +15,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    return made_up_dataset(tmp_path_factory.mktemp("gpu"))
+    return synthetic_dataset(tmp_path_factory.mktemp("gpu"))
 
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])

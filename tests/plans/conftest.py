@@ -6,7 +6,7 @@ from plan_stages import env_of_jobs, made_up, run_here
 
 
 @pytest.fixture(autouse=True)
-def made_up_stages():
+def stub_stages():
     with made_up():
         yield
 

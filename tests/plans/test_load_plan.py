@@ -4,7 +4,7 @@ import errno
 from dataclasses import replace
 
 import pytest
-from plan_stages import MadeUp
+from plan_stages import StubRecorder
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import ConfigError, ExtensionError, MissingExtraError, OutputExistsError, PlanError
@@ -109,7 +109,7 @@ def test_what_fails_while_a_part_is_opened_ends_the_run(written, tmp_path, error
     plan = load_plan(written("embeddings: false\nparts:\n  - {task: pick, episodes: 3, name: a}\n"))
     files = SeedFiles(0, 7, tmp_path / "a" / "b" / "c" / "d")
     files.folder.mkdir(parents=True)
-    MadeUp(plan).run(files)
+    StubRecorder(plan).run(files)
     with pytest.raises(raised, match=match) as found:
         Fails(plan).run(files)
     assert "\n" not in str(found.value)

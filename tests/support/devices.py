@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 import pytest
-from made_up_observations import observe, start
-from made_up_runs import stop_at, train
 from rt1_sizes import SIZES
+from synthetic_observations import observe, start
+from training_runs import stop_at, train
 
 from robocas_ms3.baselines.policy import RunPolicy
 

@@ -21,7 +21,7 @@ from robocas_ms3.plans.worker import Renderer
 SITE = Path(__file__).parent / "fault_site"
 
 
-class MadeUp:
+class StubRecorder:
     """Writes a made-up recording."""
 
     def __init__(self, plan):
@@ -71,7 +71,7 @@ def _fault(files):
     return planned[number] if number < len(planned) else None
 
 
-class MadeUpRenderer(Renderer):
+class StubRenderer(Renderer):
     """Renders without a renderer."""
 
     def open_env(self, *args):
@@ -84,7 +84,7 @@ class CannotBegin:
 
 
 @contextmanager
-def made_up(record=MadeUp, render=MadeUpRenderer):
+def made_up(record=StubRecorder, render=StubRenderer):
     """Let workers that are made inside have these stages."""
     before = worker.Recorder, worker.Renderer
     worker.Recorder, worker.Renderer = record, render
@@ -94,7 +94,7 @@ def made_up(record=MadeUp, render=MadeUpRenderer):
         worker.Recorder, worker.Renderer = before
 
 
-def run_here(out, plan=None, jobs=1, record=MadeUp, render=MadeUpRenderer, **more):
+def run_here(out, plan=None, jobs=1, record=StubRecorder, render=StubRenderer, **more):
     """Run the made-up plan on this machine."""
     from robocas_ms3.plans.executors import LocalExecutor
     from robocas_ms3.plans.run import run_plan
@@ -106,7 +106,7 @@ def run_here(out, plan=None, jobs=1, record=MadeUp, render=MadeUpRenderer, **mor
 def env_of_jobs():
     """Return environment variables of processes whose workers have made-up stages."""
     path = os.pathsep.join([str(SITE), str(SITE.parent), os.environ.get("PYTHONPATH", "")])
-    return {"PYTHONPATH": path, "ROBOCAS_FAULT": json.dumps({"made_up_plan": True})}
+    return {"PYTHONPATH": path, "ROBOCAS_FAULT": json.dumps({"stub_plan": True})}
 
 
 PLAN = Plan.model_validate(

@@ -193,10 +193,10 @@ def write_trajectory(path: Path, seeds=(3, 4, 5), failed=(), steps=STEPS):
     return path
 
 
-def made_up_vectors(source, entries):
+def stub_embeddings(source, entries):
     """Unit vectors in place of sentence embeddings, which take seconds to load."""
     texts = {text for entry in entries for text in source.texts(entry["source"])}
     return {text: np.eye(384, dtype=np.float32)[number] for number, text in enumerate(sorted(texts))}
 
 
-__all__ = ["RayCaster", "made_up_vectors", "make_states", "render_by", "write_trajectory"]
+__all__ = ["RayCaster", "stub_embeddings", "make_states", "render_by", "write_trajectory"]

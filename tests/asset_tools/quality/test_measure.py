@@ -4,7 +4,7 @@ from typing import cast
 import numpy as np
 import pytest
 import trimesh
-from made_up_assets import QUALITY, object_asset
+from asset_entries import QUALITY, object_asset
 
 from asset_tools.grasps import sample_grasps
 from asset_tools.quality import measure

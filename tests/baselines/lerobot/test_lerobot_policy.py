@@ -5,7 +5,7 @@ from collections import deque
 import numpy as np
 import pytest
 import torch
-from made_up_observations import observe, start
+from synthetic_observations import observe, start
 
 from robocas_ms3.baselines.lerobot.policy import EMBEDDING, LeRobotPolicy, scale_embeddings, state_of
 from robocas_ms3.baselines.lerobot.serve import main, open_checkpoint, rate_of

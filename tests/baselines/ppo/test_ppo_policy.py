@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from made_up_observations import observe
 from scipy.spatial.transform import Rotation
+from synthetic_observations import observe
 
 from robocas_ms3.baselines.ppo import BASELINE
 from robocas_ms3.baselines.ppo.agent import Agent

@@ -1,7 +1,7 @@
 """Advantages and outcomes, worked out by hand."""
 
 import torch
-from made_up_envs import LeftOrRight
+from stub_envs import LeftOrRight
 
 from robocas_ms3.baselines.ppo.agent import Agent
 from robocas_ms3.baselines.ppo.config import PpoConfig

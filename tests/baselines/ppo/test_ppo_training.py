@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from made_up_envs import LeftOrRight, MadeUpEnvironments
-from made_up_runs import read_log, stop_at, train
 from safetensors.torch import load_file
+from stub_envs import LeftOrRight, StubEnvironments
+from training_runs import read_log, stop_at, train
 
 from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.ppo import BASELINE
@@ -19,8 +19,8 @@ SMALL = {"width": 16, "envs": 4, "trials": 20, "layouts": 10, "train": {"steps":
 
 @pytest.fixture
 def made_up(monkeypatch):
-    monkeypatch.setitem(BASELINES.builtin, "ppo", lambda: replace(BASELINE, environments=MadeUpEnvironments))
-    monkeypatch.setattr(MadeUpEnvironments, "made", [])
+    monkeypatch.setitem(BASELINES.builtin, "ppo", lambda: replace(BASELINE, environments=StubEnvironments))
+    monkeypatch.setattr(StubEnvironments, "made", [])
 
 
 def test_it_learns(made_up, tmp_path):
@@ -51,7 +51,7 @@ def test_after_ctrl_c_a_run_continues_with_the_whole_checkpoint(made_up, tmp_pat
     assert steps == list(range(640, 1281, 64))
     assert [int(row["step"]) for row in read_log(run, "train")] == list(range(64, 1281, 64))
     assert load_file(run / "weights.safetensors")["count"].item() == pytest.approx(1280, abs=1e-3)
-    first, second = (MadeUpEnvironments.made[number].seeds[0] for number in (0, -1))
+    first, second = (StubEnvironments.made[number].seeds[0] for number in (0, -1))
     assert (first, second) == (0, 640 // LeftOrRight.STEPS % 10)  # the layouts after those that were played
     before = (run / "weights.safetensors").read_bytes()
     train("ppo", None, run)  # what is done is done
@@ -89,7 +89,7 @@ def test_data_is_refused(made_up, tmp_path):
 
 def test_a_run_of_other_scenes_is_not_continued(made_up, monkeypatch, tmp_path):
     train("ppo", None, tmp_path / "run", SMALL | {"trials": 0, "train": {"steps": 64, "batch_size": 64}})
-    monkeypatch.setattr(MadeUpEnvironments, "hash", "5678")
+    monkeypatch.setattr(StubEnvironments, "hash", "5678")
     with pytest.raises(OutputExistsError):
         train("ppo", None, tmp_path / "run")
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from made_up_observations import observe, start
-from made_up_runs import fit
 from rt1_sizes import SIZES
+from synthetic_observations import observe, start
+from training_runs import fit
 
 from robocas_ms3.baselines.rt1 import BASELINE
 from robocas_ms3.baselines.rt1.config import RT1Config

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from made_up_observations import observe, start
-from made_up_runs import fit
 from pydantic import ValidationError
 from small_sizes import TINY, VIEW
+from synthetic_observations import observe, start
+from training_runs import fit
 
 from robocas_ms3.baselines.chunks import decode_chunk
 from robocas_ms3.baselines.small import BASELINE, data

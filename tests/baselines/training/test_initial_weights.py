@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from made_up_baseline import MADE_UP
-from made_up_runs import assert_same, change_record, stop_at, train
 from safetensors.torch import load_file
+from stub_baseline import MADE_UP
+from training_runs import assert_same, change_record, stop_at, train
 
 from robocas_ms3.baselines.training.session import Progress, combine_facts, load_initial_weights
 from robocas_ms3.core.errors import OutputExistsError, TrainingError

@@ -11,11 +11,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import devices as devices_check
-import made_up_baseline
 import pytest
+import stub_baseline
 import torch
-from made_up_runs import assert_finite, assert_same, change_record, read_log, stop_at, train
 from safetensors.torch import load_file
+from training_runs import assert_finite, assert_same, change_record, read_log, stop_at, train
 
 from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.training import checkpoints, run_folder
@@ -46,7 +46,7 @@ def test_metrics_of_a_run(whole):
     assert [row["step"] for row in val] == ["20", "40"]
     assert float(val[-1]["loss"]) < float(train[0]["loss"])
     assert float(train[0]["double"]) == pytest.approx(2 * float(train[0]["loss"]), rel=1e-4)
-    x = made_up_baseline.MadeUpSamples(-1, -1).x[:, 0]
+    x = stub_baseline.StubSamples(-1, -1).x[:, 0]
     assert float(val[-1]["high"]) == pytest.approx(x[x > 0].mean().item(), rel=1e-5)  # of the samples that have it
     assert list((whole / "tensorboard").iterdir())
 
@@ -203,7 +203,7 @@ def test_a_baseline_can_not_end_the_process(made_up, data, tmp_path):
 def test_a_baseline_that_changes_the_working_directory(made_up, data, tmp_path, monkeypatch):
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path)
-    make = made_up_baseline.MadeUpModel
+    make = stub_baseline.StubModel
     made_up(model=lambda *args: os.chdir(tmp_path / "elsewhere") or make(*args))
     assert run(["train", "made-up", "--data", data.name, "--out", "run", "--steps", "4", "--device", "cpu"]) == 0
     assert (tmp_path / "run" / "run.json").is_file()
@@ -252,14 +252,14 @@ def test_a_run_that_is_no_policy(whole, change, where):
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory):
-    """Runs of two processes, see `made_up_baseline`, and their data."""
+    """Runs of two processes, see `stub_baseline`, and their data."""
     out = tmp_path_factory.mktemp("shared")
     (out / "data.h5").write_text("demonstrations")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     world = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2", "LOCAL_WORLD_SIZE": "2"}
-    words = [sys.executable, made_up_baseline.__file__, str(out / "data.h5"), str(out)]
+    words = [sys.executable, stub_baseline.__file__, str(out / "data.h5"), str(out)]
     env = {**os.environ, **world, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[3])}
     processes = [
         subprocess.Popen(words, env={**env, "RANK": rank, "LOCAL_RANK": rank}, stderr=subprocess.PIPE, text=True)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from managing import convert_made_up as run
 from managing import files_of
-from synthetic import STEPS, RayCaster, made_up_vectors, write_trajectory
+from synthetic import STEPS, RayCaster, stub_embeddings, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
 from robocas_ms3.core.poses import from_xyzw
@@ -247,17 +247,17 @@ def test_what_would_be_numbered_alike_is_refused(trajectory, tmp_path, monkeypat
     out = tmp_path / "out"
     more = write_trajectory(tmp_path / "more.h5", seeds=(10,))
     other = write_trajectory(tmp_path / "other.h5", seeds=(11,))
-    monkeypatch.setattr("robocas_ms3.datasets.conversion.convert.embed_texts", made_up_vectors)
+    monkeypatch.setattr("robocas_ms3.datasets.conversion.convert.embed_texts", stub_embeddings)
     run(trajectory, out, embeddings=True)
 
     def meanwhile(file, chosen):
         with pytest.raises(RobocasError, match="another process writes to this folder"):
             run(other, out, append=True, embeddings=True)
-        return made_up_vectors(file, chosen)
+        return stub_embeddings(file, chosen)
 
     monkeypatch.setattr("robocas_ms3.datasets.conversion.convert.embed_texts", meanwhile)
     run(more, out, append=True, embeddings=True)
-    monkeypatch.setattr("robocas_ms3.datasets.conversion.convert.embed_texts", made_up_vectors)
+    monkeypatch.setattr("robocas_ms3.datasets.conversion.convert.embed_texts", stub_embeddings)
     run(other, out, append=True, embeddings=True)
     ledger = json.loads((out / "conversion.json").read_text())["episodes"]
     assert [entry["seed"] for entry in ledger.values()] == [3, 5, 10, 11]

@@ -13,11 +13,11 @@ from robocas_ms3.datasets.conversion import convert as conversion
 
 
 @pytest.fixture
-def made_up_images(monkeypatch):
+def stub_images(monkeypatch):
     monkeypatch.setattr(conversion, "convert", render_by(RayCaster, conversion.convert))
 
 
-def test_a_conversion_and_its_repetition(trajectory, made_up_images, tmp_path, capsys):
+def test_a_conversion_and_its_repetition(trajectory, stub_images, tmp_path, capsys):
     command = ["convert", str(trajectory), "--out", str(tmp_path / "out"), "--no-embeddings", "--no-video"]
     assert run(command) == 0
     printed = capsys.readouterr()

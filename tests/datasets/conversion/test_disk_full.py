@@ -74,7 +74,7 @@ def ends_in_one_line(command, capsys):
 
 
 @pytest.fixture
-def made_up_images(monkeypatch):
+def stub_images(monkeypatch):
     monkeypatch.setattr(conversion, "convert", render_by(RayCaster, conversion.convert))
 
 
@@ -95,7 +95,7 @@ PYTHON = {
         ("write_text", 4, 2),  # data_info.json
     ],
 )
-def test_a_conversion(trajectory, made_up_images, tmp_path, monkeypatch, capsys, name, last, episodes):
+def test_a_conversion(trajectory, stub_images, tmp_path, monkeypatch, capsys, name, last, episodes):
     out, source = tmp_path / "out", files_of(trajectory.parent)
     command = ["convert", str(trajectory), "--out", str(out), "--no-embeddings", "--no-video"]
     with monkeypatch.context() as patch:

@@ -18,7 +18,7 @@ from robocas_ms3.datasets.sources.reader import Dataset
 
 
 @pytest.fixture
-def made_up_images(monkeypatch):
+def stub_images(monkeypatch):
     monkeypatch.setattr(conversion, "convert", render_by(RayCaster, conversion.convert))
 
 
@@ -56,7 +56,7 @@ def test_shows_what_the_dataset_holds(trajectory, tmp_path, monkeypatch):
     assert validate(out).violations == []
 
 
-def test_of_what_is_new(made_up_images, tmp_path):
+def test_of_what_is_new(stub_images, tmp_path):
     out, sheets, times = tmp_path / "out", [], []
     for name, seeds, flags in (("a", (1, 2), ()), ("b", (3,), ("--append",)), ("b", (3,), ("--append",))):
         assert converted(tmp_path / f"{name}.h5", out, *flags, seeds=seeds) == 0
@@ -71,7 +71,7 @@ def test_of_what_is_new(made_up_images, tmp_path):
     np.testing.assert_array_equal(np.asarray(Image.open(sheet)), of_images)
 
 
-def test_of_many_episodes_on_request(made_up_images, tmp_path, monkeypatch, capsys):
+def test_of_many_episodes_on_request(stub_images, tmp_path, monkeypatch, capsys):
     hint = "no preview videos (more than 20 episodes): pass --all-videos"
     monkeypatch.setattr(conversion, "MAX_PREVIEWS", 2)  # of 20 they take seconds
     monkeypatch.setattr(video, "SHEET_EPISODES", 2)
@@ -89,7 +89,7 @@ def test_of_many_episodes_on_request(made_up_images, tmp_path, monkeypatch, caps
     assert shown(tmp_path / "two") == ["contact_sheet.png", *videos[:2]]
 
 
-def test_none_where_they_are_not_wanted(trajectory, made_up_images, tmp_path, capsys):
+def test_none_where_they_are_not_wanted(trajectory, stub_images, tmp_path, capsys):
     assert converted(trajectory, tmp_path / "out", "--no-video") == 0
     assert shown(tmp_path / "out") == []
     assert "video" not in capsys.readouterr().out

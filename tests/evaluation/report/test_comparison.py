@@ -3,7 +3,7 @@
 import shutil
 
 import pytest
-from made_up_results import outcome, write
+from synthetic_results import outcome, write
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.protocol import EPISODES, load_protocol, shipped_protocols

@@ -3,8 +3,8 @@
 import imageio.v2 as imageio
 import numpy as np
 import pytest
-from made_up_results import of_protocol, outcome, write
 from short_protocols import shorten
+from synthetic_results import of_protocol, outcome, write
 
 from robocas_ms3.cli.eval import run
 from robocas_ms3.cli.eval_results import Videos, videos

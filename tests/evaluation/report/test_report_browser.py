@@ -2,7 +2,7 @@
 
 import pytest
 from browser import open_page
-from made_up_results import outcome, write
+from synthetic_results import outcome, write
 
 from robocas_ms3.evaluation.report import PAGE, write_report
 

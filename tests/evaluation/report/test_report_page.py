@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_up_results import of_protocol, outcome, write
+from synthetic_results import of_protocol, outcome, write
 
 from robocas_ms3.cli.eval_results import Compare, Merge, Report, Verify, compare, merge, report, verify
 from robocas_ms3.core.errors import EvaluationError

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from made_up_results import outcome, write
+from synthetic_results import outcome, write
 
 from robocas_ms3.evaluation.report.tables import render_markdown
 

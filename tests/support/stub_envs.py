@@ -42,7 +42,7 @@ class LeftOrRight:
         return self.obs
 
 
-class MadeUpEnvironments:
+class StubEnvironments:
     name, hash, facts = "left or right", "1234", {"observed": 1, "acted": 1, "rate_hz": 5}  # noqa: RUF012
     made = []  # noqa: RUF012
 

@@ -1,6 +1,6 @@
 """A baseline that trains in milliseconds.
 
-`python made_up_baseline.py DATA OUT` trains it in several processes, as RANK and WORLD_SIZE say: an uninterrupted run,
+`python stub_baseline.py DATA OUT` trains it in several processes, as RANK and WORLD_SIZE say: an uninterrupted run,
 and one that crashes and continues.
 """
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from made_up_runs import stop_at, train
+from training_runs import stop_at, train
 
 from robocas_ms3.baselines.baseline import Baseline, BaselineConfig, TrainSettings
 from robocas_ms3.baselines.registry import BASELINES
@@ -17,7 +17,7 @@ from robocas_ms3.core.errors import DatasetError, EmptySplitError
 from robocas_ms3.evaluation.policy import PolicySpec
 
 
-class MadeUpConfig(BaselineConfig):
+class StubConfig(BaselineConfig):
     width: int = 4
     broken_at: int = -1  # sample whose target is no number
     damaged_at: int = -1  # sample that can't be read
@@ -27,7 +27,7 @@ class MadeUpConfig(BaselineConfig):
     )
 
 
-class MadeUpSamples:
+class StubSamples:
     episodes = 3
 
     def __init__(self, broken_at, steep_at, damaged_at=-1):
@@ -49,7 +49,7 @@ class MadeUpSamples:
         return {"x": self.x[indices], "y": self.y[indices], "steep": self.steep[indices]}
 
 
-class MadeUpModel(torch.nn.Module):
+class StubModel(torch.nn.Module):
     def __init__(self, config, facts):
         super().__init__()
         layers = torch.nn.Linear(facts["inputs"], config.width), torch.nn.Linear(config.width, 1)
@@ -65,7 +65,7 @@ class MadeUpModel(torch.nn.Module):
         return {"loss": error, "double": 2 * error.detach(), "high": told}
 
 
-class MadeUpPolicy:
+class StubPolicy:
     spec = PolicySpec(language="none")
 
     def reset(self, episodes):
@@ -81,10 +81,10 @@ def read_samples(config, folder, split, on_read):
     if split == "val" and folder.read_text() == "damaged":
         raise DatasetError("this split is damaged", where=folder)
     bad = config.broken_at, config.steep_at, config.damaged_at
-    return MadeUpSamples(*(bad if split == "train" else (-1, -1)))
+    return StubSamples(*(bad if split == "train" else (-1, -1)))
 
 
-MADE_UP = Baseline("made-up", 1, MadeUpConfig, MadeUpModel, lambda config, facts, model: MadeUpPolicy(), read_samples)
+MADE_UP = Baseline("made-up", 1, StubConfig, StubModel, lambda config, facts, model: StubPolicy(), read_samples)
 
 
 if __name__ == "__main__":
