@@ -173,7 +173,8 @@ def import_partnet(command: ImportPartNet) -> int:
 
         print_text(template(command.models[0]))
         return 0
-    return _import_pack(partnet_jobs(command.models, command.annotations), command, _target(command.pack), "PartNet model")
+    jobs = partnet_jobs(command.models, command.annotations)
+    return _import_pack(jobs, command, _target(command.pack), "PartNet model")
 
 
 def build(command: Build) -> int:

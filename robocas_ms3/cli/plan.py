@@ -126,9 +126,9 @@ def join(command: Join) -> int:
 
 def list_plans(cfg: List) -> int:
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.plans.load import load_plan, shipped_plans
+    from robocas_ms3.plans.load import bundled_plans, load_plan
 
-    for name in shipped_plans():
+    for name in bundled_plans():
         plan = load_plan(name)
         print_line(f"{name}: {format_count(sum(part.episodes for part in plan.parts), 'episode')}. {plan.description}")
     return 0

@@ -1,4 +1,4 @@
-"""Datasets of any size from a plan: work units that any executor does, joined into one dataset.
+"""Generate large datasets from a plan: executors run its work units, whose episodes are joined into one dataset.
 
-`load.py` reads a plan, `run.py` has its work units done by one of `executors/`, `join.py` joins their episodes.
+`load.py` reads a plan, `run.py` passes its work units to one of `executors/`, `join.py` joins the episodes.
 """

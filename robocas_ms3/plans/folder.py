@@ -1,8 +1,9 @@
 """The output folder of a plan: `plan.json`, and the files of its work units.
 
-`units/PART/BLOCK/SEED/` has the episode of a seed and `outcome.json`. Its files are written into a temporary folder,
-which is renamed when they are complete. So a unit may be done twice, even at the same time: the first folder of a seed
-is kept, and another one has the same content. `seeds.jsonl` has the outcomes of a complete unit, a line each.
+`units/PART/BLOCK/SEED/` has the episode of a seed and `outcome.json`. Its files are written to a temporary folder,
+which is renamed when they are complete. So two workers may run the same work unit, even at the same time: the first
+folder of a seed is kept, and a second one would have the same content. `seeds.jsonl` has the outcomes of a complete
+work unit, one per line.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 PLAN, REPORT, UNITS = "plan.json", "report.json", "units"
 LAYOUTS, DEMOS, DATASETS, STATISTICS = "layouts", "demos", "datasets", "statistics"
 OUTCOME, OUTCOMES = "outcome.json", "seeds.jsonl"
-FREE = frozenset({"description", "limits"})
-"""Keys of a plan that may change between runs: no episode depends on them."""
+CHANGEABLE_KEYS = frozenset({"description", "limits"})
+"""Keys of a plan that may change between runs, because no episode depends on them."""
 Count = Annotated[int, Field(ge=0, le=10**15)]
 Seconds = Annotated[float, Field(ge=0, le=1e12)]
 
@@ -44,14 +45,14 @@ class Outcome:
     """Outcome of a seed."""
 
     seed: Annotated[int, Field(ge=0, le=MAX_SEED)]
-    success: bool  # whether there is an episode
+    success: bool  # whether the seed has an episode
     steps: Count = 0  # control steps of the episode
-    failures: list[str] = field(default_factory=list)  # "stage: reason" of each attempt that failed
-    crashes: list[str] = field(default_factory=list)  # of each process that died, or was killed for a limit
-    record_seconds: Seconds = 0.0  # CPU time, of the processes that made the episode
-    render_seconds: Seconds = 0.0
-    size: Count = 0  # bytes of the files, without `outcome.json`
-    end_time: Seconds = 0.0  # end of the seed since 1970, by the clock of the machine
+    failures: list[str] = field(default_factory=list)  # "stage: reason" of each failed attempt
+    crashes: list[str] = field(default_factory=list)  # "stage: reason" of each process that crashed or exceeded a limit
+    record_seconds: Seconds = 0.0  # CPU time of the process that recorded the episode
+    render_seconds: Seconds = 0.0  # CPU time of the process that rendered the episode
+    size: Count = 0  # bytes of the files without `outcome.json`
+    end_time: Seconds = 0.0  # Unix time, by the clock of the machine
 
 
 _OUTCOME: TypeAdapter[Outcome] = TypeAdapter(Outcome)
@@ -59,7 +60,7 @@ _OUTCOME: TypeAdapter[Outcome] = TypeAdapter(Outcome)
 
 @dataclass(frozen=True)
 class SeedFiles:
-    """Files of one seed of a part, in a folder."""
+    """Paths of the files of one seed of a part."""
 
     part: int
     seed: int
@@ -67,39 +68,41 @@ class SeedFiles:
 
     @property
     def layout(self) -> Path:
+        """Layout file of the stage `layouts`."""
         return self.folder / "layout.npy"
 
     @property
     def recording(self) -> Path:
-        """File of its recorded episode; a JSON file is next to it."""
+        """HDF5 file of the recorded episode; its JSON file is next to it."""
         return self.folder / "recording.h5"
 
     @property
     def episode(self) -> Path:
-        """Folder of its rendered episode."""
+        """Folder of the rendered episode."""
         return self.folder / episode_folder(0)
 
     def size(self) -> int:
-        """Return the bytes of all files but the outcome."""
+        """Return the size of all files without the outcome, bytes."""
         return sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file() and path.name != OUTCOME)
 
     def outcome(self) -> Outcome | None:
-        """Read the outcome; None: the seed is not done, or its file is damaged."""
+        """Read the outcome; return None if the seed is not complete or the file is damaged."""
         with suppress(OSError, DocumentError, ValidationError):
             return validate_json(_OUTCOME, read_bytes(self.folder / OUTCOME, JSON_LIMIT))
 
     def write(self, outcome: Outcome) -> None:
+        """Write the outcome."""
         (self.folder / OUTCOME).write_bytes(_OUTCOME.dump_json(outcome))
 
     @contextmanager
-    def temporary(self) -> Iterator[SeedFiles]:
-        """Yield files in a temporary folder; on success it is renamed to this folder, unless that exists already."""
+    def temporary_files(self) -> Iterator[SeedFiles]:
+        """Yield files in a temporary folder, which is renamed to this folder at the end unless this folder exists."""
         tmp = make_folder(self.folder.with_name(f".{self.folder.name}.{secrets.token_hex(8)}.tmp"))
         try:
             yield SeedFiles(self.part, self.seed, tmp)
-            flush_to_disk(tmp)  # a folder that survives a power cut has complete files
+            flush_to_disk(tmp)  # after a power cut, a folder with this name has complete files
             if self.folder.is_dir() and self.outcome() is None:
-                shutil.rmtree(self.folder)  # a disk error has damaged it
+                shutil.rmtree(self.folder)  # damaged by a disk error
             try:
                 tmp.rename(self.folder)
             except OSError:
@@ -111,24 +114,25 @@ class SeedFiles:
 
 @dataclass(frozen=True, order=True)
 class WorkUnit:
-    """A work unit: a block of a part's seeds."""
+    """A block of consecutive seeds of a part, which one worker runs."""
 
     part: int
     block: int
 
     def seeds(self, plan: Plan) -> range:
+        """Return the seeds of the unit."""
         size = plan.block_of(self.part)
         first = plan.parts[self.part].seed + self.block * size
         return range(first, first + size)
 
 
 def _settings_of(record: dict[str, Any]) -> dict[str, Any]:
-    """Return what must not change of the content of `plan.json`."""
+    """Return the part of the content of `plan.json` that may not change between runs."""
     plan = record["plan"]
     if isinstance(plan, dict):
-        plan = {key: value for key, value in plan.items() if key not in FREE}
+        plan = {key: value for key, value in plan.items() if key not in CHANGEABLE_KEYS}
         images = plan.get("images")
-        if isinstance(images, dict) and images.get("cameras") is None:  # of an older version
+        if isinstance(images, dict) and images.get("cameras") is None:  # written by an older version
             plan["images"] = {**images, "cameras": list(STANDARD_CAMERA_NAMES)}
     return {**record, "plan": plan}
 
@@ -144,30 +148,32 @@ class PlanFolder:
     path: Path
 
     def record(self) -> dict[str, Any]:
-        """Return the content of ``plan.json``: the plan, and the versions that it is started with."""
+        """Return the content of ``plan.json``: the plan and the versions of the packages."""
         return {"plan": self.plan.model_dump(mode="json"), "versions": versions()}
 
     def open(self, *, overwrite: bool = False, shared: bool = False) -> OutputFolder:
-        """Return the folder to be entered, which checks that it was started with this plan and these versions."""
+        """Return a context manager that checks that the folder belongs to this plan and these versions."""
         return OutputFolder(self.path, _KIND, _settings_of(self.record()), overwrite=overwrite, shared=shared)
 
     def unit_folder(self, unit: WorkUnit) -> Path:
+        """Return the folder of a work unit."""
         return self.path / UNITS / self.plan.name_of(unit.part) / f"{unit.block:05d}"
 
     def files(self, unit: WorkUnit, seed: int) -> SeedFiles:
+        """Return the files of a seed of a work unit."""
         return SeedFiles(unit.part, seed, self.unit_folder(unit) / f"{seed:010d}")
 
     def started_units(self) -> list[WorkUnit]:
-        """Return the units that have a folder, in order."""
+        """Return the work units that have a folder, in order."""
         units: list[WorkUnit] = []
         for part in range(len(self.plan.parts)):
-            with suppress(FileNotFoundError):  # listing asks an NFS server; whether a file exists may not
+            with suppress(FileNotFoundError):  # listing is up to date on NFS; a test of existence may be cached
                 names = os.listdir(self.path / UNITS / self.plan.name_of(part))
                 units += sorted(WorkUnit(part, int(name)) for name in names if name.isascii() and name.isdecimal())
         return units
 
     def outcomes(self, unit: WorkUnit) -> list[Outcome] | None:
-        """Read the outcomes of all seeds of a unit, in order; None: it is not complete."""
+        """Read the outcomes of all seeds of a work unit, in order; return None if the unit is not complete."""
         found: dict[int, Outcome] = {}
         with suppress(OSError, DocumentError):
             found = {outcome.seed: outcome for outcome in self._outcome_lines(unit).read()}
@@ -175,18 +181,18 @@ class PlanFolder:
         return [found[seed] for seed in seeds] if found.keys() >= set(seeds) else None
 
     def partial_outcomes(self, unit: WorkUnit) -> list[Outcome]:
-        """Read the outcomes of the seeds that are done of a unit that is not complete."""
+        """Read the outcomes of the completed seeds of a work unit, in order."""
         found = (self.files(unit, seed).outcome() for seed in unit.seeds(self.plan))
         return [outcome for outcome in found if outcome is not None]
 
-    def complete(self, unit: WorkUnit) -> None:
-        """Write ``seeds.jsonl`` of a unit, once all seeds are done."""
+    def write_outcomes(self, unit: WorkUnit) -> None:
+        """Write ``seeds.jsonl`` of a work unit if all its seeds are complete."""
         outcomes = self.partial_outcomes(unit)
         if len(outcomes) == len(unit.seeds(self.plan)):
             self._outcome_lines(unit).rewrite(outcomes)
 
-    def forget(self, unit: WorkUnit, seeds: Collection[int]) -> None:
-        """Delete some seeds of a unit, which are then done again."""
+    def delete_seeds(self, unit: WorkUnit, seeds: Collection[int]) -> None:
+        """Delete seeds of a work unit, so that they run again."""
         self._outcome_lines(unit).path.unlink(missing_ok=True)
         for seed in seeds:
             shutil.rmtree(self.files(unit, seed).folder, ignore_errors=True)
@@ -196,12 +202,16 @@ class PlanFolder:
 
 
 def read_plan(out: Path) -> PlanFolder:
-    """Read the plan that a folder was started with; raise PlanError if there is none."""
+    """Read the plan of an output folder; raise PlanError if the folder has no plan."""
     path = out / PLAN
     try:
         record = load_json(path)
     except (OSError, DocumentError) as error:
+        if isinstance(error, FileNotFoundError | NotADirectoryError):
+            found = "no plan.json" if out.is_dir() else "no such folder"
+            fix = "Pass the --out folder of robocas plan run."
+            raise PlanError("not the output folder of a plan", where=out, found=found, fix=fix) from error
         found = error.strerror if isinstance(error, OSError) else error
-        raise PlanError("no plan was started here", where=path, found=found) from error
+        raise PlanError("cannot read this plan", where=path, found=found) from error
     plan = record.get("plan") if isinstance(record, dict) else None
-    return PlanFolder(parse(Plan, plan, PlanError, where=path, about="not a valid plan"), out)
+    return PlanFolder(parse(Plan, plan, PlanError, where=path, about="invalid plan"), out)

@@ -1,4 +1,4 @@
-"""Joins the episodes of work units: layouts and demonstrations by part, and datasets of all parts."""
+"""Join the episodes of work units: layouts and demonstrations per part, and the dataset of all parts."""
 
 from __future__ import annotations
 
@@ -43,26 +43,28 @@ from robocas_ms3.plans.plan import Plan
 from robocas_ms3.scenes.layout_table import join_frozen_layouts
 
 TRAJECTORY = "trajectory.h5"
-Chosen = Mapping[int, Sequence[tuple[WorkUnit, Outcome]]]
+ChosenEpisodes = Mapping[int, Sequence[tuple[WorkUnit, Outcome]]]
 """Part -> its episodes, in the order of their seeds."""
 EpisodeFiles = Mapping[int, Sequence[SeedFiles]]
 OnStage = Callable[[str], None]
 _log = logging.getLogger(__name__)
 
 
-def join(folder: PlanFolder, chosen: Chosen, *, jobs: int = 1, on_stage: OnStage = lambda text: None) -> dict[str, Any]:
-    """Join all episodes, and return the content of ``report.json``; another call after a kill makes the same.
+def join(
+    folder: PlanFolder, chosen: ChosenEpisodes, *, jobs: int = 1, on_stage: OnStage = lambda text: None
+) -> dict[str, Any]:
+    """Join all episodes and return the content of ``report.json``; after a kill, another call continues.
 
-    Files of units are deleted once the joined files are on the disk and complete.
+    The files of work units are deleted when the joined files are complete and flushed to disk.
 
     Args:
-        folder: of the plan.
-        chosen: the episodes.
-        jobs: processes that make the LeRobot dataset, at most one per core.
+        folder: output folder of the plan.
+        chosen: episodes to join.
+        jobs: number of processes that write the LeRobot dataset, at most one per core.
         on_stage: called with the name of each stage.
 
     Raises:
-        PlanError: a joined file is damaged, and the files of units are gone; or the disk does not keep it.
+        PlanError: a joined file is damaged and its sources are deleted, or the disk damages files.
     """
     plan, out = folder.plan, folder.path
     report = _report(plan, chosen)
@@ -70,15 +72,15 @@ def join(folder: PlanFolder, chosen: Chosen, *, jobs: int = 1, on_stage: OnStage
     finished = False
     with suppress(OSError, ValueError):
         finished = load_json(out / REPORT) == report
-    # folders of seeds that are joined, not needed, or left by a killed process
+    # a folder of a seed: to be joined, not needed, or left by a killed process
     if not finished or any(path.is_dir() for path in (out / UNITS).glob("*/*/*")):
         _join_files(folder, files, on_stage)
     if not finished:
         if "datasets" in plan.stages and "lerobot" in plan.formats:
-            on_stage("making the LeRobot dataset")
+            on_stage("writing the LeRobot dataset")
             _convert_lerobot(plan, out / DATASETS / "robocas", out / DATASETS / "lerobot", jobs)
         if "statistics" in plan.stages:
-            on_stage("drawing statistics")
+            on_stage("writing statistics")
             _write_statistics(out)
     flush_to_disk(out)
     if not finished:
@@ -115,18 +117,18 @@ def _join_file(
     write: Callable[[], None],
     on_start: Callable[[], None],
 ) -> None:
-    """Write a file or folder that is joined from others, unless it is complete: ``damage`` returns nothing."""
+    """Write a joined file or folder unless it is complete, that is, ``damage`` returns an empty text."""
     if not (found := damage()):
         return
-    if gone := next((source for source in sources if not source.exists()), None):
-        found = f"{found}; {gone.parent.name}/{gone.name} is gone"
-        fix = "Restore either from a copy, or start again with --overwrite."
-        raise PlanError("this is damaged, and can't be joined again", where=path, found=found, fix=fix)
+    if missing := next((source for source in sources if not source.exists()), None):
+        found = f"{found}; {missing.parent.name}/{missing.name} is missing"
+        fix = "Restore one of the two from a copy, or start again with --overwrite."
+        raise PlanError("damaged, and its source files are missing", where=path, found=found, fix=fix)
     on_start()
     write()
     if found := damage():
         fix = "Check the disk; then run the command again."
-        raise PlanError("this is not what was written", where=path, found=found, fix=fix)
+        raise PlanError("damaged after writing", where=path, found=found, fix=fix)
 
 
 def _layouts_damage(path: Path, seeds: Sequence[int]) -> str:
@@ -134,7 +136,7 @@ def _layouts_damage(path: Path, seeds: Sequence[int]) -> str:
         found = load_array(path)["seed"].tolist()
     except (*DAMAGED_FILE_ERRORS, IndexError, KeyError, TypeError) as error:
         return _reason(error)
-    return "" if found == list(seeds) else f"{len(found)} layouts, of other seeds"
+    return "" if found == list(seeds) else f"{len(found)} layouts of other seeds"
 
 
 def _dataset_damage(root: Path, count: int) -> str:
@@ -145,7 +147,13 @@ def _dataset_damage(root: Path, count: int) -> str:
     except (OSError, ValueError, KeyError, TypeError) as error:
         return _reason(error)
     missing = sorted({schema.episode_folder(number) for number in range(count)} - names)
-    return f"no {missing[0]}" if missing else "" if listed == count else f"{listed} of {format_count(count, 'episode')}"
+    return (
+        f"{missing[0]} is missing"
+        if missing
+        else ""
+        if listed == count
+        else f"{listed} of {format_count(count, 'episode')} in {schema.CONVERSION_FILE}"
+    )
 
 
 def _reason(error: Exception) -> str:
@@ -163,7 +171,9 @@ def _dataset_sources(plan: Plan, root: Path, files: EpisodeFiles) -> Iterator[Pa
 def _join_dataset(plan: Plan, root: Path, files: EpisodeFiles) -> None:
     entries: dict[str, Any] = {}
     for part, episodes in files.items():
-        trajectory = {"trajectory": f"{DEMOS}/{plan.name_of(part)}/{TRAJECTORY}"}  # that of the unit is deleted
+        trajectory = {
+            "trajectory": f"{DEMOS}/{plan.name_of(part)}/{TRAJECTORY}"
+        }  # the recording of the unit is deleted
         for place, each in enumerate(episodes):
             number = plan.first_episode(part) + place
             folder = root / schema.episode_folder(number)
@@ -173,14 +183,14 @@ def _join_dataset(plan: Plan, root: Path, files: EpisodeFiles) -> None:
             with TrajectoryFile(each.recording, pack=plan.parts[part].pack) as file:
                 entry = recording_entry(file, 0)
             entries[str(number)] = {**entry, **trajectory, "trajectory_episode": place}
-    settings = dataset_settings(plan.rate, plan.images.chosen(), plan.embeddings)
+    settings = dataset_settings(plan.rate, plan.images.image_options(), plan.embeddings)
     write_json(root / schema.CONVERSION_FILE, {**header(settings, split_rule(plan)), "episodes": entries}, sync=True)
-    flush_to_disk(root)  # the episodes, before the file that lists them
+    flush_to_disk(root)  # episodes are on disk before the file that lists them
     write_info(root, split_episodes(plan, root))
 
 
 def _set_source(path: Path, source: dict[str, Any]) -> None:
-    """Set in an episode's ``scene.json`` where its recording is in the end."""
+    """Set the final path of the recording in ``scene.json`` of an episode."""
     scene = load_json(path)
     text = json_text({**scene, "source": {**scene["source"], **source}}, path, indent=1)
     with atomic_file(path, sync=True) as tmp:
@@ -188,14 +198,14 @@ def _set_source(path: Path, source: dict[str, Any]) -> None:
 
 
 def split_rule(plan: Plan) -> str:
-    """Return in words which episodes validate, for ``conversion.json``."""
+    """Return the text for ``conversion.json`` that describes the split."""
     rule = SplitOptions(plan.split.val_fraction, plan.split.group_by).rule if plan.split else SPLIT_RULE
     named = [f"{part.name}: {part.split}" for part in plan.parts if part.split]
     return "; ".join([*named, *([rule] if len(named) < len(plan.parts) else [])])
 
 
 def split_episodes(plan: Plan, root: Path) -> tuple[list[int], list[int]]:
-    """Return training and validation episodes of a dataset; of the parts that name no split, by the plan's rule."""
+    """Return the training and validation episodes; parts without `split` are split by the rule of the plan."""
     train: list[int] = []
     val: list[int] = []
     free: list[int] = []
@@ -209,7 +219,7 @@ def split_episodes(plan: Plan, root: Path) -> tuple[list[int], list[int]]:
     if plan.split is None:
         by_rule = split_by_seed({number: int(group) for number, group in groups.items()})
     elif len(set(groups.values())) < 2:
-        _log.warning("%s: all episodes have one %s: they are for training", root, by)
+        _log.warning("%s: no validation episodes: all episodes have the same %s", root, by)
         by_rule = free, []
     else:
         by_rule = cut(groups, [1 - plan.split.val_fraction, plan.split.val_fraction])
@@ -221,7 +231,7 @@ def _convert_lerobot(plan: Plan, robocas: Path, out: Path, jobs: int) -> None:
     from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 
     seconds, memory_gb = plan.limits.render_seconds, plan.limits.memory_gb
-    jobs = min(jobs, os.cpu_count() or 1)  # those of a plan may be a cluster's
+    jobs = min(jobs, os.cpu_count() or 1)  # jobs of a plan may run on a cluster
     version = plan.lerobot_version
     settings = ConversionSettings(
         robocas, out, jobs=jobs, episode_seconds=seconds, memory_gb=memory_gb, lerobot_version=version
@@ -234,11 +244,11 @@ def _write_statistics(out: Path) -> None:
     from robocas_ms3.datasets.statistics.plots import write_stats
 
     dataset = Path(DATASETS, "robocas")
-    write_stats(replace(collect(out / dataset), path=dataset), out / STATISTICS)  # the same wherever the folder is
+    write_stats(replace(collect(out / dataset), path=dataset), out / STATISTICS)  # no absolute path in the statistics
 
 
-def _report(plan: Plan, chosen: Chosen) -> dict[str, Any]:
-    """Return the report, without anything that a clock or a machine decides."""
+def _report(plan: Plan, chosen: ChosenEpisodes) -> dict[str, Any]:
+    """Return the report; it contains no times and no facts of the machine."""
     parts = {}
     for part, episodes in chosen.items():
         found = [outcome for _, outcome in episodes]

@@ -1,4 +1,4 @@
-"""Plans are read from YAML, and checked before any work begins."""
+"""Read plans from YAML files, and check them before a run starts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 from robocas_ms3.assets.pack import MANIFEST, find_packs, sha256
 from robocas_ms3.core.checks import MAX_SEED
 from robocas_ms3.core.documents import DocumentError, load_yaml
-from robocas_ms3.core.errors import MissingExtraError, PlanError, require_extra
+from robocas_ms3.core.errors import DatasetError, MissingExtraError, PlanError, RobocasError, require_extra
 from robocas_ms3.core.paths import plans_dir
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.core.text import did_you_mean, format_error
@@ -20,44 +20,46 @@ from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.plans.plan import PartConfig, Plan
 from robocas_ms3.robots.registry import find_robot
 from robocas_ms3.scenes.config import TaskConfig, bundled_configs, load_config_for
-from robocas_ms3.scenes.task_specs import TASKS
+from robocas_ms3.scenes.task_specs import SIM_FREQ, TASKS
 
 _FURNITURE_PACK = "builtin"
 
 
-def shipped_plans() -> dict[str, Path]:
+def bundled_plans() -> dict[str, Path]:
     """Return name -> file of the bundled plans."""
     return {path.stem: path for path in sorted(plans_dir().glob("*.yaml"))}
 
 
 def load_plan(plan: str | Path) -> Plan:
-    """Read a plan, and complete its parts by their configurations, names and hashes of packs.
+    """Read a plan, and resolve the configurations, names and pack hashes of its parts.
 
     Args:
         plan: name of a bundled plan, or a YAML file.
 
     Raises:
-        PlanError: there is no such plan, or a key or value is invalid.
+        PlanError: the plan does not exist, or a key or value is invalid.
         ConfigError: a configuration is invalid.
     """
-    shipped, path = shipped_plans(), Path(plan)
-    if str(plan) in shipped:
-        path = shipped[str(plan)]
+    bundled, path = bundled_plans(), Path(plan)
+    if str(plan) in bundled:
+        path = bundled[str(plan)]
     elif path.suffix not in {".yaml", ".yml"} or not path.is_file():
-        expected, fix = f"a YAML file, or one of {', '.join(shipped)}", did_you_mean(str(plan), shipped)
+        expected, fix = f"a YAML file, or one of {', '.join(bundled)}", did_you_mean(str(plan), bundled)
         raise PlanError("no such plan", where=plan, expected=expected, fix=fix)
     try:
         data = load_yaml(path)
     except (OSError, DocumentError) as error:
-        raise PlanError("this plan can't be read", where=path, found=error) from error
-    loaded = parse(Plan, data, PlanError, where=path, about="not a valid plan")
-    completed = [_completed(part, number, path) for number, part in enumerate(loaded.parts)]
-    parts = [part for part, _ in completed]
+        raise PlanError("cannot read this plan", where=path, found=error) from error
+    loaded = parse(Plan, data, PlanError, where=path, about="invalid plan")
+    _check_rates(loaded, path)
+    resolved = [_resolve_part(part, number, path) for number, part in enumerate(loaded.parts)]
+    parts = [part for part, _ in resolved]
     names = [part.name or "" for part in parts]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise PlanError("parts of one name", where=path, found=", ".join(twice), fix="Give them a name each.")
-    _check_seeds(parts, [scene for _, scene in completed], loaded.block, path)
-    cameras = _cameras(loaded, [config for _, (_, config, _) in completed], path)
+    if duplicates := sorted({name for name in names if names.count(name) > 1}):
+        what, fix = "two parts have the same name", "Set `name` of one of them."
+        raise PlanError(what, where=f"{path}, parts", found=", ".join(duplicates), fix=fix)
+    _check_seeds(parts, [scene for _, scene in resolved], loaded.block, path)
+    cameras = _cameras(loaded, [config for _, (_, config, _) in resolved], path)
     images = loaded.images.model_copy(update={"cameras": cameras})
     packs = sorted({_FURNITURE_PACK, *(part.pack for part in parts)})
     found = {pack: digest for pack in packs if (digest := _digest(pack))}
@@ -66,32 +68,42 @@ def load_plan(plan: str | Path) -> Plan:
 
 
 def max_seeds(episodes: int, block: int) -> int:
-    """Return how many seeds a part may try before the run ends because too few succeed."""
-    return episodes + max(20, 3 * episodes) + 2 * block  # the last work units are done whole
+    """Return the largest number of seeds that a part may use before the run ends because too few succeed."""
+    return episodes + max(20, 3 * episodes) + 2 * block  # the last work units are completed
 
 
 def check_packs(plan: Plan, packs: Iterable[str]) -> None:
-    """Raise PlanError if a pack, or that of the furniture, differs from the one that a plan was loaded with."""
+    """Raise PlanError if a pack, or the furniture pack, has changed since the plan was loaded."""
     for pack in {_FURNITURE_PACK, *packs}:
         expected, found = plan.packs.get(pack), _digest(pack)
         if expected and found and found != expected:
-            what, fix = "this pack differs from the one that the plan started with", "Use that pack, or --overwrite."
-            hashes = f"a manifest of sha256 {expected[:12]}...", f"{found[:12]}..."
+            what, fix = "this pack has changed since the plan was started", "Restore the pack, or pass --overwrite."
+            hashes = f"a manifest with sha256 {expected[:12]}...", f"{found[:12]}..."
             raise PlanError(what, where=pack, expected=hashes[0], found=hashes[1], fix=fix)
 
 
 def check_plan(plan: Plan) -> None:
-    """Check that this machine can record, render and join a plan: errors that would come after days of work."""
-    from robocas_ms3.demos.recordings.motion import sample_stride
+    """Check that this machine can record, render and join a plan, before a run of days starts.
 
-    for number in range(len(plan.parts)):
-        recording_settings(plan, number).check()
+    Raises:
+        RobocasError: a setting is invalid, or an extra, pack or planner is missing.
+    """
+    for number, part in enumerate(plan.parts):
+        try:
+            recording_settings(plan, number).check()
+        except RobocasError as error:
+            if not str(error.where).startswith("--"):
+                raise
+            # an option of `robocas generate` is a key of the plan here
+            where = f"part {part.name}, {str(error.where)[2:].replace('-', '_')}"
+            raise PlanError(
+                error.what, where=where, expected=error.expected, found=error.found, fix=error.fix
+            ) from error
     if "datasets" in plan.stages:
-        sample_stride(plan.control_freq, plan.rate)
         if plan.embeddings:
             from robocas_ms3.scenes.language.embed import TextEmbedder
 
-            TextEmbedder()  # raises if something is missing; loads nothing
+            TextEmbedder()  # checks the extra and the model without loading it
         if "lerobot" in plan.formats:
             from robocas_ms3.datasets.lerobot.schema import check_video_size, require_lerobot, whole_rate
 
@@ -99,24 +111,24 @@ def check_plan(plan: Plan) -> None:
             whole_rate(plan.rate)
             check_video_size(plan.images.size)
     if "statistics" in plan.stages:
-        require_extra("plots", "statistics", "matplotlib", fix="Or leave the stage out.")
+        require_extra("plots", "statistics", "matplotlib", fix="Or remove the stage `statistics`.")
 
 
 def recording_settings(plan: Plan, part: int) -> EpisodeSettings:
-    """Return how a part's episodes are recorded."""
+    """Return the settings with which the episodes of a part are recorded."""
     config = plan.parts[part]
     assert config.config is not None  # set by `load_plan`
-    rate = int(plan.rate) if plan.rate == int(plan.rate) else 5  # episodes are checked at the dataset's rate
+    rate = int(plan.rate) if plan.rate == int(plan.rate) else 5  # the open-loop check uses the rate of the dataset
     chosen = {"control_freq": plan.control_freq, "check_rate": rate, **plan.recording.model_dump(exclude_none=True)}
     return EpisodeSettings(config.task, config.config, config.pack, **chosen)
 
 
 @contextmanager
 def part_error_context(plan: Plan, part: int) -> Iterator[None]:
-    """Open an environment, or whatever else all seeds of a part share: an error there is no seed's fault.
+    """Convert errors inside the context, which affect all seeds of a part, to PlanError.
 
     Raises:
-        PlanError: it can't be opened on this machine, or the part's pack differs here.
+        PlanError: the environment of the part cannot be opened on this machine, or its pack has changed.
         MissingExtraError: an extra is missing.
         OSError: an error of the disk or the system.
     """
@@ -129,64 +141,81 @@ def part_error_context(plan: Plan, part: int) -> Iterator[None]:
     except Exception as error:
         if isinstance(error, OSError) and error.errno:
             raise
-        found, fix = format_error(error), "Repair it, and run the command again."
-        raise PlanError("this part can't be opened", where=f"part {config.name}", found=found, fix=fix) from error
+        what, fix = "cannot open the environment of this part", "Fix the error, and run the command again."
+        raise PlanError(what, where=f"part {config.name}", found=format_error(error), fix=fix) from error
 
 
-def _completed(part: PartConfig, number: int, path: Path) -> tuple[PartConfig, Any]:
-    """Return a part with its configuration, pack and name; and what its scenes depend on."""
+def _resolve_part(part: PartConfig, number: int, path: Path) -> tuple[PartConfig, Any]:
+    """Return a part with its configuration, pack and name; and (task, configuration, pack), which decide its scenes."""
     if part.task not in TASKS:
         where, expected, fix = f"{path}, parts.{number}", ", ".join(TASKS), did_you_mean(part.task, list(TASKS))
-        raise PlanError("no such task", where=where, expected=expected, found=repr(part.task), fix=fix)
+        raise PlanError("unknown task", where=where, expected=expected, found=repr(part.task), fix=fix)
     spec = TASKS[part.task]
     name, config = part.config or spec.default_config, part.config or spec.default_config
     if isinstance(config, str) and (path.parent / config).is_file():
         config = path.parent / config
     loaded = load_config_for(spec, config)
-    shipped = isinstance(config, str) and config in bundled_configs()  # a file may change until the next run
+    is_bundled = isinstance(config, str) and config in bundled_configs()  # else the content of the file is stored
     stem, pack = Path(name).stem if isinstance(name, str) else part.task, part.pack
     if pack not in find_packs():  # a folder, relative to the plan or to the working directory
         folders = [folder for folder in (path.parent / pack, Path(pack)) if folder.is_dir()]
         pack = str(folders[0].resolve()) if folders else pack
-    completed = {
-        "config": name if shipped else loaded.model_dump(mode="json"),
+    values = {
+        "config": name if is_bundled else loaded.model_dump(mode="json"),
         "pack": pack,
         "name": part.name or re.sub(r"[^\w-]+", "-", f"{number:02d}-{stem}")[:60],
     }
-    return part.model_copy(update=completed), (part.task, loaded, pack)
+    return part.model_copy(update=values), (part.task, loaded, pack)
 
 
 def _cameras(plan: Plan, configs: Sequence[TaskConfig], path: Path) -> list[str]:
-    """Return the cameras of the dataset: the chosen ones, or all that the parts' configurations declare."""
+    """Return the cameras of the dataset: `images.cameras`, or all cameras of the configurations."""
     robot, where = find_robot(plan.recording.robot).description, f"{path}, images.cameras"
     declared = [[camera.name for camera in config.cameras_of(robot)] for config in configs]
     common = [name for name in declared[0] if all(name in names for names in declared)]
     if not plan.images.cameras:
         if "datasets" in plan.stages and any(len(names) > len(common) for names in declared):
-            what, fix = "the parts have different cameras", f"Choose some of {', '.join(common)}."
-            raise PlanError(what, where=where, found=sorted({*chain(*declared)} - {*common}), fix=fix)
+            only_some = ", ".join(sorted({*chain(*declared)} - {*common}))
+            what, fix = "the parts have different cameras", f"Choose from {', '.join(common)}."
+            raise PlanError(what, where=where, found=f"{only_some} in some parts only", fix=fix)
         return common
-    if wrong := sorted({*plan.images.cameras} - {*common}):
-        raise PlanError("no such camera", where=where, expected=f"some of {', '.join(common)}", found=wrong)
+    if unknown := sorted({*plan.images.cameras} - {*common}):
+        raise PlanError("unknown camera", where=where, expected=f"any of {', '.join(common)}", found=", ".join(unknown))
     return plan.images.cameras
 
 
+def _check_rates(plan: Plan, path: Path) -> None:
+    """Check that the control rate divides the rate of physics, and the rate of the dataset the control rate."""
+    if SIM_FREQ % plan.control_freq:
+        expected = f"a divisor of {SIM_FREQ}"
+        what, where = "the control rate must divide the rate of physics", f"{path}, control_freq"
+        raise PlanError(what, where=where, expected=expected, found=plan.control_freq)
+    if "datasets" in plan.stages:
+        from robocas_ms3.demos.recordings.motion import sample_stride
+
+        try:
+            sample_stride(plan.control_freq, plan.rate)
+        except DatasetError as error:
+            where = f"{path}, rate"
+            raise PlanError(error.what, where=where, expected=error.expected, found=error.found) from error
+
+
 def _digest(pack: str) -> str:
-    """Return the hash of a pack's manifest, which has those of its files; empty where there is no such pack."""
+    """Return the hash of the manifest of a pack, or "" if there is no such pack."""
     path = find_packs().get(pack, Path(pack)) / MANIFEST
     return sha256(path) if path.is_file() else ""
 
 
 def _check_seeds(parts: Sequence[PartConfig], scenes: Sequence[Any], block: int, path: Path) -> None:
-    """Check that no two parts may try the same seed of a scene: a dataset has no episode twice."""
+    """Check that no two parts can use the same seed of the same scene: episodes of a dataset are unique."""
     for number, part in enumerate(parts):
-        where, most = f"{path}, parts.{number}.seed", max_seeds(part.episodes, block)
-        if part.seed + most > MAX_SEED:
-            expected = f"<= {MAX_SEED - most}"
-            raise PlanError(f"seeds end at {MAX_SEED}", where=where, expected=expected, found=part.seed)
+        where, count = f"{path}, parts.{number}.seed", max_seeds(part.episodes, block)
+        if part.seed + count > MAX_SEED:
+            expected = f"at most {MAX_SEED - count}"
+            raise PlanError(f"seeds may not exceed {MAX_SEED}", where=where, expected=expected, found=part.seed)
         for other, scene in zip(parts[:number], scenes, strict=False):
             first, last = sorted((part, other), key=lambda each: each.seed)
             end = first.seed + max_seeds(first.episodes, block)
             if scenes[number] == scene and last.seed < end:
-                expected, found = f"one of the two from {end} on", f"{part.seed}, and {other.seed} of {other.name}"
-                raise PlanError("two parts may try the same seeds", where=where, expected=expected, found=found)
+                expected, found = f"one of them at least {end}", f"{part.seed}, and {other.seed} of part {other.name}"
+                raise PlanError("two parts may use the same seeds", where=where, expected=expected, found=found)

@@ -1,4 +1,4 @@
-"""A plan says what a dataset is made of: the models of its YAML file."""
+"""The models of a plan, a YAML file that describes a dataset."""
 
 from __future__ import annotations
 
@@ -23,19 +23,24 @@ class PartConfig(StrictModel):
 
     task: str
     config: str | dict[str, Any] | None = Field(
-        default=None, description="a shipped configuration, a YAML file next to the plan, or a whole configuration"
+        default=None,
+        description="name of a bundled configuration, a YAML file next to the plan, or the configuration itself",
     )
     pack: str = "builtin"
     episodes: Annotated[int, Field(ge=1, le=1_000_000)] = Field(description="number of successful episodes")
-    seed: Annotated[int, Field(ge=0, le=MAX_SEED)] = Field(default=0, description="first seed; others follow")
-    split: Split | None = Field(default=None, description="split of all its episodes; default: by the plan's rule")
+    seed: Annotated[int, Field(ge=0, le=MAX_SEED)] = Field(
+        default=0, description="first seed; the following seeds are used in order"
+    )
+    split: Split | None = Field(
+        default=None, description="split of all episodes of the part; default: by `split` of the plan"
+    )
     name: Annotated[str, Field(pattern=r"^[\w-]+$", max_length=60)] | None = Field(
-        default=None, description="name of its folders"
+        default=None, description="name of the folders of the part"
     )
 
 
 class RecordingConfig(StrictModel):
-    """How episodes are recorded, where it differs from `robocas generate`; see `demos.EpisodeSettings`."""
+    """Options of `robocas generate` for all parts; a key that is missing has the default of `EpisodeSettings`."""
 
     planner: str | None = None
     robot: str | None = None
@@ -51,50 +56,54 @@ class RecordingConfig(StrictModel):
 
 
 class ImagesConfig(StrictModel):
-    """Images that are rendered."""
+    """Images of the dataset."""
 
     size: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] = (640, 480)
     depth: bool = True
     image_format: ImageFormat = "png"
-    cameras: list[str] | None = Field(default=None, description="default: all that the configurations declare")
+    cameras: list[str] | None = Field(default=None, description="default: all cameras of the configurations")
 
-    def chosen(self) -> ImageOptions:
-        """Return the settings as dataset writers take them."""
+    def image_options(self) -> ImageOptions:
+        """Return the settings in the form of dataset writers."""
         cameras = (
             STANDARD_CAMERA_NAMES if self.cameras is None else tuple(self.cameras)
-        )  # None: a plan of an older version
+        )  # None: a plan.json of an older version
         return ImageOptions(cameras=cameras, size=self.size, depth=self.depth, image_format=self.image_format)
 
 
 class LimitsConfig(StrictModel):
-    """Limits of an episode; a process that exceeds one is killed, and the episode is retried once."""
+    """Limits per episode; a process that exceeds a limit is killed, and its seed is retried once."""
 
     record_seconds: Annotated[float, Field(gt=0, le=10**7)] = 1800.0
     render_seconds: Annotated[float, Field(gt=0, le=10**7)] = 3600.0
-    memory_gb: Annotated[float, Field(gt=0, le=10**5)] = Field(default=8.0, description="of each process")
+    memory_gb: Annotated[float, Field(gt=0, le=10**5)] = Field(default=8.0, description="memory of each process, GB")
 
 
 class SplitConfig(StrictModel):
-    """Which episodes validate, of the parts that name no split; as `robocas split`."""
+    """Rule that chooses the validation episodes of the parts without `split`; as `robocas split`."""
 
     val_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    group_by: Literal["seed", "target", "task"] = Field(default="seed", description="what stays in one split")
+    group_by: Literal["seed", "target", "task"] = Field(
+        default="seed", description="episodes with the same value stay in one split"
+    )
 
 
 class Plan(StrictModel):
-    """One plan: a YAML file."""
+    """A plan; the content of a YAML file."""
 
     description: str = ""
     parts: Annotated[list[PartConfig], Field(min_length=1)]
     stages: Annotated[list[Stage], Field(min_length=1)] = ["demonstrations", "datasets", "statistics"]
     formats: list[Literal["robocas", "lerobot"]] = ["robocas"]
-    lerobot_version: Version = Field(default=NEWEST, description="version of LeRobot that reads the dataset")
+    lerobot_version: Version = Field(default=NEWEST, description="reader of the LeRobot dataset")
     recording: RecordingConfig = RecordingConfig()
     images: ImagesConfig = ImagesConfig()
-    rate: Annotated[float, Field(gt=0, le=100)] = Field(default=5.0, description="steps of a dataset per second")
+    rate: Annotated[float, Field(gt=0, le=100)] = Field(default=5.0, description="dataset steps per second")
     control_freq: Annotated[int, Field(ge=1, le=100)] = 20
     embeddings: bool = True
-    split: SplitConfig | None = Field(default=None, description="default: as `robocas convert`, 90 : 10 by seed")
+    split: SplitConfig | None = Field(
+        default=None, description="default: as `robocas convert`, 10 % for validation, by seed"
+    )
     block: Annotated[int, Field(ge=1, le=1000)] = Field(default=10, description="seeds of a work unit")
     limits: LimitsConfig = LimitsConfig()
     packs: dict[str, str] = Field(default={}, description="pack -> sha256 of its manifest when the plan was loaded")
@@ -103,29 +112,29 @@ class Plan(StrictModel):
     @classmethod
     def _robocas_first(cls, formats: list[str]) -> list[str]:
         if formats[:1] != ["robocas"]:
-            raise ValueError("robocas comes first: other formats are made of it")
+            raise ValueError("expected robocas first: other formats are converted from it")
         return formats
 
     @model_validator(mode="after")
     def _stages_fit(self) -> Plan:
         for stage in self.stages:
             if _NEEDS.get(stage, stage) not in self.stages:
-                raise ValueError(f"stages: {stage} needs {_NEEDS[stage]}")
+                raise ValueError(f"stages: {stage} needs the stage {_NEEDS[stage]}")
         if "lerobot" in self.formats and "datasets" not in self.stages:
             raise ValueError("formats: lerobot needs the stage datasets")
-        free = {part.task for part in self.parts if part.split is None}
-        if self.split and self.split.group_by == "task" and len(free) < 2:
-            raise ValueError("split: group_by task needs parts of two tasks that name no split")
+        tasks = {part.task for part in self.parts if part.split is None}
+        if self.split and self.split.group_by == "task" and len(tasks) < 2:
+            raise ValueError("split: group_by task needs parts of two tasks without `split`")
         return self
 
     def name_of(self, part: int) -> str:
-        """Return the name of a part's folders; a loaded plan names all parts."""
+        """Return the name of the folders of a part; `load_plan` sets it."""
         return f"{self.parts[part].name}"
 
     def block_of(self, part: int) -> int:
-        """Return the number of seeds of a part's work units: at most the number of its episodes."""
+        """Return the number of seeds per work unit of a part: `block`, or its number of episodes if that is smaller."""
         return min(self.block, self.parts[part].episodes)
 
     def first_episode(self, part: int) -> int:
-        """Return the number of a part's first episode in the dataset."""
+        """Return the index of the first episode of a part in the dataset."""
         return sum(other.episodes for other in self.parts[:part])

@@ -1,4 +1,4 @@
-"""Status of a plan, read from its folder: on any machine, while others work there."""
+"""Status of a plan, read from its folder, on any machine and while it runs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from robocas_ms3.plans.folder import REPORT, Outcome, read_plan
 from robocas_ms3.plans.progress import Progress
 
-_RECENT = 600.0  # s before the last episode that the rate is measured over
+_RATE_WINDOW = 600.0  # s before the last episode, over which the rate is measured
 
 
 @dataclass(frozen=True)
@@ -19,13 +19,13 @@ class PartStatus:
     """Status of a part."""
 
     name: str
-    requested: int  # episodes that the plan asks for
-    done: int  # episodes that are done, at most `requested`
-    tried: int  # seeds
-    failed: dict[str, int]  # "stage: reason" -> number of seeds whose last attempt failed for it
+    requested: int  # number of episodes in the plan
+    done: int  # number of complete episodes, at most `requested`
+    tried: int  # number of seeds that have an outcome
+    failed: dict[str, int]  # "stage: reason" of the last attempt -> number of failed seeds
     record_seconds: float  # CPU time per episode
-    render_seconds: float
-    bytes: int  # of the files of the episodes that are done
+    render_seconds: float  # CPU time per episode
+    bytes: int  # size of the complete episodes
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,13 @@ class Status:
 
     parts: list[PartStatus]
     episodes_per_hour: float  # in the ten minutes before the last episode
-    seconds_left: float | None  # until all are done, if they take the CPU time of others of their part; None: unknown
-    idle_seconds: float | None  # since the last episode; None: there is none
-    finished: bool  # whether everything is joined
+    seconds_left: float | None  # estimated from the CPU time per episode of each part; None: unknown
+    idle_seconds: float | None  # since the last episode; None: no episode yet
+    finished: bool  # whether all episodes are joined
 
 
 def read_status(out: Path) -> Status:
-    """Read the status of the plan in a folder; raise PlanError if there is none."""
+    """Read the status of the plan in a folder; raise PlanError if the folder has no plan."""
     return status_of(Progress(read_plan(out)), finished=(out / REPORT).is_file())
 
 
@@ -53,14 +53,14 @@ def status_of(progress: Progress, *, finished: bool = False) -> Status:
         _part_status(part.name or "", part.episodes, found)
         for part, found in zip(progress.plan.parts, outcomes, strict=True)
     ]
-    latest = time.time() + _RECENT  # a clock far ahead would hide all other episodes
+    latest = time.time() + _RATE_WINDOW  # ignore machines whose clock is far ahead
     ends = sorted(
         (outcome.end_time, part)
         for part, found in enumerate(outcomes)
         for outcome in found
         if outcome.success and outcome.end_time <= latest
     )
-    recent = [(at, part) for at, part in ends if at > ends[-1][0] - _RECENT]
+    recent = [(at, part) for at, part in ends if at > ends[-1][0] - _RATE_WINDOW]
     seconds = recent[-1][0] - recent[0][0] if recent else 0.0
     left = seconds_left(parts, [part for _, part in recent[1:]], seconds) if seconds else None
     return Status(
@@ -91,12 +91,12 @@ def seconds_left(parts: Sequence[PartStatus], recent: Sequence[int], seconds: fl
     """Estimate the time until all episodes are done.
 
     Args:
-        parts: status of each part: an episode takes the mean CPU time of its part, or of all where it has none.
-        recent: parts of the recent episodes, at least one.
-        seconds: that these took.
+        parts: status of each part. An episode takes the mean CPU time of its part, or of all parts if that is unknown.
+        recent: part of each recent episode, at least one.
+        seconds: wall-clock time of the recent episodes.
     """
     spent = [(part.record_seconds + part.render_seconds) * part.done for part in parts]
-    mean = sum(spent) / max(1, sum(part.done for part in parts)) or 1.0  # 1.0: no CPU times are known
-    cost = [each / part.done if each else mean for each, part in zip(spent, parts, strict=True)]
-    left = sum(each * (part.requested - part.done) for each, part in zip(cost, parts, strict=True))
+    mean = sum(spent) / max(1, sum(part.done for part in parts)) or 1.0  # 1.0: no CPU time is known
+    cost = [total / part.done if total else mean for total, part in zip(spent, parts, strict=True)]
+    left = sum(cpu * (part.requested - part.done) for cpu, part in zip(cost, parts, strict=True))
     return left * seconds / sum(cost[part] for part in recent)

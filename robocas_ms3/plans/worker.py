@@ -1,6 +1,6 @@
-"""Does work units: records the episode of each seed and renders it at once, in processes that may die.
+"""Run work units: record and render the episode of each seed, in worker processes that may crash.
 
-One process records an episode, the other one renders it; both keep the environment while the part stays the same.
+One process records, another one renders; both keep their environment until the part changes.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ if TYPE_CHECKING:
     from robocas_ms3.datasets.conversion.env_renderer import EnvRenderer
     from robocas_ms3.demos.generator import EpisodeGenerator
 
-TRIES = 2
-"""How often a seed is tried whose process dies, before it is left out."""
-_OF_A_SEED = (LayoutError, PlanningError, SimulationError, DatasetError)  # other errors of ours affect all seeds
+MAX_CRASHES = 2
+"""Crashes of the processes of a seed, after which the seed is skipped."""
+_SEED_ERRORS = (LayoutError, PlanningError, SimulationError, DatasetError)  # other RobocasErrors affect all seeds
 
 
 class Recorder:
-    """Samples the layouts of seeds and records their episodes."""
+    """Sample the layouts of seeds and record their episodes."""
 
     def __init__(self, plan: Plan) -> None:
         use_one_torch_thread()
@@ -66,7 +66,7 @@ class Recorder:
         self._layouts: Any = None
 
     def run(self, files: SeedFiles) -> dict[str, Any]:
-        """Write the layout of a seed and record its episode, as the plan asks; return fields of its `Outcome`."""
+        """Write layout and recording of a seed, if the plan has these stages; return fields of its `Outcome`."""
         start = _cpu_seconds()
         if self._part != files.part:
             self.close()
@@ -74,7 +74,7 @@ class Recorder:
                 self._open(files.part)
             self._part = files.part
         try:
-            if self._model is not None:  # as the environment samples it
+            if self._model is not None:  # the environment samples the same layout
                 layout = self._layouts(files.seed, files.seed)
                 write_frozen_layouts(files.layout, self._model.object_pack.objects, {files.seed: layout})
             result = self._record(files, self._generator) if self._generator else {"success": True}
@@ -92,19 +92,19 @@ class Recorder:
             self._model = SceneModel.load(config, pack, load_pack("builtin"), robot=robot.description)
             self._layouts = layout_source(self._model, settings.layouts)
         if "demonstrations" in self._plan.stages:
-            from robocas_ms3.demos.generator import EpisodeGenerator  # with the simulator
+            from robocas_ms3.demos.generator import EpisodeGenerator  # imports the simulator
 
             self._generator = EpisodeGenerator(settings)
 
     def _record(self, files: SeedFiles, generator: EpisodeGenerator) -> dict[str, Any]:
-        if not files.recording.is_file():  # otherwise its process died after it had written the file
+        if not files.recording.is_file():  # otherwise a process crashed after writing the file
             tmp = files.folder / ".recording.tmp.h5"
             result = generator.generate(files.seed, files.folder, tmp.stem)
             if not result.success:
                 return {"success": False, "failures": [f"{each.stage}: {each.reason}" for each in result.failures]}
             content = read_json(tmp)
             for episode in content["episodes"]:
-                episode["robocas"].pop("seconds", None)  # by a clock: every machine writes the same bytes
+                episode["robocas"].pop("seconds", None)  # wall-clock times differ between machines
             write_json(files.recording.with_suffix(".json"), content)
             tmp.with_suffix(".json").unlink()
             os.replace(tmp, files.recording)
@@ -122,10 +122,10 @@ class Recorder:
 
 
 class Renderer:
-    """Renders recorded episodes."""
+    """Render recorded episodes."""
 
     def __init__(self, plan: Plan) -> None:
-        os.environ.setdefault("LP_NUM_THREADS", "1")  # one process per core renders
+        os.environ.setdefault("LP_NUM_THREADS", "1")  # one rendering process per core
         self._plan = plan
         self._part: int | None = None
         self._source: rendered_source.RenderedSource | None = None
@@ -134,8 +134,8 @@ class Renderer:
     def run(self, files: SeedFiles) -> dict[str, Any]:
         """Render the episode of a seed; return fields of its `Outcome`."""
         start = time.process_time()
-        if not files.episode.is_dir():  # otherwise its process died after it had written the folder
-            recording = ConversionInput(self._source_of(files), self._plan.images.chosen())
+        if not files.episode.is_dir():  # otherwise a process crashed after writing the folder
+            recording = ConversionInput(self._source_of(files), self._plan.images.image_options())
             embed = self._embed if self._plan.embeddings else None
             FolderWriter(files.folder, embed).write(0, recording, 0)
         return {"render_seconds": round(time.process_time() - start, 2)}
@@ -152,7 +152,7 @@ class Renderer:
             self._source = rendered_source.RenderedSource(
                 files.recording,
                 rate_hz=self._plan.rate,
-                image_options=self._plan.images.chosen(),
+                image_options=self._plan.images.image_options(),
                 pack=self._plan.parts[files.part].pack,
                 open_renderer=self._open,
             )
@@ -169,7 +169,7 @@ class Renderer:
         from robocas_ms3.scenes.language.embed import TextEmbedder
 
         self._embedder = self._embedder or TextEmbedder()
-        # one text at a time: the last bits of an embedding depend on the rest of its batch
+        # one text at a time: rounding depends on the other texts of a batch
         return np.concatenate([self._embedder([text]) for text in texts])
 
     def close(self) -> None:
@@ -179,9 +179,9 @@ class Renderer:
 
 
 class WorkUnitWorker:
-    """Does one work unit after the other, by two processes that are kept from unit to unit.
+    """Run work units one after the other, with two processes that live from unit to unit.
 
-    One process records an episode, the other one renders it: a process with a renderer can't fork, as planning does.
+    One process records, the other one renders: planning forks its process, which a process with a renderer cannot do.
     """
 
     def __init__(self, folder: PlanFolder) -> None:
@@ -191,50 +191,51 @@ class WorkUnitWorker:
         self._record = WorkerPool(partial(Recorder, self._plan), 1, limits=limits[0], retries=0)
         self._render = WorkerPool(partial(Renderer, self._plan), 1, limits=limits[1], retries=0)
 
-    def do(self, unit: WorkUnit) -> None:
-        """Do the seeds of a unit that are not done; an error is one that every seed would meet."""
-        for _ in self.seeds(unit):
+    def run(self, unit: WorkUnit) -> None:
+        """Run the missing seeds of a unit; raise an error that affects all seeds."""
+        for _ in self.run_seeds(unit):
             pass
 
-    def seeds(self, unit: WorkUnit) -> Iterator[SeedFiles]:
-        """Do the seeds of a unit that are not done; yield the files of each, which are complete."""
+    def run_seeds(self, unit: WorkUnit) -> Iterator[SeedFiles]:
+        """Run the missing seeds of a unit; yield the complete files of each."""
         if self._folder.outcomes(unit) is not None:
             return
         for seed in unit.seeds(self._plan):
             files = self._folder.files(unit, seed)
             if files.outcome() is None:
                 self._output.check_record()
-                with files.temporary() as tmp:
+                with files.temporary_files() as tmp:
                     outcome = self._outcome(tmp)
                     if not outcome.success:
                         for path in tmp.folder.iterdir():
                             remove(path)
                     tmp.write(outcome)
-                    self._output.check_record()  # --overwrite may have started another plan
+                    self._output.check_record()  # a run with --overwrite may have replaced the plan
                 yield files
-        self._folder.complete(unit)
+        self._folder.write_outcomes(unit)
 
     def _outcome(self, files: SeedFiles) -> Outcome:
         crashes = list[str]()
-        result = self._survive(self._record, "record", files, crashes)
+        result = self._run_stage(self._record, "record", files, crashes)
         if result["success"] and "datasets" in self._plan.stages:
-            result |= self._survive(self._render, "render", files, crashes)
+            result |= self._run_stage(self._render, "render", files, crashes)
         size = files.size() if result["success"] else 0
         return Outcome(seed=files.seed, end_time=time.time(), size=size, crashes=crashes, **result)
 
-    def _survive(
+    def _run_stage(
         self, process: WorkerPool[SeedFiles, dict[str, Any]], stage: str, files: SeedFiles, crashes: list[str]
     ) -> dict[str, Any]:
-        """Do a stage of an episode; retry it when its process dies, up to `TRIES`."""
-        for _ in range(TRIES):
+        """Run a stage of an episode; retry it if its process crashes, until `MAX_CRASHES`."""
+        for _ in range(MAX_CRASHES):
             try:
                 return process.run(files)
             except (WorkerStartError, ImportError) as failed:
-                raise PlanError("a process could not start", found=failed) from failed
+                fix = "See robocas doctor."
+                raise PlanError("a worker process cannot start", found=failed, fix=fix) from failed
             except WorkerCrashError as crash:
                 reason = f"{crash.found}"
             except Exception as error:
-                if not _is_of_a_seed(error):
+                if not _is_seed_error(error):
                     raise
                 reason = format_error(error, 200)
             crashes.append(f"{stage}: {reason}")
@@ -242,7 +243,7 @@ class WorkUnitWorker:
         return {"success": False, "failures": [crashes[-1]]}
 
     def stop(self) -> None:
-        """Kill the processes; `do` in another thread raises `CancelledError`."""
+        """Kill the processes; `run` in another thread raises `CancelledError`."""
         self._record.stop()
         self._render.stop()
 
@@ -252,13 +253,13 @@ class WorkUnitWorker:
         self._render.close()
 
 
-def _is_of_a_seed(error: Exception) -> bool:
-    """Return whether an error is due to a seed: its scene or files, a bug that it has found, memory that was missing.
+def _is_seed_error(error: Exception) -> bool:
+    """Return whether an error belongs to a seed: its scene, its files, a bug, or a lack of memory.
 
-    Errors of the disk, the system or the installation are not: all seeds of a machine would be left out.
+    Errors of the disk, the system or the installation do not: they would skip all seeds of a machine.
     """
     if isinstance(error, RobocasError):
-        return isinstance(error, _OF_A_SEED)
+        return isinstance(error, _SEED_ERRORS)
     return not isinstance(error, CancelledError | OSError)
 
 

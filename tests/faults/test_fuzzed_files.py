@@ -44,7 +44,7 @@ from robocas_ms3.evaluation.report.comparison import compare_results
 from robocas_ms3.evaluation.report.page import render_page
 from robocas_ms3.evaluation.report.tables import render_markdown
 from robocas_ms3.plans.folder import OUTCOME, OUTCOMES, PLAN, Outcome, PlanFolder, WorkUnit, read_plan
-from robocas_ms3.plans.load import load_plan, shipped_plans
+from robocas_ms3.plans.load import load_plan, bundled_plans
 from robocas_ms3.plans.status import read_status
 from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 from robocas_ms3.scenes.layout import Layout
@@ -108,7 +108,7 @@ COMPLETE, STARTED = WorkUnit(0, 0), WorkUnit(0, 1)
 
 
 def plan_folder(root):
-    return PlanFolder(load_plan(next(iter(shipped_plans()))), root)
+    return PlanFolder(load_plan(next(iter(bundled_plans()))), root)
 
 
 def first_seed(folder):
@@ -120,7 +120,7 @@ def write_plan(root):
     folder = plan_folder(root)
     for unit in (COMPLETE, STARTED):
         for seed in unit.seeds(folder.plan):
-            with folder.files(unit, seed).temporary() as files:
+            with folder.files(unit, seed).temporary_files() as files:
                 files.write(Outcome(seed, True, 10, ["a: b"], ["c: d"], 1.0, 1.0, 5, 1e9))
     folder.complete(COMPLETE)
     (root / PLAN).write_text(json.dumps(folder.record()))

@@ -1,4 +1,4 @@
-"""Plans as files: what is wrong with one is a line; the shipped ones are whole."""
+"""Plans as files: an invalid plan is an error of one line; the bundled plans are complete."""
 
 import errno
 from dataclasses import replace
@@ -10,12 +10,12 @@ from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import ConfigError, ExtensionError, MissingExtraError, OutputExistsError, PlanError
 from robocas_ms3.plans.folder import PLAN, PlanFolder, SeedFiles
 from robocas_ms3.plans.load import (
+    bundled_plans,
     check_plan,
     load_plan,
     max_seeds,
     part_error_context,
     recording_settings,
-    shipped_plans,
 )
 from robocas_ms3.plans.worker import Renderer
 from robocas_ms3.scenes.config import load_task_config
@@ -33,24 +33,24 @@ def written(tmp_path):
     return write
 
 
-@pytest.mark.parametrize("name", shipped_plans())
-def test_shipped_plans_are_whole(name):
+@pytest.mark.parametrize("name", bundled_plans())
+def test_bundled_plans_are_complete(name):
     plan = load_plan(name)
     assert plan.description
     assert len({part.name for part in plan.parts}) == len(plan.parts)
 
 
-def test_the_paper_s_numbers():
+def test_paper_plan_has_the_numbers_of_the_paper():
     parts = load_plan("paper").parts
     of = {task: sum(part.episodes for part in parts if part.task == task) for task in ("pick", "select", "search")}
     assert of == {"pick": 2800, "select": 3000, "search": 1500}  # robocas_v0.md, data: 7300 episodes
 
 
-def test_parts_of_the_same_scenes_have_seeds_apart(written):
+def test_parts_with_the_same_scenes_need_separate_seeds(written):
     seed = max_seeds(5, block=10)
     text = "parts:\n  - {{task: pick, episodes: 5}}\n  - {{task: pick, episodes: 9, seed: {}}}\n"
     assert len(load_plan(written(text.format(seed))).parts) == 2
-    with pytest.raises(PlanError, match="may try the same seeds"):
+    with pytest.raises(PlanError, match="may use the same seeds"):
         load_plan(written(text.format(seed - 1)))
 
 
@@ -68,7 +68,7 @@ def test_configurations_and_packs_in_folders(written, tmp_path, monkeypatch):
     assert plan.parts[0].pack == str(tmp_path / "here" / "packs" / "mine")
 
 
-def test_a_pack_that_was_changed_is_noticed(written, tmp_path):
+def test_changed_pack_is_an_error(written, tmp_path):
     pack, out = tmp_path / "mine", tmp_path / "out"
     pack.mkdir()
     path = written("parts:\n  - {task: pick, pack: mine, episodes: 3, name: a}\n")
@@ -87,7 +87,7 @@ def test_a_pack_that_was_changed_is_noticed(written, tmp_path):
         pass
     assert error.value.where == str(pack)
     path.write_text(f"{path.read_text()}packs: {{{pack}: 12ab}}\n")
-    with pytest.raises(PlanError, match="expected a manifest of sha256 12ab"):
+    with pytest.raises(PlanError, match="expected a manifest with sha256 12ab"):
         load_plan(path)
 
 
@@ -101,7 +101,7 @@ def test_a_pack_that_was_changed_is_noticed(written, tmp_path):
         (MissingExtraError("nothing to render with"), MissingExtraError, "nothing to render with"),
     ],
 )
-def test_what_fails_while_a_part_is_opened_ends_the_run(written, tmp_path, error, raised, match):
+def test_error_while_opening_a_part_ends_the_run(written, tmp_path, error, raised, match):
     class Fails(Renderer):
         def open_env(self, *_):
             raise error
@@ -119,32 +119,34 @@ def test_what_fails_while_a_part_is_opened_ends_the_run(written, tmp_path, error
     ("text", "match"),
     [
         ("parts: []\n", "at least 1 item"),
-        ("parts:\n  - {task: fly, episodes: 1}\n", "no such task .expected pick, select, search, open_pick"),
+        ("parts:\n  - {task: fly, episodes: 1}\n", "unknown task .expected pick, select, search, open_pick"),
         (GOOD + "block: 10\nblok: 3\n", "unknown key 'blok'.*Did you mean block"),
-        (GOOD + "formats: [lerobot]\n", "robocas comes first"),
-        (GOOD + "stages: [datasets]\n", "datasets needs demonstrations"),
+        (GOOD + "formats: [lerobot]\n", "expected robocas first"),
+        (GOOD + "stages: [datasets]\n", "datasets needs the stage demonstrations"),
         (GOOD + "stages: [demonstrations]\nformats: [robocas, lerobot]\n", "lerobot needs the stage datasets"),
-        (GOOD + "images: {cameras: [nose]}\n", "no such camera"),
+        (GOOD + "images: {cameras: [nose]}\n", "unknown camera"),
         (GOOD + "split: {group_by: task}\n", "group_by task needs parts of two tasks"),
         ("parts:\n  - {task: pick, episodes: 1, name: ../up}\n", "parts.0.name"),
         (
             "parts:\n  - {task: pick, episodes: 1, name: a}\n  - {task: pick, episodes: 1, name: a}\n",
-            "one name .found a",
+            "two parts have the same name .found a",
         ),
         (
             "parts:\n" + 2 * "  - {task: pick, episodes: 1}\n",
-            "two parts may try the same seeds .expected one of the two from",
+            "two parts may use the same seeds .expected one of them at least",
         ),
-        ("[", "can't be read"),
+        ("[", "cannot read this plan"),
+        (GOOD + "control_freq: 7\n", "plan.yaml, control_freq: the control rate must divide the rate of physics"),
+        (GOOD + "rate: 7\n", "plan.yaml, rate: "),
     ],
 )
-def test_what_is_wrong_with_a_plan_is_a_line(written, text, match):
+def test_invalid_plan_is_one_line(written, text, match):
     with pytest.raises(PlanError, match=match) as error:
         load_plan(written(text))
     assert "\n" not in str(error.value)
 
 
-def test_the_cameras_are_all_that_the_configurations_declare_or_the_chosen_ones(written, tmp_path):
+def test_cameras_are_those_of_the_configurations_or_of_the_plan(written, tmp_path):
     camera = "cameras: {side_camera: {position: [1, 0, 1], look_at: [0, 0, 0]}}\n"
     (tmp_path / "mine.yaml").write_text(f"extends: pick_shelf_scattered\n{camera}")
     four = "parts:\n  - {task: pick, episodes: 3, config: mine.yaml}\n"
@@ -158,23 +160,23 @@ def test_the_cameras_are_all_that_the_configurations_declare_or_the_chosen_ones(
     assert load_plan(written(mixed + "images: {cameras: [base_camera]}\n")).images.cameras == ["base_camera"]
     without_images = mixed + "stages: [layouts, demonstrations]\nformats: [robocas]\n"
     assert load_plan(written(without_images)).images.cameras == standard
-    with pytest.raises(PlanError, match="no such camera"):
+    with pytest.raises(PlanError, match="unknown camera"):
         load_plan(written(mixed + "images: {cameras: [side_camera]}\n"))
 
 
-def test_a_configuration_of_another_task_is_refused(written):
+def test_configuration_of_another_task_is_an_error(written):
     with pytest.raises(ConfigError, match="can't run the configuration select_table_orderly"):
         load_plan(written("parts:\n  - {task: pick, config: select_table_orderly, episodes: 1}\n"))
 
 
-def test_a_misspelt_plan_names_the_nearest(capsys):
+def test_unknown_plan_suggests_the_nearest(capsys):
     assert run(["plan", "run", "tinny", "--out", "x"]) == 1
     assert "tinny: no such plan (expected a YAML file, or one of paper, tiny). Did you mean tiny?" in (
         capsys.readouterr().err
     )
 
 
-def test_a_recording_s_settings_are_the_plan_s(written):
+def test_recording_settings_are_those_of_the_plan(written):
     text = "rate: 10\ncontrol_freq: 20\nrecording: {check_trials: 0, max_attempts: 3}\n"
     settings = recording_settings(load_plan(written(GOOD + text)), 0)
     assert (settings.check_rate, settings.check_trials, settings.max_attempts) == (10, 0, 3)
@@ -183,14 +185,14 @@ def test_a_recording_s_settings_are_the_plan_s(written):
     )
 
 
-def test_a_recording_s_settings_are_checked_before_it_begins(written):
+def test_recording_settings_are_checked_before_the_run(written):
     with pytest.raises(ExtensionError, match="no such planner"):
         check_plan(load_plan(written(GOOD + "recording: {planner: mplip}\nembeddings: false\n")))
     with pytest.raises(PlanError, match="max_attempts"):
         check_plan(load_plan(written(GOOD + "recording: {max_attempts: 0}\nembeddings: false\n")))
 
 
-def test_a_wrong_option_of_an_executor_costs_nothing_that_exists(tmp_path, capsys):
+def test_invalid_executor_option_overwrites_nothing(tmp_path, capsys):
     out = tmp_path / "out"
     out.mkdir()
     (out / PLAN).write_text('{"versions": {}, "plan": {}}')
@@ -200,6 +202,6 @@ def test_a_wrong_option_of_an_executor_costs_nothing_that_exists(tmp_path, capsy
 
 
 @pytest.mark.parametrize("words", [["--overwrite"], ["--executor", "ray"]])
-def test_a_shard_only_continues_on_this_machine(tmp_path, words):
+def test_shard_excludes_overwrite_and_other_executors(tmp_path, words):
     assert run(["plan", "run", "tiny", "--out", str(tmp_path / "out"), "--shard", "0/2", *words]) == 2
     assert not (tmp_path / "out").exists()

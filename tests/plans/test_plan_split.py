@@ -67,4 +67,4 @@ def test_all_of_one_kind_train(of, caplog):
     )  # parts of pick alone are free
     train, val = of(plan)
     assert (len(train), val) == (30, [*range(20, 25)])
-    assert "all episodes have one task" in caplog.text
+    assert "all episodes have the same task" in caplog.text

@@ -104,7 +104,7 @@ def test_a_cluster_that_is_not_there_is_an_error(tmp_path, address):
 
 
 def test_a_node_that_does_not_see_the_folder_is_an_error(tmp_path, monkeypatch):
-    monkeypatch.setattr("robocas_ms3.plans.executors.ray._APPEARS", 0.0)
+    monkeypatch.setattr("robocas_ms3.plans.executors.ray._FOLDER_TIMEOUT", 0.0)
     with pytest.raises(PlanError, match="gather=yes"):
         run_units(PlanFolder(PLAN, tmp_path / "elsewhere"), [WorkUnit(0, 0)])
 

@@ -99,7 +99,7 @@ def test_two_shards_may_be_the_same_at_the_same_time(undisturbed, tmp_path):
 
 def test_the_first_folder_of_a_seed_is_kept(tmp_path):
     files = PlanFolder(PLAN, tmp_path).files(WorkUnit(0, 0), 10)
-    with files.temporary() as late, files.temporary() as first:
+    with files.temporary_files() as late, files.temporary_files() as first:
         for tmp in (late, first):
             tmp.recording.write_text("late" if tmp is late else "first")
             tmp.write(Outcome(10, True))
@@ -149,7 +149,7 @@ def test_a_machine_that_cannot_open_a_part_does_no_seed(tmp_path):
     )
     with made_up(Recorder), closing(WorkUnitWorker(PlanFolder(plan, tmp_path / "out"))) as worker:
         with pytest.raises(PlanError) as error:
-            worker.do(WorkUnit(0, 0))
+            worker.run(WorkUnit(0, 0))
         assert error.value.where == "part a"
     assert seeds_done(tmp_path / "out") == 0
 
@@ -175,7 +175,7 @@ def test_episodes_whose_files_were_cut_off_are_made_again(undisturbed, out):
 
 def test_a_disk_that_damages_files_again_and_again_ends_the_run(out, monkeypatch):
     monkeypatch.setattr("robocas_ms3.plans.progress.Progress.delete_damaged", lambda _: {WorkUnit(1, 0): [4]})
-    with pytest.raises(PlanError, match="files don't keep the sizes") as error:
+    with pytest.raises(PlanError, match="files change their size") as error:
         run_here(out)
     assert error.value.where == PlanFolder(PLAN, out).unit_folder(WorkUnit(1, 0))
     assert not (out / "datasets").exists()
@@ -226,7 +226,7 @@ def test_a_machine_with_other_versions_does_no_unit(tmp_path):
     shard(out, "4/5")
     record_other_versions(out)
     worker = WorkUnitWorker(PlanFolder(PLAN, out))
-    for start in (lambda: worker.do(WorkUnit(0, 0)), lambda: shard(out, "0/2")):
+    for start in (lambda: worker.run(WorkUnit(0, 0)), lambda: shard(out, "0/2")):
         with pytest.raises(OutputExistsError, match=r"versions\.sapien: .*2\.2\.2"):
             start()
     assert not (out / "units").exists()
@@ -236,7 +236,7 @@ def test_a_worker_of_an_older_plan_keeps_nothing_in_the_folder_of_a_new_one(tmp_
     out = tmp_path / "out"
     shard(out, "4/5")
     worker = WorkUnitWorker(PlanFolder(PLAN, out))
-    seeds = worker.seeds(WorkUnit(0, 0))
+    seeds = worker.run_seeds(WorkUnit(0, 0))
     next(seeds)
     run_here(out, PLAN.model_copy(update={"block": 2}), overwrite=True)
     with pytest.raises(OutputExistsError):

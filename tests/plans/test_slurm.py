@@ -27,7 +27,7 @@ def slurm(tmp_path, monkeypatch):
     folder = tmp_path / "bin"
     folder.mkdir()
     monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
-    monkeypatch.setattr("robocas_ms3.plans.executors.slurm._ASK", 0.0)
+    monkeypatch.setattr("robocas_ms3.plans.executors.slurm._QUEUE_INTERVAL", 0.0)
 
     def set_command(name, script):
         (folder / name).write_text(f"#!/bin/sh\n{script}\n")

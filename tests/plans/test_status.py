@@ -22,9 +22,9 @@ def started(tmp_path):
     def write(*outcomes):
         for outcome in outcomes:
             unit = WorkUnit(0, outcome.seed // 4)
-            with folder.files(unit, outcome.seed).temporary() as files:
+            with folder.files(unit, outcome.seed).temporary_files() as files:
                 files.write(outcome)
-            folder.complete(unit)
+            folder.write_outcomes(unit)
 
     return out, write
 

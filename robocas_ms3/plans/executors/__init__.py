@@ -1,4 +1,4 @@
-"""Executors run work units: in processes of this machine, in jobs of Slurm, in tasks of Ray."""
+"""Executors run work units: in processes of this machine, jobs of Slurm, or tasks of Ray."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ EXECUTORS = {
     "slurm": "robocas_ms3.plans.executors.slurm:SlurmExecutor",
     "ray": "robocas_ms3.plans.executors.ray:RayExecutor",
 }
-"""Name -> class; its module is imported when it is chosen."""
+"""Name -> import path of the class; its module is imported when the executor is used."""
 
 
 class Executor(ABC):
-    """Runs jobs, each of which does some work units; a context manager, which cancels them.
+    """Run jobs of one or more work units; a context manager that cancels its jobs on exit.
 
     Args:
-        folder: of the plan of the units.
-        jobs: maximum number of jobs at once.
-        options: values of ``--executor-option``, by name.
+        folder: output folder of the plan.
+        jobs: largest number of jobs that run at the same time.
+        options: name -> value of ``--executor-option``.
 
     Raises:
-        PlanError: an option is unknown or invalid, or the executor can't be used on this machine.
+        PlanError: an option is unknown or invalid, or the executor is not available on this machine.
         MissingExtraError: an extra is missing.
     """
 
@@ -44,7 +44,7 @@ class Executor(ABC):
         try:
             self.options: Any = self.options_type.model_validate_strings(dict(options or {}))
         except ValidationError as error:
-            about = "not a valid option of this executor"
+            about = "invalid option of this executor"
             raise error_from_validation(
                 error, self.options_type, PlanError, where="--executor-option", about=about
             ) from error
@@ -58,19 +58,19 @@ class Executor(ABC):
 
     @abstractmethod
     def submit(self, groups: Sequence[Sequence[WorkUnit]]) -> Sequence[Any]:
-        """Submit a job for each group of units; return the jobs, or those of the first groups if not all fit.
+        """Submit one job per group of units; return the jobs, or the jobs of the first groups if there is no more room.
 
-        The ``done()`` of a job returns whether it has ended, its ``result()`` raises an error that every seed would
-        meet. A job that was killed has no error.
+        ``done()`` of a job returns whether it has ended. ``result()`` raises an error that affects all seeds; a job
+        that was killed raises none.
         """
 
-    def log_of(self, job: Any) -> str:
-        """Return where a job that was killed may say why."""
+    def describe_log(self, job: Any) -> str:
+        """Return where the log of a killed job is, for an error message."""
         return "the log of the job"
 
 
 class ThreadExecutor(Executor):
-    """Waits for each job in a thread."""
+    """An executor with one thread per job."""
 
     def __enter__(self) -> ThreadExecutor:
         self.threads = ThreadPoolExecutor(self.jobs, thread_name_prefix="plan")
@@ -81,11 +81,11 @@ class ThreadExecutor(Executor):
 
     @abstractmethod
     def run(self, units: Sequence[WorkUnit]) -> None:
-        """Do some units, as a job."""
+        """Run the work units of a job."""
 
 
 class LocalExecutor(ThreadExecutor):
-    """Work units on this machine: a thread per job, each with two processes. It has no options."""
+    """Run work units on this machine: two processes per job. There are no options."""
 
     def __enter__(self) -> LocalExecutor:
         self._workers = [WorkUnitWorker(self.folder) for _ in range(self.jobs)]
@@ -97,7 +97,7 @@ class LocalExecutor(ThreadExecutor):
         worker = self._idle.pop()
         try:
             for unit in units:
-                worker.do(unit)
+                worker.run(unit)
         finally:
             self._idle.append(worker)
 
@@ -110,5 +110,5 @@ class LocalExecutor(ThreadExecutor):
 
 
 def open_executor(name: str, folder: PlanFolder, jobs: int, options: Mapping[str, str]) -> Executor:
-    """Return an executor of this name; raises as `Executor` does."""
+    """Create the executor with this name; raises the errors of `Executor`."""
     return load_object(EXECUTORS[name])(folder, jobs, options)

@@ -1,4 +1,4 @@
-"""Work units by tasks of Ray, which Ray starts again where a worker or a node dies."""
+"""Run work units as tasks of Ray, which restarts tasks whose worker or node fails."""
 
 from __future__ import annotations
 
@@ -32,32 +32,35 @@ require_extra("ray", "plans on Ray", "ray")
 ray: Any = import_module("ray")
 
 RETRIES = 2
-"""How often Ray starts a task again whose worker or node dies."""
-PIECE = 16 * 2**20  # bytes that are sent at once
-_PIECES = 4  # that wait in the object store, of each task
-_APPEARS = 20.0  # s until a file is seen on another node
-_CONNECT = 10.0  # s
-_CANCEL = 5.0  # s until tasks have ended
+"""Number of times that Ray restarts a task whose worker or node fails."""
+CHUNK_BYTES = 16 * 2**20  # largest size of a chunk
+_MAX_STORED_CHUNKS = 4  # per task, in the object store
+_FOLDER_TIMEOUT = 20.0  # s until a new file is visible on another node
+_CONNECT_TIMEOUT = 10.0  # s
+_CANCEL_TIMEOUT = 5.0  # s until cancelled tasks have ended
 _TEMPORARY = "robocas-ray-"
 _log = logging.getLogger(__name__)
-Piece = tuple[tuple[WorkUnit, int], str, bytes]
-"""(unit, seed), name of a file in the seed's folder, what follows in it."""
+FileChunk = tuple[tuple[WorkUnit, int], str, bytes]
+"""(unit, seed), name of a file in the folder of the seed, next bytes of the file."""
 
 
 class RayOptions(StrictModel):
     """Values of ``--executor-option``."""
 
     address: str | None = Field(
-        default=None, description="of the cluster; default: RAY_ADDRESS, or a cluster that is started on this machine"
+        default=None,
+        description="address of the cluster; default: RAY_ADDRESS, else a cluster is started on this machine",
     )
-    num_cpus: Annotated[float, Field(gt=0)] = Field(default=1.0, description="of a task")
-    num_gpus: Annotated[float, Field(ge=0)] = Field(default=0.0, description="of a task")
-    units_per_job: Annotated[int, Field(ge=1)] = Field(default=4, description="that a task does one after the other")
-    gather: bool = Field(default=False, description="nodes do not see the folder, and send their files")
+    num_cpus: Annotated[float, Field(gt=0)] = Field(default=1.0, description="CPUs of a task")
+    num_gpus: Annotated[float, Field(ge=0)] = Field(default=0.0, description="GPUs of a task")
+    units_per_job: Annotated[int, Field(ge=1)] = Field(
+        default=4, description="work units of a task, run one after the other"
+    )
+    gather: bool = Field(default=False, description="send files to this machine, if nodes have no access to the folder")
 
 
 class RayExecutor(ThreadExecutor):
-    """See `Executor`; a thread per task."""
+    """Run work units as tasks of Ray; see `Executor`."""
 
     options_type = RayOptions
 
@@ -70,12 +73,16 @@ class RayExecutor(ThreadExecutor):
         return self
 
     def run(self, units: Sequence[WorkUnit]) -> None:
-        """Wait for a task; one that Ray has lost leaves units that are not done."""
+        """Run a task and wait for it; units of a task that Ray has lost stay incomplete."""
         options = {"num_cpus": self.options.num_cpus, "num_gpus": self.options.num_gpus}
         if self.options.gather:
             done = [self.folder.partial_outcomes(unit) for unit in units]
-            # the outcomes decide what a task sends, so a retry needs other arguments
-            options |= {"max_retries": 0, "num_returns": "streaming", "_generator_backpressure_num_objects": _PIECES}
+            # a retry would need other outcomes: the task sends the files of the other seeds
+            options |= {
+                "max_retries": 0,
+                "num_returns": "streaming",
+                "_generator_backpressure_num_objects": _MAX_STORED_CHUNKS,
+            }
             send = ray.remote(**options)(send_units)
             task = send.remote(self.folder.plan, self.folder.record(), units, done)
         else:
@@ -87,37 +94,38 @@ class RayExecutor(ThreadExecutor):
         except ray.exceptions.RayTaskError as error:
             if isinstance(error.cause, RobocasError | OSError):
                 raise error.cause from error
-            found, fix = one_line(error)[-300:], "Do all nodes have robocas-ms3, in the same Python?"
+            fix = "Install the same versions of robocas-ms3 and Python on all nodes."
+            found = one_line(error)[-300:]
             raise PlanError("a task of Ray failed", where="Ray", found=found, fix=fix) from error
         except ray.exceptions.RayError as error:
-            _log.warning("a task of Ray was lost: %s", one_line(error)[-300:])
+            _log.warning("Ray has lost a task: %s", one_line(error)[-300:])
         finally:
             self._tasks.discard(task)
 
     def _receive(self, task: Any, units: Sequence[WorkUnit]) -> None:
-        """Receive the files of a task whose node does not see the plan's folder."""
-        pieces = (ray.get(reference) for reference in task)
-        for (unit, seed), files in groupby(pieces, lambda piece: piece[0]):
-            with self.folder.files(unit, seed).temporary() as tmp:
+        """Write the files that a task sends from a node without access to the folder of the plan."""
+        chunks = (ray.get(reference) for reference in task)
+        for (unit, seed), files in groupby(chunks, lambda chunk: chunk[0]):
+            with self.folder.files(unit, seed).temporary_files() as tmp:
                 for _, name, data in files:
                     path = tmp.folder / name
                     path.parent.mkdir(parents=True, exist_ok=True)
                     with path.open("ab") as file:
                         file.write(data)
         for unit in units:
-            self.folder.complete(unit)
+            self.folder.write_outcomes(unit)
 
-    def log_of(self, job: Any) -> str:
-        """Return where Ray says why a task died."""
-        return "the log of Ray on its node"
+    def describe_log(self, job: Any) -> str:
+        """Return where the log of a killed task is."""
+        return "the log of Ray on the node of the task"
 
     def __exit__(self, *error: object) -> None:
         with deferred_interrupts(second_ends=False):
             self.threads.shutdown(wait=False, cancel_futures=True)
-            until = time.monotonic() + _CANCEL
-            while self._tasks and time.monotonic() < until:  # Ray crashes where a thread waits for a task meanwhile
+            until = time.monotonic() + _CANCEL_TIMEOUT
+            while self._tasks and time.monotonic() < until:  # Ray crashes if a thread still waits for a task
                 for task in list(self._tasks):
-                    with suppress(Exception):  # it has just ended
+                    with suppress(Exception):  # the task may have ended
                         ray.cancel(task, force=True)
                 time.sleep(0.1)
             if self._disconnects:
@@ -125,52 +133,65 @@ class RayExecutor(ThreadExecutor):
 
 
 def _connect(options: RayOptions, jobs: int) -> None:
-    """Connect to the cluster, or start one on this machine for some jobs."""
+    """Connect to a cluster, or start one on this machine for ``jobs`` tasks."""
     address = options.address or os.environ.get("RAY_ADDRESS") or "local"
     if address.startswith("ray://"):
-        fix = "Run this on a node of the cluster, as `ray job submit` does, with address=auto."
-        raise PlanError("Ray's client is not supported", where="--executor-option address", found=address, fix=fix)
+        fix = "Run the command on a node of the cluster (`ray job submit`), with address=auto."
+        raise PlanError(
+            "the client of Ray (ray://) is not supported", where="--executor-option address", found=address, fix=fix
+        )
     host, _, port = address.rpartition(":")
     chosen: dict[str, Any] = {}
     if address == "local":
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         chosen = {"num_cpus": math.ceil(jobs * options.num_cpus), "include_dashboard": False}
     try:
-        if host and port.isdecimal():  # Ray would try for minutes, and then end the process
-            socket.create_connection((host, int(port)), _CONNECT).close()
+        if host and port.isdecimal():  # Ray would retry for minutes, and then end the process
+            socket.create_connection((host, int(port)), _CONNECT_TIMEOUT).close()
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **chosen)
     except (ray.exceptions.RayError, OSError, OverflowError, RuntimeError, ValueError) as error:
-        fix = "See `ray status` there."
-        raise PlanError("no cluster of Ray answers", where=address, found=one_line(error)[-300:], fix=fix) from error
-    wanted = {"CPU": options.num_cpus, "GPU": options.num_gpus}
+        fix = "Check the address with `ray status`."
+        raise PlanError(
+            "cannot connect to a cluster of Ray", where=address, found=one_line(error)[-300:], fix=fix
+        ) from error
+    needed = {"CPU": options.num_cpus, "GPU": options.num_gpus}
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-    if not any(all(node.get(kind, 0) >= count for kind, count in wanted.items()) for node in nodes):
-        error = PlanError("no node of Ray has room for a task", where="--executor-option", expected=wanted)
+    if not any(all(node.get(kind, 0) >= count for kind, count in needed.items()) for node in nodes):
+        what, expected = (
+            "no node of Ray has the resources of a task",
+            ", ".join(f"{kind} {n:g}" for kind, n in needed.items()),
+        )
+        error = PlanError(what, where="--executor-option", expected=expected)
         if address == "local":
             ray.shutdown()
             raise error
-        _log.warning("%s; waiting for one", error)
+        _log.warning("%s; waiting for such a node", error)
 
 
 def run_units(folder: PlanFolder, units: Sequence[WorkUnit]) -> None:
-    """Do units in the plan's folder, as a task."""
-    until = time.monotonic() + _APPEARS
+    """Run work units in the folder of the plan; the function of a task."""
+    until = time.monotonic() + _FOLDER_TIMEOUT
     while not (folder.path / PLAN).is_file():
         if time.monotonic() > until:
-            where, fix = f"node {socket.gethostname()}", "Choose an --out that all nodes share, or gather=yes."
-            raise PlanError("this node does not see the output folder", where=where, expected=folder.path, fix=fix)
+            fix = "Choose an --out folder that all nodes share, or --executor-option gather=yes."
+            where, what = f"node {socket.gethostname()}", "this node has no access to the output folder"
+            raise PlanError(what, where=where, expected=folder.path, fix=fix)
         time.sleep(0.5)
     with closing(WorkUnitWorker(folder)) as worker:
         for unit in units:
-            worker.do(unit)
+            worker.run(unit)
 
 
 def send_units(
     plan: Plan, record: Mapping[str, Any], units: Sequence[WorkUnit], done: Sequence[Sequence[Outcome]]
-) -> Iterator[Piece]:
-    """Do units in a temporary folder of the node, as a task, and send the files seed by seed.
+) -> Iterator[FileChunk]:
+    """Run work units in a temporary folder of the node, and yield the files of each seed; the function of a task.
 
-    ``record`` is the content of ``plan.json``, ``done`` has the outcomes of the seeds that are done of each unit.
+    Args:
+        plan: the plan.
+        record: content of ``plan.json``.
+        units: work units to run.
+        done: outcomes of the complete seeds of each unit.
     """
     with _temporary_folder() as out:
         folder = PlanFolder(plan, out)
@@ -182,17 +203,17 @@ def send_units(
                 files.write(outcome)
         with closing(WorkUnitWorker(folder)) as worker:
             for unit in units:
-                for files in worker.seeds(unit):
-                    yield from _pieces(unit, files)
+                for files in worker.run_seeds(unit):
+                    yield from _read_chunks(unit, files)
 
 
-def _pieces(unit: WorkUnit, files: SeedFiles) -> Iterator[Piece]:
-    """Yield the files of a seed, and delete all but its outcome."""
+def _read_chunks(unit: WorkUnit, files: SeedFiles) -> Iterator[FileChunk]:
+    """Yield the files of a seed in chunks, and delete them except for the outcome."""
     for path in sorted(path for path in files.folder.rglob("*") if path.is_file()):
         with path.open("rb") as file:
             name = path.relative_to(files.folder).as_posix()
-            yield (unit, files.seed), name, file.read(PIECE)
-            while data := file.read(PIECE):
+            yield (unit, files.seed), name, file.read(CHUNK_BYTES)
+            while data := file.read(CHUNK_BYTES):
                 yield (unit, files.seed), name, data
         if path.name != OUTCOME:
             path.unlink()
@@ -200,7 +221,7 @@ def _pieces(unit: WorkUnit, files: SeedFiles) -> Iterator[Piece]:
 
 @contextmanager
 def _temporary_folder() -> Iterator[Path]:
-    """Yield a temporary folder of this node; delete those of tasks that were killed a day ago."""
+    """Yield a temporary folder of this node; delete folders that killed tasks left a day ago."""
     for path in Path(tempfile.gettempdir()).glob(f"{_TEMPORARY}*"):
         with suppress(OSError):
             if time.time() - path.stat().st_mtime > LEFTOVER_AGE:

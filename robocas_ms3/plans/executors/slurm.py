@@ -1,7 +1,7 @@
-"""Work units by jobs of Slurm: job arrays, submitted by submitit.
+"""Run work units as jobs of Slurm: job arrays, submitted by submitit.
 
-Whether a unit is done is read from its folder. Slurm requeues a job that is preempted, whose time is up or whose node
-fails; a job that ends otherwise before its units are done is submitted again.
+The folder of a work unit tells whether it is complete. Slurm requeues a job that is preempted, exceeds its time or
+loses its node. A job that ends otherwise, with incomplete units, is submitted again.
 """
 
 from __future__ import annotations
@@ -35,34 +35,38 @@ require_extra("slurm", "plans on Slurm", "submitit")
 submitit: Any = import_module("submitit")
 
 LOGS = "slurm"
-"""In the plan's folder: logs of the jobs, and what submitit writes."""
+"""Folder in the folder of the plan, with the logs of the jobs and the files of submitit."""
 SBATCH_OPTIONS = (
     *("partition", "account", "qos", "constraint", "exclude", "nodelist", "gres", "gpus_per_node", "reservation"),
     *("licenses", "nice", "begin", "comment", "exclusive", "mem_per_cpu", "mail_type", "mail_user", "wckey"),
 )
-"""Options that are passed to sbatch as they are."""
+"""Options that are passed to sbatch unchanged."""
 _SBATCH_FIELDS: dict[str, Any] = {name: (str | None, None) for name in SBATCH_OPTIONS}
-_ASK = 5.0  # s between two calls of squeue
-_ANSWER = 60.0  # s that a command of Slurm may take
-_CANCEL = 1.0  # s that Ctrl-C waits for scancel
-_RETRY, _RETRIES = 30.0, 20  # s between two submissions, where Slurm took jobs before and refuses them now
-_STUCK = ("JobHoldMaxRequeue", "launch_failed_requeued_held", "launch failed requeued held")
+_QUEUE_INTERVAL = 5.0  # s between two calls of squeue
+_COMMAND_TIMEOUT = 60.0  # s that a command of Slurm may take
+_CANCEL_TIMEOUT = 1.0  # s that Ctrl-C waits for scancel
+_SUBMIT_INTERVAL, _MAX_REJECTIONS = 30.0, 20  # s between two submissions after a rejection
+_HELD_REASONS = ("JobHoldMaxRequeue", "launch_failed_requeued_held", "launch failed requeued held")
 _log = logging.getLogger(__name__)
 
 
 class _OwnOptions(StrictModel):
-    cluster: Literal["slurm", "local"] = Field(default="slurm", description="local: jobs are processes here")
-    units_per_job: Annotated[int, Field(ge=1)] = Field(default=1, description="one after the other")
-    time: Annotated[int, Field(ge=1)] = Field(default=240, description="minutes of a job")
-    requeues: Annotated[int, Field(ge=0)] = Field(default=3, description="of a job whose time is up")
+    cluster: Literal["slurm", "local"] = Field(default="slurm", description="local: jobs are processes of this machine")
+    units_per_job: Annotated[int, Field(ge=1)] = Field(
+        default=1, description="work units of a job, run one after the other"
+    )
+    time: Annotated[int, Field(ge=1)] = Field(default=240, description="time limit of a job, minutes")
+    requeues: Annotated[int, Field(ge=0)] = Field(
+        default=3, description="number of times that a job that exceeded its time is requeued"
+    )
     mem_gb: Annotated[float, Field(gt=0)] | None = Field(
-        default=None, description="of a job; None: the limit of its two processes, 2 x limits.memory_gb of the plan"
+        default=None, description="memory of a job, GB; None: 2 x limits.memory_gb of the plan, for two processes"
     )
     cpus_per_task: Annotated[int, Field(ge=1)] = 1
 
 
 class SlurmExecutor(Executor):
-    """See `Executor`; the plan's folder has to be at the same path on all nodes."""
+    """Run work units as jobs of Slurm; the folder of the plan has the same path on all nodes. See `Executor`."""
 
     options_type = create_model("SlurmOptions", __base__=_OwnOptions, **_SBATCH_FIELDS)
 
@@ -70,15 +74,15 @@ class SlurmExecutor(Executor):
         super().__init__(folder, jobs, options)
         self._local = self.options.cluster == "local"
         if not self._local and submitit.SlurmExecutor.affinity() < 0:
-            fix = "Run this where sbatch and srun are, or try --executor-option cluster=local."
-            raise PlanError("there is no Slurm here", where="--executor slurm", expected="srun", fix=fix)
+            fix = "Run the command on a machine with sbatch and srun, or pass --executor-option cluster=local."
+            raise PlanError("Slurm is not installed", where="--executor slurm", expected="the command srun", fix=fix)
 
     def __enter__(self) -> SlurmExecutor:
         digest = hashlib.sha256(os.fsencode(self.folder.path.resolve())).hexdigest()[:8]
         self._name = f"robocas-{re.sub(r'[^A-Za-z0-9-]', '-', self.folder.path.name)}-{digest}"
-        self._asked = 0.0
-        self._alive: set[str] | None = None
-        self._refused, self._not_before = 0, 0.0
+        self._queue_time = 0.0
+        self._queued_jobs: set[str] | None = None
+        self._rejections, self._not_before = 0, 0.0
         self._jobs: list[_Job] = []
         folder, requeues = make_folder(self.folder.path / LOGS), self.options.requeues
         if self._local:
@@ -87,7 +91,7 @@ class SlurmExecutor(Executor):
         else:
             self._submitit = submitit.SlurmExecutor(folder, max_num_timeout=requeues)
             self._submitit.update_parameters(**self._parameters())
-        self._cancel(_ANSWER)  # the jobs of a run that was killed: two at a unit are harmless, but one is enough
+        self._cancel(_COMMAND_TIMEOUT)  # jobs that a killed run has left
         return self
 
     def _parameters(self) -> dict[str, Any]:
@@ -99,7 +103,7 @@ class SlurmExecutor(Executor):
             "time": options.time,
             "mem": None if options.mem_per_cpu else f"{round(mem_gb * 1024)}MB",
             "cpus_per_task": options.cpus_per_task,
-            "srun_args": [f"--cpus-per-task={options.cpus_per_task}"],  # srun does not read that of sbatch since 22.05
+            "srun_args": [f"--cpus-per-task={options.cpus_per_task}"],  # since 22.05 srun does not take it from sbatch
             "stderr_to_stdout": True,
             "wckey": None,
             "array_parallelism": self.jobs,
@@ -112,43 +116,43 @@ class SlurmExecutor(Executor):
         try:
             handles = self._submitit.submit_array([WorkUnitJob(self.folder, tuple(group)) for group in groups])
         except Exception as error:
-            self._refused += 1
-            self._not_before = time.monotonic() + _RETRY
-            if not self._jobs or self._refused > _RETRIES:
-                fix = "See --executor-option partition, account, qos, time and mem_gb."
-                raise PlanError("Slurm refuses the jobs", where="sbatch", found=error, fix=fix) from error
-            _log.warning("Slurm refuses jobs, and is asked again in %g s: %s", _RETRY, error)
+            self._rejections += 1
+            self._not_before = time.monotonic() + _SUBMIT_INTERVAL
+            if not self._jobs or self._rejections > _MAX_REJECTIONS:
+                fix = "Check --executor-option partition, account, qos, time and mem_gb."
+                raise PlanError("Slurm rejects the jobs", where="sbatch", found=error, fix=fix) from error
+            _log.warning("Slurm rejects jobs; trying again in %g s: %s", _SUBMIT_INTERVAL, error)
             return []
-        self._refused, self._asked = 0, 0.0
+        self._rejections, self._queue_time = 0, 0.0
         jobs = [_Job(handle, None if self._local else self._has_left_queue) for handle in handles]
         self._jobs += jobs
         return jobs
 
     def _has_left_queue(self, job_id: str) -> bool:
-        if time.monotonic() - self._asked > _ASK:
-            self._alive = self._queue()
-            self._asked = time.monotonic()
-        return self._alive is not None and job_id not in self._alive
+        if time.monotonic() - self._queue_time > _QUEUE_INTERVAL:
+            self._queued_jobs = self._queue()
+            self._queue_time = time.monotonic()
+        return self._queued_jobs is not None and job_id not in self._queued_jobs
 
     def _queue(self) -> set[str] | None:
-        """Return the ids of jobs that wait or run; None: Slurm does not answer."""
-        answer = _output(["squeue", "--noheader", "--array", *self._mine(), "--format=%i|%r"])
+        """Return the ids of pending and running jobs, or None if Slurm does not answer."""
+        answer = _run_command(["squeue", "--noheader", "--array", *self._job_filter(), "--format=%i|%r"])
         if answer is None:
-            _log.warning("squeue does not answer, and is asked again; jobs continue")
+            _log.warning("squeue does not answer; trying again, jobs continue")
             return None
         reasons = dict(line.strip().split("|", 1) for line in answer.splitlines())
-        stuck = {job for job, reason in reasons.items() if reason in _STUCK}
-        for job in stuck:  # Slurm would hold it forever
-            _output(["scancel", job])
-        return set(reasons) - stuck
+        held = {job for job, reason in reasons.items() if reason in _HELD_REASONS}
+        for job in held:  # Slurm would hold it forever
+            _run_command(["scancel", job])
+        return set(reasons) - held
 
-    def log_of(self, job: _Job) -> str:
-        return f"{job.handle.paths.stdout}; --executor-option mem_gb and time may help"
+    def describe_log(self, job: _Job) -> str:
+        return str(job.handle.paths.stdout)
 
     def __exit__(self, *error: object) -> None:
-        self._cancel(_CANCEL)
+        self._cancel(_CANCEL_TIMEOUT)
 
-    def _mine(self) -> list[str]:
+    def _job_filter(self) -> list[str]:
         return [f"--name={self._name}", f"--user={os.getuid()}"]
 
     def _cancel(self, seconds: float) -> None:
@@ -159,16 +163,16 @@ class SlurmExecutor(Executor):
             while time.monotonic() < until and not all(job.done() for job in self._jobs):
                 time.sleep(0.05)
             return
-        command, none = ["scancel", "--quiet", *self._mine()], subprocess.DEVNULL
-        with suppress(OSError, subprocess.TimeoutExpired):  # a slow scancel continues by itself, despite Ctrl-C
+        command, none = ["scancel", "--quiet", *self._job_filter()], subprocess.DEVNULL
+        with suppress(OSError, subprocess.TimeoutExpired):  # a slow scancel continues after Ctrl-C
             process = subprocess.Popen(command, stdin=none, stdout=none, stderr=none, start_new_session=True)
             if process.wait(seconds):
-                _log.warning("jobs of this plan may be left: %s failed", " ".join(command))
+                _log.warning("jobs of this plan may still run: %s failed", " ".join(command))
 
 
 @dataclass(frozen=True)
 class _Job:
-    """A job that was submitted; submitit would ask sacct about it, which not every cluster has."""
+    """A submitted job; its state comes from squeue, because not every cluster has the sacct that submitit uses."""
 
     handle: Any
     has_left_queue: Callable[[str], bool] | None
@@ -177,7 +181,7 @@ class _Job:
         return self.has_left_queue(self.handle.job_id) if self.has_left_queue else self.handle.done()
 
     def result(self) -> None:
-        with suppress(OSError, EOFError):  # a job that was killed has no result
+        with suppress(OSError, EOFError):  # a killed job has no result
             outcome, error = submitit.core.utils.pickle_load(self.handle.paths.result_pickle)
             if outcome == "success" and error is not None:
                 error.reraise()
@@ -185,22 +189,22 @@ class _Job:
 
 @dataclass(frozen=True)
 class WorkUnitJob:
-    """What a job does, as submitit pickles it; a job that is requeued continues where the units stopped."""
+    """The function of a job, pickled by submitit; a requeued job continues its work units."""
 
     folder: PlanFolder
     units: tuple[WorkUnit, ...]
 
     def __call__(self) -> RemoteError | None:
-        """Do the units; return an error that every seed would meet."""
-        signal.signal(signal.SIGTERM, _exit)  # submitit would ignore it, and Slurm wait for 30 s
+        """Run the work units; return an error that affects all seeds."""
+        signal.signal(signal.SIGTERM, _exit)  # submitit would ignore it, and Slurm would wait 30 s
         worker = WorkUnitWorker(self.folder)
-        # Slurm announces the end of the time to all processes of a job: block it in those of the worker, which inherit
-        # the mask of this thread
-        announcements = {signal.SIGUSR1, signal.SIGUSR2}
-        thread = ThreadPoolExecutor(1, initializer=signal.pthread_sigmask, initargs=(signal.SIG_BLOCK, announcements))
+        # Slurm signals the end of the time to all processes of a job: block the signals in the worker processes, which
+        # inherit the mask of this thread
+        time_signals = {signal.SIGUSR1, signal.SIGUSR2}
+        thread = ThreadPoolExecutor(1, initializer=signal.pthread_sigmask, initargs=(signal.SIG_BLOCK, time_signals))
         try:
             for unit in self.units:
-                thread.submit(worker.do, unit).result()
+                thread.submit(worker.run, unit).result()
         except Exception as error:
             return RemoteError.of(error, "a job")
         finally:
@@ -208,7 +212,7 @@ class WorkUnitJob:
         return None
 
     def checkpoint(self) -> Any:
-        """Return what submitit runs once the time is up: the same job."""
+        """Return the job that submitit submits when the time is over: this one."""
         return submitit.helpers.DelayedSubmission(self)
 
 
@@ -217,11 +221,11 @@ def _exit(number: int, frame: object) -> None:
     sys.exit(128 + number)
 
 
-def _output(command: list[str]) -> str | None:
-    """Return what a command of Slurm prints; None: it failed."""
+def _run_command(command: list[str]) -> str | None:
+    """Return the output of a command of Slurm, or None if it failed."""
     try:
         return subprocess.run(
-            command, check=True, capture_output=True, text=True, timeout=_ANSWER, start_new_session=True
+            command, check=True, capture_output=True, text=True, timeout=_COMMAND_TIMEOUT, start_new_session=True
         ).stdout
     except (OSError, subprocess.SubprocessError):
         return None
