@@ -44,7 +44,7 @@ from robocas_ms3.evaluation.report.comparison import compare_results
 from robocas_ms3.evaluation.report.page import render_page
 from robocas_ms3.evaluation.report.tables import render_markdown
 from robocas_ms3.plans.folder import OUTCOME, OUTCOMES, PLAN, Outcome, PlanFolder, WorkUnit, read_plan
-from robocas_ms3.plans.load import load_plan, bundled_plans
+from robocas_ms3.plans.load import bundled_plans, load_plan
 from robocas_ms3.plans.status import read_status
 from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 from robocas_ms3.scenes.layout import Layout
