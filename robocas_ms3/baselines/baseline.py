@@ -1,4 +1,4 @@
-"""What a baseline is made of, and the settings that baselines share."""
+"""Types of a baseline, and the settings that baselines share."""
 
 from __future__ import annotations
 
@@ -18,51 +18,51 @@ Precision = Literal["auto", "fp32", "bf16"]
 Split = Literal["train", "val"]
 Batch = dict[str, torch.Tensor]
 OnRead = Callable[[int, int], None]
-"""Called with the number of episodes read, and of all."""
+"""Function called with the number of episodes read and their total number."""
 Fraction = Annotated[float, Field(ge=0, lt=1)]
 
 
 @dataclass
 class Progress:
-    """Functions that a training reports to.
+    """Functions that report the progress of a training run.
 
     Attributes:
-        note: called with a line of text.
-        read: called with the number of episodes read, and of all.
-        step: called with the number of steps done, and of all.
+        message: called with a line of text.
+        on_read: called with the number of episodes read and their total number.
+        on_step: called with the number of optimiser steps done and their total number.
     """
 
-    note: Callable[[str], None] = lambda text: None
-    read: OnRead = lambda done, total: None
-    step: Callable[[int, int], None] = lambda done, total: None
+    message: Callable[[str], None] = lambda text: None
+    on_read: OnRead = lambda done, total: None
+    on_step: Callable[[int, int], None] = lambda done, total: None
 
 
 def empty_split_error(path: Path, split: Split) -> EmptySplitError:
     """Return the error of a split without episodes."""
-    fix = "Add episodes: a tenth of them validates."
-    return EmptySplitError("this split holds no episodes", where=path, expected=f"some in {split}", fix=fix)
+    fix = "Add episodes: 10 % of the seeds are the validation split."
+    return EmptySplitError("empty split of the dataset", where=path, expected=f"episodes in {split}", fix=fix)
 
 
 class TrainSettings(StrictModel):
     """Settings of supervised training.
 
     Attributes:
-        steps: of the optimiser.
-        batch_size: samples per step, of all processes together.
-        learning_rate: of AdamW, after the warm-up.
-        min_learning_rate: at the end of the schedule.
-        weight_decay: of AdamW, on matrices and kernels; not on biases and norms.
-        betas: of AdamW.
-        warmup_steps: over which the learning rate rises from 0.
-        schedule: ``cosine`` falls once over all steps, ``restarts`` repeatedly, ``constant`` does not.
-        restart_epochs, restart_factor: first period of ``restarts`` in epochs, and the growth of each next one.
+        steps: number of optimiser steps.
+        batch_size: samples per step, summed over all processes.
+        learning_rate: learning rate of AdamW after the warm-up.
+        min_learning_rate: learning rate at the end of the schedule.
+        weight_decay: weight decay of AdamW, for matrices and kernels; biases and norms have none.
+        betas: betas of AdamW.
+        warmup_steps: steps in which the learning rate rises from 0.
+        schedule: ``cosine`` decays once over all steps, ``restarts`` repeatedly, ``constant`` not at all.
+        restart_epochs, restart_factor: first period of ``restarts`` in epochs, and the factor of each next period.
         clip_norm: largest norm of the gradient; 0: no clipping.
-        ema: decay of the exponential moving average of the weights, with which policies act; 0: no average.
-        seed: of all random numbers.
-        precision: of the forward pass. auto: bf16 on processors and GPUs that multiply it fast, else fp32.
-        workers: processes that read samples; 0: none besides this one.
+        ema: decay of the exponential moving average of the weights, which the policy uses; 0: no average.
+        seed: random seed.
+        precision: precision of the forward pass. auto: bf16 where the device supports it in hardware, else fp32.
+        workers: processes that read samples; 0: the training process reads them.
         log_every, validate_every, save_every: steps between lines of the log, validations and checkpoints.
-        validation_samples: most samples of the validation split, the same ones each time.
+        validation_samples: largest number of validation samples; the same samples at each validation.
     """
 
     steps: int = Field(default=20_000, ge=1, le=10**9)
@@ -87,17 +87,18 @@ class TrainSettings(StrictModel):
 
 
 class BaselineConfig(StrictModel):
-    """Base of the configuration of a baseline that learns from demonstrations."""
+    """Base class of the configuration of a baseline that learns from demonstrations."""
 
     train: TrainSettings = TrainSettings()
 
 
 class Samples(Protocol):
-    """Training samples, as a map-style dataset that returns whole batches.
+    """Training samples: a map-style dataset that returns whole batches.
 
     Attributes:
-        facts: JSON values that the network and the policy need: normalisation, rate, cameras.
+        facts: JSON values that network and policy need: normalisation, rate, image sizes.
         episodes: number of episodes.
+        scenes: optional `TrainingScenes`, for a warning in an evaluation with other scenes.
     """
 
     facts: dict[str, Any]
@@ -110,22 +111,22 @@ class Samples(Protocol):
 
 @dataclass(frozen=True)
 class Baseline:
-    """A baseline. It learns from demonstrations (``data``), or in simulation (``environments`` and ``train``).
+    """Definition of a baseline, which learns from demonstrations (``data``) or in simulation (``environments``).
 
-    Of demonstrations, the network's ``forward(batch)`` returns metrics by name: means over the batch (), ``loss`` among
-    them. A metric of only some samples is a sum and the number of these samples (2,).
+    For demonstrations, the network's ``forward(batch)`` returns metrics by name, with ``loss``: means over the batch,
+    shape (). A metric that only some samples have is a sum and the number of these samples, shape (2,).
 
     Attributes:
-        name: on the command line.
-        version: of weights and inputs; runs of other versions can be neither continued nor used.
-        Config: model of its configuration; its ``train`` has at least ``batch_size``, ``seed`` and ``precision``.
-        model: makes the network of a configuration and the facts of its data.
-        policy: makes the policy that acts with a configuration, facts and a trained network.
-        data: reads the samples of a configuration, a dataset's path and a split, and reports its progress. Raises
-            DatasetError if the dataset lacks what the baseline needs, EmptySplitError if the split has no episodes.
-        environments: makes the environments of a configuration on ``cpu`` or ``cuda``: `Samples` without batches, with
-            ``name`` and ``hash`` of their scenes for the record of the run, and ``close()``.
-        train: trains into a `RunFolder` the network of a configuration in these environments; see `train_ppo`.
+        name: name on the command line.
+        version: version of weights and inputs; runs of other versions can be neither continued nor used.
+        Config: model of the configuration; its ``train`` has at least ``batch_size``, ``seed`` and ``precision``.
+        model: function that makes the network, from configuration and facts.
+        policy: function that makes the policy, from configuration, facts and trained network.
+        data: function that reads the samples of a dataset's split, from configuration, path, split and progress
+            function. Raises DatasetError if the dataset does not suit, EmptySplitError if the split has no episodes.
+        environments: function that makes the training environments, from configuration and ``cpu`` or ``cuda``:
+            `Samples` without batches, with ``name`` and ``hash`` of their scenes, and ``close()``.
+        train: function that trains the network in these environments and writes to a `RunFolder`; see `train_ppo`.
     """
 
     name: str

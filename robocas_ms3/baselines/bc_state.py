@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from contextlib import suppress
+from contextlib import closing, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -35,11 +35,13 @@ from robocas_ms3.baselines.chunks import (
 )
 from robocas_ms3.baselines.dataset_checks import check_base_is_fixed
 from robocas_ms3.baselines.training.record import hash_dataset
+from robocas_ms3.baselines.training.scenes import read_training_scenes
 from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS
 from robocas_ms3.core.errors import DatasetError, EvaluationError
 from robocas_ms3.core.files import atomic_file
 from robocas_ms3.core.paths import cache_dir
 from robocas_ms3.core.poses import from_wxyz
+from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.recordings.motion import sample_states, sample_stride
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
@@ -94,6 +96,8 @@ class StateSamples:
         self.episodes = len(numbers)
         if not numbers:
             raise empty_split_error(path, split)
+        with closing(open_source(path)) as source:
+            self.scenes = read_training_scenes(source, source.numbers)
         ends = np.cumsum(arrays["lengths"])
         rows = [slice(int(ends[number] - arrays["lengths"][number]), int(ends[number])) for number in numbers]
         poses, opened = arrays["poses"], arrays["opened"]

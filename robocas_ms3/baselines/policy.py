@@ -1,4 +1,4 @@
-"""The folder of a training run as a policy: ``robocas eval pick --policy RUN``."""
+"""Policy of a training run: ``robocas eval pick --policy RUN``."""
 
 from __future__ import annotations
 
@@ -13,19 +13,23 @@ from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.core.text import format_error
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, PolicySpec
+from robocas_ms3.scenes.config import TaskConfig
 
 
 def shipped_small() -> RunPolicy:
-    """Return the policy ``small`` with the bundled weights, see docs/baselines.md."""
+    """Make the policy ``small`` from the bundled weights, which are for pick; see docs/baselines.md."""
     return RunPolicy(BUNDLED / "small")
 
 
 class RunPolicy:
-    """The policy of a run.
+    """Policy of a training run.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         device: ``auto`` (a GPU if there is one), ``cpu`` or ``cuda``.
+
+    Raises:
+        TrainingError: there is no run, its files are damaged, or it is a run of another version of the baseline.
     """
 
     def __init__(self, folder: Path, device: str = "auto") -> None:
@@ -37,11 +41,11 @@ class RunPolicy:
 
         if record.version != baseline.version:
             raise TrainingError(
-                f"a run of another version of {record.baseline}",
+                f"run of another version of {record.baseline}",
                 where=folder,
                 expected=baseline.version,
                 found=record.version,
-                fix="Train again, or use the release that it was trained with.",
+                fix="Train again, or install the release that trained it (run.json, versions).",
             )
         config = parse(baseline.Config, record.config, TrainingError, where=folder / RUN)
         weights = checkpoints.load(folder / WEIGHTS, record.metadata)
@@ -53,13 +57,15 @@ class RunPolicy:
         model = model.to(device).eval()
         with _damaged_facts(folder / RUN):
             self._policy: Policy = baseline.policy(config, record.facts, model)
-        self._about = {
+        self._name, self._scenes, self._has_warned = f"policy {folder.name}", record.data.scenes, False
+        self._description = {
             "baseline": record.baseline,
             "version": record.version,
             "steps": weights.step,
-            "data": record.data.model_dump(),
+            "data": record.data.model_dump(exclude={"scenes"}),
+            "trained_in": record.data.scenes.summary(),
             "config": record.config,
-            "start": record.start,
+            "init_from": record.init_from,
             "trained_with": record.versions,
             "weights": hash_weights(folder),
         }
@@ -69,22 +75,34 @@ class RunPolicy:
         return self._policy.spec
 
     def describe(self) -> dict[str, Any]:
-        return {**self._about, **getattr(self._policy, "describe", dict)()}
+        return {**self._description, **getattr(self._policy, "describe", dict)()}
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
         self._policy.reset(episodes)
 
+    def protocol_warnings(self, configs: dict[str, TaskConfig]) -> list[str]:
+        """Return a warning if configurations have tasks, scenes, objects or cameras that the training data lacks.
+
+        Each policy object warns once.
+        """
+        differences = [] if self._has_warned else self._scenes.differences(configs, self.spec.cameras)
+        if not differences:
+            return []
+        self._has_warned = True
+        what = f"{self._name} was not trained for {', '.join(configs)}: expect a low success rate"
+        return [f"{what}. Not in the training data: {'; '.join(differences)}. Trained for: {self._scenes.summary()}."]
+
     def act(self, observations: Observations) -> Any:
-        """Return actions, or chunks of them."""
+        """Return actions (E, A), or chunks (E, H, A)."""
         return self._policy.act(observations)
 
 
 @contextmanager
 def _damaged_facts(path: Path) -> Iterator[None]:
-    """Turn errors of building a network or policy from damaged facts into one that names their file."""
+    """Raise errors of building a network or policy from damaged facts as a TrainingError that names their file."""
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
         found = format_error(error, 200)
-        what = "no network can be built from this configuration and these facts"
+        what = "config and facts do not make a network"
         raise TrainingError(what, where=path, found=found) from error

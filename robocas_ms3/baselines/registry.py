@@ -1,4 +1,4 @@
-"""The baselines by name, each imported when it is used; other packages add theirs by entry points."""
+"""Registry of the baselines, imported at first use; other packages add baselines by entry points."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ GROUP = "robocas_ms3.baselines"
 
 @dataclass(frozen=True)
 class Builtin:
-    """Imports a baseline of this package.
+    """Function that imports a baseline of this package.
 
     Attributes:
-        folder: next to this file.
-        about: a line for `robocas list`.
+        folder: module or package next to this file.
+        description: one line for `robocas list`.
     """
 
     folder: str
-    about: str
+    description: str
 
     def __call__(self) -> Baseline:
         return import_module(f"robocas_ms3.baselines.{self.folder}").BASELINE
@@ -39,21 +39,25 @@ BASELINES: Registry[Callable[[], Baseline]] = Registry(
     GROUP,
     Callable,
     {
-        "small": Builtin("small", "base and gripper camera, language; chunks of poses by a small transformer"),
-        "bc-state": Builtin("bc_state", "privileged state of the simulator; chunks of poses by residual layers"),
-        "rt1": Builtin("rt1", "RT-1 of the paper: base and gripper camera, language; action tokens by a transformer"),
-        "ppo": Builtin("ppo", "reinforcement learning from dense rewards and privileged state; no data"),
+        "small": Builtin(
+            "small", "base and gripper camera, language; action chunks by a small transformer; bundled weights for pick"
+        ),
+        "bc-state": Builtin("bc_state", "privileged state of the simulator; action chunks by a residual MLP"),
+        "rt1": Builtin(
+            "rt1", "RT-1 of the RoboCAS paper: base and gripper camera, language; action tokens by a transformer"
+        ),
+        "ppo": Builtin("ppo", "reinforcement learning from dense rewards and privileged state; needs no data"),
     },
 )
-"""Functions that return a baseline, by its name."""
+"""Functions that import a baseline, by name."""
 
 
 def find_baseline(name: str, *, where: object = "") -> Baseline:
-    """Return the baseline of a name."""
+    """Import the baseline registered under a name; ``where`` is the place of the name, for errors."""
     if name not in BASELINES:
         known = list(BASELINES)
         expected = f"one of {', '.join(known)}"
-        raise TrainingError("no such baseline", where=where or name, expected=expected, fix=did_you_mean(name, known))
+        raise TrainingError("unknown baseline", where=where or name, expected=expected, fix=did_you_mean(name, known))
     require_extra("train", "baselines", "safetensors")
     with forbid_exit(f"baseline {name}"):
         return BASELINES[name]()

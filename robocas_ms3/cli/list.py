@@ -67,7 +67,7 @@ def list_all() -> dict[str, list[dict[str, Any]]]:
     for points in POLICIES.entry_points.values():
         policies += [{"name": point.name, "package": package_of(point), "entry_point": point.value} for point in points]
     baselines = [
-        {"name": name, "package": "robocas_ms3", "summary": getattr(row, "about", "")}
+        {"name": name, "package": "robocas_ms3", "summary": getattr(row, "description", "")}
         for name, row in BASELINES.builtin.items()
     ]
     for points in BASELINES.entry_points.values():

@@ -11,9 +11,9 @@ from typing import Any, Literal
 from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.cli.options import Maybe, Repeated, resumable
 
-DESCRIPTION = """Train a baseline on demonstrations, for `robocas eval TASK --policy RUN`; docs/baselines.md.
+DESCRIPTION = """Train a baseline policy. The folder of the run is a policy: `robocas eval TASK --policy RUN`.
 
-Several GPUs: `accelerate launch --no_python robocas train ...`.
+Several GPUs: `accelerate launch --no_python robocas train ...`. More: docs/baselines.md.
 """
 
 
@@ -22,24 +22,24 @@ class Training:
     """Options of every baseline."""
 
     out: Maybe[Path] = None
-    """Folder of the run. Default: runs/BASELINE-DATA, or runs/BASELINE without data."""
+    """Output folder of the run. Default: runs/BASELINE-DATA, or runs/BASELINE without data."""
     config: Maybe[Path] = None
-    """YAML file with the values that differ from the defaults of the baseline."""
+    """YAML file with configuration values that differ from the defaults."""
     set: Repeated[str] = ()
-    """Set a value of the configuration, such as `--set chunk=4` or `--set train.learning_rate=3e-4`; repeatable."""
+    """Set a configuration value, such as `--set chunk=4` or `--set train.learning_rate=3e-4`; repeatable."""
     steps: Maybe[int] = None
-    """Steps of the optimiser; short for --set train.steps."""
+    """Number of optimiser steps; short for --set train.steps=N."""
     batch_size: Maybe[int] = None
-    """Samples per step; short for --set train.batch_size."""
+    """Number of samples per optimiser step, over all processes; short for --set train.batch_size=N."""
     seed: Maybe[int] = None
-    """Random seed; short for --set train.seed."""
-    start: Maybe[str] = None
-    """Start from the weights of this run, and from its configuration where no option says otherwise: a folder, or small
-    for the bundled weights (name a folder of that name ./small). Default: random weights."""
+    """Random seed; short for --set train.seed=N."""
+    init_from: Maybe[str] = None
+    """Run with the initial weights: a folder, or `small` for the bundled weights (for a folder of that name: ./small).
+    Its configuration replaces the defaults. Default: random weights."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device of the networks. Auto: a GPU if there is one."""
+    """Device of the network. auto: a GPU if there is one."""
     overwrite: bool = False
-    """Start again. Default: continue a run with the same settings, as if it had not been interrupted."""
+    """Replace an existing run. Default: continue a run that has the same settings."""
 
 
 @dataclass(kw_only=True)
@@ -47,12 +47,12 @@ class FromData(Training):
     """Options of a baseline that learns from demonstrations."""
 
     data: Path
-    """Folder of a dataset of `robocas convert`."""
+    """Dataset folder, made by `robocas convert`."""
 
 
 @dataclass(kw_only=True)
 class Small(FromData):
-    """Train `small`: base and gripper camera, language; chunks of poses by a small transformer, for two CPU cores.
+    """Train `small`: base and gripper camera, language; action chunks by a small transformer. Trains on two CPU cores.
 
     Example: robocas train small --data datasets/pick --out runs/pick
     """
@@ -60,18 +60,18 @@ class Small(FromData):
 
 @dataclass(kw_only=True)
 class BCState(Training):
-    """Train `bc-state`: privileged state of the simulator; chunks of poses by residual layers.
+    """Train `bc-state`: privileged state of the simulator; action chunks by a residual MLP.
 
     Example: robocas train bc-state --data demos/pick/trajectory.h5 --steps 4000
     """
 
     data: Path
-    """The trajectory.h5 of `robocas generate`."""
+    """Trajectory file, made by `robocas generate`: trajectory.h5."""
 
 
 @dataclass(kw_only=True)
 class RT1(FromData):
-    """Train `rt1`, the RT-1 of the RoboCAS paper: base and gripper camera, language; action tokens.
+    """Train `rt1`, RT-1 as in the RoboCAS paper: base and gripper camera, language; action tokens.
 
     Example: robocas train rt1 --data datasets/pick --set train.workers=4
     """
@@ -79,7 +79,7 @@ class RT1(FromData):
 
 @dataclass(kw_only=True)
 class PPO(Training):
-    """Train `ppo` in simulation, without data: dense rewards, privileged state of the simulator; docs/rl.md.
+    """Train `ppo` in simulation, without data: dense rewards, privileged state of the simulator. More: docs/rl.md.
 
     Example: robocas train ppo --seed 1 --out runs/ppo
     """
@@ -87,14 +87,14 @@ class PPO(Training):
 
 @dataclass(kw_only=True)
 class Other(Training):
-    """Train a baseline of another package."""
+    """Train a baseline that another package registers."""
 
     data: Maybe[Path] = None
-    """Folder of a dataset, or a trajectory.h5, if the baseline learns from data."""
+    """Dataset folder or trajectory.h5, if the baseline learns from data."""
 
 
 def command(baseline: str, settings: type[Training]) -> Callable[[Any], int]:
-    """Return the command that trains a baseline with settings of a type."""
+    """Make the function of a subcommand, which trains a baseline with options of a type."""
 
     def run(cfg: Training) -> int:
         return train(baseline, cfg)
@@ -122,20 +122,28 @@ def train(baseline: str, cfg: Training) -> int:
 
     data = getattr(cfg, "data", None)
     out = cfg.out or _default_out(baseline, data)
-    start = None if cfg.start is None else find_run(Path(cfg.start)).absolute()
+    init_from = None if cfg.init_from is None else find_run(Path(cfg.init_from)).absolute()
     with ProgressBar("episodes read", transient=True) as reading, ProgressBar("steps trained") as stepping:
 
         def step(done: int, of: int) -> None:
-            reading.close()  # a terminal has room for one
+            reading.close()  # one progress bar at a time
             stepping.update(done, of)
 
-        first = os.environ.get("RANK", "0") == "0"  # one of several processes writes to the terminal
+        first = os.environ.get("RANK", "0") == "0"  # only one process prints
         progress = Progress(stepping.add_note, reading.update, step) if first else Progress()
-        changes, place = changes_of(cfg), out.absolute()
-        options = RunOptions(baseline, data, place, changes, start=start, device=cfg.device, overwrite=cfg.overwrite)
+        options = RunOptions(
+            baseline,
+            data,
+            out.absolute(),
+            config_changes(cfg),
+            init_from=init_from,
+            device=cfg.device,
+            overwrite=cfg.overwrite,
+        )
         train_run(options, progress)
     if first:
-        print_line(f"{out}: trained. Next: robocas eval TASK --policy {out} --protocol {'paper-v1' if data else 'P'}")
+        protocol = "paper-v1" if data else "PROTOCOL"
+        print_line(f"{out}: trained. Next: robocas eval TASK --policy {out} --protocol {protocol}")
     return 0
 
 
@@ -146,8 +154,8 @@ def _default_out(baseline: str, data: Path | None) -> Path:
     return Path("runs") / f"{baseline}-{data.parent.name if data.is_file() else data.name}"
 
 
-def changes_of(cfg: Training) -> dict[str, Any]:
-    """Return the configuration values of the file and of the options; options win."""
+def config_changes(cfg: Training) -> dict[str, Any]:
+    """Return the configuration values of --config and of the options; options override the file."""
     from robocas_ms3.baselines.training.session import merge_configs
     from robocas_ms3.core.checks import check_number
     from robocas_ms3.core.documents import load_yaml
@@ -161,9 +169,11 @@ def changes_of(cfg: Training) -> dict[str, Any]:
         except FileNotFoundError:
             raise TrainingError("no such file", where=cfg.config) from None
         except (OSError, ValueError) as error:
-            raise TrainingError("can't be read", where=cfg.config, found=error) from error
+            raise TrainingError("unreadable file", where=cfg.config, found=error) from error
         if not isinstance(read, dict):
-            raise TrainingError("no configuration", where=cfg.config, expected="a mapping", found=type(read).__name__)
+            raise TrainingError(
+                "invalid configuration", where=cfg.config, expected="a mapping", found=type(read).__name__
+            )
         found = read
     for text in cfg.set:
         found = merge_configs(found, parse_override(text, TrainingError, "train.seed=1"))

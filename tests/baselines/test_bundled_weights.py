@@ -1,6 +1,7 @@
-"""The bundled weights: small, of this version, and the policy `small` by name."""
+"""The bundled weights of `small`."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -12,24 +13,54 @@ from robocas_ms3.baselines.training.session import load_initial_weights
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.evaluation.policies import make_policy
+from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.scenes.config import load_task_config
 
 
-def test_they_are_small_and_of_this_version():
+def test_file_size_and_version():
     record = read_run(BUNDLED / "small")
     assert (record.baseline, record.version) == ("small", BASELINE.version)
     assert sum(path.stat().st_size for path in BUNDLED.rglob("*")) < 10e6
     assert not (BUNDLED / "small" / CHECKPOINT).exists()
 
 
-def test_they_are_a_policy_by_name():
+def test_policy_by_name():
     policy = make_policy("small")
     assert isinstance(policy, RunPolicy)
     assert (policy.spec.convention, policy.spec.rate_hz, policy.spec.language) == ("robocas", 5.0, "embedding")
-    assert policy.describe()["steps"] > 0
+    description = policy.describe()
+    assert description["steps"] > 0 and description["trained_in"].startswith("pick, in pick_upstream_eval, objects ")
 
 
-def test_they_are_initial_weights_by_name(tmp_path, monkeypatch):
-    """Also where a folder is called so, which a longer path names."""
+def configs_of(protocol, task):
+    loaded = load_protocol(protocol)
+    names = {episode.config for episode in loaded.episodes if episode.task == task}
+    return {name: load_task_config(loaded.config_file(name)) for name in sorted(names)}
+
+
+@pytest.mark.parametrize("protocol", ["paper-v1", "paper-words-v1"])
+def test_no_warning_in_the_scenes_of_the_training_data(protocol):
+    configs = configs_of(protocol, "pick")
+    assert configs and make_policy("small").protocol_warnings(configs) == []
+
+
+@pytest.mark.parametrize(
+    ("protocol", "task", "expected"),
+    [
+        ("smoke", "pick", "scene settings .*; objects .*Trained for: pick, in pick_upstream_eval"),
+        ("paper-v1", "search", "Not in the training data: task search; scene settings"),
+        ("cameras-v1", "pick", "cameras randomisation.cameras"),
+    ],
+)
+def test_one_warning_in_other_scenes(protocol, task, expected):
+    policy, configs = make_policy("small"), configs_of(protocol, task)
+    (message,) = policy.protocol_warnings(configs)
+    assert re.search(expected, message) and set(configs) <= set(re.findall(r"[\w-]+", message))
+    assert policy.protocol_warnings(configs) == []
+
+
+def test_initial_weights_by_name(tmp_path, monkeypatch):
+    """A folder with the same name needs a path such as ./small."""
     monkeypatch.chdir(tmp_path)
     initial = load_initial_weights(BASELINE, Path("small"), None, tmp_path / "out")
     assert initial is not None and initial.weights
@@ -37,13 +68,13 @@ def test_they_are_initial_weights_by_name(tmp_path, monkeypatch):
     Path("small").mkdir()
     again = load_initial_weights(BASELINE, Path("small"), None, tmp_path / "out")
     assert again is not None and again.name == initial.name
-    with pytest.raises(TrainingError, match="no run of robocas train"):
+    with pytest.raises(TrainingError, match="not a training run"):
         load_initial_weights(BASELINE, tmp_path / "small", None, tmp_path / "out")
 
 
 @pytest.mark.slow
-def test_they_reach_the_target(short, tmp_path, needs_renderer):
-    """Of three objects one at least: which of them depends on how a processor rounds."""
+def test_policy_reaches_a_target(short, tmp_path, needs_renderer):
+    """At least one of three objects; which one depends on the rounding of the CPU."""
     words = ["eval", "--policy", "small", "--protocol", short, "--envs", "2"]
     assert run([*words, "--out", str(tmp_path / "eval")]) == 0
     played = [json.loads(line) for line in (tmp_path / "eval" / "episodes.jsonl").read_text().splitlines()]

@@ -1,4 +1,4 @@
-"""`robocas train`: options to a configuration, defaults, and errors of a line."""
+"""`robocas train`: configuration from options, defaults, one-line errors."""
 
 import json
 import re
@@ -9,7 +9,7 @@ from stub_baseline import MADE_UP
 
 from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.cli.main import run
-from robocas_ms3.cli.train import COMMANDS, Other, Training, changes_of, command
+from robocas_ms3.cli.train import COMMANDS, Other, Training, command, config_changes
 
 
 @pytest.fixture
@@ -18,11 +18,11 @@ def made_up(monkeypatch):
     monkeypatch.setitem(COMMANDS, "made-up", command("made-up", Other))
 
 
-def test_options_win_over_the_file_and_later_ones_over_earlier(tmp_path):
+def test_options_override_the_file_and_later_options_earlier_ones(tmp_path):
     file = tmp_path / "c.yaml"
     file.write_text("chunk: 4\ntrain: {steps: 10, seed: 1, ema: 0.5}\nviews: {gripper_camera: null}\n")
-    told = ("chunk=5", "train.seed=2", "train.learning_rate=3e-4", "chunk=6")
-    found = changes_of(Training(config=file, set=told, steps=20, batch_size=8, seed=3))
+    values = ("chunk=5", "train.seed=2", "train.learning_rate=3e-4", "chunk=6")
+    found = config_changes(Training(config=file, set=values, steps=20, batch_size=8, seed=3))
     assert found == {
         "chunk": 6,
         "views": {"gripper_camera": None},
@@ -31,15 +31,15 @@ def test_options_win_over_the_file_and_later_ones_over_earlier(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "expected"),
     [
         (None, "c.yaml: no such file"),
-        ("a: [", "c.yaml: can't be read"),
-        ("- a", "no configuration.*a mapping.*list"),
+        ("a: [", "c.yaml: unreadable file"),
+        ("- a", "invalid configuration.*a mapping.*list"),
         ("widht: 3", "Did you mean width"),
     ],
 )
-def test_a_file_that_is_none(made_up, tmp_path, capsys, content, said):
+def test_invalid_configuration_files(made_up, tmp_path, capsys, content, expected):
     file, data = tmp_path / "c.yaml", tmp_path / "data.h5"
     data.write_text("demonstrations")
     if content is not None:
@@ -47,7 +47,7 @@ def test_a_file_that_is_none(made_up, tmp_path, capsys, content, said):
     words = ["train", "made-up", "--data", str(data), "--out", str(tmp_path / "run"), "--config", str(file)]
     assert run(words) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert re.search(f"^error: .*{said}", line)
+    assert re.search(f"^error: .*{expected}", line)
     assert not (tmp_path / "run").exists()
 
 
@@ -60,6 +60,6 @@ def test_a_training_from_the_command_line(made_up, tmp_path, monkeypatch, capsys
     record = json.loads((made / "run.json").read_text())
     assert record["config"]["width"] == 3
     assert [record["config"]["train"][key] for key in ("steps", "batch_size", "seed")] == [8, 2, 5]
-    said = capsys.readouterr()
-    assert f"robocas eval TASK --policy {made} --protocol paper-v1" in said.out
-    assert "steps trained: 8/8" in said.err
+    output = capsys.readouterr()
+    assert f"robocas eval TASK --policy {made} --protocol paper-v1" in output.out
+    assert "steps trained: 8/8" in output.err

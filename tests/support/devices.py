@@ -24,7 +24,7 @@ def check(dataset, tmp_path, name, precision, device):
     with pytest.raises(KeyboardInterrupt):
         train(name, dataset, out, changes, device=device, progress=stop_at(3, KeyboardInterrupt()))
     record = train(name, dataset, out, device=device)
-    assert (record.device, record.resumed) == (device, [])
+    assert (record.device, record.hardware_changes) == (device, [])
     rows = (out / "metrics.csv").read_text().splitlines()
     assert [row.split(",")[:2] for row in rows[1:]] == [
         [step, split] for step, split in (("2", "train"), ("3", "val"), ("4", "train"), ("6", "train"), ("6", "val"))

@@ -20,7 +20,7 @@ def stop_at(step, error):
         if done == step:
             raise error
 
-    return Progress(step=report)
+    return Progress(on_step=report)
 
 
 def read_log(folder, split=None):

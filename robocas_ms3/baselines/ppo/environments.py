@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +15,7 @@ from gymnasium.vector.utils import batch_space
 
 import robocas_ms3
 from robocas_ms3.baselines.ppo.config import ONE_FRUIT, ONE_FRUIT_STEPS, PpoConfig
+from robocas_ms3.baselines.training.scenes import TrainingScenes, scene_settings
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 from robocas_ms3.scenes.config import TaskConfig, load_task_config
@@ -87,6 +89,8 @@ class PpoEnvironments:
         scene = {"task": config.task, "scenes": scenes.model_dump(mode="json"), "horizon": horizon}
         self.hash = hashlib.sha256(json.dumps(scene, sort_keys=True).encode()).hexdigest()
         self.episodes = config.layouts
+        name = Path(config.scenes).stem if config.scenes else "one fruit"
+        self.scenes = TrainingScenes(tasks=[config.task], configs={name: scene_settings(scenes)})
         self.envs = self.make(config.envs, 0, config.layouts - 1)
         shape = self.envs.single_observation_space.shape
         assert shape is not None

@@ -46,7 +46,7 @@ def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: Ppo
     def save() -> None:
         run.save(state.step, state.tensors(), agent.state_dict())
 
-    run.progress.step(min(state.step, settings.steps), settings.steps)
+    run.progress.on_step(min(state.step, settings.steps), settings.steps)
     saved_step = state.step
     collector = None
     try:
@@ -63,7 +63,7 @@ def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: Ppo
                 if is_last or state.step // settings.save_every > saved_step // settings.save_every:
                     save()
                     saved_step = state.step
-            run.progress.step(min(state.step, settings.steps), settings.steps)
+            run.progress.on_step(min(state.step, settings.steps), settings.steps)
         if config.trials and not state.is_tested:
             outcomes = evaluate_agent(agent, environments, config.trials)
             with deferred_interrupts(second_ends=False):
@@ -72,7 +72,7 @@ def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: Ppo
                 save()
             mean_return, *rates = outcomes.mean(dim=0).tolist()
             text = ", ".join(f"{name} {rate:.0%}" for name, rate in zip(OUTCOMES[1:], rates, strict=True))
-            run.progress.note(f"test without noise, {len(outcomes)} other layouts: return {mean_return:.2f}, {text}")
+            run.progress.message(f"test without noise, {len(outcomes)} other layouts: return {mean_return:.2f}, {text}")
     except KeyboardInterrupt:
         if state.step > saved_step:
             save()
@@ -150,7 +150,7 @@ class _TrainingState:
 def _check_finite(run: RunFolder, losses: dict[str, float], step: int) -> None:
     wrong = [name for name, value in losses.items() if not math.isfinite(value)]
     if wrong:
-        raise run.error(f"the {'gradient' if wrong == ['gradient'] else 'loss'} is NaN or infinite", step)
+        raise run.make_error(f"the {'gradient' if wrong == ['gradient'] else 'loss'} is NaN or infinite", step)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import torch
 from robocas_ms3.baselines.baseline import Batch, OnRead, Split
 from robocas_ms3.baselines.dataset_checks import check_dataset
 from robocas_ms3.baselines.rt1.config import RT1Config
+from robocas_ms3.baselines.training.scenes import read_training_scenes
 from robocas_ms3.datasets.actions import ActionScale
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.training.options import SampleOptions
@@ -46,7 +47,7 @@ class RT1Samples:
             ),
         )
         self._lengths, self._terminate = source.lengths, config.terminate_steps
-        self.episodes = len(self._data.episodes)
+        self.episodes, self.scenes = len(self._data.episodes), read_training_scenes(source, self._data.episodes)
         scale = ActionScale.from_action_space(source.action_space(), folder)
         for done, number in enumerate(self._data.episodes, start=1):  # damage is found before hours of training
             read_episode(source, number, self._data.options)

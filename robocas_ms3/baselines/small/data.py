@@ -30,6 +30,7 @@ from robocas_ms3.baselines.small.objects import (
     locate_objects,
     same_calibration,
 )
+from robocas_ms3.baselines.training.scenes import read_training_scenes
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import Array, from_xyzw
 from robocas_ms3.datasets.formats import open_source
@@ -48,7 +49,7 @@ class SmallSamples:
         self._config, self._source = config, open_source(path)
         source, views = self._source, config.views
         numbers = check_dataset(source, split, views, config.rate_hz, language=config.language)
-        self.episodes = len(numbers)
+        self.episodes, self.scenes = len(numbers), read_training_scenes(source, numbers)
         first = source.episode(numbers[0])
         shapes = {camera: first.rgb(camera, 0).shape for camera in views}
         sizes = {camera: (shape[1], shape[0]) for camera, shape in shapes.items()}

@@ -1,4 +1,4 @@
-"""Tensors in safetensors files: weights, optimiser and random states. Nothing is unpickled."""
+"""Checkpoints: weights, optimiser and random states in safetensors files, without pickle."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ Tensors = Mapping[str, torch.Tensor]
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The tensors of a file, as of a step of a training.
+    """Tensors of a checkpoint or weights file.
 
     Attributes:
-        path: of the file.
-        step: at which it was written.
-        tensors: by name.
+        path: path of the file.
+        step: training step at which it was written.
+        tensors: tensors by name.
     """
 
     path: Path
@@ -35,21 +35,22 @@ class Checkpoint:
     tensors: dict[str, torch.Tensor]
 
     def part(self, name: str) -> dict[str, torch.Tensor]:
-        """Return the tensors of a part, see `join_parts`."""
+        """Return the tensors of a part by name, see `join_parts`."""
         prefix = f"{name}."
         return {key.removeprefix(prefix): value for key, value in self.tensors.items() if key.startswith(prefix)}
 
     def load_model(self, model: torch.nn.Module, part: str = "") -> None:
+        """Load a part, or all tensors, into a model; raise TrainingError if names or shapes differ."""
         own, tensors = model.state_dict(), self.part(part) if part else self.tensors
         missing, more = own.keys() - tensors.keys(), tensors.keys() - own.keys()
         shapes = [name for name in own if name in tensors and own[name].shape != tensors[name].shape]
         for name in (sorted(missing) or sorted(more) or sorted(shapes))[:1]:
             raise TrainingError(
-                "not the weights of this model",
+                "the weights do not fit the model",
                 where=f"{self.path}, {name}",
                 expected=list(own[name].shape) if name in own else "none",
                 found=list(tensors[name].shape) if name in tensors else "none",
-                fix="They fit the configuration that they were trained with: leave out options that change sizes.",
+                fix="Omit options that change sizes: weights fit the configuration that they were trained with.",
             )
         model.load_state_dict(dict(tensors))
 
@@ -63,26 +64,26 @@ class Checkpoint:
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, torch.Tensor]:
-    """Return the state of an optimiser by ``number of the parameter.name``."""
+    """Return the state of an optimiser by ``PARAMETER_INDEX.NAME``."""
     state: dict[int, dict[str, Any]] = optimizer.state_dict()["state"]
     return {f"{number}.{name}": torch.as_tensor(value) for number, of in state.items() for name, value in of.items()}
 
 
 def join_parts(**parts: Tensors) -> dict[str, torch.Tensor]:
-    """Return the tensors of all parts by ``part.name``."""
+    """Return the tensors of all parts by ``PART.NAME``."""
     return {f"{part}.{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()}
 
 
 def save(path: Path, tensors: Tensors, metadata: Mapping[str, str], step: int) -> None:
-    """Write tensors; an existing file stays whole until the new one is."""
+    """Write a file of tensors atomically."""
     copies = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     content = _sort_header(to_bytes(copies, {**metadata, "step": str(step)}))
     with atomic_file(path, sync=True) as tmp:
-        tmp.write_bytes(content)  # save_file writes files that only the owner reads
+        tmp.write_bytes(content)  # save_file makes files that only the owner can read
 
 
 def _sort_header(content: bytes) -> bytes:
-    """Sort the keys of the header: safetensors writes metadata in any order, and results name weights by their hash."""
+    """Sort the header keys: safetensors writes metadata in random order, and results record the file's hash."""
     end = 8 + int.from_bytes(content[:8], "little")
     header = json.dumps(json.loads(content[8:end]), sort_keys=True, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 8)  # aligns the tensors
@@ -90,9 +91,9 @@ def _sort_header(content: bytes) -> bytes:
 
 
 def load(path: Path, expected: Mapping[str, str]) -> Checkpoint:
-    """Read the tensors of a file, whose metadata must be as expected."""
+    """Read a file of tensors; raise TrainingError if it is damaged or its metadata is not as expected."""
     if not path.is_file():
-        fix = "`robocas train` into this folder continues a training that ended before it wrote one."
+        fix = "Continue the run: call `robocas train` with the same --out."
         raise TrainingError("no such file", where=path, fix=fix)
     try:
         with safe_open(path, "pt") as file:
@@ -100,13 +101,17 @@ def load(path: Path, expected: Mapping[str, str]) -> Checkpoint:
             for key, value in expected.items():
                 if metadata.get(key) != value:
                     found = metadata.get(key, "none")[:80]
-                    raise TrainingError(f"another {key.replace('_', ' ')}", where=path, expected=value, found=found)
+                    raise TrainingError(f"wrong {key.replace('_', ' ')}", where=path, expected=value, found=found)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (no mapping)
     except (SafetensorError, OSError) as error:
         is_weights = path.name == WEIGHTS
-        fix = "`robocas train` into this folder writes it again." if is_weights else "Start again with --overwrite."
-        raise TrainingError("can't be read", where=path, found=error, fix=fix) from error
+        fix = (
+            "Continue the run: `robocas train` writes the file again."
+            if is_weights
+            else "Start again with --overwrite."
+        )
+        raise TrainingError("unreadable file", where=path, found=error, fix=fix) from error
     step = metadata.get("step", "")
     if not re.fullmatch(r"[0-9]{1,12}", step):
-        raise TrainingError("no step of a training", where=path, expected="a whole number", found=repr(step[:40]))
+        raise TrainingError("invalid step in the metadata", where=path, expected="an integer", found=repr(step[:40]))
     return Checkpoint(path, int(step), tensors)

@@ -1,4 +1,4 @@
-"""A network in supervised training, with its optimiser, the average of its weights, and its metrics."""
+"""Learner of supervised training: network, optimiser, weight average and metrics."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from torch.optim.swa_utils import AveragedModel
 
 from robocas_ms3.baselines.baseline import Batch, TrainSettings
 from robocas_ms3.baselines.training.checkpoints import Checkpoint, join_parts, optimizer_tensors
-from robocas_ms3.baselines.training.metrics import means_of_sums, sum_of_batch
+from robocas_ms3.baselines.training.metrics import batch_sum, sums_to_means
 from robocas_ms3.baselines.training.run_folder import RunFolder
 from robocas_ms3.core.errors import TrainingError
 
 
 class Learner:
-    """Takes optimiser steps, averages weights and metrics, and saves and restores all of that.
+    """Network with optimiser, weight average and sums of metrics; saves and restores its state.
 
     Attributes:
-        step: number of steps done.
+        step: number of optimiser steps done.
     """
 
     def __init__(self, run: RunFolder, model: torch.nn.Module, settings: TrainSettings) -> None:
         self.step = 0
         self._run, self._accelerator, self._settings = run, run.accelerator, settings
-        self._bare = model
+        self._network = model
         self._average = AveragedModel(model, multi_avg_fn=self._update_average) if settings.ema else None
         self._sums: dict[str, torch.Tensor] = {}  # of metrics since the last line of the log
         self._norms = torch.zeros((), dtype=torch.float64, device=self._accelerator.device)  # sum of gradients' norms
@@ -40,7 +40,7 @@ class Learner:
             run.checkpoint.load_optimizer(self._optimizer)
 
     def update(self, batch: Batch, learning_rate: float) -> None:
-        """Take a step of the optimiser. A GPU is not waited for: there NaN is an error of `take_means`."""
+        """Take an optimiser step. On a GPU, NaN values raise in the next `take_means`, to avoid synchronisation."""
         for group in self._optimizer.param_groups:
             group["lr"] = learning_rate
         self._model.train()
@@ -56,19 +56,19 @@ class Learner:
         self._optimizer.zero_grad()
         self.step += 1
         if self._average is not None:
-            self._average.update_parameters(self._bare)
-        self._sums = {name: self._sums.get(name, 0.0) + sum_of_batch(value, 1) for name, value in metrics.items()}
+            self._average.update_parameters(self._network)
+        self._sums = {name: self._sums.get(name, 0.0) + batch_sum(value, 1) for name, value in metrics.items()}
 
     def take_means(self) -> dict[str, float]:
-        """Return the means of the metrics since the last call, over all processes."""
-        means = means_of_sums(self._reduce(self._sums))
+        """Return the means of the metrics since the last call, over all processes, and reset them."""
+        means = sums_to_means(self._reduce(self._sums))
         self._sums = {}
         self.check_finite(self.step, loss=means["loss"], gradient=self._norms)
         return means
 
     @torch.no_grad()
     def evaluate(self, batches: Iterable[tuple[int, Batch]]) -> dict[str, float]:
-        """Return the means of the metrics of the averaged weights over this process's batches, with their sizes."""
+        """Return the mean metrics of the policy's weights over this process's batches of (size, batch)."""
         model = self._acting_model().eval()
         device = self._accelerator.device
         sums: dict[str, torch.Tensor] = {}
@@ -76,27 +76,27 @@ class Learner:
             torch.manual_seed(self._settings.seed)
             for size, batch in batches:
                 for name, value in model(batch).items():
-                    sums[name] = sum_of_batch(value, size) + sums.get(name, 0.0)
-        return means_of_sums(self._reduce(sums))
+                    sums[name] = batch_sum(value, size) + sums.get(name, 0.0)
+        return sums_to_means(self._reduce(sums))
 
     def check_finite(self, step: int, **values: torch.Tensor | float) -> None:
         for name, value in values.items():
             if not math.isfinite(value):
-                raise self._run.error(f"the {name} is NaN or infinite", step)
+                raise self._run.make_error(f"the {name} is NaN or infinite", step)
 
     def weights(self) -> dict[str, torch.Tensor]:
-        """Return the weights that a policy acts with."""
+        """Return the weights of the policy."""
         return self._acting_model().state_dict()
 
     def save(self) -> None:
-        """Write a checkpoint; all processes have to call this.
+        """Write a checkpoint; call it in all processes.
 
-        Not if a value is NaN or infinite: then the next `take_means` ends the run, and the last checkpoint stays.
+        If a metric is NaN or infinite, nothing is written, and the next `take_means` raises.
         """
         random, sums = self._random_states(), self._reduce(self._sums)
         if all(torch.isfinite(value).all() for value in (*self._sums.values(), self._norms)):
             state = join_parts(
-                model=self._bare.state_dict(),
+                model=self._network.state_dict(),
                 average={} if self._average is None else self._average.state_dict(),
                 optimizer=optimizer_tensors(self._optimizer),
                 sums=sums,
@@ -105,7 +105,7 @@ class Learner:
             self._run.save(self.step, state, self.weights())
 
     def _restore(self, checkpoint: Checkpoint) -> None:
-        checkpoint.load_model(self._bare, "model")
+        checkpoint.load_model(self._network, "model")
         if self._average is not None:
             checkpoint.load_model(self._average, "average")
         is_main = float(self._accelerator.is_main_process)  # the sums are those of all processes
@@ -115,10 +115,10 @@ class Learner:
         self.step = checkpoint.step
 
     def _acting_model(self) -> torch.nn.Module:
-        return self._average.module if self._average is not None else self._bare
+        return self._average.module if self._average is not None else self._network
 
     def _update_average(self, average: Any, now: Any, _: Any) -> None:
-        """Update the average of the weights: fast at first, as it starts with random ones."""
+        """Update the weight average, with a lower decay at first, as the first weights are random."""
         decay = min(self._settings.ema, (self.step + 1) / (self.step + 10))
         torch._foreach_lerp_(average, now, 1 - decay)  # pyright: ignore[reportPrivateImportUsage]
 
@@ -129,7 +129,7 @@ class Learner:
         return dict(zip(sums, reduced, strict=True))
 
     def _random_states(self) -> dict[str, torch.Tensor]:
-        """Return the states of the random generators of all processes, by ``cpu.N`` or ``cuda.N``."""
+        """Return the states of all processes' random generators, by ``cpu.N`` or ``cuda.N``."""
         states, device = {"cpu": torch.get_rng_state()}, self._accelerator.device
         if device.type == "cuda":
             states["cuda"] = torch.cuda.get_rng_state()
@@ -143,11 +143,11 @@ class Learner:
         processes = sum(name.startswith("cpu.") for name in states)
         if processes != self._accelerator.num_processes:
             raise TrainingError(
-                "a run continues in as many processes as it started with",
+                "wrong number of processes to continue this run",
                 where=checkpoint.path,
                 expected=processes,
                 found=self._accelerator.num_processes,
-                fix=f"accelerate launch --num_processes {processes}, or start again with --overwrite.",
+                fix=f"Use `accelerate launch --num_processes {processes}`, or start again with --overwrite.",
             )
         number = self._accelerator.process_index
         torch.set_rng_state(states[f"cpu.{number}"])
@@ -156,7 +156,7 @@ class Learner:
 
 
 def _parameter_groups(model: torch.nn.Module, decay: float) -> list[dict[str, Any]]:
-    """Return parameters with weight decay, matrices and kernels, and those without."""
+    """Return two parameter groups: matrices and kernels with weight decay, all others without."""
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     return [
         {"params": [parameter for parameter in parameters if parameter.ndim > 1], "weight_decay": decay},

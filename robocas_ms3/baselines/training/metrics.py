@@ -1,4 +1,4 @@
-"""Metrics of batches, their means, and their log: ``metrics.csv`` and TensorBoard's files."""
+"""Metrics of batches, their means, and their log: ``metrics.csv`` and TensorBoard events."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ def mean_of_sum(sum_and_count: torch.Tensor) -> torch.Tensor:
     return sum_and_count[0] / sum_and_count[1].clamp(min=1)
 
 
-def sum_of_batch(metric: torch.Tensor, samples: int) -> torch.Tensor:
-    """Return a sum and a count (2,) float64 of a metric of a batch: its mean (), or already a sum and a count (2,)."""
+def batch_sum(metric: torch.Tensor, samples: int) -> torch.Tensor:
+    """Return sum and count (2,) float64 of a batch metric: a mean () of ``samples``, or sum and count (2,)."""
     metric = metric.detach().double()
     return metric if metric.ndim else torch.stack([metric * samples, torch.full_like(metric, samples)])
 
 
-def means_of_sums(sums: Mapping[str, torch.Tensor]) -> dict[str, float]:
-    """Return means by name; NaN for a count of 0."""
+def sums_to_means(sums: Mapping[str, torch.Tensor]) -> dict[str, float]:
+    """Return the means by name; NaN for a count of 0."""
     return {name: float(mean_of_sum(value)) if value[1] else math.nan for name, value in sums.items()}
 
 
 class MetricsLog:
-    """Appends lines to ``metrics.csv`` and events to ``tensorboard/``.
+    """Log of metrics: ``metrics.csv`` and TensorBoard events.
 
     Args:
-        folder: of the run.
-        step: of the checkpoint; later lines, of a training that was killed, are removed.
+        folder: folder of the run.
+        step: step of the checkpoint; later lines of a killed run are removed.
 
     Attributes:
-        seconds: of training up to that step.
+        seconds: training time up to that step.
     """
 
     def __init__(self, folder: Path, step: int) -> None:
@@ -58,7 +58,7 @@ class MetricsLog:
         self._tensorboard = TensorBoardWriter(folder / TENSORBOARD, step + 1 if step else 0)
 
     def has(self, step: int, split: str) -> bool:
-        """Return whether a line was written before this run continued."""
+        """Return whether a line of a step and split was written before this run continued."""
         return (step, split) in self._written
 
     def add(self, step: int, split: str, about: Mapping[str, float], metrics: Mapping[str, float]) -> None:
@@ -94,7 +94,7 @@ class MetricsLog:
 
 
 class TensorBoardWriter:
-    """Writes TensorBoard events without the thread of TensorBoard's own writer, whose errors would come late."""
+    """Writer of TensorBoard events without a thread; TensorBoard's own writer reports errors late."""
 
     def __init__(self, folder: Path, first: int = 0) -> None:
         from tensorboard.compat.proto import event_pb2, summary_pb2
@@ -128,7 +128,7 @@ class TensorBoardWriter:
 
 
 def _number(text: Any, default: float) -> float:
-    """Return the number in a field, which a kill may have cut off."""
+    """Parse a number; return the default for text that a kill has cut off."""
     try:
         return float(text)
     except (TypeError, ValueError):

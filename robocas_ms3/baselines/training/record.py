@@ -2,10 +2,10 @@
 
 ::
 
-    run.json                 baseline and version, configuration, facts and hash of the data, package versions, device
-    metrics.csv              lines of training and validation
-    tensorboard/             the same
-    checkpoint.safetensors   the state of the training, see `checkpoints`
+    run.json                 record of the run, see `RunRecord`
+    metrics.csv              training and validation metrics
+    tensorboard/             the same metrics as TensorBoard events
+    checkpoint.safetensors   state of the training, see `checkpoints`
     weights.safetensors      weights of the policy
 """
 
@@ -16,6 +16,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
+from robocas_ms3.baselines.training.scenes import TrainingScenes
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.strict_model import StrictModel, parse
@@ -23,40 +24,42 @@ from robocas_ms3.core.strict_model import StrictModel, parse
 RUN, METRICS, TENSORBOARD = "run.json", "metrics.csv", "tensorboard"
 CHECKPOINT, WEIGHTS = "checkpoint.safetensors", "weights.safetensors"
 BUNDLED = Path(__file__).parents[2] / "data" / "runs"
-"""Runs with bundled weights, which have no checkpoints."""
+"""Folder of the bundled runs, which have weights and no checkpoint."""
 _PACKAGES = ("robocas-ms3", "torch", "accelerate", "safetensors", "transformers", "numpy")
 _BLOCK = 1 << 20
 
 
 class DataRecord(StrictModel):
-    """The data of a run.
+    """Training data of a run.
 
     Attributes:
-        name: of the folder, the file or the scenes.
-        hash: see `hash_dataset`.
-        episodes, samples: of the training split.
+        name: name of the folder, file or scenes.
+        hash: hash of the data, see `hash_dataset`.
+        episodes, samples: size of the training split.
+        scenes: tasks, objects and scene settings of the training split.
     """
 
     name: str
     hash: str
     episodes: int
     samples: int
+    scenes: TrainingScenes = TrainingScenes()
 
 
 class RunRecord(StrictModel):
-    """``run.json``.
+    """Content of ``run.json``.
 
     Attributes:
-        kind: always this.
-        baseline, version: what was trained.
-        config: its whole configuration.
-        facts: of the data, see `Samples`.
-        data: that it was trained on.
-        versions: of packages.
-        device, precision: of the training; others round differently.
-        threads: of the CPU; as many add in the same order. 0: a GPU, or not known.
-        resumed: lines on continuations with another device, precision or number of threads.
-        start: the run whose weights it started from: folder name and hash; empty: random weights.
+        kind: constant that identifies the file.
+        baseline, version: the baseline and the version of its weights.
+        config: the complete configuration.
+        facts: facts of the training data, see `Samples`.
+        data: the training data.
+        versions: versions of packages.
+        device, precision: device and precision of the training, which determine rounding.
+        threads: number of CPU threads, which determines the order of sums; 0: a GPU, or not known.
+        hardware_changes: one line per continuation with another device, precision or number of threads.
+        init_from: run of the initial weights: folder name and hash; empty: random weights.
     """
 
     kind: Literal["robocas training run"] = "robocas training run"
@@ -69,17 +72,17 @@ class RunRecord(StrictModel):
     device: str
     precision: str
     threads: int = 0
-    resumed: list[str] = []
-    start: str = ""
+    hardware_changes: list[str] = []
+    init_from: str = ""
 
     @property
     def metadata(self) -> dict[str, str]:
-        """Metadata of the files with tensors, by which they are of this run."""
+        """Return the metadata that its tensor files must have."""
         return {"baseline": self.baseline, "version": str(self.version), "dataset": self.data.hash}
 
 
 def find_run(run: Path) -> Path:
-    """Return the folder of a run: a single name is that of bundled weights, if there are such."""
+    """Return the folder of a run; the name of a bundled run means the bundled run."""
     return BUNDLED / run if len(run.parts) == 1 and (BUNDLED / run).is_dir() else run
 
 
@@ -87,14 +90,14 @@ def read_run(folder: Path) -> RunRecord:
     """Read the record of a training run, `run.json` in its folder; raise TrainingError if there is none."""
     path = folder / RUN
     if not path.is_file():
-        fix = "Name the --out of a `robocas train`."
-        raise TrainingError("no run of robocas train", where=folder, expected=RUN, fix=fix)
+        fix = "Pass the --out folder of `robocas train`."
+        raise TrainingError("not a training run", where=folder, expected=RUN, fix=fix)
     try:
         record = load_json(path)
     except ValueError as error:
-        raise TrainingError("not readable", where=path, found=error) from error
+        raise TrainingError("unreadable file", where=path, found=error) from error
     if not isinstance(record, dict) or record.get("kind") != RunRecord.model_fields["kind"].default:
-        raise TrainingError("no run of robocas train", where=path, expected="kind robocas training run")
+        raise TrainingError("not a training run", where=path, expected="kind robocas training run")
     return parse(RunRecord, record, TrainingError, where=path)
 
 
@@ -103,10 +106,10 @@ def package_versions() -> dict[str, str]:
 
 
 def hash_dataset(data: Path) -> str:
-    """Return a SHA-256 hash of a dataset.
+    """Return the hex SHA-256 of a dataset.
 
-    Hashed are the bytes of a trajectory and of the JSON next to it; of a folder the JSON files, tables, arrays and the
-    sizes of all files.
+    For a trajectory: of the bytes of the file and of the JSON next to it. For a folder: of JSON files, tables, arrays,
+    and the sizes of all files.
     """
     digest = hashlib.sha256()
     if data.is_file():
@@ -122,12 +125,12 @@ def hash_dataset(data: Path) -> str:
             if path.suffix in {".json", ".npz", ".npy", ".parquet"}:
                 _hash_file(digest, path)
     else:
-        raise TrainingError("no dataset here", where=data, expected="a dataset's folder or trajectory.h5")
+        raise TrainingError("no such dataset", where=data, expected="a dataset folder or a trajectory.h5")
     return digest.hexdigest()
 
 
 def hash_weights(folder: Path) -> str:
-    """Return a SHA-256 hash of the weights of a run; empty: there are none yet."""
+    """Return the hex SHA-256 of the weights of a run; empty if there are none yet."""
     path, digest = folder / WEIGHTS, hashlib.sha256()
     if not path.is_file():
         return ""

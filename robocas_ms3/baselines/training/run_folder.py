@@ -1,4 +1,4 @@
-"""The folder of a training run and its device, as a training loop uses them."""
+"""Folder and device of a training run, for the training loops."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of malloc.h
 
 
 class RunFolder:
-    """Writes record, metrics, checkpoints and weights of a run; only its main process writes.
+    """Writer of a run's record, metrics, checkpoints and weights; only the main process writes.
 
     Attributes:
-        record: of the run.
-        accelerator: that it is trained on.
-        progress: functions to report to.
-        checkpoint: to continue from; None: the run starts from step 0.
+        record: record of the run.
+        accelerator: accelerate's accelerator, which has the device.
+        progress: functions that report the progress.
+        checkpoint: checkpoint to continue from; None: the run starts from step 0.
     """
 
     def __init__(self, output: OutputFolder, record: RunRecord, accelerator: Accelerator, progress: Progress) -> None:
@@ -49,12 +49,20 @@ class RunFolder:
             self._log.close()
 
     def start(self, step: int, model: torch.nn.Module, weights: Tensors, size: str) -> None:
-        """Write the record and open the log; weights of another step than the checkpoint are written again."""
+        """Write the record and open the log; rewrite the weights if their step is not that of the checkpoint.
+
+        Args:
+            step: first step.
+            model: the network.
+            weights: weights of the policy at that step.
+            size: size of the training data, for the log.
+        """
         accelerator, record = self.accelerator, self.record
         changes = _hardware_changes(record, accelerator)
         if self._output.recorded is not None and changes:
-            record.resumed.append(f"from step {step} by {changes}")
-            self.progress.note(f"continues {record.resumed[-1]}: results differ from those of an uninterrupted run")
+            record.hardware_changes.append(f"from step {step}: {changes}")
+            what = "the result will differ from that of an uninterrupted run"
+            self.progress.message(f"hardware changed {record.hardware_changes[-1]}; {what}")
         if accelerator.is_main_process:
             self._output.start(record.model_dump(mode="json"))
             if self.checkpoint is not None:
@@ -63,13 +71,13 @@ class RunFolder:
         parameters = sum(parameter.numel() for parameter in model.parameters()) / 1e6
         precision = "bf16" if accelerator.mixed_precision == "bf16" else "fp32"
         device = accelerator.device.type
-        self.progress.note(f"{record.baseline}: {parameters:.2f} M parameters, {size}, {device}, {precision}")
+        self.progress.message(f"{record.baseline}: {parameters:.2f} M parameters, {size}, {device}, {precision}")
         if accelerator.is_main_process:
             self._log = MetricsLog(self._output.path, step)
         self._started_at = time.monotonic() - (self._log.seconds if self._log else 0.0)
 
     def has_logged(self, step: int, split: str) -> bool:
-        """Return whether a run that continues has logged a line before; all processes have to call this."""
+        """Return whether a line was logged before this run continued; call it in all processes."""
         return broadcast_object_list([self._log is not None and self._log.has(step, split)])[0]
 
     def log(self, step: int, split: str, metrics: Mapping[str, float], *, epoch: float, learning_rate: float) -> None:
@@ -88,11 +96,11 @@ class RunFolder:
             checkpoints.save(self._output.path / WEIGHTS, weights, self.record.metadata, step)
             checkpoints.save(self._output.path / CHECKPOINT, state, self.record.metadata, step)
 
-    def error(self, message: str, step: int) -> TrainingError:
+    def make_error(self, message: str, step: int) -> TrainingError:
         return TrainingError(
             message,
             where=f"{self._output.path}, step {step}",
-            fix="Start another run from this one (--start), with a lower train.learning_rate.",
+            fix="Start another run from this run's weights: --init-from RUN, with a lower train.learning_rate.",
         )
 
     def _repair_weights(self, step: int, weights: Tensors) -> None:
@@ -104,15 +112,15 @@ class RunFolder:
 
 
 def _hardware_changes(record: RunRecord, accelerator: Accelerator) -> str:
-    """Return how this hardware differs from that of the record, which changes results; empty: it does not."""
+    """Return the differences of this hardware from the record, which change rounding; empty: none."""
     now = describe_hardware(accelerator) | ({} if record.threads else {"threads": 0})
     return ", ".join(f"{name} {value}" for name, value in now.items() if getattr(record, name) != value)
 
 
 def make_accelerator(device: str, precision: Precision) -> Accelerator:
-    """Return accelerate's accelerator for a device: ``auto`` (a GPU if there is one), ``cpu`` or ``cuda``."""
+    """Make accelerate's accelerator for a device: ``auto`` (a GPU if there is one), ``cpu`` or ``cuda``."""
     if device == "cuda" and not torch.cuda.is_available():
-        raise TrainingError("there is no GPU that torch can use", where="--device", found="cuda", fix="--device cpu")
+        raise TrainingError("no GPU available to torch", where="--device", found="cuda", fix="Pass --device cpu.")
     cpu = device == "cpu" or not torch.cuda.is_available()
     if cpu:
         _keep_freed_memory()
@@ -129,14 +137,14 @@ def make_accelerator(device: str, precision: Precision) -> Accelerator:
 
 
 def describe_hardware(accelerator: Accelerator) -> dict[str, Any]:
-    """Return the values of a `RunRecord` on which rounding depends: device, precision, and threads of the CPU."""
+    """Return the values of a `RunRecord` that determine rounding: device, precision, number of CPU threads."""
     device = accelerator.device.type
     threads = torch.get_num_threads() if device == "cpu" else 0
     return {"device": device, "precision": str(accelerator.mixed_precision), "threads": threads}
 
 
 def _keep_freed_memory() -> None:
-    """Let glibc keep freed memory: to get pages from the system at each step takes a tenth of its time."""
+    """Let glibc keep freed memory: requesting pages from the system takes 10 % of a training step."""
     with suppress(OSError, AttributeError):  # another C library
         libc = ctypes.CDLL(None)
         libc.mallopt(_M_MMAP_MAX, 0)
@@ -144,6 +152,6 @@ def _keep_freed_memory() -> None:
 
 
 def _cpu_has_bf16() -> bool:
-    """Return whether the processor has bf16 instructions; without them bf16 is slower than fp32."""
+    """Return whether the CPU has bf16 instructions; without them bf16 is slower than fp32."""
     cpu: Any = torch.cpu
     return any(getattr(cpu, name, bool)() for name in ("_is_avx512_bf16_supported", "_is_amx_tile_supported"))

@@ -1,4 +1,4 @@
-"""Start or continue a training run: the work of `robocas train`."""
+"""Start or continue a training run, for `robocas train`."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from robocas_ms3.baselines.training.record import (
     package_versions,
     read_run,
 )
+from robocas_ms3.baselines.training.scenes import TrainingScenes
 from robocas_ms3.core.errors import EmptySplitError, TrainingError, require_extra
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder, list_setting_changes
 from robocas_ms3.core.signals import forbid_exit
@@ -37,41 +38,41 @@ if TYPE_CHECKING:
 
 OUTPUT = FolderKind("robocas train", (RUN,), "baseline")
 _INPUTS = ("rate_hz", "image_sizes", "cameras", "calibration", "observed", "acted")
-"""Facts that have to be the same in both runs. Others, such as scales, need the same shape."""
-_TOLERANCE = 1e-3  # of these: camera poses differ in the last bits
+"""Facts that must be equal in a run and the run of its initial weights; others, such as scales, need equal shapes."""
+_TOLERANCE = 1e-3  # of `_INPUTS`: camera poses differ by rounding
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What to train, on which data, and where.
+    """Options of a training run.
 
     Attributes:
-        baseline: its name.
-        data: dataset; None for a baseline that learns in simulation.
+        baseline: name of the baseline.
+        data: dataset folder or trajectory.h5; None for a baseline that learns in simulation.
         out: folder of the run.
-        changes: values of the configuration, nested; a run that continues needs none.
-        start: folder of a run to start from: its weights, scales and configuration, the latter below ``changes``.
+        changes: nested values that differ from the default configuration; a run that continues needs none.
+        init_from: folder of a run with the initial weights; also its scales and, below ``changes``, its configuration.
         device: ``auto``, ``cpu`` or ``cuda``.
-        overwrite: start again, and replace the run in ``out`` once the data is read.
+        overwrite: start again; the run in ``out`` is replaced when the data is read.
     """
 
     baseline: str
     data: Path | None
     out: Path
     changes: Mapping[str, Any] = field(default_factory=dict)
-    start: Path | None = None
+    init_from: Path | None = None
     device: str = "auto"
     overwrite: bool = False
 
 
 @dataclass(frozen=True)
 class InitialWeights:
-    """Weights of another run.
+    """Initial weights of a run, from another run.
 
     Attributes:
-        record: of that run.
-        name: of its folder, with a hash of its weights.
-        weights: None if the new run has a checkpoint already.
+        record: record of the other run.
+        name: name of its folder and hash of its weights.
+        weights: its weights; None if the new run already has a checkpoint.
     """
 
     record: RunRecord
@@ -83,10 +84,10 @@ def train_run(options: RunOptions, progress: Progress | None = None) -> RunRecor
     """Train a baseline, or continue a run with the same settings.
 
     Raises:
-        TrainingError: the configuration is wrong.
+        TrainingError: invalid configuration or initial weights.
         DatasetError: the data does not suit the baseline.
-        OutputExistsError: the folder is a run with other settings, versions or data, or no run.
-        KeyboardInterrupt: Ctrl-C; the run can be continued.
+        OutputExistsError: the folder has a run with other settings, versions or data, or other files.
+        KeyboardInterrupt: Ctrl-C; the same call continues the run.
     """
     require_extra("train", "baselines", "accelerate", "safetensors", "tensorboard", "transformers")
     from robocas_ms3.baselines.training.run_folder import RunFolder, describe_hardware, make_accelerator
@@ -97,17 +98,18 @@ def train_run(options: RunOptions, progress: Progress | None = None) -> RunRecor
     _check_data(baseline, data)
     with forbid_exit(f"baseline {options.baseline}"), _open_output(options) as output, ExitStack() as stack:
         recorded = _read_recorded(output, baseline)
-        initial = load_initial_weights(baseline, options.start, recorded, options.out)
+        initial = load_initial_weights(baseline, options.init_from, recorded, options.out)
         base = recorded or (initial.record if initial else None)
         below = base.config if base else baseline.Config().model_dump(mode="json")
         changed = merge_configs(below, options.changes)
         config = parse(baseline.Config, changed, TrainingError, where=baseline.name)
         settings: dict[str, Any] = {"config": config.model_dump(mode="json")}
-        output.check_settings(settings | ({"start": initial.name} if initial else {}))
+        output.check_settings(settings | ({"init_from": initial.name} if initial else {}))
         accelerator = make_accelerator(options.device, _precision(config.train.precision, recorded))
         if config.train.batch_size % accelerator.num_processes:
             found = f"{config.train.batch_size} for {accelerator.num_processes} processes"
-            raise TrainingError("processes share a batch evenly", where="train.batch_size", found=found)
+            expected = "a multiple of the number of processes"
+            raise TrainingError("invalid batch size", where="train.batch_size", expected=expected, found=found)
         if data is None:
             source = stack.enter_context(closing(baseline.environments(config, accelerator.device.type)))
             name, data_hash = source.name, source.hash
@@ -116,18 +118,24 @@ def train_run(options: RunOptions, progress: Progress | None = None) -> RunRecor
         if recorded is not None:
             output.check_settings({"data": {**recorded.data.model_dump(), "hash": data_hash}})
         if data is not None:
-            progress.note(f"reading {data}")
-            source = baseline.data(config, data, "train", progress.read)
+            progress.message(f"reading {data}")
+            source = baseline.data(config, data, "train", progress.on_read)
             validation = _read_validation(partial(baseline.data, config, data), progress)
         record = recorded or RunRecord(
             baseline=baseline.name,
             version=baseline.version,
             config=config.model_dump(mode="json"),
             facts=combine_facts(source.facts, initial, data),
-            data=DataRecord(name=name, hash=data_hash, episodes=source.episodes, samples=len(source)),
+            data=DataRecord(
+                name=name,
+                hash=data_hash,
+                episodes=source.episodes,
+                samples=len(source),
+                scenes=getattr(source, "scenes", TrainingScenes()),
+            ),
             versions=package_versions(),
             **describe_hardware(accelerator),
-            start=initial.name if initial else "",
+            init_from=initial.name if initial else "",
         )
         run = stack.enter_context(closing(RunFolder(output, record, accelerator, progress)))
         model = _make_model(baseline, config, record, initial).to(accelerator.device)
@@ -151,26 +159,26 @@ def merge_configs(defaults: Mapping[str, Any], changes: Mapping[str, Any]) -> di
 
 
 def load_initial_weights(
-    baseline: Baseline, start: Path | None, recorded: RunRecord | None, out: Path
+    baseline: Baseline, init_from: Path | None, recorded: RunRecord | None, out: Path
 ) -> InitialWeights | None:
-    """Load the weights of the run to start from, if one is named."""
+    """Load the initial weights from a run; None without ``init_from``."""
     from robocas_ms3.baselines.training import checkpoints
 
     has_checkpoint = recorded is not None and (out / CHECKPOINT).is_file()
-    if start is None:
-        if recorded is not None and recorded.start and not has_checkpoint:
-            what = "this run has no checkpoint yet, and starts from the weights of another"
-            raise TrainingError(what, where=out, expected=recorded.start, fix="Name that run by --start again.")
+    if init_from is None:
+        if recorded is not None and recorded.init_from and not has_checkpoint:
+            what, fix = "this run has no checkpoint and needs its initial weights", "Pass --init-from again."
+            raise TrainingError(what, where=out, expected=recorded.init_from, fix=fix)
         return None
-    start = find_run(start)
-    record = read_run(start)
+    folder = find_run(init_from)
+    record = read_run(folder)
     expected = {"baseline": baseline.name, "version": str(baseline.version)}
-    weights = None if has_checkpoint else checkpoints.load(start / WEIGHTS, expected)
-    return InitialWeights(record, f"{start.resolve().name}, {hash_weights(start)[:12]}", weights)
+    weights = None if has_checkpoint else checkpoints.load(folder / WEIGHTS, expected)
+    return InitialWeights(record, f"{folder.resolve().name}, {hash_weights(folder)[:12]}", weights)
 
 
 def combine_facts(own: dict[str, Any], initial: InitialWeights | None, data: Path | None) -> dict[str, Any]:
-    """Return the facts of a run; on a dataset, with initial weights, the other run's, whose scales fit the weights."""
+    """Return the facts of a run: those of the run of its initial weights, whose scales fit the weights, if any."""
     if initial is None:
         return own
     others = initial.record.facts
@@ -178,23 +186,23 @@ def combine_facts(own: dict[str, Any], initial: InitialWeights | None, data: Pat
     for key in (*_INPUTS, *scales):
         tolerance = _TOLERANCE if key in _INPUTS else math.inf
         if changes := list_setting_changes(others.get(key), own.get(key), key, tolerance):
-            what, where = f"the run of --start has other {key}", data or initial.name
-            fix = "Start from a run with the same inputs, convert the data as for that run, or leave out --start."
+            what, where = f"{key} differs from the run of --init-from", data or initial.name
+            fix = "Choose a run with the same inputs, convert the data as for that run, or omit --init-from."
             raise TrainingError(what, where=where, found=changes[0], fix=fix)
     return own if data is None else others
 
 
 def _check_data(baseline: Baseline, data: Path | None) -> None:
     if data is None and baseline.data is not None:
-        expected = "a dataset's folder or a trajectory.h5"
-        raise TrainingError(f"{baseline.name} needs a dataset", where="--data", expected=expected)
+        expected = "a dataset folder or a trajectory.h5"
+        raise TrainingError(f"baseline {baseline.name} needs a dataset", where="--data", expected=expected)
     if data is not None and baseline.data is None:
-        raise TrainingError(f"{baseline.name} takes no dataset", where="--data", fix="Leave it out.")
+        raise TrainingError(f"baseline {baseline.name} takes no dataset", where="--data", fix="Omit --data.")
 
 
 @contextmanager
 def _open_output(options: RunOptions) -> Iterator[OutputFolder]:
-    """Lock the folder of a run; of several processes only the main one of `accelerate launch`."""
+    """Lock the folder of a run, in the main process of `accelerate launch`; other processes only read it."""
     output = OutputFolder(options.out, OUTPUT, overwrite=options.overwrite)
     if os.environ.get("RANK", "0") == "0":
         with output:
@@ -205,7 +213,7 @@ def _open_output(options: RunOptions) -> Iterator[OutputFolder]:
 
 
 def _read_recorded(output: OutputFolder, baseline: Baseline) -> RunRecord | None:
-    """Return the record of a run that continues; options that are newer than it have their defaults."""
+    """Return the record of a run that continues, with defaults for configuration keys that it lacks."""
     output.check_settings({"baseline": baseline.name, "version": baseline.version, "versions": package_versions()})
     if output.recorded is None:
         return None
@@ -218,7 +226,7 @@ def _read_recorded(output: OutputFolder, baseline: Baseline) -> RunRecord | None
 
 
 def _precision(precision: Precision, recorded: RunRecord | None) -> Precision:
-    """Return the precision: a run continues with the one it started with, even if another is fast here."""
+    """Return the precision: with ``auto`` a run continues with the precision it was started with."""
     if recorded is None or precision != "auto":
         return precision
     return "bf16" if recorded.precision == "bf16" else "fp32"
@@ -226,9 +234,9 @@ def _precision(precision: Precision, recorded: RunRecord | None) -> Precision:
 
 def _read_validation(read: Callable[[Split, OnRead], Samples], progress: Progress) -> Samples | None:
     try:
-        return read("val", progress.read)
+        return read("val", progress.on_read)
     except EmptySplitError:
-        progress.note("no validation: there are too few episodes")
+        progress.message("no validation: too few episodes")
         return None
 
 

@@ -1,6 +1,6 @@
 """Supervised training on a CPU, a GPU or several (``accelerate launch``).
 
-Samples and learning rate are functions of the step alone, so that a run can continue at any step.
+Samples and learning rate depend on the step only, so a run can continue at any step.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from robocas_ms3.core.signals import deferred_interrupts, exit_error
 def train_supervised(
     run: RunFolder, model: torch.nn.Module, settings: TrainSettings, samples: Samples, validation: Samples | None
 ) -> None:
-    """Train a network until all steps are done, from the checkpoint of the run if it has one."""
+    """Train a network up to the last step, starting from the checkpoint of the run if there is one."""
     accelerator, count = run.accelerator, len(samples)
     learner = Learner(run, model, settings)
     run.start(learner.step, model, learner.weights(), f"{count} samples of {samples.episodes} episodes")
@@ -39,17 +39,17 @@ def train_supervised(
             log("val", metrics)
             text = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items() if math.isfinite(value))
             epoch = epoch_at(learner.step, count, settings)
-            run.progress.note(f"step {learner.step}, epoch {epoch:.1f}, validation: {text}")
+            run.progress.message(f"step {learner.step}, epoch {epoch:.1f}, validation: {text}")
 
-    run.progress.step(learner.step, settings.steps)
+    run.progress.on_step(learner.step, settings.steps)
     saved_step = learner.step
     try:
-        if not run.has_logged(learner.step, "val"):  # it was interrupted
+        if not run.has_logged(learner.step, "val"):  # interrupted before this validation
             validate()
         process = (accelerator.process_index, accelerator.num_processes)
         indices = batch_indices(count, settings, learner.step, process)
         for batch in _read_batches(run, samples, indices, settings.workers):
-            with deferred_interrupts():  # after a step everything is as a checkpoint has it
+            with deferred_interrupts():  # interrupt only after a complete step
                 learner.update(batch, learning_rate(learner.step, count, settings))
                 is_last = learner.step == settings.steps
                 if is_last or learner.step % settings.log_every == 0:
@@ -58,9 +58,9 @@ def train_supervised(
                     learner.save()
                     saved_step = learner.step
             validate()
-            run.progress.step(learner.step, settings.steps)
+            run.progress.on_step(learner.step, settings.steps)
     except KeyboardInterrupt:
-        if learner.step > saved_step and accelerator.num_processes == 1:  # several may be at different steps
+        if learner.step > saved_step and accelerator.num_processes == 1:  # several processes may be at different steps
             learner.save()
         raise
 
@@ -68,15 +68,15 @@ def train_supervised(
 def batch_indices(
     count: int, settings: TrainSettings, first: int = 0, process: tuple[int, int] = (0, 1)
 ) -> Iterator[list[int]]:
-    """Yield the indices of batches, from permutations by (seed, epoch).
+    """Yield the sample indices of each batch, from one permutation per (seed, epoch).
 
-    The rest of an epoch is the beginning of the first batch of the next.
+    A batch may contain the end of an epoch and the start of the next.
 
     Args:
         count: number of samples, at least 1.
         settings: seed, batch size, number of steps.
-        first: step to begin at.
-        process: (number, count) of the processes that share each batch.
+        first: first step.
+        process: index and number of the processes that share each batch.
     """
     size, (number, processes) = settings.batch_size, process
     epoch, order = -1, torch.empty(0, dtype=torch.int64)
@@ -92,14 +92,14 @@ def batch_indices(
 
 
 def epoch_at(step: int, count: int, settings: TrainSettings) -> float:
-    """Return how often each of ``count`` samples has been drawn after so many steps."""
+    """Return the number of epochs after ``step`` steps of training on ``count`` samples."""
     return step * settings.batch_size / count
 
 
 def learning_rate(step: int, count: int, settings: TrainSettings) -> float:
     """Return the learning rate after ``step`` steps of training on ``count`` samples.
 
-    ``restarts`` is cosine annealing with warm restarts (Loshchilov and Hutter 2017), a period in epochs.
+    ``restarts`` is cosine annealing with warm restarts (Loshchilov and Hutter 2017), with periods in epochs.
     """
     if step < settings.warmup_steps:
         return settings.learning_rate * (step + 1) / settings.warmup_steps
@@ -117,11 +117,11 @@ def learning_rate(step: int, count: int, settings: TrainSettings) -> float:
 
 
 def _validation_batches(run: RunFolder, samples: Samples, settings: TrainSettings) -> Iterator[tuple[int, Batch]]:
-    """Yield this process's batches with their sizes; the same samples at each validation."""
+    """Yield this process's validation batches with their sizes; the samples are the same at each validation."""
     accelerator = run.accelerator
     count = min(len(samples), settings.validation_samples)
     indices = torch.linspace(0, len(samples) - 1, count).long().tolist()
-    if count >= accelerator.num_processes:  # else each process takes all
+    if count >= accelerator.num_processes:  # else each process evaluates all samples
         indices = indices[accelerator.process_index :: accelerator.num_processes]
     size = settings.batch_size
     batches = [indices[first : first + size] for first in range(0, len(indices), size)]
@@ -129,14 +129,14 @@ def _validation_batches(run: RunFolder, samples: Samples, settings: TrainSetting
 
 
 def _read_batches(run: RunFolder, samples: Samples, indices: Iterable[list[int]], workers: int) -> Iterator[Batch]:
-    """Yield the batches of some indices on the device of a run."""
+    """Yield the batches of sample indices on the device of a run."""
     loader = DataLoader(
         _CaughtErrors(samples),  # pyright: ignore[reportArgumentType]
         batch_sampler=indices,
         collate_fn=_identity,
         num_workers=workers,
         persistent_workers=workers > 0,
-        generator=torch.Generator(),  # it draws a seed at the start, which a run that continues does once more
+        generator=torch.Generator(),  # a generator of its own: the loader draws a seed at each start
         multiprocessing_context="forkserver" if workers else None,
     )
     for batch in loader:
@@ -146,7 +146,7 @@ def _read_batches(run: RunFolder, samples: Samples, indices: Iterable[list[int]]
 
 
 class _CaughtErrors:
-    """Samples that return errors: raised in a worker process, an error would arrive as the text of a traceback."""
+    """Samples that return errors instead of raising: from a worker process an error would arrive as traceback text."""
 
     def __init__(self, samples: Samples) -> None:
         self._samples = samples
@@ -159,7 +159,7 @@ class _CaughtErrors:
             return self._samples.__getitems__(indices)
         except RobocasError as error:
             return error
-        except SystemExit as error:  # it would end a worker without a message
+        except SystemExit as error:  # would end a worker process without a message
             return exit_error(error, "samples of the dataset")
 
 

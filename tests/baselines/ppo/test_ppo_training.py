@@ -47,7 +47,7 @@ def test_after_ctrl_c_a_run_continues_with_the_whole_checkpoint(made_up, tmp_pat
     again, steps = load_file(run / "checkpoint.safetensors"), []
     assert kept.keys() == again.keys() and any(name.startswith("optimizer.") for name in kept)
     assert all(torch.equal(kept[name], again[name]) for name in kept)
-    train("ppo", None, run, progress=Progress(step=lambda done, of: steps.append(done)))
+    train("ppo", None, run, progress=Progress(on_step=lambda done, of: steps.append(done)))
     assert steps == list(range(640, 1281, 64))
     assert [int(row["step"]) for row in read_log(run, "train")] == list(range(64, 1281, 64))
     assert load_file(run / "weights.safetensors")["count"].item() == pytest.approx(1280, abs=1e-3)

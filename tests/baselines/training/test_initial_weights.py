@@ -1,4 +1,4 @@
-"""Settings and weights that a run starts or continues with, and what has to match."""
+"""Initial weights and settings of a run, and what must match when it continues."""
 
 import json
 import shutil
@@ -49,7 +49,7 @@ def test_facts_with_initial_weights(whole, facts, own, expected):
         (SIMULATION, {"observed": 40, "horizon": 200}, "observed: 30 -> 40"),
     ],
 )
-def test_other_inputs_are_refused(whole, facts, own, found):
+def test_initial_weights_with_other_inputs_are_refused(whole, facts, own, found):
     with pytest.raises(TrainingError) as caught:
         combine(whole, facts, own)
     assert caught.value.found.startswith(found)
@@ -57,7 +57,7 @@ def test_other_inputs_are_refused(whole, facts, own, found):
 
 
 @pytest.mark.parametrize("changes", [{"widht": 3}, {"train": {"steps": 0}}, {"width": "wide"}], ids=str)
-def test_wrong_options(made_up, data, tmp_path, changes):
+def test_invalid_options(made_up, data, tmp_path, changes):
     with pytest.raises(TrainingError):
         train("made-up", data, tmp_path / "run", changes)
     assert not (tmp_path / "run").exists()
@@ -74,7 +74,7 @@ def test_wrong_options(made_up, data, tmp_path, changes):
         (lambda run, data: (run / "checkpoint.safetensors").write_bytes(b"x"), "checkpoint.safetensors"),
     ],
 )
-def test_a_run_of_something_else_is_not_continued(whole, data, change, where):
+def test_a_run_with_other_data_or_settings_is_not_continued(whole, data, change, where):
     change(whole, data)
     with pytest.raises((TrainingError, OutputExistsError)) as error:
         train("made-up", data, whole)
@@ -82,45 +82,46 @@ def test_a_run_of_something_else_is_not_continued(whole, data, change, where):
     assert (whole / "weights.safetensors").is_file()
 
 
-def test_a_run_starts_from_weights_and_configuration_of_another(made_up, data, tmp_path):
+def test_initial_weights_and_configuration_come_from_another_run(made_up, data, tmp_path):
     first, second = tmp_path / "first", tmp_path / "second"
     train("made-up", data, first, {"width": 8, "train": {"steps": 8, "learning_rate": 0.002}})
     data.write_text("more")
-    record = train("made-up", data, second, {"train": {"steps": 1, "learning_rate": 1e-9, "ema": 0}}, start=first)
+    record = train("made-up", data, second, {"train": {"steps": 1, "learning_rate": 1e-9, "ema": 0}}, init_from=first)
     assert record.config["width"] == 8 and record.config["train"]["batch_size"] == 4  # the baseline's default
     before, after = (load_file(folder / "weights.safetensors") for folder in (first, second))
     assert all(torch.allclose(before[key], after[key], atol=1e-6) for key in before)
-    assert record.start.startswith("first, ")
-    abouts = [make_policy(str(folder)).describe() for folder in (first, second)]
-    assert abouts[1]["start"] == record.start and abouts[0]["weights"] != abouts[1]["weights"]
-    change_record(second, facts={"inputs": 3, "pictures": {"base_camera": [64, 48]}})
+    assert record.init_from.startswith("first, ")
+    descriptions = [make_policy(str(folder)).describe() for folder in (first, second)]
+    assert descriptions[1]["init_from"] == record.init_from
+    assert descriptions[0]["weights"] != descriptions[1]["weights"]
+    change_record(second, facts={"inputs": 3, "image_sizes": {"base_camera": [64, 48]}})
     for start, options in ((tmp_path, {}), (first, {"width": 5}), (second, {})):  # no run; other sizes; other images
         with pytest.raises(TrainingError):
-            train("made-up", data, tmp_path / "other", options, start=start)
+            train("made-up", data, tmp_path / "other", options, init_from=start)
     assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.parametrize("step", [3, 11])
-def test_a_run_that_started_from_weights_continues_with_the_same(whole, data, tmp_path, step):
+def test_a_run_with_initial_weights_continues_with_the_same_weights(whole, data, tmp_path, step):
     """At step 3 there is no checkpoint yet: the initial weights are needed again."""
     other = shutil.copytree(whole, tmp_path / "other")
     out, few = tmp_path / "next", {"train": {"steps": 12}}
     with pytest.raises(RuntimeError):
-        train("made-up", data, out, few, start=whole, progress=stop_at(step, RuntimeError("gone")))
+        train("made-up", data, out, few, init_from=whole, progress=stop_at(step, RuntimeError("gone")))
     if step == 3:
         with pytest.raises(TrainingError) as caught:
             train("made-up", data, out)
-        assert caught.value.where == out and "--start" in caught.value.fix
+        assert caught.value.where == out and "--init-from" in caught.value.fix
     for folder in (out, whole):
-        with pytest.raises(OutputExistsError, match="start: "):
-            train("made-up", data, folder, start=other)
-    train("made-up", data, out, start=whole)
+        with pytest.raises(OutputExistsError, match="init_from: "):
+            train("made-up", data, folder, init_from=other)
+    train("made-up", data, out, init_from=whole)
     train("made-up", data, out)
-    train("made-up", data, tmp_path / "unbroken", few, start=whole)
+    train("made-up", data, tmp_path / "unbroken", few, init_from=whole)
     assert_same(tmp_path / "unbroken", out)
 
 
-def test_an_option_that_is_newer_than_the_run_has_its_default(whole, data):
+def test_configuration_keys_newer_than_the_run_have_their_defaults(whole, data):
     config = json.loads((whole / "run.json").read_text())["config"]
     del config["width"]
     change_record(whole, config=config)
@@ -130,15 +131,15 @@ def test_an_option_that_is_newer_than_the_run_has_its_default(whole, data):
 @pytest.mark.parametrize(
     ("recorded", "changes"),
     [
-        ({"device": "cuda"}, ["from step 40 by device cpu"]),
-        ({"threads": 99}, ["from step 40 by threads {threads}"]),
+        ({"device": "cuda"}, ["from step 40: device cpu"]),
+        ({"threads": 99}, ["from step 40: threads {threads}"]),
         ({"threads": 0}, []),  # not known
     ],
 )
-def test_other_hardware_is_recorded(whole, data, recorded, changes):
+def test_hardware_changes_are_recorded(whole, data, recorded, changes):
     changes = [change.format(threads=torch.get_num_threads()) for change in changes]  # other tests change it
     change_record(whole, **recorded)
-    notes = []
-    train("made-up", data, whole, progress=Progress(note=notes.append))
-    assert json.loads((whole / "run.json").read_text())["resumed"] == changes
-    assert all(any(change in note for note in notes) for change in changes)
+    messages = []
+    train("made-up", data, whole, progress=Progress(message=messages.append))
+    assert json.loads((whole / "run.json").read_text())["hardware_changes"] == changes
+    assert all(any(change in message for message in messages) for change in changes)

@@ -35,7 +35,7 @@ def test_a_folder_is_its_arrays_and_sizes_of_images(tmp_path):
 
 
 def test_nothing_is_no_dataset(tmp_path):
-    with pytest.raises(TrainingError, match="no dataset here"):
+    with pytest.raises(TrainingError, match="no such dataset"):
         hash_dataset(tmp_path / "nowhere")
 
 

@@ -1,4 +1,4 @@
-"""Training runs: interrupted and continued to the bit, and refused if they are of something else."""
+"""Training runs: bit-identical continuation after interruptions, and refused folders."""
 
 import json
 import os
@@ -36,8 +36,8 @@ def test_files_of_a_run_and_its_policy(whole):
     assert {"torch", "numpy", "robocas-ms3"} <= record["versions"].keys()
     assert record["threads"] == torch.get_num_threads()
     assert {path.stat().st_mode & 0o777 for path in whole.glob("*.safetensors")} == {0o644}  # for everybody to read
-    about = make_policy(str(whole)).describe()
-    assert (about["baseline"], about["steps"], about["data"]["samples"]) == ("made-up", 40, 30)
+    description = make_policy(str(whole)).describe()
+    assert (description["baseline"], description["steps"], description["data"]["samples"]) == ("made-up", 40, 30)
 
 
 def test_metrics_of_a_run(whole):
@@ -55,12 +55,12 @@ def test_metrics_of_a_run(whole):
     ("step", "error", "continued_at"),
     [*((step, KeyboardInterrupt, step) for step in (17, 20)), (5, RuntimeError, 0), (31, RuntimeError, 30)],
 )
-def test_a_run_that_was_stopped_continues_to_the_bit(whole, data, tmp_path, step, error, continued_at):
-    """Ctrl-C loses nothing, a crash the steps after the last checkpoint."""
+def test_a_stopped_run_continues_bit_identically(whole, data, tmp_path, step, error, continued_at):
+    """Ctrl-C loses no step, a crash loses the steps after the last checkpoint."""
     out, steps = tmp_path / "again", []
     with pytest.raises(error):
         train("made-up", data, out, progress=stop_at(step, error("stopped")))
-    train("made-up", data, out, progress=Progress(step=lambda done, total: steps.append(done)))
+    train("made-up", data, out, progress=Progress(on_step=lambda done, total: steps.append(done)))
     assert steps[0] == continued_at
     assert_same(whole, out)
 
@@ -76,8 +76,8 @@ def test_weights_are_repaired_from_the_checkpoint(whole, data, damage):
 
 
 @pytest.mark.parametrize("room", [0, 4, 8, 16])
-def test_a_full_disk_is_an_error_and_loses_nothing(whole, data, small_disk, capsys, room):
-    """A real one, with room for so many kB: it is full at the record, the log, the curves or a checkpoint."""
+def test_a_full_disk_is_an_error_and_the_run_continues(whole, data, small_disk, capsys, room):
+    """On a real small disk with ``room`` kB: writing the record, log, curves or checkpoint fails."""
     out = small_disk / "run"
     words = ["train", "made-up", "--data", str(data), "--out", str(out), "--device", "cpu"]
     filler = small_disk / "filler"
@@ -112,7 +112,7 @@ def test_an_interrupted_validation_is_repeated(whole, data, tmp_path, monkeypatc
     assert_same(whole, tmp_path / "again")
 
 
-def test_a_finished_run_stays_as_it_is_and_seeds_differ(whole, data, tmp_path):
+def test_a_finished_run_is_unchanged_and_seeds_differ(whole, data, tmp_path):
     before = (whole / "weights.safetensors").read_bytes()
     train("made-up", data, whole)
     assert (whole / "weights.safetensors").read_bytes() == before
@@ -121,7 +121,7 @@ def test_a_finished_run_stays_as_it_is_and_seeds_differ(whole, data, tmp_path):
     assert not torch.equal(first["net.0.weight"], second["net.0.weight"])
 
 
-def test_no_such_baseline_and_no_data(made_up, data, tmp_path):
+def test_unknown_baseline_and_missing_data(made_up, data, tmp_path):
     with pytest.raises(TrainingError, match="small"):
         train("smal", data, tmp_path / "run")
     with pytest.raises(TrainingError) as caught:
@@ -131,8 +131,8 @@ def test_no_such_baseline_and_no_data(made_up, data, tmp_path):
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_a_folder_of_something_else_is_refused(made_up, data, tmp_path, overwrite):
-    """Such as notes, and the log of another trainer."""
+def test_a_folder_with_other_files_is_refused(made_up, data, tmp_path, overwrite):
+    """For example notes, and the log of another trainer."""
     out = tmp_path / "mine"
     out.mkdir()
     (out / ".draft.tmp.txt").write_text("mine")
@@ -152,10 +152,10 @@ def test_overwrite_starts_again(whole, data):
     "changes", [{"broken_at": 7}, {"steep_at": 7}, {"steep_at": 7, "train": {"clip_norm": 0.0}}], ids=str
 )
 def test_a_nan_ends_the_run_and_the_last_checkpoint_stays(made_up, data, tmp_path, changes):
-    """Of the loss, or of the gradient alone."""
+    """A NaN in the loss, or in the gradient alone."""
     out, done = tmp_path / "run", []
     changes = merge_configs(changes, {"train": {"save_every": 1}})
-    progress = Progress(step=lambda step, _: done.append(step))
+    progress = Progress(on_step=lambda step, _: done.append(step))
     with pytest.raises(TrainingError):
         train("made-up", data, out, changes, progress=progress)
     assert_finite(out)
@@ -165,7 +165,7 @@ def test_a_nan_ends_the_run_and_the_last_checkpoint_stays(made_up, data, tmp_pat
 
 
 def test_an_unchecked_nan_is_not_saved(made_up, data, tmp_path, monkeypatch):
-    """As on a GPU, where steps are not waited for, and without lines of the log, which end the run."""
+    """As on a GPU, where values are checked late, and without log lines, which would end the run."""
     monkeypatch.setattr(Learner, "check_finite", lambda self, step, **values: None)
     changes = {"steep_at": 7, "train": {"save_every": 1, "log_every": 100, "validate_every": 100}}
     train("made-up", data, tmp_path / "run", changes)
@@ -185,7 +185,7 @@ def test_a_removed_folder_is_an_error(made_up, data, tmp_path, monkeypatch):
         save(path, *what)
 
     with pytest.raises(RobocasError) as caught:
-        train("made-up", data, out, progress=Progress(step=remove))
+        train("made-up", data, out, progress=Progress(on_step=remove))
     assert caught.value.where == out
     monkeypatch.setattr(checkpoints, "save", remove_and_save)
     with pytest.raises(RobocasError) as caught:
@@ -193,7 +193,7 @@ def test_a_removed_folder_is_an_error(made_up, data, tmp_path, monkeypatch):
     assert caught.value.where == out
 
 
-def test_a_baseline_can_not_end_the_process(made_up, data, tmp_path):
+def test_a_baseline_cannot_end_the_process(made_up, data, tmp_path):
     made_up(model=lambda config, facts: sys.exit(0))
     with pytest.raises(ExtensionError) as caught:
         train("made-up", data, tmp_path / "run")
@@ -219,14 +219,14 @@ def test_a_validation_split_may_be_empty_but_not_damaged(made_up, data, tmp_path
         train("made-up", data, tmp_path / "other")
 
 
-def test_processes_share_a_batch_evenly(made_up, data, tmp_path, monkeypatch):
+def test_batch_size_must_be_a_multiple_of_the_processes(made_up, data, tmp_path, monkeypatch):
     monkeypatch.setattr(run_folder, "make_accelerator", lambda *_: SimpleNamespace(num_processes=3))
     with pytest.raises(TrainingError) as caught:
         train("made-up", data, tmp_path / "run")
     assert caught.value.where == "train.batch_size"
 
 
-def test_an_error_of_a_worker_is_that_of_the_samples(made_up, data, tmp_path):
+def test_worker_processes_report_errors_of_the_samples(made_up, data, tmp_path):
     with pytest.raises(DatasetError) as caught:
         train("made-up", data, tmp_path / "run", {"damaged_at": 7, "train": {"workers": 1}})
     assert caught.value.where == "sample 7"
@@ -243,7 +243,7 @@ def test_an_error_of_a_worker_is_that_of_the_samples(made_up, data, tmp_path):
         (lambda run: (run / "run.json").write_text('{"protocol_hash": 1}'), "run.json"),
     ],
 )
-def test_a_run_that_is_no_policy(whole, change, where):
+def test_invalid_runs_are_not_policies(whole, change, where):
     change(whole)
     with pytest.raises(TrainingError) as caught:
         make_policy(str(whole))
@@ -252,7 +252,7 @@ def test_a_run_that_is_no_policy(whole, change, where):
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory):
-    """Runs of two processes, see `stub_baseline`, and their data."""
+    """Return a folder with runs of two processes (`stub_baseline`) and their data."""
     out = tmp_path_factory.mktemp("shared")
     (out / "data.h5").write_text("demonstrations")
     with socket.socket() as free:
@@ -282,14 +282,14 @@ def test_each_process_continues_with_its_own_random_state(shared):
 
 
 @pytest.mark.slow
-def test_a_run_continues_in_as_many_processes(made_up, shared):
+def test_a_run_continues_with_the_same_number_of_processes(made_up, shared):
     with pytest.raises(TrainingError, match="num_processes 2"):
         train("made-up", shared / "data.h5", shared / "whole")
 
 
 @pytest.mark.parametrize("name", devices_check.CHANGES)
-def test_a_real_network_in_bf16_continues_to_the_bit_and_acts(folder, tmp_path, name):
-    """With all that is random: crops, shifts, light and dropout; as tests/gpu checks it on a GPU."""
+def test_a_real_network_in_bf16_continues_bit_identically_and_acts(folder, tmp_path, name):
+    """With all random augmentations and dropout; tests/gpu runs the same check on a GPU."""
     devices_check.check(folder, tmp_path, name, "bf16", "cpu")
     config = json.loads((tmp_path / "run" / "run.json").read_text())["config"]
     train(name, folder, tmp_path / "whole", config)

@@ -1,0 +1,132 @@
+"""Scenes of a run's training data, and their differences from the task configurations of an evaluation."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.core.errors import ConfigError
+from robocas_ms3.core.strict_model import StrictModel
+from robocas_ms3.datasets.sources.episode_source import EpisodeSource
+from robocas_ms3.scenes.config import TaskConfig, load_task_config
+from robocas_ms3.scenes.lookup import find_objects
+
+_NOT_SCENE = {"task", "description", "target", "language", "objects"}
+"""Keys of a task configuration that do not change the scene; objects are compared by their ids."""
+_MAX_NAMES = 5  # that a message lists
+
+
+class TrainingScenes(StrictModel):
+    """Scenes of the training data of a run; an empty field is not known.
+
+    Attributes:
+        tasks: short names of the tasks.
+        objects: asset ids of the objects.
+        configs: scene settings by the name of a task configuration, see `scene_settings`.
+    """
+
+    tasks: list[str] = []
+    objects: list[str] = []
+    configs: dict[str, dict[str, Any]] = {}
+
+    def differences(self, configs: Mapping[str, TaskConfig], cameras: Collection[str]) -> list[str]:
+        """Return what task configurations have that the training data lacks, as phrases; empty: nothing.
+
+        Args:
+            configs: task configurations by name.
+            cameras: cameras that the policy uses; settings of other cameras do not count.
+        """
+        settings, objects = set[str](), set[str]()
+        trained = [_select_cameras(values, cameras) for values in self.configs.values()]
+        for config in configs.values():
+            values = scene_settings(config, cameras)
+            changes = [{key for key in {*values, *known} if values.get(key) != known.get(key)} for known in trained]
+            settings |= min(changes, key=len, default=set())
+            objects |= _object_ids(config) if self.objects else set()
+        camera_settings = {key for key in settings if "camera" in key}
+        tasks = {config.task for config in configs.values()} if self.tasks else set()
+        found = {
+            "task": tasks - set(self.tasks),
+            "scene settings": settings - camera_settings,
+            "objects": objects - set(self.objects),
+            "cameras": {key.removeprefix("cameras.") for key in camera_settings},
+        }
+        return [f"{kind} {_join(names)}" for kind, names in found.items() if names]
+
+    def summary(self) -> str:
+        """Return one line with the tasks, configurations and objects."""
+        parts = {"": self.tasks, "in ": list(self.configs), "objects ": self.objects}
+        return ", ".join(f"{word}{_join(names)}" for word, names in parts.items() if names)
+
+
+def read_training_scenes(source: EpisodeSource, numbers: Iterable[int]) -> TrainingScenes:
+    """Read the scenes of episodes from their ``scene.json``; fields stay empty where it lacks them."""
+    tasks, objects, configs, known = set[str](), set[str](), dict[str, dict[str, Any]](), set[str]()
+    for number in numbers:
+        scene = source.episode(number).scene
+        if isinstance(task := scene.get("task"), str):
+            tasks.add(task)
+        objects |= {str(one["id"]) for one in scene.get("objects") or () if isinstance(one, Mapping) and one.get("id")}
+        config = scene.get("config")
+        if not isinstance(config, Mapping) or (text := json.dumps(config, sort_keys=True)) in known:
+            continue
+        known.add(text)
+        try:
+            settings = scene_settings(load_task_config(dict(config)))
+        except ConfigError:  # written by a version with other keys
+            continue
+        if settings not in configs.values():
+            configs[_config_name(scene, configs)] = settings
+    return TrainingScenes(tasks=sorted(tasks), objects=sorted(objects), configs=configs)
+
+
+def scene_settings(config: TaskConfig, cameras: Collection[str] | None = None) -> dict[str, Any]:
+    """Return the values of a task configuration that change what a policy observes, or where it acts.
+
+    Keys are those of the configuration, ``randomisation.KEY``, ``objects.count``, and ``cameras.NAME`` or
+    ``static_camera`` of the named cameras (None: all).
+    """
+    values = config.model_dump(mode="json")
+    nested = {"randomisation": values.pop("randomisation"), "cameras": values.pop("cameras", {})}
+    settings = {key: value for key, value in values.items() if key not in _NOT_SCENE}
+    settings |= {f"{key}.{name}": value for key, part in nested.items() for name, value in part.items() if value}
+    settings["objects.count"] = config.objects.count
+    return settings if cameras is None else _select_cameras(settings, cameras)
+
+
+def _select_cameras(settings: Mapping[str, Any], cameras: Collection[str]) -> dict[str, Any]:
+    """Leave out the settings of cameras that are not named; no camera: also their random poses and the lights."""
+    unused = {"static_camera"} - set(cameras)
+    if not cameras:
+        unused |= {"lights", "room", "randomisation.lights", "randomisation.room", "randomisation.finishes"}
+        unused |= {"randomisation.cameras"}
+    return {
+        key: value
+        for key, value in settings.items()
+        if key not in unused and (not key.startswith("cameras.") or key.removeprefix("cameras.") in cameras)
+    }
+
+
+def _object_ids(config: TaskConfig) -> set[str]:
+    """Return the asset ids of the objects of a configuration; as they are written, if the pack is not installed."""
+    try:
+        return set(find_objects(load_pack("builtin"), config))
+    except ConfigError:  # ids of another pack
+        return set() if config.objects.ids == "all" else {str(name) for name in config.objects.ids}
+
+
+def _config_name(scene: Mapping[str, Any], known: Collection[str]) -> str:
+    info = scene.get("env_info")
+    kwargs = info.get("env_kwargs") if isinstance(info, Mapping) else None
+    given = kwargs.get("config") if isinstance(kwargs, Mapping) else None
+    name = Path(given).stem if isinstance(given, str) else "configuration"
+    return name if name not in known else f"{name}-{len(known) + 1}"
+
+
+def _join(names: Collection[str]) -> str:
+    ordered = sorted(names)
+    more = len(ordered) - _MAX_NAMES
+    return ", ".join(ordered[:_MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
