@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from asset_tools.quality.hulls import hull_quality, volume_iou
 from asset_tools.solids import to_mesh, to_solid
-from robocas_ms3.assets.cooked_hulls import OBLONG, SHRINKAGE, cook_hulls
+from robocas_ms3.assets.cooked_hulls import MAX_SHRINKAGE, MAX_SLENDERNESS, cook_hulls
 from robocas_ms3.assets.hulls import center_of_mass, find_box, slenderness
 from robocas_ms3.assets.physics import cook
 from robocas_ms3.core.errors import AssetError
@@ -36,7 +36,7 @@ BOX = 8  # vertices: as few are left as they are
 TRIES = 8  # mergers in a row that are too much
 LOST_OVERLAP = 0.02  # that merging the hulls of a hollow thing may cost
 SLIVER = 1e-4  # of the body's volume: parts below it are left out
-SLENDER = 0.95 * OBLONG  # slenderness that hulls are thickened to
+SLENDER = 0.95 * MAX_SLENDERNESS  # slenderness that hulls are thickened to
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def for_engine(points: Array) -> Array:
         local[:, thin] *= max(excess, 1.01)
         points = center + local @ axes
     try:
-        if cook_hulls([points])[0].lost > SHRINKAGE:
+        if cook_hulls([points])[0].shrinkage > MAX_SHRINKAGE:
             points = np.array(cook(points, physx.PhysxMaterial(1, 1, 0)).vertices, dtype=float)
     except RuntimeError:
         to_box, extents = trimesh.bounds.oriented_bounds(points)

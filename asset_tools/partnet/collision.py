@@ -13,7 +13,7 @@ from shapely.geometry import MultiPolygon, Polygon
 
 from asset_tools.decompose import few_vertices
 from asset_tools.repair import close
-from robocas_ms3.assets.cooked_hulls import OBLONG
+from robocas_ms3.assets.cooked_hulls import MAX_SLENDERNESS
 from robocas_ms3.assets.hulls import find_box, slenderness
 from robocas_ms3.core.errors import AssetError
 
@@ -29,7 +29,7 @@ FLAT = 0.0005  # m
 LEVEL = 0.9  # of a normal's z
 FILLED = 0.1  # share of the surface that closing may add; more is a lid on something open
 LARGEST_FACETS = 40  # of an open shell
-SLENDER = 0.95 * OBLONG
+SLENDER = 0.95 * MAX_SLENDERNESS
 MOST = 40  # pieces of a link
 SAMPLES = 300
 DENSE = 1000  # triangles: of carved work; distances from more are measured to points on it

@@ -1,4 +1,4 @@
-"""Resting poses, grasps and surface points of an object: ``annotations.npz``. Metres, the asset's frame."""
+"""Resting poses, grasps and surface points of an object (``annotations.npz``) in the asset's frame, in metres."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from robocas_ms3.assets.hulls import Array
 from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, open_arrays
 from robocas_ms3.core.errors import AssetError
 
-# The open gripper that grasps are annotated for, in the TCP frame (z approach, y closing), one half of it (the other is
-# mirrored at y = 0): low and high corner, m. Upstream uses fingers 0.04..0.045 x +-0.01 x -0.09..0 and a palm +-0.1 x
-# +-0.02 x -0.18..-0.09. These are the same parts of the Panda with 3 cm longer fingers: pads reach 8 mm beyond the TCP;
-# knuckles and hand are wider and lower than upstream's.
+# One half of the open gripper of the annotated grasps in the TCP frame (z approach, y closing); the other half is
+# mirrored at y = 0. Boxes: low and high corner, m. RoboCAS-v0 uses fingers 0.04..0.045 x +-0.01 x -0.09..0 and a palm
+# +-0.1 x +-0.02 x -0.18..-0.09. Here the boxes fit the Panda with 3 cm longer fingers: the pads end 8 mm beyond the
+# TCP, and knuckles and hand are wider and lower.
 GRIPPER_BOXES = np.array(
     [
         ((-0.010, 0.040, -0.040), (0.010, 0.046, 0.0085)),  # tip
@@ -24,25 +24,25 @@ GRIPPER_BOXES = np.array(
         ((-0.033, 0.000, -0.180), (0.033, 0.104, -0.067)),  # palm
     ]
 )
-GRIPPER_RADIUS = 0.22  # m from the TCP, holds all boxes
+GRIPPER_RADIUS = 0.22  # m, radius of a sphere around the TCP that contains all boxes
 
 
 @dataclass(frozen=True)
 class Annotations:
-    """Annotations of an object. S stable poses, G grasps, P surface points; metres, asset frame.
+    """Annotations of an object: S resting poses, G grasps, P surface points; metres, asset frame.
 
     Attributes:
-        resting_poses: (S, 4, 4) ``T_plane_object``: the object's frame in a frame whose z = 0 is the plane it rests
-            on, its centre of mass at x = y = 0.
-        footprints: (S, K, 2) what the object covers of that plane in each pose: convex polygons, counter-clockwise
-            around the centre of mass, their last corner repeated to make up K.
-        resting_probabilities: (S,) share of random drops that end in each pose; they sum to 1.
-        display_pose: index of the pose in which the object stands upright, or -1.
-        grasps_tcp_in_object: (G, 4, 4) TCP poses, z approach, y closing, origin midway between the finger tips.
-        grasp_widths: (G,) finger opening the object needs, m.
-        grasp_qualities: (G,) lowest friction coefficient that closes the grasp; smaller is better.
+        resting_poses: (S, 4, 4) ``T_plane_object``: pose of the object in a frame whose plane z = 0 supports it, with
+            its centre of mass at x = y = 0.
+        footprints: (S, K, 2) convex polygon of the covered plane in each pose, counter-clockwise, relative to the
+            centre of mass; the last corner is repeated up to K corners.
+        resting_probabilities: (S,) fraction of random drops that end in each pose; the sum is 1.
+        display_pose: index of the upright pose, or -1.
+        grasps_tcp_in_object: (G, 4, 4) TCP poses: z approach, y closing, origin between the finger tips.
+        grasp_widths: (G,) required finger opening, m.
+        grasp_qualities: (G,) smallest friction coefficient for force closure; smaller is better.
         surface_points: (P, 3) points on the visual mesh.
-        surface_normals: (P, 3) their outward unit normals.
+        surface_normals: (P, 3) outward unit normals of the points.
     """
 
     resting_poses: Array
@@ -72,7 +72,12 @@ class Annotations:
             if found.shape != shape or not np.isfinite(found).all():
                 raise AssetError("wrong shape or non-finite numbers", where=name, expected=shape, found=found.shape)
         if poses == 0 or not -1 <= self.display_pose < poses:
-            raise AssetError("no such resting pose", where="display_pose", found=f"{self.display_pose} of {poses}")
+            raise AssetError(
+                "index of a resting pose out of range",
+                where="display_pose",
+                expected=f"-1 to {poses - 1}",
+                found=self.display_pose,
+            )
 
     def save(self, path: Path) -> None:
         arrays: dict[str, Any] = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
@@ -91,16 +96,16 @@ class Annotations:
             return cls(**{**arrays, "display_pose": int(arrays["display_pose"])})
         except (*DAMAGED_FILE_ERRORS, AssetError, KeyError) as error:
             fix = "Make the pack again."
-            raise AssetError("can't read the annotations", where=path, found=error, fix=fix) from error
+            raise AssetError("cannot read the annotations", where=path, found=error, fix=fix) from error
 
     def footprint(self, pose_index: int) -> Array:
-        """Return the polygon (K, 2) that the object covers in a resting pose, each corner once, m."""
+        """Return the footprint polygon (K, 2) of a resting pose in m, without repeated corners."""
         corners = self.footprints[pose_index]
         return corners[~np.all(corners == np.roll(corners, 1, axis=0), axis=1)]
 
 
 def compute_footprints(hulls: list[Array], poses: Array) -> Array:
-    """Return what convex hulls, vertices (V, 3), cover of the plane in resting poses (S, 4, 4); see `Annotations`."""
+    """Return the footprints of convex hulls (V, 3) in resting poses (S, 4, 4); see `Annotations`."""
     points = np.concatenate(hulls)
     polygons = []
     for pose in poses:

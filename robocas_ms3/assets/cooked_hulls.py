@@ -1,7 +1,7 @@
-"""Check what PhysX makes of convex hulls, on a CPU and for a GPU.
+"""Check the convex hulls that PhysX builds ("cooks") for CPU and GPU.
 
-PhysX "cooks" hulls: it leaves out detail of up to 0.7 mm, and for a GPU whatever goes beyond 64 vertices or 64 faces,
-which can shrink a hull by millimetres without a warning.
+PhysX omits details up to 0.7 mm, and limits hulls for a GPU to 64 vertices and 64 faces. This can shrink a hull by
+millimetres without a warning.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from robocas_ms3.assets.physics import cook
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 
-SHRINKAGE = 0.0015  # m that a hull may lose anywhere: PhysX merges vertices and faces within 0.7 mm each
-OBLONG = 100  # slenderness from which on PhysX makes no hull for a GPU
+MAX_SHRINKAGE = 0.0015  # m; PhysX merges vertices and faces within 0.7 mm
+MAX_SLENDERNESS = 100  # PhysX builds no hull for a GPU at or above this value
 
 
 @dataclass(frozen=True)
@@ -30,42 +30,42 @@ class CookedHull:
     """Result of cooking a hull.
 
     Attributes:
-        lost: m, distance of its farthest vertex from the cooked hull; infinite: the engine made none.
-        oblong: whether it is too slender for a GPU.
+        shrinkage: m, distance of the farthest vertex from the cooked hull; infinite: the engine built no hull.
+        too_slender: whether the hull is too slender for a GPU.
     """
 
-    lost: float
-    oblong: bool
+    shrinkage: float
+    too_slender: bool
 
 
 @dataclass(frozen=True)
 class HullViolation:
-    """A hull that is smaller once cooked.
+    """A hull that PhysX shrinks or cannot build.
 
     Attributes:
-        asset: its folder in the pack; of a moving part ``<furniture>/links/<link>``.
-        hull: its number in the file, from 0 on.
-        way: ``CPU`` or ``GPU``.
-        cooked: the result.
+        asset: folder of the asset in the pack; ``<furniture>/links/<link>`` for a moving part.
+        hull: index of the hull in the file.
+        device: ``CPU`` or ``GPU``.
+        cooked: result of cooking the hull.
     """
 
     asset: str
     hull: int
-    way: str
+    device: str
     cooked: CookedHull
 
     def __str__(self) -> str:
-        if not np.isfinite(self.cooked.lost):
-            what = "can't be built"
-        elif self.cooked.oblong:
+        if not np.isfinite(self.cooked.shrinkage):
+            what = "cannot be built"
+        elif self.cooked.too_slender:
             what = "is too slender"
         else:
-            what = f"shrinks by {1e3 * self.cooked.lost:.1f} mm"
-        return f"{self.asset}: hull {self.hull} {what} on a {self.way}"
+            what = f"shrinks by {1e3 * self.cooked.shrinkage:.1f} mm"
+        return f"{self.asset}: hull {self.hull} {what} on a {self.device}"
 
 
 def find_hull_violations(folder: Path) -> list[HullViolation]:
-    """Cook all hulls in a pack's folder, but boxes, for CPU and GPU; return those that shrink or can't be built."""
+    """Cook all hulls of a pack's folder except boxes; return hulls that shrink or cannot be built on CPU or GPU."""
     named: list[tuple[str, int, Array]] = []
     for path in sorted(folder.rglob(HULLS)):
         name = path.parent.relative_to(folder).as_posix()
@@ -75,36 +75,41 @@ def find_hull_violations(folder: Path) -> list[HullViolation]:
         return []
     pieces = [vertices for _, _, vertices in named]
 
-    def raise_crash(task: object, why: str) -> NoReturn:
-        raise AssetError("the process that cooked its hulls died", where=folder, found=why, fix="Is memory short?")
+    def raise_crash(task: object, reason: str) -> NoReturn:
+        raise AssetError(
+            "the process that cooked the hulls crashed",
+            where=folder,
+            found=reason,
+            fix="Free some memory and try again.",
+        )
 
-    with WorkerPool(_as_a_gpu_does, 1, on_crash=raise_crash) as pool:
+    with WorkerPool(_make_gpu_worker, 1, on_crash=raise_crash) as pool:
         on_gpu = pool.run(pieces)
-    ways = {"GPU": on_gpu, "CPU": cook_hulls(pieces)}
+    by_device = {"GPU": on_gpu, "CPU": cook_hulls(pieces)}
     return [
-        HullViolation(name, number, way, result)
-        for way, results in ways.items()
+        HullViolation(name, number, device, result)
+        for device, results in by_device.items()
         for (name, number, _), result in zip(named, results, strict=True)
-        if result.lost > SHRINKAGE or (result.oblong and way == "GPU")
+        if result.shrinkage > MAX_SHRINKAGE or (result.too_slender and device == "GPU")
     ]
 
 
 def cook_hulls(hulls: Sequence[Array]) -> list[CookedHull]:
-    """Cook convex hulls of points (V, 3) with the engine's settings of this process."""
+    """Cook convex hulls of points (V, 3) with the engine settings of this process."""
     material = physx.PhysxMaterial(0.5, 0.5, 0.0)
     results = []
     for vertices in hulls:
         try:
             shape = cook(vertices, material)
         except RuntimeError:
-            results.append(CookedHull(np.inf, oblong=False))
+            results.append(CookedHull(np.inf, too_slender=False))
             continue
         planes = ConvexHull(shape.vertices).equations
-        lost = max(0.0, float((vertices @ planes[:, :3].T + planes[:, 3]).max()))
-        results.append(CookedHull(lost, oblong=slenderness(vertices) >= OBLONG))
+        shrinkage = max(0.0, float((vertices @ planes[:, :3].T + planes[:, 3]).max()))
+        results.append(CookedHull(shrinkage, too_slender=slenderness(vertices) >= MAX_SLENDERNESS))
     return results
 
 
-def _as_a_gpu_does() -> FunctionWorker[Sequence[Array], list[CookedHull]]:
+def _make_gpu_worker() -> FunctionWorker[Sequence[Array], list[CookedHull]]:
     physx._enable_gpu()
     return FunctionWorker(cook_hulls)

@@ -1,4 +1,4 @@
-"""Convex hulls of an asset: the ``hulls.obj`` file, and geometry of hulls. Metres, the asset's frame."""
+"""Read, write and sample the convex hulls of an asset (``hulls.obj``) in the asset's frame, in metres."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from robocas_ms3.core.text import format_count
 
 Array = NDArray[np.float64]
 
-_LIMIT = 2**26  # bytes of a file: hulls of 64 vertices have 5 kB each
-_HIDDEN_DEPTH = 0.0005  # m; points of one hull that are deeper in another are hidden
-_SQUARE = 1e-5  # m that corners of a box may be off: files round to a ten thousandth of a millimetre
+_LIMIT = 2**26  # bytes of a file; a hull of 64 vertices has 5 kB
+_HIDDEN_DEPTH = 0.0005  # m; points deeper inside another hull are not on the surface of the union
+_BOX_TOLERANCE = 1e-5  # m; files round to 1e-7 m
 
 
 @dataclass(frozen=True)
 class Hull:
-    """A convex hull: vertices (V, 3), m, and faces (F, 3), indices of vertices."""
+    """A convex hull: vertices (V, 3) in m, and faces (F, 3) as vertex indices."""
 
     vertices: Array
     faces: NDArray[np.int64]
@@ -32,14 +32,14 @@ class Hull:
 
 @dataclass(frozen=True)
 class Box:
-    """A box: half its size (3,), m, and the pose (4, 4) of its centre and axes in the frame of the hull."""
+    """A box: half sizes (3,) in m, and the pose (4, 4) of its centre and axes in the hull's frame."""
 
     half_size: Array
     pose: Array
 
 
 def read_hulls(path: Path) -> list[Hull]:
-    """Read ``hulls.obj``: an ``o`` group per hull, triangles only."""
+    """Read ``hulls.obj``, which has one ``o`` group of triangles per hull."""
     vertices: list[list[float]] = []
     groups: list[list[list[int]]] = []
     try:
@@ -62,14 +62,14 @@ def read_hulls(path: Path) -> list[Hull]:
             raise ValueError("NaN or infinity")
     except (OSError, ValueError, IndexError, OverflowError) as error:
         fix = "Make the pack again."
-        raise AssetError("can't read the convex hulls", where=path, found=str(error), fix=fix) from error
+        raise AssetError("cannot read the convex hulls", where=path, found=str(error), fix=fix) from error
     if not hulls or any(len(hull.faces) < 4 for hull in hulls):
         raise AssetError("no convex hull in the file", where=path, fix="Make the pack again.")
     return hulls
 
 
 def write_hulls(path: Path, hulls: Sequence[Array]) -> None:
-    """Write the convex hulls of points (V, 3) as ``hulls.obj``, an ``o`` group per hull, faces turned outwards."""
+    """Write convex hulls of points (V, 3) to ``hulls.obj``, one ``o`` group per hull, with outward faces."""
     lines, offset = [], 1
     for number, points in enumerate(hulls):
         vertices, faces = convex_faces(points)
@@ -86,7 +86,7 @@ def convex_faces(points: Array) -> tuple[Array, NDArray[np.int64]]:
         hull = ConvexHull(points)
     except (QhullError, ValueError) as error:
         raise AssetError(
-            "the points of a convex hull lie in a plane", found=format_count(len(points), "point")
+            "the points of a convex hull are coplanar", found=format_count(len(points), "point")
         ) from error
     used, local = np.unique(hull.simplices, return_inverse=True)
     vertices, faces = np.asarray(points, dtype=np.float64)[used], local.reshape(-1, 3)
@@ -98,16 +98,16 @@ def convex_faces(points: Array) -> tuple[Array, NDArray[np.int64]]:
 
 
 def find_box(vertices: Array) -> Box | None:
-    """Return the box of which points (8, 3) are the corners, however it is turned; None if they are not a box's.
+    """Return the box with these corners (8, 3) in any orientation, or None if they do not form a box.
 
-    Order and signs of its axes turn it least: a box along x, y and z has no rotation.
+    Order and signs of the axes are chosen for the smallest rotation: an axis-aligned box has no rotation.
     """
     if len(vertices) != 8:
         return None
     return _box_of(np.ascontiguousarray(vertices, dtype=np.float64).tobytes())
 
 
-@lru_cache(maxsize=4096)  # the same furniture is built again and again
+@lru_cache(maxsize=4096)  # the same furniture is built many times
 def _box_of(corners: bytes) -> Box | None:
     vertices = np.frombuffer(corners).reshape(8, 3)
     center = vertices.mean(axis=0)
@@ -118,25 +118,25 @@ def _box_of(corners: bytes) -> Box | None:
     edges = edges[order] * np.where(np.diagonal(edges[order]) < 0, -1.0, 1.0)[:, None]
     if np.linalg.det(edges) < 0:
         edges[2] *= -1
-    # the rotation nearest to the edges as they are: the longest say most
+    # rotation that fits the edges best, weighted by their lengths
     left, _, right = np.linalg.svd(edges.T)
     axes = left @ right
     half = np.linalg.norm(edges, axis=1) / 2
     signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
-    ought = center + (signs * half) @ axes.T
-    apart = np.linalg.norm(vertices[:, None] - ought, axis=2)
-    if max(apart.min(axis=0).max(), apart.min(axis=1).max()) > _SQUARE:
+    expected = center + (signs * half) @ axes.T
+    distances = np.linalg.norm(vertices[:, None] - expected, axis=2)
+    if max(distances.min(axis=0).max(), distances.min(axis=1).max()) > _BOX_TOLERANCE:
         return None
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = axes, center
     return Box(_frozen(half), _frozen(pose))
 
 
-def _edges(ways: Array) -> Array | None:
-    """Return the three edges (3, 3) of a box at a corner, given the ways (7, 3) from there to the other corners."""
+def _edges(vectors: Array) -> Array | None:
+    """Return the three edges (3, 3) of a box at a corner from the vectors (7, 3) to the other corners, or None."""
     found: list[Array] = []
-    for way in ways[np.argsort(np.linalg.norm(ways, axis=1), kind="stable")]:
-        if all(abs(way @ edge) <= _SQUARE * np.linalg.norm(way) for edge in found):
+    for way in vectors[np.argsort(np.linalg.norm(vectors, axis=1), kind="stable")]:
+        if all(abs(way @ edge) <= _BOX_TOLERANCE * np.linalg.norm(way) for edge in found):
             found.append(way)
     return np.stack(found) if len(found) == 3 else None
 
@@ -157,7 +157,7 @@ def center_of_mass(points: Array) -> Array:
 
 
 def sample_surface(hulls: Sequence[Hull], spacing: float) -> Array:
-    """Return points (P, 3) on the surface of the union of hulls, about ``spacing`` m apart, the same on every call."""
+    """Return points (P, 3) on the surface of the union of hulls, about ``spacing`` m apart; deterministic."""
     equations = [ConvexHull(hull.vertices).equations for hull in hulls]
     kept = []
     for index, hull in enumerate(hulls):
@@ -166,7 +166,7 @@ def sample_surface(hulls: Sequence[Hull], spacing: float) -> Array:
             if other == index:
                 continue
             low, high = hulls[other].vertices.min(axis=0), hulls[other].vertices.max(axis=0)
-            close = np.flatnonzero(np.all((points >= low) & (points <= high), axis=1))  # the others can't be inside
+            close = np.flatnonzero(np.all((points >= low) & (points <= high), axis=1))  # only these can be inside
             if len(close):
                 depth = np.max(points[close] @ planes[:, :3].T + planes[:, 3], axis=1)
                 points = np.delete(points, close[depth <= -_HIDDEN_DEPTH], axis=0)
@@ -175,7 +175,7 @@ def sample_surface(hulls: Sequence[Hull], spacing: float) -> Array:
 
 
 def sample_triangles(corners: Array, spacing: float) -> Array:
-    """Return points (P, 3) of grids on triangles (F, 3, 3), at most ``spacing`` apart, corners and edges included."""
+    """Return grid points (P, 3) on triangles (F, 3, 3), at most ``spacing`` m apart, including edges and corners."""
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
     longest = np.argmax(lengths, axis=1)
     rows = np.arange(len(corners))
@@ -193,10 +193,10 @@ def sample_triangles(corners: Array, spacing: float) -> Array:
 
 
 def thin_points(points: Array, spacing: float) -> Array:
-    """Keep one point (P, 3) per cube of edge ``spacing / 2``: the first one given."""
+    """Keep the first of the points (P, 3) in each cube with edges of ``spacing / 2``."""
     cells = np.floor(points / (spacing / 2) + 0.25).astype(np.int64)
     low, high = cells.min(axis=0), cells.max(axis=0)
-    key = np.ravel_multi_index(tuple((cells - low).T), tuple(high - low + 1))  # one number a cell sorts faster
+    key = np.ravel_multi_index(tuple((cells - low).T), tuple(high - low + 1))  # one number per cell sorts faster
     first = np.unique(key, return_index=True)[1]
     return points[np.sort(first)]
 

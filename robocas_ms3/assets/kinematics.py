@@ -1,4 +1,4 @@
-"""Forward kinematics of furniture."""
+"""Compute forward kinematics of furniture."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 def joint_motion(joint: Joint, position: float) -> Array:
-    """Return 4x4 by which a joint at a position (m or rad) moves its link from its pose at 0, furniture's frame."""
+    """Return the motion (4, 4) of a link from joint position 0 to ``position`` (m or rad) in the furniture's frame."""
     motion = np.eye(4)
     if joint.kind == "prismatic":
         motion[:3, 3] = np.multiply(joint.axis, position)
@@ -25,7 +25,7 @@ def joint_motion(joint: Joint, position: float) -> Array:
 
 
 def link_poses(links: Sequence[Link], positions: Mapping[str, float]) -> dict[str, Array]:
-    """Return poses 4x4 of links, parents first, in the furniture's frame; joints that are not named are at 0."""
+    """Return the poses (4, 4) of links, listed parents first, in the furniture's frame; missing joints are at 0."""
     poses: dict[str, Array] = {}
     for link in links:
         above = poses[link.parent] if link.parent else np.eye(4)
@@ -34,7 +34,7 @@ def link_poses(links: Sequence[Link], positions: Mapping[str, float]) -> dict[st
 
 
 def joint_frame(joint: Joint) -> Array:
-    """Return 4x4 of a frame at the joint's origin whose x is its axis, in the furniture's frame."""
+    """Return the pose (4, 4) of a frame at the joint's origin with x along its axis, in the furniture's frame."""
     x = np.asarray(joint.axis, dtype=float)
     x = x / np.linalg.norm(x)
     y = np.cross(x, np.eye(3)[np.argmin(np.abs(x))])

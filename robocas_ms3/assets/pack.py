@@ -1,4 +1,4 @@
-"""Read and check asset packs; ``manifest.py`` has the format. Needs no SAPIEN."""
+"""Read and verify asset packs (format: ``manifest.py``); SAPIEN is not needed."""
 
 from __future__ import annotations
 
@@ -30,38 +30,42 @@ VISUALS: dict[VisualLevel, str] = {"fast": "visual_fast.glb", "full": "visual_fu
 LINKS, FINISHES = "links", "finishes"
 
 _FILE_LIMIT = 2**31  # bytes
-_hashes: dict[tuple[str, int, int], str] = {}  # (path, size, mtime) -> sha256: only changed files are read again
-_packs: dict[tuple[str, int, int], Pack] = {}  # (path, size, mtime) -> pack: geometry is computed once per process
+_hashes: dict[
+    tuple[str, int, int], str
+] = {}  # (path, size, mtime) -> sha256, so that only changed files are read again
+_packs: dict[
+    tuple[str, int, int], Pack
+] = {}  # (path, size, mtime) -> pack, so that geometry is computed once per process
 
 
 @dataclass(frozen=True)
 class BodyFiles:
-    """The geometry of one body: a folder with files to render and hulls for physics."""
+    """Files of one body: visual meshes and convex hulls in a folder."""
 
     folder: Path
     _points: dict[float, Array] = field(default_factory=dict, repr=False, compare=False)
 
     def visual(self, level: VisualLevel = "fast") -> Path:
-        """Return the textured mesh (GLB) at a level of detail."""
+        """Return the path of the textured mesh (GLB) at a level of detail."""
         return self.folder / VISUALS[level]
 
     @property
     def hulls_path(self) -> Path:
-        """The convex hulls (OBJ, one group each)."""
+        """Path of the convex hulls (OBJ, one group per hull)."""
         return self.folder / HULLS
 
     @cached_property
     def hull_meshes(self) -> list[Hull]:
-        """The convex hulls with their faces, in the asset's frame."""
+        """Convex hulls with faces, in the asset's frame, m."""
         return read_hulls(self.hulls_path)
 
     @property
     def hulls(self) -> list[Array]:
-        """The vertices (V, 3) of each convex hull, m, in the asset's frame."""
+        """Vertices (V, 3) of each convex hull, in the asset's frame, m."""
         return [hull.vertices for hull in self.hull_meshes]
 
     def surface_points(self, spacing: float = 0.005) -> Array:
-        """Return points (P, 3), about ``spacing`` m apart, on the surface of the hulls' union, in the asset's frame."""
+        """Return points (P, 3) on the surface of the hulls' union, about ``spacing`` m apart, in the asset's frame."""
         if spacing not in self._points:
             points = sample_surface(self.hull_meshes, spacing)
             points.setflags(write=False)
@@ -71,7 +75,7 @@ class BodyFiles:
 
 @dataclass(frozen=True)
 class LoadedObject(BodyFiles):
-    """A thing to pick up, with its entry in the manifest."""
+    """An object that can be picked, with its manifest entry."""
 
     asset: ObjectAsset = field(kw_only=True)
 
@@ -82,23 +86,23 @@ class LoadedObject(BodyFiles):
 
 @dataclass(frozen=True)
 class LoadedFurniture(BodyFiles):
-    """Furniture, a basket or a room, with its entry in the manifest. As a part, it is the fixed body.
+    """Furniture, a basket or a room, with its manifest entry; its own files are those of the fixed body.
 
     Attributes:
-        links: its moving parts by name, in the furniture's frame with all joints at 0.
+        links: moving parts by name, in the furniture's frame with all joints at 0.
     """
 
     asset: FurnitureAsset = field(kw_only=True)
     links: dict[str, BodyFiles] = field(default_factory=dict, kw_only=True)
 
     def all_surface_points(self, positions: Mapping[str, float]) -> Array:
-        """Return points (P, 3), m, on body and links in the furniture's frame; joints not in ``positions`` are at 0."""
+        """Return points (P, 3) on body and links in the furniture's frame, m; joints not in ``positions`` are at 0."""
         poses = link_poses(self.asset.links, positions)
         links = [transform_points(pose, self.links[name].surface_points()) for name, pose in poses.items()]
         return np.concatenate([self.surface_points(), *links])
 
     def finish(self, part: str, name: str) -> Path:
-        """Return the textured mesh (GLB) of a part in one of its finishes."""
+        """Return the path of the textured mesh (GLB) of a part with a finish."""
         found = self.asset.finishes.get(part, ())
         if name not in found:
             what = f"{self.asset.id}: no such finish of {part!r}"
@@ -108,7 +112,7 @@ class LoadedFurniture(BodyFiles):
 
 @dataclass(frozen=True)
 class Pack:
-    """An asset pack in the folder ``root``: things to pick up and furniture, by id."""
+    """An asset pack in the folder ``root``: objects and furniture by id."""
 
     name: str
     root: Path
@@ -118,7 +122,7 @@ class Pack:
 
 
 def find_packs() -> dict[str, Path]:
-    """Return name -> folder of every pack, the shipped ones first; a user's pack can't hide a shipped one."""
+    """Return name -> folder of all packs; bundled packs come first and cannot be replaced by a user's pack."""
     found: dict[str, Path] = {}
     for parent in (builtin_packs_dir(), data_dir() / "packs"):
         if parent.is_dir():
@@ -132,10 +136,10 @@ def load_pack(name_or_path: str | Path) -> Pack:
     """Load and verify a pack.
 
     Args:
-        name_or_path: name of a shipped or imported pack, or the folder of one.
+        name_or_path: name of a bundled or imported pack, or its folder.
 
     Raises:
-        AssetError: there is no such pack, or a file of it is missing, changed, damaged or not listed.
+        AssetError: the pack is unknown, or one of its files is missing, changed, damaged or not listed.
     """
     known = find_packs()
     folder = known.get(str(name_or_path), Path(name_or_path)).resolve()
@@ -157,29 +161,29 @@ def load_pack(name_or_path: str | Path) -> Pack:
 
 
 def verify_pack(pack: Pack) -> None:
-    """Check that the files of all assets are those the manifest lists. A file is read once per process and change."""
+    """Check all files of a pack against its manifest; an unchanged file is read once per process."""
     for asset in pack.manifest.assets:
         folder = pack.root / asset.id
-        for name in _files(str(folder)):
+        for name in _iter_files(str(folder)):
             if name not in asset.files:
-                what = "the manifest of the asset pack doesn't list this file"
+                what = "file is not in the manifest of the asset pack"
                 raise AssetError(what, where=folder / name, fix="Remove it, or make the pack again.")
         fix = f"Restore the file, or make the pack {pack.name!r} again."
         for name, wanted in asset.files.items():
             path = folder / name
             if not path.is_file():
-                raise AssetError("this file of the asset pack is missing", where=path, fix=fix)
+                raise AssetError("missing file of the asset pack", where=path, fix=fix)
             try:
                 found = sha256(path)
             except (OSError, DocumentError) as error:
-                raise AssetError("can't read this file of the asset pack", where=path, found=error, fix=fix) from error
+                raise AssetError("cannot read this file of the asset pack", where=path, found=error, fix=fix) from error
             if found != wanted:
-                what, expected = "this file of the asset pack was changed or cut short", f"sha256 {wanted[:12]}..."
+                what, expected = "changed or truncated file of the asset pack", f"sha256 {wanted[:12]}..."
                 raise AssetError(what, where=path, expected=expected, found=f"{found[:12]}...", fix=fix)
 
 
 def sha256(path: Path) -> str:
-    """Return the hash of a file, from memory if its size and time of change are those of the last call."""
+    """Return the sha256 of a file; cached by size and modification time."""
     check_regular(path, _FILE_LIMIT)
     status = path.stat()
     key = (str(path), status.st_size, status.st_mtime_ns)
@@ -192,8 +196,8 @@ def sha256(path: Path) -> str:
     return _hashes[key]
 
 
-def _files(folder: str, prefix: str = "") -> Iterator[str]:
-    """Yield paths of the files in a folder, relative to it, but hidden ones, which systems and editors leave."""
+def _iter_files(folder: str, prefix: str = "") -> Iterator[str]:
+    """Yield relative paths of the files in a folder, except hidden files, which systems and editors create."""
     if not os.path.isdir(folder):
         return
     with os.scandir(folder) as entries:
@@ -201,7 +205,7 @@ def _files(folder: str, prefix: str = "") -> Iterator[str]:
             if entry.name.startswith("."):
                 continue
             if entry.is_dir(follow_symlinks=False):
-                yield from _files(entry.path, f"{prefix}{entry.name}/")
+                yield from _iter_files(entry.path, f"{prefix}{entry.name}/")
             else:
                 yield prefix + entry.name
 
@@ -211,17 +215,17 @@ class _Header(BaseModel):
 
 
 def _read(folder: Path, path: Path) -> Pack:
-    fix = "Make the pack again: run the import or build that made it."
+    fix = "Make the pack again with the command that imported or built it."
     try:
         data = read_bytes(path, JSON_LIMIT)
         version = _Header.model_validate_json(data).schema_version
         if type(version) is not int or version != SCHEMA_VERSION:
-            what, expected = "this pack has another format", f"pack format {SCHEMA_VERSION}"
+            what, expected = "unsupported format of the asset pack", f"pack format {SCHEMA_VERSION}"
             found = "none" if version is None else repr(version)[:40]
             raise AssetError(what, where=path, expected=expected, found=found, fix=fix)
         manifest = validate_json(PackManifest, data)
     except (OSError, DocumentError) as error:
-        raise AssetError("can't read the manifest of the asset pack", where=path, found=error) from error
+        raise AssetError("cannot read the manifest of the asset pack", where=path, found=error) from error
     except ValidationError as error:
         raise error_from_validation(
             error, PackManifest, AssetError, where=path, about="the manifest is damaged", fix=fix
@@ -230,10 +234,10 @@ def _read(folder: Path, path: Path) -> Pack:
     furniture: dict[str, LoadedFurniture] = {}
     for asset in manifest.assets:
         if asset.id in objects or asset.id in furniture:
-            raise AssetError("two assets of the pack have the same id", where=path, found=asset.id)
+            raise AssetError("duplicate asset id in the pack", where=path, found=asset.id)
         for name in _required_files(asset):
             if name not in asset.files:
-                raise AssetError("the manifest lists no such file", where=path, expected=f"{asset.id}/{name}")
+                raise AssetError("required file is missing in the manifest", where=path, expected=f"{asset.id}/{name}")
         home = folder / asset.id
         if isinstance(asset, ObjectAsset):
             objects[asset.id] = LoadedObject(home, asset=asset)

@@ -1,4 +1,4 @@
-"""Bodies in a bare PhysX scene, with the settings of the environments."""
+"""Build bodies in a PhysX scene with the physics settings of the environments."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray
 
-TIME_STEP = 0.01  # s, the environments'
-# m, the environments'. Shapes that come nearer than twice this are a pair that costs time; with ManiSkill's 0.02 a heap
-# has three times as many pairs, and rests, holds and stays no better.
+TIME_STEP = 0.01  # s, as in the environments
+# m, as in the environments. PhysX computes contacts for shapes closer than twice this distance. ManiSkill's 0.02 gives
+# three times more contact pairs in a heap, without more stable heaps or grasps.
 CONTACT_OFFSET = 0.005
-DAMPING = 0.1  # 1/s, linear and angular, of every free body; upstream's
+DAMPING = 0.1  # 1/s, linear and angular, of every free body, as in RoboCAS-v0
 TABLE_FRICTION = 0.99
-SPACING = 10.0  # m between objects that are simulated at once
+SPACING = 10.0  # m between objects that are simulated together
 
 
 @dataclass(frozen=True)
 class RigidBody:
-    """A free body, in its own frame: hulls of vertices (V, 3), m; mass, kg; principal moments (3,), kg m2, and axes."""
+    """A free rigid body: hulls (V, 3) in m, mass in kg, principal moments (3,) in kg m2 and their axes."""
 
     hulls: Sequence[Array]
     mass: float
@@ -41,9 +41,9 @@ class RigidBody:
 
 @contextmanager
 def engine_settings() -> Iterator[None]:
-    """Set the engine up as the environments do; its settings are those of the process, and are restored."""
+    """Use the physics settings of the environments in this process; restore the old settings at the end."""
     scene, body, shape = physx.get_scene_config(), physx.get_body_config(), physx.get_shape_config()
-    gravity: Any = np.array([0, 0, -9.81])  # SAPIEN's stubs ask for a shape type that no NumPy array has
+    gravity: Any = np.array([0, 0, -9.81])  # the type in SAPIEN's stubs fits no NumPy array
     physx.set_scene_config(gravity=gravity)
     physx.set_body_config(solver_position_iterations=15, solver_velocity_iterations=1, sleep_threshold=0.005)
     physx.set_shape_config(contact_offset=CONTACT_OFFSET, rest_offset=0.0)
@@ -56,7 +56,7 @@ def engine_settings() -> Iterator[None]:
 
 
 def make_scene(time_step: float = TIME_STEP) -> sapien.Scene:
-    """Return an empty scene without a renderer; use it within `engine_settings`."""
+    """Create an empty scene without a renderer; call it within `engine_settings`."""
     scene = sapien.Scene([physx.PhysxCpuSystem()])
     scene.set_timestep(time_step)
     return scene
@@ -70,7 +70,7 @@ def add_body(scene: sapien.Scene, solid: RigidBody, pose: Array) -> physx.PhysxR
         for piece in solid.hulls:
             free.attach(make_shape(piece, material))
     except RuntimeError as error:
-        raise AssetError("the physics engine refused a convex hull", found=error) from error
+        raise AssetError("the physics engine rejected a convex hull", found=error) from error
     free.mass = solid.mass
     free.cmass_local_pose = sapien.Pose(solid.center_of_mass, solid.inertia_wxyz)
     free.set_inertia(np.asarray(solid.inertia, np.float64).tolist())
@@ -86,7 +86,7 @@ def make_solid(asset: LoadedObject) -> RigidBody:
 
 
 def add_static_body(scene: sapien.Scene, hulls: Sequence[Array], pose: Array, friction: float) -> None:
-    """Add convex pieces (V, 3) that never move, their frame at a pose (4, 4) in the world."""
+    """Add a static body of convex hulls (V, 3) at a pose (4, 4) in the world."""
     material = physx.PhysxMaterial(friction, friction, 0.0)
     body = physx.PhysxRigidStaticComponent()
     for piece in hulls:
@@ -95,7 +95,7 @@ def add_static_body(scene: sapien.Scene, hulls: Sequence[Array], pose: Array, fr
 
 
 def add_ground(scene: sapien.Scene, origin: Array) -> None:
-    """Add 2 x 2 m of table, its top at a point (3,)."""
+    """Add a table of 2 x 2 m with the centre of its top at a point (3,)."""
     material = physx.PhysxMaterial(TABLE_FRICTION, TABLE_FRICTION, 0.0)
     ground = physx.PhysxRigidStaticComponent()
     ground.attach(physx.PhysxCollisionShapeBox([1.0, 1.0, 0.05], material))
@@ -103,33 +103,33 @@ def add_ground(scene: sapien.Scene, origin: Array) -> None:
 
 
 def grid_origins(count: int) -> Array:
-    """Return origins (N, 3) of objects that are simulated at once: a grid, four per row."""
+    """Return grid positions (N, 3) of objects that are simulated together, four per row."""
     origins = np.zeros((count, 3))
     origins[:, 0], origins[:, 1] = np.arange(count) % 4 * SPACING, np.arange(count) // 4 * SPACING
     return origins
 
 
 def make_shape(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShape:
-    """Return the shape of a convex hull of points (V, 3); a box, which is exact and fast, if they are its corners."""
+    """Create the shape of a convex hull (V, 3); corners of a box give a box, which is exact and fast."""
     box = find_box(vertices)
     return cook(vertices, material) if box is None else _box_shape(box, material)
 
 
 def cook(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShapeConvexMesh:
-    """Return the engine's convex mesh of points (V, 3); it may leave some out (`cooked_hulls`)."""
+    """Create the engine's convex mesh of points (V, 3), which may be smaller than their hull (`cooked_hulls`)."""
     return physx.PhysxCollisionShapeConvexMesh(
         vertices=np.asarray(vertices, np.float32), scale=[1, 1, 1], material=material
     )
 
 
 def load_shapes(part: BodyFiles, material: physx.PhysxMaterial) -> list[physx.PhysxCollisionShape]:
-    """Return the shapes of all hulls of an asset; bodies made of one file share the engine's meshes."""
+    """Return the shapes of all hulls of a body; bodies of the same file share the engine's meshes."""
     boxes = [find_box(hull) for hull in part.hulls]
-    # a file of boxes is not cooked: the engine rejects slender ones on a GPU
+    # boxes are not cooked: the engine rejects slender ones on a GPU
     loaded = [] if all(boxes) else _load(part.hulls_path, material)
     if loaded and len(loaded) != len(boxes):
         raise AssetError(
-            "the physics engine refused a convex hull",
+            "the physics engine rejected a convex hull",
             where=part.hulls_path,
             expected=f"{len(boxes)} hulls",
             found=len(loaded),
@@ -142,7 +142,7 @@ def _load(path: Path, material: physx.PhysxMaterial) -> list[physx.PhysxCollisio
     try:
         return physx.PhysxCollisionShapeConvexMesh.load_multiple(str(path), [1, 1, 1], material)
     except RuntimeError as error:
-        raise AssetError("the physics engine refused a convex hull", where=path, found=error) from error
+        raise AssetError("the physics engine rejected a convex hull", where=path, found=error) from error
 
 
 def _box_shape(box: Box, material: physx.PhysxMaterial) -> physx.PhysxCollisionShapeBox:
@@ -159,5 +159,5 @@ def add_component(scene: sapien.Scene, component: physx.PhysxRigidBaseComponent,
 
 
 def pose_matrix(body: physx.PhysxRigidBaseComponent) -> Array:
-    """Return the pose (4, 4) of a body in the world, double precision."""
+    """Return the pose (4, 4) of a body in the world frame, float64."""
     return np.asarray(body.entity_pose.to_transformation_matrix(), float)

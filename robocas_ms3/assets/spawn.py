@@ -1,4 +1,4 @@
-"""Build assets into a ManiSkill scene. Without a renderer, bodies are built without visuals."""
+"""Build assets in a ManiSkill scene; without a renderer, bodies have no visual meshes."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ def spawn(
     finishes: Mapping[str, str] | None = None,
     scene_idxs: Sequence[int] | None = None,
 ) -> Actor:
-    """Build an asset without moving parts as one actor: a free body if it has a mass, else a static one.
+    """Build an asset without moving parts as an actor: dynamic if it has a mass, static otherwise.
 
     Args:
         scene: the ManiSkill scene.
         asset: the asset.
         name: unique name of the actor.
         pose: initial pose of the asset's frame in the world.
-        level: of detail of the visual mesh.
-        finishes: part -> finish, of rooms; parts not named get their default.
-        scene_idxs: sub-scenes to build it in; default: all.
+        level: level of detail of the visual mesh.
+        finishes: part -> finish, for rooms; other parts have their default finish.
+        scene_idxs: indices of the sub-scenes; default: all.
 
     Raises:
-        AssetError: the physics engine refused a hull, or there is no such finish.
+        AssetError: the physics engine rejected a hull, or a finish is unknown.
     """
     builder: Any = scene.create_actor_builder()
     facts = asset.asset
@@ -67,7 +67,7 @@ def spawn_articulation(
     pose: sapien.Pose,
     level: VisualLevel = "fast",
 ) -> Articulation:
-    """Build furniture with moving parts, its body fixed in the world, its joints at 0. Arguments as in `spawn`."""
+    """Build furniture with moving parts, with a fixed body and all joints at 0; arguments as in `spawn`."""
     builder: Any = scene.create_articulation_builder()
     facts = asset.asset
     root = builder.create_link_builder()
@@ -80,7 +80,7 @@ def spawn_articulation(
         part = builder.create_link_builder(made[link.parent])
         part.set_name(link.name)
         part.set_joint_name(link.joint.name)
-        # all frames coincide with every joint at 0, so the joint is in the same place in both
+        # all link frames coincide with joints at 0, so the joint has the same pose in both
         frame = sapien.Pose(joint_frame(link.joint))
         part.set_joint_properties(link.joint.kind, [link.joint.limits], frame, frame, damping=link.joint.damping)
         _add_shapes(part, asset.links[link.name], facts.friction, level, render=scene.can_render())
@@ -89,7 +89,7 @@ def spawn_articulation(
     builder.initial_pose = pose
     articulation = builder.build(name)
     frictions = {link.joint.name: link.joint.friction for link in facts.links}
-    for joint in articulation.active_joints:  # the builder drops what it is told of friction
+    for joint in articulation.active_joints:  # the builder ignores friction
         joint.set_friction(frictions[joint.name])
     return articulation
 
@@ -98,7 +98,7 @@ def _add_shapes(builder: Any, part: BodyFiles, friction: float, level: VisualLev
     make = builder.build_physx_component
 
     def build(link_parent: Any = None) -> Any:
-        # not by the builder's own means: it makes no boxes of a file's hulls, and drops those that can't be cooked
+        # the builder itself would not detect boxes, and would skip hulls that cannot be cooked
         component = make(link_parent)
         for shape in load_shapes(part, sapien.physx.PhysxMaterial(friction, friction, 0.0)):
             component.attach(shape)
@@ -111,6 +111,6 @@ def _add_shapes(builder: Any, part: BodyFiles, friction: float, level: VisualLev
 
 def _set_mass(builder: Any, facts: ObjectAsset | FurnitureAsset | Link) -> None:
     if facts.inertia is None:
-        raise AssetError("a body with a mass needs its inertia too", where=getattr(facts, "id", ""))
+        raise AssetError("expected an inertia in addition to the mass", where=getattr(facts, "id", ""))
     frame = sapien.Pose(list(facts.center_of_mass), list(facts.inertia_wxyz))
     builder.set_mass_and_inertia(facts.mass, frame, np.array(facts.inertia))

@@ -17,7 +17,7 @@ from asset_tools.repair import close
 from asset_tools.simplify import simplified
 from asset_tools.sources import ObjectSource
 from asset_tools.visual import to_display
-from robocas_ms3.assets.cooked_hulls import OBLONG, SHRINKAGE, cook_hulls, find_hull_violations
+from robocas_ms3.assets.cooked_hulls import MAX_SHRINKAGE, MAX_SLENDERNESS, cook_hulls, find_hull_violations
 
 
 def moved(mesh, *by):
@@ -183,10 +183,10 @@ def test_slender_hulls_are_thickened_as_a_gpu_needs_it():
     for mesh in (disk, rod, blade):
         hulls = [for_engine(np.asarray(mesh.vertices))]
         (cooked,) = cook_hulls(hulls)
-        assert not cooked.oblong and cooked.lost <= SHRINKAGE
+        assert not cooked.too_slender and cooked.shrinkage <= MAX_SHRINKAGE
         np.testing.assert_allclose(np.ptp(hulls[0], axis=0), mesh.extents, atol=0.005)
     plate = box([0.1, 0.1, 0.0002])
-    assert for_engine(plate.vertices) is plate.vertices and OBLONG < 0.05 / 0.0001
+    assert for_engine(plate.vertices) is plate.vertices and MAX_SLENDERNESS < 0.05 / 0.0001
 
 
 def test_a_mesh_that_cannot_be_simplified_to_the_limit_is_taken_with_more_faces():

@@ -3,7 +3,7 @@
 import numpy as np
 import trimesh
 
-from robocas_ms3.assets.cooked_hulls import SHRINKAGE, HullViolation, cook_hulls, find_hull_violations
+from robocas_ms3.assets.cooked_hulls import MAX_SHRINKAGE, HullViolation, cook_hulls, find_hull_violations
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.core.paths import builtin_packs_dir
 
@@ -33,8 +33,8 @@ def test_hulls_that_a_gpu_would_cut_down_or_leave_out_are_named(tmp_path):
     # both are a metre long and 2 mm thick, but boxes are never cooked
     written(tmp_path / "rods", [box(1.0, 0.002, 0.002), prism(6, radius=0.001, length=1.0)])
     found = find_hull_violations(tmp_path)
-    lost = found[0].cooked.lost
-    assert SHRINKAGE < lost < 0.05
+    lost = found[0].cooked.shrinkage
+    assert MAX_SHRINKAGE < lost < 0.05
     assert [str(fault) for fault in found] == [
         f"ball: hull 1 shrinks by {1e3 * lost:.1f} mm on a GPU",
         f"desk/links/drawer: hull 0 shrinks by {1e3 * lost:.1f} mm on a GPU",
@@ -44,7 +44,7 @@ def test_hulls_that_a_gpu_would_cut_down_or_leave_out_are_named(tmp_path):
 
 def test_what_the_engine_refuses_is_named():
     (cooked,) = cook_hulls([np.eye(3)])  # no body of three points
-    assert cooked.lost == np.inf
+    assert cooked.shrinkage == np.inf
     assert str(HullViolation("dot", 2, "CPU", cooked)) == "dot: hull 2 can't be built on a CPU"
 
 

@@ -29,7 +29,7 @@ def test_hulls_survive_writing_and_reading(tmp_path):
 
 
 def test_points_in_a_plane_are_no_hull():
-    with pytest.raises(AssetError, match="lie in a plane"):
+    with pytest.raises(AssetError, match="are coplanar"):
         convex_faces(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], dtype=float))
 
 
