@@ -1,4 +1,4 @@
-"""Every fault in every command, with real episodes and processes. A line of the table each; see scripts/faults.sh."""
+"""Each fault in each command, with real episodes and processes. A test writes a row of the table of faults.sh."""
 
 import os
 import random
@@ -13,18 +13,18 @@ from faults import (
     PATIENCE,
     Command,
     Row,
-    alive,
-    begun,
     content,
+    count_readable,
     environment,
-    is_one_line,
-    lines_of,
-    note,
-    readable,
+    is_single_error,
+    lines_without_progress,
+    live_processes,
     run,
-    running,
-    succeed,
+    run_successfully,
+    running_command,
+    task_starts,
     wait_until,
+    write_row,
 )
 
 from robocas_ms3.evaluation.protocol import load_protocol
@@ -45,7 +45,7 @@ limits: {record_seconds: 45, render_seconds: 600, memory_gb: 1.5}
 
 @pytest.fixture(scope="session")
 def commands(tmp_path_factory):
-    """What is run."""
+    """Return the commands by name."""
     folder = tmp_path_factory.mktemp("inputs")
     plan, protocol = folder / "plan.yaml", folder / "short"
     plan.write_text(PLAN)
@@ -69,20 +69,20 @@ def commands(tmp_path_factory):
             hit=load_protocol("smoke").episodes[1].seed,
         ),
     }
-    succeed(made["generate"].line(recorded))
+    run_successfully(made["generate"].line(recorded))
     return made
 
 
 @pytest.fixture(scope="session")
-def undisturbed(commands, tmp_path_factory):
-    """(command) -> what it makes where nothing befalls it."""
+def expected_content(commands, tmp_path_factory):
+    """Return a function (command) -> (content, seconds) of a run without faults."""
     kept = {}
 
     def of(command):
         if command.name not in kept:
-            out = tmp_path_factory.mktemp("undisturbed") / "out"
+            out = tmp_path_factory.mktemp("expected_content") / "out"
             started = time.monotonic()
-            succeed(command.line(out))
+            run_successfully(command.line(out))
             kept[command.name] = content(command, out), time.monotonic() - started
             assert len(kept[command.name][0]) == EPISODES
         return kept[command.name]
@@ -99,40 +99,40 @@ def command(request, commands):
 def row(request):
     found = Row(request.node.originalname.removeprefix("test_").replace("_", " "), "")
     yield found
-    note(found)
+    write_row(found)
 
 
-def waits(log, key):
-    """Seconds between the tries of a task."""
-    tries = [when for when, which in begun(log) if which == str(key)]
+def delays(log, key):
+    """Return the seconds between the starts of a task."""
+    tries = [when for when, which in task_starts(log) if which == str(key)]
     return [round(after - before, 1) for before, after in zip(tries, tries[1:], strict=False)]
 
 
 @pytest.mark.parametrize(("fault", "times"), [("crash", 1), ("crash", 2), ("hang", 1), ("grow", 1)])
-def test_a_task_whose_process(command, undisturbed, tmp_path, row, fault, times):
-    """Once, it is begun again; twice, it is left out: another seed, an error in the end, or a failed episode."""
+def test_task_process(command, expected_content, tmp_path, row, fault, times):
+    """After one fault the task is retried; after two it is skipped: another seed, an error, or a failed episode."""
     row.fault, row.command, row.injected = f"{fault}{' twice' * (times > 1)}", command.name, times
     log, out = tmp_path / "log", tmp_path / "out"
     limits = command.slow if fault == "hang" else command.large if fault == "grow" else ()
     words = command.line(out, 2, *limits)
-    told = {"log": str(log), "at": {"key": command.hit, "fault": fault, "times": times}}
-    code, said = run(words, told)
-    row.seconds = waits(log, command.hit)
-    expected = undisturbed(command)[0]
+    injection = {"log": str(log), "at": {"key": command.hit, "fault": fault, "times": times}}
+    code, stderr = run(words, injection)
+    row.seconds = delays(log, command.hit)
+    expected = expected_content(command)[0]
     if times == 1:
-        assert code == 0, said[-2000:]
-        row.judge(expected, content(command, out))
+        assert code == 0, stderr[-2000:]
+        row.compare(expected, content(command, out))
         return
-    if command.name == "convert":  # an error that names it; what is left goes on
+    if command.name == "convert":  # an error names the episode; the other episodes are converted
         assert code == 1
-        assert "episode_0000001: its process died twice: SIGSEGV" in said
+        assert "episode_0000001: its process died twice: SIGSEGV" in stderr
         assert command.finished(out) == EPISODES - 1
-        succeed(words)
-        row.judge(expected, content(command, out))
+        run_successfully(words)
+        row.compare(expected, content(command, out))
         return
-    assert code == (command.name == "eval"), said[-2000:]  # an episode with an error: exit status 1
+    assert code == (command.name == "eval"), stderr[-2000:]  # an episode with an error: exit status 1
     found = content(command, out)
-    row.judge(expected, found, without=(1,))
+    row.compare(expected, found, without=(1,))
     if command.name == "eval":
         assert dict(found)[1]["error"] == "the worker process of the env crashed: SIGSEGV"
         row.note = "counted as failed"
@@ -141,51 +141,51 @@ def test_a_task_whose_process(command, undisturbed, tmp_path, row, fault, times)
         assert len(found) == EPISODES
 
 
-def test_kill_9_of_all_at_random_moments(command, undisturbed, tmp_path, row):
+def test_kill_9_of_all_at_random_times(command, expected_content, tmp_path, row):
     row.command, chance = command.name, random.Random(SEED)
-    expected, whole = undisturbed(command)
+    expected, whole = expected_content(command)
     log, out = tmp_path / "log", tmp_path / "out"
     row.note = f"seed {SEED}"
     while True:
         started = time.monotonic()
-        with running(command.line(out, 2), {"log": str(log)}) as process:
+        with running_command(command.line(out, 2), {"log": str(log)}) as process:
             kill = row.injected < KILLS
             try:
-                _, said = process.communicate(timeout=chance.uniform(0, 1.1 * whole) if kill else PATIENCE)
+                _, stderr = process.communicate(timeout=chance.uniform(0, 1.1 * whole) if kill else PATIENCE)
             except subprocess.TimeoutExpired:
                 row.injected += 1
                 os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
             else:
-                assert process.returncode == 0, said[-2000:]
-                row.judge(expected, content(command, out))
+                assert process.returncode == 0, stderr[-2000:]
+                row.compare(expected, content(command, out))
                 if not kill:
                     return
                 shutil.rmtree(out)
-        row.seconds += [round(when - started, 1) for when, _ in begun(log) if when > started][:1]
+        row.seconds += [round(when - started, 1) for when, _ in task_starts(log) if when > started][:1]
 
 
 @pytest.mark.parametrize("times", [1, 2])
-def test_ctrl_c(command, undisturbed, tmp_path, row, times):
+def test_ctrl_c(command, expected_content, tmp_path, row, times):
     row.fault, row.command, row.injected = "Ctrl-C" + " twice at once" * (times > 1), command.name, 1
     log, out = tmp_path / "log", tmp_path / "out"
-    with running(command.line(out, 8), {"log": str(log)}) as process:
-        wait_until(lambda: begun(log), process)
+    with running_command(command.line(out, 8), {"log": str(log)}) as process:
+        wait_until(lambda: task_starts(log), process)
         pressed = time.monotonic()
         for _ in range(times):
             os.killpg(process.pid, signal.SIGINT)
-        _, said = process.communicate(timeout=60)
+        _, stderr = process.communicate(timeout=60)
         ended = time.monotonic() - pressed
-        while alive(process.pid):
-            assert time.monotonic() - pressed < 3, alive(process.pid)
+        while live_processes(process.pid):
+            assert time.monotonic() - pressed < 3, live_processes(process.pid)
         row.note = f"ended after {ended:.1f} s"
         assert ended < 3
     assert process.returncode == 130
-    assert len(lines_of(said)) == 1, said
+    assert len(lines_without_progress(stderr)) == 1, stderr
     resumed = time.monotonic()
-    succeed(command.line(out, 2), {"log": str(log)})
-    row.seconds = [round(when - resumed, 1) for when, _ in begun(log) if when > resumed][:1]
-    row.judge(undisturbed(command)[0], content(command, out))
+    run_successfully(command.line(out, 2), {"log": str(log)})
+    row.seconds = [round(when - resumed, 1) for when, _ in task_starts(log) if when > resumed][:1]
+    row.compare(expected_content(command)[0], content(command, out))
 
 
 ROOM = """\
@@ -194,7 +194,7 @@ mkdir -p "$1/disk"
 mount -t tmpfs -o "size=$2" tmpfs "$1/disk"
 shift 2
 set +e
-"$@" 2>"$0/said"; echo $? >"$0/code"
+"$@" 2>"$0/stderr"; echo $? >"$0/code"
 df --output=avail "$0/disk" >"$0/room"
 cp -r "$0/disk/out" "$0/full"
 mount -o remount,"$AGAIN" "$0/disk" || exit 9
@@ -203,22 +203,22 @@ cp -r "$0/disk/out" "$0/out"
 """
 
 
-def test_a_full_disk(command, undisturbed, tmp_path, row):
-    """A disk of its own, in a namespace, which is made larger then."""
+def test_full_disk(command, expected_content, tmp_path, row):
+    """A small disk, mounted in a namespace, is enlarged after the error."""
     if subprocess.run(["unshare", "-rm", "true"], check=False).returncode:
-        pytest.skip("this machine lets nobody mount anything")
+        pytest.skip("this machine does not allow mounts in a namespace")
     row.command, row.injected = command.name, 1
     size = {"generate": "500k", "convert": "3m", "plan run": "3500k", "eval": "8k"}[command.name]
     words = ["unshare", "-rm", "sh", "-c", ROOM, str(tmp_path), str(tmp_path), size]
     env = {**environment(), "AGAIN": "size=1g"}
     line = command.line(tmp_path / "disk" / "out", 2)
     subprocess.run([*words, *line], env=env, check=True, timeout=PATIENCE, stdout=subprocess.DEVNULL)
-    said = (tmp_path / "said").read_text()
-    assert (tmp_path / "code").read_text() == "1\n", said[-2000:]
-    assert is_one_line(said) and "No space left on device" in said, said[-2000:]
-    row.note = f"{readable(command, tmp_path / 'full')} finished, readable"
+    stderr = (tmp_path / "stderr").read_text()
+    assert (tmp_path / "code").read_text() == "1\n", stderr[-2000:]
+    assert is_single_error(stderr) and "No space left on device" in stderr, stderr[-2000:]
+    row.note = f"{count_readable(command, tmp_path / 'full')} finished, readable"
     assert (tmp_path / "code_after").read_text() == "0\n", (tmp_path / "said_after").read_text()[-2000:]
-    row.judge(undisturbed(command)[0], content(command, tmp_path / "out"))
+    row.compare(expected_content(command)[0], content(command, tmp_path / "out"))
 
 
 def make_writable(out, *, yes):
@@ -227,46 +227,47 @@ def make_writable(out, *, yes):
 
 
 @pytest.mark.parametrize("how", ["vanishes", "becomes read-only"])
-def test_an_output_folder_that(command, undisturbed, tmp_path, row, how):
+def test_output_folder(command, expected_content, tmp_path, row, how):
     row.fault, row.command, row.injected = f"output folder {how}", command.name, 1
     log, out, vanishes = tmp_path / "log", tmp_path / "out", how == "vanishes"
-    powerless = [] if os.geteuid() else ["setpriv", "--bounding-set=-dac_override,-dac_read_search"]  # root may all
-    with running([*powerless, *command.line(out, 2)], {"log": str(log)}) as process:
-        wait_until(lambda: begun(log), process)
+    # root ignores permissions
+    drop_privileges = [] if os.geteuid() else ["setpriv", "--bounding-set=-dac_override,-dac_read_search"]
+    with running_command([*drop_privileges, *command.line(out, 2)], {"log": str(log)}) as process:
+        wait_until(lambda: task_starts(log), process)
         hit = time.monotonic()
         if vanishes:
             out.rename(tmp_path / "gone")
         else:
             make_writable(out, yes=False)
-        _, said = process.communicate(timeout=PATIENCE)
+        _, stderr = process.communicate(timeout=PATIENCE)
         row.note = f"ended after {time.monotonic() - hit:.0f} s"
-    assert process.returncode == 1, said[-2000:]
-    assert is_one_line(said), said[-2000:]
+    assert process.returncode == 1, stderr[-2000:]
+    assert is_single_error(stderr), stderr[-2000:]
     if not vanishes:
         make_writable(out, yes=True)
-        succeed(command.line(out, 2))
-        row.judge(undisturbed(command)[0], content(command, out))
+        run_successfully(command.line(out, 2))
+        row.compare(expected_content(command)[0], content(command, out))
 
 
-def test_a_clock_that_runs_backwards(command, undisturbed, tmp_path, row):
+def test_clock_runs_backwards(command, expected_content, tmp_path, row):
     row.command, row.injected = command.name, 1
-    succeed(command.line(tmp_path / "out", 2), {"backwards": True})
-    row.judge(undisturbed(command)[0], content(command, tmp_path / "out"))
+    run_successfully(command.line(tmp_path / "out", 2), {"backwards": True})
+    row.compare(expected_content(command)[0], content(command, tmp_path / "out"))
 
 
-def cut(path):
+def truncate(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
-def stopped_half_way(command, out, log):
-    """A run that was killed with an episode or two done."""
-    with running(command.line(out, 2), {"log": str(log)}) as process:
+def kill_after_one_episode(command, out, log):
+    """Start a run and kill it when an episode is finished."""
+    with running_command(command.line(out, 2), {"log": str(log)}) as process:
         wait_until(lambda: command.finished(out) >= 1, process)
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
 
 
-CUT = {
+TRUNCATED = {
     "generate": ("episodes/seed_*.h5", "episodes/seed_*.json"),
     "convert": ("episode_*/episode_info.npz", "episode_*/base_camera/rgb/0001.png", "episode_*/scene.json"),
     "plan run": ("units/*/*/[0-9]*/outcome.json",),
@@ -274,56 +275,56 @@ CUT = {
 }
 
 
-@pytest.mark.parametrize(("name", "pattern"), [(name, pattern) for name, of in CUT.items() for pattern in of])
-def test_a_file_of_a_run_that_was_cut_off(commands, undisturbed, tmp_path, row, name, pattern):
-    """A recording, its JSON, a ledger, an image, arrays: what they held is done again."""
+@pytest.mark.parametrize(("name", "pattern"), [(name, pattern) for name, of in TRUNCATED.items() for pattern in of])
+def test_truncated_file_of_a_run(commands, expected_content, tmp_path, row, name, pattern):
+    """The episodes of a truncated recording, JSON file, image or array file are produced again."""
     command, out = commands[name], tmp_path / "out"
-    row.command, row.fault = name, f"cut off: {pattern.rpartition('/')[2]}"
-    stopped_half_way(command, out, tmp_path / "log")
+    row.command, row.fault = name, f"truncated: {pattern.rpartition('/')[2]}"
+    kill_after_one_episode(command, out, tmp_path / "log")
     for path in out.glob(pattern):
-        cut(path)
+        truncate(path)
         row.injected += 1
     assert row.injected
-    succeed(command.line(out, 2))
-    row.judge(undisturbed(command)[0], content(command, out))
+    run_successfully(command.line(out, 2))
+    row.compare(expected_content(command)[0], content(command, out))
 
 
-def test_a_layout_cache_that_was_cut_off(commands, undisturbed, tmp_path, row, monkeypatch):
-    """Its layouts are made anew."""
+def test_truncated_layout_cache(commands, expected_content, tmp_path, row, monkeypatch):
+    """Its layouts are sampled again."""
     command, cache = commands["generate"], tmp_path / "cache"
     row.command = command.name
-    expected = undisturbed(command)[0]
+    expected = expected_content(command)[0]
     monkeypatch.setenv("ROBOCAS_CACHE", str(cache))
-    succeed(command.line(tmp_path / "before"))
+    run_successfully(command.line(tmp_path / "before"))
     for path in (path for path in (cache / "layouts").rglob("*") if path.is_file()):
-        cut(path)
+        truncate(path)
         row.injected += 1
     assert row.injected
-    succeed(command.line(tmp_path / "out"))
-    row.judge(expected, content(command, tmp_path / "out"))
+    run_successfully(command.line(tmp_path / "out"))
+    row.compare(expected, content(command, tmp_path / "out"))
 
 
-def test_two_runs_into_one_folder(command, undisturbed, tmp_path, row):
+def test_two_runs_into_one_folder(command, expected_content, tmp_path, row):
     row.command, row.injected = command.name, 1
     log, out = tmp_path / "log", tmp_path / "out"
-    with running(command.line(out, 2), {"log": str(log)}) as process:
-        wait_until(lambda: begun(log), process)
-        code, said = run(command.line(out, 2))
+    with running_command(command.line(out, 2), {"log": str(log)}) as process:
+        wait_until(lambda: task_starts(log), process)
+        code, stderr = run(command.line(out, 2))
         assert code == 1
-        assert is_one_line(said) and "another process writes to this folder" in said, said[-2000:]
+        assert is_single_error(stderr) and "another process writes to this folder" in stderr, stderr[-2000:]
         assert process.wait(PATIENCE) == 0
-    row.judge(undisturbed(command)[0], content(command, out))
+    row.compare(expected_content(command)[0], content(command, out))
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_another_version(commands, tmp_path, row, name):
-    """Whoever goes on with one is refused: what comes of it would be of two."""
+    """A run cannot be continued with another version of a package: its files would be from two versions."""
     command = commands[name]
     row.command, row.injected = name, 1
     log, out = tmp_path / "log", tmp_path / "out"
-    stopped_half_way(command, out, log)
+    kill_after_one_episode(command, out, log)
     before = command.finished(out)
-    code, said = run(command.line(out, 2), {"versions": {"sapien": "2.2.2"}})
-    assert code == 1, said[-2000:]
-    assert is_one_line(said) and "2.2.2" in said, said[-2000:]
+    code, stderr = run(command.line(out, 2), {"versions": {"sapien": "2.2.2"}})
+    assert code == 1, stderr[-2000:]
+    assert is_single_error(stderr) and "2.2.2" in stderr, stderr[-2000:]
     assert command.finished(out) == before

@@ -2,12 +2,12 @@ import os
 import shutil
 
 import pytest
-from plan_stages import env_of_jobs, made_up, run_here
+from plan_stages import env_of_jobs, run_here, stub_stages
 
 
 @pytest.fixture(autouse=True)
-def stub_stages():
-    with made_up():
+def replaced_stages():
+    with stub_stages():
         yield
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import psutil
 import pytest
 from plan_jobs import Jobs, wait_for
-from plan_stages import PLAN, assert_same, deaths_of, env_of_jobs, plan_faults, run_here
+from plan_stages import PLAN, assert_same, crashes_of, env_of_jobs, plan_faults, run_here
 
 from robocas_ms3.core.errors import MissingExtraError, PlanError
 from robocas_ms3.plans.executors import open_executor
@@ -54,7 +54,7 @@ def test_a_job_that_ends_costs_nothing_and_blames_no_seed(jobs, undisturbed, tmp
         process.send_signal(number)
     assert runner.wait(240) == 0, runner.stderr.read()
     assert_same(undisturbed, out)
-    assert deaths_of(out) == []
+    assert crashes_of(out) == []
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGKILL])
@@ -73,7 +73,7 @@ def test_a_run_that_is_ended_leaves_no_harm_and_continues_later(jobs, undisturbe
     wait_for(lambda: not jobs.processes(out))
     run_here(out)
     assert_same(undisturbed, out)
-    assert deaths_of(out) == []
+    assert crashes_of(out) == []
 
 
 def test_a_unit_that_kills_its_jobs_again_and_again_ends_the_run(jobs, tmp_path):
@@ -95,7 +95,7 @@ def test_an_error_of_all_seeds_ends_the_run(jobs, undisturbed, tmp_path):
         jobs.run(out)
     jobs.run(out)
     assert_same(undisturbed, out)
-    assert deaths_of(out) == []
+    assert crashes_of(out) == []
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 from plan_stages import (
     PLAN,
-    CannotBegin,
+    FailingStage,
     assert_same,
-    deaths_of,
-    made_up,
+    crashes_of,
     plan_faults,
     run_here,
     seeds_done,
+    stub_stages,
 )
 
 from robocas_ms3.core.checks import parse_shard
@@ -121,7 +121,7 @@ def test_a_process_that_dies_once_costs_nothing(undisturbed, tmp_path):
     limits = PLAN.limits.model_copy(update={"record_seconds": 4, "memory_gb": 0.5})
     run_here(out, PLAN.model_copy(update={"limits": limits}))
     assert_same(undisturbed, out)
-    assert deaths_of(out) == [
+    assert crashes_of(out) == [
         (10, "record: SIGSEGV"),
         (12, "record: memory limit exceeded"),
         (13, "record: ValueError: a bug of two lines"),
@@ -138,7 +138,7 @@ def test_a_seed_that_kills_twice_is_left_out_and_another_takes_its_place(tmp_pat
     assert found.parts[0].failed == {"record: SIGSEGV": 1, "grasp: slipped": 1, damaged: 1}
     assert (found.parts[0].done, found.parts[0].requested) == (5, 5)
     assert found.finished
-    assert deaths_of(out) == [(11, "record: SIGSEGV")] * 2 + [(13, damaged)] * 2
+    assert crashes_of(out) == [(11, "record: SIGSEGV")] * 2 + [(13, damaged)] * 2
 
 
 def test_a_machine_that_cannot_open_a_part_does_no_seed(tmp_path):
@@ -147,7 +147,7 @@ def test_a_machine_that_cannot_open_a_part_does_no_seed(tmp_path):
     (tmp_path / "out" / "plan.json").write_text(
         json.dumps({"plan": plan.model_dump(mode="json"), "versions": versions()})
     )
-    with made_up(Recorder), closing(WorkUnitWorker(PlanFolder(plan, tmp_path / "out"))) as worker:
+    with stub_stages(Recorder), closing(WorkUnitWorker(PlanFolder(plan, tmp_path / "out"))) as worker:
         with pytest.raises(PlanError) as error:
             worker.run(WorkUnit(0, 0))
         assert error.value.where == "part a"
@@ -247,5 +247,5 @@ def test_a_worker_of_an_older_plan_keeps_nothing_in_the_folder_of_a_new_one(tmp_
 
 def test_a_process_that_cannot_begin_ends_the_run_and_blames_no_seed(tmp_path):
     with pytest.raises(PlanError, match="no such library"):
-        run_here(tmp_path / "out", render=CannotBegin)
+        run_here(tmp_path / "out", render=FailingStage)
     assert seeds_done(tmp_path / "out") == 0

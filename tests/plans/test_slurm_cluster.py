@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("submitit", reason='plans on Slurm need submitit: pip install -e ".[slurm]"')
 
 from plan_jobs import Jobs, wait_for
-from plan_stages import assert_same, deaths_of, env_of_jobs, plan_faults
+from plan_stages import assert_same, crashes_of, env_of_jobs, plan_faults
 
 from robocas_ms3.core.errors import PlanError
 
@@ -57,7 +57,7 @@ class Running:
     def ends_well(self, undisturbed):
         assert self.process.wait(240) == 0, self.process.stderr.read()[-2000:]
         assert_same(undisturbed, self.out)
-        assert deaths_of(self.out) == []  # no seed is blamed
+        assert crashes_of(self.out) == []  # no seed is blamed
         wait_for(lambda: not JOBS.processes(self.out), 30)
 
 

@@ -1,18 +1,18 @@
-"""Print the table of faults, of the lines that `tests/faults` noted: `python fault_table.py ROWS [OUT.json]`."""
+"""Print the fault table from the rows of `tests/faults`: `python fault_table.py ROWS [OUT.json]`."""
 
 import json
 import sys
 from pathlib import Path
 
-HEAD = ("fault", "command", "times injected", "episodes lost", "doubled", "seconds to go on", "")
+HEAD = ("fault", "command", "times injected", "episodes lost", "duplicates", "seconds to continue", "")
 
 
 def cells(row):
     seconds = row["seconds"]
-    spent = f"{min(seconds):g}" if seconds else "-"
+    delay = f"{min(seconds):g}" if seconds else "-"
     if seconds and max(seconds) > min(seconds):
-        spent += f" to {max(seconds):g}"
-    return (row["fault"], row["command"], row["injected"], row["lost"], row["doubled"], spent, row["note"])
+        delay += f" to {max(seconds):g}"
+    return (row["fault"], row["command"], row["injected"], row["lost"], row["duplicates"], delay, row["note"])
 
 
 def table(rows):

@@ -1,4 +1,4 @@
-"""Real commands, and what faults of all kinds do to them: what `tests/faults` are made of."""
+"""Run real commands with injected faults and compare their files: helpers of `tests/faults`."""
 
 from __future__ import annotations
 
@@ -30,21 +30,20 @@ from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 
 ROOT = Path(__file__).resolve().parents[2]
 SITE = Path(__file__).resolve().parent / "fault_site"
-PATIENCE = 900  # s that a command may take on a busy machine
+PATIENCE = 900  # s, limit of a command on a busy machine
 EPISODES = 4
 
 
 @dataclass(frozen=True)
 class Command:
-    """A command that makes four episodes.
+    """A command that produces four episodes.
 
     Attributes:
-        name: of the command.
-        words: it consists of, but for the folder and --jobs.
-        jobs: the flag that says how many processes.
-        hit: what faults happen to: a seed, or a number of an episode.
-        limits: flags of what an episode may take, while it hangs, and while it grows.
-        finished: (folder) -> how many episodes are finished.
+        name: name of the command.
+        words: words of the command line, without output folder and --jobs.
+        jobs: option for the number of processes.
+        hit: task that a fault affects: a seed, or the number of an episode.
+        slow, large: options that limit the time and the memory of an episode.
     """
 
     name: str
@@ -55,6 +54,7 @@ class Command:
     large: tuple[str, ...] = ("--memory-gb", "1.5")
 
     def line(self, out, jobs=2, *more):
+        """Return the words of the command line."""
         return [
             sys.executable,
             str(ROOT / "robocas_cli.py"),
@@ -67,6 +67,7 @@ class Command:
         ]
 
     def finished(self, out):
+        """Return the number of finished episodes in an output folder."""
         patterns = {
             "generate": "episodes/seed_*.h5",
             "convert": "episode_*",
@@ -80,7 +81,7 @@ class Command:
 
 
 def content(command, out):
-    """(episode, what came of it), without what a clock said; none may be there twice."""
+    """Return (episode, content) of each episode in an output folder, without measured times; check duplicates."""
     if command.name == "generate":
         episodes = json.loads((out / "trajectory.json").read_text())["episodes"]
         lines: list[FailedAttempt] = JsonLinesFile(out / FAILURES_FILE, FailedAttempt).read()
@@ -95,7 +96,7 @@ def content(command, out):
         found = [(number, one.reproducible_values()) for number, one in results.read_result(out).outcomes.items()]
     elif command.name == "convert":
         found = [(path.name, files_of(path)) for path in sorted(out.glob("episode_*"))]
-    else:  # by seed: where one was left out, the numbers of others are others, which their scenes say
+    else:  # by seed: without a skipped seed, other episodes have other numbers, which scene.json contains
         data = Dataset(out / "datasets" / "robocas")
         folders = {data.entry(number)["seed"]: data.root / f"episode_{number:07d}" for number in data.numbers}
         assert len(folders) == len(data.numbers)
@@ -103,8 +104,8 @@ def content(command, out):
     return found
 
 
-def readable(command, out):
-    """How many episodes of a run that ended early are there, each of which is whole."""
+def count_readable(command, out):
+    """Return the number of episodes of an interrupted run; check that each is complete."""
     if command.name == "generate":
         recorded = sorted((out / "episodes").glob("seed_*.h5"))
         for path in recorded:
@@ -121,49 +122,49 @@ def readable(command, out):
 
 
 def _causes(failures):
-    """Without the seconds of a clock."""
+    """Return attempts, stages and reasons, without measured times."""
     return [(one.attempt, one.stage, one.reason) for one in failures]
 
 
 def _of_recording(episode, group):
-    said = {**episode, "episode_id": 0, "robocas": {k: v for k, v in episode["robocas"].items() if k != "seconds"}}
+    stderr = {**episode, "episode_id": 0, "robocas": {k: v for k, v in episode["robocas"].items() if k != "seconds"}}
     arrays = {}
     group.visititems(lambda name, item: arrays.update({name: item[()]} if isinstance(item, h5py.Dataset) else {}))
-    return json.dumps(said, sort_keys=True), {name: np.asarray(value).tobytes() for name, value in arrays.items()}
+    return json.dumps(stderr, sort_keys=True), {name: np.asarray(value).tobytes() for name, value in arrays.items()}
 
 
 @dataclass
 class Row:
-    """A line of the table."""
+    """A row of the fault table."""
 
     fault: str
     command: str
     injected: int = 0
     lost: int = 0
-    doubled: int = 0
+    duplicates: int = 0
     seconds: list[float] = field(default_factory=list)
-    """until a task began after it"""
+    """From the fault to the next start of a task."""
     note: str = ""
 
-    def judge(self, expected, found, without=()):
-        """Count what is lost and doubled, and see that all others are as they were."""
+    def compare(self, expected, found, without=()):
+        """Count lost and duplicate episodes; check that all other episodes, except `without`, are unchanged."""
         numbers = [number for number, _ in found]
-        self.doubled += len(numbers) - len(set(numbers))
-        there = dict(found)
-        self.lost += sum(number not in there for number, _ in expected)
-        different = [number for number, one in expected if number in there and there[number] != one]
+        self.duplicates += len(numbers) - len(set(numbers))
+        contents = dict(found)
+        self.lost += sum(number not in contents for number, _ in expected)
+        different = [number for number, content in expected if contents.get(number, content) != content]
         assert set(different) <= set(without), (self, different)
 
 
 def environment(fault=None):
-    """Of a command that something befalls."""
+    """Return the environment variables of a command with a fault."""
     path = os.pathsep.join([str(SITE), str(ROOT)])
     return {**os.environ, "PYTHONPATH": path, "PYTHONWARNINGS": "ignore", "ROBOCAS_FAULT": json.dumps(fault or {})}
 
 
 @contextmanager
-def running(words, fault=None):
-    """A command in a group of processes of its own; none is left in the end."""
+def running_command(words, fault=None):
+    """Start a command in a new process group, yield its process, and kill the group at the end."""
     process = subprocess.Popen(
         words,
         env=environment(fault),
@@ -182,35 +183,35 @@ def running(words, fault=None):
 
 
 def run(words, fault=None):
-    """Run it to its end: exit code, stderr."""
-    with running(words, fault) as process:
-        _, said = process.communicate(timeout=PATIENCE)
-    return process.returncode, said
+    """Run a command; return its exit status and stderr."""
+    with running_command(words, fault) as process:
+        _, stderr = process.communicate(timeout=PATIENCE)
+    return process.returncode, stderr
 
 
-def succeed(words, fault=None):
-    code, said = run(words, fault)
-    assert code == 0, (words, said[-2000:])
-    return said
+def run_successfully(words, fault=None):
+    code, stderr = run(words, fault)
+    assert code == 0, (words, stderr[-2000:])
+    return stderr
 
 
-def wait_until(what, process):
-    until = time.monotonic() + PATIENCE
-    while not what():
+def wait_until(condition, process):
+    deadline = time.monotonic() + PATIENCE
+    while not condition():
         assert process.poll() is None, process.communicate()[1][-2000:]
-        assert time.monotonic() < until
+        assert time.monotonic() < deadline
         time.sleep(0.05)
 
 
-def begun(log):
-    """(when, which) of the tasks that began."""
+def task_starts(log):
+    """Return (time, key) of each start of a task."""
     if not log.is_file():
         return []
     return [(float(when), key) for when, key in map(str.split, log.read_text().splitlines())]
 
 
-def alive(group):
-    """Processes of a group that have not ended."""
+def live_processes(group):
+    """Return the processes of a group that have not ended."""
     found = []
     for process in psutil.process_iter():
         with suppress(psutil.Error, ProcessLookupError):
@@ -219,24 +220,24 @@ def alive(group):
     return found
 
 
-def lines_of(said):
-    """What is left of stderr without the lines of progress."""
+def lines_without_progress(stderr):
+    """Return the lines of stderr without progress lines."""
     progress = re.compile(r"([a-z ]+: )?\d+ of \d+( episodes)?(,|$)")
-    return [line for line in said.splitlines() if line.strip() and not progress.match(line)]
+    return [line for line in stderr.splitlines() if line.strip() and not progress.match(line)]
 
 
-def is_one_line(said):
-    """One error, and nothing of tracebacks."""
-    errors = [line for line in lines_of(said) if line.startswith("error: ")]
-    return len(errors) == 1 and "Traceback" not in said
+def is_single_error(stderr):
+    """Return whether stderr has exactly one error line and no traceback."""
+    errors = [line for line in lines_without_progress(stderr) if line.startswith("error: ")]
+    return len(errors) == 1 and "Traceback" not in stderr
 
 
 def files_of(root):
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
-def note(row):
-    """Add a line to the file of ROBOCAS_FAULT_ROWS."""
+def write_row(row):
+    """Append a row to the file in ROBOCAS_FAULT_ROWS."""
     if path := os.environ.get("ROBOCAS_FAULT_ROWS"):
         with Path(path).open("a") as file:
             file.write(json.dumps(asdict(row)) + "\n")

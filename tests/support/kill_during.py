@@ -1,4 +1,4 @@
-"""Run `robocas` and die by SIGKILL on the way: `python dying.py MOMENT ROBOCAS_ARGUMENTS...`; images are made up."""
+"""Run `robocas` with synthetic images and kill it at a point: `python kill_during.py POINT ROBOCAS_ARGUMENTS...`."""
 
 import os
 import signal
@@ -12,7 +12,7 @@ from robocas_ms3.core import files
 from robocas_ms3.datasets.conversion import convert, episode_folder
 from robocas_ms3.datasets.manage import copy_episodes, import_robocas
 
-PLACES = {  # moment -> (module, function, which call is the last)
+POINTS = {  # point -> (module, function, number of the call at which to kill)
     "image": (episode_folder, "write_image", 50),  # in the second episode
     "arrays": (episode_folder, "write_episode_files", 2),
     "file": (copy_episodes.FilePlacer, "place", 70),  # in the second episode
@@ -20,11 +20,11 @@ PLACES = {  # moment -> (module, function, which call is the last)
     "convert overview": (convert, "write_info", 1),
     "merge overview": (copy_episodes, "write_info", 1),
     "import overview": (import_robocas, "write_info", 1),
-    "rmtree": (os, "rmdir", 3),  # --overwrite, with two folders of the old one gone
+    "rmtree": (os, "rmdir", 3),  # --overwrite, after two folders of the old dataset are removed
 }
 
 
-def lerobot_places():
+def lerobot_points():
     from robocas_ms3.datasets.lerobot import convert as lerobot
     from robocas_ms3.datasets.lerobot import video, writer
 
@@ -33,27 +33,27 @@ def lerobot_places():
         "frame": (video.VideoEncoder, "add", 50),  # in the second episode
         "join": (video.VideoJoiner, "add", 7),
         "table": (writer.RollingTable, "add", 4),
-        "folders": (lerobot.os, "replace", 3),  # plan, data, videos: the third
+        "folders": (lerobot.os, "replace", 3),  # the third of plan, data, videos
         "joined": (Path, "rmdir", 1),
         "parts": (lerobot.shutil, "rmtree", 1),
     }
 
 
-def die_at(module, name, last):
-    whole, calls = getattr(module, name), []
+def kill_at(module, name, number):
+    function, calls = getattr(module, name), []
 
-    def dying(*args, **kwargs):
+    def count_calls(*args, **kwargs):
         calls.append(name)
-        if len(calls) == last:
+        if len(calls) == number:
             os.kill(os.getpid(), signal.SIGKILL)
-        return whole(*args, **kwargs)
+        return function(*args, **kwargs)
 
-    setattr(module, name, dying)
+    setattr(module, name, count_calls)
 
 
 if __name__ == "__main__":
     if "lerobot" in sys.argv:
-        PLACES |= lerobot_places()
-    die_at(*PLACES[sys.argv[1]])
+        POINTS |= lerobot_points()
+    kill_at(*POINTS[sys.argv[1]])
     convert.convert = render_by(RayCaster, convert.convert)
     sys.exit(run(sys.argv[2:]))

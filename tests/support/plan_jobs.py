@@ -1,4 +1,4 @@
-"""The made-up plan by the jobs of an executor."""
+"""Run the synthetic plan with the jobs of an executor."""
 
 import os
 import subprocess
@@ -17,7 +17,7 @@ RUNNER = Path(__file__).with_name("plan_runner.py")
 
 
 class Jobs:
-    """An executor of two jobs, in this process or by a program."""
+    """An executor with two jobs, called in this process or in a program."""
 
     def __init__(self, name, **options):
         self.name, self.options = name, options
@@ -26,25 +26,25 @@ class Jobs:
         return run_plan(open_executor(self.name, PlanFolder(PLAN, out), 2, self.options | more))
 
     def start(self, out):
-        """Return the program, which has a process group of its own."""
+        """Start the program in a new process group; return its process."""
         words = [sys.executable, RUNNER, out, self.name, *(f"{name}={value}" for name, value in self.options.items())]
         env = {**os.environ, "PLAN_OUT": str(out)}
         return subprocess.Popen(words, env=env, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
     def processes(self, out):
-        """Those that a program started to do units; of Ray those of any plan."""
+        """Return the worker processes of a program; with Ray, those of any plan."""
         found = []
         for process in psutil.process_iter(["cmdline", "environ"]):
             line = process.info["cmdline"] or [""]
             if self.name == "ray":
-                found += [process] * " ".join(line).startswith(("ray::do_", "ray::send_"))
+                found += [process] * " ".join(line).startswith(("ray::run_units", "ray::send_units"))
             elif (process.info["environ"] or {}).get("PLAN_OUT") == str(out) and not line[0].endswith("srun"):
                 found += [process] * (str(RUNNER) not in line)
         return found
 
 
-def wait_for(what, seconds=60):
-    until = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < until
+def wait_for(condition, seconds=60):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
         time.sleep(0.05)

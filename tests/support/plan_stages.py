@@ -1,4 +1,4 @@
-"""Stages of an episode that need no simulator, and fail, crash, hang or grow as a file beside the units says."""
+"""Stages of an episode without a simulator; a file next to the plan makes them fail, crash, hang or grow."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SITE = Path(__file__).parent / "fault_site"
 
 
 class StubRecorder:
-    """Writes a made-up recording."""
+    """Stage that writes a synthetic recording."""
 
     def __init__(self, plan):
         self.plan = plan
@@ -56,7 +56,7 @@ class StubRecorder:
 
 
 def _faults_of(out):
-    """The folder with faults of a plan: next to it, or where nodes of Ray see it."""
+    """Return the folder with the faults of a plan: its parent, or a folder that all Ray nodes share."""
     return Path(os.environ.get("PLAN_FAULTS", out.parent))
 
 
@@ -72,20 +72,20 @@ def _fault(files):
 
 
 class StubRenderer(Renderer):
-    """Renders without a renderer."""
+    """Stage that renders by ray casting."""
 
     def open_env(self, *args):
         return RayCaster(*args)
 
 
-class CannotBegin:
+class FailingStage:
     def __init__(self, plan):
         raise ImportError("no such library")
 
 
 @contextmanager
-def made_up(record=StubRecorder, render=StubRenderer):
-    """Let workers that are made inside have these stages."""
+def stub_stages(record=StubRecorder, render=StubRenderer):
+    """Replace the stages of workers that are made within the block."""
     before = worker.Recorder, worker.Renderer
     worker.Recorder, worker.Renderer = record, render
     try:
@@ -95,16 +95,16 @@ def made_up(record=StubRecorder, render=StubRenderer):
 
 
 def run_here(out, plan=None, jobs=1, record=StubRecorder, render=StubRenderer, **more):
-    """Run the made-up plan on this machine."""
+    """Run the synthetic plan on this machine."""
     from robocas_ms3.plans.executors import LocalExecutor
     from robocas_ms3.plans.run import run_plan
 
-    with made_up(record, render):
+    with stub_stages(record, render):
         return run_plan(LocalExecutor(PlanFolder(plan or PLAN, out), jobs), **more)
 
 
 def env_of_jobs():
-    """Return environment variables of processes whose workers have made-up stages."""
+    """Return environment variables of processes whose workers have stub stages."""
     path = os.pathsep.join([str(SITE), str(SITE.parent), os.environ.get("PYTHONPATH", "")])
     return {"PYTHONPATH": path, "ROBOCAS_FAULT": json.dumps({"stub_plan": True})}
 
@@ -126,9 +126,10 @@ PLAN = Plan.model_validate(
 
 
 def plan_faults(out, faults):
-    """Seed -> what happens at each of its tries, the first ones first; nothing more where the list ends.
+    """Write the faults of a plan; return a function that returns the process ids of the tries of a seed.
 
-    Return a function that returns the processes of the tries of a seed.
+    Args:
+        faults: by seed, the faults of its first tries; later tries have none.
     """
     folder = _faults_of(out)
     for old in folder.glob("tries-*"):
@@ -144,7 +145,7 @@ def plan_faults(out, faults):
 
 
 def products(out):
-    """Paths of what a plan makes, without what a clock says."""
+    """Return the paths of the products of a plan that contain no measured times."""
     return {
         path.relative_to(out)
         for name in ("demos", "datasets", "report.json")
@@ -154,21 +155,21 @@ def products(out):
 
 
 def assert_same(one, other):
-    """See that two plans made the same, byte for byte, and that the second left nothing but its outcomes."""
+    """Check that two plans have equal products, and that the second one deleted its work units except outcomes."""
     assert products(one) == products(other) != set()
     assert not [path for path in products(one) if not filecmp.cmp(one / path, other / path, shallow=False)]
     assert {path.name for path in (other / "units").glob("*/*/*")} == {"seeds.jsonl"}
 
 
-def deaths_of(out, plan=PLAN):
-    """(seed, what its process died of) in units that are complete."""
+def crashes_of(out, plan=PLAN):
+    """Return (seed, reason) of the crashes in complete work units."""
     units = [WorkUnit(part, block) for part in range(len(plan.parts)) for block in range(9)]
     found = (PlanFolder(plan, out).outcomes(unit) for unit in units)
-    return [(one.seed, death) for outcomes in found if outcomes for one in outcomes for death in one.crashes]
+    return [(one.seed, crash) for outcomes in found if outcomes for one in outcomes for crash in one.crashes]
 
 
 def seeds_done(out):
-    """How many seeds are done."""
+    """Return the number of finished seeds."""
     units = {path.parent for path in out.glob("units/*/*/seeds.jsonl")}
-    whole = sum(len((unit / "seeds.jsonl").read_text().splitlines()) for unit in units)
-    return whole + sum(path.parent.parent not in units for path in out.glob("units/*/*/*/outcome.json"))
+    complete = sum(len((unit / "seeds.jsonl").read_text().splitlines()) for unit in units)
+    return complete + sum(path.parent.parent not in units for path in out.glob("units/*/*/*/outcome.json"))
