@@ -45,7 +45,7 @@ def test_hulls_that_a_gpu_would_cut_down_or_leave_out_are_named(tmp_path):
 def test_what_the_engine_refuses_is_named():
     (cooked,) = cook_hulls([np.eye(3)])  # no body of three points
     assert cooked.shrinkage == np.inf
-    assert str(HullViolation("dot", 2, "CPU", cooked)) == "dot: hull 2 can't be built on a CPU"
+    assert str(HullViolation("dot", 2, "CPU", cooked)) == "dot: hull 2 cannot be built on a CPU"
 
 
 def test_hulls_of_the_builtin_pack_are_cooked_as_they_are():
