@@ -13,7 +13,7 @@ import trimesh
 from asset_tools.decompose import Decomposition, decompose, is_hollow
 from asset_tools.glb import write_glb
 from asset_tools.grasps import sample_grasps
-from asset_tools.inertia import moments_of, piece_inertia, principal_inertia, triple
+from asset_tools.inertia import piece_inertia, principal_inertia, to_moments, to_tuple
 from asset_tools.quality.furniture import measure_furniture
 from asset_tools.quality.hulls import volume_iou
 from asset_tools.quality.measure import measure_object
@@ -78,9 +78,9 @@ def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
     hulls = [hull.vertices for hull in read_hulls(folder / HULLS)]
 
     # as the manifest has them, so that whoever measures the pack again finds the same
-    center = np.array(triple(closed.center_mass))
+    center = np.array(to_tuple(closed.center_mass))
     moments, axes = principal_inertia(closed, source.mass)
-    inertia = np.array(moments_of(moments))
+    inertia = np.array(to_moments(moments))
     solid = RigidBody(hulls, source.mass, center, inertia, np.array(axes), source.friction)
     rest = resting_poses(solid)
     grasps, reason = source.grasps, ""
@@ -113,14 +113,14 @@ def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
         source=source.source,
         licence=source.licence,
         attribution=source.attribution,
-        extents=triple(mesh.extents),
+        extents=to_tuple(mesh.extents),
         friction=source.friction,
         repairs=repairs,
         files=_hashes(folder),
         graspnet_id=source.graspnet_id,
         mass=source.mass,
-        center_of_mass=triple(center),
-        inertia=moments_of(inertia),
+        center_of_mass=to_tuple(center),
+        inertia=to_moments(inertia),
         inertia_wxyz=axes,
         grasp_count=len(grasps),
         no_grasps_because=reason,
@@ -142,8 +142,8 @@ def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
         center, inertia, axes = piece_inertia(source.pieces, source.mass)
         body = {
             "mass": source.mass,
-            "center_of_mass": triple(center),
-            "inertia": moments_of(inertia),
+            "center_of_mass": to_tuple(center),
+            "inertia": to_moments(inertia),
             "inertia_wxyz": axes,
         }
     asset = FurnitureAsset(
@@ -153,7 +153,7 @@ def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
         source=source.source,
         licence=source.licence,
         attribution=source.attribution,
-        extents=triple(source.mesh.extents),
+        extents=to_tuple(source.mesh.extents),
         friction=source.friction,
         repairs=source.repairs,
         files=_hashes(folder),

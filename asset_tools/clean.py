@@ -39,7 +39,7 @@ class CleanScan:
     welded: trimesh.Trimesh
 
 
-def clean(scan: trimesh.Trimesh, repairs: list[str]) -> CleanScan:
+def clean_scan(scan: trimesh.Trimesh, repairs: list[str]) -> CleanScan:
     """Drop faces that are no part of the outer surface, and turn all others outwards.
 
     Args:

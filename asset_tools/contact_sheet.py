@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from asset_tools.quality.measure import top_grasps
-from asset_tools.renderer import PAPER, Body, Colour, Studio, box_faces
+from asset_tools.renderer import PAPER, Colour, RenderBody, Renderer, box_faces
 from robocas_ms3.assets.annotations import Annotations
 from robocas_ms3.assets.hulls import Hull
 from robocas_ms3.assets.kinematics import link_poses
@@ -33,7 +33,7 @@ INK, FAINT = (25, 25, 25), (120, 120, 120)
 FINGER = 0.003  # m, thickness of drawn grippers
 
 
-def contact_sheet(pack: Pack, path: Path, ids: Sequence[str] | None = None) -> None:
+def write_contact_sheet(pack: Pack, path: Path, ids: Sequence[str] | None = None) -> None:
     """Draw a pack, furniture last.
 
     Args:
@@ -51,7 +51,7 @@ def contact_sheet(pack: Pack, path: Path, ids: Sequence[str] | None = None) -> N
     chosen = [assets[id_] for id_ in ids or assets]
     size, columns = (LARGE, 2) if len(chosen) <= FEW else (SMALL, 3)
     columns = min(columns, len(chosen))
-    studio = Studio(size)
+    studio = Renderer(size)
     width, height = CELLS * size, CAPTION + size + LABEL
     rows = -(-len(chosen) // columns)
     sheet = Image.new("RGB", (columns * (width + GAP) + GAP, rows * (height + GAP) + GAP), "white")
@@ -62,7 +62,7 @@ def contact_sheet(pack: Pack, path: Path, ids: Sequence[str] | None = None) -> N
     sheet.save(path)
 
 
-def _strip(studio: Studio, asset: LoadedObject | LoadedFurniture) -> Image.Image:
+def _strip(studio: Renderer, asset: LoadedObject | LoadedFurniture) -> Image.Image:
     if isinstance(asset, LoadedObject):
         title, line, images = asset.asset.id, _object_line(asset.asset), _object_images(studio, asset)
         if asset.asset.graspnet_id is not None:
@@ -100,10 +100,10 @@ def _furniture_line(furniture: LoadedFurniture) -> str:
     return ", ".join(parts)
 
 
-def _object_images(studio: Studio, asset: LoadedObject) -> list[LabelledImage]:
+def _object_images(studio: Renderer, asset: LoadedObject) -> list[LabelledImage]:
     notes = asset.annotations
     points, tried = np.concatenate(asset.hulls), top_grasps(notes)
-    fast = Body(points, file=asset.visual("fast"))
+    fast = RenderBody(points, file=asset.visual("fast"))
     grippers = [
         _solid(gripper_faces(float(width)), _tone(float(quality)), pose)
         for pose, width, quality in zip(
@@ -115,9 +115,9 @@ def _object_images(studio: Studio, asset: LoadedObject) -> list[LabelledImage]:
     chances = " ".join(f"{notes.resting_probabilities[i]:.0%}" for i in best)
     return [
         ("fast", studio.image([fast], -60, 25)),
-        ("full, from behind", studio.image([Body(points, file=asset.visual("full"))], 120, 25)),
+        ("full, from behind", studio.image([RenderBody(points, file=asset.visual("full"))], 120, 25)),
         ("hulls", studio.image(hull_bodies(asset.hull_meshes), -60, 25)),
-        (f"rests {chances}", studio.image(standing(fast, notes.resting_poses[best]), -60, 30)),
+        (f"rests {chances}", studio.image(place_in_row(fast, notes.resting_poses[best]), -60, 30)),
         (f"best {len(grippers)} of {len(notes.grasp_widths)} grasps", studio.image([fast, *grippers], -60, 30)),
     ]
 
@@ -130,18 +130,19 @@ def _shown_poses(notes: Annotations) -> list[int]:
     return order[:POSES]
 
 
-def _furniture_images(studio: Studio, furniture: LoadedFurniture) -> list[LabelledImage]:
+def _furniture_images(studio: Renderer, furniture: LoadedFurniture) -> list[LabelledImage]:
     asset = furniture.asset
     parts = {"": furniture, **furniture.links}
     wide = {link.joint.name: max(link.joint.limits, key=abs) for link in asset.links}
     shut, open_ = ({"": np.eye(4), **link_poses(asset.links, at)} for at in ({}, wide))
 
-    def looks(poses: dict[str, Array]) -> list[Body]:
+    def looks(poses: dict[str, Array]) -> list[RenderBody]:
         bodies = [
-            Body(np.concatenate(part.hulls), file=part.visual("fast"), pose=poses[name]) for name, part in parts.items()
+            RenderBody(np.concatenate(part.hulls), file=part.visual("fast"), pose=poses[name])
+            for name, part in parts.items()
         ]
         finishes = [furniture.finish(part, names[0]) for part, names in asset.finishes.items()]
-        return bodies + [Body(np.empty((0, 3)), file=path) for path in finishes]
+        return bodies + [RenderBody(np.empty((0, 3)), file=path) for path in finishes]
 
     hulls = [
         body
@@ -168,7 +169,7 @@ def _furniture_images(studio: Studio, furniture: LoadedFurniture) -> list[Labell
     ]
 
 
-def hull_bodies(hulls: Sequence[Hull], *, pose: Array | None = None, first_colour: int = 0) -> list[Body]:
+def hull_bodies(hulls: Sequence[Hull], *, pose: Array | None = None, first_colour: int = 0) -> list[RenderBody]:
     """Hulls in colours of their own, each drawn a little smaller than it is, so that all are seen."""
     bodies = []
     for i, hull in enumerate(hulls):
@@ -176,12 +177,12 @@ def hull_bodies(hulls: Sequence[Hull], *, pose: Array | None = None, first_colou
         small = middle + 0.97 * (hull.vertices - middle)
         colour = _hue(i + first_colour)
         bodies.append(
-            Body(hull.vertices, faces=small[hull.faces], colour=colour, pose=np.eye(4) if pose is None else pose)
+            RenderBody(hull.vertices, faces=small[hull.faces], colour=colour, pose=np.eye(4) if pose is None else pose)
         )
     return bodies
 
 
-def standing(body: Body, poses: Array) -> list[Body]:
+def place_in_row(body: RenderBody, poses: Array) -> list[RenderBody]:
     """Copies of a body in resting poses, side by side on a slab."""
     turned = [body.points @ pose[:3, :3].T + pose[:3, 3] for pose in poses]
     step = 1.12 * np.max([np.ptp(points[:, :2], axis=0) for points in turned], axis=0) + 0.01
@@ -189,7 +190,7 @@ def standing(body: Body, poses: Array) -> list[Body]:
     for i, (pose, points) in enumerate(zip(poses, turned, strict=True)):
         moved = np.array(pose, dtype=float)
         moved[:2, 3] += (i % 2, i // 2) * step - (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
-        bodies.append(Body(body.points, file=body.file, pose=moved))
+        bodies.append(RenderBody(body.points, file=body.file, pose=moved))
     places = np.array([(i % 2, i // 2) for i in range(len(poses))])
     slab = box_faces((*(-0.5 * step), -0.004), (*((places.max(axis=0) + 0.5) * step), 0.0))
     return [*bodies, _solid(slab, GROUND)]
@@ -215,8 +216,8 @@ def frame_faces(low: Array, high: Array, half: float) -> Array:
     return np.concatenate(bars)
 
 
-def _solid(faces: Array, colour: Colour, pose: Array | None = None) -> Body:
-    return Body(faces.reshape(-1, 3), faces=faces, colour=colour, pose=np.eye(4) if pose is None else pose)
+def _solid(faces: Array, colour: Colour, pose: Array | None = None) -> RenderBody:
+    return RenderBody(faces.reshape(-1, 3), faces=faces, colour=colour, pose=np.eye(4) if pose is None else pose)
 
 
 def _count(number: int, thing: str) -> str:

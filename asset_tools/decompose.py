@@ -64,7 +64,7 @@ def decompose(closed: trimesh.Trimesh) -> Decomposition:
     if not closed.is_watertight or closed.volume <= 0:
         raise AssetError("can't decompose a mesh that isn't closed", expected="watertight, volume > 0")
     found = _decompose(closed)
-    hulls = [for_engine(hull) for hull in found.hulls]
+    hulls = [limit_for_engine(hull) for hull in found.hulls]
     if all(hull is old for hull, old in zip(hulls, found.hulls, strict=True)):
         return found
     return Decomposition(hulls, volume_iou(closed, hulls))
@@ -74,7 +74,7 @@ def _decompose(closed: trimesh.Trimesh) -> Decomposition:
     """Return one hull if it is close enough, or else CoACD's hulls, merged."""
     best: Decomposition | None = None
     if closed.volume / closed.convex_hull.volume >= WANTED_OVERLAP - 0.02:
-        hulls = [few_vertices(np.asarray(closed.vertices))]
+        hulls = [reduce_vertices(np.asarray(closed.vertices))]
         best = Decomposition(hulls, volume_iou(closed, hulls))
         if best.volume_iou >= WANTED_OVERLAP:
             return best
@@ -93,7 +93,7 @@ def _decompose(closed: trimesh.Trimesh) -> Decomposition:
     return best
 
 
-def few_vertices(points: Array, *, bevel: float = BEVEL) -> Array:
+def reduce_vertices(points: Array, *, bevel: float = BEVEL) -> Array:
     """Vertices of the convex hull of points, m, thinned to what the engine keeps: same volume, most of its shape.
 
     Small bevels around broad faces across x, y or z are squared: the engine would keep a corner or two of one, on which
@@ -123,14 +123,14 @@ def few_vertices(points: Array, *, bevel: float = BEVEL) -> Array:
         others = [other for other in chosen if other != index]
         if _outside(vertices[[index]], vertices[others])[0] <= unfelt:
             chosen = others
-    if len(chosen) > MAX_VERTICES and flat_faces(vertices[chosen]) > GPU_LIMIT:
+    if len(chosen) > MAX_VERTICES and count_flat_faces(vertices[chosen]) > GPU_LIMIT:
         chosen = chosen[:MAX_VERTICES]
     kept = vertices[chosen]
     center = center_of_mass(kept)
     return center + (kept - center) * np.cbrt(hull.volume / ConvexHull(kept).volume)
 
 
-def for_engine(points: Array) -> Array:
+def limit_for_engine(points: Array) -> Array:
     """Return the vertices (V, 3) of a convex hull so that the physics engine builds it, on a CPU and a GPU.
 
     A hull that is too slender is stretched along its thin axes. One that loses too much is what the engine makes of it.
@@ -183,7 +183,7 @@ def _outside(points: Array, corners: Array) -> Array:
     return (points @ planes[:, :3].T + planes[:, 3]).max(axis=1)
 
 
-def flat_faces(points: Array) -> int:
+def count_flat_faces(points: Array) -> int:
     """How many faces the convex hull of points (V, 3) has, triangles in one plane being one."""
     return len(np.unique(np.round(ConvexHull(points).equations, 6), axis=0))
 
@@ -213,7 +213,7 @@ def _merged(closed: trimesh.Trimesh, found: Decomposition, hollow: bool) -> Deco
         i, j = min(costs, key=lambda pair: (costs[pair], pair))
         kept = {k: hull for k, hull in hulls.items() if k not in (i, j)}
         new = max(volumes) + 1
-        kept[new] = few_vertices(np.concatenate([hulls[i], hulls[j]]))
+        kept[new] = reduce_vertices(np.concatenate([hulls[i], hulls[j]]))
         fewer = Decomposition(list(kept.values()), volume_iou(closed, list(kept.values())))
         if not _good_enough(closed, fewer, hollow, least):
             tries += 1
@@ -250,7 +250,9 @@ def _run_coacd(body: trimesh.Trimesh, threshold: float) -> list[Array]:
         mcts_max_depth=1,  # cuts that are not looked ahead for are mended by merging, in a tenth of the time
         seed=0,
     )
-    return [few_vertices(points) for points in (np.array(vertices) for vertices, _ in parts) if _volume(points) > least]
+    return [
+        reduce_vertices(points) for points in (np.array(vertices) for vertices, _ in parts) if _volume(points) > least
+    ]
 
 
 def _volume(points: Array) -> float:

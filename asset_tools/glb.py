@@ -50,9 +50,9 @@ def write_glb(mesh: trimesh.Trimesh, path: Path | str) -> None:
         {"bufferView": view(indices.tobytes(), target=34963), **whole},
     ]
     shading: dict[str, Any] = {
-        "baseColorFactor": (rgba_of(material.baseColorFactor) / 255).tolist(),
+        "baseColorFactor": (get_rgba(material.baseColorFactor) / 255).tolist(),
         "metallicFactor": float(material.metallicFactor or 0),
-        "roughnessFactor": roughness_of(material),
+        "roughnessFactor": get_roughness(material),
     }
     primitive = {"attributes": {"POSITION": 0, "NORMAL": 1}, "indices": 2, "material": 0}
     tree: dict = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
@@ -80,12 +80,12 @@ def write_glb(mesh: trimesh.Trimesh, path: Path | str) -> None:
         tmp.write_bytes(start + head + struct.pack("<I4s", len(blob), b"BIN\0") + blob)
 
 
-def roughness_of(material: Any) -> float:
+def get_roughness(material: Any) -> float:
     """Roughness of a material, which need not say any."""
     value = getattr(material, "roughnessFactor", None)
     return DEFAULT_ROUGHNESS if value is None else float(value)
 
 
-def rgba_of(color: Any) -> NDArray[np.float64]:
+def get_rgba(color: Any) -> NDArray[np.float64]:
     """(4,) of a colour, 0 to 255; white where there is none."""
     return np.asarray((255,) * 4 if color is None else to_rgba(color), dtype=float)

@@ -101,7 +101,7 @@ def sample_grasps(
     scores = 0.5 * shares - 2.0 * (frictions - MIN_FRICTION) - lever / 0.15 - distance / 0.3
     left = np.flatnonzero(shares >= MIN_PAD_SHARE)
     left = left[_not_dominated(poses[left], frictions[left])]
-    chosen = left[spread_out(poses[left], scores[left], count)]
+    chosen = left[select_spread(poses[left], scores[left], count)]
     return Grasps(poses[chosen], widths[chosen], frictions[chosen])
 
 
@@ -217,7 +217,7 @@ def _not_dominated(poses: Array, frictions: Array) -> NDArray[np.int_]:
     return np.flatnonzero(keep)
 
 
-def spread_out(poses: Array, scores: Array, count: int) -> NDArray[np.int_]:
+def select_spread(poses: Array, scores: Array, count: int) -> NDArray[np.int_]:
     """Pick greedily: the best score plus the distance (in approach, closing axis, place) from what was picked."""
     closing = poses[:, :3, 1]
     both_ways = np.einsum("ni,nj->nij", closing, closing).reshape(-1, 9)  # the same for either sign of the axis

@@ -15,8 +15,8 @@ import trimesh
 
 from asset_tools.build import build_object
 from asset_tools.inspection import Inspect, ModelSource, inspect_models
-from asset_tools.pipeline import Job, content_hash, failing_job
-from asset_tools.prepare import prepare
+from asset_tools.pipeline import AssetJob, content_hash, make_failing_job
+from asset_tools.prepare import prepare_scan
 from asset_tools.readers.choice import is_collision, is_mesh
 from asset_tools.readers.files import files_below
 from asset_tools.scan import Unit, Up, guess_unit, guess_units
@@ -71,7 +71,7 @@ def scan_jobs(
     settings: ImportSettings,
     inspect: Inspect = inspect_models,
     on_skipped: Callable[[str], None] = lambda reason: None,
-) -> list[Job]:
+) -> list[AssetJob]:
     """Return the jobs that import a folder of scans. One that can't be read is a job that fails when it is its turn.
 
     Args:
@@ -105,11 +105,11 @@ def scan_jobs(
     jobs = []
     for id_ in ids:
         if id_ in errors:
-            jobs.append(failing_job(id_, errors[id_]))
+            jobs.append(make_failing_job(id_, errors[id_]))
             continue
         make = partial(_make, id_, scans.models[id_], units[id_], settings)
         facts = (id_, units[id_], settings.up, settings.masses.get(id_), settings.licence, settings.attribution)
-        jobs.append(Job(id_, make, content_hash(*facts, files=inspected[id_].files)))
+        jobs.append(AssetJob(id_, make, content_hash(*facts, files=inspected[id_].files)))
     return jobs
 
 
@@ -186,7 +186,7 @@ def _in_some_unit(side: float) -> bool:
 
 
 def _make(id_: str, model: ModelSource, unit: Unit, settings: ImportSettings, folder: Path) -> ObjectAsset:
-    scan = prepare(model.paths, root=model.root, up=settings.up, unit=unit)
+    scan = prepare_scan(model.paths, root=model.root, up=settings.up, unit=unit)
     source = ObjectSource(
         id=id_,
         name=id_.replace("_", " "),

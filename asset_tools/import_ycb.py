@@ -17,8 +17,8 @@ from asset_tools.build import build_object
 from asset_tools.graspnet.catalogue import ENTRIES, NUMBERS
 from asset_tools.import_scans import estimate_mass, object_id
 from asset_tools.inspection import Inspect, Inspection, ModelSource, inspect_models
-from asset_tools.pipeline import Job, content_hash, failing_job
-from asset_tools.prepare import prepare
+from asset_tools.pipeline import AssetJob, content_hash, make_failing_job
+from asset_tools.prepare import prepare_scan
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset
 from robocas_ms3.core.documents import load_json
@@ -75,7 +75,7 @@ def default_root() -> Path:
     return data / "assets" / "mani_skill2_ycb"
 
 
-def ycb_jobs(root: Path | None = None, ids: Sequence[str] = (), inspect: Inspect = inspect_models) -> list[Job]:
+def ycb_jobs(root: Path | None = None, ids: Sequence[str] = (), inspect: Inspect = inspect_models) -> list[AssetJob]:
     """Return the jobs that import ManiSkill's YCB folder. A model that can't be read is a job that fails.
 
     Args:
@@ -114,7 +114,7 @@ def ycb_source(root: Path, model: str) -> ObjectSource:
     info = _info(root)
     if model not in info:
         raise AssetError("no such YCB object", where=root / INFO, expected=f"among {len(info)}", found=model)
-    scan = prepare(_mesh(root, model), root=root, up="z", unit="m")
+    scan = prepare_scan(_mesh(root, model), root=root, up="z", unit="m")
     scale = _scale(root, model, info[model])
     if scale != 1:
         scan.mesh.apply_scale(scale)
@@ -146,15 +146,15 @@ def ycb_id(model: str) -> str:
     return object_id(f"{name}_{letter}" if letter else name)
 
 
-def _job(root: Path, model: str, info: dict[str, Any], inspected: Inspection) -> Job:
+def _job(root: Path, model: str, info: dict[str, Any], inspected: Inspection) -> AssetJob:
     if inspected.error is not None:
-        return failing_job(ycb_id(model), inspected.error)
+        return make_failing_job(ycb_id(model), inspected.error)
     try:
         scale = _scale(root, model, info)
     except AssetError as error:
-        return failing_job(ycb_id(model), error)
+        return make_failing_job(ycb_id(model), error)
     content = content_hash("ycb", model, scale, files=inspected.files, packages=["graspnet"])
-    return Job(ycb_id(model), partial(_make, root, model), content)
+    return AssetJob(ycb_id(model), partial(_make, root, model), content)
 
 
 def _mesh(root: Path, model: str) -> Path:

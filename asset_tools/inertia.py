@@ -42,13 +42,13 @@ def _principal(tensor: np.ndarray) -> tuple[np.ndarray, tuple[float, float, floa
     return moments, (w, x, y, z)
 
 
-def triple(values: np.ndarray) -> tuple[float, float, float]:
+def to_tuple(values: np.ndarray) -> tuple[float, float, float]:
     """To a billionth, as manifests say metres."""
     x, y, z = (round(float(value), 9) for value in values)
     return x, y, z
 
 
-def moments_of(values: np.ndarray) -> tuple[float, float, float]:
+def to_moments(values: np.ndarray) -> tuple[float, float, float]:
     """Moments of inertia to nine digits, however small: those of a dice are 4e-10 kg m2."""
     x, y, z = (float(f"{value:.9g}") for value in values)
     return x, y, z

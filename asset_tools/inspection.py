@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
-from asset_tools.readers.limits import SECONDS, reading_limits
+from asset_tools.readers.limits import MAX_SECONDS, reading_limits
 from asset_tools.readers.model import read_model
 from robocas_ms3.core.errors import AssetError, RobocasError
 from robocas_ms3.core.workers import FunctionWorker, Limits, WorkerPool
@@ -63,7 +63,7 @@ def inspect_models(
     Returns:
         What was found, by id; models that can't be read have an error.
     """
-    limits, found = Limits(SECONDS + GRACE, MEMORY_GB), {}
+    limits, found = Limits(MAX_SECONDS + GRACE, MEMORY_GB), {}
     with WorkerPool(partial(FunctionWorker, _inspect), processes, limits=limits, on_crash=_crashed) as pool:
         for id_, inspection in pool.map(models.items(), ordered=False):
             found[id_] = inspection

@@ -34,15 +34,20 @@ from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 
 MADE_FROM = "made_from.json"  # of a pack: asset id -> hash of what it was made from
 ENTRY = "asset.json"  # what the manifest says of a kept asset; written last
-KEPT_DAYS = 60  # an asset that wasn't asked for in this time is made again
+CACHE_DAYS = 60  # an asset that wasn't asked for in this time is made again
 TOOLS = ("coacd", "trimesh", "manifold3d", "numpy", "scipy", "sapien", "xatlas", "fast-simplification", "embreex") + (
     "pillow",
     "scikit-image",
     "shapely",
 )
-SKIP = "Pass --skip-errors to leave it out."
+SKIP_FIX = "Pass --skip-errors to leave it out."
 PACK_NAME = r"[a-z0-9_\-]+"
-NOT_INVOLVED = ("inspection", "pipeline", "sheet", "studio")  # files that do not change what an asset is made into
+UNRELATED_FILES = (
+    "inspection",
+    "pipeline",
+    "contact_sheet",
+    "renderer",
+)  # modules that do not affect the files of an asset
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +55,7 @@ _ASSET: TypeAdapter[ObjectAsset | FurnitureAsset] = TypeAdapter(Asset)
 
 
 @dataclass(frozen=True)
-class Job:
+class AssetJob:
     """An asset to make.
 
     Attributes:
@@ -70,7 +75,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class JobResult:
+class AssetJobResult:
     """What became of a job.
 
     Attributes:
@@ -88,16 +93,16 @@ class JobResult:
     seconds: float = 0.0
 
 
-def failing_job(id_: str, error: AssetError) -> Job:
+def make_failing_job(id_: str, error: AssetError) -> AssetJob:
     """Return a job that raises an error when it is its turn, so that it can be left out as any other."""
-    return Job(id_, partial(_fail, error), content_hash(str(error)), error)
+    return AssetJob(id_, partial(_fail, error), content_hash(str(error)), error)
 
 
 def _fail(error: AssetError, folder: Path) -> ObjectAsset:
     raise error
 
 
-def check_jobs(jobs: Iterable[Job]) -> None:
+def check_jobs(jobs: Iterable[AssetJob]) -> None:
     """Raise the error of the first job that is known to fail.
 
     Raises:
@@ -105,10 +110,10 @@ def check_jobs(jobs: Iterable[Job]) -> None:
     """
     for job in jobs:
         if job.error is not None:
-            raise AssetError(_failed(job, str(job.error)).error.rstrip("."), fix=SKIP)
+            raise AssetError(_failed_result(job, str(job.error)).error.rstrip("."), fix=SKIP_FIX)
 
 
-def make_assets(jobs: Sequence[Job], out: Path, kept: Path, *, processes: int = 1) -> Iterator[JobResult]:
+def make_assets(jobs: Sequence[AssetJob], out: Path, kept: Path, *, processes: int = 1) -> Iterator[AssetJobResult]:
     """Make assets into ``out/<id>``, or copy them from where earlier runs kept them; yields each as it gets done.
 
     A run that was interrupted goes on where it stopped, since every finished asset is kept.
@@ -119,21 +124,21 @@ def make_assets(jobs: Sequence[Job], out: Path, kept: Path, *, processes: int = 
         kept: folder where finished assets are kept.
         processes: how many to make at a time.
     """
-    _forget_old(kept)
+    _delete_old_entries(kept)
     todo = []
     for job in jobs:
         place = kept / f"{job.id}-{job.content[:20]}"
-        asset = _copied(place, out / job.id)
+        asset = _copy_from_cache(place, out / job.id)
         if asset is None:
             todo.append((job, place))
         else:
-            yield JobResult(job.id, asset, reused=True)
+            yield AssetJobResult(job.id, asset, reused=True)
     for made, place in _run(todo, processes):
         # another run may be replacing it by the same just now
-        if made.asset is None or _copied(place, out / made.id) or _copied(place, out / made.id):
+        if made.asset is None or _copy_from_cache(place, out / made.id) or _copy_from_cache(place, out / made.id):
             yield made
         else:
-            yield JobResult(made.id, None, f"{made.id}: what was made is gone from {place.parent}")
+            yield AssetJobResult(made.id, None, f"{made.id}: what was made is gone from {place.parent}")
 
 
 def content_hash(*parts: object, files: Iterable[Path] = (), packages: Sequence[str] = ()) -> str:
@@ -157,7 +162,7 @@ def _code(package: str) -> str:
     here = Path(__file__).parent
     digest = hashlib.sha256()
     for path in sorted(path for path in (here / package).iterdir() if path.suffix in (".py", ".yaml")):
-        if package or not path.name.startswith(NOT_INVOLVED):
+        if package or not path.name.startswith(UNRELATED_FILES):
             digest.update(path.read_bytes())
     if not package:
         for path in sorted((here.parent / "robocas_ms3" / "assets").glob("*.py")):
@@ -166,18 +171,18 @@ def _code(package: str) -> str:
     return digest.hexdigest()
 
 
-def _run(todo: list[tuple[Job, Path]], processes: int) -> Iterator[tuple[JobResult, Path]]:
+def _run(todo: list[tuple[AssetJob, Path]], processes: int) -> Iterator[tuple[AssetJobResult, Path]]:
     workers = processes if min(processes, len(todo)) > 1 else 0
     with WorkerPool(partial(FunctionWorker, _make), workers, on_crash=_crashed) as pool:
         yield from pool.map(todo, ordered=False)
 
 
-def _crashed(task: tuple[Job, Path], why: str) -> tuple[JobResult, Path]:
+def _crashed(task: tuple[AssetJob, Path], why: str) -> tuple[AssetJobResult, Path]:
     job, place = task
-    return JobResult(job.id, None, f"{job.id}: the process that made it died ({why}); is there memory enough?"), place
+    return AssetJobResult(job.id, None, f"{job.id}: the worker process crashed ({why})"), place
 
 
-def _make(task: tuple[Job, Path]) -> tuple[JobResult, Path]:
+def _make(task: tuple[AssetJob, Path]) -> tuple[AssetJobResult, Path]:
     job, place = task
     start = time.perf_counter()
     try:
@@ -185,20 +190,20 @@ def _make(task: tuple[Job, Path]) -> tuple[JobResult, Path]:
             asset = job.make(tmp)
             (tmp / ENTRY).write_text(asset.model_dump_json(), encoding="utf-8")
     except RobocasError as error:
-        made = _failed(job, str(error))
+        made = _failed_result(job, str(error))
     except Exception as error:  # whatever a mesh library trips over: one asset fails, with its name, not the run
         log.debug("%s failed", job.id, exc_info=True)
-        made = _failed(job, f"{type(error).__name__}: {' '.join(str(error).split())}")
+        made = _failed_result(job, f"{type(error).__name__}: {' '.join(str(error).split())}")
     else:
-        made = JobResult(job.id, asset, seconds=time.perf_counter() - start)
+        made = AssetJobResult(job.id, asset, seconds=time.perf_counter() - start)
     return made, place
 
 
-def _failed(job: Job, message: str) -> JobResult:
-    return JobResult(job.id, None, message if message.startswith(job.id) else f"{job.id}: {message}")
+def _failed_result(job: AssetJob, message: str) -> AssetJobResult:
+    return AssetJobResult(job.id, None, message if message.startswith(job.id) else f"{job.id}: {message}")
 
 
-def _copied(place: Path, folder: Path) -> ObjectAsset | FurnitureAsset | None:
+def _copy_from_cache(place: Path, folder: Path) -> ObjectAsset | FurnitureAsset | None:
     """Copy an asset that was kept; none if there is none, or it was damaged since."""
     try:
         asset = validate_json(_ASSET, (place / ENTRY).read_bytes())
@@ -212,15 +217,15 @@ def _copied(place: Path, folder: Path) -> ObjectAsset | FurnitureAsset | None:
     return None
 
 
-def _forget_old(kept: Path) -> None:
-    oldest = time.time() - KEPT_DAYS * 86400
+def _delete_old_entries(kept: Path) -> None:
+    oldest = time.time() - CACHE_DAYS * 86400
     for place in kept.glob("*-*"):
         if place.stat().st_mtime < oldest:
             shutil.rmtree(place, ignore_errors=True)
 
 
 def write_pack(
-    jobs: Sequence[Job],
+    jobs: Sequence[AssetJob],
     folder: Path,
     kept: Path,
     *,
@@ -228,8 +233,8 @@ def write_pack(
     processes: int = 1,
     skip_errors: bool = False,
     record: bool = True,
-    on_made: Callable[[JobResult], None] = lambda made: None,
-) -> list[JobResult]:
+    on_made: Callable[[AssetJobResult], None] = lambda made: None,
+) -> list[AssetJobResult]:
     """Make a pack of assets: it appears at ``folder`` when all are done, or not at all.
 
     Args:
@@ -245,15 +250,15 @@ def write_pack(
     Raises:
         AssetError: an asset can't be made, or not be simulated as it is, naming it and why; or none can.
     """
-    check_target(folder)
+    check_pack_folder(folder)
     results = []
     with atomic_folder(folder) as tmp:
         for made in make_assets(jobs, tmp, kept, processes=processes):
             if made.asset is None and not skip_errors:
-                raise AssetError(made.error.rstrip("."), fix=SKIP)
+                raise AssetError(made.error.rstrip("."), fix=SKIP_FIX)
             results.append(made)
             on_made(made)
-        results = _without_miscooked(results, tmp, skip_errors)
+        results = _remove_hull_violations(results, tmp, skip_errors)
         assets = sorted((made.asset for made in results if made.asset), key=lambda asset: (asset.kind, asset.id))
         if not assets:
             raise AssetError("none of the assets could be made", where=folder, found=results[0].error)
@@ -265,19 +270,19 @@ def write_pack(
     return results
 
 
-def _without_miscooked(results: list[JobResult], folder: Path, skip_errors: bool) -> list[JobResult]:
+def _remove_hull_violations(results: list[AssetJobResult], folder: Path, skip_errors: bool) -> list[AssetJobResult]:
     """Give up, or leave them out, where the physics engine makes less of hulls than their files say."""
     faults: dict[str, str] = {}
     for fault in find_hull_violations(folder):
         faults.setdefault(fault.asset.partition("/")[0], str(fault))
     if faults and not skip_errors:
-        raise AssetError("; ".join(faults.values()), fix=SKIP)
+        raise AssetError("; ".join(faults.values()), fix=SKIP_FIX)
     for name in faults:
         shutil.rmtree(folder / name)
-    return [JobResult(made.id, None, faults[made.id]) if made.id in faults else made for made in results]
+    return [AssetJobResult(made.id, None, faults[made.id]) if made.id in faults else made for made in results]
 
 
-def check_target(folder: Path) -> None:
+def check_pack_folder(folder: Path) -> None:
     """See that a pack may be written to a folder.
 
     Raises:
@@ -290,7 +295,7 @@ def check_target(folder: Path) -> None:
     check_replaceable(folder, overwrite=True, markers=(MANIFEST,))
 
 
-def made_of(jobs: Sequence[Job], folder: Path, *, skip_errors: bool = False) -> bool:
+def is_up_to_date(jobs: Sequence[AssetJob], folder: Path, *, skip_errors: bool = False) -> bool:
     """Whether a pack was made of just these assets, by this code; with ``skip_errors``, some may have been left out."""
     try:
         found = load_json(folder / MADE_FROM)

@@ -14,8 +14,8 @@ from scipy.spatial import ConvexHull, QhullError
 
 from asset_tools.readers.model import read_model
 from asset_tools.readers.surface import Textures
-from asset_tools.repair import close
-from asset_tools.scan import METRES, PLAUSIBLE, Unit, Up, guess_unit, guess_up, upright
+from asset_tools.repair import close_scan
+from asset_tools.scan import METRES_PER_UNIT, PLAUSIBLE, Unit, Up, guess_unit, guess_up, rotate_upright
 from asset_tools.solids import to_mesh, to_solid
 from robocas_ms3.core.errors import AssetError
 
@@ -26,7 +26,7 @@ DEEPEST, SHARE = 0.004, 0.04  # m, and share of the height, above which nothing 
 BROAD = 0.6  # reach of the base over that of the body's outline; a ball's reaches 0.45 there
 FEET, ROCKS = 0.0003, 0.5  # m that contacts forgive; with less of the base's reach within it, it rocks
 FLAT = 0.8  # of the base's reach that is wanted
-NAMES = {"cm": "centimetres", "mm": "millimetres", "inch": "inches"}
+UNIT_NAMES = {"cm": "centimetres", "mm": "millimetres", "inch": "inches"}
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class PreparedScan:
     repairs: tuple[str, ...]
 
 
-def prepare(
+def prepare_scan(
     path: Path | Sequence[Path], *, root: Path | None = None, up: Up | None = None, unit: Unit | None = None
 ) -> PreparedScan:
     """Read a scan and repair it: files, faces, holes, axis, unit, base.
@@ -65,7 +65,7 @@ def prepare(
     """
     model = read_model(path if isinstance(path, Path) else list(path), root)
     repairs = list(model.notes)
-    solid = close(model.mesh)
+    solid = close_scan(model.mesh)
     repairs += solid.repairs
     repairs += _about_colours(solid.scan)
     known = up or model.up
@@ -74,17 +74,17 @@ def prepare(
         repairs.append(f"turned {up} up" if known else f"turned {up} up, a guess")
     longest = float(solid.mesh.extents.max())
     unit = unit or guess_unit([longest])
-    if not PLAUSIBLE[0] <= longest * METRES[unit] <= PLAUSIBLE[1]:
+    if not PLAUSIBLE[0] <= longest * METRES_PER_UNIT[unit] <= PLAUSIBLE[1]:
         raise AssetError(
             "the scan is of no size that can be picked up",
             where=path if isinstance(path, Path) else path[0],
             expected=f"{PLAUSIBLE[0]} to {PLAUSIBLE[1]} m for the longest side",
-            found=f"{longest * METRES[unit]:g} m, taking its {longest:g} for {NAMES.get(unit, 'metres')}",
+            found=f"{longest * METRES_PER_UNIT[unit]:g} m, taking its {longest:g} for {UNIT_NAMES.get(unit, 'metres')}",
             fix="Pass --units with the unit of the file.",
         )
     if unit != "m":
-        repairs.append(f"scaled from {NAMES[unit]}")
-    mesh, closed = (upright(part, up).apply_scale(METRES[unit]) for part in (solid.scan, solid.mesh))
+        repairs.append(f"scaled from {UNIT_NAMES[unit]}")
+    mesh, closed = (rotate_upright(part, up).apply_scale(METRES_PER_UNIT[unit]) for part in (solid.scan, solid.mesh))
     mesh, closed = level_base(mesh, closed, repairs)
     return PreparedScan(mesh, closed, up, unit, tuple(repairs))
 

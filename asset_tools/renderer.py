@@ -23,7 +23,7 @@ MARGIN = 1.06  # of the frame around what it shows
 
 
 @dataclass(frozen=True)
-class Body:
+class RenderBody:
     """Something to look at.
 
     Attributes:
@@ -41,7 +41,7 @@ class Body:
     pose: Array = field(default_factory=lambda: np.eye(4))
 
 
-class Studio:
+class Renderer:
     """A room with lights and a camera that sees all lines in parallel.
 
     Args:
@@ -67,7 +67,7 @@ class Studio:
         holder.add_component(self._camera)
         self._scene.add_entity(holder)
 
-    def image(self, bodies: Sequence[Body], azimuth: float, elevation: float) -> Image.Image:
+    def image(self, bodies: Sequence[RenderBody], azimuth: float, elevation: float) -> Image.Image:
         """What a camera sees that looks at the bodies from a direction, degrees from +x and above the horizon."""
         entities = [self._entity(body) for body in bodies]
         for entity in entities:
@@ -104,7 +104,7 @@ class Studio:
             light.set_entity_pose(sapien.Pose(q=_turning_x_to(away).tolist()))
 
     @staticmethod
-    def _entity(body: Body) -> sapien.Entity:
+    def _entity(body: RenderBody) -> sapien.Entity:
         component = sapien.render.RenderBodyComponent()
         if body.file is not None:
             component.attach(sapien.render.RenderShapeTriangleMesh(str(body.file)))

@@ -13,7 +13,7 @@ from scipy.spatial import KDTree, QhullError
 from trimesh.visual.color import ColorVisuals
 from trimesh.visual.texture import TextureVisuals
 
-from asset_tools.clean import clean
+from asset_tools.clean import clean_scan
 from asset_tools.solids import to_mesh, to_solid
 from robocas_ms3.core.errors import AssetError
 
@@ -50,7 +50,7 @@ class ClosedScan:
     repairs: tuple[str, ...]
 
 
-def close(scan: trimesh.Trimesh) -> ClosedScan:
+def close_scan(scan: trimesh.Trimesh) -> ClosedScan:
     """Make a watertight solid of a scan: weld, drop dirt, turn faces outwards, fill holes; else mesh it anew.
 
     A shell inside of the outer surface (an empty can scanned through) is dropped: things are solid.
@@ -62,7 +62,7 @@ def close(scan: trimesh.Trimesh) -> ClosedScan:
         AssetError: it encloses nothing (a sheet), or can't be closed.
     """
     repairs: list[str] = []
-    cleaned = clean(scan, repairs)
+    cleaned = clean_scan(scan, repairs)
     mesh, shown = cleaned.welded, cleaned.scan
     if not mesh.is_watertight:
         mesh, shown = _filled(mesh, shown, repairs)

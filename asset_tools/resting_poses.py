@@ -12,8 +12,8 @@ from asset_tools.stability import (
     BELOW,
     UPRIGHT_DEG,
     merge_poses,
-    only_rocks,
     pool_probabilities,
+    rocks_in_place,
     select_poses,
     stable_directions,
     toppling_angle,
@@ -163,7 +163,7 @@ def _firm(body: _Body, directions: Array, which: list[int]) -> tuple[Array, list
     if len(directions) == 0:
         return directions, which
     margins = np.array([toppling_angle(body.cooked, body.solid.center_of_mass, up) for up in directions])
-    rocks = np.array([only_rocks(body.cooked - body.solid.center_of_mass, up) for up in directions])
+    rocks = np.array([rocks_in_place(body.cooked - body.solid.center_of_mass, up) for up in directions])
     firm = np.flatnonzero((margins >= min(MIN_TOPPLING_DEG, margins.max())) | rocks)
     return directions[firm], [which[i] for i in firm]
 

@@ -16,8 +16,8 @@ Array = NDArray[np.float64]
 Unit = Literal["m", "cm", "mm", "inch"]
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 
-METRES: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
-UPS: tuple[str, ...] = get_args(Up)
+METRES_PER_UNIT: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+UP_AXES: tuple[str, ...] = get_args(Up)
 PLAUSIBLE = (0.005, 1.5)  # m, longest side of a thing that a hand can pick up, generously
 TYPICAL = 0.15  # m, longest side of a household object
 GIANT = 5.0  # times the typical size: next to scans in another unit, more likely one of ten times smaller things
@@ -38,8 +38,8 @@ def guess_unit(longest: Sequence[float]) -> Unit:
         AssetError: in none of them are the things of a size that can be picked up.
     """
     middle = float(np.median(longest))
-    best = min(("m", "cm", "mm"), key=lambda unit: abs(np.log(middle * METRES[unit] / TYPICAL)))
-    if not PLAUSIBLE[0] <= middle * METRES[best] <= PLAUSIBLE[1]:
+    best = min(("m", "cm", "mm"), key=lambda unit: abs(np.log(middle * METRES_PER_UNIT[unit] / TYPICAL)))
+    if not PLAUSIBLE[0] <= middle * METRES_PER_UNIT[best] <= PLAUSIBLE[1]:
         raise AssetError(
             "can't guess the unit of the scans",
             expected=f"{PLAUSIBLE[0]} to {PLAUSIBLE[1]} m for the longest side",
@@ -59,13 +59,13 @@ def guess_units(longest: Mapping[str, float]) -> dict[str, Unit]:
         AssetError: a scan is in no unit of a size that can be picked up.
     """
     cost = {
-        unit: sum(min(abs(np.log(side * METRES[unit] / TYPICAL)), FAR) for side in longest.values())
+        unit: sum(min(abs(np.log(side * METRES_PER_UNIT[unit] / TYPICAL)), FAR) for side in longest.values())
         for unit in ("m", "cm", "mm")
     }
     usual: Any = min(cost, key=lambda unit: cost[unit])
     units: dict[str, Unit] = {}
     for name, side in longest.items():
-        fits = PLAUSIBLE[0] <= side * METRES[usual] <= GIANT * TYPICAL
+        fits = PLAUSIBLE[0] <= side * METRES_PER_UNIT[usual] <= GIANT * TYPICAL
         try:
             units[name] = usual if fits else guess_unit([side])
         except AssetError as error:
@@ -95,7 +95,7 @@ def guess_up(mesh: trimesh.Trimesh) -> Up:
     return "y" if y < z else "z"
 
 
-def upright(mesh: trimesh.Trimesh, up: Up) -> trimesh.Trimesh:
+def rotate_upright(mesh: trimesh.Trimesh, up: Up) -> trimesh.Trimesh:
     """A copy with an axis of the file turned to +z."""
     turned = mesh.copy(include_cache=True)  # with its normals
     axis = np.zeros(3)

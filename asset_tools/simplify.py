@@ -18,7 +18,7 @@ GRIDS = (512, 362, 256, 181, 128, 91, 64, 45, 32, 16, 8)  # cells along the diag
 LEFT = 0.8  # share of area and volume that simplifying has to leave: with less, parts are lost or holes torn
 
 
-def simplified(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
+def simplify_mesh(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
     """Merge vertices by position, collapse faces to the limit, and wind them outward.
 
     A mesh with many holes or pieces can't be collapsed to the limit, or loses parts on the way. Up to six times as many
@@ -27,7 +27,7 @@ def simplified(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
     Raises:
         AssetError: no face is left.
     """
-    body = welded(mesh)
+    body = merge_vertices(mesh)
     center, size = body.bounds.mean(axis=0), float(np.linalg.norm(body.extents))
     whole = (np.asarray(body.vertices) - center) / size, np.asarray(body.faces)
     most, area = ENOUGH * triangles, float(body.area)
@@ -58,16 +58,16 @@ def simplified(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
     return body
 
 
-def welded(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+def merge_vertices(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Return the faces of a mesh, in the same order, over vertices merged by position."""
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     body.merge_vertices(digits_vertex=None)
     return body
 
 
-def outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+def orient_outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Return a welded mesh with its faces outwards, in the same order."""
-    body = welded(mesh)
+    body = merge_vertices(mesh)
     if body.volume < 0:
         body.faces = np.array(body.faces)[:, ::-1]
     return body

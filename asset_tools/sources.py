@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from asset_tools.grasps import Grasps
-from asset_tools.inertia import moments_of, piece_inertia, triple
+from asset_tools.inertia import piece_inertia, to_moments, to_tuple
 from robocas_ms3.assets.manifest import Handle, InnerBox, Joint, Link, Surface, check_asset_name
 
 
@@ -87,8 +87,8 @@ class LinkSource:
             parent=self.parent,
             joint=self.joint,
             mass=self.mass,
-            center_of_mass=triple(center),
-            inertia=moments_of(inertia),
+            center_of_mass=to_tuple(center),
+            inertia=to_moments(inertia),
             inertia_wxyz=axes,
         )
 

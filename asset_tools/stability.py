@@ -102,7 +102,7 @@ def pool_probabilities(directions: Array, probabilities: Array, kept: list[int])
     return np.bincount(nearest, probabilities, len(kept))
 
 
-def only_rocks(points: Array, up: Array) -> bool:
+def rocks_in_place(points: Array, up: Array) -> bool:
     """Whether a body of corners (V, 3) about its centre of mass stays near a pose even if it leaves it.
 
     The sides of an oval bottle are a few facets, and on each of them it stands by a hair.

@@ -14,9 +14,9 @@ from scipy.spatial import KDTree
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
-from asset_tools.glb import rgba_of, roughness_of
+from asset_tools.glb import get_rgba, get_roughness
 from asset_tools.readers.surface import TEXTURE, TINT, Textures, decode_srgb, encode_srgb
-from asset_tools.simplify import outward, simplified, welded
+from asset_tools.simplify import merge_vertices, orient_outward, simplify_mesh
 from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
@@ -58,7 +58,7 @@ def to_display(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: in
         texture = None if source.single is None else _shrunk(source.single, texture_size)
     else:
         kept = source.layered and len(mesh.faces) <= triangles
-        body = outward(mesh) if kept else simplified(mesh, triangles)
+        body = orient_outward(mesh) if kept else simplify_mesh(mesh, triangles)
         corner_normals = _crease_normals(body)
         faces, uv, texture = np.asarray(body.faces), None, None
         origin = np.arange(len(body.vertices))
@@ -99,7 +99,7 @@ class Appearance:
         visual: Any = mesh.visual
         material: Any = getattr(visual, "material", None)
         uv = getattr(visual, "uv", None)
-        self.roughness, self.factor = roughness_of(material), rgba_of(None)
+        self.roughness, self.factor = get_roughness(material), get_rgba(None)
         self.uv = np.zeros((0, 2)) if uv is None else np.array(uv, dtype=float)
         self.texture, self.tints = np.zeros(len(mesh.faces), int), None
         images: Sequence[Image.Image | None]
@@ -108,7 +108,7 @@ class Appearance:
             self.texture = np.asarray(mesh.vertex_attributes[TEXTURE])[mesh.faces[:, 0]]
             self.tints = np.asarray(mesh.vertex_attributes[TINT])[mesh.faces]
         elif isinstance(material, PBRMaterial):
-            images, self.factor = [material.baseColorTexture], rgba_of(material.baseColorFactor)
+            images, self.factor = [material.baseColorTexture], get_rgba(material.baseColorFactor)
         else:
             images = [getattr(material, "image", None)]  # a diffuse colour next to it is a mere default
         self.images = [] if uv is None else [image.convert("RGB") for image in images if image is not None]
@@ -118,7 +118,7 @@ class Appearance:
         elif visual.kind == "vertex":
             self.colors = np.asarray(visual.vertex_colors, dtype=float)[mesh.faces][:, :, :3]
         elif material is not None and not isinstance(material, PBRMaterial):
-            self.colors = np.broadcast_to(rgba_of(material.main_color)[:3], (len(mesh.faces), 3, 3))
+            self.colors = np.broadcast_to(get_rgba(material.main_color)[:3], (len(mesh.faces), 3, 3))
         self.plain = not self.images and bool((self.colors == self.colors[0, 0]).all())
         if self.plain and not isinstance(material, PBRMaterial):
             self.factor = 255 * decode_srgb(self.colors[0, 0])
@@ -175,9 +175,9 @@ def _shaded(mesh: trimesh.Trimesh) -> tuple[Array, NDArray, Array, NDArray]:
     own = mesh._cache.cache.get("vertex_normals")
     if own is not None:
         return vertices, faces, np.array(own), np.arange(len(vertices))
-    welded = trimesh.Trimesh(vertices, faces, process=False)
-    welded.merge_vertices(digits_vertex=None)
-    normals = _crease_normals(welded).reshape(-1, 3)
+    merged = trimesh.Trimesh(vertices, faces, process=False)
+    merged.merge_vertices(digits_vertex=None)
+    normals = _crease_normals(merged).reshape(-1, 3)
     keys = np.column_stack([faces.reshape(-1), np.rint(normals * 1e4)])
     _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     origin = faces.reshape(-1)[first]
@@ -241,7 +241,7 @@ def _baked(
     """
     rows, columns, face, weights = _rasterised(corner_uv, size)
     if same_faces:
-        turned = (np.asarray(body.faces)[:, 0] != np.asarray(welded(mesh).faces)[:, 0]).any()
+        turned = (np.asarray(body.faces)[:, 0] != np.asarray(merge_vertices(mesh).faces)[:, 0]).any()
         origin_face, origin_weights = face, weights[:, ::-1] if turned else weights
     else:
         points = np.einsum("nc,ncd->nd", weights, np.asarray(body.triangles)[face])

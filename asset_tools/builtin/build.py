@@ -10,7 +10,7 @@ from pathlib import Path
 from asset_tools.build import build_furniture, build_object
 from asset_tools.builtin.catalogue import products
 from asset_tools.builtin.furniture import MAKERS
-from asset_tools.pipeline import Job, content_hash
+from asset_tools.pipeline import AssetJob, content_hash
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import FurnitureAsset, ObjectAsset
 from robocas_ms3.core.errors import AssetError
@@ -29,7 +29,7 @@ def formulas_hash() -> str:
     return digest.hexdigest()
 
 
-def builtin_jobs(ids: Sequence[str] = ()) -> list[Job]:
+def builtin_jobs(ids: Sequence[str] = ()) -> list[AssetJob]:
     """What is to be made.
 
     Args:
@@ -43,7 +43,7 @@ def builtin_jobs(ids: Sequence[str] = ()) -> list[Job]:
     if unknown:
         raise AssetError("no such builtin asset", expected=f"one of {', '.join(known)}", found=", ".join(unknown))
     content = content_hash(packages=("builtin", "builtin/furniture", "builtin/products"))
-    return [Job(id_, partial(build_asset, id_), content) for id_ in ids or known]
+    return [AssetJob(id_, partial(build_asset, id_), content) for id_ in ids or known]
 
 
 def build_asset(asset_id: str, folder: Path) -> ObjectAsset | FurnitureAsset:

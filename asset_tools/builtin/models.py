@@ -15,7 +15,7 @@ from scipy.ndimage import distance_transform_edt
 from asset_tools.builtin.blends import Field, Point, mesh_of, smooth_min
 from asset_tools.builtin.mesh import Shape, Size, creased_shape
 from asset_tools.builtin.textures import Colour, as_jpeg
-from asset_tools.decompose import few_vertices
+from asset_tools.decompose import reduce_vertices
 
 MM = 1e-3
 CREASE_DEG = 55.0  # simplified roundings are coarse
@@ -93,7 +93,7 @@ class Model:
         if np.abs(factor - 1).max() > 0.2:
             raise ValueError(f"the parts give {self.body.extents} mm for a shape of {size} m")
         points = (self.body.vertices - self.body.bounds.mean(0)) * MM * factor
-        pieces = tuple(few_vertices((piece - self.body.bounds.mean(0)) * MM * factor) for piece in self._pieces())
+        pieces = tuple(reduce_vertices((piece - self.body.bounds.mean(0)) * MM * factor) for piece in self._pieces())
         return unwrapped(np.asarray(points), np.asarray(self.body.faces), self.texture_size, pieces)
 
     def paint(self, shape: Shape, rng: np.random.Generator) -> Image.Image:

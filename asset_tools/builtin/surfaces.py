@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from asset_tools.builtin.mesh import Patch
-from asset_tools.decompose import few_vertices
+from asset_tools.decompose import reduce_vertices
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ def stacked_pieces(patches: list[Patch], cuts: Sequence[float] = ()) -> list[np.
             rows = np.concatenate([rows, (1 - share) * rows[i : i + 1] + share * rows[i + 1 : i + 2]])
     height = rows[:, 0, 2]
     return [
-        few_vertices(rows[(height >= low - 1e-9) & (height <= high + 1e-9)].reshape(-1, 3))
+        reduce_vertices(rows[(height >= low - 1e-9) & (height <= high + 1e-9)].reshape(-1, 3))
         for low, high in itertools.pairwise(edges)
     ]
 
@@ -180,7 +180,7 @@ def stacked_pieces(patches: list[Patch], cuts: Sequence[float] = ()) -> list[np.
 def prism_piece(rings: Sequence[tuple[float, float]], sides: int = 16) -> np.ndarray:
     """Convex piece (k, 3) of an upright round part: regular polygons, of the area of its circles.
 
-    Its facets are equal, so that it comes to rest on any of them; on unequal ones, as `few_vertices` leaves them, a
+    Its facets are equal, so that it comes to rest on any of them; on unequal ones, as `reduce_vertices` leaves them, a
     round thing rocks for long. With up to three rings of 16 the engine keeps every corner.
 
     Args:
@@ -197,7 +197,7 @@ def chained_pieces(patch: Patch, count: int) -> list[np.ndarray]:
     """Convex pieces (k, 3) of a swept tube, each of an equal share of its rings."""
     rows = patch.points[1:-1, :-1]
     bounds = np.round(np.linspace(0, len(rows) - 1, count + 1)).astype(int)
-    return [few_vertices(rows[a : b + 1].reshape(-1, 3)) for a, b in itertools.pairwise(bounds.tolist())]
+    return [reduce_vertices(rows[a : b + 1].reshape(-1, 3)) for a, b in itertools.pairwise(bounds.tolist())]
 
 
 FACES = {  # right, up as seen from outside: (axis, sign) each

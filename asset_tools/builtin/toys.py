@@ -11,7 +11,7 @@ from asset_tools.builtin.mesh import Patch, Shape, Size, fitted
 from asset_tools.builtin.models import paint_in_space, unwrapped
 from asset_tools.builtin.surfaces import FACES
 from asset_tools.builtin.textures import Colour, Painter, lettering
-from asset_tools.decompose import few_vertices
+from asset_tools.decompose import reduce_vertices
 
 STICKERS: dict[str, Colour] = {
     "top": (242, 242, 240),
@@ -52,7 +52,7 @@ def rubiks_cube(size: Size) -> Shape:
         uv = np.stack([u, v], axis=-1) / (2 * half) + 0.5
         patches.append(Patch(name, points, uv, (2 * half, 2 * half)))
     body = np.concatenate([patch.points.reshape(-1, 3) for patch in patches])
-    return fitted([patches], size, pieces=[few_vertices(body)])
+    return fitted([patches], size, pieces=[reduce_vertices(body)])
 
 
 def paint_rubiks_cube(shape: Shape, rng: np.random.Generator) -> Image.Image:
@@ -95,7 +95,7 @@ def ball(size: Size, *, texture_size: int = 256) -> Shape:
     sphere = trimesh.creation.icosphere(subdivisions=3)
     points = sphere.vertices * np.asarray(size) / sphere.extents
     middle = (points.max(0) + points.min(0)) / 2
-    return unwrapped(points - middle, np.asarray(sphere.faces), texture_size, (few_vertices(points - middle),))
+    return unwrapped(points - middle, np.asarray(sphere.faces), texture_size, (reduce_vertices(points - middle),))
 
 
 def paint_racquetball(shape: Shape, rng: np.random.Generator) -> Image.Image:

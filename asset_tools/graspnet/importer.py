@@ -16,8 +16,8 @@ from asset_tools.graspnet.labels import label_checksums, label_grasps
 from asset_tools.grasps import Grasps, sample_grasps
 from asset_tools.import_scans import estimate_mass
 from asset_tools.inspection import Inspect, Inspection, ModelSource, inspect_models
-from asset_tools.pipeline import Job, content_hash, failing_job
-from asset_tools.prepare import prepare
+from asset_tools.pipeline import AssetJob, content_hash, make_failing_job
+from asset_tools.prepare import prepare_scan
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset
 from robocas_ms3.core.errors import AssetError
@@ -26,7 +26,7 @@ LICENCE = "CC BY-NC-SA 4.0"
 ATTRIBUTION = "GraspNet-1Billion (H.-S. Fang, C. Wang, M. Gou, C. Lu, CVPR 2020)"
 
 
-def graspnet_jobs(root: Path, ids: Sequence[int] = (), inspect: Inspect = inspect_models) -> list[Job]:
+def graspnet_jobs(root: Path, ids: Sequence[int] = (), inspect: Inspect = inspect_models) -> list[AssetJob]:
     """Return the jobs that import the dataset. A model that can't be read is a job that fails.
 
     Args:
@@ -70,7 +70,7 @@ def graspnet_source(root: Path, number: int) -> ObjectSource:
         AssetError: the model or the label file is damaged, or the model is missing or can't be closed.
     """
     entry = catalogue_entry(number)
-    model = prepare(_mesh(root, number), root=root, up="z", unit="m")
+    model = prepare_scan(_mesh(root, number), root=root, up="z", unit="m")
     grasps, notes = _grasps(_labels(root, number), model.closed, entry.id)
     return ObjectSource(
         id=entry.id,
@@ -102,16 +102,16 @@ def _grasps(labels: Path, closed: trimesh.Trimesh, id_: str) -> tuple[Grasps | N
     return found.joined(sampled), (note,)
 
 
-def _job(root: Path, number: int, inspected: Inspection) -> Job:
+def _job(root: Path, number: int, inspected: Inspection) -> AssetJob:
     id_, labels = catalogue_entry(number).id, _labels(root, number)
     if inspected.error is not None:
-        return failing_job(id_, inspected.error)
+        return make_failing_job(id_, inspected.error)
     try:
         checksums = label_checksums(labels) if labels.is_file() else ()
     except AssetError as error:
-        return failing_job(id_, error)
+        return make_failing_job(id_, error)
     content = content_hash("graspnet", number, checksums, files=inspected.files, packages=["graspnet"])
-    return Job(id_, partial(_make, root, number), content)
+    return AssetJob(id_, partial(_make, root, number), content)
 
 
 def _make(root: Path, number: int, folder: Path) -> ObjectAsset:

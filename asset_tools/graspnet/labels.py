@@ -19,7 +19,7 @@ import trimesh
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from asset_tools.grasps import Grasps, local_points, spread_out, surface_samples
+from asset_tools.grasps import Grasps, local_points, select_spread, surface_samples
 from robocas_ms3.assets.annotations import GRIPPER_BOXES
 from robocas_ms3.core.errors import AssetError
 
@@ -110,7 +110,7 @@ def label_grasps(path: Path, closed: trimesh.Trimesh) -> tuple[Grasps, int]:
     # Weight far off the approach line twists the object in the pads; along that line it does little harm.
     lever = np.linalg.norm(np.cross(to_center, poses[:, :3, 2]), axis=1)
     scores = -2.0 * frictions - lever / 0.15 - np.linalg.norm(to_center, axis=1) / 0.3
-    chosen = spread_out(poses, scores, MOST_GRASPS)
+    chosen = select_spread(poses, scores, MOST_GRASPS)
     return Grasps(poses[chosen], labels.widths[clear][chosen], frictions[chosen]), len(labels)
 
 

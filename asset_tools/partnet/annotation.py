@@ -12,7 +12,7 @@ from robocas_ms3.core.documents import DocumentError, load_yaml
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.strict_model import StrictModel, parse
 
-SHIPPED = Path(__file__).parent / "annotations"
+BUNDLED_ANNOTATIONS = Path(__file__).parent / "annotations"
 LARGEST = 100.0
 """m or rad: greatest limit of a joint, and greatest coordinate."""
 
@@ -20,7 +20,7 @@ Coordinate = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Scale = Annotated[float, Field(ge=1e-4, le=1e4)]
 
 
-class HandleNote(StrictModel):
+class HandleAnnotation(StrictModel):
     """Where to take hold of what a joint moves: pose of the TCP in the furniture's frame, joints closed."""
 
     joint: str
@@ -29,7 +29,7 @@ class HandleNote(StrictModel):
     width: Positive
 
 
-class JointNote(StrictModel):
+class JointAnnotation(StrictModel):
     """What to change about a joint."""
 
     mass: Positive | None = Field(default=None, description="of what it moves, kg; none: by volume")
@@ -44,7 +44,7 @@ class JointNote(StrictModel):
     fixed: bool = Field(default=False, description="hold it closed")
 
 
-class Annotation(StrictModel):
+class ModelAnnotation(StrictModel):
     """The file. Surfaces name the URDF's links; those of the fixed body leave ``link`` out."""
 
     name: Annotated[str, Field(min_length=1)]
@@ -53,11 +53,11 @@ class Annotation(StrictModel):
     scale: Scale = Field(default=1.0, description="metres of one unit of the model; all else here is in metres")
     mass: Positive | None = Field(default=None, description="kg; none: it can't be moved")
     surfaces: dict[Name, Surface] = {}
-    handles: dict[Name, HandleNote] = {}
-    joints: dict[str, JointNote] = {}
+    handles: dict[Name, HandleAnnotation] = {}
+    joints: dict[str, JointAnnotation] = {}
 
 
-def find_annotation(model_id: str, folder: Path | None = None) -> Annotation:
+def find_annotation(model_id: str, folder: Path | None = None) -> ModelAnnotation:
     """The annotation of a model: the user's, or else the one that comes with this package.
 
     Args:
@@ -67,11 +67,11 @@ def find_annotation(model_id: str, folder: Path | None = None) -> Annotation:
     Raises:
         AssetError: there is none, or it is wrong.
     """
-    places = [home / f"{model_id}.yaml" for home in (folder, SHIPPED) if home is not None]
+    places = [home / f"{model_id}.yaml" for home in (folder, BUNDLED_ANNOTATIONS) if home is not None]
     for path in places:
         if path.is_file():
             return load_annotation(path)
-    shipped = ", ".join(sorted(path.stem for path in SHIPPED.glob("*.yaml")))
+    shipped = ", ".join(sorted(path.stem for path in BUNDLED_ANNOTATIONS.glob("*.yaml")))
     raise AssetError(
         "no annotation of this model",
         where=model_id,
@@ -80,7 +80,7 @@ def find_annotation(model_id: str, folder: Path | None = None) -> Annotation:
     )
 
 
-def load_annotation(path: Path) -> Annotation:
+def load_annotation(path: Path) -> ModelAnnotation:
     """Read an annotation file.
 
     Raises:
@@ -90,4 +90,4 @@ def load_annotation(path: Path) -> Annotation:
         data = load_yaml(path)
     except (OSError, DocumentError) as error:
         raise AssetError("the annotation can't be read", where=path, found=error) from error
-    return parse(Annotation, data, AssetError, where=path, about="the annotation is wrong")
+    return parse(ModelAnnotation, data, AssetError, where=path, about="the annotation is wrong")

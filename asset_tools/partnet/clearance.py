@@ -22,7 +22,7 @@ PASSES = 3  # what one cut left too deep for the next may be shallow after it
 STOPS = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 
 
-def trimmed(pieces: Sequence[Array], others: Sequence[Array], joint: Joint) -> list[Array]:
+def trim_pieces(pieces: Sequence[Array], others: Sequence[Array], joint: Joint) -> list[Array]:
     """Pieces of a moving part, trimmed so as to pass the rest of the furniture all the way.
 
     Each is cut by the plane that takes off least. Where that would be more than 3 cm, or most of the piece, it is left.

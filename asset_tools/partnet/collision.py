@@ -11,8 +11,8 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 from shapely import unary_union
 from shapely.geometry import MultiPolygon, Polygon
 
-from asset_tools.decompose import few_vertices
-from asset_tools.repair import close
+from asset_tools.decompose import reduce_vertices
+from asset_tools.repair import close_scan
 from robocas_ms3.assets.cooked_hulls import MAX_SLENDERNESS
 from robocas_ms3.assets.hulls import find_box, slenderness
 from robocas_ms3.core.errors import AssetError
@@ -37,7 +37,7 @@ CUTS, STEPS, DEPTH = 6, 5, 4  # planes tried across each axis at faces and evenl
 
 
 @dataclass(frozen=True)
-class Part:
+class CollisionPart:
     """A part of the furniture, as PartNet names it.
 
     Attributes:
@@ -49,7 +49,7 @@ class Part:
     meshes: list[Array]
 
 
-def pieces_of(parts: Sequence[Part], middle: Array) -> list[Array]:
+def make_pieces(parts: Sequence[CollisionPart], middle: Array) -> list[Array]:
     """Corners (V, 3) of the convex pieces of a link's parts, at most 40.
 
     A part that nearly fills its hull is one piece. Others are split: into their meshes, these into loose components,
@@ -68,7 +68,7 @@ def pieces_of(parts: Sequence[Part], middle: Array) -> list[Array]:
         fine = "handle" in part.name or "knob" in part.name
         # of what else than handles is that slender nothing leans on
         found += [piece for piece in _split(part.meshes, fine, middle) if _size(piece, 0 if fine else 1) >= TINY]
-    hulls = [few_vertices(piece, bevel=0) for piece in found]
+    hulls = [reduce_vertices(piece, bevel=0) for piece in found]
     hulls = _without_hidden(hulls)
     if not hulls:
         where, expected = ", ".join(part.name for part in parts)[:80], f"a part of {TINY * 1000:g} mm"
@@ -79,14 +79,14 @@ def pieces_of(parts: Sequence[Part], middle: Array) -> list[Array]:
     return hulls
 
 
-def for_gpu(hull: Array) -> list[Array]:
+def limit_for_gpu(hull: Array) -> list[Array]:
     """A hull (V, 3); where it is too slender for a GPU its two halves, or the box around it, which may be slender."""
     if _sturdy(hull):
         return [hull]
     axis = int(np.ptp(hull, axis=0).argmax())
     middle = float(hull[:, axis].min() + hull[:, axis].max()) / 2
     corners = hull[ConvexHull(hull).simplices]
-    halves = [few_vertices(_half(corners, axis, middle, side).reshape(-1, 3), bevel=0) for side in (1.0, -1.0)]
+    halves = [reduce_vertices(_half(corners, axis, middle, side).reshape(-1, 3), bevel=0) for side in (1.0, -1.0)]
     if all(_sturdy(half) for half in halves):
         return halves
     to_middle, extents = trimesh.bounds.oriented_bounds(hull)
@@ -123,7 +123,7 @@ def _is_shell(body: trimesh.Trimesh) -> bool:
     if body.is_watertight:
         return False
     try:
-        return close(body).mesh.area > (1 + FILLED) * body.area
+        return close_scan(body).mesh.area > (1 + FILLED) * body.area
     except AssetError:
         return True
 

@@ -12,14 +12,14 @@ from scipy.spatial import ConvexHull
 
 from asset_tools.build import build_furniture
 from asset_tools.import_scans import object_id
-from asset_tools.partnet.annotation import LARGEST, Annotation, JointNote, find_annotation
-from asset_tools.partnet.clearance import trimmed
-from asset_tools.partnet.collision import Part, for_gpu, pieces_of
+from asset_tools.partnet.annotation import LARGEST, JointAnnotation, ModelAnnotation, find_annotation
+from asset_tools.partnet.clearance import trim_pieces
+from asset_tools.partnet.collision import CollisionPart, limit_for_gpu, make_pieces
 from asset_tools.partnet.geometry import Geometry
 from asset_tools.partnet.obj import Faces
 from asset_tools.partnet.textures import merged
 from asset_tools.partnet.urdf import URDF, Mobility, MovingLink, Visual, read_urdf, urdf_of
-from asset_tools.pipeline import Job, content_hash, failing_job
+from asset_tools.pipeline import AssetJob, content_hash, make_failing_job
 from asset_tools.readers.files import LARGEST_FILE, files_below
 from asset_tools.readers.limits import reading_limits
 from asset_tools.sources import FurnitureSource, LinkSource
@@ -40,7 +40,7 @@ SUFFIXES = {".obj", ".stl", ".mtl", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".t
 EDGE = 0.002  # m that a surface may reach beyond the model
 
 
-def read_partnet(folder: Path, annotation: Annotation) -> FurnitureSource:
+def read_partnet(folder: Path, annotation: ModelAnnotation) -> FurnitureSource:
     """Read a model: collision pieces, one textured mesh a link, joints, surfaces and handles.
 
     The frame is upstream's: the model's origin, x out of its front, z up; joints closed at 0. Links and joints keep
@@ -76,14 +76,14 @@ def read_partnet(folder: Path, annotation: Annotation) -> FurnitureSource:
     ids = _ids([link.name for link in model.links], repairs)
     joint_ids = _ids([link.joint for link in model.links], repairs)
     middle = bounds.mean(axis=0)
-    pieces = {name: _for_gpu(pieces_of(_parts(group), middle)) for name, group in looks.items()}
+    pieces = {name: _for_gpu(make_pieces(_parts(group), middle)) for name, group in looks.items()}
     joints = {link.name: _joint(link, joint_ids[link.joint], annotation) for link in model.links}
     for link in model.links:
         others = [piece for name, group in pieces.items() if name not in _carried(model, link.name) for piece in group]
-        pieces[link.name] = _for_gpu(trimmed(pieces[link.name], others, joints[link.name]))
+        pieces[link.name] = _for_gpu(trim_pieces(pieces[link.name], others, joints[link.name]))
     links = []
     for link in model.links:
-        note = annotation.joints.get(link.joint, JointNote())
+        note = annotation.joints.get(link.joint, JointAnnotation())
         volume = sum(ConvexHull(piece).volume for piece in pieces[link.name])
         mesh = merged([faces for _, _, faces in looks[link.name]])
         mass = note.mass or max(0.3, round(DENSITY * volume, 2))
@@ -143,10 +143,10 @@ def _short(repairs: Sequence[str]) -> tuple[str, ...]:
 
 
 def _for_gpu(pieces: Sequence[np.ndarray]) -> list[np.ndarray]:
-    return [part for piece in pieces for part in for_gpu(piece)]
+    return [part for piece in pieces for part in limit_for_gpu(piece)]
 
 
-def partnet_jobs(folders: Sequence[Path], annotations: Path | None = None) -> list[Job]:
+def partnet_jobs(folders: Sequence[Path], annotations: Path | None = None) -> list[AssetJob]:
     """What is to be made of models.
 
     Args:
@@ -156,8 +156,8 @@ def partnet_jobs(folders: Sequence[Path], annotations: Path | None = None) -> li
     Returns:
         Jobs; those that can only fail come first, so that an import that is to stop does so before anything is made.
     """
-    good: dict[str, Job] = {}
-    bad: dict[str, Job] = {}
+    good: dict[str, AssetJob] = {}
+    bad: dict[str, AssetJob] = {}
     for folder in dict.fromkeys(folder.resolve() for folder in folders):
         name = object_id(folder.name)
         try:
@@ -166,18 +166,18 @@ def partnet_jobs(folders: Sequence[Path], annotations: Path | None = None) -> li
             good[name] = _job(name, folder, annotations)
         except AssetError as error:
             label = name if name not in good and name not in bad else object_id(str(folder))
-            bad[label] = failing_job(label, error)
+            bad[label] = make_failing_job(label, error)
     return [*bad.values(), *good.values()]
 
 
-def _job(name: str, folder: Path, annotations: Path | None) -> Job:
+def _job(name: str, folder: Path, annotations: Path | None) -> AssetJob:
     urdf_of(folder)  # else the annotation would be what is missing
     annotation = find_annotation(folder.name, annotations)
     model, geometry = read_urdf(folder, annotation.joints, annotation.scale), Geometry(folder)
     for link, visuals in _groups(model):
         geometry.check(link, visuals)
     content = content_hash(name, annotation, files=_files(folder), packages=("partnet", "readers"))
-    return Job(name, partial(_make, folder, annotation), content)
+    return AssetJob(name, partial(_make, folder, annotation), content)
 
 
 def _files(folder: Path) -> list[Path]:
@@ -190,19 +190,21 @@ def _files(folder: Path) -> list[Path]:
     return found
 
 
-def _make(folder: Path, annotation: Annotation, out: Path) -> FurnitureAsset:
+def _make(folder: Path, annotation: ModelAnnotation, out: Path) -> FurnitureAsset:
     return build_furniture(read_partnet(folder, annotation), out)
 
 
-def _parts(group: Sequence[tuple[str, str, Faces]]) -> list[Part]:
+def _parts(group: Sequence[tuple[str, str, Faces]]) -> list[CollisionPart]:
     parts: dict[str, dict[str, list[Array]]] = {}
     for name, source, faces in group:
         parts.setdefault(name, {}).setdefault(source, []).append(faces.corners)
-    return [Part(name, [np.concatenate(blocks) for blocks in meshes.values()]) for name, meshes in parts.items()]
+    return [
+        CollisionPart(name, [np.concatenate(blocks) for blocks in meshes.values()]) for name, meshes in parts.items()
+    ]
 
 
-def _joint(link: MovingLink, name: str, annotation: Annotation) -> Joint:
-    note, limits = annotation.joints.get(link.joint, JointNote()), link.limits
+def _joint(link: MovingLink, name: str, annotation: ModelAnnotation) -> Joint:
+    note, limits = annotation.joints.get(link.joint, JointAnnotation()), link.limits
     if not limits[0] <= 0 <= limits[1] or limits[0] == limits[1]:
         raise AssetError("a joint's range doesn't hold 0, which is closed", where=link.joint, found=limits)
     x, y, z = (float(value) for value in np.round(link.axis, 9) + 0.0)
@@ -227,7 +229,7 @@ def _carried(model: Mobility, name: str) -> set[str]:
     return carried
 
 
-def _check(model: Mobility, annotation: Annotation, bounds: Array) -> None:
+def _check(model: Mobility, annotation: ModelAnnotation, bounds: Array) -> None:
     where = model.folder.name
     moving = {link.joint for link in model.links}
     for name in annotation.joints:

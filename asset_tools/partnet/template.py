@@ -22,7 +22,7 @@ surfaces:                     # where objects may stand
 {joints}"""
 
 
-def template(folder: Path) -> str:
+def make_template(folder: Path) -> str:
     """A YAML annotation of a model with its joints and links in place and numbers to be filled in.
 
     Args:

@@ -13,7 +13,7 @@ from xml.parsers import expat
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from asset_tools.partnet.annotation import LARGEST, JointNote
+from asset_tools.partnet.annotation import LARGEST, JointAnnotation
 from asset_tools.readers.files import read_file
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.strict_model import check_name
@@ -96,7 +96,7 @@ class _Joint:
     element: ET.Element
 
 
-def read_urdf(folder: Path, notes: Mapping[str, JointNote] | None = None, scale: float = 1.0) -> Mobility:
+def read_urdf(folder: Path, notes: Mapping[str, JointAnnotation] | None = None, scale: float = 1.0) -> Mobility:
     """Read a model's links and joints. Joints without a finite range (casters) are fixed unless a note gives limits.
 
     Args:
@@ -111,7 +111,7 @@ def read_urdf(folder: Path, notes: Mapping[str, JointNote] | None = None, scale:
 
 
 class _Reader:
-    def __init__(self, folder: Path, notes: Mapping[str, JointNote], scale: float) -> None:
+    def __init__(self, folder: Path, notes: Mapping[str, JointAnnotation], scale: float) -> None:
         self._folder, self._path, self._notes, self._scale = folder, folder / URDF, notes, scale
         self._repairs: list[str] = []
         self._colors: dict[str, tuple[float, float, float]] = {}
@@ -176,7 +176,7 @@ class _Reader:
 
     def _range(self, joint: _Joint) -> tuple[float, tuple[float, float]] | None:
         """Return the closed position in the URDF's count, and the limits from there; None: the joint is fixed."""
-        note = self._notes.get(joint.name, JointNote())
+        note = self._notes.get(joint.name, JointAnnotation())
         if joint.kind == "fixed" or note.fixed:
             return None
         if joint.kind not in KINDS:
@@ -200,7 +200,7 @@ class _Reader:
             return None
         return closed, (low - closed, high - closed)
 
-    def _limits(self, joint: _Joint, note: JointNote, unit: float) -> tuple[float, float]:
+    def _limits(self, joint: _Joint, note: JointAnnotation, unit: float) -> tuple[float, float]:
         """Return limits in m or rad, in the URDF's count; infinite where there are none."""
         limit = joint.element.find("limit")
         if limit is None or joint.kind == "continuous":

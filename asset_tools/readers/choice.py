@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from asset_tools.readers.files import TEXTURE_FOLDERS
-from asset_tools.readers.surface import Part
+from asset_tools.readers.surface import MeshPart
 from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
@@ -51,7 +51,7 @@ class Candidate:
     """
 
     path: Path
-    parts: list[Part]
+    parts: list[MeshPart]
 
     @cached_property
     def bounds(self) -> Array:
@@ -130,7 +130,7 @@ def is_collision(path: Path, folder: Path) -> bool:
     return COLLISION.search(path.stem.lower()) is not None or bool(folders & COLLISION_FOLDERS)
 
 
-def choose(candidates: Sequence[Candidate], folder: Path, notes: list[str]) -> list[Candidate]:
+def choose_candidates(candidates: Sequence[Candidate], folder: Path, notes: list[str]) -> list[Candidate]:
     """Return the candidates that together are the object.
 
     What another mesh shows is left out: another version of it, or a part of it. Of versions the textured and most

@@ -22,7 +22,7 @@ from trimesh.visual.material import PBRMaterial
 from asset_tools.readers.files import LARGEST_FILE, ModelFiles
 from asset_tools.readers.images import open_texture
 from asset_tools.readers.obj import MOST_FACES, MOST_VERTICES, decode_text
-from asset_tools.readers.surface import Material, Part, decode_srgb
+from asset_tools.readers.surface import Material, MeshPart, decode_srgb
 from robocas_ms3.core.errors import AssetError, require_extra
 from robocas_ms3.core.text import format_error
 
@@ -33,7 +33,7 @@ LONGEST_HEADER = 65536  # bytes of a PLY file
 BLACK = 0.02  # linear
 
 
-def read_exchange(path: Path, files: ModelFiles) -> list[Part]:
+def read_exchange(path: Path, files: ModelFiles) -> list[MeshPart]:
     """Read a file of one of these formats.
 
     Args:
@@ -192,7 +192,7 @@ def _off_faces(data: bytes, path: Path, files: ModelFiles) -> int:
     return int(counts[1])
 
 
-def _parts(scene: trimesh.Scene, textures: _Textures) -> Iterator[Part]:
+def _parts(scene: trimesh.Scene, textures: _Textures) -> Iterator[MeshPart]:
     for node in scene.graph.nodes_geometry:
         pose, name = scene.graph[node]
         mesh = scene.geometry[name]
@@ -206,17 +206,17 @@ def _parts(scene: trimesh.Scene, textures: _Textures) -> Iterator[Part]:
             yield part
 
 
-def _part(mesh: trimesh.Trimesh, textures: _Textures) -> Part:
+def _part(mesh: trimesh.Trimesh, textures: _Textures) -> MeshPart:
     vertices, faces = np.array(mesh.vertices, float), np.array(mesh.faces, np.int64)
     normals = mesh._cache.cache.get("vertex_normals")  # those of the file, no computed ones
     visual: Any = mesh.visual
     if visual.kind == "face":
         colors = np.repeat(decode_srgb(np.asarray(visual.face_colors)[:, :3]), 3, axis=0)
-        return Part(vertices[faces.reshape(-1)], np.arange(3 * len(faces)).reshape(-1, 3), colors=colors)
+        return MeshPart(vertices[faces.reshape(-1)], np.arange(3 * len(faces)).reshape(-1, 3), colors=colors)
     if visual.kind == "vertex":
-        return Part(vertices, faces, None, decode_srgb(np.asarray(visual.vertex_colors)[:, :3]), normals)
+        return MeshPart(vertices, faces, None, decode_srgb(np.asarray(visual.vertex_colors)[:, :3]), normals)
     if visual.kind != "texture":
-        return Part(vertices, faces, normals=normals)
+        return MeshPart(vertices, faces, normals=normals)
     material, uvs = visual.material, visual.uv
     image = getattr(material, "image", None)
     if isinstance(material, PBRMaterial):
@@ -224,9 +224,9 @@ def _part(mesh: trimesh.Trimesh, textures: _Textures) -> Part:
     if image is None or uvs is None or len(uvs) != len(vertices):
         colors = mesh.vertex_attributes.get("color")
         if colors is not None and len(colors) == len(vertices):
-            return Part(vertices, faces, None, decode_srgb(_bytes(colors)[:, :3]), normals)
-        return Part(vertices, faces, normals=normals, material=Material(_plain(material)))
-    return Part(vertices, faces, np.array(uvs, float), None, normals, Material(image=textures.shared(image)))
+            return MeshPart(vertices, faces, None, decode_srgb(_bytes(colors)[:, :3]), normals)
+        return MeshPart(vertices, faces, normals=normals, material=Material(_plain(material)))
+    return MeshPart(vertices, faces, np.array(uvs, float), None, normals, Material(image=textures.shared(image)))
 
 
 def _plain(material: Any) -> tuple[float, float, float]:

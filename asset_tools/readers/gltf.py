@@ -19,7 +19,7 @@ from asset_tools.readers.files import ModelFiles
 from asset_tools.readers.gltf_buffers import Buffers, entry
 from asset_tools.readers.gltf_materials import READ_EXTENSIONS, Materials
 from asset_tools.readers.obj import MOST_FACES
-from asset_tools.readers.surface import Material, Part
+from asset_tools.readers.surface import Material, MeshPart
 from robocas_ms3.core.documents import decode_json
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.text import one_line
@@ -31,7 +31,7 @@ COMPRESSED = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mesh
 LINES, STRIP, FAN = (0, 1, 2, 3), 5, 6
 
 
-def read_gltf(path: Path, files: ModelFiles) -> list[Part]:
+def read_gltf(path: Path, files: ModelFiles) -> list[MeshPart]:
     """Read a glTF file.
 
     Args:
@@ -81,10 +81,10 @@ def _split(data: bytes, path: Path) -> tuple[Any, bytes]:
         raise _damaged(path, f"no JSON: {error}") from error
 
 
-def _parts(model: schema.Gltf, blob: bytes, path: Path, files: ModelFiles, ignored: set[str]) -> list[Part]:
+def _parts(model: schema.Gltf, blob: bytes, path: Path, files: ModelFiles, ignored: set[str]) -> list[MeshPart]:
     buffers = Buffers(model, blob, path, files)
     materials = Materials(model, buffers, files.notes, ignored)
-    found: list[Part] = []
+    found: list[MeshPart] = []
     faces = 0
     for node, pose in _placed(model):
         if node.skin is not None:
@@ -128,7 +128,7 @@ def _placed(model: schema.Gltf) -> list[tuple[schema.Node, Array]]:
     return found
 
 
-def _part(primitive: schema.Primitive, buffers: Buffers, materials: Materials, ignored: set[str]) -> Part:
+def _part(primitive: schema.Primitive, buffers: Buffers, materials: Materials, ignored: set[str]) -> MeshPart:
     """Return the triangles of a primitive in the frame of its node."""
     attributes = primitive.attributes
     if "POSITION" not in attributes:
@@ -160,10 +160,10 @@ def _part(primitive: schema.Primitive, buffers: Buffers, materials: Materials, i
             raise ValueError(f"{len(values)} {name} of {len(vertices)} vertices")
     if "JOINTS_0" in attributes:
         ignored.add("a skin")
-    return Part(vertices, faces, uvs, colors, normals, material)
+    return MeshPart(vertices, faces, uvs, colors, normals, material)
 
 
-def _moved(part: Part, pose: Array) -> Part:
+def _moved(part: MeshPart, pose: Array) -> MeshPart:
     """Return a part in the frame of the scene; mirroring keeps its faces outwards."""
     linear = pose[:3, :3]
     part.vertices = part.vertices @ linear.T + pose[:3, 3]

@@ -13,8 +13,8 @@ from types import FrameType
 
 from robocas_ms3.core.errors import AssetError
 
-SECONDS = 25.0
-MEMORY = 2 * 2**30  # bytes
+MAX_SECONDS = 25.0
+MAX_MEMORY = 2 * 2**30  # bytes
 
 
 @contextmanager
@@ -30,9 +30,11 @@ def reading_limits(where: object) -> Iterator[None]:
         AssetError: a limit was reached.
     """
     fix = "Reduce the mesh, or leave the model out."
-    too_slow = AssetError("reading the model takes too long", where=where, expected=f"at most {SECONDS:.0f} s", fix=fix)
+    too_slow = AssetError(
+        "reading the model takes too long", where=where, expected=f"at most {MAX_SECONDS:.0f} s", fix=fix
+    )
     limit = resource.getrlimit(resource.RLIMIT_DATA)
-    wanted = _data_size() + MEMORY
+    wanted = _data_size() + MAX_MEMORY
     if limit[1] != resource.RLIM_INFINITY:
         wanted = min(wanted, limit[1])
     main_thread = threading.current_thread() is threading.main_thread()
@@ -41,12 +43,12 @@ def reading_limits(where: object) -> Iterator[None]:
     try:
         resource.setrlimit(resource.RLIMIT_DATA, (wanted, limit[1]))
         if main_thread:
-            signal.setitimer(signal.ITIMER_REAL, SECONDS)
+            signal.setitimer(signal.ITIMER_REAL, MAX_SECONDS)
         yield
     except MemoryError as error:
         what = "reading the model needs too much memory"
-        raise AssetError(what, where=where, expected=f"at most {MEMORY >> 30} GB", fix=fix) from error
-    except _TooSlow as error:
+        raise AssetError(what, where=where, expected=f"at most {MAX_MEMORY >> 30} GB", fix=fix) from error
+    except _Timeout as error:
         raise too_slow from error
     except Exception as error:
         if alarm.rung:  # native code has made another error of it
@@ -59,7 +61,7 @@ def reading_limits(where: object) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_DATA, limit)
 
 
-class _TooSlow(BaseException):
+class _Timeout(BaseException):
     """No parser takes it for an error of the file."""
 
 
@@ -69,7 +71,7 @@ class _Alarm:
 
     def ring(self, number: int, frame: FrameType | None) -> None:
         self.rung = True
-        raise _TooSlow
+        raise _Timeout
 
 
 def _data_size() -> int:

@@ -12,16 +12,16 @@ from typing import Literal
 import numpy as np
 import trimesh
 
-from asset_tools.readers.choice import FORMATS, Candidate, choose, is_collision, is_mesh, mesh_files
+from asset_tools.readers.choice import FORMATS, Candidate, choose_candidates, is_collision, is_mesh, mesh_files
 from asset_tools.readers.exchange import read_exchange
 from asset_tools.readers.files import ModelFiles
 from asset_tools.readers.gltf import read_gltf
 from asset_tools.readers.obj import MOST_FACES
 from asset_tools.readers.obj_model import read_obj
-from asset_tools.readers.surface import Part, to_mesh
+from asset_tools.readers.surface import MeshPart, to_mesh
 from robocas_ms3.core.errors import AssetError, RobocasError
 
-READERS: dict[str, Callable[[Path, ModelFiles], list[Part]]] = {
+READERS: dict[str, Callable[[Path, ModelFiles], list[MeshPart]]] = {
     ".obj": read_obj,
     ".glb": read_gltf,
     ".gltf": read_gltf,
@@ -89,7 +89,7 @@ def _chosen(paths: list[Path], files: ModelFiles) -> list[Candidate]:
             errors[path] = error
     if not candidates:
         raise next(iter(errors.values()))
-    chosen = choose([candidate for candidate, _ in candidates], files.home, files.notes)
+    chosen = choose_candidates([candidate for candidate, _ in candidates], files.home, files.notes)
     names = {path: path.relative_to(files.home).as_posix() for path in paths}
     if not files.notes and len(paths) > 1:
         files.notes.append(f"used {names[chosen[0].path]}")
@@ -116,7 +116,7 @@ def _candidate(path: Path, files: ModelFiles) -> Candidate:
     return Candidate(path, parts)
 
 
-def _clean(part: Part, path: Path, files: ModelFiles) -> Part:
+def _clean(part: MeshPart, path: Path, files: ModelFiles) -> MeshPart:
     """Return a part without unused vertices, and without coordinates and colours that are not finite.
 
     Raises:
@@ -139,7 +139,7 @@ def _clean(part: Part, path: Path, files: ModelFiles) -> Part:
         colors = None
     if normals is not None and not (np.isfinite(normals).all() and (np.abs(normals) <= 1.01).all()):
         normals = None
-    return Part(vertices, faces.reshape(-1, 3), uvs, colors, normals, part.material)
+    return MeshPart(vertices, faces.reshape(-1, 3), uvs, colors, normals, part.material)
 
 
 def _check(mesh: trimesh.Trimesh, path: Path) -> None:

@@ -11,7 +11,7 @@ from PIL import Image
 from asset_tools.readers.files import ModelFiles, missing_path
 from asset_tools.readers.images import open_texture
 from asset_tools.readers.obj import MtlMaterial, ObjMesh, decode_text, find_material, parse_mtl, parse_obj
-from asset_tools.readers.surface import WHITE, Material, Part, decode_srgb
+from asset_tools.readers.surface import WHITE, Material, MeshPart, decode_srgb
 from robocas_ms3.core.errors import AssetError
 
 Ints = NDArray[np.int64]
@@ -22,7 +22,7 @@ COLOURED = 0.05  # difference of the channels of a colour that is no grey
 MOST_MATERIALS = 1000
 
 
-def read_obj(path: Path, files: ModelFiles) -> list[Part]:
+def read_obj(path: Path, files: ModelFiles) -> list[MeshPart]:
     """Read an OBJ file: one part per material.
 
     Faces without a material, or of one that no MTL file has, get the only textured material there is; where there is
@@ -133,7 +133,7 @@ def _part(
     place: Path,
     images: dict[str, Image.Image],
     files: ModelFiles,
-) -> Part:
+) -> MeshPart:
     """Return the triangles of one material, a vertex for each different corner."""
     use_normals = bool((mesh.face_normals[rows] >= 0).all())
     shown, uv_map = _look(material, place, images, files, bool((mesh.face_uvs[rows] >= 0).all()))
@@ -155,7 +155,7 @@ def _part(
     normals = mesh.normals[corners[:, 2]] if use_normals else None
     if normals is not None:
         normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return Part(mesh.vertices[corners[:, 0]], inverse.reshape(-1, 3), uvs, colors, normals, shown)
+    return MeshPart(mesh.vertices[corners[:, 0]], inverse.reshape(-1, 3), uvs, colors, normals, shown)
 
 
 def _look(

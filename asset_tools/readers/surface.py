@@ -38,7 +38,7 @@ class Material:
 
 
 @dataclass(eq=False)
-class Part:
+class MeshPart:
     """Triangles of one material.
 
     Attributes:
@@ -85,7 +85,7 @@ class Textures(TrimeshMaterial):
         return isinstance(other, Textures) and other.images == self.images
 
 
-def to_mesh(parts: Sequence[Part]) -> trimesh.Trimesh:
+def to_mesh(parts: Sequence[MeshPart]) -> trimesh.Trimesh:
     """Return one mesh of all parts, which shows the same colours.
 
     Its visual is undefined where everything is white, vertex colours (sRGB) where there is no image, a
@@ -134,10 +134,10 @@ def encode_srgb(values: Array) -> NDArray[np.uint8]:
     return np.rint(255 * share).astype(np.uint8)
 
 
-def _image(part: Part) -> Image.Image | None:
+def _image(part: MeshPart) -> Image.Image | None:
     return None if part.uvs is None else part.material.image
 
 
-def _tint(part: Part) -> Array:
+def _tint(part: MeshPart) -> Array:
     tint = np.tile(np.asarray(part.material.color, float), (len(part.vertices), 1))
     return tint if part.colors is None else tint * part.colors

@@ -18,7 +18,7 @@ from robocas_ms3.core.text import format_count
 
 CONTACT_SHEET = "contact_sheet.png"
 MAX_SHEET_ASSETS = 60  # assets on the contact sheet of an import
-# `asset_tools.pipeline.Job`, imported only when a command runs
+# `asset_tools.pipeline.AssetJob`, imported only when a command runs
 Job = Any
 
 
@@ -163,7 +163,7 @@ def import_partnet(command: ImportPartNet) -> int:
 
     require_mesh_tools()
     from asset_tools.partnet.importer import partnet_jobs
-    from asset_tools.partnet.template import template
+    from asset_tools.partnet.template import make_template
 
     if not command.models:
         expected, fix = "folders with a mobility.urdf", "Pass at least one folder."
@@ -171,7 +171,7 @@ def import_partnet(command: ImportPartNet) -> int:
     if command.template:
         from robocas_ms3.cli.terminal import print_text
 
-        print_text(template(command.models[0]))
+        print_text(make_template(command.models[0]))
         return 0
     jobs = partnet_jobs(command.models, command.annotations)
     return _import_pack(jobs, command, _target(command.pack), "PartNet model")
@@ -215,7 +215,7 @@ def _inspect(command: _ImportOptions, models: Mapping[str, Any]) -> Mapping[str,
 
 def _target(name: str) -> Path:
     """Return the folder of an imported pack; raise AssetError if the name is invalid or taken by a bundled pack."""
-    from asset_tools.pipeline import check_target
+    from asset_tools.pipeline import check_pack_folder
     from robocas_ms3.core.errors import AssetError
     from robocas_ms3.core.paths import builtin_packs_dir, data_dir
 
@@ -223,19 +223,19 @@ def _target(name: str) -> Path:
         what, fix = "invalid name for an imported pack", "Choose another name."
         raise AssetError(what, where="--pack", expected="a name that no bundled pack has", found=repr(name), fix=fix)
     out = data_dir() / "packs" / name
-    check_target(out)
+    check_pack_folder(out)
     return out
 
 
 def _import_pack(jobs: list[Job], command: _ImportOptions, out: Path, what: str) -> int:
-    from asset_tools.pipeline import check_jobs, made_of
+    from asset_tools.pipeline import check_jobs, is_up_to_date
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.errors import AssetError, OutputExistsError
 
     if not command.skip_errors:
         check_jobs(jobs)
-    if made_of(jobs, out, skip_errors=command.skip_errors):
+    if is_up_to_date(jobs, out, skip_errors=command.skip_errors):
         try:
             load_pack(out)
         except AssetError as error:
@@ -253,7 +253,7 @@ def _import_pack(jobs: list[Job], command: _ImportOptions, out: Path, what: str)
 
 
 def _write(jobs: list[Job], command: _ImportOptions, out: Path, description: str, *, record: bool = True) -> int:
-    from asset_tools.pipeline import JobResult, write_pack
+    from asset_tools.pipeline import AssetJobResult, write_pack
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.paths import cache_dir
@@ -261,7 +261,7 @@ def _write(jobs: list[Job], command: _ImportOptions, out: Path, description: str
     with ProgressBar(f"assets of {out.name} processed") as bar:
         bar.start(len(jobs))
 
-        def on_made(made: JobResult) -> None:
+        def on_made(made: AssetJobResult) -> None:
             bar.advance()
             if made.asset is None:
                 bar.add_note(f"skipped: {made.error}")
@@ -290,7 +290,7 @@ def _write(jobs: list[Job], command: _ImportOptions, out: Path, description: str
 
 
 def _draw_sheet(folder: Path) -> None:
-    from asset_tools.contact_sheet import contact_sheet
+    from asset_tools.contact_sheet import write_contact_sheet
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.cli.progress import spinner
     from robocas_ms3.cli.terminal import print_line
@@ -300,7 +300,7 @@ def _draw_sheet(folder: Path) -> None:
     ids = [asset.id for asset in pack.manifest.assets]
     try:
         with spinner(f"rendering {format_count(len(ids[:MAX_SHEET_ASSETS]), 'asset')}"):
-            contact_sheet(pack, folder / CONTACT_SHEET, ids[:MAX_SHEET_ASSETS])
+            write_contact_sheet(pack, folder / CONTACT_SHEET, ids[:MAX_SHEET_ASSETS])
     except AssetError as error:
         print_line(f"no contact sheet: {error}")
         return

@@ -149,7 +149,7 @@ def verify(command: Verify) -> int:
 
 def sheet(command: Sheet) -> int:
     require_mesh_tools()
-    from asset_tools.contact_sheet import contact_sheet
+    from asset_tools.contact_sheet import write_contact_sheet
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.cli.progress import spinner
     from robocas_ms3.cli.terminal import print_line
@@ -161,7 +161,7 @@ def sheet(command: Sheet) -> int:
         found = out.suffix or "no suffix"
         raise AssetError("unknown image format of a contact sheet", where=out, expected=".png or .jpg", found=found)
     with spinner(f"rendering {format_count(len(command.ids) or len(pack.manifest.assets), 'asset')}"):
-        contact_sheet(pack, out, ids=command.ids or None)
+        write_contact_sheet(pack, out, ids=command.ids or None)
     print_line(f"wrote {out}")
     return 0
 

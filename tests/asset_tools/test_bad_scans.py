@@ -19,7 +19,7 @@ import trimesh
 from models import texels, write_obj
 from PIL import Image
 
-from asset_tools.prepare import prepare
+from asset_tools.prepare import prepare_scan
 from asset_tools.visual import to_display
 from robocas_ms3.core.errors import AssetError
 
@@ -104,7 +104,7 @@ def check_bottle(scan, *, colors=True, volume=0.005):
 
 
 def test_a_good_scan_has_nothing_to_mend(tmp_path):
-    scan = prepare(write_scan(tmp_path))
+    scan = prepare_scan(write_scan(tmp_path))
     assert (scan.up, scan.unit, scan.repairs) == ("z", "m", ())
     check_bottle(scan)
 
@@ -115,7 +115,7 @@ def test_normals(tmp_path, sign, repairs):
     normals = sign * trimesh.Trimesh(*bottle()[::2], process=False).vertex_normals
     text = "".join("vn {} {} {}\n".format(*normal) for normal in normals)
     path.write_text(text + re.sub(r"(\d+)/(\d+)", r"\1/\2/\1", path.read_text()))
-    scan = prepare(path)
+    scan = prepare_scan(path)
     assert scan.repairs == repairs
     check_bottle(scan)
 
@@ -126,7 +126,7 @@ def test_holes(tmp_path):
     middles = vertices[faces].mean(axis=1)
     for hole in ([0.03, 0, 0.05], [-0.03, 0, 0.05]):
         kept &= np.linalg.norm(middles - hole, axis=1) > 0.006
-    scan = prepare(write_scan(tmp_path, (vertices, uv, faces[kept])))
+    scan = prepare_scan(write_scan(tmp_path, (vertices, uv, faces[kept])))
     assert scan.repairs == ("filled 2 holes",)
     check_bottle(scan)
     # what is looked at has no holes either
@@ -138,7 +138,7 @@ def test_a_hole_too_large_is_an_error(tmp_path):
     vertices, uv, faces = bottle()
     half = vertices[faces].mean(axis=1)[:, 0] > 0
     with pytest.raises(AssetError, match=r"can't be closed to a solid.*holes of at most 35%"):
-        prepare(write_scan(tmp_path, (vertices, uv, faces[half])))
+        prepare_scan(write_scan(tmp_path, (vertices, uv, faces[half])))
 
 
 def test_thousands_of_loose_bits(tmp_path):
@@ -148,13 +148,13 @@ def test_thousands_of_loose_bits(tmp_path):
     dust = len(vertices) + np.arange(15000).reshape(-1, 3)
     model = (np.concatenate([vertices, corners.reshape(-1, 3)]), np.concatenate([uv, np.zeros((15000, 2))]),
              np.concatenate([faces, dust]))  # fmt: skip
-    scan = prepare(write_scan(tmp_path, model))
+    scan = prepare_scan(write_scan(tmp_path, model))
     assert len(scan.repairs) == 1 and "5000" in scan.repairs[0]
     check_bottle(scan)
 
 
 def test_a_large_texture_is_shrunk(tmp_path):
-    scan = prepare(write_scan(tmp_path, image=pixels((4200, 3150))))
+    scan = prepare_scan(write_scan(tmp_path, image=pixels((4200, 3150))))
     assert scan.repairs == ("shrank the texture from 4200 x 3150 to 2100 x 1575",)
     check_bottle(scan)
 
@@ -167,7 +167,7 @@ def test_a_texture_beyond_all_bounds_is_an_error(tmp_path):
     head[29:33] = zlib.crc32(head[12:29]).to_bytes(4, "big")
     image.write_bytes(head)
     with pytest.raises(AssetError, match=r"skin\.png: the texture is too large"):
-        prepare(path)
+        prepare_scan(path)
 
 
 def test_several_materials(tmp_path):
@@ -183,7 +183,7 @@ def test_several_materials(tmp_path):
         Image.new("RGB", (16, 16), tuple(color.tolist())).save(tmp_path / f"part{k}.png")
     path.write_text("\n".join(lines))
     (tmp_path / "skin.mtl").write_text(mtl)
-    check_bottle(prepare(path, up="z"))
+    check_bottle(prepare_scan(path, up="z"))
 
 
 @pytest.mark.parametrize(("colored", "repair"), [(True, "baked colours into a texture"), (False, "has no colours")])
@@ -194,7 +194,7 @@ def test_scans_without_a_texture(tmp_path, colored, repair):
         turned = trimesh.transformations.rotation_matrix(-0.001, [0, 0, 1])[:3, :3]  # no vertex is between two colours
         mesh.visual.vertex_colors = np.insert(COLORS[quarter_of(vertices @ turned.T)], 3, 255, axis=1).astype(np.uint8)
     mesh.export(tmp_path / "scan.ply")
-    scan = prepare(tmp_path / "scan.ply", up="z")
+    scan = prepare_scan(tmp_path / "scan.ply", up="z")
     assert repair in scan.repairs
     check_bottle(scan, colors=colored, volume=0.01)
 
@@ -221,7 +221,7 @@ print(int(peak) / 1024**2, abs(light.volume / scan.mesh.volume - 1))
 
 @pytest.mark.parametrize(("scale", "unit", "words"), [(100, "cm", "centimetres"), (1000, "mm", "millimetres")])
 def test_other_units_and_y_up(tmp_path, scale, unit, words):
-    scan = prepare(write_scan(tmp_path, scale=scale, y_up=True))
+    scan = prepare_scan(write_scan(tmp_path, scale=scale, y_up=True))
     assert (scan.up, scan.unit) == ("y", unit)
     assert scan.repairs == ("turned y up, a guess", f"scaled from {words}")
     turned = scan.mesh.copy(include_cache=True), scan.closed.copy()
@@ -234,14 +234,14 @@ def test_other_units_and_y_up(tmp_path, scale, unit, words):
 def test_a_wrong_unit_is_an_error(tmp_path):
     path = write_scan(tmp_path, scale=1000)
     with pytest.raises(AssetError, match=r"no size that can be picked up.*160 m, taking its 160 for metres.*--units"):
-        prepare(path, unit="m")
+        prepare_scan(path, unit="m")
 
 
 def test_double_vertices_and_faces(tmp_path):
     vertices, uv, faces = bottle()
     soup = np.arange(3 * len(faces)).reshape(-1, 3)
     model = (vertices[faces].reshape(-1, 3), uv[faces].reshape(-1, 2), np.concatenate([soup, soup[:10]]))
-    scan = prepare(write_scan(tmp_path, model))
+    scan = prepare_scan(write_scan(tmp_path, model))
     assert scan.repairs[1:] == ("dropped 10 double or degenerate faces",)
     assert scan.repairs[0] == f"merged {3 * len(faces) - len(vertices)} duplicate vertices"
     check_bottle(scan)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from asset_tools.contact_sheet import CAPTION, CELLS, GAP, LABEL, LARGE, contact_sheet
-from asset_tools.renderer import PAPER, Body, Studio, box_faces
+from asset_tools.contact_sheet import CAPTION, CELLS, GAP, LABEL, LARGE, write_contact_sheet
+from asset_tools.renderer import PAPER, RenderBody, Renderer, box_faces
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import AssetError
 
@@ -13,7 +13,7 @@ from robocas_ms3.core.errors import AssetError
 @pytest.fixture(scope="module")
 def studio(needs_renderer):
     """Kept for all tests: as long as one is alive, others start at once."""
-    return Studio(64)
+    return Renderer(64)
 
 
 def share(image, channel):
@@ -26,7 +26,7 @@ def share(image, channel):
 @pytest.mark.slow
 def test_a_sheet_shows_the_assets_asked_for(tmp_path, studio):
     pack = load_pack("builtin")
-    contact_sheet(pack, tmp_path / "new" / "sheet.png", ids=["tomato_soup_can", "cabinet"])
+    write_contact_sheet(pack, tmp_path / "new" / "sheet.png", ids=["tomato_soup_can", "cabinet"])
     sheet = Image.open(tmp_path / "new" / "sheet.png").convert("RGB")
     width, height = CELLS * LARGE, CAPTION + LARGE + LABEL
     assert sheet.size == (2 * width + 3 * GAP, height + 2 * GAP)
@@ -38,14 +38,14 @@ def test_a_sheet_shows_the_assets_asked_for(tmp_path, studio):
     assert not (cells[CELLS] == cells[CELLS + 1]).all()
     assert (np.asarray(sheet.crop((GAP, GAP, GAP + width, GAP + CAPTION))) < 90).any()  # a caption
     with pytest.raises(AssetError, match="found blue_box"):
-        contact_sheet(pack, tmp_path / "sheet.png", ids=["blue_box"])
+        write_contact_sheet(pack, tmp_path / "sheet.png", ids=["blue_box"])
 
 
 @pytest.mark.slow
 def test_the_camera_looks_from_where_it_should(studio):
     # a red and a blue cube, side by side along y: from +x red, which stands at +y, is on the right
     cubes = [
-        Body(faces.reshape(-1, 3), faces=faces, colour=colour)
+        RenderBody(faces.reshape(-1, 3), faces=faces, colour=colour)
         for faces, colour in (
             (box_faces((-0.5, 1, -0.5), (0.5, 2, 0.5)), (0.9, 0.05, 0.05)),
             (box_faces((-0.5, -2, -0.5), (0.5, -1, 0.5)), (0.05, 0.05, 0.9)),

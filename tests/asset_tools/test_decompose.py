@@ -8,8 +8,8 @@ import pytest
 import trimesh
 from models import ball_dropped_into
 
-from asset_tools.decompose import GPU_LIMIT, MAX_VERTICES, decompose, few_vertices, flat_faces
-from asset_tools.prepare import prepare
+from asset_tools.decompose import GPU_LIMIT, MAX_VERTICES, count_flat_faces, decompose, reduce_vertices
+from asset_tools.prepare import prepare_scan
 from asset_tools.quality.hulls import hull_quality
 from robocas_ms3.assets.cooked_hulls import find_hull_violations
 from robocas_ms3.assets.hulls import write_hulls
@@ -28,13 +28,15 @@ def test_a_scanned_cup_stays_hollow(tmp_path):
     mesh = cup()
     mesh.visual.vertex_colors = [200, 60, 40, 255]
     mesh.export(tmp_path / "cup.ply")
-    closed = prepare(tmp_path / "cup.ply", up="z").closed
+    closed = prepare_scan(tmp_path / "cup.ply", up="z").closed
     assert closed.volume == pytest.approx(mesh.volume, rel=0.02)
     found = decompose(closed)
     quality = hull_quality(closed, found.hulls, hollow=True)
     assert quality.surface_p95 <= 0.004
     assert quality.hull_count <= 18
-    assert quality.hull_vertices <= 62 and max(map(flat_faces, found.hulls)) <= GPU_LIMIT  # the floor's is the largest
+    assert (
+        quality.hull_vertices <= 62 and max(map(count_flat_faces, found.hulls)) <= GPU_LIMIT
+    )  # the floor's is the largest
     (tmp_path / "asset").mkdir()
     write_hulls(tmp_path / "asset" / HULLS, found.hulls)
     assert find_hull_violations(tmp_path) == []
@@ -68,7 +70,7 @@ def test_the_same_mesh_gives_the_same_hulls():
 
 def test_few_vertices_keep_volume():
     ball = trimesh.creation.icosphere(subdivisions=4)
-    kept = few_vertices(np.asarray(ball.vertices))
+    kept = reduce_vertices(np.asarray(ball.vertices))
     assert len(kept) == MAX_VERTICES == 34
     assert trimesh.convex.convex_hull(kept).volume == pytest.approx(ball.volume, rel=1e-6)
 
@@ -80,22 +82,22 @@ def test_small_bevels_are_squared_and_large_ones_kept():
     def bevelled(by):
         return np.concatenate([signs * (half - by * (np.arange(3) != axis)) for axis in range(3)])
 
-    box = few_vertices(bevelled(0.0009))
+    box = reduce_vertices(bevelled(0.0009))
     np.testing.assert_allclose(sorted(box.tolist()), sorted((signs * half).tolist()), atol=1e-12)
-    assert len(few_vertices(bevelled(0.004))) == 24
+    assert len(reduce_vertices(bevelled(0.004))) == 24
 
 
 def test_few_flat_faces_keep_their_vertices():
     angles = np.arange(30) * 2 * np.pi / 30
     ring = 0.2 * np.stack([np.cos(angles), np.sin(angles)], axis=1)  # each corner is 4 mm outside of the others' hull
     column = np.concatenate([np.column_stack([ring, np.full(30, z)]) for z in (0.0, 0.5)])
-    assert flat_faces(column) == 32
-    assert sorted(few_vertices(column).round(9).tolist()) == sorted(column.round(9).tolist())
+    assert count_flat_faces(column) == 32
+    assert sorted(reduce_vertices(column).round(9).tolist()) == sorted(column.round(9).tolist())
 
 
 def test_vertices_that_the_engine_would_drop_are_left_out():
     cube = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)])
     bumps = [[0.05, 0.05, 0.1006], [0.05, 0.05, -0.0006], [0.1006, 0.05, 0.05]]
-    assert len(few_vertices(np.concatenate([cube, bumps]))) == 8
-    higher = few_vertices(np.concatenate([cube, [[0.05, 0.05, 0.102]]]))
+    assert len(reduce_vertices(np.concatenate([cube, bumps]))) == 8
+    higher = reduce_vertices(np.concatenate([cube, [[0.05, 0.05, 0.102]]]))
     assert len(higher) == 9

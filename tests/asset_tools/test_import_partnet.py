@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from asset_tools.partnet.annotation import SHIPPED, Annotation, find_annotation, load_annotation
-from asset_tools.partnet.collision import for_gpu
+from asset_tools.partnet.annotation import BUNDLED_ANNOTATIONS, ModelAnnotation, find_annotation, load_annotation
+from asset_tools.partnet.collision import limit_for_gpu
 from asset_tools.partnet.importer import partnet_jobs, read_partnet
-from asset_tools.partnet.template import template
+from asset_tools.partnet.template import make_template
 from asset_tools.pipeline import write_pack
 from asset_tools.quality.furniture import examine_furniture
 from asset_tools.quality.overlap import convex, deepest
@@ -70,7 +70,7 @@ def overlap(link, others, share):
 
 
 def read(folder, **more):
-    return read_partnet(folder, Annotation.model_validate(NOTE | more))
+    return read_partnet(folder, ModelAnnotation.model_validate(NOTE | more))
 
 
 def test_the_frame_is_turned_and_the_drawer_shut(chest):
@@ -99,11 +99,11 @@ def test_what_is_too_slender_for_a_gpu_is_halved_or_becomes_a_box():
     # a bar whose section is a triangle with sides of 3, 4 and 5 cm: 8 mm from its middle to the nearest face
     section = np.array([[0, 0, 0], [0, 0.03, 0], [0, 0, 0.04]])
     bars = {length: np.concatenate([section, section + [length, 0, 0]]) for length in (1.5, 1.6, 4.0)}
-    assert [piece.tolist() for piece in for_gpu(bars[1.5])] == [bars[1.5].tolist()]
-    halves = for_gpu(bars[1.6])
+    assert [piece.tolist() for piece in limit_for_gpu(bars[1.5])] == [bars[1.5].tolist()]
+    halves = limit_for_gpu(bars[1.6])
     assert [len(half) for half in halves] == [6, 6]
     assert sorted(half[:, 0].max() for half in halves) == pytest.approx([0.8, 1.6])
-    (box,) = [find_box(piece) for piece in for_gpu(bars[4.0])]
+    (box,) = [find_box(piece) for piece in limit_for_gpu(bars[4.0])]
     assert box is not None and 8 * np.prod(box.half_size) == pytest.approx(4.0 * 0.03 * 0.04)
 
 
@@ -170,7 +170,7 @@ def test_the_users_annotation_goes_first(tmp_path):
     assert find_annotation("45855", tmp_path).name == "sliding door cabinet"
     (tmp_path / "45855.yaml").write_text("name: mine\ncategory: b\norigin_lift: 0\n")
     assert find_annotation("45855", tmp_path).name == "mine"
-    assert {path.stem for path in SHIPPED.glob("*.yaml")} == set(SIX)
+    assert {path.stem for path in BUNDLED_ANNOTATIONS.glob("*.yaml")} == set(SIX)
 
 
 def test_a_model_becomes_a_pack_and_the_same_bytes_again(chest, tmp_path):
@@ -224,7 +224,7 @@ def test_real_models_open_close_and_hold(shared_dir, name):
 
 
 def test_a_template_names_the_models_own_joints_and_is_an_annotation(shared_dir, tmp_path):
-    text = template(shared_dir / "partnet_mobility" / "45949")
+    text = make_template(shared_dir / "partnet_mobility" / "45949")
     (tmp_path / "45949.yaml").write_text(text)
     note = find_annotation("45949", tmp_path)
     assert set(note.joints) == {"joint_0", "joint_1", "joint_2"} and len(note.handles) == 3

@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from asset_tools.import_scans import ImportSettings, estimate_mass, find_scans, object_id, scan_jobs
-from asset_tools.pipeline import made_of, write_pack
+from asset_tools.pipeline import is_up_to_date, write_pack
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import AssetError
 
@@ -66,8 +66,8 @@ def test_scans_in_centimetres_become_a_pack_without_the_bad_ones(tmp_path):
     assert len(box.annotations.resting_poses) == 6
     assert box.asset.grasp_count >= 50
     # nothing to do a second time, until a scan or a setting changes
-    assert made_of(scan_jobs(scans, settings), tmp_path / "mine", skip_errors=True)
-    assert not made_of(scan_jobs(scans, ImportSettings()), tmp_path / "mine", skip_errors=True)
+    assert is_up_to_date(scan_jobs(scans, settings), tmp_path / "mine", skip_errors=True)
+    assert not is_up_to_date(scan_jobs(scans, ImportSettings()), tmp_path / "mine", skip_errors=True)
     with pytest.raises(AssetError, match="found smal"):
         scan_jobs(scans, ImportSettings(masses={"smal": 0.2}))
 

@@ -12,9 +12,9 @@ from shapely import Polygon
 from trimesh.creation import box, cone, cylinder, icosphere
 
 from asset_tools.build import build_object
-from asset_tools.decompose import decompose, few_vertices, for_engine
-from asset_tools.repair import close
-from asset_tools.simplify import simplified
+from asset_tools.decompose import decompose, limit_for_engine, reduce_vertices
+from asset_tools.repair import close_scan
+from asset_tools.simplify import simplify_mesh
 from asset_tools.sources import ObjectSource
 from asset_tools.visual import to_display
 from robocas_ms3.assets.cooked_hulls import MAX_SHRINKAGE, MAX_SLENDERNESS, cook_hulls, find_hull_violations
@@ -86,7 +86,7 @@ def union(mesh):
 @pytest.mark.parametrize("change", [lambda mesh: mesh, soup], ids=["as made", "soup"])
 def test_parts_that_touch_become_one_solid(name, change):
     mesh = TOUCHING[name]
-    solid = close(change(mesh)).mesh
+    solid = close_scan(change(mesh)).mesh
     assert solid.is_watertight and solid.is_winding_consistent
     assert solid.volume == pytest.approx(union(mesh), rel=1e-4)
     np.testing.assert_allclose(solid.bounds, mesh.bounds, atol=1e-6)
@@ -96,7 +96,7 @@ def test_a_single_wall_between_parts_is_dropped_from_the_looks_as_well():
     boxes = TOUCHING["boxes"].copy()
     boxes.merge_vertices()
     boxes.update_faces(boxes.unique_faces())
-    closed = close(boxes)
+    closed = close_scan(boxes)
     assert closed.mesh.volume == pytest.approx(0.06 * 0.06 * 0.07)
     between = np.abs(closed.scan.triangles_center - [0, 0, 0.02]).max(axis=1) < 0.029
     assert not between.any()
@@ -105,7 +105,7 @@ def test_a_single_wall_between_parts_is_dropped_from_the_looks_as_well():
 
 def test_a_fin_on_an_edge_is_dropped():
     fin = trimesh.Trimesh([[0.015, 0.015, -0.015], [0.015, 0.015, 0.015], [0.0155, 0.0155, 0]], [[0, 1, 2]])
-    closed = close(joined(CUBE, fin))
+    closed = close_scan(joined(CUBE, fin))
     assert closed.mesh.volume == pytest.approx(CUBE.volume)
     assert closed.repairs
 
@@ -133,7 +133,7 @@ SMALL_PIECES = {
 @pytest.mark.parametrize("name", SMALL_PIECES)
 def test_small_parts_are_kept(name):
     mesh = SMALL_PIECES[name]
-    closed = close(mesh)
+    closed = close_scan(mesh)
     assert closed.repairs == ()
     assert closed.mesh.is_watertight
     assert closed.mesh.volume == pytest.approx(union(mesh), rel=0.01)
@@ -152,7 +152,7 @@ def test_dirt_is_dropped_and_its_share_reported(far):
     scrap = box([0.003] * 3)
     scrap.update_faces(np.arange(12) < 4)
     scraps = [moved(scrap, *at) for at in rng.uniform(0.15, 0.2, (20, 3))]
-    closed = close(joined(mesh, *specks, *scraps))
+    closed = close_scan(joined(mesh, *specks, *scraps))
     assert closed.mesh.volume == pytest.approx(union(mesh), rel=0.01)
     np.testing.assert_allclose(closed.mesh.bounds, mesh.bounds, atol=1e-6)
     assert str(len(specks) + len(scraps)) in closed.repairs[-1] and "%" in closed.repairs[-1]
@@ -171,7 +171,7 @@ def test_small_objects_with_many_faces_have_hulls():
     radius = 0.0135 + 0.0015 * np.sign(np.sin(10 * angle + 0.01))
     outline = radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
     gear = trimesh.creation.extrude_polygon(Polygon(outline), 0.008)
-    found = decompose(close(gear).mesh)
+    found = decompose(close_scan(gear).mesh)
     assert found.volume_iou > 0.8
 
 
@@ -181,12 +181,12 @@ def test_slender_hulls_are_thickened_as_a_gpu_needs_it():
         [[0, 0, 0], [0.15, 0, 0], [0, 0.03, 0], [0.15, 0.025, 0], [0, 0, 0.002], [0.15, 0, 0.002]]
     )
     for mesh in (disk, rod, blade):
-        hulls = [for_engine(np.asarray(mesh.vertices))]
+        hulls = [limit_for_engine(np.asarray(mesh.vertices))]
         (cooked,) = cook_hulls(hulls)
         assert not cooked.too_slender and cooked.shrinkage <= MAX_SHRINKAGE
         np.testing.assert_allclose(np.ptp(hulls[0], axis=0), mesh.extents, atol=0.005)
     plate = box([0.1, 0.1, 0.0002])
-    assert for_engine(plate.vertices) is plate.vertices and MAX_SLENDERNESS < 0.05 / 0.0001
+    assert limit_for_engine(plate.vertices) is plate.vertices and MAX_SLENDERNESS < 0.05 / 0.0001
 
 
 def test_a_mesh_that_cannot_be_simplified_to_the_limit_is_taken_with_more_faces():
@@ -194,7 +194,7 @@ def test_a_mesh_that_cannot_be_simplified_to_the_limit_is_taken_with_more_faces(
     light = to_display(posts, triangles=1000)
     assert 1000 < len(light.faces) <= 6000
     np.testing.assert_allclose(light.bounds, posts.bounds, atol=1e-3)
-    few = simplified(posts, 100)
+    few = simplify_mesh(posts, 100)
     assert 0 < len(few.faces) <= 600
     np.testing.assert_allclose(few.bounds, posts.bounds, atol=5e-3)
 
@@ -204,7 +204,7 @@ DIE = box([0.004] * 3)
 
 @pytest.mark.parametrize("mesh", [cone(0.03, 0.08), box([0.15, 0.1, 0.0002]), DIE], ids=["cone", "sheet", "die"])
 def test_an_object_is_built(mesh, tmp_path):
-    closed = close(mesh)
+    closed = close_scan(mesh)
     source = ObjectSource("thing", "thing", "scan", closed.scan, closed.mesh, 1e-4, repairs=closed.repairs)
     asset = build_object(source, tmp_path / "thing")
     assert asset.quality.rest_share >= 0.9
@@ -218,7 +218,7 @@ def test_open_pegs_are_kept_since_they_are_much_of_the_surface():
     pegs = joined(*PEGS)
     pegs.update_faces(pegs.face_normals[:, 2] > -0.9)
     mesh = joined(box([0.12, 0.08, 0.006]), pegs)
-    closed = close(mesh)
+    closed = close_scan(mesh)
     np.testing.assert_allclose(closed.mesh.bounds, mesh.bounds, atol=1e-6)
     assert closed.mesh.volume > 0.12 * 0.08 * 0.006 * 1.1
 
@@ -239,11 +239,11 @@ def test_thin_parts_of_a_solid_survive_its_simplification():
         cylinder(0.0003, 0.025, sections=12), np.linspace(-0.07, 0.07, 30), np.linspace(-0.01, 0.01, 8), 0
     )
     brush = joined(box([0.15, 0.03, 0.004]), *bristles)
-    np.testing.assert_allclose(close(brush).mesh.bounds, brush.bounds, atol=2e-4)
+    np.testing.assert_allclose(close_scan(brush).mesh.bounds, brush.bounds, atol=2e-4)
 
 
 def test_few_vertices_of_extreme_points_in_one_plane():
     """All extreme ones along the axes and diagonals are corners of a base; the apex is next to it."""
     base = np.array([[x, y, -0.3 * (x + y)] for x in (-0.03, 0.03) for y in (-0.03, 0.03)])
     points = np.concatenate([base, base * [0.5, 0.5, 0.5] - [0, 0, 0.0005], [[0, 0, -0.004]]])
-    assert trimesh.convex.convex_hull(few_vertices(points)).volume > 0
+    assert trimesh.convex.convex_hull(reduce_vertices(points)).volume > 0

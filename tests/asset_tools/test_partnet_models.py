@@ -10,9 +10,9 @@ import trimesh
 from PIL import Image
 from trimesh.exchange.obj import export_obj
 
-from asset_tools.partnet.annotation import Annotation, find_annotation
+from asset_tools.partnet.annotation import ModelAnnotation, find_annotation
 from asset_tools.partnet.importer import partnet_jobs, read_partnet
-from asset_tools.partnet.template import template
+from asset_tools.partnet.template import make_template
 from asset_tools.pipeline import write_pack
 from robocas_ms3.core.errors import AssetError
 
@@ -44,7 +44,7 @@ def folder(tmp_path):
 
 def read(folder, text, **more):
     (folder / "mobility.urdf").write_text(text, encoding="utf-8")
-    return read_partnet(folder, Annotation.model_validate(NOTE | more))
+    return read_partnet(folder, ModelAnnotation.model_validate(NOTE | more))
 
 
 def mesh(name, more=""):
@@ -134,7 +134,7 @@ def test_a_moving_link_without_a_mesh_can_be_held(folder):
     assert "fixed: true" in raised.value.fix
     (link,) = read(folder, urdf(rest=empty), joints={"spin": {"fixed": True}}).links
     assert link.name == "tray"
-    (folder / "model.yaml").write_text(template(folder))  # the template holds it
+    (folder / "model.yaml").write_text(make_template(folder))  # the template holds it
     assert find_annotation("model", folder).joints["spin"].fixed
 
 
@@ -193,7 +193,7 @@ def test_other_names_become_names_of_a_pack(folder):
     assert (link.name, link.joint.name) == ("left_tur_1", "slide_1")
     assert source.surfaces["in"].link == source.handles["a"].link == "left_tur_1"
     assert source.surfaces["top"].link == ""
-    (folder / "model.yaml").write_text(template(folder), encoding="utf-8")
+    (folder / "model.yaml").write_text(make_template(folder), encoding="utf-8")
     assert find_annotation("model", folder).surfaces["left_tur_1"].link == "Left Tür 1"
     (clash,) = read(folder, urdf(link="body")).links  # what the fixed body is called in a pack
     assert clash.name != "body"
@@ -338,4 +338,4 @@ def test_names_that_are_no_folder_of_a_pack_are_refused(folder, name):
 def test_a_linked_folder_is_the_model_itself(folder, tmp_path):
     (folder / "mobility.urdf").write_text(urdf(tray=mesh("cube.obj")))
     (tmp_path / "alias").symlink_to(folder)
-    assert read_partnet(tmp_path / "alias", Annotation.model_validate(NOTE)).id == "model"
+    assert read_partnet(tmp_path / "alias", ModelAnnotation.model_validate(NOTE)).id == "model"

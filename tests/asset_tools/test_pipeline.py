@@ -13,7 +13,7 @@ import trimesh
 from asset_entries import furniture_asset
 
 from asset_tools import pipeline
-from asset_tools.pipeline import Job, content_hash, made_of, make_assets, write_pack
+from asset_tools.pipeline import AssetJob, content_hash, is_up_to_date, make_assets, write_pack
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.pack import HULLS, VISUALS, load_pack, sha256
 from robocas_ms3.core.errors import AssetError, OutputExistsError
@@ -36,7 +36,7 @@ def make(id_, folder, log, fail="", seconds=0.0, hull=CUBE):
 
 
 def jobs(log, **contents):
-    return [Job(id_, partial(make, id_, log=log), content) for id_, content in contents.items()]
+    return [AssetJob(id_, partial(make, id_, log=log), content) for id_, content in contents.items()]
 
 
 def made_in(log):
@@ -67,7 +67,7 @@ def test_a_kept_asset_that_was_damaged_is_made_again(tmp_path):
 
 def test_hulls_that_the_engine_would_shrink_make_no_pack(tmp_path):
     log = tmp_path / "log"
-    todo = [*jobs(log, cube="1" * 64), Job("ball", partial(make, "ball", log=log, hull=BALL), "2" * 64)]
+    todo = [*jobs(log, cube="1" * 64), AssetJob("ball", partial(make, "ball", log=log, hull=BALL), "2" * 64)]
     with pytest.raises(AssetError, match=r"ball: hull 0 shrinks by \d+\.\d mm on a GPU"):
         write_pack(todo, tmp_path / "pack", tmp_path / "kept")
     assert not (tmp_path / "pack").exists()
@@ -81,7 +81,7 @@ def test_hulls_that_the_engine_would_shrink_make_no_pack(tmp_path):
 
 def test_a_failure_names_the_asset_leaves_no_pack_and_loses_nothing(tmp_path):
     log, kept = tmp_path / "log", tmp_path / "kept"
-    bad = Job("bad", partial(make, "bad", log=log, fail="it has no faces"), "9" * 64)
+    bad = AssetJob("bad", partial(make, "bad", log=log, fail="it has no faces"), "9" * 64)
     todo = [*jobs(log, a="1" * 64), bad]
     with pytest.raises(AssetError, match="bad: it has no faces"):
         write_pack(todo, tmp_path / "pack", kept)
@@ -90,7 +90,7 @@ def test_a_failure_names_the_asset_leaves_no_pack_and_loses_nothing(tmp_path):
     results = write_pack(todo, tmp_path / "pack", kept, skip_errors=True)
     assert [result.id for result in results if result.asset is None] == ["bad"]
     assert made_in(log) == ["a", "bad", "bad"]
-    assert made_of(todo, tmp_path / "pack", skip_errors=True) and not made_of(todo, tmp_path / "pack")
+    assert is_up_to_date(todo, tmp_path / "pack", skip_errors=True) and not is_up_to_date(todo, tmp_path / "pack")
     with pytest.raises(AssetError, match="none of the assets could be made"):
         write_pack([bad], tmp_path / "none", kept, skip_errors=True)
 
@@ -116,7 +116,7 @@ def die(folder):
 
 def test_whatever_goes_wrong_is_said_of_the_asset_and_costs_no_other(tmp_path):
     log = tmp_path / "log"
-    todo = [Job("odd", trip, "7" * 64), Job("deadly", die, "8" * 64), *jobs(log, a="1" * 64, b="2" * 64)]
+    todo = [AssetJob("odd", trip, "7" * 64), AssetJob("deadly", die, "8" * 64), *jobs(log, a="1" * 64, b="2" * 64)]
     results = write_pack(todo, tmp_path / "pack", tmp_path / "kept", skip_errors=True, processes=2)
     errors = {made.id: made.error for made in results}
     assert errors["odd"] == "odd: IndexError: list index out of range"

@@ -6,7 +6,7 @@ import trimesh
 
 from asset_tools.decompose import decompose
 from asset_tools.inertia import principal_inertia
-from asset_tools.prepare import level_base, prepare
+from asset_tools.prepare import level_base, prepare_scan
 from asset_tools.resting_poses import resting_poses
 from robocas_ms3.assets.physics import RigidBody
 from robocas_ms3.core.errors import AssetError
@@ -49,19 +49,19 @@ def test_a_bulging_base_is_pressed_flat():
 
 def test_axis_and_unit_can_be_given(tmp_path):
     trimesh.creation.box([1.0, 2.0, 5.0]).export(tmp_path / "box.ply")
-    scan = prepare(tmp_path / "box.ply", up="x", unit="inch")
+    scan = prepare_scan(tmp_path / "box.ply", up="x", unit="inch")
     assert (scan.up, scan.unit) == ("x", "inch")
     np.testing.assert_allclose(sorted(scan.closed.extents), [0.0254, 0.0508, 0.127])
     assert scan.closed.extents[2] == pytest.approx(0.0254)
     assert {"turned x up", "scaled from inches"} <= set(scan.repairs)
     with pytest.raises(AssetError, match="no such mesh"):
-        prepare(tmp_path / "lost.ply")
+        prepare_scan(tmp_path / "lost.ply")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["alphabet_soup", "ketchup", "orange_juice", "salad_dressing"])
 def test_what_stands_in_life_stands_here(shared_dir, name):
-    scan = prepare(shared_dir / "scans" / "hope" / name, unit="cm")
+    scan = prepare_scan(shared_dir / "scans" / "hope" / name, unit="cm")
     found = decompose(scan.closed)
     assert found.volume_iou >= 0.9
     assert len(found.hulls) <= 8

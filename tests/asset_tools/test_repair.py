@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from asset_tools.repair import close, winding_number
+from asset_tools.repair import close_scan, winding_number
 from robocas_ms3.core.errors import AssetError
 
 RADIUS, HEIGHT = 0.03, 0.1
@@ -14,7 +14,7 @@ def can():
 
 
 def closed_volume(mesh, words):
-    solid = close(mesh)
+    solid = close_scan(mesh)
     assert solid.mesh.is_watertight and solid.mesh.is_winding_consistent
     assert any(words in repair for repair in solid.repairs) or (not words and not solid.repairs)
     return solid.mesh.volume
@@ -59,7 +59,7 @@ def test_what_encloses_nothing_is_an_error():
     plate = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
     for mesh in (plate, cap, trimesh.Trimesh(confetti, np.arange(300).reshape(-1, 3), process=False)):
         with pytest.raises(AssetError, match="can't be closed to a solid"):
-            close(mesh)
+            close_scan(mesh)
 
 
 def test_winding_number_of_a_ball_with_and_without_a_cap():
@@ -81,7 +81,7 @@ def test_boxes_that_share_parts_of_faces_and_edges_keep_both_volumes(upright, sc
     wall.apply_translation([-35, 0, upright[2] / 2 - 5])
     both = trimesh.util.concatenate([base, wall]).apply_scale(scale)
     soup = trimesh.Trimesh(both.triangles.reshape(-1, 3), np.arange(72).reshape(-1, 3), process=False)
-    closed = close(soup)
+    closed = close_scan(soup)
     assert closed.mesh.volume / scale**3 == pytest.approx(80 * 40 * 10 + 10 * 40 * (upright[2] - 10))
     np.testing.assert_allclose(closed.mesh.bounds, both.bounds)
 
@@ -94,4 +94,4 @@ def test_bodies_that_overlap_count_once(can):
 
 def test_faces_without_size_are_an_error():
     with pytest.raises(AssetError, match="no faces of any size"):
-        close(trimesh.Trimesh([[0, 0, 0], [1, 0, 0]], [[0, 1, 1], [0, 0, 1]], process=False))
+        close_scan(trimesh.Trimesh([[0, 0, 0], [1, 0, 0]], [[0, 1, 1], [0, 0, 1]], process=False))

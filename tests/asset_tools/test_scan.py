@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from asset_tools.scan import guess_unit, guess_units, guess_up, upright
+from asset_tools.scan import guess_unit, guess_units, guess_up, rotate_upright
 from robocas_ms3.core.errors import AssetError
 
 
@@ -55,7 +55,7 @@ def test_any_axis_can_be_turned_up(up):
     tip["xyz".index(up[-1])] = -1.0 if up[0] == "-" else 1.0
     mesh = trimesh.creation.box([1, 2, 3])
     marked = trimesh.Trimesh(np.vstack([mesh.vertices, tip]), mesh.faces, process=False)
-    turned = upright(marked, up)
+    turned = rotate_upright(marked, up)
     np.testing.assert_array_equal(turned.vertices[-1], [0, 0, 1])
     assert turned.volume == pytest.approx(6)  # turned, not mirrored
     np.testing.assert_array_equal(marked.vertices[-1], tip)  # the scan itself stays

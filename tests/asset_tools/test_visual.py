@@ -18,8 +18,8 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from asset_tools.glb import write_glb
-from asset_tools.readers.surface import Material, Part, to_mesh
-from asset_tools.simplify import simplified
+from asset_tools.readers.surface import Material, MeshPart, to_mesh
+from asset_tools.simplify import simplify_mesh
 from asset_tools.visual import to_display
 
 COLORS = np.array([[220, 30, 30], [30, 200, 40], [30, 40, 220], [230, 220, 40], [200, 40, 210], [40, 210, 210]])
@@ -105,7 +105,7 @@ def test_sides_have_flat_normals_though_vertices_meet(light_box):
 def test_dense_meshes_do_not_fold_over(make):
     dense = make()
     assert len(dense.faces) > 200_000
-    light = simplified(dense, 1000)
+    light = simplify_mesh(dense, 1000)
     assert len(light.faces) <= 1000
     assert light.volume == pytest.approx(dense.volume, rel=0.01)
     assert light.area == pytest.approx(dense.area, rel=0.01)
@@ -183,7 +183,7 @@ def test_a_label_close_to_a_bottle_keeps_its_colour(triangles):
         wall = trimesh.creation.cylinder(radius, height, sections=96)
         uvs = np.full((len(wall.vertices), 2), 0.5)
         image = Image.new("RGB", (4, 4), color)
-        parts.append(Part(np.array(wall.vertices), np.array(wall.faces), uvs, material=Material(image=image)))
+        parts.append(MeshPart(np.array(wall.vertices), np.array(wall.faces), uvs, material=Material(image=image)))
     light = to_display(to_mesh(parts), triangles=triangles, texture_size=256)
     points, faces = trimesh.sample.sample_surface(light, 3000, seed=0)[:2]
     radius = np.linalg.norm(points[:, :2], axis=1)

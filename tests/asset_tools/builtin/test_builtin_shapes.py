@@ -10,7 +10,7 @@ from shapely import MultiPoint, Point
 
 from asset_tools.builtin import bottles, shapes
 from asset_tools.builtin.catalogue import products
-from asset_tools.decompose import GPU_LIMIT, flat_faces
+from asset_tools.decompose import GPU_LIMIT, count_flat_faces
 from asset_tools.glb import write_glb
 from asset_tools.quality.hulls import volume_iou
 
@@ -103,7 +103,7 @@ def test_pieces_fill_the_shape(spec):
     shape, toy = shape_of(spec.id), spec.id in TOYS
     closed, pieces = shape.closed(), list(shape.pieces)
     assert 1 <= len(pieces) <= (24 if toy else 13 if spec.hollow else 8)
-    assert max(map(len, pieces)) <= 48 and max(map(flat_faces, pieces)) <= GPU_LIMIT
+    assert max(map(len, pieces)) <= 48 and max(map(count_flat_faces, pieces)) <= GPU_LIMIT
     if not (toy and spec.hollow):  # of thin walls a tenth of a millimetre is a share of its own
         assert volume_iou(closed, pieces) >= (0.75 if spec.hollow else 0.88 if toy else 0.9)
     if toy:

@@ -46,7 +46,7 @@ def test_reading_is_bounded_in_memory():
 
 
 def test_reading_is_bounded_in_time(monkeypatch):
-    monkeypatch.setattr("asset_tools.readers.limits.SECONDS", 0.05)
+    monkeypatch.setattr("asset_tools.readers.limits.MAX_SECONDS", 0.05)
     with pytest.raises(AssetError), reading_limits("mug"):
         while True:
             pass
