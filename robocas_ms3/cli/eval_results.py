@@ -1,4 +1,4 @@
-"""``robocas eval report | merge | compare | verify | videos``: work with results of evaluations."""
+"""``robocas eval report | merge | compare | verify | videos``: read and check results of evaluations."""
 
 from __future__ import annotations
 
@@ -18,41 +18,41 @@ if TYPE_CHECKING:
 
 @dataclass
 class Results:
-    """Results that a command reads."""
+    """Result folders to read."""
 
     folders: Folders
-    """Folder of a result, or of its parts, such as shards."""
+    """Folder of a result, or folders of partial results, such as shards."""
     protocol: Maybe[str] = None
-    """Folder of the protocol, if it is not a bundled one."""
+    """Folder of the protocol, if the protocol is not bundled."""
 
 
 @dataclass
 class Report(Results):
-    """Print the tables of a result, and write its page report.html.
+    """Print the tables of a result and write report.html.
 
     Example: robocas eval report eval/pick
     """
 
     out: Maybe[Path] = None
-    """Folder of the page. Default: the folder of the result; required for several folders."""
+    """Output folder of the reports. Default: the result folder; required for several folders."""
 
 
 @dataclass(kw_only=True)
 class Merge(Results):
-    """Write the parts of a result, such as shards, as one result.
+    """Merge partial results of one evaluation, such as shards, into one result.
 
     Example: robocas eval merge eval/0 eval/1 --out eval/pick
     """
 
     out: Path
-    """Folder of the new result."""
+    """Output folder of the merged result."""
 
 
 @dataclass
 class Compare(Results):
-    """Compare results over the same scenes, by exact tests; the splits of one result with each other.
+    """Compare results over the same scenes with exact paired tests; with one result, compare its splits.
 
-    Of more than two folders, those with the same settings are parts of one result.
+    Of more than two folders, folders with equal settings count as partial results of one evaluation.
 
     Example: robocas eval compare eval/small eval/rt1
     """
@@ -60,7 +60,7 @@ class Compare(Results):
 
 @dataclass
 class Verify(Results):
-    """Check that a result is complete and belongs to its protocol; exit code 1 if not.
+    """Check that a result is complete and consistent with its protocol; exit status 1 if not.
 
     Example: robocas eval verify eval/pick
     """
@@ -68,7 +68,7 @@ class Verify(Results):
 
 @dataclass
 class Videos:
-    """Run failed episodes again, film them, and link the videos in the page of the result.
+    """Record videos of failed episodes by running them again, and link the videos in report.html.
 
     Example: robocas eval videos eval/pick --count 4
     """
@@ -76,11 +76,11 @@ class Videos:
     folder: Annotated[Path, tyro.conf.Positional]
     """Folder of the result."""
     protocol: Maybe[str] = None
-    """Folder of the protocol, if it is not a bundled one."""
+    """Folder of the protocol, if the protocol is not bundled."""
     policy: Maybe[str] = None
-    """Name of the policy, to confirm one that is not installed: a file does not choose code to run."""
+    """Name of the policy, required for policies that are not installed: confirms that its code may run."""
     count: int = 8
-    """How many videos, of all kinds of failures in turn."""
+    """Number of videos, alternating between configurations and kinds of failures."""
 
 
 def report(cfg: Report) -> int:
@@ -90,7 +90,7 @@ def report(cfg: Report) -> int:
     result = _read(cfg.folders)
     print_text(render_markdown(result))
     if cfg.out is None and len(cfg.folders) > 1:
-        print_line("Pass --out DIR for the page of several folders.")
+        print_line("no report.html for several folders: pass --out DIR")
     else:
         write_pages(result, cfg.out or result.folder, cfg.protocol)
     return 0
@@ -128,12 +128,12 @@ def verify(cfg: Verify) -> int:
 
     result = _read(cfg.folders)
     found = find_violations(result, _protocol_of(result, cfg.protocol))
-    for problem in found:
-        print_line(problem)
+    for violation in found:
+        print_line(violation)
     if broken := result.error_count():
-        print_line(f"note: broken off by an error: {format_count(broken, 'episode')}, counted as failed")
-    valid = f"{format_count(len(result.outcomes), 'episode')} of {result.run.protocol}, all well"
-    print_line(f"{', '.join(map(str, cfg.folders))}: {format_count(len(found), 'problem') if found else valid}")
+        print_line(f"note: {format_count(broken, 'episode')} ended by an error, counted as failed")
+    valid = f"{format_count(len(result.outcomes), 'episode')} of {result.run.protocol}, no violations"
+    print_line(f"{', '.join(map(str, cfg.folders))}: {format_count(len(found), 'violation') if found else valid}")
     return 1 if found else 0
 
 
@@ -148,24 +148,25 @@ def videos(cfg: Videos) -> int:
     result = _read((cfg.folder,))
     protocol, name = _protocol_of(result, cfg.protocol), result.run.policy.name
     if name not in {*POLICIES.builtin, *POLICIES.entry_points} and cfg.policy != name:
-        fix = f"Name it yourself, if you trust it: --policy {name}"
-        raise EvaluationError("this result is of a policy of somebody's own", where=cfg.folder, found=name, fix=fix)
+        fix = f"Pass --policy {name} if you trust its code."
+        raise EvaluationError("the policy of the result is not installed", where=cfg.folder, found=name, fix=fix)
     from robocas_ms3.core.workers import use_one_torch_thread
     from robocas_ms3.evaluation.report.videos import choose_failed_episodes, record_videos
 
     use_one_torch_thread()
     numbers = choose_failed_episodes(result, cfg.count)
-    with open_policy(name) as policy, ProgressBar("episodes filmed") as bar:
+    with open_policy(name) as policy, ProgressBar("videos recorded") as bar:
         for done, (path, same) in enumerate(record_videos(result, protocol, policy, numbers), start=1):
-            print_line(str(path) + ("" if same else ": this time it came out differently"))
+            print_line(str(path) + ("" if same else ": the outcome differs from the recorded outcome"))
             bar.update(done, len(numbers))
     if not numbers:
-        print_line("no episode failed")
+        print_line("no failed episodes")
     write_pages(result, cfg.folder, cfg.protocol)
     return 0
 
 
 def write_pages(result: Result, out: Path, protocol: str | None) -> None:
+    """Write the reports of a result into a folder and print their names."""
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.report import write_report
@@ -173,19 +174,21 @@ def write_pages(result: Result, out: Path, protocol: str | None) -> None:
     try:
         loaded = _protocol_of(result, protocol)
     except EvaluationError:
-        loaded = None  # one of the user's own
+        loaded = None  # not bundled
     matches = loaded is not None and loaded.hash == result.run.protocol_hash
     written = write_report(result, out, loaded if matches else None)
     print_line(f"{out}: {', '.join(path.name for path in written)}")
     if not any(path.suffix == ".parquet" for path in written):
-        print_line('no episodes.parquet without pyarrow; in the clone: pip install -e ".[lerobot]"')
+        print_line('episodes.parquet was not written: pyarrow is missing; in the clone: pip install -e ".[lerobot]"')
 
 
 def _check_folders(folders: tuple[Path, ...]) -> None:
     from robocas_ms3.core.errors import EvaluationError
 
     if not folders:
-        raise EvaluationError("missing result folder", where="DIR", expected="the folder of a result, or of its parts")
+        raise EvaluationError(
+            "missing result folder", where="DIR", expected="the folder of a result, or of partial results"
+        )
 
 
 def _read(folders: tuple[Path, ...]) -> Result:
@@ -196,12 +199,12 @@ def _read(folders: tuple[Path, ...]) -> Result:
 
 
 def _protocol_of(result: Result, given: str | None) -> LoadedProtocol:
-    """Return the given protocol, or the shipped one that a result names: a result chooses no folder."""
+    """Load the given protocol, or the bundled protocol of a result; folders named in a result are not read."""
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 
     name, shipped = result.run.protocol, shipped_protocols()
     if given is None and name not in shipped:
-        what, fix = "its protocol is not shipped", "Pass --protocol FOLDER."
+        what, fix = "the protocol of the result is not bundled", "Pass --protocol FOLDER."
         raise EvaluationError(what, where=result.folder, expected=f"one of {', '.join(shipped)}", found=name, fix=fix)
     return load_protocol(shipped[name] if given is None else given)

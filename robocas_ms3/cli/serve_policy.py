@@ -1,4 +1,4 @@
-"""``robocas serve-policy``: serve a policy over a socket."""
+"""``robocas serve-policy``: serve a policy over a websocket."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from robocas_ms3.cli.options import Several
 
 @dataclass
 class ServePolicy:
-    """Serve a policy to evaluations on other machines: robocas eval --policy ws://HOST:PORT. Ctrl-C ends it.
+    """Serve a policy to evaluations on other machines (robocas eval --policy ws://HOST:PORT). Stop with Ctrl-C.
 
-    There is no password: everyone who reaches the port can use it. Keep the loopback address, and use ssh -L.
+    There is no password: everyone who can reach the port can use the policy. Keep the loopback address and use ssh -L.
 
     Example: robocas serve-policy runs/pick --port 8000
     """
 
     policy: Annotated[str, tyro.conf.Positional]
-    """Policy, as in robocas eval: scripted, random, noop, replay:TRAJECTORY.h5, a folder of robocas train, or
-    module:Class of your own."""
+    """Policy to serve, as in robocas eval: a name from robocas list, a run folder of robocas train,
+    replay:TRAJECTORY.h5, or module:Class of your own code."""
     host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0: all addresses of this machine."""
+    """Address to listen on; 0.0.0.0: all addresses of the machine."""
     port: int = 8000
-    """Port; 0: a free one, which is printed."""
+    """Port to listen on; 0: a free port. The address is printed."""
     protocol: Several[Path] = ()
-    """Folders of your own protocols, for policies that read an episode's configuration, such as scripted. Clients may
-    choose among these and the shipped ones."""
+    """Folders of your own protocols, for policies that read task configurations, such as scripted. Clients can use the
+    configurations of these and of the bundled protocols."""
     max_batch: int = 64
-    """Largest number of envs per call of the policy; fewer where their images exceed the size limit of a message."""
+    """Maximum number of environments per call of the policy; less if the images exceed the message limit (64 MiB)."""
 
 
 def main(cfg: ServePolicy) -> int:
@@ -47,11 +47,11 @@ def main(cfg: ServePolicy) -> int:
     check_number("--port", cfg.port, 0, 2**16 - 1)
     check_number("--max-batch", cfg.max_batch, 1, LARGEST_BATCH)
     if not cfg.host:
-        raise EvaluationError("no address to listen on", where="--host", expected="such as 127.0.0.1 or ::1")
+        raise EvaluationError("empty address", where="--host", expected="an address such as 127.0.0.1 or ::1")
     packs = [load_protocol(folder).rules.pack for folder in cfg.protocol]
     files = ServedFiles.collect(cfg.protocol, packs)
     if not _is_loopback(strip_brackets(cfg.host)):
-        print_line(f"{cfg.host} is no loopback address: whoever can reach it can ask this policy")
+        print_line(f"warning: {cfg.host} is no loopback address: everyone who can reach it can use the policy")
     with open_policy(cfg.policy) as policy:
         server = PolicyServer(policy, cfg.host, cfg.port, files, cfg.max_batch)
         server.run(lambda url: print_line(f"{cfg.policy} at {url}"))

@@ -1,4 +1,4 @@
-"""Make a protocol from a plan: choose its scenes and write them to files."""
+"""Freeze a protocol from a plan: sample its scenes and write them to files."""
 
 from __future__ import annotations
 
@@ -36,35 +36,36 @@ from robocas_ms3.scenes.layout_table import write_frozen_layouts
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.base import RoboCASEnv
 
-INVALID_PLAN = "no plan of a protocol"
-_WRONG = 300  # stream of the object that a wrong instruction names
+INVALID_PLAN = "invalid protocol plan"
+_WRONG = 300  # random stream that draws the object of a wrong instruction
 
 
 class ConfigVariant(StrictModel):
-    """A configuration with changes."""
+    """A task configuration with changed keys."""
 
-    config: str = Field(description="name of a shipped configuration, or a YAML file, from the plan's folder")
+    config: str = Field(description="name of a bundled configuration, or a YAML file relative to the plan")
     name: str = Field(
         default="",
         pattern=r"^[A-Za-z0-9_-]*$",
-        description="of the file it becomes; default: the configuration's, and the split's",
+        description="name of the written file; default: name of the configuration, with the split",
     )
-    change: dict[str, Any] = Field(default={}, description="keys that have other values, in the configuration's form")
+    change: dict[str, Any] = Field(default={}, description="changed keys, in the format of the configuration")
 
     def resolve(self, overrides: Sequence[str] = ()) -> TaskConfig:
-        """Return the resolved configuration: the file, with ``change`` and then ``overrides`` merged over it."""
+        """Return the configuration of the file with ``change`` and then ``overrides`` applied."""
         return load_task_config(self.config, self.change, overrides)
 
     @property
     def file(self) -> str:
+        """Return the name of the written file, without suffix."""
         return self.name or Path(self.config).stem
 
 
 class ProtocolPart(ConfigVariant):
-    """Episodes of one configuration."""
+    """Episodes of one configuration in a protocol plan."""
 
-    count: int = Field(ge=1, description="how many episodes")
-    first_seed: int = Field(ge=0, description="of which seeds; those without a layout are skipped, and more taken")
+    count: int = Field(ge=1, description="number of episodes")
+    first_seed: int = Field(ge=0, description="first scene seed; seeds without a layout are skipped")
     split: str = "test"
     instruction: Literal["correct", "wrong", "empty"] = Field(
         default="correct",
@@ -77,16 +78,16 @@ class ProtocolPart(ConfigVariant):
 
 
 class ProtocolPlan(StrictModel):
-    """What a protocol is made from."""
+    """Plan of a protocol: rules, episodes, and configurations for training."""
 
-    rules: dict[str, object] = Field(description="of `Protocol`, but for the pack's hash")
+    rules: dict[str, object] = Field(description="fields of `Protocol` without pack_hash")
     parts: list[ProtocolPart]
-    train: list[ConfigVariant] = Field(default=[], description="configurations to train on")
-    lists: dict[str, Any] = Field(default={}, description="for YAML's anchors: lists that changes refer to")
+    train: list[ConfigVariant] = Field(default=[], description="configurations for training")
+    lists: dict[str, Any] = Field(default={}, description="YAML anchors that `change` refers to")
 
 
 def read_plan(path: Path) -> ProtocolPlan:
-    """Read a plan. Files that it names are in its folder, or where the command runs."""
+    """Read a plan; paths of configurations are relative to the plan or to the working directory."""
     try:
         data = load_yaml(path)
     except (OSError, DocumentError) as error:
@@ -102,9 +103,9 @@ def read_plan(path: Path) -> ProtocolPlan:
 
 
 def freeze(plan: ProtocolPlan, folder: Path, overrides: Sequence[str] = ()) -> Iterator[tuple[int, int]]:
-    """Write a protocol into a folder, which appears whole; yield the number of episodes that are chosen, and of all.
+    """Write a protocol into a folder atomically; yield the number of sampled episodes and of all episodes.
 
-    ``overrides`` are keys to set in all its configurations, see `load_task_config`.
+    ``overrides``: keys to set in all configurations, see `load_task_config`.
     """
     pack = load_pack(str(plan.rules.get("pack", "builtin")))
     values = {**plan.rules, "pack_hash": sha256(pack.root / MANIFEST)}
@@ -126,7 +127,7 @@ def freeze(plan: ProtocolPlan, folder: Path, overrides: Sequence[str] = ()) -> I
             write_frozen_layouts(tmp / LAYOUTS / f"{name}.npy", pack.objects, found)
         with atomic_file(tmp / EPISODES) as file:
             file.write_text("".join(f"{episode.model_dump_json()}\n" for episode in episodes), encoding="utf-8")
-        # A protocol that names no robot has the default.
+        # The default robot is left out of the file.
         _write_yaml(
             rules.model_dump(mode="json", exclude={"robot"} if rules.robot == DEFAULT_ROBOT else None), tmp / RULES
         )
@@ -137,11 +138,11 @@ def _configs(parts: Sequence[ConfigVariant], overrides: Sequence[str]) -> dict[s
     for part in parts:
         config = part.resolve(overrides)
         if not re.fullmatch(CONFIG_NAME, part.file) or len(part.file) > MAX_NAME_BYTES:
-            what, fix = "invalid name of a configuration", "Give it a `name`, and a plain `split`."
+            what, fix = "invalid name of a configuration", "Set `name`, and use a `split` of letters and digits."
             expected = f"letters, digits, _ and -, at most {MAX_NAME_BYTES}"
             raise EvaluationError(what, where=part.config, expected=expected, found=repr(part.file)[:80], fix=fix)
         if found.setdefault(part.file, config) != config:
-            raise EvaluationError("two configurations of one name", where=part.file, fix="Give one of them a `name`.")
+            raise EvaluationError("two configurations have the same name", where=part.file, fix="Set `name` of one.")
     return found
 
 
@@ -188,6 +189,7 @@ def _instruction(part: ProtocolPart, env: RoboCASEnv, seed: int) -> str:
         return env.instruction().text
     others = sorted(env.object_names() - {env.target_asset().asset.name})
     if not others:
-        raise EvaluationError("no other object whose name would be wrong", where=f"{part.file}, seed {seed}")
+        what, fix = "instruction: wrong needs a second kind of object", "Increase objects.count."
+        raise EvaluationError(what, where=f"{part.file}, seed {seed}", fix=fix)
     rng = np.random.default_rng([seed, _WRONG])
     return env.instruction(0, others[int(rng.integers(len(others)))]).text

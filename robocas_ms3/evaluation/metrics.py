@@ -1,4 +1,4 @@
-"""Measures of an episode: sums and extremes since the reset, and in search the order in which objects are moved."""
+"""Metrics of an episode: sums and maxima since the reset, and the retrieval order in search."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from robocas_ms3.tasks.bodies import link_poses
 from robocas_ms3.tasks.goals import TaskState
 from robocas_ms3.tasks.search import ENVS_AT_ONCE, RoboCASSearchEnv
 
-V0_RADIUS = 0.1  # m between the origins of target and basket in xy: upstream's success
+V0_RADIUS = 0.1  # m between the origins of target and basket in xy: RoboCAS-v0's success
 MEASURES = ("path_length", "contact_impulse", "disturbed_most", "fallen")
-SUMS = (*MEASURES, "v0_steps")  # columns of what is read
+SUMS = (*MEASURES, "v0_steps")  # columns of ``info["sums"]``
 _PATH, _IMPULSE, _DISTURBED, _FALLEN, _V0_STEPS = range(len(SUMS))
-# share of an object that another one hides from above, from which on it lies over it; what is measured of points is off
-# by 0.08 at the 95th percentile
+# An object is on top of another object if it hides this fraction of it from above. The fraction is estimated from
+# points, with an error of 0.08 at the 95th percentile.
 COVER_THRESHOLD = 0.1
-SIMULTANEOUS_SECONDS = 1.0  # s of the scene in which objects that are pushed as one begin to move
+SIMULTANEOUS_SECONDS = 1.0  # simulated time within which objects that are pushed together start to move
 _NEVER = 2**30  # control steps
 
 
 class EpisodeMetrics:
-    """Accumulates the measures of each env of a RoboCAS environment that has been reset.
+    """Metrics of each env of a RoboCAS environment, accumulated since its reset.
 
-    `update` is called after every control step, `end_step` and `read` once per policy step. The impulse integrates the
-    forces found after each control step, so it is accurate for lasting contacts and an estimate for knocks. If nothing
+    Call `update` after each control step, and `end_step` and `read` once per policy step. The impulse integrates the
+    forces after each control step: accurate for lasting contacts, an estimate for short impacts. If nothing
     has moved or touched the gripper since the last call (`TaskState`), only the TCP is read.
     """
 
@@ -44,6 +44,7 @@ class EpisodeMetrics:
         self._retrieval = RetrievalOrder(env) if isinstance(env, RoboCASSearchEnv) else None
 
     def reset(self, envs: Any) -> None:
+        """Start new episodes in some envs."""
         self._sums[envs] = 0
         self._near[envs] = self._in_v0[envs] = False
         self._tcp[envs] = self._tcp_pos()[envs]
@@ -52,7 +53,7 @@ class EpisodeMetrics:
             self._retrieval.reset(envs)
 
     def update(self, opened: np.ndarray) -> None:
-        """Add a control step; ``opened`` (N,): whether the last command of each gripper was to open."""
+        """Add a control step; ``opened`` (N,): whether the last command to each gripper was to open."""
         env, sums = self._env, self._sums
         tcp = self._tcp_pos()
         sums[:, _PATH] += norm(tcp - self._tcp)
@@ -65,7 +66,7 @@ class EpisodeMetrics:
             sums[:, _DISTURBED] = maximum(sums[:, _DISTURBED], as_float(moment.disturbed.sum(1)))
             sums[:, _FALLEN] = maximum(sums[:, _FALLEN], as_float(env.success_check.fallen_objects().sum(1)))
             target = terms.select_target(moment.objects[..., :2], to_native(env.target_slot))
-            if moment.basket is not None:  # otherwise that rule never holds
+            if moment.basket is not None:  # without a basket the rule never holds
                 self._near = norm(target - moment.basket[:, :2]) <= V0_RADIUS
             if self._retrieval is not None:
                 self._retrieval.update(moment)
@@ -73,19 +74,21 @@ class EpisodeMetrics:
         self._in_v0 = self._near & open_command
 
     def _tcp_pos(self) -> Any:
-        return link_poses(self._env.scene, [self._env.agent.tcp])[:, 0, :3]  # a fourth of `tcp.pose`'s time
+        return link_poses(self._env.scene, [self._env.agent.tcp])[:, 0, :3]  # takes a fourth of the time of `tcp.pose`
 
     def end_step(self) -> None:
+        """End a policy step."""
         self._sums[:, _V0_STEPS] += self._in_v0
         if self._retrieval is not None:
             self._retrieval.end_step()
 
     def read(self) -> dict[str, torch.Tensor]:
-        """Return the measures since the reset, as entries of an info.
+        """Return the metrics since the reset as entries of ``info``.
 
-        ``sums`` (N, 5), see ``SUMS``: m of the TCP's path; N s between gripper and objects; numbers of objects
-        disturbed at once, and fallen; policy steps that upstream's rule has held. ``success_v0`` (N,) bool, that rule
-        at this moment, where there is a basket. Of search also ``retrieval``, `RetrievalOrder.read`.
+        ``sums`` (N, 5) has the columns ``SUMS``: path length of the TCP in m; contact impulse between gripper and
+        objects in N s; maximum numbers of disturbed and of fallen objects; policy steps in which RoboCAS-v0's rule has
+        held. ``success_v0`` (N,) bool: whether the rule holds now, if there is a basket. In search also ``retrieval``
+        (`RetrievalOrder.read`).
         """
         order = {} if self._retrieval is None else {"retrieval": self._retrieval.read()}
         v0 = {} if self._env.model.basket is None else {"success_v0": as_tensor(self._in_v0).clone()}
@@ -93,16 +96,16 @@ class EpisodeMetrics:
 
 
 def read_sum(info: dict[str, Any], name: str) -> Any:
-    """Return one column of an info's ``sums`` by name, (N,)."""
+    """Return a column of ``info["sums"]`` by name, (N,)."""
     return info["sums"][:, SUMS.index(name)]
 
 
 class RetrievalOrder:
-    """Records when the objects of each env were first moved. `update` is called after every control step.
+    """Policy steps at which the objects of each env were first moved. Call `update` after each control step.
 
-    An object was moved if it was more than 3 cm from where it had been or had fallen over (`disturbed`) before the
-    target was first held. It was **needed** if at the reset it hid or hemmed in the target (an obstacle of
-    `occlusion.clutter`, or it hid a tenth of it) or lay over one that was, and so on upwards.
+    An object counts as moved if it was displaced by more than 3 cm or had fallen over (`disturbed`) before the target
+    was first held. It was **needed** if at the reset it hid or hemmed in the target (an obstacle of
+    `occlusion.clutter`, or it hid a tenth of the target), or if it was on top of a needed object.
     """
 
     def __init__(self, env: RoboCASSearchEnv) -> None:
@@ -112,11 +115,14 @@ class RetrievalOrder:
         self._needed = torch.zeros(shape, dtype=torch.bool, device=env.device)
         self._moved_at = to_native(torch.zeros(shape, dtype=torch.int16, device=env.device))
         self._moved_time = to_native(torch.zeros(shape, dtype=torch.int32, device=env.device))  # control steps
-        self._held = to_native(torch.zeros(shape[0], dtype=torch.bool, device=env.device))  # by now
+        self._held = to_native(
+            torch.zeros(shape[0], dtype=torch.bool, device=env.device)
+        )  # whether the target has been held
         self._steps = to_native(torch.zeros(shape[0], dtype=torch.int16, device=env.device))
-        self._found: Tensor | None = None  # of `read`, until something changes
+        self._found: Tensor | None = None  # result of `read`, until something changes
 
     def reset(self, envs: Any) -> None:
+        """Start new episodes in some envs."""
         for some in torch.arange(len(self._steps), device=self._env.device)[envs].split(ENVS_AT_ONCE):
             self._reset(some)
 
@@ -124,7 +130,7 @@ class RetrievalOrder:
         env = self._env
         over = env.pairwise_occlusion(envs) >= COVER_THRESHOLD
         rows = torch.arange(len(over), device=env.device)
-        over[rows, env.target_slot[envs]] = False  # what the target lies on need not wait for it
+        over[rows, env.target_slot[envs]] = False  # objects under the target may be moved before it
         first = env.clutter(envs).obstacles | over[rows, :, env.target_slot[envs]]
         self._over[envs], self._needed[envs] = over, objects_to_move(first, over)
         some = to_native(envs)
@@ -145,10 +151,11 @@ class RetrievalOrder:
         self._steps += 1
 
     def read(self) -> Tensor:
-        """(N, K, 3) int16, of each object.
+        """Return the record (N, K, 3) int16 of the objects by slot.
 
-        The policy step after which each object was first moved, from 1 on, or 0; whether it was needed; and whether
-        that came in order: what lay over it moved earlier, or within a second, as what is pushed as one does.
+        The columns are the policy step after which the object was first moved (from 1 on; 0: never), whether it was
+        needed, and whether it was moved in order: the objects on top of it moved earlier or within one second, as
+        objects that are pushed together do.
         """
         if self._found is not None:
             return self._found
@@ -161,7 +168,10 @@ class RetrievalOrder:
 
 
 def objects_to_move(first: Tensor, over: Tensor) -> Tensor:
-    """Return which objects have to be moved: the ``first`` (N, K), those ``over`` them (row over column), and so on."""
+    """Return which objects must be moved, (N, K): ``first``, and all objects on top of them.
+
+    ``over`` (N, K, K): whether the row object is on top of the column object.
+    """
     found = first
     for _ in range(first.shape[1]):
         found = found | (over & found[:, None]).any(dim=2)

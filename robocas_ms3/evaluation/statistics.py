@@ -1,4 +1,4 @@
-"""Statistics of success counts: intervals of rates, paired comparisons over the same scenes, their power, and bins."""
+"""Statistics of success counts: rates with intervals, paired comparisons over the same scenes, and their power."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike
 from scipy.optimize import root_scalar
 from scipy.stats import beta, binom, norm
 
-_TAIL = (1 - 0.95) / 2  # error at each end of an interval
+_TAIL = (1 - 0.95) / 2  # error probability at each end of an interval
 _POWER = 0.8
 
 
 @dataclass(frozen=True)
 class SuccessRate:
-    """A success rate, k of n, and the limits of its 95 % interval, 0..1."""
+    """A success rate k / n with its 95 % interval, 0..1."""
 
     k: int
     n: int
@@ -25,17 +25,18 @@ class SuccessRate:
 
     @property
     def rate(self) -> float:
+        """Return k / n."""
         return self.k / self.n
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two runs, A and B, over the same scenes.
+    """Paired comparison of two runs, A and B, over the same scenes.
 
     Attributes:
-        both, only_a, only_b, neither: numbers of scenes in which these succeeded.
-        p_value: two-sided, of the hypothesis that A and B succeed equally often (`mcnemar`).
-        low, high: limits of the 95 % interval of A's rate less B's, -1..1 (`paired_interval`).
+        both, only_a, only_b, neither: numbers of scenes in which both runs, only A, only B or neither succeeded.
+        p_value: two-sided p-value of the hypothesis that A and B have equal success rates (`mcnemar`).
+        low, high: 95 % interval of the difference of the rates, A - B, -1..1 (`paired_interval`).
     """
 
     both: int
@@ -48,6 +49,7 @@ class Comparison:
 
     @classmethod
     def from_counts(cls, both: int, only_a: int, only_b: int, neither: int) -> Comparison:
+        """Return the comparison with these numbers of scenes."""
         limits = paired_interval(only_a, only_b, both + only_a + only_b + neither)
         return cls(both, only_a, only_b, neither, mcnemar(only_a, only_b), *limits)
 
@@ -65,15 +67,16 @@ class Comparison:
 
     @property
     def difference(self) -> float:
-        """A's rate less B's, -1..1."""
+        """Return the difference of the success rates, A - B, -1..1."""
         return (self.only_a - self.only_b) / self.n
 
 
 def success_rate(k: int, n: int) -> SuccessRate:
-    """Return a rate with its exact interval, which holds the true rate in at least 95 % of all evaluations.
+    """Return a success rate with its exact 95 % interval.
 
-    Clopper and Pearson, Biometrika 26 (1934) 404-413, by quantiles of beta distributions. At k = 0 the lower limit
-    is 0, at k = n the upper limit is 1; the other limit keeps half of the error.
+    Clopper and Pearson, Biometrika 26 (1934) 404-413, by quantiles of beta distributions. The interval contains the
+    true rate in at least 95 % of all evaluations. At k = 0 the lower limit is 0, at k = n the upper limit is 1; the
+    other limit keeps half of the error probability.
     """
     low = float(beta.ppf(_TAIL, k, n - k + 1)) if k else 0.0
     high = float(beta.isf(_TAIL, k + 1, n - k)) if k < n else 1.0
@@ -81,34 +84,34 @@ def success_rate(k: int, n: int) -> SuccessRate:
 
 
 def mcnemar(only_a: int, only_b: int) -> float:
-    """Return the exact two-sided p-value of two runs over the same scenes; 1 if they disagree in no scene.
+    """Return McNemar's exact two-sided p-value of two runs over the same scenes.
 
-    McNemar, Psychometrika 12 (1947) 153-157, exact form: with equal rates, a scene that only one run solves is A's with
-    probability 1/2, so the p-value is twice the binomial tail of the smaller count, at most 1.
+    McNemar, Psychometrika 12 (1947) 153-157, exact form: with equal rates, a scene that only one run solves is solved
+    by A with probability 1/2. The p-value is twice the binomial tail of the smaller count, at most 1.
     """
     return min(1.0, 2 * float(binom.cdf(min(only_a, only_b), only_a + only_b, 0.5)))
 
 
 def paired_interval(only_a: int, only_b: int, n: int) -> tuple[float, float]:
-    """Return Tango's score interval of the difference of two rates over the same n scenes, A's less B's.
+    """Return Tango's 95 % score interval of the difference of two rates over the same n scenes, A - B.
 
     The differences d that the score test of paired data does not reject (Tango, Statistics in Medicine 17 (1998)
     891-908):
 
         |only_a - only_b - n d| <= z sqrt(n (2 q + d (1 - d)))
 
-    where q is the likeliest probability of a scene that only B solves, given d. It stays within -1..1 and has a width
-    if the runs disagree in no scene. With 6 to 50 scenes at 95 % it holds the true difference in 95 % of cases or more
-    on average over the truths, in 94 % or more for 19 of 20 truths, and in 89 % at worst from 9 scenes on (83 % below);
-    the worst are runs that disagree nearly everywhere. The score test is approximate: if the exact p-value is a little
-    above 0.05, the interval can exclude 0. Claims go by the p-value.
+    where q is the most likely probability of a scene that only B solves, given d. The interval is within -1..1 and has
+    a positive width even if the runs agree in all scenes. Its coverage with 6 to 50 scenes is at least 95 % on average
+    over the true rates, at least 94 % for 19 of 20 true rates, and at worst 89 % from 9 scenes on (83 % below 9). The
+    worst cases are runs that disagree in nearly all scenes. The score test is approximate: if the exact p-value is
+    slightly above 0.05, the interval can exclude 0. Decide by the p-value.
     """
     z2 = float(norm.isf(_TAIL)) ** 2
     middle = (only_a - only_b) / n
 
     def excess(d: float) -> float:
         if d == middle:
-            return -1.0  # it is 0 there if the variance is, which is no limit of the interval
+            return -1.0  # with zero variance the value is 0 here, which is no limit of the interval
         # q solves 2 n q^2 + linear q - only_b d (1 - d) = 0
         linear = (2 * n - only_a + only_b) * d - only_a - only_b
         q = (np.sqrt(max(0.0, linear**2 + 8 * n * only_b * d * (1 - d))) - linear) / (4 * n)
@@ -122,17 +125,17 @@ def paired_interval(only_a: int, only_b: int, n: int) -> tuple[float, float]:
 
 
 def compare(a: ArrayLike, b: ArrayLike) -> Comparison:
-    """Compare two runs by whether each succeeded in each scene, (n,) bool each, in the same order of scenes."""
+    """Compare two runs by their successes (n,) bool, in the same order of scenes."""
     a, b = np.asarray(a, dtype=bool), np.asarray(b, dtype=bool)
     return Comparison.from_counts(*(int(cases.sum()) for cases in (a & b, a & ~b, ~a & b, ~a & ~b)))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Return the p-values of several comparisons, adjusted, in their order.
+    """Return p-values of several comparisons adjusted by Holm's method, in their order.
 
-    Claiming a difference where they are at most alpha makes any false claim with probability at most alpha. The i-th
-    smallest of m is multiplied by m - i + 1, and is no less than those before it (Holm, Scandinavian Journal of
-    Statistics 6 (1979) 65-70).
+    If a difference is claimed where the adjusted p-value is at most alpha, the probability of any false claim is at
+    most alpha. The i-th smallest of m p-values is multiplied by m - i + 1, and is at least the previous adjusted value
+    (Holm, Scandinavian Journal of Statistics 6 (1979) 65-70).
     """
     p = np.asarray(p_values, dtype=float)
     order = np.argsort(p, kind="stable")
@@ -142,12 +145,12 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def success_rates_by_bin(values: ArrayLike, successes: ArrayLike, edges: Sequence[float]) -> list[SuccessRate | None]:
-    """Return success rates over bins of a number that each episode has, such as p_vis; None: an empty bin.
+    """Return success rates by bins of a value per episode, such as p_vis; None: an empty bin.
 
     Args:
-        values: (n,) the numbers, within the outermost edges.
+        values: (n,) values within the outermost edges.
         successes: (n,) bool.
-        edges: (bins + 1,) ascending; a bin holds its lower edge, the last one also its upper edge.
+        edges: (bins + 1,) ascending; a bin contains its lower edge, the last bin also its upper edge.
     """
     done, ends = np.asarray(successes, dtype=bool), np.asarray(edges, dtype=float)
     place = np.minimum(np.searchsorted(ends, np.asarray(values), side="right") - 1, len(ends) - 2)
@@ -156,18 +159,18 @@ def success_rates_by_bin(values: ArrayLike, successes: ArrayLike, edges: Sequenc
 
 
 def mcnemar_power(n: int, difference: float, discordant: float, *, alpha: float = 0.05) -> float:
-    """Return the probability that the exact McNemar test tells two runs over the same n scenes apart.
+    """Return the power of the exact McNemar test for two runs over the same n scenes.
 
-    Summed exactly over the number of scenes in which the runs disagree, and over which run solves them.
+    The power is summed exactly over the number of scenes in which the runs disagree and over the run that solves them.
 
     Args:
         n: number of scenes.
-        difference: of the true rates, 0..1.
-        discordant: the probability that the runs disagree in a scene, at least ``difference``.
-        alpha: they are told apart if the p-value is at most this.
+        difference: difference of the true rates, 0..1.
+        discordant: probability that the runs disagree in a scene, at least ``difference``.
+        alpha: significance level of the p-value.
     """
-    m = np.arange(1, n + 1)  # scenes in which they disagree
-    # The largest count of the weaker run that is told apart; -1 if none is.
+    m = np.arange(1, n + 1)  # number of scenes in which the runs disagree
+    # Largest count of the weaker run with a significant p-value; -1: no count.
     most = binom.ppf(alpha / 2, m, 0.5)
     most = np.where(binom.cdf(most, m, 0.5) <= alpha / 2, most, most - 1)
     better = (1 + difference / discordant) / 2 if discordant else 0.5
@@ -176,15 +179,15 @@ def mcnemar_power(n: int, difference: float, discordant: float, *, alpha: float 
 
 
 def smallest_paired_difference(n: int, discordant: float, *, alpha: float = 0.05) -> float | None:
-    """Return the smallest difference of rates that two runs over the same n scenes show with a probability of 80 %.
+    """Return the smallest difference of rates that two runs over the same n scenes show with 80 % power.
 
-    None if n is too small for any: six scenes that one run alone solves make the first p-value below 0.05.
+    None: n is too small for any difference; the p-value is below 0.05 from six scenes on that only one run solves.
 
     Args:
         n: number of scenes.
-        discordant: the share of scenes in which the runs disagree, 0..1. With a difference greater than it, all scenes
-            in which they disagree are the better run's.
-        alpha: see `mcnemar_power`.
+        discordant: fraction of scenes in which the runs disagree, 0..1. With a greater difference, the better run
+            solves all scenes in which they disagree.
+        alpha: significance level of the p-value.
     """
 
     def missing(difference: float) -> float:
@@ -194,9 +197,10 @@ def smallest_paired_difference(n: int, discordant: float, *, alpha: float = 0.05
 
 
 def power_warning(comparison: Comparison, *, alpha: float = 0.05) -> str | None:
-    """Return a warning if the runs are not told apart at ``alpha``, with the difference that as many scenes would show.
+    """Return a warning if the difference is not significant at ``alpha``; None otherwise.
 
-    That difference assumes that the runs disagree in as many scenes as they did, so it is an estimate itself.
+    The warning names the smallest difference that this number of scenes shows with 80 % power. It assumes the observed
+    fraction of scenes in which the runs disagree, so it is an estimate.
     """
     c = comparison
     if c.p_value <= alpha:
@@ -206,4 +210,4 @@ def power_warning(comparison: Comparison, *, alpha: float = 0.05) -> str | None:
         "no difference, however large" if shown is None else f"differences of {np.ceil(100 * shown):.0f} points or more"
     )
     count = "1 episode shows" if c.n == 1 else f"{c.n} episodes show"
-    return f"not told apart: {count} {difference} ({100 * _POWER:g} % power)"
+    return f"no significant difference: {count} {difference} ({100 * _POWER:g} % power)"

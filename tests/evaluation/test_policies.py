@@ -59,7 +59,7 @@ def here(tmp_path, monkeypatch):
 
 
 def test_specifications():
-    assert "observe_every" not in policy_spec_values(PolicySpec())  # for servers and clients of older versions
+    assert "observe_every" not in policy_spec_values(PolicySpec())  # the default is left out
     assert policy_spec_values(PolicySpec(observe_every=7))["observe_every"] == 7
     for wrong in ({"convention": "words"}, {"language": "loud"}, {"reference": "me"}, {"observe_every": 0}):
         with pytest.raises(EvaluationError) as error:
@@ -67,36 +67,36 @@ def test_specifications():
         assert error.value.where == next(iter(wrong))
 
 
-def test_a_module_in_the_folder_of_the_command(here):
+def test_policy_modules_in_the_working_directory_are_found(here):
     assert type(make_policy("own_policy:Mine")).__name__ == "Mine"
-    assert sys.path[-1] == str(here)  # and not before what is installed
+    assert sys.path[-1] == str(here)  # after the installed packages
     assert isinstance(make_policy("noop"), NoopPolicy)
 
 
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("scriptd", "no such policy .*Did you mean scripted"),
-        ("replay:", "no such policy"),
-        ("json:Nothing", "no such policy"),
-        ("http://127.0.0.1:9", "no such policy .*ws://host:port"),
-        ("own_policy.py:Mine", "no such policy.*Leave the .py out: own_policy:Mine"),
-        ("own_nowhere:Mine", "no such policy .*No module named 'own_nowhere'.*PYTHONPATH"),
-        ("own_policy:Yours", "no such policy .*Yours"),
-        ("own_spoilt:Mine", "own_spoilt: this policy's module can't be imported .*SyntaxError"),
-        ("own_importing:Mine", "own_importing: this policy's module can't be imported .*not_there_at_all"),
-        ("own_policy:Picky", "this policy can't be made .*takes no arguments"),
-        ("own_policy:Wishless", "a policy without spec"),
-        ("own_policy:Idle", "a policy without act"),
+        ("scriptd", "unknown policy .*Did you mean scripted"),
+        ("replay:", "unknown policy"),
+        ("json:Nothing", "unknown policy"),
+        ("http://127.0.0.1:9", "unknown policy .*ws://host:port"),
+        ("own_policy.py:Mine", "unknown policy.*Omit the suffix .py: own_policy:Mine"),
+        ("own_nowhere:Mine", "unknown policy .*No module named 'own_nowhere'.*PYTHONPATH"),
+        ("own_policy:Yours", "unknown policy .*Yours"),
+        ("own_spoilt:Mine", "own_spoilt: cannot import the module of the policy .*SyntaxError"),
+        ("own_importing:Mine", "own_importing: cannot import the module of the policy .*not_there_at_all"),
+        ("own_policy:Picky", "cannot make the policy .*without required arguments"),
+        ("own_policy:Wishless", "the policy has no valid spec"),
+        ("own_policy:Idle", "the policy has no valid act"),
     ],
 )
-def test_what_is_no_policy_is_one_line(here, name, message):
+def test_invalid_policy_names_are_errors_of_one_line(here, name, message):
     with pytest.raises(EvaluationError, match=message) as caught:
         make_policy(name)
     assert "\n" not in str(caught.value)
 
 
-def test_an_error_of_the_policys_own_is_its_own(here):
+def test_an_error_inside_the_policy_is_not_changed(here):
     with pytest.raises(TypeError, match="len"):
         make_policy("own_policy:Broken")
 
@@ -108,7 +108,7 @@ def test_an_error_of_the_policys_own_is_its_own(here):
         *(f"own_policy:Leaves{when}" for when in ("Made", "Acting", "Described", "Closed", "Converted", "LookedUp")),
     ],
 )
-def test_a_policy_can_not_end_the_process(here, name):
+def test_a_policy_cannot_end_the_process(here, name):
     with pytest.raises(ExtensionError) as caught, open_policy(name) as policy:
         describe(policy)
         play(CountingEnv(1, None), policy, [EpisodeSpec(-1, 0, "pick", "", "", "", 2, "")], 3)

@@ -118,7 +118,7 @@ def test_a_configuration_that_extends_another_file_is_refused(folder, inside, ke
         (lambda f: change_rules(f, max_seconds={"pick": 3}), "episodes of this task have no time limit.*max_seconds"),
         (lambda f: change_rules(f, stepping="upstream"), "invalid protocol rules.*upstream requires max_steps"),
         (lambda f: change_episode(f, 1, task="tidy"), "episodes.jsonl: unknown task.*found tidy"),
-        (lambda f: (f / EPISODES).unlink(), "episodes.jsonl: can't read"),
+        (lambda f: (f / EPISODES).unlink(), "episodes.jsonl: cannot read"),
         (lambda f: (f / EPISODES).write_text("{\n"), "episodes.jsonl:1: invalid episode"),
         (lambda f: change_episode(f, 1, seed=-1), "episodes.jsonl:2: invalid episode.*seed"),
         (lambda f: change_episode(f, 1, episode=0), "episodes.jsonl:2: episode out of order.*expected 1, found 0"),

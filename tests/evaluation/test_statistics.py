@@ -168,7 +168,7 @@ def test_the_smallest_difference_has_the_power_asked_for(n, discordant):
 
 def test_a_warning_says_what_would_show():
     assert power_warning(Comparison.from_counts(20, 8, 5, 7)) == (
-        "not told apart: 40 episodes show differences of 26 points or more (80 % power)"
+        "no significant difference: 40 episodes show differences of 26 points or more (80 % power)"
     )
     assert "5 episodes show no difference, however large" in (power_warning(Comparison.from_counts(0, 5, 0, 0)) or "")
     assert power_warning(Comparison.from_counts(0, 6, 0, 0)) is None  # p = 1/32

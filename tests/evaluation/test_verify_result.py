@@ -160,7 +160,7 @@ def test_the_command_fails_where_something_is_wrong_and_a_result_chooses_no_fold
     assert "8 episodes of smoke, no violations" in capsys.readouterr().out
     shutil.copytree(load_protocol("smoke").folder, tmp_path / "easy")
     tamper_run(folder, protocol="easy")
-    with pytest.raises(EvaluationError, match="its protocol is not shipped.*found easy.*--protocol FOLDER"):
+    with pytest.raises(EvaluationError, match="protocol of the result is not bundled.*found easy.*--protocol FOLDER"):
         verify(Verify((folder,)))
     assert verify(Verify((folder,), protocol="easy")) == 0
     tamper(folder, 3, seed=5)

@@ -34,7 +34,7 @@ def test_it_is_found_and_listed_by_its_name(site):
     listed = {row["name"]: row for row in list_all()["policies"]}
     assert listed["descend"] == {"name": "descend", "package": "my-policies", "of": "my_policies:Descend"}
     assert {"scripted", "scripted-ee-delta", "random", "noop"} <= listed.keys()
-    with pytest.raises(EvaluationError, match="no such policy .*Did you mean descend"):
+    with pytest.raises(EvaluationError, match="unknown policy .*Did you mean descend"):
         make_policy("decend")
 
 

@@ -1,1 +1,1 @@
-"""Episodes of a protocol in the evaluation loops of other packages: vla-eval and LeRobot."""
+"""Adapters that run episodes of a protocol in the evaluation loops of vla-eval and LeRobot."""

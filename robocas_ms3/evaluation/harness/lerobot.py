@@ -1,6 +1,6 @@
-"""``--env.type=robocas`` of LeRobot's commands: its settings, and the environments made from them.
+"""Environment ``--env.type=robocas`` of LeRobot's commands.
 
-Needs lerobot 0.6. LeRobot imports this through the distribution ``lerobot_env_robocas``.
+Needs lerobot 0.6. LeRobot imports this module through the distribution ``lerobot_env_robocas``.
 """
 
 from dataclasses import dataclass, field
@@ -20,19 +20,19 @@ from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 @EnvConfig.register_subclass("robocas")
 @dataclass
 class RoboCASEnvConfig(EnvConfig):
-    """Settings of RoboCAS in LeRobot. The defaults are those of the LeRobot datasets that robocas_ms3 writes.
+    """Configuration of RoboCAS environments in LeRobot; the defaults fit the LeRobot datasets of this package.
 
     Attributes:
-        task: short name of a task; several separated by commas; ``all`` tasks of the protocol.
-        fps: actions per second, as the policy was trained with.
-        protocol: name of a shipped protocol, such as ``ms3-v1`` or ``smoke``, or its folder.
-        split: use the episodes of this split only, such as ``seen`` of ``objects-v1``; empty: all.
-        cameras: names separated by commas. LeRobot films the first one.
-        observation_width, observation_height: size of the images of every camera, pixels.
+        task: short names of tasks, separated by commas; ``all``: all tasks of the protocol.
+        fps: actions per second, as in the training data of the policy.
+        protocol: name of a bundled protocol, such as ``ms3-v1`` or ``smoke``, or a protocol folder.
+        split: run only the episodes of this split, such as ``seen`` of ``objects-v1``; empty: all.
+        cameras: names separated by commas. LeRobot records videos of the first camera.
+        observation_width, observation_height: size of the images of each camera, pixels.
         depth: add the depth of each camera as ``observation.images.CAMERA_depth``, (1, H, W) float32 in mm.
-        convention, reference: meaning of the actions (docs/evaluation.md).
+        convention, reference: action convention and reference of motions (docs/evaluation.md).
         backend: ``processes``, ``gpu`` or ``auto``.
-        results: folder for results that ``robocas eval report`` reads, one subfolder per task.
+        results: folder of the results for ``robocas eval report``, one subfolder per task.
         policy_name: name of the policy in these results.
     """
 
@@ -72,13 +72,14 @@ class RoboCASEnvConfig(EnvConfig):
 
     @property
     def spec(self) -> PolicySpec:
+        """Return the policy specification of these settings."""
         size = (self.observation_width, self.observation_height)
         cameras = dict.fromkeys(_names(self.cameras, "env.cameras"), size)
         return PolicySpec(self.convention, cast(Reference, self.reference), self.fps, cameras, depth=self.depth)
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Return nothing: `create_envs` does not call ``gym.make``."""
+        """Return no arguments: `create_envs` does not call ``gym.make``."""
         return {}
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
@@ -109,5 +110,5 @@ class RoboCASEnvConfig(EnvConfig):
 def _names(text: str, where: str) -> list[str]:
     names = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
     if not names:
-        raise EvaluationError("no name given", where=where, expected="names separated by commas", found=repr(text))
+        raise EvaluationError("missing name", where=where, expected="names separated by commas", found=repr(text))
     return names

@@ -1,4 +1,4 @@
-"""Robot state in observations of LeRobot environments: the values and names of our LeRobot datasets."""
+"""Robot state in observations of LeRobot environments, with the values and names of our LeRobot datasets."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from robocas_ms3.robots.quantities import ARM_BASE, STATE, feature_columns, lero
 from robocas_ms3.robots.registry import find_robot
 
 KEYS = {"agent_pos": STATE} | {key.removeprefix("observation."): key for key in lerobot_features() if key != STATE}
-"""Key of an environment's observation -> column of our LeRobot datasets."""
+"""Column of our LeRobot datasets by key of the observation of an environment."""
 WIDTHS = {name: next(one.width for one in schema.FEATURES if one.key == column) for name, column in KEYS.items()}
 _QUATERNIONS = {"agent_pos": feature_columns(STATE)["ee_orn"], "arm_base": feature_columns(ARM_BASE)["base_orn"]}
 _YAW = feature_columns(STATE)["agv_pose"].stop - 1  # in agent_pos
 
 
 def depth_key(camera: str) -> str:
-    """Return the key of a camera's depth in observations; LeRobot puts ``observation.`` before it."""
+    """Return the key of a depth image in observations; LeRobot adds the prefix ``observation.``."""
     return schema.depth_key(camera).removeprefix("observation.")
 
 
 class Proprioception:
-    """Reads the state of the robots of N envs, step by step."""
+    """State of the robots of N envs, read once per step."""
 
     def __init__(self, robot: str) -> None:
         self._spec = find_robot(robot)
 
     def reset(self, obs: dict[str, Any]) -> None:
-        """Start an episode in each env with its first observation, arrays (N, ...)."""
+        """Start an episode in each env from the first observation, arrays (N, ...)."""
         robot, agent = self._spec.description, obs["agent"]
         poses = (agent["tcp_in_arm_base"], obs["extra"]["tcp_pose"])
         in_base, in_world = (from_wxyz(np.asarray(pose, np.float64)) for pose in poses)
@@ -43,12 +43,17 @@ class Proprioception:
         base_in_root = chain_poses(
             self._spec.files().urdf, robot.root_link, robot.arm_base_link, qpos[:, robot.base_slice]
         )
-        self._roots = in_world @ inverse(in_base) @ inverse(base_in_root)  # (N, 4, 4) root links, which stay there
-        self._widths = qpos[:, robot.finger_slice].sum(axis=1)  # m, of the grippers at the start
+        self._roots = (
+            in_world @ inverse(in_base) @ inverse(base_in_root)
+        )  # (N, 4, 4) poses of the root links, which do not move
+        self._widths = qpos[:, robot.finger_slice].sum(axis=1)  # initial gripper widths, m
         self._last: dict[int, dict[str, NDArray[np.float32]]] = {}  # by env
 
     def read(self, env: int, obs: dict[str, Any], gripper: float | None) -> dict[str, NDArray[np.float32]]:
-        """Return the values (D,) of each of `KEYS`; ``gripper``: last command, -1 closed to 1 open, None: none yet."""
+        """Return the values (D,) of each key in `KEYS`.
+
+        ``gripper``: last gripper command, -1 closed to 1 open; None: no command in the episode yet.
+        """
         qpos, qvel = (obs["agent"][name][env][None].astype(np.float64) for name in ("qpos", "qvel"))
         commands, width = np.array([] if gripper is None else [gripper]), float(self._widths[env])
         opened = gripper_open(self._spec.description, commands, np.array([len(commands)]), initial_width=width)
@@ -62,7 +67,7 @@ class Proprioception:
 def _continued(
     before: dict[str, NDArray[np.float32]], now: dict[str, NDArray[np.float32]]
 ) -> dict[str, NDArray[np.float32]]:
-    """Return the values without sign flips of quaternions and jumps by full turns, as in an episode of a dataset."""
+    """Return the values without sign flips of quaternions and jumps by full turns, as in datasets."""
     found = {name: values.copy() for name, values in now.items()}
     for name, turn in _QUATERNIONS.items():
         if before[name][turn] @ found[name][turn] < 0:

@@ -1,4 +1,4 @@
-"""The episodes of one task of a protocol as a gymnasium vector environment, in LeRobot's conventions."""
+"""Gymnasium vector environment for the episodes of one task of a protocol, with LeRobot's conventions."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from robocas_ms3.evaluation.settings import EvaluationSettings
 
 
 class ProtocolVectorEnv(gym.vector.VectorEnv):
-    """Run the frozen episodes of one task, N at a time.
+    """Vector environment that runs the frozen episodes of one task, N at a time.
 
     A seed is the index of an episode in the task's list, modulo the length of the list. There is no automatic reset:
     an env whose episode has ended returns its last observation until the next reset.
 
     Observations: ``pixels`` by camera (N, H, W, 3) uint8; ``agent_pos`` (N, 18), ``joint_velocity`` (N, 7),
     ``arm_base`` (N, 7) and ``gripper_open`` (N, 1) float32, the state columns of our LeRobot datasets; with depth
-    ``images.CAMERA_depth`` (N, 1, H, W) float32 in mm, 0: nothing measured. Reward: 1 at the step where an episode ends
+    ``images.CAMERA_depth`` (N, 1, H, W) float32 in mm, 0: no measurement. Reward: 1 at the step where an episode ends
     with success, else 0. ``info["is_success"]`` (N,) is also in ``info["final_info"]`` at steps where an episode ends.
 
     Args:
         spec: cameras, action convention and rate.
-        settings: protocol; ``tasks`` names the task; number of envs, where they run, split, name of the policy; folder
-            for a result that ``robocas eval report`` reads, if ``out`` names one.
+        settings: protocol, task (``tasks``), number of envs, backend, split and policy name; ``out``: folder of the
+            result, None: no result is written.
     """
 
     def __init__(self, spec: PolicySpec, settings: EvaluationSettings) -> None:
@@ -45,16 +45,16 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         if settings.envs > 1:
             splits = ", ".join(dict.fromkeys(episode.split for episode in self._episodes))
             self._session.protocol.check_same_configuration(
-                self._episodes, f"Choose one of the splits {splits}, or use one env."
+                self._episodes, f"Select one of the splits {splits}, or use one env."
             )
         self._task = self._episodes[0].task
         self._max_steps = self._session.max_steps(self._task)
         self._lock = ExitStack()
-        self._folder, self._recorded = settings.out, set[int]()  # episodes that the result has
+        self._folder, self._recorded = settings.out, set[int]()  # episodes that were written
         if (folder := settings.out) is not None:
             with ExitStack() as lock:
                 if lock.enter_context(results.open_result(folder, self._session.run_record)):
-                    raise EvaluationError("there is a result already", where=folder, fix="Choose another folder.")
+                    raise EvaluationError("the folder already has a result", where=folder, fix="Choose another folder.")
                 self._lock = lock.pop_all()  # held until `close`
         self._convention = CONVENTIONS[spec.convention]
         self._proprioception = Proprioception(self._session.protocol.rules.robot)
@@ -67,7 +67,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         self.single_action_space = gym.spaces.Box(-np.inf, np.inf, (self._convention.size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, count)
         self.action_space = batch_space(self.single_action_space, count)
-        self.episodes = np.zeros(count, np.int64)  # numbers in the protocol's list
+        self.episodes = np.zeros(count, np.int64)  # episode numbers of the protocol
         self._instructions = [""] * count
         self._grippers: list[float | None] = [None] * count  # last command, -1 closed to 1 open
         self._obs: dict[str, Any] = {}
@@ -75,11 +75,12 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode in each env; ``options`` are ignored.
+        """Start an episode in each env.
 
         Args:
-            seed: of the first env, whose successors the other envs get, or one per env; None: the episodes after
-                those of the last reset.
+            seed: seed of the first env; the other envs get the next seeds. A list has one seed per env. None: the
+                episodes after those of the last reset.
+            options: ignored.
         """
         first: Any = self._next if seed is None else seed
         seeds = [first + env for env in range(self.num_envs)] if np.ndim(first) == 0 else list(first)
@@ -95,12 +96,12 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         self._proprioception.reset(self._session.observation)
         self._obs = cast(dict[str, Any], create_empty_array(self.single_observation_space, self.num_envs))
         self._read(list(range(self.num_envs)))
-        return deepcopy(self._obs), self._info(np.zeros(self.num_envs, bool))  # the caller may keep them
+        return deepcopy(self._obs), self._info(np.zeros(self.num_envs, bool))  # a copy: the caller may keep it
 
     def step(
         self, actions: ArrayLike
     ) -> tuple[dict[str, Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Step the envs whose episodes run, by actions (N, A)."""
+        """Step the envs with a running episode by actions (N, A)."""
         acts = np.asarray(actions, np.float32)
         if acts.shape != self.action_space.shape:
             raise ValueError(f"actions: expected {self.action_space.shape}, found {acts.shape}")
@@ -146,12 +147,12 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         return np.where(opened, 1.0, -1.0).tolist()
 
     def _by_env(self, holds: Callable[[Outcome], bool]) -> NDArray[np.bool_]:
-        """Return (N,) whether an env's episode has ended with an outcome of which something holds."""
+        """Return (N,) whether the episode of each env has ended with an outcome for which ``holds`` is true."""
         outcomes = [self._session.outcomes.get(env) for env in range(self.num_envs)]
         return np.array([outcome is not None and holds(outcome) for outcome in outcomes])
 
     def _record(self, envs: list[int]) -> None:
-        """Write the outcomes of envs into the result, each episode once."""
+        """Write the outcomes of envs to the result, each episode once."""
         for outcome in (self._session.outcomes[env] for env in envs):
             if self._folder is not None and outcome.episode not in self._recorded:
                 results.append_outcome(self._folder, outcome)

@@ -66,7 +66,7 @@ POLICY_FOLDERS: Registry[Callable[[Path], Policy]] = Registry(
 
 
 def find_policy(name: str) -> Callable[[], Policy]:
-    """Return what makes a policy; nothing is imported before it is called."""
+    """Return the factory of a policy by name; nothing is imported before the factory is called."""
     known, (kind, _, rest) = [*POLICIES.builtin, *POLICIES.entry_points], name.partition(":")
     if name in known:
         return lambda: _call(name, POLICIES[name])
@@ -81,15 +81,15 @@ def find_policy(name: str) -> Callable[[], Policy]:
     if re.fullmatch(r"\w+(\.\w+)*", kind) and rest.isidentifier():
         return partial(_make_own, name, kind, rest)
     expected = f"{', '.join(known)}, a folder of robocas train, replay:TRAJECTORY.h5, module:Class or ws://host:port"
-    raise EvaluationError("no such policy", where=name, expected=expected, fix=did_you_mean(name, known))
+    raise EvaluationError("unknown policy", where=name, expected=expected, fix=did_you_mean(name, known))
 
 
 def make_policy(name: str) -> Policy:
     """Make a policy.
 
     Raises:
-        EvaluationError: there is no such policy (`find_policy`), or it lacks something that `Policy` has.
-        ExtensionError: that of a package can't be loaded, or several have it.
+        EvaluationError: the policy is unknown (`find_policy`), or it lacks an attribute of `Policy`.
+        ExtensionError: the policy of a package cannot be loaded, or several packages register the name.
     """
     with forbid_exit(f"policy {name}"):
         policy: Any = find_policy(name)()
@@ -99,14 +99,14 @@ def make_policy(name: str) -> Policy:
             ("act", callable(getattr(policy, "act", None))),
         ):
             if not fits:
-                expected = "spec (robocas_ms3.evaluation.policy.PolicySpec), reset(starts) and act(observations)"
-                raise EvaluationError(f"a policy without {what}", where=name, expected=expected)
+                expected = "spec (robocas_ms3.evaluation.PolicySpec), reset(episodes) and act(observations)"
+                raise EvaluationError(f"the policy has no valid {what}", where=name, expected=expected)
     return policy
 
 
 @contextmanager
 def open_policy(name: str) -> Iterator[Policy]:
-    """Make a policy, and close it at the end if it can be closed."""
+    """Make a policy, and close it at the end if it has a ``close`` method."""
     with forbid_exit(f"policy {name}"):
         policy = make_policy(name)
         try:
@@ -117,18 +117,18 @@ def open_policy(name: str) -> Iterator[Policy]:
 
 def _make_own(name: str, module: str, attribute: str) -> Policy:
     if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # last: a file in the folder must not hide an installed module
+        sys.path.append(os.getcwd())  # last, so that a file in the folder hides no installed module
     try:
         make: Any = getattr(importlib.import_module(module), attribute)
     except AttributeError as error:
-        raise EvaluationError("no such policy", where=name, found=error) from error
-    except Exception as error:  # code of the user may raise anything
+        raise EvaluationError("unknown policy", where=name, found=error) from error
+    except Exception as error:  # user code may raise any exception
         is_file = module.endswith(".py")
         if isinstance(error, ModuleNotFoundError) and (is_file or error.name == module.partition(".")[0]):
-            fix = "Run in its folder, or install it, or put its folder on PYTHONPATH."
-            fix = f"Leave the .py out: {module[:-3]}:{attribute}" if is_file else fix
-            raise EvaluationError("no such policy", where=name, found=error, fix=fix) from error
-        what, found = "this policy's module can't be imported", f"{type(error).__name__}: {error}"
+            fix = "Run in the folder of the module, install the module, or add its folder to PYTHONPATH."
+            fix = f"Omit the suffix .py: {module[:-3]}:{attribute}" if is_file else fix
+            raise EvaluationError("unknown policy", where=name, found=error, fix=fix) from error
+        what, found = "cannot import the module of the policy", f"{type(error).__name__}: {error}"
         raise EvaluationError(what, where=module, found=found) from error
     return _call(name, make)
 
@@ -137,7 +137,7 @@ def _call(name: str, make: Any) -> Policy:
     try:
         return make()
     except TypeError as error:
-        if error.__traceback__ is not None and error.__traceback__.tb_next is None:  # raised by the call itself
-            what, expected = "this policy can't be made", "a class that takes no arguments"
+        if error.__traceback__ is not None and error.__traceback__.tb_next is None:  # the call itself failed
+            what, expected = "cannot make the policy", "a class without required arguments"
             raise EvaluationError(what, where=name, expected=expected, found=error) from error
         raise

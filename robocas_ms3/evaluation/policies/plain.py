@@ -1,4 +1,4 @@
-"""Policies that observe nothing: their scores are what a task gives away."""
+"""Policies without observations; they show the success rate that a task has by chance."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
-_REACH, _TURN = 0.05, 0.2  # largest motion of a random action, m and rad
+_REACH, _TURN = 0.05, 0.2  # largest motion per random action, m and rad
 _CHANGE = 0.1  # probability that a random action opens or closes the gripper
 
 
 class NoopPolicy:
-    """Do not move, with the gripper open."""
+    """Policy that does not move and keeps the gripper open."""
 
     spec = PolicySpec(reference="tcp", language="none")
 
@@ -24,7 +24,7 @@ class NoopPolicy:
 
 
 class RandomPolicy:
-    """Move at random, in each episode from its own seed."""
+    """Policy that moves at random, seeded per episode."""
 
     spec = PolicySpec(reference="tcp", language="none")
 

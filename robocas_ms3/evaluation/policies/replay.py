@@ -1,4 +1,4 @@
-"""Policies that follow a track of joint targets or TCP poses; `ReplayPolicy` follows recorded episodes."""
+"""Policies that follow a track of joint targets or TCP poses; `ReplayPolicy` replays recorded episodes."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ Array = NDArray[np.floating]
 
 @dataclass
 class JointTrack:
-    """Joint targets (S, 8), of which the last one is held; without any the arm stays where it is."""
+    """A track of joint targets (S, 8); the last target is held. With S = 0 the arm does not move."""
 
     actions: Array
     step: int = 0
 
     def next(self, observations: Observations, row: int) -> Array:
-        """Return the next action (8,) of a row's env."""
+        """Return the next action (8,) for the env of a row."""
         if not len(self.actions):
             self.actions = np.append(observations.qpos[row, RobotDescription.arm_slice], 1.0)[None]
         action = self.actions[min(self.step, len(self.actions) - 1)]
@@ -41,11 +41,11 @@ class JointTrack:
 
 @dataclass
 class PoseTrack:
-    """Poses of the TCP, one per policy step: each action leads there from where the TCP is by then.
+    """A track of TCP poses, one per policy step; each action moves from the present TCP pose to the next pose.
 
     Attributes:
-        poses: (S, 4, 4) in the arm's base frame; without any the arm stays where it is.
-        open: (S,) bool, commands of the gripper.
+        poses: (S, 4, 4) in the frame of the arm's base; with S = 0 the arm does not move.
+        open: (S,) bool, gripper commands.
     """
 
     poses: Array
@@ -54,9 +54,13 @@ class PoseTrack:
 
     @classmethod
     def from_recording(cls, robot: RobotSpec, robot_states: Array, gripper: Array, stride: int) -> PoseTrack:
-        """Return the track of a recording, one pose per ``stride`` control steps.
+        """Return the track of a recording with one pose per ``stride`` control steps.
 
-        ``robot_states`` (S + 1, 37) after the reset and each control step; ``gripper`` (S,) commands in [-1, 1].
+        Args:
+            robot: the robot.
+            robot_states: (S + 1, 37) after the reset and after each control step.
+            gripper: (S,) commands in [-1, 1].
+            stride: control steps per pose.
         """
         if not len(gripper):
             return cls(np.zeros((0, 4, 4)), np.zeros(0, dtype=bool))
@@ -64,7 +68,7 @@ class PoseTrack:
         return cls(motion.tcp_in_base[1:], motion.gripper_open[1:])
 
     def next(self, observations: Observations, row: int) -> Array:
-        """Return the next action (7,) of a row's env, in RoboCAS' convention."""
+        """Return the next action (7,) for the env of a row, in the convention ``robocas``."""
         place = min(self.step, len(self.poses) - 1)
         self.step += 1
         if place < 0:
@@ -77,14 +81,14 @@ class PoseTrack:
 
 
 class TrackPolicy(ABC):
-    """Follow a track in each episode."""
+    """Base class of policies that follow one track per episode."""
 
     def __init__(self) -> None:
         self._tracks: dict[int, JointTrack | PoseTrack] = {}  # by env
 
     @abstractmethod
     def track(self, episode: EpisodeSpec) -> JointTrack | PoseTrack:
-        pass
+        """Return the track of an episode."""
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
         self._tracks |= {episode.env: self.track(episode) for episode in episodes}
@@ -96,10 +100,10 @@ class TrackPolicy(ABC):
 
 
 class ReplayPolicy(TrackPolicy):
-    """Repeat the actions of a trajectory file, at its rate; do not move in an episode whose seed it lacks.
+    """Policy that replays the actions of a trajectory file at its rate; it does not move for other seeds.
 
     Args:
-        trajectory: HDF5 file of joint targets (``pd_joint_pos``), with its JSON file next to it.
+        trajectory: HDF5 file of joint targets (``pd_joint_pos``) with a JSON file of the same name.
     """
 
     def __init__(self, trajectory: Path) -> None:
@@ -108,11 +112,14 @@ class ReplayPolicy(TrackPolicy):
         data = read_json(trajectory)
         env = read_env(data["env_info"], trajectory.with_suffix(".json"))
         if env.control_mode != "pd_joint_pos":
-            what, found = "can't be played here", env.control_mode
+            what, found = "cannot replay actions of this control mode", env.control_mode
             raise EvaluationError(what, where=trajectory, expected="pd_joint_pos", found=found)
         if any(map(is_intervention, data["episodes"])):
-            what, fix = "episodes that begin where another policy was", "Use robocas replay, which begins there too."
-            raise EvaluationError(what, where=trajectory, expected="episodes that begin with a reset", fix=fix)
+            what, fix = (
+                "cannot replay expert interventions, which start in a state of another policy",
+                "Use robocas replay.",
+            )
+            raise EvaluationError(what, where=trajectory, expected="episodes that start with a reset", fix=fix)
         self._episodes = {
             read_reset(one, f"{trajectory}, traj_{one['episode_id']}")[0]: one["episode_id"] for one in data["episodes"]
         }
@@ -129,6 +136,6 @@ class ReplayPolicy(TrackPolicy):
         with open_trajectory(self._trajectory) as file:
             actions = read_actions(open_episode(file, number))
         if (found := actions.shape[1]) != 8:
-            where, expected = f"{self._trajectory}, traj_{number}", "8 numbers an action"
-            raise EvaluationError("can't be played here", where=where, expected=expected, found=found)
+            where, expected = f"{self._trajectory}, traj_{number}", "8 numbers per action"
+            raise EvaluationError("cannot replay actions of this size", where=where, expected=expected, found=found)
         return JointTrack(actions)

@@ -1,4 +1,4 @@
-"""The scripted policy that records demonstrations, in the evaluation's loop."""
+"""Scripted policy of the demonstrations, as a policy for evaluations."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec
 from robocas_ms3.robots.registry import find_robot
 from robocas_ms3.scenes.task_specs import TASKS
 
-OFFSETS = (0.01, 0.05)  # m sideways, least and most: a finger on top of the target, or of an object next to it
+OFFSETS = (0.01, 0.05)  # smallest and largest offset in m: a finger lands on the target or on a neighbouring object
 _FREQ = 20  # Hz, control rate of the plans
-_MAX_GENERATORS = 4  # environments that are open at a time
-_OFFSET_STREAM = 411  # of an episode's seed
+_MAX_GENERATORS = 4  # maximum number of open environments
+_OFFSET_STREAM = 411  # random stream of the offset
 
 
 class ScriptedPolicy(TrackPolicy):
-    """Plan each episode in an environment of its own, with privileged state, and repeat it.
+    """Policy that plans each episode from privileged state in an environment of its own and replays the plan.
 
-    Its score is what the scripted policies and their planner reach in the loop in which learned policies are measured.
-    It does not move in an episode for which no demonstration is found. Its base does not drive.
+    Its success rate is the rate of the scripted policies under the conditions of learned policies. It does not move in
+    episodes without a demonstration, and it does not drive the base.
 
     Args:
-        convention: joint targets at 20 Hz, as planned; or RoboCAS' motions from where the TCP is, at 5 Hz.
-        perturbed: shift these motions sideways (`offset`), like those of a policy that misjudges positions.
+        convention: ``joint_positions``: planned joint targets at 20 Hz; ``robocas``: 7-D actions relative to the TCP
+            at 5 Hz.
+        perturbed: shift the motions horizontally (`offset`), like a policy that misjudges positions.
     """
 
     def __init__(
@@ -43,10 +44,10 @@ class ScriptedPolicy(TrackPolicy):
         self._perturbed = perturbed
         rate = _FREQ if convention == "joint_positions" else 5
         self.spec = PolicySpec(convention, reference="tcp", rate_hz=rate, language="none")
-        self._generators: dict[EpisodeSettings, EpisodeGenerator] = {}  # the one used last is the last
+        self._generators: dict[EpisodeSettings, EpisodeGenerator] = {}  # most recently used last
 
     def track(self, episode: EpisodeSpec) -> JointTrack | PoseTrack:
-        """Plan an episode, which takes seconds."""
+        """Plan an episode; this takes seconds."""
         actions, states = np.zeros((0, 8)), np.zeros((1, 37))
         generator = self._generator_of(episode)
         with tempfile.TemporaryDirectory() as folder:
@@ -62,15 +63,16 @@ class ScriptedPolicy(TrackPolicy):
         return track
 
     def close(self) -> None:
+        """Close all environments."""
         for generator in self._generators.values():
             generator.close()
 
     def _generator_of(self, episode: EpisodeSpec) -> EpisodeGenerator:
-        """Return the generator of an episode's scenes; the one used longest ago is closed if there are too many."""
+        """Return the generator for the scenes of an episode; close the least recently used one if too many are open."""
         for name in ("config_file", "layouts_file", "pack"):
             if not getattr(episode, name):
-                what, fix = "unknown configuration or scene", "Start the server with --protocol FOLDER."
-                expected = "a file of a shipped protocol, or of one that the server was started with"
+                what, fix = "the policy server has no such file or pack", "Start the server with --protocol FOLDER."
+                expected = "a file of a bundled protocol or of a protocol that was passed to robocas serve-policy"
                 raise EvaluationError(what, where=f"start.{name}", expected=expected, fix=fix)
         TASKS.find(episode.task, where="start.task")
         find_robot(episode.robot, where="start.robot")
@@ -91,7 +93,7 @@ class ScriptedPolicy(TrackPolicy):
 
 
 def offset(seed: int) -> NDArray[np.floating]:
-    """Return the shift (2,) of an episode's poses, m in the arm's base frame: in any direction, as far as `OFFSETS`."""
+    """Return the horizontal offset (2,) of the poses of an episode, m in the frame of the arm's base (`OFFSETS`)."""
     generator = np.random.default_rng([seed, _OFFSET_STREAM])
     angle, distance = generator.uniform(0, 2 * np.pi), generator.uniform(*OFFSETS)
     return distance * np.array([np.cos(angle), np.sin(angle)])

@@ -1,7 +1,7 @@
-"""Policies behind a websocket, in messages that openpi's client and server understand too.
+"""Remote policies over websockets, compatible with openpi's client and server.
 
-`client` is the policy that asks a server; `server` serves any policy. `messages` and `wire` are the format, which
-docs/remote_policies.md describes.
+`client` is a policy that requests actions from a server; `server` serves any policy. `messages` and `wire` define the
+message format (docs/remote_policies.md).
 """
 
 from robocas_ms3.core.errors import require_extra

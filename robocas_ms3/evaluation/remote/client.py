@@ -1,4 +1,4 @@
-"""A policy that asks a server for actions."""
+"""Remote policy that requests actions from a policy server."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from robocas_ms3.evaluation.remote.messages import (
 from robocas_ms3.evaluation.remote.wire import pack
 
 _log = logging.getLogger(__name__)
-_SHARED = -1  # key of the connection for batched requests; other keys are numbers of envs
+_SHARED = -1  # key of the connection for batched requests; other keys are indices of envs
 _T = TypeVar("_T")
 
 
@@ -49,21 +49,21 @@ class _ConnectionLost(EvaluationError):
 
 @dataclass
 class _Connection:
-    """A connection, and the envs whose episodes the server knows by it."""
+    """A connection, and the envs whose episodes were started over it."""
 
     socket: ClientConnection
     envs: set[int] = field(default_factory=set)
 
 
 class RemotePolicy:
-    """Ask a server for the actions of all envs at the same time.
+    """Policy that requests the actions of all envs from a server at the same time.
 
     A server that announces ``robocas_max_batch`` gets the observations of all envs in one request. Any other server
-    gets one request per env, each over a connection of its own, and all of them are in flight together. Answers are
-    read in the order of the envs, so the order in which they arrive changes nothing.
+    gets one request per env, each over its own connection, and all requests are in flight at the same time. Answers
+    are read in the order of the envs, so the order of arrival has no effect.
 
-    A lost connection is opened again when the next episode starts: a server that restarted does not know the present
-    one. If it can't be opened, `act` raises an error that ends the evaluation.
+    A lost connection ends the running episodes, because a restarted server does not know them. The connection is opened
+    again for the next episodes. If this fails, `act` raises an error that ends the evaluation.
 
     A forked process cannot use the policy of its parent; it makes its own.
 
@@ -77,7 +77,7 @@ class RemotePolicy:
         self._thread = threading.Thread(target=self._loop.run_forever, name="robocas-remote", daemon=True)
         self._thread.start()
         self._connections: dict[int, _Connection] = {}
-        self._starts: dict[int, EpisodeSpec] = {}  # of episodes that the server does not know yet
+        self._starts: dict[int, EpisodeSpec] = {}  # episodes that were not sent to the server yet
         self._chunk_length: int | None = None
         self._last_answer = 0.0  # clock time, s
         self._metadata = ServerMetadata()
@@ -87,19 +87,24 @@ class RemotePolicy:
         except BaseException:
             self.close()
             raise
-        # With `n_action_steps` the server is asked before a chunk ends, so each observation needs images.
+        # With `n_action_steps` a request may follow any step, so each observation needs images.
         self.spec: PolicySpec = replace(spec, observe_every=1) if self._address.n_action_steps else spec
 
     def describe(self) -> dict[str, Any]:
+        """Return the description by the server and the options of the address."""
         rename = {"rename": self._address.rename} if self._address.rename else {}
         return {"server": self._metadata.policy, "n_action_steps": self._address.n_action_steps, **rename}
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
-        """Start episodes; the server learns of them with their first observation."""
+        """Start episodes; they are sent to the server with their first observation."""
         self._starts |= {episode.env: episode for episode in episodes}
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Return (E, H, A) chunks."""
+        """Return action chunks (E, H, A).
+
+        Raises:
+            PolicyError: the server returned no valid actions for some envs.
+        """
         envs: list[int] = observations.envs.tolist()
         starts = {env: self._starts.pop(env) for env in envs if env in self._starts}
         messages = [self._message(observations, row, starts.get(env)) for row, env in enumerate(envs)]
@@ -122,6 +127,7 @@ class RemotePolicy:
         return actions
 
     def close(self) -> None:
+        """Close all connections and stop the network thread."""
         if self._loop.is_closed():
             return
         self._run(self._close(*self._connections))
@@ -149,18 +155,18 @@ class RemotePolicy:
         chunk = parse_actions(answer, self.spec.convention)[: self._address.n_action_steps]
         self._chunk_length = self._chunk_length or len(chunk)
         if len(chunk) != self._chunk_length:
-            raise WireError("chunks differ in length", expected=self._chunk_length, found=len(chunk))
+            raise WireError("chunk of another length than before", expected=self._chunk_length, found=len(chunk))
         return chunk
 
     def _forget(self, env: int) -> None:
-        """End an episode without an answer; without batches its connection is closed."""
+        """Drop the episode of an env without an answer; without batches its connection is closed."""
         if env in self._connections:
             self._run(self._close(env))
         elif _SHARED in self._connections:
             self._connections[_SHARED].envs.discard(env)
 
     async def _ask(self, envs: list[int], messages: list[dict[str, Any]], starting: set[int]) -> dict[int, Any]:
-        """Send a message per env, of which some are ``starting`` episodes; return by row the answer or the error."""
+        """Send one message per env and return the answer or error by row; envs in ``starting`` start an episode."""
         answers: dict[int, Any] = {}
         size = min(self._metadata.max_batch or 1, LARGEST_BATCH)
         slots = asyncio.Semaphore(1 if self._metadata.max_batch else self._address.max_in_flight or len(envs))
@@ -170,7 +176,7 @@ class RemotePolicy:
                 answers.update(await self._request(key, rows, envs, messages))
 
         rows = range(len(envs))
-        for _ in range(2):  # a server may have restarted since the last episode: new ones are asked about again
+        for _ in range(2):  # repeat requests of new episodes once: the server may have restarted
             groups: dict[int, list[int]] = {}
             for row in rows:
                 key = _SHARED if self._metadata.max_batch else envs[row]
@@ -178,8 +184,8 @@ class RemotePolicy:
                 if envs[row] in known | starting:
                     groups.setdefault(key, []).append(row)
                 else:
-                    answers[row] = _ConnectionLost("the connection is lost")
-            # A plain openpi server accepts no connection during inference, so all are opened before the first request.
+                    answers[row] = _ConnectionLost("lost connection")
+            # A plain openpi server accepts no connection during inference, so open all connections first.
             missing = groups.keys() - self._connections.keys()
             await asyncio.gather(*(self._connect(key) for key in missing))
             parts = [(key, group[at : at + size]) for key, group in groups.items() for at in range(0, len(group), size)]
@@ -190,11 +196,11 @@ class RemotePolicy:
     async def _request(
         self, key: int, rows: Sequence[int], envs: list[int], messages: list[dict[str, Any]]
     ) -> dict[int, Any]:
-        """Send one request and return the answers by row; errors are answers too."""
+        """Send one request and return the answers or errors by row."""
         connection = self._connections.get(key)
         try:
-            if connection is None:  # another request has lost it
-                raise _ConnectionLost("the connection is lost")
+            if connection is None:  # another request has closed it
+                raise _ConnectionLost("lost connection")
             if self._metadata.max_batch is None:
                 answers = [await self._answer(connection.socket, messages[rows[0]])]
             else:
@@ -207,10 +213,13 @@ class RemotePolicy:
         return dict(zip(rows, answers, strict=True))
 
     async def _answer(self, socket: ClientConnection, message: dict[str, Any]) -> Any:
-        """Send a message and return the answer; raise if there is none in time, or it is an error or invalid.
+        """Send a message and return the answer.
 
-        A server that computes one answer after another may take ``timeout_s`` for each of them, so the time counts from
-        the last answer to any request.
+        The time limit is counted from the last answer to any request, because a server may compute its answers one
+        after another.
+
+        Raises:
+            EvaluationError: no answer within ``timeout_s``, or the answer is invalid or an error of the server.
         """
 
         async def exchange() -> str | bytes:
@@ -222,12 +231,15 @@ class RemotePolicy:
             while not answer.done():
                 left = max(sent, self._last_answer) + timeout_s - time.monotonic()
                 if left <= 0:
-                    raise EvaluationError(f"no answer within {timeout_s:g} s")
+                    raise EvaluationError(
+                        f"no answer from the policy server within {timeout_s:g} s",
+                        fix="Increase timeout_s in the address.",
+                    )
                 await asyncio.wait({answer}, timeout=left)
             self._last_answer = time.monotonic()
             return read_message(answer.result())
         except CONNECTION_ERRORS as error:
-            raise _ConnectionLost(f"the connection is lost: {one_line(error, 300)}") from error
+            raise _ConnectionLost(f"lost connection: {one_line(error, 300)}") from error
         finally:
             answer.cancel()
 
@@ -240,7 +252,7 @@ class RemotePolicy:
         socket, metadata = await self._open()
         if self._spec_of(metadata) != self._spec_of(self._metadata) or metadata.max_batch != self._metadata.max_batch:
             await close_connection(socket)
-            raise EvaluationError("another policy is served now", where=self._address.url)
+            raise EvaluationError("the server now serves another policy", where=self._address.url)
         self._connections[key] = _Connection(socket)
 
     async def _open(self) -> tuple[ClientConnection, ServerMetadata]:
@@ -252,17 +264,17 @@ class RemotePolicy:
         await asyncio.gather(*(close_connection(connection.socket) for connection in found))
 
     def _spec_of(self, metadata: ServerMetadata) -> PolicySpec:
-        """Return the policy's specification, from its server or the address; raise if both have one."""
+        """Return the specification of the policy from its server or the address; raise if both have a specification."""
         url, given = self._address.url, self._address.spec
         if metadata.spec is None:
             return given or PolicySpec()
         if given is not None:
-            fix = "Leave these options out of the address."
-            raise EvaluationError("the server announces its policy specification itself", where=url, fix=fix)
+            fix = "Remove the fields of PolicySpec from the address."
+            raise EvaluationError("the server announces its policy specification", where=url, fix=fix)
         return read_policy_spec(metadata.spec, url)
 
 
 def _without_error(answer: dict[str, Any]) -> Any:
-    """Return an answer of a batch, or the error that it holds."""
+    """Return an answer of a batch, or the error in it."""
     text = answer.get(ERROR)
     return server_error(text) if isinstance(text, str) else answer

@@ -1,6 +1,6 @@
-"""Addresses of policy servers, connections to them, and detection of dead peers.
+"""Addresses of policy servers, connections to them, and detection of unreachable peers.
 
-TCP keepalive is on at both ends, and websocket pings are sent to peers that answer them.
+Both ends use TCP keepalive, and send websocket pings to peers that answer pings.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ PING_TIMEOUT = 60.0  # s without an answer to a ping
 TCP_OPTIONS = {"TCP_KEEPIDLE": 30, "TCP_KEEPINTVL": 10, "TCP_KEEPCNT": 3}  # s, s, probes without an answer
 MAX_ANSWER = 16 * 2**20  # bytes
 CONNECTION_ERRORS = (OSError, EOFError, asyncio.TimeoutError, WebSocketException)
-"""Errors of a connection that is closed or can't be opened."""
-_RETRY_S = 0.2  # between attempts to connect
-_CLOSE_S = 1.0  # for a server's answer to a close frame
+"""Errors of a connection that was closed or cannot be opened."""
+_RETRY_S = 0.2  # s between attempts to connect
+_CLOSE_S = 1.0  # s to wait for the answer to a close frame
 _log = logging.getLogger(__name__)
 _Seconds = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _Text = Annotated[str, Field(min_length=1)]
@@ -39,16 +39,16 @@ _Text = Annotated[str, Field(min_length=1)]
 
 @dataclass(frozen=True)
 class Address:
-    """Where a remote policy is, and how to talk to it.
+    """Address of a remote policy with its options.
 
     Attributes:
-        url: without options.
-        spec: the policy's specification, for servers that do not announce it; None: not given.
-        rename: other keys of an observation, by name: of a camera, ``qpos``, ``prompt``, ...
-        n_action_steps: number of actions of a chunk that are executed before the server is asked again; None: all.
-        max_in_flight: number of requests without an answer, for servers without batches; None: one per env.
-        timeout_s: clock time in which the server has to answer one of the requests.
-        connect_s: clock time in which a connection has to be open, when an episode starts.
+        url: address without options.
+        spec: specification of the policy, for servers that announce none; None: not given.
+        rename: keys in messages by the names of cameras and quantities, such as ``qpos`` or ``prompt``.
+        n_action_steps: number of actions of a chunk to execute before the next request; None: all.
+        max_in_flight: maximum number of unanswered requests to servers without batches; None: one per env.
+        timeout_s: time limit for the answer to a request, s.
+        connect_s: time limit to open a connection when an episode starts, s.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")
@@ -66,7 +66,7 @@ _FORM = TypeAdapter(Address)
 
 
 def read_address(text: str) -> Address:
-    """Read an address. Its options are the fields of `PolicySpec` and `Address`.
+    """Parse an address; its options are the fields of `PolicySpec` and `Address`.
 
     ``cameras=base_camera:224x224,gripper_camera:224x224`` (width x height) and
     ``rename=base_camera:observation/image,qpos:observation/state`` are lists of pairs.
@@ -77,10 +77,10 @@ def read_address(text: str) -> Address:
     try:
         parts = urlsplit(text)
         valid = parts.scheme in ("ws", "wss") and bool(parts.hostname) and parts.port != 0
-    except ValueError:  # of brackets or a port
+    except ValueError:  # invalid brackets or port
         valid = False
     if not valid:
-        raise EvaluationError("invalid address of a policy", where=text, expected="ws://host:port or ws://[::1]:port")
+        raise EvaluationError("invalid policy address", where=text, expected="ws://host:port or ws://[::1]:port")
     options: dict[str, Any] = dict(parse_qsl(parts.query, keep_blank_values=True))
     for name in options.keys() & {"cameras", "rename"}:
         options[name] = {key: value for key, _, value in (pair.partition(":") for pair in options[name].split(","))}
@@ -92,26 +92,26 @@ def read_address(text: str) -> Address:
         return _FORM.validate_python({**options, "url": url, "spec": spec or None})
     except ValidationError as problem:
         raise error_from_validation(
-            problem, _FORM, EvaluationError, where=text, about="invalid address of a policy"
+            problem, _FORM, EvaluationError, where=text, about="invalid policy address"
         ) from problem
 
 
 def enable_tcp_keepalive(connection: Any) -> None:
-    """Let the kernel close an idle websocket connection 60 s after the other machine stopped answering.
+    """Enable TCP keepalive: the kernel closes an idle connection 60 s after the other machine stops answering.
 
-    The other machine's kernel answers, so a busy process keeps its connections. The kernel sends no probes while sent
-    data are unacknowledged: pings and ``timeout_s`` detect a network that is lost then. ``TCP_USER_TIMEOUT`` is not
-    set, as it also closes a connection to a server that reads no data for that time during inference.
+    The kernel of the other machine answers the probes, so a busy process keeps its connections. The kernel sends no
+    probes while sent data are unacknowledged; pings and ``timeout_s`` detect a lost network in this case.
+    ``TCP_USER_TIMEOUT`` is not set: it would also close connections to a server that reads no data during inference.
     """
     tcp = connection.transport.get_extra_info("socket")
     tcp.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for name, value in TCP_OPTIONS.items():
-        if hasattr(socket, name):  # not on every system
+        if hasattr(socket, name):  # some systems lack the option
             tcp.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
 
 async def open_connection(url: str, connect_s: float, *, pings: bool) -> tuple[ClientConnection, ServerMetadata]:
-    """Connect to a policy server and read its metadata; retry for ``connect_s`` while there is no server.
+    """Connect to a policy server and read its metadata; retry for ``connect_s`` seconds.
 
     ``pings``: whether the server answers websocket pings during inference.
     """
@@ -122,10 +122,10 @@ async def open_connection(url: str, connect_s: float, *, pings: bool) -> tuple[C
             break
         except CONNECTION_ERRORS as error:
             if deadline - time.monotonic() < _RETRY_S:
-                what, fix = f"no server within {connect_s:g} s", "Start it, then run the command again."
+                what, fix = f"no connection to the policy server within {connect_s:g} s", "Start the server and retry."
                 raise EvaluationError(what, where=url, found=one_line(error, 300), fix=fix) from error
             if not warned:
-                _log.warning("waiting for a policy server at %s, up to %g s", url, connect_s)
+                _log.warning("waiting up to %g s for the policy server at %s", connect_s, url)
                 warned = True
             await asyncio.sleep(_RETRY_S)
     try:
@@ -136,7 +136,7 @@ async def open_connection(url: str, connect_s: float, *, pings: bool) -> tuple[C
 
 
 async def close_connection(connection: ClientConnection) -> None:
-    """Close a connection within 2 s, whatever the server does."""
+    """Close a connection within 2 s, even if the server does not answer."""
     try:
         await asyncio.wait_for(connection.close(), 2 * _CLOSE_S)
     except CONNECTION_ERRORS:
@@ -144,7 +144,11 @@ async def close_connection(connection: ClientConnection) -> None:
 
 
 def read_message(message: str | bytes) -> Any:
-    """Return the value of a server's message."""
+    """Decode a message of a server.
+
+    Raises:
+        EvaluationError: the message is invalid, or it is a text: an error of the server.
+    """
     if isinstance(message, str):
         raise server_error(message)
     try:
@@ -154,8 +158,8 @@ def read_message(message: str | bytes) -> Any:
 
 
 def server_error(text: str) -> EvaluationError:
-    """Return the error of a server's text, whose last line names it in a traceback."""
-    lines = [line for line in text.splitlines() if line.strip()] or ["nothing"]
+    """Return the error in a text of a server, such as a traceback; its last line names the error."""
+    lines = [line for line in text.splitlines() if line.strip()] or ["no message"]
     return EvaluationError(f"the server failed: {one_line(lines[-1], 300)}")
 
 

@@ -1,9 +1,9 @@
-"""The messages between a policy's client and server: plain maps, which `wire` packs; docs/remote_policies.md.
+"""Messages between policy clients and servers: maps that `wire` encodes (docs/remote_policies.md).
 
 The first message of a server is its `ServerMetadata`. A request is the observation of one env, without an axis for
-envs; the answer is ``{"actions": (H, A)}``, or a text with the error, after which the server closes the connection. A
-batched request is ``{"batch": [observation, ...]}``; the answer is ``{"batch": [answer, ...]}`` in the same order; an
-answer is ``{"actions": (H, A)}`` or ``{"error": text}``.
+envs. The answer is ``{"actions": (H, A)}``, or a text with the error, after which the server closes the connection. A
+batched request is ``{"batch": [observation, ...]}``; the answer is ``{"batch": [answer, ...]}`` in the same order,
+where each answer is ``{"actions": (H, A)}`` or ``{"error": text}``.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from robocas_ms3.robots.registry import DEFAULT_ROBOT
 ENV, RESET, START, PROMPT, ACTIONS, BATCH, ERROR = "env_id", "reset", "start", "prompt", "actions", "batch", "error"
 PREFIX = "observation/"
 DEFAULT_BATCH, LARGEST_BATCH = 64, 256  # envs
-FILE_NAME_PARTS = 3  # of a file's name in messages: folder of the protocol, folder in it, file
-_LARGEST_ACTION = 1e3  # m or rad; physics breaks far below it
-_OTHER_BYTES = 8 * 2**20  # of a request, besides images
-_MAX_DESCRIPTION = 2**20  # characters of JSON: it is in every result
+FILE_NAME_PARTS = 3  # path components of a file name in messages: protocol folder, subfolder, file
+_LARGEST_ACTION = 1e3  # m or rad; far beyond what the simulation can execute
+_OTHER_BYTES = 8 * 2**20  # of a request, in addition to images
+_MAX_DESCRIPTION = 2**20  # characters of JSON; the description is part of every result
 _POLICY_SPEC = TypeAdapter(PolicySpec)
 _Text = Annotated[str, Field(max_length=10_000)]
 _Number = Annotated[int, Field(ge=0, le=2**32 - 1)]
@@ -39,17 +39,17 @@ _Number = Annotated[int, Field(ge=0, le=2**32 - 1)]
 
 def _short(description: JsonValue) -> JsonValue:
     if (found := len(json.dumps(description))) > _MAX_DESCRIPTION:
-        raise ValueError(f"expected {_MAX_DESCRIPTION} characters of JSON at most, found {found}")
+        raise ValueError(f"expected at most {_MAX_DESCRIPTION} characters of JSON, found {found}")
     return description
 
 
 class ServerMetadata(BaseModel):
-    """The metadata of a server. A plain openpi server announces none of them.
+    """Metadata of a policy server. A plain openpi server announces none of these fields.
 
     Attributes:
-        spec: what the policy declares, as a message has it; None: not announced.
+        spec: specification of the policy as JSON values; None: not announced.
         policy: description of the policy.
-        max_batch: number of envs that a batched request may have; None: no batched requests.
+        max_batch: maximum number of envs per batched request; None: no batched requests.
         answers_pings: whether the server answers websocket pings during inference.
     """
 
@@ -62,7 +62,7 @@ class ServerMetadata(BaseModel):
 
 
 class _Start(BaseModel):
-    """An `EpisodeSpec` in a request, without its env; some clients send none."""
+    """An `EpisodeSpec` in a request, without its env; some clients send no specification."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
 
@@ -77,7 +77,7 @@ class _Start(BaseModel):
 
 
 class Request(BaseModel):
-    """The keys of a request that are not of an observation (`read_observations`)."""
+    """Keys of a request without the observation (`read_observations`)."""
 
     model_config = ConfigDict(strict=True)
 
@@ -87,13 +87,13 @@ class Request(BaseModel):
     start: _Start = _Start()
 
     def episode_spec(self, env: int) -> EpisodeSpec:
-        """Return the episode that starts, in an env of the policy."""
+        """Return the specification of the episode that starts in an env of the policy."""
         values: dict[str, Any] = {"instruction": self.prompt, **self.start.model_dump(exclude_none=True)}
         return EpisodeSpec(env=env, **values)
 
 
 def read_request(message: Mapping[str, Any]) -> Request:
-    """Read the keys of a request; unknown keys are ignored."""
+    """Parse the keys of a request; unknown keys are ignored."""
     try:
         return Request.model_validate(message)
     except ValidationError as problem:
@@ -101,7 +101,7 @@ def read_request(message: Mapping[str, Any]) -> Request:
 
 
 def read_metadata(message: Any, url: str) -> ServerMetadata:
-    """Read a server's metadata; keys of other packages are ignored."""
+    """Parse the metadata of a server; unknown keys are ignored."""
     try:
         return ServerMetadata.model_validate(message if isinstance(message, dict) else {})
     except ValidationError as problem:
@@ -111,7 +111,7 @@ def read_metadata(message: Any, url: str) -> ServerMetadata:
 
 
 def read_policy_spec(message: Any, where: object) -> PolicySpec:
-    """Read a policy's specification; missing fields have the defaults of `PolicySpec`."""
+    """Parse a policy specification; missing fields have the defaults of `PolicySpec`."""
     what = "invalid policy specification"
     try:
         return _POLICY_SPEC.validate_json(json.dumps(message), strict=True)
@@ -124,7 +124,14 @@ def read_policy_spec(message: Any, where: object) -> PolicySpec:
 def observation_message(
     observations: Observations, row: int, start: EpisodeSpec | None, *, reset: bool
 ) -> dict[str, Any]:
-    """Return the message with a row of observations; ``start``: the episode that starts, if the server may know it."""
+    """Return the message for a row of observations.
+
+    Args:
+        observations: observations of the envs.
+        row: row of the env.
+        start: specification of the episode that starts; None: it is not sent.
+        reset: whether an episode starts.
+    """
     arrays: dict[str, Any] = {name: values[row] for name, values in observations.robot.items()}
     arrays |= {name: images[row] for name, images in observations.images.items()}
     arrays |= {f"{name}_depth": depths[row] for name, depths in observations.depths.items()}
@@ -136,14 +143,14 @@ def observation_message(
     if start is not None:
         values = {name: value for name, value in vars(start).items() if name != "env"}
         values |= {name: file_name(values[name]) for name in ("config_file", "layouts_file")}
-        if start.robot == DEFAULT_ROBOT:  # unknown to servers of older versions
+        if start.robot == DEFAULT_ROBOT:  # the default robot is left out
             del values["robot"]
         message[START] = values
     return message
 
 
 def read_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int], spec: PolicySpec) -> Observations:
-    """Return the observations of requests of one env each, whose numbers are ``envs``, as a policy gets them."""
+    """Parse requests of one env each into the observations of a policy; ``envs``: indices of the envs."""
 
     def stack(name: str, dtype: str, *shape: int | None) -> NDArray[Any]:
         arrays: list[Any] = [message.get(PREFIX + name) for message in messages]
@@ -155,9 +162,14 @@ def read_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int]
                 and all(length in (None, actual) for length, actual in zip(shape, found.shape, strict=True))
             ):
                 what = f"{found.shape} {found.dtype}" if isinstance(found, np.ndarray) else type(found).__name__
-                raise WireError("not in the observation", where=PREFIX + name, expected=f"{shape} {dtype}", found=what)
+                raise WireError(
+                    "missing or invalid array in the observation",
+                    where=PREFIX + name,
+                    expected=f"{shape} {dtype}",
+                    found=what,
+                )
         if len({array.shape for array in arrays}) > 1:
-            raise WireError("observations of a batch differ in shape", where=PREFIX + name)
+            raise WireError("observations of the batch have different shapes", where=PREFIX + name)
         return np.stack(arrays).astype(dtype)
 
     sizes = {name: (height, width) for name, (width, height) in spec.cameras.items()}
@@ -173,7 +185,7 @@ def read_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int]
 
 
 def file_name(path: str) -> str:
-    """Return the name of a protocol's file in messages; its path if a shipped protocol has that name."""
+    """Return the name of a protocol file in messages, or its path if a bundled protocol has the same name."""
     parts, shipped = Path(path).parts[-FILE_NAME_PARTS:], protocols_dir()
     if len(parts) < FILE_NAME_PARTS or ((shipped / parts[0]).exists() and not Path(path).is_relative_to(shipped)):
         return path
@@ -181,28 +193,28 @@ def file_name(path: str) -> str:
 
 
 def parse_actions(answer: Any, convention: str) -> NDArray[np.float32]:
-    """Return the (H, A) actions of an answer, which may have (A,).
+    """Return the actions (H, A) of an answer with actions (H, A) or (A,).
 
     Raises:
-        WireError: there are none, or they do not fit the convention, or are not finite.
+        WireError: the actions are missing, do not fit the convention, or are NaN, infinite or too large.
     """
     size = CONVENTIONS[convention].size
     values = answer.get(ACTIONS) if isinstance(answer, dict) else None
     try:
         actions = np.asarray(values)
     except ValueError as error:  # lists of different lengths
-        raise WireError("no actions", expected=f"(chunk, {size})", found=one_line(error, 200)) from error
+        raise WireError("invalid actions", expected=f"(chunk, {size}) numbers", found=one_line(error, 200)) from error
     if actions.dtype.kind not in "iuf" or actions.ndim not in (1, 2) or actions.shape[-1] != size or not actions.size:
         found = one_line(answer, 200) if values is None else f"{actions.shape} {actions.dtype}"
-        raise WireError("no actions", expected=f"(chunk, {size}) numbers", found=found)
+        raise WireError("invalid actions", expected=f"(chunk, {size}) numbers", found=found)
     if not (np.abs(actions.astype(np.float64)) <= _LARGEST_ACTION).all():  # NaN too
-        expected, found = f"{_LARGEST_ACTION:g} at most", one_line(actions.tolist(), 200)
+        expected, found = f"at most {_LARGEST_ACTION:g}", one_line(actions.tolist(), 200)
         raise WireError("action value out of range", expected=expected, found=found)
     return actions.reshape(-1, size).astype(np.float32)
 
 
 def parse_batch(message: Any, least: int, most: int) -> list[dict[str, Any]]:
-    """Return the maps of a batched request, or of the answer to it, ``least`` to ``most`` of them."""
+    """Return the maps of a batched request or answer, ``least`` to ``most`` maps."""
     batch = message.get(BATCH) if isinstance(message, dict) else None
     if not isinstance(batch, list) or not all(isinstance(one, dict) for one in batch):
         raise WireError("invalid batch", where=BATCH, expected="a list of maps", found=type(batch).__name__)
@@ -212,12 +224,12 @@ def parse_batch(message: Any, least: int, most: int) -> list[dict[str, Any]]:
 
 
 def request_size_limit(spec: PolicySpec, max_batch: int = 1) -> int:
-    """Return the size limit of a request: 8 MiB, and the images of all envs or four times those of one."""
+    """Return the size limit of a request in bytes: 8 MiB plus the images of ``max_batch`` envs, at least of 4."""
     return min(MAX_BYTES, _OTHER_BYTES + max(4, max_batch) * _image_bytes(spec))
 
 
 def batch_limit(spec: PolicySpec, envs: int) -> int:
-    """Return how many of these envs fit in one request of `MAX_BYTES`, at least 1."""
+    """Return the number of envs that fit in one request of `MAX_BYTES`, at least 1 and at most ``envs``."""
     return max(1, min(envs, LARGEST_BATCH, (MAX_BYTES - _OTHER_BYTES) // max(1, _image_bytes(spec))))
 
 

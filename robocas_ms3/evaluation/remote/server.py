@@ -1,4 +1,4 @@
-"""Serve a policy over websockets, to our clients and openpi's."""
+"""Server of a policy over websockets, for the clients of this package and openpi's client."""
 
 from __future__ import annotations
 
@@ -54,20 +54,20 @@ from robocas_ms3.evaluation.remote.wire import pack, unpack
 HEALTH = "/healthz"
 MAX_CONNECTIONS = 256
 _log = logging.getLogger(__name__)
-_MAX_ENVS = 1024  # of all clients
-_IDLE = 3600.0  # s without a message, after which a connection is closed
-_STOP_S = 5.0  # for the network's thread to end
+_MAX_ENVS = 1024  # maximum number of envs of all clients
+_IDLE = 3600.0  # s without a message until a connection is closed
+_STOP_S = 5.0  # s to wait for the end of the network thread
 _FAILED, _INVALID, _FULL = 1011, 1008, 1013  # close codes
 
 
 @dataclass(frozen=True)
 class ServedFiles:
-    """Files and packs that clients may choose by name. No text of a message becomes a path.
+    """Files and packs that clients may select by name. No text of a message is used as a path.
 
     Attributes:
-        files: paths of configurations and layouts, by the names that messages have for them, such as
-            ``smoke/configs/pick.yaml``, and by themselves, for clients on the same machine.
-        packs: names, or folders as protocols of the server have them.
+        files: paths of configurations and layouts by their names in messages, such as ``smoke/configs/pick.yaml``, and
+            by their paths, for clients on the same machine.
+        packs: names of packs, or folders of packs as in the protocols of the server.
     """
 
     files: dict[str, str]
@@ -75,11 +75,11 @@ class ServedFiles:
 
     @classmethod
     def collect(cls, protocols: Iterable[Path] = (), packs: Iterable[str] = ()) -> ServedFiles:
-        """Collect the files of shipped protocols and installed packs, and of other protocols and their packs."""
+        """Collect the files of the bundled protocols, of other protocols, and the installed and other packs."""
         folders = {folder.name: folder for folder in protocols_dir().iterdir()}
         for folder in protocols:
             if folder.resolve() != folders.setdefault(folder.name, folder).resolve():
-                what, fix = "two protocols have one name", "Rename the folder."
+                what, fix = "two protocol folders have the same name", "Rename one folder."
                 raise EvaluationError(what, where=folder, found=folders[folder.name], fix=fix)
         files = {}
         for pattern in ("configs/*.yaml", "layouts/*.npy"):
@@ -90,24 +90,24 @@ class ServedFiles:
         return cls(files, frozenset({*names, *packs}))
 
     def resolve(self, start: EpisodeSpec) -> EpisodeSpec:
-        """Return a client's episode with paths of this machine; empty: files and packs that are not served."""
+        """Return an episode of a client with paths of this machine; files that are not served become empty."""
         config, layouts = (self.files.get(name, "") for name in (start.config_file, start.layouts_file))
         pack = start.pack if start.pack in self.packs else ""
         return replace(start, config_file=config, layouts_file=layouts, pack=pack)
 
 
 class PolicyServer:
-    """Serve a policy: one request after another, in the thread that calls `run`.
+    """Server of a policy; it answers one request after another in the thread that calls `run`.
 
-    So the policy stays in the thread that made it, and Ctrl-C reaches its code. A second thread does the network's
-    work: it answers pings and ``/healthz`` during inference.
+    The policy stays in the thread that made it, and Ctrl-C reaches its code. A second thread handles the network: it
+    answers pings and ``/healthz`` during inference.
 
     Args:
-        policy: that acts.
+        policy: the served policy.
         host: address to listen on. There is no password: everyone who can reach the address can use the policy.
-        port: 0: a free one.
-        files: that clients may choose; default: those of shipped protocols.
-        max_batch: number of envs that a batched request may have; fewer where their images exceed a message's size.
+        port: port to listen on; 0: a free port.
+        files: files that clients may select; default: the files of the bundled protocols.
+        max_batch: maximum number of envs per batched request; less if the images would exceed the message limit.
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class PolicyServer:
         self._connections = 0
 
     def run(self, listening: Callable[[str], object] = lambda url: None) -> None:
-        """Serve until `stop`; ``listening`` is called with the server's address as soon as it can be reached."""
+        """Serve until `stop`; ``listening`` is called with the address when the server accepts connections."""
         started: Future[tuple[str, Callable[[], object]]] = Future()
         network = threading.Thread(target=self._serve, args=(started,), name="robocas-server", daemon=True)
         network.start()
@@ -144,14 +144,14 @@ class PolicyServer:
             listening(url)
             while call := self._calls.get():
                 future, work = call
-                if future.set_running_or_notify_cancel():  # the client is still there
+                if future.set_running_or_notify_cancel():  # the client is still connected
                     future.set_result(work())
         finally:
             end()
             network.join(_STOP_S)
 
     def stop(self) -> None:
-        """End `run`, from another thread, after the requests that it has received."""
+        """End `run` from another thread, after all received requests."""
         self._calls.put(None)
 
     def _serve(self, started: Future[tuple[str, Callable[[], object]]]) -> None:
@@ -172,7 +172,7 @@ class PolicyServer:
             self._host,
             self._port,
             process_request=_answer_health_check,
-            origins=[None],  # no web page may talk to a server on its reader's machine
+            origins=[None],  # refuse requests from web pages in a browser on this machine
             compression=None,
             max_size=self._max_bytes,
             max_queue=1,
@@ -183,7 +183,7 @@ class PolicyServer:
         try:
             running = await server
         except (OSError, UnicodeError) as error:
-            raise EvaluationError("can't listen", where=_netloc(self._host, self._port), found=error) from error
+            raise EvaluationError("cannot listen", where=_netloc(self._host, self._port), found=error) from error
         async with running:
             url = f"ws://{_netloc(self._host, next(iter(running.sockets)).getsockname()[1])}"
             started.set_result((url, lambda: loop.call_soon_threadsafe(ended.set)))
@@ -194,7 +194,7 @@ class PolicyServer:
             return await client.close(_FULL, "too many clients")
         self._connections += 1
         connection.enable_tcp_keepalive(client)
-        envs: dict[int, int] = {}  # the client's to the policy's
+        envs: dict[int, int] = {}  # index of the policy by index of the client
         closed = asyncio.ensure_future(client.wait_closed())
         try:
             await client.send(self._metadata)
@@ -222,39 +222,39 @@ class PolicyServer:
         return future
 
     def _reply(self, message: str | bytes, envs: dict[int, int]) -> tuple[str | bytes, int]:
-        """Return an answer, and the code to close the connection with; 0: it stays open."""
+        """Return an answer and the close code of the connection; 0: the connection stays open."""
         try:
             value = unpack(message, self._max_bytes) if isinstance(message, bytes) else None
             return pack(self._handler.answer(value, envs)), 0
         except WireError as error:
             _log.warning("a client sent an invalid message: %s", error)
             return format_error(error, 300), _INVALID
-        except Exception as error:  # a policy may raise anything; other clients are still served
+        except Exception as error:  # a policy may raise any exception; other clients are still served
             return _log_failure(error), _FAILED
 
 
 class _RequestHandler:
-    """Convert requests to calls of a policy, and actions to answers.
+    """Handler that converts requests to calls of a policy, and actions to answers.
 
-    A batched request is one call of ``reset`` with all episodes that start and one call of ``act`` with all
-    observations, both in the request's order, as in an evaluation without a server. A request without a batch is a
-    call with one env. An env keeps the client's number unless another client uses it. Clients that send neither
-    ``env_id`` nor ``reset``, such as openpi's, have one episode per connection.
+    A batched request becomes one call of ``reset`` with all starting episodes and one call of ``act`` with all
+    observations, in the order of the request, as in an evaluation without a server. A single request becomes a call
+    with one env. An env keeps the index of the client unless another client uses this index. Clients that send neither
+    ``env_id`` nor ``reset``, such as openpi's client, have one episode per connection.
     """
 
     def __init__(self, policy: Policy, files: ServedFiles, max_batch: int) -> None:
         self._policy, self._files, self._max_batch = policy, files, max_batch
         with policy_exit_guard(policy):
             self._spec = policy.spec
-        self._used: set[int] = set()  # envs of the policy
+        self._used: set[int] = set()  # envs of the policy in use
 
     def answer(self, message: Any, envs: dict[int, int]) -> dict[str, Any]:
         """Return the answer to a message.
 
-        ``envs`` has the policy's env by the client's, of this connection; new ones are added.
+        ``envs``: env of the policy by env of the client, for this connection; new envs are added.
         """
         if not isinstance(message, dict):
-            raise WireError("no observation", expected="a map")
+            raise WireError("invalid request", expected="a map")
         if BATCH not in message:
             return {ACTIONS: self._act(*self._read([message], envs))[0]}
         observations, starts = self._read(parse_batch(message, 1, self._max_batch), envs)
@@ -263,6 +263,7 @@ class _RequestHandler:
         return {BATCH: [{ERROR: reasons[env]} if env in reasons else {ACTIONS: actions[row]} for row, env in rows]}
 
     def release(self, envs: dict[int, int]) -> None:
+        """Free the envs of a closed connection."""
         self._used -= set(envs.values())
 
     def _read(self, messages: Sequence[dict[str, Any]], envs: dict[int, int]) -> tuple[Observations, list[EpisodeSpec]]:
@@ -274,31 +275,33 @@ class _RequestHandler:
             if is_new or request.reset:
                 starts.append(self._files.resolve(request.episode_spec(number)))
         if len(set(numbers)) < len(numbers):
-            raise WireError("invalid batch", where=ENV, expected="each env once", found=sorted(numbers))
+            raise WireError("invalid batch", where=ENV, expected="each env at most once", found=sorted(numbers))
         return read_observations(messages, numbers, self._spec), starts
 
     def _env(self, env: int, reset: bool | None, envs: dict[int, int]) -> tuple[int, bool]:
-        """Return the policy's number of a client's env, and whether it is new."""
+        """Return the env of the policy for an env of a client, and whether it is new."""
         if env in envs:
             return envs[env], False
         if reset is False:
-            raise WireError("no episode is running", where=f"{ENV} {env}", expected=f"{RESET}: true first")
+            raise WireError(
+                "no episode is running", where=f"{ENV} {env}", expected=f"{RESET}: true in the first request"
+            )
         if len(self._used) >= _MAX_ENVS:
-            raise WireError("too many envs", expected=f"{_MAX_ENVS} at most")
-        wanted = [env] if 0 <= env < _MAX_ENVS else []  # the client's number, if it is free
+            raise WireError("too many envs", expected=f"at most {_MAX_ENVS}")
+        wanted = [env] if 0 <= env < _MAX_ENVS else []  # the index of the client, if it is free
         envs[env] = next(number for number in itertools.chain(wanted, itertools.count()) if number not in self._used)
         self._used.add(envs[env])
         return envs[env], True
 
     def _act(self, observations: Observations, starts: list[EpisodeSpec]) -> NDArray[Any]:
-        """Return the policy's (E, H, A) actions."""
+        """Return the actions (E, H, A) of the policy."""
         with policy_exit_guard(self._policy):
             if starts:
                 self._policy.reset(starts)
             return as_action_chunks(self._policy.act(observations), len(observations.envs), None)
 
     def _act_or_explain(self, observations: Observations, starts: list[EpisodeSpec]) -> tuple[Any, dict[int, str]]:
-        """Return the policy's (E, H, A) actions, and by env why it has none; an error without an env is that of all."""
+        """Return the actions (E, H, A) of the policy and the errors by env; other errors apply to all envs."""
         reasons: dict[int, str] = {}
         try:
             return self._act(observations, starts), {}
@@ -307,13 +310,13 @@ class _RequestHandler:
             reasons = {env: one_line(reason, 300) for env, reason in failed.reasons.items()}
             if failed.actions is not None:
                 return as_action_chunks(failed.actions, len(observations.envs), None), reasons
-        except Exception as error:  # a policy may raise anything; other clients are still served
+        except Exception as error:  # a policy may raise any exception; other clients are still served
             text = _log_failure(error)
         return None, {env: reasons.get(env, text) for env in observations.envs.tolist()}
 
 
 def strip_brackets(host: str) -> str:
-    """Return a host without the brackets that an IPv6 address has in a URL."""
+    """Return a host without the brackets of an IPv6 address."""
     return host[1:-1] if host.startswith("[") and host.endswith("]") else host
 
 
@@ -322,7 +325,7 @@ def _netloc(host: str, port: int) -> str:
 
 
 def _log_failure(error: Exception) -> str:
-    """Log an error of a policy, with a traceback if it is none of ours, and return it as a line for its client."""
+    """Log an error of a policy and return it as one line; foreign exceptions are logged with a traceback."""
     _log.warning("the policy failed: %s", error, exc_info=None if isinstance(error, RobocasError) else error)
     return format_error(error, 300)
 

@@ -1,4 +1,4 @@
-"""Values as bytes: msgpack, with arrays as openpi-client writes them. Bytes that are read are not trusted."""
+"""Encoding of messages: msgpack, with arrays in the format of openpi-client. Received bytes are not trusted."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import WireError
 from robocas_ms3.core.text import one_line
 
-MAX_BYTES = 64 * 2**20  # of a message
-MAX_DEPTH = 16  # of nested maps and lists
-MAX_ITEMS = 100_000  # of all maps and lists together; arrays count as one
+MAX_BYTES = 64 * 2**20  # per message
+MAX_DEPTH = 16  # levels of nested maps and lists
+MAX_ITEMS = 100_000  # in all maps and lists of a message; an array counts as one item
 _MAX_LIST, _MAX_MAP, _MAX_DIMENSIONS, _MAX_LENGTH = 10_000, 1_000, 8, 2**31
-_DTYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248])")  # np.dtype reads much more, pickled objects among it
+_DTYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248])")  # np.dtype accepts more types, such as pickled objects
 _ARRAY, _SCALAR = b"__ndarray__", b"__npgeneric__"
 
 
 def pack(value: Any) -> bytes:
-    """Return the bytes of a value made of maps, lists, texts, bytes, numbers, None and NumPy arrays of numbers.
+    """Encode a value made of maps, lists, texts, bytes, numbers, None and numeric NumPy arrays.
 
     Raises:
-        WireError: it holds something else.
+        WireError: the value contains another type.
     """
     try:
         return msgpack.Packer(default=_encode).pack(value)
     except (TypeError, ValueError, OverflowError) as error:
-        raise WireError("can't be sent", found=error) from error
+        raise WireError("cannot encode the message", found=error) from error
 
 
 def unpack(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
-    """Return the value of bytes; arrays are writable copies in to_native byte order, NumPy scalars become Python's.
+    """Decode a message; arrays are writable copies in native byte order, NumPy scalars become Python numbers.
 
     Raises:
-        WireError: they are no message, or one beyond the limits.
+        WireError: the bytes are no valid message, or exceed a limit.
     """
     if len(data) > max_bytes:
-        raise WireError("a message is too large", expected=f"{max_bytes} bytes at most", found=len(data))
+        raise WireError("message too large", expected=f"at most {max_bytes} bytes", found=len(data))
     items = 0
 
     def count(container: Any) -> Any:
-        """Count items while they are read, so that a small message can't fill the memory."""
+        """Count items during decoding, so that a small message cannot fill the memory."""
         nonlocal items
         items += 1 + len(container)
         if items > MAX_ITEMS:
@@ -56,7 +56,7 @@ def unpack(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
             data, object_hook=count, list_hook=count, max_array_len=_MAX_LIST, max_map_len=_MAX_MAP, max_ext_len=0
         )
     except (ValueError, OverflowError, RecursionError, msgpack.UnpackException) as error:
-        raise WireError("no message", found=one_line(error, 200)) from error
+        raise WireError("invalid message", found=one_line(error, 200)) from error
     return _decode(value, 0)
 
 
@@ -72,19 +72,19 @@ def _encode(value: Any) -> dict[bytes, Any]:
 
 def _decode(value: Any, depth: int) -> Any:
     if depth > MAX_DEPTH:
-        raise WireError("a message is too deep", expected=f"{MAX_DEPTH} levels at most")
+        raise WireError("message nested too deeply", expected=f"at most {MAX_DEPTH} levels")
     if isinstance(value, list):
         return [_decode(one, depth + 1) for one in value]
     if not isinstance(value, dict):
         if isinstance(value, msgpack.ExtType):
-            raise WireError("no message", found=one_line(value, 200))
+            raise WireError("invalid message", found=one_line(value, 200))
         return value
     if _ARRAY in value:
         return _array(value)
     if _SCALAR in value:
         return _scalar(value)
     if not all(isinstance(key, str) for key in value):
-        raise WireError("keys have to be text", found=one_line(list(value), 200))
+        raise WireError("invalid keys", expected="texts", found=one_line(list(value), 200))
     return {key: _decode(one, depth + 1) for key, one in value.items()}
 
 
@@ -99,11 +99,13 @@ def _array(value: dict[Any, Any]) -> NDArray[Any]:
         or len(data) != math.prod(shape) * dtype.itemsize
     ):
         found = f"{type(data).__name__} of {len(data) if isinstance(data, bytes) else '?'} bytes, shape {shape}"
-        raise WireError("invalid array", expected="data, dtype and a shape that fit", found=one_line(found, 200))
-    stored = np.dtype(np.uint8) if dtype.kind == "b" else dtype  # a bool's byte may be any, and NumPy expects 0 or 1
+        raise WireError("invalid array", expected="data, dtype and shape of equal size", found=one_line(found, 200))
+    stored = (
+        np.dtype(np.uint8) if dtype.kind == "b" else dtype
+    )  # received bytes may be any value; NumPy requires 0 or 1 for bool
     try:
         return np.ndarray(shape, stored, buffer=data).astype(dtype.newbyteorder("="))
-    except ValueError as error:  # an empty array with lengths beyond NumPy's
+    except ValueError as error:  # an empty array with lengths beyond NumPy's limit
         raise WireError("invalid array", found=one_line(error, 200)) from error
 
 
@@ -118,4 +120,4 @@ def _scalar(value: dict[Any, Any]) -> bool | int | float:
 def _dtype(text: Any) -> np.dtype:
     if isinstance(text, str) and _DTYPE.fullmatch(text):
         return np.dtype(text)
-    raise WireError("invalid type of numbers", expected="such as <f4 or |u1", found=one_line(repr(text), 200))
+    raise WireError("invalid dtype", expected="such as <f4 or |u1", found=one_line(repr(text), 200))

@@ -1,4 +1,4 @@
-"""A result for people: ``report.md``, ``report.html``, and ``episodes.parquet`` for notebooks."""
+"""Reports of a result: ``report.md``, ``report.html``, and ``episodes.parquet`` for notebooks."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _NESTED = {"flags": "int64", "flag_seconds": "float64", "measures": "float64"}  
 
 
 def write_report(result: Result, folder: Path, protocol: LoadedProtocol | None = None) -> list[Path]:
-    """Write the tables, the page and, if pyarrow is installed, the columns of a result, and return the files.
+    """Write the reports of a result into a folder and return their paths; the Parquet file needs pyarrow.
 
-    The page links the videos in the folder's ``videos``, and names episodes that are missing of the protocol, if given.
+    The page links the videos in ``videos``. With ``protocol`` it lists missing episodes.
     """
     make_folder(folder)
     written = []
@@ -42,7 +42,7 @@ def write_report(result: Result, folder: Path, protocol: LoadedProtocol | None =
 
 
 def write_parquet(result: Result, path: Path) -> None:
-    """Write a result as a table whose columns have the names and units of `Outcome`."""
+    """Write a result as a Parquet table; columns have the names and units of `Outcome`."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

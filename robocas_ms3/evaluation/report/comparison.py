@@ -1,4 +1,4 @@
-"""Results over the same scenes, compared pair by pair: several of one protocol, or the splits of one result."""
+"""Paired comparisons over the same scenes: results of one protocol, or the splits of one result."""
 
 from __future__ import annotations
 
@@ -18,7 +18,13 @@ ALL = "all"
 
 @dataclass(frozen=True)
 class Row:
-    """Two runs over the scenes of a configuration or task, or of `ALL`; compares the second with the first."""
+    """A row of a comparison: two runs over the scenes of a configuration, a task or `ALL`.
+
+    Attributes:
+        where: name of the configuration or task.
+        pair: names of the first and the second run.
+        found: comparison of the second run with the first.
+    """
 
     where: str
     pair: tuple[str, str]
@@ -26,24 +32,30 @@ class Row:
 
 
 def compare_results(results: Sequence[Result]) -> str:
-    """Return the comparison of two or more results, over the episodes that all have, as Markdown."""
+    """Compare two or more results over their common episodes; return Markdown.
+
+    Raises:
+        EvaluationError: the protocols differ, only one result has the weld, or no episode is in all results.
+    """
     first = results[0]
     for other in results[1:]:
         if first.run.protocol_hash != other.run.protocol_hash:
             expected, found = first.run.protocol_hash[:16], other.run.protocol_hash[:16]
-            what = "results of different protocols can't be compared"
+            what = "cannot compare results of different protocols"
             raise EvaluationError(what, where=other.folder, expected=expected, found=found)
         if first.run.weld != other.run.weld:
             welded = (first if first.run.weld else other).folder
-            raise EvaluationError("a result with upstream's weld can't be compared with one without", where=welded)
+            raise EvaluationError("cannot compare results with and without RoboCAS-v0's weld", where=welded)
     shared = sorted(set.intersection(*(set(result.outcomes) for result in results)))
     if not shared:
-        raise EvaluationError("these results have no episodes in common", where=results[-1].folder)
+        raise EvaluationError("the results have no common episodes", where=results[-1].folder)
     names = [chr(ord("A") + number) for number in range(len(results))]
-    measured = first.run.protocol + (" with upstream's weld" if first.run.weld else "")
-    said = [f"{name}: {one.run.policy.name} ({one.folder})" for name, one in zip(names, results, strict=True)]
+    measured = first.run.protocol + (" with RoboCAS-v0's weld" if first.run.weld else "")
+    runs = [f"{name}: {one.run.policy.name} ({one.folder})" for name, one in zip(names, results, strict=True)]
     both = "both" if len(results) == 2 else "all"
-    head = escape_markdown(f"{', '.join(said)}; {format_count(len(shared), 'episode')} of {measured} that {both} have.")
+    head = escape_markdown(
+        f"{', '.join(runs)}; {format_count(len(shared), 'episode')} of {measured} in {both} results."
+    )
     others = [one.run for one in results[1:]]
     differing = ["backend"] if any(run.backend != first.run.backend for run in others) else []
     differing += ["versions"] if any(run.versions != first.run.versions for run in others) else []
@@ -62,10 +74,12 @@ def compare_results(results: Sequence[Result]) -> str:
 
 
 def compare_splits(result: Result, protocol: LoadedProtocol) -> str:
-    """Return the comparison of a result's splits with the same scenes, each with the first one, as Markdown."""
+    """Compare the splits of a result that have the same scenes with the first split; return Markdown."""
     if (found := result.run.protocol_hash) != protocol.hash:
-        raise EvaluationError("it is of another protocol", where=result.folder, expected=protocol.hash, found=found)
-    scenes: dict[tuple[str, bytes], list[tuple[str, str]]] = {}  # (split, configuration) of those with the same scenes
+        raise EvaluationError(
+            "the result has another protocol hash", where=result.folder, expected=protocol.hash, found=found
+        )
+    scenes: dict[tuple[str, bytes], list[tuple[str, str]]] = {}  # (split, configuration) with equal scenes
     for task, split, config in dict.fromkeys((one.task, one.split, one.config) for one in protocol.episodes):
         scenes.setdefault((task, protocol.layouts_file(config).read_bytes()), []).append((split, config))
     rows = []
@@ -80,22 +94,22 @@ def compare_splits(result: Result, protocol: LoadedProtocol) -> str:
                 found = compare([sides[1][seed] for seed in seeds], [sides[0][seed] for seed in seeds])
                 rows.append(Row(task, (first[0], other[0]), found))
     if not rows:
-        fix = "Name another result to compare it with."
-        raise EvaluationError("no two splits of this result have the same scenes", where=result.folder, fix=fix)
+        fix = "Pass a second result."
+        raise EvaluationError("no two splits of the result have the same scenes", where=result.folder, fix=fix)
     head = f"{result.run.policy.name} ({result.folder}), splits of {result.run.protocol} over the same scenes."
     return _table(escape_markdown(head), "task", rows)
 
 
 def _table(head: str, where: str, rows: list[Row]) -> str:
-    """Return rows of one family of claims, and those over all configurations, which are a family of their own."""
+    """Return the table; rows over all configurations are adjusted as a family of their own."""
     adjusted: dict[int, tuple[float, int]] = {}
     for pooled in (False, True):
         family = [number for number, row in enumerate(rows) if (row.where == ALL) == pooled]
         for number, p in zip(family, holm([rows[number].found.p_value for number in family]), strict=True):
             adjusted[number] = p, len(family)
     lines = [
-        f"{head} McNemar's exact test, Tango's interval; claims go by Holm's p, adjusted for all rows but "
-        f"`{ALL}`, and for all of these.",
+        f"{head} McNemar's exact test, Tango's 95 % interval. Decide by Holm's p, adjusted for all rows except "
+        f"`{ALL}`, and separately for the rows `{ALL}`.",
         "",
         f"| {where} | first, second | n | first | second | only first | only second | second - first | p | Holm's p |",
         "|---|---|---|---|---|---|---|---|---|---|",

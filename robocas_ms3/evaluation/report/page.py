@@ -1,4 +1,4 @@
-"""A result as one HTML page that needs no other file. Its SVG has no text, so it may be stretched to any width."""
+"""A result as a single HTML page without other files. The SVG images contain no text, so they can be stretched."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from robocas_ms3.core.text import format_count
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.tables import (
-    WELD_NOTE,
     Cell,
     FailureCount,
     Table,
     failure_name,
     mean,
+    notes,
     stage_names,
     tables,
 )
@@ -32,11 +32,12 @@ VIDEOS = "videos"
 
 
 def video_name(episode: int) -> str:
+    """Return the file name of the video of an episode."""
     return f"episode_{episode:05d}.mp4"
 
 
 def render_page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | None = None) -> str:
-    """Return the page of a result, for a folder that may have ``videos``; see `write_report`."""
+    """Return the HTML page of a result; videos in ``folder`` are linked (`write_report`)."""
     here = files("robocas_ms3.evaluation.report")
     style, script = ((here / name).read_text(encoding="utf-8") for name in ("style.css", "script.js"))
     title, parts = escape(title_of(result)), [_lead(result, protocol)]
@@ -56,17 +57,15 @@ def _lead(result: Result, protocol: LoadedProtocol | None) -> str:
     count = len(result.outcomes)
     total = count if protocol is None else len(protocol.episodes)
     episodes = format_count(count, "episode") if protocol is None else f"{count} of {format_count(total, 'episode')}"
-    notes = [WELD_NOTE] if result.run.weld else []
+    texts = [escape(note, quote=False) for note in notes(result)]
     if protocol is not None and count < total:
         missing = Counter(episode.config for episode in protocol.episodes if episode.episode not in result.outcomes)
         of = ", ".join(f"{many} of {escape(config)}" for config, many in missing.items())
-        notes.append(
-            f"Missing of the protocol: {format_count(missing.total(), 'episode')} ({of}). This is no whole result."
-        )
+        texts.append(f"Incomplete result: {format_count(missing.total(), 'episode')} of the protocol missing ({of}).")
     if broken := result.error_count():
-        notes.append(f"Broken off by an error: {format_count(broken, 'episode')}, counted as failed.")
+        texts.append(f"Ended by an error: {format_count(broken, 'episode')}, counted as failed.")
     lead = f"{episodes}, protocol hash <code>{escape(result.run.protocol_hash[:16])}</code>."
-    return f'<p class="lead">{lead}</p>\n' + "".join(f'<p class="note">{note}</p>\n' for note in notes)
+    return f'<p class="lead">{lead}</p>\n' + "".join(f'<p class="note">{note}</p>\n' for note in texts)
 
 
 def _funnels(result: Result) -> str:
@@ -97,8 +96,8 @@ def _seconds(result: Result) -> str:
     for config, values in taken.items():
         cells = [f"{value:.1f}" for value in np.quantile(values, (0, 0.25, 0.5, 0.75, 1))] if values else [""] * 5
         rows.append([escape(config), str(len(values)), *cells, _spread(values, most) if values else ""])
-    heads = ("configuration", "succeeded#", "least#", "25 %#", "median#", "75 %#", "most#", _axis(most, "s"))
-    note = "Simulated seconds, over the episodes that succeeded. A tick is an episode, the box half of them."
+    heads = ("configuration", "succeeded#", "min#", "25 %#", "median#", "75 %#", "max#", _axis(most, "s"))
+    note = "Simulated seconds of the successful episodes. A tick is an episode; the box contains half of them."
     return _section("Seconds to success", note, _html_table(heads, rows))
 
 
@@ -123,32 +122,34 @@ def _effort(result: Result) -> Table:
         *("path, mean m#", "impulse, median N s#", "policy, mean ms per step#"),
     )
     note = (
-        "Disturbed: objects other than the target more than 3 cm from where they were, or tipped, at the worst step. "
-        "Path is the gripper's. Impulse is of contacts between gripper and objects. The policy's time is clock time."
+        "Disturbed: maximum number of objects (not the target) that were displaced by more than 3 cm or tipped over. "
+        "Path: path length of the gripper. Impulse: contacts between gripper and objects. Policy: clock time."
     )
     return Table("Disturbance and effort", note, heads, rows)
 
 
 def _record(result: Result, protocol: LoadedProtocol | None) -> str:
     run, policy = result.run, result.run.policy
-    pairs: list[tuple[str, object]] = [("protocol", run.protocol), ("its hash", run.protocol_hash)]
+    pairs: list[tuple[str, object]] = [("protocol", run.protocol), ("protocol hash", run.protocol_hash)]
     if protocol is not None:
         names = {"rate_hz", "stepping", "max_steps", "max_seconds", "ends_on", "max_v0_steps"}
         rules = protocol.rules.model_dump(mode="json", include=names, exclude_none=True)
-        pairs += [("what it says", protocol.rules.description), ("its rules", _plain(rules))]
+        pairs += [("description", protocol.rules.description), ("rules", _plain(rules))]
     entries = policy.model_dump(exclude_unset=True, exclude={"name"})
     pairs += [("policy", policy.name), *((f"policy, {name}", _plain(value)) for name, value in entries.items())]
-    pairs += [("upstream's weld", "yes" if run.weld else "no"), ("backend", run.backend)]
+    pairs += [("RoboCAS-v0's weld", "yes" if run.weld else "no")]
+    pairs += [("played_as", _plain(run.played_as))] if run.played_as else []
+    pairs += [("backend", run.backend)]
     pairs += [("versions", _plain(run.versions)), *((f"pack {name}", hash_) for name, hash_ in run.pack_hashes.items())]
     machines = {_plain(part.machine) for part in run.merged_from} or {_plain(run.machine or {})}
     pairs += [("machine", machine) for machine in sorted(machines)]
     rows = [[escape(part.folder), str(part.episodes)] for part in run.merged_from]
-    parts = _html_table(("part", "episodes#"), rows) if rows else ""
-    return _section("What it was measured with", "", _facts(pairs) + parts)
+    parts = _html_table(("merged from", "episodes#"), rows) if rows else ""
+    return _section("Settings", "", _facts(pairs) + parts)
 
 
 def _plain(value: object) -> str:
-    """Return a dictionary as ``a 1, b 2``; anything else as JSON, texts as they are."""
+    """Return a dictionary as ``a 1, b 2``, a text unchanged, and other values as JSON."""
     if isinstance(value, dict):
         return ", ".join(
             f"{name} {json.dumps(inner) if isinstance(inner, dict) else _plain(inner)}" for name, inner in value.items()
@@ -157,7 +158,7 @@ def _plain(value: object) -> str:
 
 
 def _failed_episodes(result: Result, folder: Path | None) -> str:
-    """Return the list of failed episodes, whose numbers link to videos; empty if none failed."""
+    """Return the section of failed episodes with links to videos; empty without failures."""
     failed = [outcome for outcome in result.outcomes.values() if not outcome.success]
     if not failed:
         return ""
@@ -177,10 +178,10 @@ def _failed_episodes(result: Result, folder: Path | None) -> str:
     )
     linked = any("<a " in row[0] for row in rows)
     command = "<code>robocas eval videos RESULT --policy POLICY</code>"
-    videos = "Numbers that are links lead to videos." if linked else f"{command} films some of them."
+    videos = "Linked numbers open videos." if linked else f"{command} records videos of some episodes."
     note = (
         f'<span id="count">{len(failed)}</span> of {format_count(len(result.outcomes), "episode")}. '
-        f"Ended by: the time limit, a failure such as a target on the floor, or an error. {videos}"
+        f"Ended by: the time limit, a failure such as the target on the floor, or an error. {videos}"
     )
     table = _html_table(heads, rows, "failed")
     return _section("Failed episodes", note, f'<form class="filters">{filters}</form>\n{table}')
@@ -210,7 +211,7 @@ def _section(title: str, note: str, content: str) -> str:
 
 
 def _table_section(table: Table) -> str:
-    """Return the section of a table, in which rates have bars."""
+    """Return the section of a table; rates have bars."""
     heads = []
     for head in map(escape, table.heads):
         heads += [f"{head[:-1]}#", "0 to 100 %"] if head.endswith("%") else [head]
@@ -221,7 +222,7 @@ def _table_section(table: Table) -> str:
 
 
 def _html_table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
-    """Return a table of cells that are HTML; a head that ends in ``#`` is that of numbers, which are at the right."""
+    """Return an HTML table of HTML cells; columns whose head ends with ``#`` are aligned to the right."""
     right = ["number" if head.endswith("#") else "" for head in heads]
     head = "".join(_tag("th", name.rstrip("#"), how) for name, how in zip(heads, right, strict=True))
     body = "".join(
@@ -233,7 +234,7 @@ def _html_table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str =
 
 
 def _bar(rate: SuccessRate, kind: str = "") -> str:
-    """Return a bar of 0..100 % with its interval."""
+    """Return an SVG bar of a rate on 0..100 % with its interval."""
     low, high, here = 100 * rate.low, 100 * rate.high, 100 * rate.rate
     label = f"{rate.k} of {rate.n}: {here:.1f} %, {low:.1f} to {high:.1f}"
     return (
@@ -245,7 +246,7 @@ def _bar(rate: SuccessRate, kind: str = "") -> str:
 
 
 def _spread(values: Sequence[float], most: float) -> str:
-    """Return where numbers are in 0..most: a tick each, a box from the lower to the upper quartile, and the median."""
+    """Return an SVG of values on 0..most: a tick per value, a box between the quartiles, and the median."""
     low, middle, high = (100 * np.quantile(values, (0.25, 0.5, 0.75)) / most).tolist()
     ticks = "".join(f"M{100 * value / most:.2f} 10V16" for value in values)
     return (
@@ -263,19 +264,19 @@ def _axis(most: float, unit: str) -> str:
 
 
 def _facts(pairs: Iterable[tuple[str, object]]) -> str:
-    """Return a list of names and values, which are plain text."""
+    """Return an HTML list of names and values in plain text."""
     entries = "".join(f"<dt>{escape(name)}</dt><dd>{escape(str(value))}</dd>\n" for name, value in pairs)
     return f"<dl>\n{entries}</dl>\n"
 
 
 def _round_up(value: float) -> float:
-    """Return 1, 2, 4 or 8 times a power of ten that is no smaller, for the end of an axis."""
+    """Round up to 1, 2, 4 or 8 times a power of ten, for the end of an axis."""
     power = 10.0 ** np.floor(np.log10(max(value, 1e-9)))
     return float(next(power * step for step in (1, 2, 4, 8, 10) if power * step >= value * (1 - 1e-9)))
 
 
 def _cells(cell: Cell, head: str) -> list[str]:
-    """Return the HTML of a cell: a rate with a bar is two."""
+    """Return the HTML cells of a value; a rate in a ``%`` column takes two cells: text and bar."""
     if isinstance(cell, SuccessRate):
         rate = f"{100 * cell.rate:.0f} %<small>{100 * cell.low:.0f} to {100 * cell.high:.0f}</small>"
         return [rate, _bar(cell, "good")] if head.endswith("%") else [rate]

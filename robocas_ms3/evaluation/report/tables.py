@@ -1,4 +1,4 @@
-"""The tables of a result, and a result as Markdown."""
+"""Tables of a result, and a result as Markdown."""
 
 from __future__ import annotations
 
@@ -15,10 +15,14 @@ from robocas_ms3.scenes.task_specs import TASKS
 
 P_VIS_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 WELD_NOTE = (
-    "With upstream's weld: what closed fingers had lifted hung on the hand until the gripper was told to open. "
-    "Never compare this with results without it."
+    "With RoboCAS-v0's weld: a lifted object was fixed to the hand until the gripper was commanded to open. "
+    "Do not compare with results without the weld."
 )
-_STAGE_NOTE = "RA, PA: any object reached, lifted; RR: the target reached; CO: what hid it cleared."
+PAPER_NOTE = (
+    "Comparison with the RoboCAS paper: the object meshes are stand-ins, success is stricter than the paper's rule, "
+    "and a policy trained on pick_upstream_eval or search_upstream_eval is evaluated in its training distribution."
+)
+_STAGE_NOTE = "RA: any object touched; PA: any object lifted; RR: target touched; CO: obstacles cleared."
 STAGE_NAMES = {
     "furniture_opened": "furniture opened",
     "reached_any": "an object touched (RA)",
@@ -30,18 +34,18 @@ STAGE_NAMES = {
     "target_in_basket": "target in basket",
     "success": "success",
 }
-"""In the order in which stages are usually reached."""
+"""Names of the stages, in the usual order."""
 FAILURE_NAMES = {
     **{stage: name.split(" (")[0] for stage, name in STAGE_NAMES.items() if stage != "success"},
     "placed": "placed, at rest",
-    "error": "broken off",
+    "error": "ended by an error",
 }
-"""By the first stage not reached (`outcomes.failure_stage`)."""
+"""Names of the values of `outcomes.failure_stage`."""
 
 
 @dataclass(frozen=True)
 class FailureCount:
-    """A count out of n, shown as the count on a background as strong as its share."""
+    """A count out of n episodes; pages shade the cell by count / n."""
 
     count: int
     n: int
@@ -55,10 +59,10 @@ class Table:
     """A table of a report.
 
     Attributes:
-        title: of its section.
-        note: how to read it; plain text.
-        heads: of the columns. One that ends with ``#`` is of numbers, with ``%`` of rates with their intervals.
-        rows: cells of plain text and rates.
+        title: title of the section.
+        note: explanation in plain text.
+        heads: column heads; a final ``#`` marks a column of numbers, ``%`` a column of rates with intervals.
+        rows: cells: plain text, rates, or counts.
     """
 
     title: str
@@ -68,7 +72,7 @@ class Table:
 
 
 def tables(result: Result) -> Iterator[Table]:
-    """Yield the tables of a result with at least one episode."""
+    """Yield the tables of a result that has at least one episode."""
     yield _success(result)
     if len(result.group_by("split")) > 1:
         yield _splits(result)
@@ -80,16 +84,17 @@ def tables(result: Result) -> Iterator[Table]:
 
 
 def render_markdown(result: Result) -> str:
+    """Return the tables of a result as Markdown."""
     run, broken = result.run, result.error_count()
     versions = ", ".join(f"{name} {number}" for name, number in run.versions.items())
     lines = [
         f"# {escape_markdown(title(result))}",
         "",
-        *([f"**{WELD_NOTE}**", ""] if run.weld else []),
+        *(line for note in notes(result) for line in (f"**{escape_markdown(note)}**", "")),
         f"Protocol hash {escape_markdown(run.protocol_hash[:16])}, {format_count(len(result.outcomes), 'episode')}, "
         f"{escape_markdown(run.backend)}; {escape_markdown(versions)}. "
         f"Intervals are Clopper-Pearson's, 95 %. {_STAGE_NOTE}",
-        *(["", f"**Broken off by an error: {format_count(broken, 'episode')}, counted as failed.**"] if broken else []),
+        *(["", f"**Ended by an error: {format_count(broken, 'episode')}, counted as failed.**"] if broken else []),
     ]
     for table in tables(result) if result.outcomes else ():
         heads = " | ".join(escape_markdown(head.rstrip("#%")) for head in table.heads)
@@ -101,12 +106,23 @@ def render_markdown(result: Result) -> str:
 
 
 def title(result: Result) -> str:
-    weld = " with upstream's weld" if result.run.weld else ""
-    return f"{result.run.policy.name} by {result.run.protocol}{weld}"
+    """Return the title of a report: policy and protocol."""
+    weld = " with RoboCAS-v0's weld" if result.run.weld else ""
+    return f"{result.run.policy.name} on {result.run.protocol}{weld}"
+
+
+def notes(result: Result) -> list[str]:
+    """Return the conditions that readers of a result need: the weld, aliases of tasks, and the paper's rules."""
+    played_as = [
+        f"{task} was evaluated in the episodes of {other} (played_as), as RoboCAS-v0's evaluator does."
+        for task, other in result.run.played_as.items()
+    ]
+    paper = [PAPER_NOTE] if result.run.protocol.startswith("paper-") else []
+    return [*([WELD_NOTE] if result.run.weld else []), *played_as, *paper]
 
 
 def stage_names(task: str) -> dict[str, str]:
-    """Return the names of a task's stages in their order; stages of another package by their own names."""
+    """Return the display names of the stages of a task, in order."""
     row = TASKS.get(task)
     if row is None or row.stages == DEFAULT_STAGES:
         return STAGE_NAMES
@@ -114,11 +130,12 @@ def stage_names(task: str) -> dict[str, str]:
 
 
 def failure_name(stage: str) -> str:
+    """Return the display name of a failure stage."""
     return FAILURE_NAMES.get(stage, stage.replace("_", " "))
 
 
 def outcomes_of_first_split(result: Result) -> list[Outcome]:
-    """Return the outcomes; if scenes occur several times, those of each task's first split."""
+    """Return the outcomes; if scenes occur in several splits, only those of the first split of each task."""
     if not result.repeats_scenes():
         return list(result.outcomes.values())
     first: dict[str, str] = {}
@@ -133,7 +150,7 @@ def mean(values: Sequence[float]) -> float:
 
 def _success(result: Result) -> Table:
     def rate(flag: str, outcomes: list[Outcome]) -> SuccessRate | None:
-        known = [one for one in outcomes if flag in one.flags]  # tasks without obstacles have no stage for them
+        known = [one for one in outcomes if flag in one.flags]  # tasks without obstacles lack the stage CO
         error_count = [one for one in outcomes if one.error and not one.flags]
         return result.rate(flag, known + error_count) if known else None
 
@@ -145,11 +162,11 @@ def _success(result: Result) -> Table:
         overall = result.rate("success", outcomes)
         rows.append((config, str(overall.n), overall, *ends, *stages, f"{steps:.0f}", f"{seconds:.1f}"))
     note = (
-        f"Success held at some step; at the last one; upstream's rule at the last one. {_STAGE_NOTE} Intervals are "
-        "Clopper and Pearson's, 95 %. Steps and seconds of the scene are means over all episodes"
-        + ("." if result.repeats_scenes() else ", as is the last row.")
+        "success: success at some step; at the end: success at the last step; RoboCAS-v0: its rule at the last step. "
+        f"{_STAGE_NOTE} Intervals: Clopper-Pearson, 95 %. Steps and simulated seconds are means over all episodes."
+        + ("" if result.repeats_scenes() else " The row all pools the episodes of all configurations.")
     )
-    heads = ("configuration", "n#", "success%", "at the end#", "upstream's#", *(f"{name}#" for name in PAPER_STAGES))
+    heads = ("configuration", "n#", "success%", "at the end#", "RoboCAS-v0#", *(f"{name}#" for name in PAPER_STAGES))
     return Table("Success", note, (*heads, "steps#", "s#"), rows)
 
 
@@ -162,7 +179,7 @@ def _splits(result: Result) -> Table:
             row += [str(len(chosen)), result.rate("success", chosen) if chosen else None]
         rows.append(row)
     heads = [head for split in splits for head in (f"{split}, n#", f"{split}%")]
-    return Table("Splits", "Success, side by side.", ["task", *heads], rows)
+    return Table("Splits", "Success rates by split.", ["task", *heads], rows)
 
 
 def _failures(result: Result) -> Table:
@@ -176,7 +193,7 @@ def _failures(result: Result) -> Table:
         cells = (FailureCount(count[stage], n) for stage in stages)
         rows.append((config, str(n), str(n - count[""]), *cells))
     heads = ("configuration", "n#", "failed#", *(f"{failure_name(stage)}#" for stage in stages))
-    note = "Episodes by the first stage not reached after the furthest one that was reached."
+    note = "Number of episodes by the first stage not reached, counted from the furthest reached stage."
     return Table("Where episodes failed", note, heads, rows)
 
 
@@ -185,7 +202,7 @@ def _occlusion(hidden: list[Outcome]) -> Table:
     edges = zip(P_VIS_EDGES[:-1], P_VIS_EDGES[1:], bins, strict=True)
     rows = [(f"{low:g} to {high:g}", str(rate.n if rate else 0), rate) for low, high, rate in edges]
     configs = ", ".join(sorted({outcome.config for outcome in hidden}))
-    note = f"By p_vis, the share of the target that is visible from above at the start; episodes of {configs}."
+    note = f"p_vis: visible fraction of the target from above at the reset. Episodes of {configs}."
     return Table("Success by occlusion", note, ("p_vis", "n#", "success%"), rows)
 
 
@@ -201,19 +218,19 @@ def _retrieval(result: Result) -> Iterator[Table]:
             counts = (f"{len(moved) / len(held):.1f}", f"{100 * needed:.0f} %", f"{left:.1f}")
             rows.append((config, str(len(held)), f"{score:.2f}", *counts))
     note = (
-        "Objects that were moved before the target was first held. Needed: they hid or hemmed it in, or lay over one "
-        "that did. The score is the share, of what was moved or left in the way, that was needed and moved from the "
-        "top down."
+        "Objects moved before the target was first held. Needed objects hid or hemmed in the target, or were on top of "
+        "a needed object. Order score: fraction of the moved and left objects that were needed and moved from the top "
+        "down."
     )
-    heads = ("configuration", "target held#", "order score#", "moved, mean#", "needed of these#", "left, mean#")
+    heads = ("configuration", "target held#", "order score#", "moved, mean#", "needed, % of moved#", "left, mean#")
     if rows:
         yield Table("Retrieval order", note, heads, rows)
 
 
 def _with_all(groups: dict[str, list[Outcome]]) -> list[tuple[str, list[Outcome]]]:
-    """Return the groups, and if there are several, all of them together."""
+    """Return the groups, and a last group of all outcomes if there are several groups."""
     every = [outcome for outcomes in groups.values() for outcome in outcomes]
-    return [*groups.items(), *([("all together", every)] if len(groups) > 1 else [])]
+    return [*groups.items(), *([("all", every)] if len(groups) > 1 else [])]
 
 
 def _markdown_cell(cell: Cell, head: str) -> str:

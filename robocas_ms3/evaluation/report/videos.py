@@ -1,4 +1,4 @@
-"""Videos of failed episodes: they run again, filmed from over the robot's shoulder."""
+"""Videos of failed episodes: the episodes run again with a camera behind the robot."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
 SIZE = (480, 360)  # pixels
-_FRAMES = 5  # a second of the scene
-_SPEED = 4  # times as fast as the scene
+_FRAMES = 5  # per simulated second
+_SPEED = 4  # playback speed relative to simulated time
 
 
 def choose_failed_episodes(result: Result, count: int) -> list[int]:
-    """Return numbers of failed episodes: of each configuration in turn, and there of each failure stage in turn."""
+    """Return numbers of failed episodes, alternating between configurations and failure stages."""
     groups: dict[str, dict[str, list[int]]] = {}
     for outcome in result.outcomes.values():
         if not outcome.success:
@@ -42,16 +42,23 @@ def _in_turn(lists: list[list[int]]) -> list[int]:
 def record_videos(
     result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Sequence[int]
 ) -> Iterator[tuple[Path, bool]]:
-    """Run episodes again, in processes, and write videos into the result's ``videos``.
+    """Run episodes again in worker processes and write videos into the folder ``videos`` of the result.
 
-    Yields each video, and whether the outcome is the same as before.
+    Yields the path of each video and whether the outcome equals the recorded outcome.
     """
     if (expected := result.run.protocol_hash) != (found := protocol.hash):
-        raise EvaluationError("it is of another protocol", where=result.folder, expected=expected, found=found)
+        raise EvaluationError(
+            "the result has another protocol hash", where=result.folder, expected=expected, found=found
+        )
     require_renderer()
     recorder = _VideoRecorder()
     settings = EvaluationSettings(
-        protocol=str(protocol.folder), envs=1, backend="processes", weld=result.run.weld, render_size=SIZE
+        tuple(result.run.played_as),
+        protocol=str(protocol.folder),
+        envs=1,
+        backend="processes",
+        weld=result.run.weld,
+        render_size=SIZE,
     )
     session = EvaluationSession(policy, settings, recorder.wrap)
     recorder.period = max(1, round(session.rate / _FRAMES))
@@ -59,7 +66,7 @@ def record_videos(
     with closing(session):
         for number in sorted(episodes, key=lambda one: protocol.episodes[one].config):
             before, path = result.outcomes[number], result.folder / VIDEOS / video_name(number)
-            # As long as the first time, so that it is the same episode whatever ended it.
+            # As many steps as recorded, whatever ended the episode.
             fps = session.rate / recorder.period * _SPEED
             with atomic_file(path) as tmp, open_video(tmp, fps, quality=6) as recorder.writer:
                 (outcome,) = session.run_episodes([protocol.episodes[number]], before.steps)
@@ -67,7 +74,7 @@ def record_videos(
 
 
 class _VideoRecorder:
-    """A wrapper of a vector environment with one env; it adds an image to ``writer`` every ``period`` policy steps."""
+    """Wrapper of a vector environment with one env; adds an image to ``writer`` every ``period`` policy steps."""
 
     num_envs = 1
 

@@ -125,7 +125,7 @@ def test_outcomes_are_written_once_per_episode(make, tmp_path):
     result = results.read_result(tmp_path / "result")
     assert sorted(result.outcomes) == [0, 1] and result.run.policy.name == "mine"
     for _ in range(2):  # a refused environment does not keep the lock
-        with pytest.raises(EvaluationError, match="there is a result already"):
+        with pytest.raises(EvaluationError, match="already has a result"):
             make(1, out=tmp_path / "result")
 
 

@@ -127,7 +127,7 @@ def test_an_env_without_an_answer_fails_alone():
         with pytest.raises(PolicyError) as failed:
             remote.act(some_observations(*range(ENVS)))
         ended.set()
-        assert failed.value.reasons == {2: "no answer within 1 s"}
+        assert failed.value.reasons == {2: "no answer from the policy server within 1 s"}
         assert failed.value.actions[[0, 1, 3, 4], 0, 0].tolist() == [0, 1, 3, 4]
         remote.reset([a_start(2)])
         assert remote.act(some_observations(2, 3))[:, 0, 0].tolist() == [2, 3]
@@ -233,7 +233,7 @@ with answering(lambda *_: time.sleep(1000)) as url:  # a plain openpi server, wh
     try:
         policy.act(some_observations(0))
     except EvaluationError as failed:
-        print("no server within" in str(failed), flush=True)
+        print("no connection to the policy server within" in str(failed), flush=True)
     os._exit(0)
 """
 

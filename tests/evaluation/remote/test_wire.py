@@ -66,7 +66,7 @@ def test_openpi_reads_what_we_write_and_we_what_it_writes(array):
     ids=lambda value: type(value).__name__,
 )
 def test_what_can_not_be_sent(value):
-    with pytest.raises(WireError, match="can't be sent"):
+    with pytest.raises(WireError, match="cannot encode"):
         pack(value)
 
 
@@ -123,7 +123,7 @@ def test_depth_and_size_are_bounded():
     for _ in range(wire.MAX_DEPTH):
         value = [value]
     assert unpack(pack(value)) == value
-    with pytest.raises(WireError, match="too deep"):
+    with pytest.raises(WireError, match="nested too deeply"):
         unpack(pack([value]))
     with pytest.raises(WireError, match="too large"):
         unpack(bytes(11), max_bytes=10)

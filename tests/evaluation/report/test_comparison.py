@@ -16,11 +16,13 @@ def rows(said: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[1:]]
 
 
-def test_it_takes_the_episodes_that_both_have(tmp_path):
+def test_comparison_uses_the_common_episodes(tmp_path):
     one = write(tmp_path / "a", [outcome(number, came_to=0) for number in range(8)])
     other = write(tmp_path / "b", [outcome(number) for number in range(1, 9)], policy={"name": "better"})
     said = compare_results([one, other])
-    assert said.startswith(f"A: mine ({one.folder}), B: better ({other.folder}); 7 episodes of made_up that both have.")
+    assert said.startswith(
+        f"A: mine ({one.folder}), B: better ({other.folder}); 7 episodes of made_up in both results."
+    )
     ((config, pair, *counts, change, p, adjusted),) = rows(said)
     assert (config, pair, counts) == ("table", "A, B", ["7", "0", "7", "0", "7"])
     assert change.startswith("+100.0 (")
@@ -28,7 +30,7 @@ def test_it_takes_the_episodes_that_both_have(tmp_path):
 
 
 def test_several_claims_are_adjusted_by_holm(tmp_path):
-    """Of three results over two configurations; those over all configurations are a family of their own."""
+    """Three results over two configurations; the rows over all configurations are a separate family."""
 
     def result(name: str, good: int):
         outcomes = [outcome(n, 7 if n % 20 < good else 0, config="left" if n < 20 else "right") for n in range(40)]
@@ -46,8 +48,8 @@ def test_several_claims_are_adjusted_by_holm(tmp_path):
         assert float(row[-1]) == pytest.approx(by_holm, rel=0.01)
 
 
-def test_too_few_for_several_claims_though_enough_for_one(tmp_path):
-    """Six scenes that one alone solves: p = 1/32, which is a claim by itself, but not one of two."""
+def test_a_difference_that_is_significant_alone_but_not_among_two_claims_gets_a_warning(tmp_path):
+    """Six scenes that only one run solves: p = 1/32 is significant alone, but not after Holm's correction for two."""
 
     def result(name: str, came_to: int):
         return write(
@@ -69,21 +71,21 @@ def test_scenes_that_occur_several_times_are_not_pooled_and_other_backends_are_n
     assert "**Measured with different backend.**" in said
 
 
-def test_results_that_can_not_be_compared(tmp_path):
+def test_results_that_cannot_be_compared_are_refused(tmp_path):
     one, other = write(tmp_path / "a", [outcome(0)]), write(tmp_path / "b", [outcome(0)], protocol_hash="ef" * 32)
     with pytest.raises(EvaluationError, match="different protocols"):
         compare_results([one, one, other])
-    with pytest.raises(EvaluationError, match="no episodes in common"):
+    with pytest.raises(EvaluationError, match="no common episodes"):
         compare_results([one, write(tmp_path / "c", [outcome(1)])])
     welded = write(tmp_path / "d", [outcome(0)], weld=True)
-    assert "1 episode of made_up with upstream's weld that both have" in compare_results([welded, welded])
+    assert "1 episode of made_up with RoboCAS-v0's weld in both results" in compare_results([welded, welded])
     for pair in ([one, welded], [welded, one]):
-        with pytest.raises(EvaluationError, match=r"/d: a result with upstream's weld can't be compared"):
+        with pytest.raises(EvaluationError, match=r"/d: cannot compare results with and without RoboCAS-v0's weld"):
             compare_results(pair)
 
 
 def of_suite(folder, name, succeeds):
-    """A result in which an episode of a suite succeeds or not."""
+    """A result of a protocol; ``succeeds`` chooses the outcome of each episode."""
     protocol = load_protocol(name)
     outcomes = [
         outcome(
@@ -94,7 +96,7 @@ def of_suite(folder, name, succeeds):
     return write(folder, outcomes, protocol_hash=protocol.hash), protocol
 
 
-def test_splits_over_the_same_scenes(tmp_path):
+def test_splits_with_the_same_scenes_are_compared(tmp_path):
     found = rows(
         compare_splits(*of_suite(tmp_path / "a", "instructions-v1", lambda one: one.split in {"seen", "paraphrase"}))
     )
@@ -105,7 +107,7 @@ def test_splits_over_the_same_scenes(tmp_path):
 
 
 def test_a_split_may_have_several_configurations(tmp_path):
-    """Of the same seeds: those with the same scenes are pairs."""
+    """Configurations with the same scenes are compared."""
     folder = shutil.copytree(shipped_protocols()["cameras-v1"], tmp_path / "mine")
     lines = (folder / EPISODES).read_text()
     (folder / EPISODES).write_text(lines.replace('"task":"select"', '"task":"pick"'))
@@ -122,9 +124,9 @@ def test_a_split_may_have_several_configurations(tmp_path):
     ]
 
 
-def test_splits_over_other_scenes_are_no_pairs(tmp_path):
+def test_splits_with_different_scenes_are_refused(tmp_path):
     result, _ = of_suite(tmp_path / "b", "instructions-v1", lambda one: True)
-    with pytest.raises(EvaluationError, match="another protocol"):
+    with pytest.raises(EvaluationError, match="another protocol hash"):
         compare_splits(result, load_protocol("cameras-v1"))
-    with pytest.raises(EvaluationError, match="no two splits of this result have the same scenes"):
+    with pytest.raises(EvaluationError, match="no two splits of the result have the same scenes"):
         compare_splits(*of_suite(tmp_path / "a", "objects-v1", lambda one: True))

@@ -25,37 +25,39 @@ def test_all_kinds_of_failures_have_their_turn(tmp_path):
     assert choose_failed_episodes(result, 99) == [0, 1, 2, 3, 5, 6]
 
 
-def test_another_protocol_is_refused(tmp_path):
+def test_result_of_another_protocol_is_refused(tmp_path):
     result = of_protocol(tmp_path / "a", load_protocol("smoke"))
     result.run.protocol_hash = "0"
-    with pytest.raises(EvaluationError, match="another protocol"):
+    with pytest.raises(EvaluationError, match="another protocol hash"):
         next(record_videos(result, load_protocol("smoke"), RandomPolicy(), [0]))
 
 
 @pytest.mark.parametrize("installed", ["random", "small"])
-def test_where_none_failed_there_is_nothing_to_film(tmp_path, capsys, installed):
+def test_without_failed_episodes_no_video_is_recorded(tmp_path, capsys, installed):
     result = of_protocol(tmp_path / "b", load_protocol("smoke"))
     record = result.folder / "run.json"
     record.write_text(record.read_text().replace('"mine"', f'"{installed}"'))
     assert videos(Videos(result.folder)) == 0
-    assert "no episode failed" in capsys.readouterr().out
+    assert "no failed episodes" in capsys.readouterr().out
 
 
-def test_a_result_chooses_no_code(tmp_path, capsys):
+def test_a_policy_named_in_a_result_is_not_imported_without_confirmation(tmp_path, capsys):
     result = of_protocol(tmp_path / "b", load_protocol("smoke"))
-    with pytest.raises(EvaluationError, match=r"a policy of somebody's own \(found mine\).*--policy mine"):
+    with pytest.raises(
+        EvaluationError, match=r"the policy of the result is not installed \(found mine\).*--policy mine"
+    ):
         videos(Videos(result.folder))
-    with pytest.raises(EvaluationError, match="mine: no such policy"):  # now it is asked for
+    with pytest.raises(EvaluationError, match="mine: unknown policy"):  # confirmed
         videos(Videos(result.folder, policy="mine"))
 
 
 @pytest.mark.slow
-def test_a_failure_is_filmed_and_linked(tmp_path, needs_renderer, capsys):
+def test_video_of_a_failed_episode_is_recorded_and_linked(tmp_path, needs_renderer, capsys):
     out, protocol = tmp_path / "result", str(shorten("paper-v1", tmp_path / "tiny", 2, episodes=1))
     assert run(EvaluationSettings((), "random", protocol, out, backend="processes", weld=True)) == 0
     assert videos(Videos(out, protocol=protocol)) == 0
     said = capsys.readouterr().out
-    assert "episode_00000.mp4" in said and "differently" not in said
+    assert "episode_00000.mp4" in said and "differs" not in said
     frames = np.stack([np.asarray(frame) for frame in imageio.get_reader(out / "videos" / "episode_00000.mp4")])
     assert frames.shape == (3, SIZE[1], SIZE[0], 3)  # at the reset, after each of 2 steps
     assert frames.std() > 10

@@ -16,11 +16,11 @@ from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.report import PARQUET, write_report
 from robocas_ms3.evaluation.report.page import render_page, video_name
 
-VOID = {"meta", "rect", "path"}  # of HTML, and those that SVG closes at once
+VOID = {"meta", "rect", "path"}  # elements without an end tag
 
 
 class Reader(HTMLParser):
-    """Sees that elements end as they began, and keeps what they print_line and where they lead to."""
+    """Parser that checks that elements are closed, and collects texts and links."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -59,29 +59,31 @@ def result(tmp_path):
     return write(tmp_path / "result", [*table, *heap])
 
 
-def test_numbers_stages_failures_and_the_record(result):
+def test_page_shows_rates_stages_failures_and_settings(result):
     read = Reader(render_page(result))
     # 2 of 4, 6.8 to 93.2; 2 of 2, 0.025 ** (1 / 2) = 15.8
     assert read.after("table", 3) == ["4", "50 %", "7 to 93"]
     assert read.after("heap", 3) == ["2", "100 %", "16 to 100"]
     assert "2 of 4: 50.0 %, 6.8 to 93.2" in read.texts  # of the bar
-    assert read.after("all together", 2) == ["6", "67 %"]
+    assert read.after("all", 2) == ["6", "67 %"]
     assert read.after("table, n 4", 3) == ["an object touched (RA)", "3 of 4: 75.0 %, 19.4 to 99.4", "75 %"]
-    assert {"placed, at rest", "broken off", "Broken off by an error: 1 episode, counted as failed."} <= set(read.texts)
+    assert {"placed, at rest", "ended by an error", "Ended by an error: 1 episode, counted as failed."} <= set(
+        read.texts
+    )
     assert {"hard, n", "test, n", "0.2 to 0.4"} <= set(read.texts)
     assert {"ab" * 32, "cd" * 32, "robocas_ms3 0.1.0, torch 2.4", "mine:Policy"} <= set(read.texts)
     assert read.after("Failed episodes", 1) == ["2"]
     assert "the policy said <b>no</b> & died" in read.texts
 
 
-def test_it_names_the_weld(result, tmp_path):
+def test_page_names_the_weld(result, tmp_path):
     reader = Reader(render_page(write(tmp_path / "welded", result.outcomes.values(), weld=True)))
-    assert any(text.startswith("With upstream's weld: ") for text in reader.texts)
-    assert reader.after("upstream's weld", 1) == ["yes"]
-    assert Reader(render_page(result)).after("upstream's weld", 1) == ["no"]
+    assert any(text.startswith("With RoboCAS-v0's weld: ") for text in reader.texts)
+    assert reader.after("RoboCAS-v0's weld", 1) == ["yes"]
+    assert Reader(render_page(result)).after("RoboCAS-v0's weld", 1) == ["no"]
 
 
-def test_it_leads_nowhere_but_to_its_own_videos(result):
+def test_page_links_only_its_own_videos(result):
     text = render_page(result, result.folder)
     assert Reader(text).links == []
     assert "robocas eval videos" in text
@@ -91,14 +93,14 @@ def test_it_leads_nowhere_but_to_its_own_videos(result):
     assert Reader(render_page(result, result.folder)).links == ["videos/episode_00003.mp4"]
 
 
-def test_a_result_that_lacks_episodes_says_so(tmp_path):
+def test_page_names_missing_episodes(tmp_path):
     protocol = load_protocol("smoke")
     whole = of_protocol(tmp_path / "whole", protocol)
     assert "8 of 8 episodes" in render_page(whole, protocol=protocol)
     part = write(tmp_path / "part", list(whole.outcomes.values())[:5])
     configs = Counter(outcome.config for outcome in list(whole.outcomes.values())[5:])
     of = ", ".join(f"{many} of {config}" for config, many in configs.items())
-    assert f"Missing of the protocol: 3 episodes ({of}). This" in render_page(part, protocol=protocol)
+    assert f"Incomplete result: 3 episodes of the protocol missing ({of})." in render_page(part, protocol=protocol)
 
 
 @pytest.mark.parametrize("count", [0, 1])
@@ -121,7 +123,7 @@ def test_columns(result, monkeypatch, capsys):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "pyarrow" else find(name))
     assert report(Report((result.folder,))) == 0
     assert not (result.folder / PARQUET).exists()
-    assert "no episodes.parquet without pyarrow" in capsys.readouterr().out
+    assert "episodes.parquet was not written: pyarrow is missing" in capsys.readouterr().out
 
 
 def test_commands_on_parts(tmp_path, capsys):
