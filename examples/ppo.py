@@ -37,7 +37,7 @@ class Args:
 def main(args: Args) -> None:
     torch.set_num_threads(1)
     train = {"seed": args.seed, "steps": args.steps, "batch_size": args.batch}
-    config = {"envs": args.envs, "workers": args.workers, "layouts": args.layouts, "trials": args.test_episodes}
+    config = {"envs": args.envs, "workers": args.workers, "layouts": args.layouts, "test_episodes": args.test_episodes}
     train_run(RunOptions("ppo", None, args.out, {**config, "train": train}, overwrite=True), Progress(message=print))
 
 

@@ -3,7 +3,7 @@
 from torch import nn
 
 SIZES = {
-    "image": (64, 48),
+    "image_size": (64, 48),
     "crop_height": 40,
     "image_width": 0.25,
     "image_depth": 0.1,

@@ -6,4 +6,4 @@ from robocas_ms3.baselines.ppo.config import PpoConfig
 from robocas_ms3.baselines.ppo.environments import PpoEnvironments
 from robocas_ms3.baselines.ppo.train import train_ppo
 
-BASELINE = Baseline("ppo", 1, PpoConfig, make_agent, PpoPolicy, environments=PpoEnvironments, train=train_ppo)
+BASELINE = Baseline("ppo", 2, PpoConfig, make_agent, PpoPolicy, environments=PpoEnvironments, train=train_ppo)

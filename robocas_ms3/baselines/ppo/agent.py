@@ -1,4 +1,4 @@
-"""The agent of `ppo`: policy and value networks, and how it acts in an evaluation."""
+"""Agent of `ppo`: policy and value networks, and the policy for evaluations."""
 
 from __future__ import annotations
 
@@ -21,27 +21,34 @@ _SCALE = np.array([POSITION_SCALE] * 3 + [ROTATION_SCALE] * 3 + [1.0])
 
 
 class Agent(nn.Module):
-    """Two networks of two layers, on observations normalised by their running statistics."""
+    """Policy and value network of two hidden layers each; observations are normalised by running statistics.
+
+    Args:
+        observation_size: size of an observation, O.
+        action_size: size of an action, A.
+        width: size of the hidden layers.
+    """
 
     mean: torch.Tensor
     square: torch.Tensor
     count: torch.Tensor
 
-    def __init__(self, observed: int, acted: int, width: int) -> None:
+    def __init__(self, observation_size: int, action_size: int, width: int) -> None:
         super().__init__()
-        self.register_buffer("mean", torch.zeros(observed))
-        self.register_buffer("square", torch.ones(observed))
+        self.register_buffer("mean", torch.zeros(observation_size))
+        self.register_buffer("square", torch.ones(observation_size))
         self.register_buffer("count", torch.tensor(1e-4, dtype=torch.float64))
-        self.actor, self.critic = _layers(observed, width, acted, 0.01), _layers(observed, width, 1, 1.0)
-        self.log_std = nn.Parameter(torch.full((acted,), -0.7))
+        self.actor = _layers(observation_size, width, action_size, 0.01)
+        self.critic = _layers(observation_size, width, 1, 1.0)
+        self.log_std = nn.Parameter(torch.full((action_size,), -0.7))
 
     @torch.no_grad()
     def update_statistics(self, obs: torch.Tensor) -> None:
         """Add observations (N, O) to the running mean and mean square."""
         self.count += len(obs)
-        share = (len(obs) / self.count).float()
-        self.mean += share * (obs.mean(dim=0) - self.mean)
-        self.square += share * ((obs**2).mean(dim=0) - self.square)
+        fraction = (len(obs) / self.count).float()
+        self.mean += fraction * (obs.mean(dim=0) - self.mean)
+        self.square += fraction * ((obs**2).mean(dim=0) - self.square)
 
     def normalize(self, obs: torch.Tensor) -> torch.Tensor:
         """Return observations (N, O) with mean 0 and deviation 1, clipped to [-5, 5]."""
@@ -56,13 +63,13 @@ class Agent(nn.Module):
         """Return values (N,) of normalised observations."""
         return self.critic(normalized)[:, 0]
 
-    def best(self, obs: torch.Tensor) -> torch.Tensor:
-        """Return actions (N, A) without noise for observations that are not normalised."""
+    def mean_action(self, obs: torch.Tensor) -> torch.Tensor:
+        """Return mean actions (N, A) for observations (N, O) that are not normalised."""
         return self.actor(self.normalize(obs))
 
 
 def make_agent(config: PpoConfig, facts: dict[str, Any]) -> Agent:
-    return Agent(facts["observed"], facts["acted"], config.width)
+    return Agent(facts["observation_size"], facts["action_size"], config.width)
 
 
 def _layers(inputs: int, width: int, outputs: int, gain: float) -> nn.Sequential:
@@ -76,14 +83,14 @@ def _layers(inputs: int, width: int, outputs: int, gain: float) -> nn.Sequential
 
 
 class PpoPolicy:
-    """Acts without noise, in the convention of ``pd_ee_delta_pose``."""
+    """Policy that executes the mean action, in the convention of ``pd_ee_delta_pose``."""
 
     def __init__(self, config: PpoConfig, facts: dict[str, Any], agent: Agent) -> None:
-        # Rotations are about one axis, where Euler angles and rotation vectors are the same
+        # Rotations are about one axis: Euler angles and rotation vectors are equal
         self.spec = PolicySpec(
             "delta_axis_angle", reference="target", rate_hz=facts["rate_hz"], state=True, language="none"
         )
-        self._agent, self._size = agent, facts["observed"]
+        self._agent, self._size = agent, facts["observation_size"]
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
         pass
@@ -94,8 +101,8 @@ class PpoPolicy:
         width = observations.robot[GRIPPER_WIDTH]
         obs = join_observation(observations.qpos, observations.tcp_in_base, width, observations.state)
         if obs.shape[1] != self._size:
-            what, fix = "the policy was trained in other scenes", "Evaluate it in the task and scenes of its training."
+            what, fix = "wrong size of the observation", "Evaluate in the task and scenes of the training."
             raise EvaluationError(what, where="ppo", expected=f"{self._size} numbers", found=obs.shape[1], fix=fix)
         with torch.inference_mode():
-            action = expand_action(self._agent.best(obs.to(self._agent.mean.device)))
+            action = expand_action(self._agent.mean_action(obs.to(self._agent.mean.device)))
         return action.double().cpu().numpy() * _SCALE

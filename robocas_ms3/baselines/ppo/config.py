@@ -8,25 +8,25 @@ from pydantic import Field
 
 from robocas_ms3.core.strict_model import StrictModel
 
-ONE_FRUIT: dict[str, Any] = {  # changes to pick_table_scattered: one small fruit near the gripper
+ONE_FRUIT: dict[str, Any] = {  # changes of pick_table_scattered: one small fruit near the gripper
     "description": "A single fruit on a table.",
     "objects": {"ids": ["lemon", "plum"], "count": 1},
     "surface": {"furniture": "table", "name": "top", "min_xy": [0.18, -0.12], "max_xy": [0.34, 0.12]},
     "robot": {"position": [0.9, 0.42, 0.0], "yaw_deg": 90.0},
 }
-ONE_FRUIT_STEPS = 15  # of 0.2 s per episode
+ONE_FRUIT_STEPS = 15  # per episode, 0.2 s each
 
 
 class PpoSettings(StrictModel):
-    """Settings of the training.
+    """Training settings of `ppo`.
 
     Attributes:
-        steps: of all environments together; rounded up to whole updates.
-        batch_size: steps between updates, of all environments together.
-        learning_rate: of the optimiser.
+        steps: number of environment steps, summed over environments; rounded up to whole updates.
+        batch_size: environment steps between updates, summed over environments.
+        learning_rate: learning rate of the optimiser.
         clip_norm: largest norm of the gradient; 0: no clipping.
-        seed: of all random numbers but those of the environments.
-        precision: of the forward pass.
+        seed: random seed, except of the environments.
+        precision: precision of the forward pass.
         save_every: steps between checkpoints.
     """
 
@@ -44,18 +44,18 @@ class PpoConfig(StrictModel):
 
     Attributes:
         task: short name of the task.
-        scenes: a bundled configuration or a YAML file; None: a single fruit on a table, which an agent learns to reach
-            and hold on a CPU in minutes.
-        horizon: steps of 0.2 s per episode; None: 15 for the single fruit, else those of docs/rl.md.
-        layouts: number of different scenes.
+        scenes: name of a bundled task configuration, or a YAML file; None: a single fruit on a table, which an agent
+            learns to reach and hold in minutes on a CPU.
+        horizon: steps of 0.2 s per episode; None: 15 for the single fruit, otherwise as in docs/rl.md.
+        layouts: number of different layouts.
         envs: number of environments.
-        workers: processes with the environments, on a CPU; None: one per environment, at most one per core.
-        epochs, minibatches: passes over each rollout, and the number of its parts.
-        gamma, trace: discount, and lambda of the advantages.
-        clip: range of the ratio of probabilities.
-        entropy: weight of the entropy.
-        width: of the two layers.
-        trials: test episodes at the end, in other layouts and without noise; 0: none.
+        workers: processes that run the environments on a CPU; None: one per environment, at most one per core.
+        epochs, minibatches: passes over each rollout, and minibatches per pass.
+        gamma, gae_lambda: discount, and lambda of the generalised advantage estimation.
+        clip_range: clipping range of the probability ratio.
+        entropy_coeff: weight of the entropy bonus.
+        width: size of the two hidden layers.
+        test_episodes: test episodes at the end, in other layouts and without noise; 0: none.
         train: see `PpoSettings`.
     """
 
@@ -68,9 +68,9 @@ class PpoConfig(StrictModel):
     epochs: int = Field(default=10, ge=1)
     minibatches: int = Field(default=4, ge=1)
     gamma: float = Field(default=0.92, ge=0, lt=1)
-    trace: float = Field(default=0.9, ge=0, le=1)
-    clip: float = Field(default=0.2, gt=0)
-    entropy: float = Field(default=1e-3, ge=0)
+    gae_lambda: float = Field(default=0.9, ge=0, le=1)
+    clip_range: float = Field(default=0.2, gt=0)
+    entropy_coeff: float = Field(default=1e-3, ge=0)
     width: int = Field(default=128, ge=1, le=16384)
-    trials: int = Field(default=50, ge=0)
+    test_episodes: int = Field(default=50, ge=0)
     train: PpoSettings = PpoSettings()

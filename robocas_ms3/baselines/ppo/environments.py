@@ -1,4 +1,4 @@
-"""Environments of `ppo`, with the observations and actions of a policy in an evaluation."""
+"""Environments of `ppo`, with the observations and actions that its policy has in an evaluation."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from robocas_ms3.scenes.config import TaskConfig, load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.rl import CONTROL_FREQ
 
-FIRST_TEST_SEED = 20_000  # of layouts that are not trained on
+FIRST_TEST_SEED = 20_000  # of test layouts, which are not in the training
 ACTION_SIZE = 5
 
 
 def expand_action(action: torch.Tensor) -> torch.Tensor:
-    """Return actions (..., 7) of ``pd_ee_delta_pose``, which keep the direction of the gripper, for five numbers.
+    """Expand 5-D actions (..., 5) to actions (..., 7) of ``pd_ee_delta_pose`` that keep the gripper's direction.
 
-    1 is a translation by 5 cm, or a rotation by 0.25 rad. The gripper opens or closes fully, as in an evaluation.
+    1 is a translation by 5 cm or a rotation by 0.25 rad. The gripper opens or closes fully, as in an evaluation.
 
     Args:
-        action: (..., 5) translation along the TCP's axes, rotation about its z, gripper; clipped to [-1, 1].
+        action: (..., 5) translation along the TCP axes, rotation about the TCP's z axis, gripper; clipped to [-1, 1].
     """
     x, y, z, yaw, gripper = action.clip(-1, 1).unbind(-1)
     zero = torch.zeros_like(x)
@@ -41,12 +41,12 @@ def expand_action(action: torch.Tensor) -> torch.Tensor:
 
 
 def join_observation(qpos: Any, tcp_in_base: Any, width: Any, state: Any) -> torch.Tensor:
-    """Return (N, O) float32 of entries of `Observations`: proprioception and privileged state."""
+    """Concatenate proprioception and privileged state to observations (N, O) float32."""
     return torch.cat([torch.as_tensor(part).float() for part in (qpos, tcp_in_base, width, state)], dim=1)
 
 
-class TopDown(gym.Wrapper):
-    """Takes the five numbers of `expand_action`; around one env, or a batch on a GPU."""
+class TopDownActionWrapper(gym.Wrapper):
+    """Action wrapper for the 5-D actions of `expand_action`; wraps one env, or a batch on a GPU."""
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
@@ -74,18 +74,18 @@ def _observation(obs: dict[str, Any]) -> torch.Tensor:
 
 
 class PpoEnvironments:
-    """Environments to train in. A success does not end an episode, and each env keeps its objects."""
+    """Training environments of `ppo`. A success does not end an episode, and each env keeps its objects."""
 
     def __init__(self, config: PpoConfig, device: str) -> None:
         scenes = load_scenes(config)
         kwargs: dict[str, Any] = robocas_ms3.rl_kwargs(config.task, scenes) | {"obs_mode": "state_dict"}
         if kwargs["control_mode"] != "pd_ee_delta_pose":
-            what = "the base has to drive in these scenes, and ppo moves the arm alone"
+            what = "these scenes need base motion, and ppo moves only the arm"
             raise TrainingError(what, where=config.scenes or config.task, fix="Choose scenes without base_motion.")
         horizon = config.horizon or (ONE_FRUIT_STEPS if config.scenes is None else kwargs["max_episode_steps"])
         self._config, self._device = config, device
         self._kwargs: dict[str, Any] = kwargs | {"max_episode_steps": horizon}
-        self.name = f"trials of {config.scenes or f'one fruit, {config.task}'}"
+        self.name = f"episodes of {config.scenes or f'one fruit, {config.task}'}"
         scene = {"task": config.task, "scenes": scenes.model_dump(mode="json"), "horizon": horizon}
         self.hash = hashlib.sha256(json.dumps(scene, sort_keys=True).encode()).hexdigest()
         self.episodes = config.layouts
@@ -94,19 +94,24 @@ class PpoEnvironments:
         self.envs = self.make(config.envs, 0, config.layouts - 1)
         shape = self.envs.single_observation_space.shape
         assert shape is not None
-        self.facts: dict[str, Any] = {"observed": shape[0], "acted": ACTION_SIZE, "rate_hz": CONTROL_FREQ, **scene}
+        self.facts: dict[str, Any] = {
+            "observation_size": shape[0],
+            "action_size": ACTION_SIZE,
+            "rate_hz": CONTROL_FREQ,
+            **scene,
+        }
 
     def __len__(self) -> int:
         return self._config.train.steps
 
     def make(self, count: int, first_seed: int, last_seed: int) -> VectorEnv:
-        """Create environments with the layouts of some seeds."""
+        """Make a vector environment with the layouts of a range of seeds."""
         return robocas_ms3.make_vec(
             next(spec.env_id for spec in TASKS.values() if self._config.task in (spec.name, spec.env_id)),
             count,
             backend="gpu" if self._device == "cuda" else "processes",
             workers=self._config.workers if self._device == "cpu" else None,
-            wrappers=[TopDown],
+            wrappers=[TopDownActionWrapper],
             ignore_terminations=True,
             reconfiguration_freq=0,
             seeds=(first_seed, last_seed),

@@ -1,4 +1,4 @@
-"""Proximal policy optimisation (Schulman et al. 2017) into the folder of a run."""
+"""Proximal policy optimisation (Schulman et al. 2017)."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from robocas_ms3.baselines.training.run_folder import RunFolder
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.signals import deferred_interrupts
 
-OUTCOMES = ("return", "held", "lifted", "success")  # of an episode; all but the return at its end
-_LAST_EPISODES = 100  # that are averaged in the log
+OUTCOMES = ("return", "held", "lifted", "success")  # of an episode; except the return, at its last step
+_LAST_EPISODES = 100  # averaged in the log
 
 
 def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: PpoEnvironments) -> None:
-    """Train an agent until all steps are done, then test it without noise in other layouts.
+    """Train an agent up to the last step, then test it without noise in other layouts.
 
-    A run that continues has the weights, the optimiser, the observation statistics, the last episodes and the random
-    states of the last update. Its environments start again, with the layouts after those that were used, so it
-    does not repeat an uninterrupted run bit for bit.
+    A run that continues restores weights, optimiser, observation statistics, outcomes of the last episodes and random
+    states of the last update. Its environments start again with the next layouts, so the result is not bit-identical
+    to that of an uninterrupted run.
     """
     if run.accelerator.num_processes > 1:
-        found, fix = f"{run.accelerator.num_processes} processes", "Run it without `accelerate launch`."
-        raise TrainingError("ppo trains in one process", where=run.record.baseline, found=found, fix=fix)
+        found, fix = f"{run.accelerator.num_processes} processes", "Call robocas train without `accelerate launch`."
+        raise TrainingError("ppo trains in one process only", where=run.record.baseline, found=found, fix=fix)
     settings = config.train
     state = _TrainingState(agent, config, run.checkpoint)
     size = f"{len(environments)} steps in {environments.episodes} layouts"
@@ -53,7 +53,7 @@ def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: Ppo
         while state.step < settings.steps:
             collector = collector or RolloutCollector(environments.envs, agent, config, state.episodes, state.outcomes)
             rollout = collector.collect()
-            with deferred_interrupts():  # after an update everything is as a checkpoint has it
+            with deferred_interrupts():  # interrupt only after a complete update
                 losses = update(agent, state.optimizer, rollout, config)
                 state.step += config.envs * steps_per_env(config)
                 _check_finite(run, losses, state.step)
@@ -64,8 +64,8 @@ def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: Ppo
                     save()
                     saved_step = state.step
             run.progress.on_step(min(state.step, settings.steps), settings.steps)
-        if config.trials and not state.is_tested:
-            outcomes = evaluate_agent(agent, environments, config.trials)
+        if config.test_episodes and not state.is_tested:
+            outcomes = evaluate_agent(agent, environments, config.test_episodes)
             with deferred_interrupts(second_ends=False):
                 log("val", outcomes, {"noise": 0.0})
                 state.is_tested = True
@@ -80,7 +80,7 @@ def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: Ppo
 
 
 def update(agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, config: PpoConfig) -> dict[str, float]:
-    """Improve an agent by a rollout; returns means of its losses, its entropy and the norm of the gradient."""
+    """Update an agent with a rollout; return the mean losses, entropy and gradient norm."""
     agent.update_statistics(rollout.obs)
     tensors = rollout.normalized, rollout.action, rollout.log_prob, rollout.advantage, rollout.returns
     metrics = []
@@ -90,11 +90,13 @@ def update(agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, con
             advantage = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
             policy = agent.policy(obs)
             ratio = (policy.log_prob(action).sum(-1) - log_prob).exp()
-            gain = torch.min(ratio * advantage, ratio.clamp(1 - config.clip, 1 + config.clip) * advantage).mean()
+            gain = torch.min(
+                ratio * advantage, ratio.clamp(1 - config.clip_range, 1 + config.clip_range) * advantage
+            ).mean()
             error = (agent.value(obs) - returns).square().mean()
             entropy = policy.entropy().sum(-1).mean()
             optimizer.zero_grad()
-            (error / 2 - gain - config.entropy * entropy).backward()
+            (error / 2 - gain - config.entropy_coeff * entropy).backward()
             norm = nn.utils.clip_grad_norm_(agent.parameters(), config.train.clip_norm or float("inf"))
             optimizer.step()
             metrics.append(torch.stack([error, -gain, entropy, norm]).detach())
@@ -104,19 +106,19 @@ def update(agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, con
 
 @torch.inference_mode()
 def evaluate_agent(agent: Agent, environments: PpoEnvironments, count: int) -> torch.Tensor:
-    """Return the (count, 4) `OUTCOMES` of episodes without noise, in layouts that the agent was not trained on."""
+    """Return `OUTCOMES` (count, 4) of test episodes without noise, in layouts that were not trained on."""
     envs = environments.make(count, FIRST_TEST_SEED, FIRST_TEST_SEED + count - 1)
     try:
         obs, info = envs.reset(seed=FIRST_TEST_SEED)
-        while "final_info" not in info:  # all end at the same step
-            obs, _, _, _, info = envs.step(agent.best(obs))  # pyright: ignore[reportArgumentType]
+        while "final_info" not in info:  # all episodes end at the same step
+            obs, _, _, _, info = envs.step(agent.mean_action(obs))  # pyright: ignore[reportArgumentType]
     finally:
         envs.close()
     return read_outcomes(info)
 
 
 class _TrainingState:
-    """Agent, optimiser, and counts of a training."""
+    """State of a PPO training: optimiser, counts of steps and episodes, outcomes of the last episodes."""
 
     def __init__(self, agent: Agent, config: PpoConfig, checkpoint: Checkpoint | None) -> None:
         self.optimizer = torch.optim.Adam(agent.parameters(), lr=config.train.learning_rate, eps=1e-5)
@@ -128,8 +130,8 @@ class _TrainingState:
         tensors = checkpoint.tensors
         checkpoint.load_model(agent, "model")
         checkpoint.load_optimizer(self.optimizer)
-        self.episodes, self.outcomes = int(tensors["episodes.played"]), tensors["episodes.last"]
-        self.step, self.is_tested = checkpoint.step, bool(tensors["tried_out"])
+        self.episodes, self.outcomes = int(tensors["episodes.count"]), tensors["episodes.last"]
+        self.step, self.is_tested = checkpoint.step, bool(tensors["is_tested"])
         torch.set_rng_state(tensors["random.cpu"])
         if "random.cuda" in tensors and agent.mean.is_cuda:
             torch.cuda.set_rng_state(tensors["random.cuda"])
@@ -141,10 +143,10 @@ class _TrainingState:
         parts = join_parts(
             model=self._agent.state_dict(),
             optimizer=optimizer_tensors(self.optimizer),
-            episodes={"played": torch.tensor(self.episodes), "last": self.outcomes},
+            episodes={"count": torch.tensor(self.episodes), "last": self.outcomes},
             random=random,
         )
-        return {**parts, "tried_out": torch.tensor(self.is_tested)}
+        return {**parts, "is_tested": torch.tensor(self.is_tested)}
 
 
 def _check_finite(run: RunFolder, losses: dict[str, float], step: int) -> None:
@@ -155,15 +157,15 @@ def _check_finite(run: RunFolder, losses: dict[str, float], step: int) -> None:
 
 @dataclass(frozen=True)
 class Rollout:
-    """Steps of all environments, B in all.
+    """B steps of all environments.
 
     Attributes:
         obs: (B, O) observations.
-        normalized: (B, O) observations as the policy got them.
-        action: (B, A).
-        log_prob: (B,) of the actions.
-        advantage: (B,).
-        returns: (B,) targets of the value.
+        normalized: (B, O) normalised observations, as the policy got them.
+        action: (B, A) actions.
+        log_prob: (B,) log probabilities of the actions.
+        advantage: (B,) advantages.
+        returns: (B,) targets of the value network.
     """
 
     obs: torch.Tensor
@@ -175,7 +177,7 @@ class Rollout:
 
 
 class RolloutCollector:
-    """Steps environments with a policy and its noise, and keeps the outcomes of the last episodes."""
+    """Collector of rollouts with exploration noise; keeps the outcomes of the last episodes."""
 
     def __init__(self, envs: VectorEnv, agent: Agent, config: PpoConfig, episodes: int, outcomes: torch.Tensor) -> None:
         self.episodes = episodes
@@ -185,7 +187,7 @@ class RolloutCollector:
         self._obs: torch.Tensor = envs.reset(seed=first % config.layouts)[0]
 
     def last_outcomes(self) -> torch.Tensor:
-        """Return the (n, 4) `OUTCOMES` of the last episodes."""
+        """Return `OUTCOMES` (n, 4) of the last episodes."""
         return torch.tensor(list(self._outcomes)).reshape(-1, len(OUTCOMES))
 
     @torch.no_grad()
@@ -198,7 +200,7 @@ class RolloutCollector:
             policy = agent.policy(normalized)
             action = policy.sample()
             self._obs, reward, _, truncated, info = self._envs.step(action)  # pyright: ignore[reportArgumentType]
-            # Episodes end by truncation alone, so the value of the observation after it counts
+            # Episodes end by truncation only, so the value of the final observation counts
             next_value = agent.value(agent.normalize(info.get("final_obs", self._obs)))
             log_prob = policy.log_prob(action).sum(-1)
             value = agent.value(normalized)
@@ -211,7 +213,7 @@ class RolloutCollector:
             torch.stack(part) for part in zip(*steps, strict=True)
         )
         deltas = reward + config.gamma * next_value - value
-        advantage = advantages(deltas, truncated, config.gamma * config.trace)
+        advantage = advantages(deltas, truncated, config.gamma * config.gae_lambda)
         parts = (obs, normalized, action, log_prob, advantage, advantage + value)
         return Rollout(*(part.flatten(0, 1) for part in parts))
 
@@ -222,15 +224,15 @@ def steps_per_env(config: PpoConfig) -> int:
 
 
 def advantages(deltas: torch.Tensor, truncated: torch.Tensor, decay: float) -> torch.Tensor:
-    """Return generalised advantages (T, N) of temporal differences; decay: gamma lambda (Schulman et al. 2016)."""
-    found, last = torch.zeros_like(deltas), torch.zeros_like(deltas[0])
+    """Return generalised advantages (T, N) of temporal differences; decay: gamma * lambda (Schulman et al. 2016)."""
+    result, last = torch.zeros_like(deltas), torch.zeros_like(deltas[0])
     for t in reversed(range(len(deltas))):
-        last = found[t] = deltas[t] + decay * ~truncated[t] * last
-    return found
+        last = result[t] = deltas[t] + decay * ~truncated[t] * last
+    return result
 
 
 def read_outcomes(info: dict[str, Any]) -> torch.Tensor:
-    """Return the (n, 4) `OUTCOMES` of the episodes that have just ended."""
+    """Return `OUTCOMES` (n, 4) of the episodes that ended at this step."""
     final = info["final_info"]
     held = final["reward_terms"]["grasp"] == 1
     parts = [final["episode"]["return"], held, final["target_lifted"], final["success"]]

@@ -18,19 +18,19 @@ from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 
 class RT1Policy:
-    """Takes the likeliest action for the last six frames, the first one repeated at the start.
+    """Policy that executes the most probable action for the last six frames; at the start the first frame is repeated.
 
-    Frames are encoded once and kept as tokens, with the language of their time. After an action that ends the episode
-    the policy does nothing, with the last gripper command.
+    Each frame is encoded once, with the instruction of its step. After an action with the terminate token, the policy
+    does not move and repeats the last gripper command.
 
-    Images are requested as the dataset stores them, and scaled as its samples are: images rendered at 320 x 256 would
-    show another field of view than images of 640 x 480 scaled to that.
+    Images are rendered in the size of the dataset and scaled as the training samples: images rendered at 320 x 256 have
+    another field of view than images of 640 x 480 scaled to 320 x 256.
     """
 
     def __init__(self, config: RT1Config, facts: dict[str, Any], model: RT1Model) -> None:
         self._config, self._model = config, model.eval()
-        self._frames: dict[int, deque[torch.Tensor]] = {}  # by env, tokens (images, width), the oldest first
-        self._final: dict[int, NDArray[np.float32]] = {}  # by env that has ended, the action that does nothing
+        self._frames: dict[int, deque[torch.Tensor]] = {}  # by env, tokens (images, width), oldest first
+        self._final: dict[int, NDArray[np.float32]] = {}  # by env with a terminate token: the action without motion
         self.spec = PolicySpec(
             convention="robocas",
             reference="tcp",
@@ -40,7 +40,7 @@ class RT1Policy:
         )
 
     def describe(self) -> dict[str, Any]:
-        """Return what results record about the policy: the initial weights of its image encoders."""
+        """Return the initial weights of the image encoders, for the record of a result."""
         path = self._config.image_weights
         name = path.name if path is not None and bool(self._model.from_imagenet) else "from scratch"
         return {"image_weights": name}
@@ -51,7 +51,7 @@ class RT1Policy:
             self._final.pop(episode.env, None)
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Return actions (E, 7), of each env by itself: in a batch their last bits depend on the other rows."""
+        """Return actions (E, 7), computed per env: in a batch, rounding depends on the other rows."""
         return np.stack([self._act(observations, row) for row in range(len(observations.envs))])
 
     def _act(self, observations: Observations, row: int) -> NDArray[np.floating]:
@@ -70,11 +70,11 @@ class RT1Policy:
 
     def _encode(self, observations: Observations, row: int) -> torch.Tensor:
         assert observations.embeddings is not None
-        views = [resize(observations.images[name][row], self._config.image) for name in self._config.cameras]
+        views = [resize(observations.images[name][row], self._config.image_size) for name in self._config.cameras]
         device = self._model.mean.device
         images = torch.from_numpy(np.stack(views).transpose(0, 3, 1, 2)[None].copy()).to(device)
         with torch.inference_mode():
             return self._model.encode(images, torch.from_numpy(observations.embeddings[row : row + 1]).to(device))[0]
 
 
-BASELINE = Baseline("rt1", 1, RT1Config, RT1Model, RT1Policy, RT1Samples)
+BASELINE = Baseline("rt1", 2, RT1Config, RT1Model, RT1Policy, RT1Samples)

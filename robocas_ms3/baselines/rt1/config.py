@@ -1,7 +1,7 @@
 """Configuration of `rt1`; the defaults are those of the RoboCAS paper's RT-1.
 
-They are of RoboCAS-v0's training configuration, as is the batch of 24, where the paper says 64; what that leaves open,
-such as TokenLearner's bottleneck, is of RT-1 itself (Brohan et al. 2022, and its code).
+The defaults come from RoboCAS-v0's training configuration. Its batch size is 24; the paper says 64. Values that it does
+not contain, such as TokenLearner's bottleneck, come from RT-1 (Brohan et al. 2022) and its code.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from robocas_ms3.baselines.baseline import BaselineConfig, Fraction, TrainSettin
 
 _IMAGENET_STD = (0.229, 0.224, 0.225)
 _KERAS_STD = (0.47853944, 0.4732864, 0.47434163)
-"""Of EfficientNet's published weights, by which transformers divides: the roots of the others."""
+"""Standard deviations of EfficientNet's published weights: the square roots of ImageNet's; transformers uses them."""
 
 
 class RT1Train(TrainSettings):
-    """Settings of the training; 140 000 steps are the paper's 20 epochs of about 2.8 k episodes of 60 steps.
+    """Training settings of RT-1; 140 000 steps are the paper's 20 epochs of about 2800 episodes of 60 steps.
 
-    A class of its own, so that changing one of these numbers leaves the others as they are here.
+    A subclass, so that a configuration that changes one value keeps the other defaults of RT-1.
     """
 
     steps: int = Field(default=140_000, ge=1)
@@ -29,7 +29,7 @@ class RT1Train(TrainSettings):
     learning_rate: float = Field(default=1e-4, gt=0)
     min_learning_rate: float = Field(default=1e-5, ge=0)
     weight_decay: float = Field(default=0.01, ge=0)
-    betas: tuple[Fraction, Fraction] = (0.9, 0.999)  # of AdamW, as nothing else is said
+    betas: tuple[Fraction, Fraction] = (0.9, 0.999)  # defaults of AdamW; RoboCAS-v0 gives no values
     warmup_steps: int = Field(default=0, ge=0)
     schedule: Literal["cosine", "constant", "restarts"] = "restarts"
     restart_epochs: float = Field(default=20, gt=0)
@@ -45,30 +45,30 @@ class RT1Config(BaselineConfig):
     """Configuration of `rt1`.
 
     Attributes:
-        cameras: one encoder each; their tokens are concatenated in this order.
-        image: width and height in pixels that images are scaled to.
-        crop_height: rows of an image that are used: any in training, the middle ones when acting.
-        rate_hz: steps per second of the data and of the policy.
-        frames: number of steps in the history, the present one included.
-        image_width, image_depth: coefficients of EfficientNet; 1.2 and 1.4 make B3.
-        drop_connect: probability that the last of EfficientNet's blocks is skipped in training; others in proportion.
+        cameras: cameras with one encoder each; their tokens are concatenated in this order.
+        image_size: width and height that images are scaled to, pixels.
+        crop_height: number of image rows that are used: random rows in training, the middle rows in evaluation.
+        rate_hz: policy steps per second, of the data and of the policy.
+        frames: number of steps in the history, with the present step.
+        image_width, image_depth: coefficients of EfficientNet; 1.2 and 1.4 are B3.
+        drop_connect: probability that EfficientNet's last block is skipped in training; earlier blocks in proportion.
         norm_momentum: momentum of EfficientNet's batch norms.
-        image_mean: subtracted from images in 0..1, by colour.
-        image_std: divides them; None: ImageNet's, or with ``image_weights`` that of these weights.
+        image_mean: mean that is subtracted from images in 0..1, per colour.
+        image_std: standard deviation that divides them; None: ImageNet's, or that of ``image_weights``.
         image_weights: file of EfficientNet's weights, such as ``model.safetensors`` of google/efficientnet-b3; None:
-            random weights. Only the start of a training reads it.
+            random weights. Only a new run reads it.
         token_width: size of an image token.
-        image_tokens: per image, after TokenLearner.
+        image_tokens: number of tokens per image, after TokenLearner.
         token_bottleneck: width of TokenLearner's hidden layer.
-        width: of the transformer, and in RT-1 of its feed-forward layer.
-        layers, heads, key_width, dropout: of the transformer.
-        bins: per number of an action.
-        terminate_steps: number of last actions of an episode that are labelled as its end.
+        width: width of the transformer and of its feed-forward layer.
+        layers, heads, key_width, dropout: sizes of the transformer.
+        bins: number of bins per axis of an action.
+        terminate_steps: number of last actions of an episode that are labelled as terminal.
         train: see `TrainSettings`.
     """
 
     cameras: tuple[str, ...] = ("base_camera", "gripper_camera")
-    image: tuple[int, int] = (320, 256)
+    image_size: tuple[int, int] = (320, 256)
     crop_height: int = Field(236, ge=32, le=4096)
     rate_hz: float = Field(5.0, gt=0, le=100)
     frames: int = Field(6, ge=1, le=1000)
@@ -94,18 +94,20 @@ class RT1Config(BaselineConfig):
     @model_validator(mode="after")
     def _check(self) -> RT1Config:
         if not self.cameras or len(set(self.cameras)) < len(self.cameras):
-            raise ValueError("cameras have to be named, each once")
-        if min(self.image) < 32:
-            raise ValueError("an image has to be at least 32 pixels wide and high")
-        if self.crop_height > self.image[1]:
-            raise ValueError(f"crop_height {self.crop_height} is more than the image's {self.image[1]} rows")
+            raise ValueError("cameras: expected at least one name, each once")
+        if min(self.image_size) < 32:
+            raise ValueError("image_size: expected at least 32 x 32 pixels")
+        if self.crop_height > self.image_size[1]:
+            raise ValueError(
+                f"crop_height {self.crop_height}: expected at most the {self.image_size[1]} rows of image_size"
+            )
         if min(self.std) <= 0:
-            raise ValueError("image_std has to be above 0")
+            raise ValueError("image_std: expected values above 0")
         return self
 
     @property
     def std(self) -> tuple[float, float, float]:
-        """What images in 0..1 are divided by, after the mean is subtracted."""
+        """Return the standard deviation that normalises images in 0..1."""
         if self.image_std is not None:
             return self.image_std
         return _IMAGENET_STD if self.image_weights is None else _KERAS_STD

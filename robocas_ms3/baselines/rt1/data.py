@@ -1,4 +1,4 @@
-"""Samples of `rt1`: a history of images, and the action of each step."""
+"""Training samples of `rt1`: a history of images, and the action of each step."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset, read_epi
 
 
 class RT1Samples:
-    """Samples of a dataset's split.
+    """Training samples of a dataset's split.
 
-    A batch of B samples of F frames and C cameras holds
+    A batch of B samples with F frames and C cameras has
 
     =============  ====================  ===========================================================================
-    ``rgb``        (B, F, C, 3, h, w)    uint8, scaled to ``config.image``; the first one repeated before an episode
+    ``rgb``        (B, F, C, 3, h, w)    uint8, scaled to ``config.image_size``; its first image also before an episode
     ``language``   (B, 384)              float32 embeddings of the instructions
-    ``action``     (B, F, 7)             float32, m and rad in the TCP's frame, gripper command (1 = open)
-    ``mask``       (B, F)                bool, False = before the episode
+    ``action``     (B, F, 7)             float32, m and rad in the TCP frame, gripper command (1 = open)
+    ``mask``       (B, F)                bool, False before the start of the episode
     ``terminate``  (B, F)                bool, whether the action is among the last ``terminate_steps`` of its episode
     =============  ====================  ===========================================================================
 
-    The last action is the one that leads to an episode's last step, T - 2.
+    The last action of an episode has index T - 2 and leads to its last step.
     """
 
     def __init__(self, config: RT1Config, folder: Path, split: Split, on_read: OnRead) -> None:
@@ -42,14 +42,14 @@ class RT1Samples:
                 split=split,
                 observation_horizon=config.frames,
                 cameras=config.cameras,
-                size=config.image,
+                size=config.image_size,
                 embedding=True,
             ),
         )
         self._lengths, self._terminate = source.lengths, config.terminate_steps
         self.episodes, self.scenes = len(self._data.episodes), read_training_scenes(source, self._data.episodes)
         scale = ActionScale.from_action_space(source.action_space(), folder)
-        for done, number in enumerate(self._data.episodes, start=1):  # damage is found before hours of training
+        for done, number in enumerate(self._data.episodes, start=1):  # finds damaged episodes before the training
             read_episode(source, number, self._data.options)
             on_read(done, self.episodes)
         first = source.episode(self._data.episodes[0])

@@ -1,4 +1,4 @@
-"""Image tokens, as in RT-1 (Brohan et al. 2022): EfficientNet with FiLM by language, then TokenLearner."""
+"""Image tokens as in RT-1 (Brohan et al. 2022): EfficientNet with FiLM by language, then TokenLearner."""
 
 from __future__ import annotations
 
@@ -15,58 +15,58 @@ from robocas_ms3.core.errors import TrainingError, require_extra
 from robocas_ms3.scenes.language.embed import DIMENSIONS
 
 _SQUARE_PADDED = (5, 18)
-"""EfficientNet-B3's blocks that halve an odd number of rows: of 300, its own size, 75 and 19; of 236 rows 59 and 15."""
-_EXPECTED = "EfficientNet's weights by transformers' names"
+"""EfficientNet-B3's blocks that halve an odd number of rows: 75 and 19 of 300 rows; 59 and 15 of 236 rows."""
+_EXPECTED = "weights of transformers' EfficientNetModel"
 
 
 class FiLM(nn.Module):
-    """Language scales and shifts the channels of feature maps (Perez et al. 2018); at first it changes nothing."""
+    """FiLM layer (Perez et al. 2018): language scales and shifts the channels; initialised to the identity."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.told = nn.Linear(DIMENSIONS, 2 * channels)
-        nn.init.zeros_(self.told.weight)
-        nn.init.zeros_(self.told.bias)
+        self.linear = nn.Linear(DIMENSIONS, 2 * channels)
+        nn.init.zeros_(self.linear.weight)
+        nn.init.zeros_(self.linear.bias)
 
     def forward(self, features: torch.Tensor, language: torch.Tensor) -> torch.Tensor:
-        """Return (N, C, h, w) for (N, C, h, w) and embeddings (N, 384)."""
-        scale, shift = self.told(language)[:, :, None, None].chunk(2, dim=1)
+        """Return features (N, C, h, w) for features (N, C, h, w) and embeddings (N, 384)."""
+        scale, shift = self.linear(language)[:, :, None, None].chunk(2, dim=1)
         return features * (1 + scale) + shift
 
 
 class TokenLearner(nn.Module):
-    """A few tokens, each a mean of an image's features, weighted by these (Ryoo et al. 2021, V1.1)."""
+    """TokenLearner V1.1 (Ryoo et al. 2021): each token is an attention-weighted mean of an image's features."""
 
     def __init__(self, width: int, bottleneck: int, tokens: int) -> None:
         super().__init__()
         self.norm = nn.LayerNorm(width, eps=1e-6)
-        self.hidden, self.weigh = nn.Linear(width, bottleneck), nn.Linear(bottleneck, tokens)
+        self.hidden, self.score = nn.Linear(width, bottleneck), nn.Linear(bottleneck, tokens)
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
         """Return (N, tokens, C) for features (N, P, C)."""
-        logits = self.weigh(F.gelu(self.hidden(self.norm(features)), approximate="tanh"))
+        logits = self.score(F.gelu(self.hidden(self.norm(features)), approximate="tanh"))
         return logits.softmax(dim=1).transpose(1, 2) @ features
 
 
 class StochasticDepth(nn.Module):
-    """Skips a block for whole images (Huang et al. 2016); transformers drops single numbers."""
+    """Stochastic depth (Huang et al. 2016): skips a block per image; transformers uses plain dropout instead."""
 
-    def __init__(self, share: float) -> None:
+    def __init__(self, rate: float) -> None:
         super().__init__()
-        self.share = share
+        self.rate = rate
 
     def forward(self, branch: torch.Tensor) -> torch.Tensor:
-        """Return (N, C, h, w) for the same."""
-        if not self.training or self.share == 0:
+        """Return features (N, C, h, w) for features (N, C, h, w)."""
+        if not self.training or self.rate == 0:
             return branch
-        kept = torch.rand(len(branch), 1, 1, 1, device=branch.device) >= self.share
-        return branch * kept / (1 - self.share)
+        kept = torch.rand(len(branch), 1, 1, 1, device=branch.device) >= self.rate
+        return branch * kept / (1 - self.rate)
 
 
 class ImageEncoder(nn.Module):
-    """Tokens of a camera's images.
+    """Encoder of a camera's images to tokens.
 
-    FiLM follows each of EfficientNet's blocks (26 in B3) and, as in RT-1's own code, the convolution after it.
+    FiLM layers follow each block of EfficientNet (26 in B3) and, as in RT-1's code, the convolution after the blocks.
     """
 
     def __init__(self, config: RT1Config) -> None:
@@ -80,7 +80,7 @@ class ImageEncoder(nn.Module):
         self.learner = TokenLearner(config.token_width, config.token_bottleneck, config.image_tokens)
 
     def features(self, images: torch.Tensor, language: torch.Tensor) -> torch.Tensor:
-        """Return (N, token_width, h / 32, w / 32) for normalised images (N, 3, h, w) and embeddings (N, 384)."""
+        """Return features (N, token_width, h / 32, w / 32) for normalised images and embeddings (N, 384)."""
         hidden = self.net.embeddings(images)
         encoder = self.net.encoder
         for block, film in zip(encoder.blocks, self.films, strict=True):
@@ -89,11 +89,11 @@ class ImageEncoder(nn.Module):
         return self.film(self.project(hidden), language)
 
     def forward(self, images: torch.Tensor, language: torch.Tensor) -> torch.Tensor:
-        """Return (N, image_tokens, token_width) for the same."""
+        """Return tokens (N, image_tokens, token_width) for normalised images (N, 3, h, w) and embeddings (N, 384)."""
         return self.learner(self.features(images, language).flatten(2).transpose(1, 2))
 
     def load_efficientnet(self, path: Path) -> None:
-        """Load EfficientNet's weights from a file, which may hold more, such as a classifier's."""
+        """Load EfficientNet's weights from a file; other tensors in it, such as a classifier's, are ignored."""
         tensors = {name.removeprefix("efficientnet."): value for name, value in _read_weights(path).items()}
         own = self.net.state_dict()
         counters = {name: value for name, value in own.items() if name.endswith("num_batches_tracked")}
@@ -101,11 +101,11 @@ class ImageEncoder(nn.Module):
         wrong = [name for name, value in own.items() if getattr(tensors.get(name), "shape", None) != value.shape]
         if wrong:
             raise TrainingError(
-                "not the weights of this network",
+                "the weights do not fit the network",
                 where=path,
                 expected=f"{_EXPECTED}, such as {wrong[0]} {tuple(own[wrong[0]].shape)}",
                 found=f"{len(wrong)} of {len(own)} missing or of another shape",
-                fix="image_width and image_depth say which EfficientNet: 1.2 and 1.4 are B3.",
+                fix="Set image_width and image_depth to those of the weights: 1.2 and 1.4 for B3.",
             )
         self.net.load_state_dict({name: tensors[name] for name in own})
 
@@ -121,14 +121,14 @@ def _read_weights(path: Path) -> dict[str, Any]:
             found = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, SafetensorError, pickle.UnpicklingError, RuntimeError, EOFError, ValueError) as error:
         reason = str(error).partition("\n")[0]
-        raise TrainingError("can't be read", where=path, expected=_EXPECTED, found=reason) from error
+        raise TrainingError("unreadable file", where=path, expected=_EXPECTED, found=reason) from error
     if not isinstance(found, dict):
-        raise TrainingError("no weights", where=path, expected=_EXPECTED, found=type(found).__name__)
+        raise TrainingError("invalid file of weights", where=path, expected=_EXPECTED, found=type(found).__name__)
     return found
 
 
 def efficientnet(config: RT1Config) -> Any:
-    """Return EfficientNetModel of transformers with random weights: B3 by default, with 10.7 M parameters."""
+    """Make transformers' EfficientNetModel with random weights; default: B3, with 10.7 M parameters."""
     require_extra("train", "rt1", "transformers")
     from transformers import EfficientNetConfig, EfficientNetModel
 
@@ -145,7 +145,7 @@ def efficientnet(config: RT1Config) -> Any:
     for block in blocks:
         block.projection.dropout = StochasticDepth(block.projection.dropout.p)
     for module in net.modules():
-        # transformers begins with all weights near 0, even those of norms, and lets a batch be 99 % of running means
+        # transformers initialises all weights near 0, also those of norms, and updates running means by 99 % per batch
         if isinstance(module, nn.BatchNorm2d):
             module.momentum = config.norm_momentum
             module.reset_parameters()
@@ -155,6 +155,6 @@ def efficientnet(config: RT1Config) -> Any:
 
 
 def _round_channels(channels: float) -> int:
-    """Round channels as EfficientNet does: to eights, down by a tenth at most."""
+    """Round a number of channels as EfficientNet does: to a multiple of 8, by at most 10 % down."""
     rounded = max(8, int(channels + 4) // 8 * 8)
     return rounded + 8 if rounded < 0.9 * channels else rounded

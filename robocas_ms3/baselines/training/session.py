@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from robocas_ms3.baselines.training.checkpoints import Checkpoint
 
 OUTPUT = FolderKind("robocas train", (RUN,), "baseline")
-_INPUTS = ("rate_hz", "image_sizes", "cameras", "calibration", "observed", "acted")
+_INPUTS = ("rate_hz", "image_sizes", "cameras", "calibration", "observation_size", "action_size")
 """Facts that must be equal in a run and the run of its initial weights; others, such as scales, need equal shapes."""
 _TOLERANCE = 1e-3  # of `_INPUTS`: camera poses differ by rounding
 

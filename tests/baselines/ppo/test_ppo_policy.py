@@ -15,7 +15,7 @@ from robocas_ms3.evaluation.action_wrapper import control_mode
 from robocas_ms3.evaluation.policy import CONVENTIONS
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 
-FACTS = {"observed": 12 + 7 + 1 + 4, "acted": 5, "rate_hz": 5}
+FACTS = {"observation_size": 12 + 7 + 1 + 4, "action_size": 5, "rate_hz": 5}
 
 
 def see(count, state=4):

@@ -23,7 +23,7 @@ def test_advantages():
 
 def test_the_value_after_a_truncation_counts():
     """Episodes end when their time is up, so their last steps have a future."""
-    config = PpoConfig(envs=1, gamma=0.5, trace=0.0, train={"batch_size": LeftOrRight.STEPS})
+    config = PpoConfig(envs=1, gamma=0.5, gae_lambda=0.0, train={"batch_size": LeftOrRight.STEPS})
     agent = Agent(1, 1, 4)
     torch.nn.init.zeros_(agent.critic[-1].weight)
     torch.nn.init.constant_(agent.critic[-1].bias, 3.0)

@@ -14,7 +14,7 @@ from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.baselines.training.session import Progress
 from robocas_ms3.core.errors import OutputExistsError, TrainingError
 
-SMALL = {"width": 16, "envs": 4, "trials": 20, "layouts": 10, "train": {"steps": 1280, "batch_size": 64}}
+SMALL = {"width": 16, "envs": 4, "test_episodes": 20, "layouts": 10, "train": {"steps": 1280, "batch_size": 64}}
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_after_ctrl_c_a_run_continues_with_the_whole_checkpoint(made_up, tmp_pat
     kept, weights = load_file(run / "checkpoint.safetensors"), load_file(run / "weights.safetensors")
     assert not read_log(run, "val")
     assert weights["count"].item() == pytest.approx(640, abs=1e-3)
-    assert int(kept["episodes.played"]) == 640 // LeftOrRight.STEPS
+    assert int(kept["episodes.count"]) == 640 // LeftOrRight.STEPS
     with pytest.raises(KeyboardInterrupt):
         train("ppo", None, run, progress=stop_at(640, KeyboardInterrupt()))  # before the next update
     again, steps = load_file(run / "checkpoint.safetensors"), []
@@ -88,7 +88,7 @@ def test_data_is_refused(made_up, tmp_path):
 
 
 def test_a_run_of_other_scenes_is_not_continued(made_up, monkeypatch, tmp_path):
-    train("ppo", None, tmp_path / "run", SMALL | {"trials": 0, "train": {"steps": 64, "batch_size": 64}})
+    train("ppo", None, tmp_path / "run", SMALL | {"test_episodes": 0, "train": {"steps": 64, "batch_size": 64}})
     monkeypatch.setattr(StubEnvironments, "hash", "5678")
     with pytest.raises(OutputExistsError):
         train("ppo", None, tmp_path / "run")
@@ -97,7 +97,14 @@ def test_a_run_of_other_scenes_is_not_continued(made_up, monkeypatch, tmp_path):
 @pytest.mark.slow
 def test_a_short_run_in_the_simulator(tmp_path):
     run = tmp_path / "run"
-    small = {"envs": 2, "workers": 1, "layouts": 2, "trials": 2, "epochs": 1, "train": {"steps": 128, "batch_size": 64}}
+    small = {
+        "envs": 2,
+        "workers": 1,
+        "layouts": 2,
+        "test_episodes": 2,
+        "epochs": 1,
+        "train": {"steps": 128, "batch_size": 64},
+    }
     train("ppo", None, run, small)
     rows = read_log(run, "train")
     assert [row["step"] for row in rows] == ["64", "128"]

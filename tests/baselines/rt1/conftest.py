@@ -28,8 +28,8 @@ def model(config, facts, batch):
     with torch.no_grad():
         for encoder in made.encoders:
             for film in [*encoder.films, encoder.film]:
-                film.told.weight.normal_(0, 0.3)
-        made.transformer.leave.weight.normal_(0, 1)
+                film.linear.weight.normal_(0, 0.3)
+        made.transformer.head.weight.normal_(0, 1)
         settle(made, batch)
     return made
 

@@ -61,7 +61,7 @@ def test_facts(samples, folder):
         ({"crop_height": 300}, "crop_height 300"),
         ({"cameras": ["base_camera", "base_camera"]}, "cameras"),
         ({"cameras": []}, "cameras"),
-        ({"image": [16, 256]}, "32 pixels"),
+        ({"image_size": [16, 256]}, "32 pixels"),
         ({"image_std": [0.2, 0.0, 0.2]}, "image_std"),
         ({"bins": 1}, "bins"),
         ({"layer": 3}, "layers"),

@@ -26,14 +26,14 @@ def striped(count, height=256, width=4):
 
 
 def test_acting_uses_the_middle_rows():
-    rows = rows_of(crop_rows(striped(2), 236, anywhere=False))
+    rows = rows_of(crop_rows(striped(2), 236, random=False))
     assert rows.dtype == torch.float32
     assert rows.tolist() == [list(range(10, 246))] * 2
 
 
 def test_training_crops_each_image_at_random():
     torch.manual_seed(0)
-    seen = crop_rows(striped(600).view(100, 3, 2, 3, 256, 4), 236, anywhere=True)
+    seen = crop_rows(striped(600).view(100, 3, 2, 3, 256, 4), 236, random=True)
     assert seen.shape == (100, 3, 2, 3, 236, 4)
     flat = seen.flatten(0, 2)
     first = rows_of(flat)[:, 0]
@@ -42,15 +42,15 @@ def test_training_crops_each_image_at_random():
     assert (flat[..., -1] == 7).all()  # columns stay
     assert torch.equal(flat[:, 0], flat[:, 2])  # colours are cropped together
     torch.manual_seed(0)
-    assert torch.equal(crop_rows(striped(600).view(100, 3, 2, 3, 256, 4), 236, anywhere=True), seen)
+    assert torch.equal(crop_rows(striped(600).view(100, 3, 2, 3, 256, 4), 236, random=True), seen)
 
 
 def test_film_by_hand():
     film = FiLM(2)
     features = torch.ones(1, 2, 1, 3)
     with torch.no_grad():
-        film.told.bias[:] = torch.tensor([1.0, 0.0, 0.5, -4.0])  # scales, then shifts
-        film.told.weight[3, 0] = 2.0
+        film.linear.bias[:] = torch.tensor([1.0, 0.0, 0.5, -4.0])  # scales, then shifts
+        film.linear.weight[3, 0] = 2.0
     language = torch.zeros(1, 384)
     language[0, 0] = 10
     assert film(features, language)[0, :, 0].tolist() == [[2.5] * 3, [17.0] * 3]
@@ -68,19 +68,19 @@ def test_language_changes_nothing_at_first_and_something_once_learned(config):
         wanted = encoder.project(encoder.net(images).last_hidden_state)
         assert torch.allclose(plain, wanted, atol=1e-6)
         for number in (0, len(encoder.films) - 1):
-            encoder.films[number].told.weight.normal_(0, 0.1)
+            encoder.films[number].linear.weight.normal_(0, 0.1)
             spoken = encoder.features(images, words)
             assert not torch.allclose(spoken, plain, rtol=1e-3)
-            encoder.films[number].told.weight.zero_()
-        encoder.film.told.weight.normal_(0, 0.1)
+            encoder.films[number].linear.weight.zero_()
+        encoder.film.linear.weight.normal_(0, 0.1)
         assert not torch.allclose(encoder.features(images, words), plain, rtol=1e-3)
 
 
 def test_token_learner_weighs_places():
     learner = TokenLearner(2, 3, 2)
     with torch.no_grad():
-        learner.weigh.weight.zero_()
-        learner.weigh.bias.zero_()
+        learner.score.weight.zero_()
+        learner.score.bias.zero_()
     features = torch.tensor([[[1.0, 5.0], [3.0, -1.0], [2.0, 2.0]]])
     assert torch.allclose(learner(features), torch.tensor([[[2.0, 2.0], [2.0, 2.0]]]))  # the mean, for each token
     with torch.no_grad():
@@ -88,7 +88,7 @@ def test_token_learner_weighs_places():
         learner.hidden.weight.zero_()
         learner.hidden.bias.zero_()
         learner.hidden.weight[0, 0] = 100.0
-        learner.weigh.weight[1, 0] = 1.0
+        learner.score.weight[1, 0] = 1.0
     found = learner(features)
     assert torch.allclose(found[0, 0], torch.tensor([2.0, 2.0]))
     assert torch.allclose(found[0, 1], torch.tensor([3.0, -1.0]), atol=1e-5)  # the second place alone

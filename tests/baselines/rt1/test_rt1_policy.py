@@ -26,7 +26,7 @@ def observations(envs, images, words):
 @pytest.fixture
 def policy(config, facts, model):
     """That never ends an episode."""
-    model.transformer.leave.bias.data[1] = -1e3
+    model.transformer.head.bias.data[1] = -1e3
     return BASELINE.policy(config, facts, model)
 
 
@@ -104,7 +104,7 @@ def test_after_the_end_an_env_does_nothing(policy, model, seen):
 
 def test_samples_are_learned(folder):
     """The loss of one batch falls, from chance on."""
-    sizes = {"image": (48, 36), "crop_height": 32, "frames": 2, "image_width": 0.1, "token_width": 64, "width": 64}
+    sizes = {"image_size": (48, 36), "crop_height": 32, "frames": 2, "image_width": 0.1, "token_width": 64, "width": 64}
     config = RT1Config(**{**SIZES, **sizes, "dropout": 0.0, "drop_connect": 0.0})
     samples = BASELINE.data(config, folder, "val", lambda done, total: None)  # one episode
     _, losses = fit(BASELINE, config, samples, 25)

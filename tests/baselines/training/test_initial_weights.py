@@ -16,7 +16,7 @@ from robocas_ms3.evaluation.policies import make_policy
 
 CALIBRATION = {"calibration": {"x": [1.0, 2], "hand": True}}
 SCALES = {"inputs": {"mean": [0.5] * 20}}
-SIMULATION = {"observed": 30, "horizon": 100}
+SIMULATION = {"observation_size": 30, "horizon": 100}
 
 
 def combine(whole, facts, own):
@@ -30,7 +30,11 @@ def combine(whole, facts, own):
     [
         (CALIBRATION, {"calibration": {"x": [1.0004, 2], "hand": True}}, CALIBRATION),  # equal to a mm
         (SCALES, {"inputs": {"mean": [9.0] * 20}}, SCALES),  # the weights fit the other run's
-        (SIMULATION, {"observed": 30, "horizon": 200}, {"observed": 30, "horizon": 200}),  # those of its environments
+        (
+            SIMULATION,
+            {"observation_size": 30, "horizon": 200},
+            {"observation_size": 30, "horizon": 200},
+        ),  # those of its environments
     ],
 )
 def test_facts_with_initial_weights(whole, facts, own, expected):
@@ -46,7 +50,7 @@ def test_facts_with_initial_weights(whole, facts, own, expected):
         (CALIBRATION, {"calibration": {"x": [1.0, 2], "hand": False}}, "calibration.hand: true -> false"),
         (CALIBRATION, {}, "calibration: {"),
         (SCALES, {"inputs": {"mean": [9.0] * 30}}, "inputs.mean: ["),  # the scenes hold another number of objects
-        (SIMULATION, {"observed": 40, "horizon": 200}, "observed: 30 -> 40"),
+        (SIMULATION, {"observation_size": 40, "horizon": 200}, "observation_size: 30 -> 40"),
     ],
 )
 def test_initial_weights_with_other_inputs_are_refused(whole, facts, own, found):
