@@ -125,7 +125,7 @@ def test_task_process(command, expected_content, tmp_path, row, fault, times):
         return
     if command.name == "convert":  # an error names the episode; the other episodes are converted
         assert code == 1
-        assert "episode_0000001: its process died twice: SIGSEGV" in stderr
+        assert "episode_0000001: its worker process crashed twice: SIGSEGV" in stderr
         assert command.finished(out) == EPISODES - 1
         run_successfully(words)
         row.compare(expected, content(command, out))
