@@ -1,4 +1,4 @@
-"""What all tests share. The user's data folder is kept out; the cache of robot files is kept, as it is only a cache."""
+"""Fixtures of all tests. Tests use a temporary data folder, and the cache folder of the user."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ LONGEST = {
     "tests/test_emulated_gpu.py",
     "tests/viewer/test_page.py",
 }
-"""Files of half a minute and more."""
+"""Test files that take half a minute or more."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -46,9 +46,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the long run on the emulated GPU interface unless asked for, and start with the longest files.
+    """Deselect tests marked `emulated_gpu_full` unless requested, and start with the longest files.
 
-    A process that has a long file at the end is waited for by the other processes.
+    Otherwise one process could run a long file at the end, while the others are idle.
     """
     if "emulated_gpu_full" not in (config.option.markexpr or ""):
         marked = [item for item in items if item.get_closest_marker("emulated_gpu_full")]
@@ -59,7 +59,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Keep imported modules out of garbage collections: these take 0.3 s, and ManiSkill runs one per closed env."""
+    """Exclude imported modules from garbage collections, which take 0.3 s; ManiSkill runs one per closed env."""
     gc.freeze()
 
 
@@ -72,7 +72,7 @@ _DATA = pytest.StashKey[str]()
 
 @pytest.fixture(scope="session")
 def shared_dir() -> Path:
-    """The folder of material that can't travel with the project: $ROBOCAS_SHARED, or `shared` beside the checkout."""
+    """Return the folder of reference material outside the project: $ROBOCAS_SHARED, or `shared` next to the checkout."""
     folder = Path(os.environ.get("ROBOCAS_SHARED") or ROOT.parent / "shared")
     if not folder.is_dir():
         pytest.skip(f"no reference material: {folder} is not a folder (set ROBOCAS_SHARED)")
@@ -81,7 +81,7 @@ def shared_dir() -> Path:
 
 @pytest.fixture(scope="session")
 def needs_renderer() -> str:
-    """The render device. Without one: a skip, on CI a failure, as setup installs one there."""
+    """Return the render device. Without one, skip the test, or fail it on CI, where setup.sh installs one."""
     device, problem = _render_device()
     if device is None:
         without_renderer(problem)
@@ -90,20 +90,20 @@ def needs_renderer() -> str:
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """A file system of 600 kB; skipped where it can't be mounted."""
+    """Mount a file system of 600 kB; skip the test if that is impossible."""
     folder = tmp_path / "small"
     folder.mkdir()
     done = subprocess.run(
         ["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", str(folder)], check=False, capture_output=True, text=True
     )
     if done.returncode:
-        pytest.skip(f"DISK FULL IS NOT TESTED ON A REAL DISK HERE: no tmpfs can be mounted: {done.stderr.strip()}")
+        pytest.skip(f"a full disk is not tested: tmpfs cannot be mounted: {done.stderr.strip()}")
     yield folder
     subprocess.run(["umount", "--lazy", str(folder)], check=True)
 
 
 def without_renderer(problem: str) -> NoReturn:
-    """Skip the test, on CI fail it."""
+    """Skip the test, or fail it on CI."""
     if os.environ.get("CI", "").lower() in ("", "0", "false"):
         pytest.skip(f"no render device: {problem}")
     pytest.fail(f"no render device: {problem}", pytrace=False)

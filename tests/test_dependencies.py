@@ -1,4 +1,4 @@
-"""What the code imports is what pyproject.toml declares; a clean installation lacks nothing."""
+"""Imported packages are declared in pyproject.toml, so that a clean installation is complete."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
 DISTRIBUTIONS = metadata.packages_distributions()
-# Import name -> who brings it, where that is not a declaration of ours.
-BROUGHT = {
-    "transformers": "sentence-transformers is made of it",
-    "lerobot": "its own environment imports what imports it",
-    "vla_eval": "only it uses the benchmark that imports it",
+# Imported modules that are not declared, with the reason.
+UNDECLARED = {
+    "transformers": "a dependency of sentence-transformers",
+    "lerobot": "only imported in the environment of LeRobot",
+    "vla_eval": "only imported by vla-eval itself",
 }
 
 
 def declared(*extras: str) -> set[str]:
-    """Normalised names of what an installation with these extras asks for."""
+    """Return the normalised names of the requirements with these extras."""
     items = [Requirement(line) for line in metadata.requires("robocas-ms3") or []]
     return {
         item.name.lower().replace("_", "-")
@@ -32,7 +32,7 @@ def declared(*extras: str) -> set[str]:
 
 
 def third_party(path: Path) -> set[str]:
-    """Top-level modules a file imports that are neither Python's nor this project's."""
+    """Return the top-level modules that a file imports, without those of Python and of this project."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -42,7 +42,7 @@ def third_party(path: Path) -> set[str]:
     return found - set(sys.stdlib_module_names) - {"robocas_ms3", "asset_tools"}
 
 
-EXTRAS = {  # files that may import what an extra brings
+EXTRAS = {  # files that may import packages of an extra
     "robocas_ms3/baselines/": "train",
     "robocas_ms3/baselines/lerobot/": "lerobot",
     "robocas_ms3/scenes/language/": "language",
@@ -62,15 +62,15 @@ def test_imports_are_declared(folder):
     for path in (ROOT / folder).rglob("*.py"):
         name = path.relative_to(ROOT).as_posix()
         known = declared(*(extra for start, extra in EXTRAS.items() if name.startswith(start)))
-        for module in third_party(path) - BROUGHT.keys():
-            # a distribution of one compiled module does not list it, and is called like it
+        for module in third_party(path) - UNDECLARED.keys():
+            # a distribution of one compiled module does not list the module, which has its name
             names = {name.lower().replace("_", "-") for name in DISTRIBUTIONS.get(module, [module])}
             if not names & known:
                 undeclared[module] = (str(path.relative_to(ROOT)), sorted(names))
     assert undeclared == {}
 
 
-def test_locked_versions_are_the_ones_installed():
+def test_installed_versions_are_the_locked_ones():
     locked = {}
     for line in (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines():
         if line and not line.startswith("#"):

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @pytest.fixture(scope="module", autouse=True)
 def needs_supported_torch() -> None:
-    """Skip the tests with another build of torch; on CI fail, as setup.sh installs the right one there."""
+    """Skip the tests with an unsupported build of torch, or fail on CI, where setup.sh installs a supported one."""
     problem = unsupported_torch()
     if problem is not None and os.environ.get("CI", "").lower() in ("", "0", "false"):
         pytest.skip(problem)
@@ -24,7 +24,7 @@ def needs_supported_torch() -> None:
 
 
 def run(*arguments: str) -> int:
-    """Run tests/gpu on the emulation; return how many tests passed."""
+    """Run tests/gpu on the emulation; return the number of passed tests."""
     path = os.pathsep.join(filter(None, [str(ROOT), str(ROOT / "tests/support"), os.environ.get("PYTHONPATH")]))
     command = [sys.executable, "-m", "pytest", "-q", "-p", "gpu_emulation.plugin", "-p", "no:cacheprovider"]
     done = subprocess.run(

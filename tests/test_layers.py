@@ -1,4 +1,4 @@
-"""The import layers of docs/architecture.md, read from the source: who may know whom."""
+"""The import layers of docs/architecture.md, checked in the source code."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LAYERS = (
     "cli",
 )
 RANK = {name: rank for rank, name in enumerate(LAYERS)}
-RANK["registration"] = RANK["tasks"]  # a module beside the packages, as importing `tasks` loads ManiSkill
+RANK["registration"] = RANK["tasks"]  # a module outside the packages, because importing `tasks` loads ManiSkill
 SIMULATOR_FREE = (
     "core",
     "scenes.task_specs",
@@ -48,7 +48,7 @@ SIMULATORS = {"sapien", "mani_skill"}
 
 
 def modules(folder: Path) -> dict[str, Path]:
-    """Dotted name -> file of every module under a package's folder."""
+    """Return the file of each module in a package, by dotted name."""
     found = {}
     for path in sorted(folder.rglob("*.py")):
         parts = path.relative_to(ROOT).with_suffix("").parts
@@ -62,7 +62,7 @@ MESH_TOOLS = modules(ROOT / "asset_tools")
 
 @lru_cache
 def imports(module: str, path: Path) -> tuple[tuple[str, bool], ...]:
-    """(imported module, whether inside a function) of every import, type-checking ones too."""
+    """Return (imported module, whether in a function) of each import, with imports for type checking."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     local = {
         id(node)
@@ -87,12 +87,12 @@ def imports(module: str, path: Path) -> tuple[tuple[str, bool], ...]:
 
 
 def layer(module: str) -> str:
-    """`robocas_ms3.tasks.pick` is in `tasks`; the package itself in none."""
+    """Return the layer of a module: `tasks` of `robocas_ms3.tasks.pick`, "" of the package."""
     return module.split(".")[1] if module.count(".") else ""
 
 
 def reachable(module: str) -> dict[str, str]:
-    """Everything a module imports, directly or through others of this package -> who imports it."""
+    """Return all modules that a module imports, directly or indirectly, with the module that imports them."""
     found: dict[str, str] = {}
     todo = [module]
     while todo:
@@ -134,15 +134,15 @@ def test_pure_modules_import_no_simulator():
     assert found == set()
 
 
-def test_no_modules_import_each_other_in_a_circle():
-    """Neither for types nor inside of functions: what two modules share lies in a third below them."""
-    shipped = MODULES | MESH_TOOLS
-    edges = {module: {name for name, _ in imports(module, path)} - {module} for module, path in shipped.items()}
+def test_there_are_no_circular_imports():
+    """This includes imports for type checking and in functions. Code that two modules share is in a third module."""
+    packaged = MODULES | MESH_TOOLS
+    edges = {module: {name for name, _ in imports(module, path)} - {module} for module, path in packaged.items()}
     graph = nx.DiGraph((module, name) for module, names in edges.items() for name in names)
-    assert [sorted(circle) for circle in nx.strongly_connected_components(graph) if len(circle) > 1] == []
+    assert [sorted(cycle) for cycle in nx.strongly_connected_components(graph) if len(cycle) > 1] == []
 
 
-def test_mesh_tools_are_imported_by_the_assets_command_alone_when_it_runs():
+def test_only_the_assets_command_imports_mesh_tools():
     users = {
         (module, local)
         for module, path in MODULES.items()
@@ -152,12 +152,12 @@ def test_mesh_tools_are_imported_by_the_assets_command_alone_when_it_runs():
     assert users <= {("robocas_ms3.cli.assets", True), ("robocas_ms3.cli.assets_show", True)}
 
 
-def test_the_builtin_formulas_are_imported_by_their_command_alone():
+def test_only_the_assets_command_imports_the_builtin_formulas():
     """They are not in the wheel."""
-    shipped = MODULES | MESH_TOOLS | {"robocas_cli": ROOT / "robocas_cli.py"}
+    packaged = MODULES | MESH_TOOLS | {"robocas_cli": ROOT / "robocas_cli.py"}
     users = {
         (module, local)
-        for module, path in shipped.items()
+        for module, path in packaged.items()
         if not module.startswith("asset_tools.builtin")
         for name, local in imports(module, path)
         if f"{name}.".startswith("asset_tools.builtin.")
@@ -165,7 +165,7 @@ def test_the_builtin_formulas_are_imported_by_their_command_alone():
     assert users == {("robocas_ms3.cli.assets", True)}
 
 
-def test_mesh_tools_know_only_the_lowest_layers():
+def test_mesh_tools_import_only_core_and_assets():
     allowed = {"core", "assets"}
     for module, path in MESH_TOOLS.items():
         for name, _ in imports(module, path):

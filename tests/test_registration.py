@@ -1,4 +1,4 @@
-"""Importing the package registers the tasks with gymnasium, those of other packages too, without a simulator."""
+"""Importing the package registers all tasks with gymnasium, without loading a simulator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The built wheel, installed by itself: what travels with it, and that an environment can be made from it."""
+"""The wheel in a clean environment: its files, an environment, the command and the mesh tools."""
 
 import json
 import os
@@ -46,9 +46,9 @@ def wheel(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(wheel, tmp_path_factory) -> Path:
-    """Python of a clean environment with the wheel; its dependencies are the tests' own, nothing is downloaded.
+    """Return the Python of a clean environment with the wheel and the dependencies of the tests, without downloads.
 
-    A .pth line adds a folder to the path without reading the .pth files in it: the checkout is not on that path.
+    A .pth line adds a folder to the path without reading the .pth files in it, so that the checkout is not on the path.
     """
     venv = tmp_path_factory.mktemp("clean")
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", venv], check=True)
@@ -71,7 +71,7 @@ def run(python: Path, *words: str, cwd: Path) -> str:
     return done.stdout
 
 
-def test_configs_and_builtin_pack_travel_in_the_wheel(wheel):
+def test_wheel_contains_the_data_files(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     for path in (ROOT / "task_configs").glob("*.yaml"):
         assert f"robocas_ms3/data/task_configs/{path.name}" in names

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from fuzzing import SCALARS, VALUES, damaged, twisted
+from fuzzing import SCALARS, VALUES, change_value, damage
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -45,7 +45,7 @@ def test_a_damaged_layout_of_a_cache_is_made_again(cache):
     path = cache.path(0, 0)
     whole = path.read_bytes()
     for seed in range(80):
-        path.write_bytes(damaged(path.name, whole, seed))
+        path.write_bytes(damage(path.name, whole, seed))
         again = cache.get(0, 0)
         assert again.object_ids == made.object_ids, seed
         assert np.array_equal(again.object_poses, made.object_poses), seed
@@ -55,7 +55,7 @@ def test_caches_with_damaged_notes_are_listed(cache, capsys):
     cache.get(0, 0)
     path = cache.folder / ABOUT
     whole = json.loads(path.read_text())
-    for content in [*(twisted(whole, seed) for seed in range(60)), *VALUES]:
+    for content in [*(change_value(whole, seed) for seed in range(60)), *VALUES]:
         path.write_text(json.dumps(content))
         assert info(Info(folder=cache.folder.parent)) == 0, content
     assert "damaged" in capsys.readouterr().out

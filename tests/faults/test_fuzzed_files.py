@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import synthetic_results
-from fuzzing import damaged, flipped
+from fuzzing import damage, flip_bits
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.assets.annotations import Annotations
@@ -305,7 +305,7 @@ def test_it_is_read_or_refused(folder_of, tmp_path, write, name, read, count, le
         assert not is_refused(read, root, "whole")
     whole, refused = (root / name).read_bytes(), 0
     for seed in range(count):
-        (root / name).write_bytes(damaged(name, whole, seed))
+        (root / name).write_bytes(damage(name, whole, seed))
         refused += is_refused(read, root, seed)
     assert refused >= least
 
@@ -316,7 +316,7 @@ def test_damage_of_images_and_arrays_is_found(folder_of, tmp_path):
         path = root / "episode_0000000" / name
         whole, found = path.read_bytes(), 0
         for seed in range(12):
-            path.write_bytes(flipped(whole, seed))
+            path.write_bytes(flip_bits(whole, seed))
             found += bool(validate(root).violations)
         assert found > 6
         path.write_bytes(whole)

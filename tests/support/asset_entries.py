@@ -1,4 +1,4 @@
-"""Entries of manifests."""
+"""Valid entries of pack manifests."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ QUALITY = ObjectQuality(
 
 
 def object_asset(id_: str = "thing", **facts: Any) -> ObjectAsset:
-    """Return the entry of an object as good as packs should be."""
+    """Return the entry of an object that satisfies all quality limits."""
     body = {"mass": 0.1, "center_of_mass": (0, 0, 0), "inertia": (1e-4, 1e-4, 1e-4), "extents": (0.1, 0.1, 0.1)}
     return ObjectAsset(**{"id": id_, "name": id_, **COMMON, **body, "grasp_count": 60, "quality": QUALITY, **facts})
 

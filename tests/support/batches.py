@@ -1,4 +1,4 @@
-"""Motions of a batch of envs, what they lead to, and checks that compare a batch with single envs and with itself."""
+"""Step a batch of envs, and compare its states with those of single envs and with its own earlier states."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def make_singles(task: str, count: int, **kwargs: Any) -> list[gym.Env]:
 def _step_when_built(base: Any) -> None:
     """Let a single env step its physics once when its scene is built, as `PhysxGpuSystem.gpu_init` does.
 
-    PhysX solves contacts in the order in which pairs of bodies met. Without the step, this order, and so the motion
-    of some heaps, is another one.
+    PhysX solves contacts in the order in which pairs of bodies met. Without the step, this order and the motion of
+    some heaps would differ.
     """
     after_reconfigure = base._after_reconfigure
 
@@ -106,7 +106,7 @@ def _state(base: Any) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 
 def smooth_actions(env: gym.Env, mode: str, steps: int) -> torch.Tensor:
-    """(T, N, A) actions of a smooth motion from the present state, another one in each env, on the CPU.
+    """Return actions (T, N, A) of smooth motions from the current state, different in each env, on the CPU.
 
     The fingers close after half of the steps. The base moves in the modes that take it.
     """
@@ -139,9 +139,9 @@ def check_equals_singles(batch: gym.Env, singles: Sequence[gym.Env], mode: str, 
 
     Args:
         batch: N envs (`make_batch`).
-        singles: N single envs (`make_singles`), which have made the same steps as the batch before.
-        mode: control mode, which both have.
-        steps: T.
+        singles: N single envs (`make_singles`) that have made the same steps as the batch.
+        mode: control mode of all envs.
+        steps: number of steps T.
 
     Raises:
         AssertionError: they differ by more than the tolerances of this module.
@@ -161,7 +161,7 @@ def check_equals_singles(batch: gym.Env, singles: Sequence[gym.Env], mode: str, 
 
 
 def check_partial_reset(batch: gym.Env, some: Sequence[int], mode: str, *, exact: bool) -> None:
-    """Check that a reset of some envs of a batch leaves the others unchanged; if exact, to the bit and in later steps.
+    """Check that a reset of some envs of a batch leaves the others unchanged; if exact, bit by bit and in later steps.
 
     Raises:
         AssertionError: another env has changed.
@@ -191,7 +191,7 @@ def check_partial_reset(batch: gym.Env, some: Sequence[int], mode: str, *, exact
 
 
 def check_state_round_trip(batch: gym.Env, some: Sequence[int], mode: str) -> None:
-    """Check that a state that is set again is the one that was read, in all envs or in some, and leads to the same.
+    """Check that a restored state equals the state that was read, in all envs or in some, and so do later states.
 
     Raises:
         AssertionError: a state differs.

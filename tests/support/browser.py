@@ -12,7 +12,7 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 
 
 def require_chromium():
-    """Return the program: $ROBOCAS_CHROMIUM, or an installed one. Without one the test is skipped, on CI it fails."""
+    """Return the program: $ROBOCAS_CHROMIUM, or an installed one. Without one, skip the test, or fail it on CI."""
     program = os.environ.get("ROBOCAS_CHROMIUM") or next((path for path in map(shutil.which, NAMES) if path), None)
     if program is not None:
         return program
@@ -24,7 +24,7 @@ def require_chromium():
 
 @contextmanager
 def open_page():
-    """Open a page; its ``errors`` are those of scripts and requests."""
+    """Open a page with the attribute ``errors``: errors of scripts and requests."""
     with sync_playwright() as playwright:
         # root in a container needs --no-sandbox; only our own pages are opened
         browser = playwright.chromium.launch(executable_path=require_chromium(), args=["--no-sandbox"])
@@ -41,7 +41,7 @@ def open_page():
 
 
 def wait(page, expression):
-    """Wait until an expression is true; Playwright's own function evaluates text in the page, which its CSP forbids."""
+    """Wait until an expression is true. Playwright's function evaluates text in the page, which the CSP forbids."""
     end = time.monotonic() + 60
     while not page.evaluate(expression):
         assert time.monotonic() < end, f"never true: {expression}; errors: {page.errors}"

@@ -1,4 +1,4 @@
-"""A training on a device in a precision that is interrupted and continues, and its policy."""
+"""Interrupt and continue a training on a device with a precision, and run its policy."""
 
 import json
 

@@ -1,6 +1,6 @@
-"""Commands without the seconds that imports take: a process that has imported the package forks for each.
+"""Run commands without the seconds of imports: a process that has imported the package forks for each command.
 
-It is itself the fork of one that has imported the libraries, whatever folders of packages there are.
+This process is a fork of a process that has imported the libraries, which all servers share.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _LIBRARIES = """
 import os, pickle, signal, socket, sys
 import torch, mani_skill.envs
 link = socket.socket(fileno=int(sys.argv.pop()))
-signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for its forks
+signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel reaps its forks
 while True:
     order, ends, *_ = socket.recv_fds(link, 2**20, 2)
     if not order:
@@ -46,9 +46,9 @@ answers = os.fdopen(os.dup(1), "wb")
 os.dup2(2, 1)
 import robocas_ms3.cli.main, robocas_ms3.demos.generation, robocas_ms3.evaluation.session, robocas_ms3.tasks.base
 
-def obey(words, folder, said):
+def execute(words, folder, outputs):
     for stream in (1, 2):
-        os.dup2(os.open(said[stream - 1], os.O_WRONLY | os.O_TRUNC), stream)
+        os.dup2(os.open(outputs[stream - 1], os.O_WRONLY | os.O_TRUNC), stream)
     os.chdir(folder)
     sys.argv = list(words)
     if words[0] == "-c":
@@ -68,7 +68,7 @@ while True:
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
         code = 0
         try:
-            obey(*order)
+            execute(*order)
         except SystemExit as exit:
             code = exit.code if isinstance(exit.code, int) else int(exit.code is not None)
         except BaseException:
@@ -86,7 +86,7 @@ os._exit(0)
 
 @cache
 def _libraries() -> socket.socket:
-    """The link to the process that has imported the libraries; it ends with this one."""
+    """Return the socket of the process that has imported the libraries; it ends with this process."""
     here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with there:
         command = [sys.executable, "-W", "ignore", "-c", _LIBRARIES, str(there.fileno())]
@@ -98,7 +98,7 @@ class ForkServer:
     """Python with the package imported, ready for commands.
 
     Args:
-        path: folders of packages before all others.
+        path: folders of packages, before all other folders.
     """
 
     def __init__(self, *path: Path) -> None:
@@ -108,10 +108,10 @@ class ForkServer:
         with orders, answers:
             order = pickle.dumps((_PROGRAM, folders, dict(env)))
             socket.send_fds(_libraries(), [order], [orders.fileno(), answers.fileno()])
-        weakref.finalize(self, self._orders.close)  # then it ends
+        weakref.finalize(self, self._orders.close)  # ends the process
 
     def run(self, *words: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-        """Do as ``python WORDS`` would: a script or ``-c CODE``, and arguments."""
+        """Run ``python WORDS``: a script or ``-c CODE``, with arguments."""
         with tempfile.NamedTemporaryFile("r") as out, tempfile.NamedTemporaryFile("r") as err:
             command = tuple(map(str, words))
             pickle.dump((command, str(cwd or Path.cwd()), (out.name, err.name)), self._orders)
@@ -121,6 +121,6 @@ class ForkServer:
 
 
 def _pipe() -> tuple[Any, Any]:
-    """What is read from, and what is written to."""
+    """Return the two ends of a pipe, for reading and for writing."""
     ends = os.pipe()
     return os.fdopen(ends[0], "rb"), os.fdopen(ends[1], "wb")

@@ -1,4 +1,4 @@
-"""Files that were whole, damaged in ways that follow from a seed."""
+"""Damage valid files in ways that depend on a seed."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ VALUES = [*SCALARS, [], [[]], {}, {"x": 1}, [None], json.loads("[" * 150 + "]" *
 ARRAYS = (np.zeros(0), np.array("x"), np.full((2, 4, 4), np.nan), np.array(2**63, np.uint64), np.array([True]), None)
 
 
-def damaged(name: str, whole: bytes, seed: int) -> bytes:
-    """Another value in JSON, or in the first line of many; another array; brackets without end; else other bytes."""
+def damage(name: str, whole: bytes, seed: int) -> bytes:
+    """Return a damaged file: a changed JSON value, a changed array, endless brackets, or changed bytes."""
     if seed % 2 and name.endswith(".npz"):
-        return with_another_array(whole, seed)
+        return change_array(whole, seed)
     if seed % 2 and name.endswith((".json", ".jsonl")):
         first, *others = whole.splitlines() if name.endswith("l") else [whole]
-        return b"\n".join([json.dumps(twisted(json.loads(first), seed)).encode(), *others])
-    return b"[" * 100_000 if seed == 0 and name.endswith(".json") else flipped(whole, seed)
+        return b"\n".join([json.dumps(change_value(json.loads(first), seed)).encode(), *others])
+    return b"[" * 100_000 if seed == 0 and name.endswith(".json") else flip_bits(whole, seed)
 
 
-def with_another_array(whole: bytes, seed: int) -> bytes:
-    """The file with something else in place of an array, or without it."""
+def change_array(whole: bytes, seed: int) -> bytes:
+    """Return an .npz file with one array replaced or removed."""
     rng = random.Random(seed)
     arrays = dict(np.load(io.BytesIO(whole)))
     name, value = rng.choice(list(arrays)), rng.choice(ARRAYS)
@@ -43,8 +43,8 @@ def with_another_array(whole: bytes, seed: int) -> bytes:
     return file.getvalue()
 
 
-def flipped(whole: bytes, seed: int) -> bytes:
-    """Some bytes are others, or the end is missing."""
+def flip_bits(whole: bytes, seed: int) -> bytes:
+    """Return data with some flip_bits bits, or without its end."""
     rng = random.Random(seed)
     data = bytearray(whole)
     for _ in range(rng.choice((1, 3, 30))):
@@ -59,8 +59,8 @@ def _places(node: Any, path: tuple = ()) -> Iterator[tuple]:
         yield from _places(child, (*path, key))
 
 
-def twisted(whole: Any, seed: int) -> Any:
-    """A value of JSON is another one, or missing, or there once more under another key."""
+def change_value(whole: Any, seed: int) -> Any:
+    """Return JSON data with one value changed, removed, or repeated under another key."""
     rng = random.Random(seed)
     data = copy.deepcopy(whole)
     *way, last = rng.choice(list(_places(data)))

@@ -1,4 +1,4 @@
-"""Grasps by hand: the arm's base at the origin, the object 0.5 m in front of it (along x)."""
+"""Grasp poses for an arm base at the origin and an object 0.5 m in front of it (along x)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ NO_POINTS = np.zeros((0, 3))
 
 
 def grasp(lean_deg=0.0, heading_deg=0.0, closing_deg=0.0, at=CENTER):
-    """A grasp leaning from straight down towards a heading, turned by ``closing_deg`` about its own approach."""
+    """Return a grasp tilted from straight down towards a heading, turned by ``closing_deg`` about its approach axis."""
     heading = np.deg2rad(heading_deg)
     across = np.array([-np.sin(heading), np.cos(heading), 0.0])
     down = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))

@@ -1,4 +1,4 @@
-"""Files on which a plain read never ends, or takes all memory."""
+"""Files whose plain read never ends, or takes all memory."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Small models of our own, written by hand in the formats that are imported."""
+"""Write small models in the formats that can be imported."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def box(size=(0.06, 0.05, 0.1), at=(0.0, 0.0, 0.0)) -> trimesh.Trimesh:
 
 
 def obj_text(mesh: trimesh.Trimesh, *, head="mtllib skin.mtl", use="usemtl skin", uvs=True) -> str:
-    """An OBJ with the texture coordinates (V, 2), or with all of them in the middle of the image, or with none."""
+    """Return an OBJ with texture coordinates: (V, 2), the center of the image (True), or none (False)."""
     lines = [head] if head else []
     lines += [f"v {x:.8f} {y:.8f} {z:.8f}" for x, y, z in mesh.vertices]
     lines += [f"vt {u:.6f} {v:.6f}" for u, v in ([[0.5, 0.5]] if isinstance(uvs, bool) else uvs)]
@@ -52,7 +52,7 @@ def write_obj(folder: Path, name="mug", mesh=None, *, mtl="newmtl skin\nmap_Kd s
 
 
 class Gltf:
-    """Builds a GLB: one primitive of one mesh, unless its JSON is changed."""
+    """Builder of a GLB file with one primitive of one mesh; tests change its JSON."""
 
     def __init__(self, mesh: trimesh.Trimesh | None = None) -> None:
         mesh = box() if mesh is None else mesh
@@ -96,7 +96,7 @@ class Gltf:
         self.primitive["attributes"][name] = self.array(values, **more)
 
     def texture(self, image: Image.Image) -> int:
-        """An image in the file, as a texture; its number."""
+        """Add an image to the file as a texture; return the index of the texture."""
         stream = io.BytesIO()
         image.save(stream, "PNG")
         self.tree.setdefault("images", []).append({"bufferView": self.view(stream.getvalue()), "mimeType": "image/png"})
@@ -151,7 +151,7 @@ def write_mtl(folder, image):
 
 
 def write_library(folder, name):
-    """The OBJ, whose materials are in that file."""
+    """Write an OBJ whose materials are in the file `name`."""
     return write_obj(folder, color=None, mtl=None, head=f"mtllib {name}")
 
 
@@ -182,7 +182,7 @@ def write_glb(folder, image):
 
 
 def write_gltf(folder, name):
-    """The glTF, whose arrays are in that file."""
+    """Write a glTF whose arrays are in the file `name`."""
     gltf = Gltf()
     gltf.write(folder / "mug.glb")
     gltf.tree["buffers"][0]["uri"] = name
@@ -191,7 +191,7 @@ def write_gltf(folder, name):
 
 
 def shown_colors(mesh: trimesh.Trimesh) -> np.ndarray:
-    """(F, 3) sRGB colour that the import shows in the middle of each face, 0 to 255."""
+    """Return the imported sRGB colour at the center of each face, (F, 3), 0 to 255."""
     from asset_tools.visual import Appearance
 
     faces = np.arange(len(mesh.faces))
@@ -199,7 +199,7 @@ def shown_colors(mesh: trimesh.Trimesh) -> np.ndarray:
 
 
 def texels(mesh: trimesh.Trimesh, points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(N, 3) colours of the texture at points (N, 3) on faces (N,)."""
+    """Return the colours (N, 3) of the texture at points (N, 3) on faces (N,)."""
     visual: Any = mesh.visual
     weights = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], points)
     uv = np.einsum("nc,ncd->nd", weights, visual.uv[mesh.faces[faces]])
@@ -210,7 +210,7 @@ def texels(mesh: trimesh.Trimesh, points: np.ndarray, faces: np.ndarray) -> np.n
 
 
 def ball_dropped_into(hulls: Path, start: list[float], radius: float) -> np.ndarray:
-    """Where a ball comes to rest that is let go above a container held in place; the container's frame, m."""
+    """Drop a ball into a fixed container; return its resting position in the frame of the container, in m."""
     scene = sapien.Scene([physx.PhysxCpuSystem()])
     builder = scene.create_actor_builder()
     builder.add_multiple_convex_collisions_from_file(str(hulls))

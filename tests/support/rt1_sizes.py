@@ -1,4 +1,4 @@
-"""Small sizes of rt1, and norms that have seen images."""
+"""Small sizes of rt1, and normalization layers with statistics of images."""
 
 from torch import nn
 
@@ -20,7 +20,7 @@ SIZES = {
 
 
 def settle(network, *seen):
-    """Let the norms of a network take its inputs for what is usual; at first they know no image, and dim all."""
+    """Set the statistics of the normalization layers of a network from its inputs; initial ones suppress the signal."""
     norms = [module for module in network.modules() if isinstance(module, nn.BatchNorm2d)]
     before = [module.momentum for module in norms]
     for module in norms:

@@ -1,4 +1,4 @@
-"""Scenes of shipped configurations with changes."""
+"""Scenes of bundled configurations with changes."""
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.scenes.config import load_task_config
@@ -6,7 +6,7 @@ from robocas_ms3.scenes.model import SceneModel
 
 
 def load_scene(name: str = "pick_table_scattered", **changes: object) -> SceneModel:
-    """Load a shipped configuration, some of whose keys are replaced, with the builtin pack."""
+    """Load a bundled configuration with the builtin pack; keyword arguments replace its keys."""
     pack = load_pack("builtin")
     data = {**load_task_config(name).model_dump(mode="json"), **changes}
     return SceneModel.load(load_task_config(data), pack, pack)

@@ -1,4 +1,4 @@
-"""Sizes of a `small` that trains in seconds."""
+"""Sizes of the baseline `small` for tests, which train in seconds."""
 
 from robocas_ms3.baselines.small.config import View
 

@@ -1,7 +1,7 @@
-"""A baseline that trains in milliseconds.
+"""Stub baseline that trains in milliseconds.
 
-`python stub_baseline.py DATA OUT` trains it in several processes, as RANK and WORLD_SIZE say: an uninterrupted run,
-and one that crashes and continues.
+`python stub_baseline.py DATA OUT` trains it in several processes (RANK, WORLD_SIZE): an uninterrupted run, and a run
+that crashes and continues.
 """
 
 import sys
@@ -19,9 +19,9 @@ from robocas_ms3.evaluation.policy import PolicySpec
 
 class StubConfig(BaselineConfig):
     width: int = 4
-    broken_at: int = -1  # sample whose target is no number
-    damaged_at: int = -1  # sample that can't be read
-    steep_at: int = -1  # sample whose loss is a number, and whose gradient is none
+    broken_at: int = -1  # sample with a NaN target
+    damaged_at: int = -1  # sample that cannot be read
+    steep_at: int = -1  # sample with a finite loss and a NaN gradient
     train: TrainSettings = TrainSettings(
         steps=40, batch_size=4, log_every=4, validate_every=20, save_every=10, warmup_steps=3, ema=0.9, precision="fp32"
     )
@@ -45,7 +45,7 @@ class StubSamples:
 
     def __getitems__(self, indices):
         if self.damaged_at in indices:
-            raise DatasetError("damaged", where=f"sample {self.damaged_at}", fix="Mend it.")
+            raise DatasetError("damaged", where=f"sample {self.damaged_at}", fix="Repair it.")
         return {"x": self.x[indices], "y": self.y[indices], "steep": self.steep[indices]}
 
 
@@ -53,16 +53,16 @@ class StubModel(torch.nn.Module):
     def __init__(self, config, facts):
         super().__init__()
         layers = torch.nn.Linear(facts["inputs"], config.width), torch.nn.Linear(config.width, 1)
-        self.net = torch.nn.Sequential(layers[0], torch.nn.Dropout(0.3), layers[1])  # random, so that a resume has to
-        # have the generator's state too
+        self.net = torch.nn.Sequential(layers[0], torch.nn.Dropout(0.3), layers[1])  # random, so that a continued run
+        # needs the state of the generator
 
     def forward(self, batch):
         error = (self.net(batch["x"]) - batch["y"]).square().mean()
         if batch["steep"].any():
             error = error + (0 * self.net[0].weight).sum().sqrt()
         high = batch["x"][:, 0].clamp(min=0)
-        told = torch.stack([high.sum(), (high > 0).sum()])  # what not every sample tells
-        return {"loss": error, "double": 2 * error.detach(), "high": told}
+        high_sum = torch.stack([high.sum(), (high > 0).sum()])  # a metric of only some samples
+        return {"loss": error, "double": 2 * error.detach(), "high": high_sum}
 
 
 class StubPolicy:

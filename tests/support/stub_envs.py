@@ -1,10 +1,10 @@
-"""Environments of a few lines for `ppo`."""
+"""Small environments for `ppo`."""
 
 import torch
 
 
 class LeftOrRight:
-    """Rewards an action with the sign of the observation; episodes of a few steps."""
+    """Env that rewards actions with the sign of the observation, in short episodes."""
 
     STEPS = 4
 

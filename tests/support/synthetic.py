@@ -1,4 +1,4 @@
-"""A small made-up recording, and a ray caster that shows it: trajectories and frames without a simulator."""
+"""Synthetic recordings, and a ray caster that renders them: trajectories and frames without a simulator."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from robocas_ms3.datasets.sources.episode_source import CameraModel, StepImages
 from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES, standard_camera_parent
 from robocas_ms3.robots.description import MOBILE_PANDA
 
-STEPS = 22  # control steps: with a stride of 4 the last dataset step is a short one
+STEPS = 22  # control steps; with a stride of 4 the last dataset step is shorter
 SIZE = (64, 48)
 TABLE = ((0.3, 0.6, 0.0), (1.5, 1.4, 0.61))
 ROOM = ((-3.0, -3.0, 0.0), (3.0, 3.0, 4.0))
-HALF = 0.05  # of the cubes on the table
+HALF = 0.05  # m, half the edge of the cubes on the table
 COLOURS = np.array([[90, 90, 90], [200, 160, 100], [220, 40, 40], [40, 200, 60], [40, 60, 220]], np.uint8)
 
 
@@ -31,7 +31,7 @@ def pose(xyz, rotation=None):
 
 
 def looking(eye, at):
-    """OpenCV camera (x right, y down, z forward) at a place, looking at another, not rolled."""
+    """Return the pose of an OpenCV camera (x right, y down, z forward) at `eye` that looks at `at`, without roll."""
     z = np.subtract(at, eye) / np.linalg.norm(np.subtract(at, eye))
     x = np.cross(z, [0, 0, 1])
     x /= np.linalg.norm(x)
@@ -48,12 +48,12 @@ CAMERA_IN_PARENT = {
 
 
 def render_by(renderer, convert):
-    """Return a conversion that renders with another renderer, whatever its settings say."""
+    """Return a conversion function that uses another renderer than its settings."""
     return lambda settings, **more: convert(replace(settings, open_renderer=renderer), **more)
 
 
 class RayCaster:
-    """A ``Renderer``: floor, room, table and a cube for each actor."""
+    """``Renderer`` of a room with a floor, a table and a cube for each actor."""
 
     def __init__(self, env_info, control_mode, image_options=None):
         self.image_options = (image_options or ImageOptions()).choose(STANDARD_CAMERA_NAMES, "here")
@@ -82,7 +82,7 @@ class RayCaster:
 
     def intrinsic(self):
         width, height = self.size
-        return np.array([height / 2, height / 2, width / 2, height / 2])  # 90 deg upright
+        return np.array([height / 2, height / 2, width / 2, height / 2])  # 90 deg vertical field of view
 
     def frames(self, recording, samples):
         motion = recording.motion(np.asarray(samples))
@@ -93,7 +93,7 @@ class RayCaster:
             wanted = {n: CAMERA_IN_PARENT[n] for n in self.image_options.cameras}
             shots = {n: self.shoot(parents[n] @ camera, boxes) for n, camera in wanted.items()}
             depth = {n: p[1] for n, p in shots.items() if self.image_options.depth}
-            masks = {n: p[2] == 2 for n, p in shots.items() if self.image_options.boxes}  # behind the table: the target
+            masks = {n: p[2] == 2 for n, p in shots.items() if self.image_options.boxes}  # after the table: the target
             found = {n: box for n, mask in masks.items() if (box := bounding_box(mask))}
             yield StepImages({n: p[0] for n, p in shots.items()}, depth, found)
 
@@ -119,7 +119,7 @@ def slab(eye, rays, box):
 
 
 def make_states(seed, steps=STEPS):
-    """States 0..S of a robot that reaches out, and of three cubes of which the first is lifted."""
+    """Return states 0..S of a robot that reaches out, and of three cubes, the first of which is lifted."""
     rng = np.random.default_rng(seed)
     t = np.linspace(0, 1, steps + 1)[:, None]
     qpos = np.zeros((steps + 1, 12))
@@ -142,7 +142,7 @@ def make_states(seed, steps=STEPS):
 
 
 def write_trajectory(path: Path, seeds=(3, 4, 5), failed=(), steps=STEPS):
-    """Write ``F.h5`` and ``F.json`` in the generator's form; gives the path."""
+    """Write ``F.h5`` and ``F.json`` as the generator does; return the path."""
     episodes = []
     with h5py.File(path, "w") as file:
         for number, seed in enumerate(seeds):
@@ -194,7 +194,7 @@ def write_trajectory(path: Path, seeds=(3, 4, 5), failed=(), steps=STEPS):
 
 
 def stub_embeddings(source, entries):
-    """Unit vectors in place of sentence embeddings, which take seconds to load."""
+    """Return unit vectors instead of sentence embeddings, whose model takes seconds to load."""
     texts = {text for entry in entries for text in source.texts(entry["source"])}
     return {text: np.eye(384, dtype=np.float32)[number] for number, text in enumerate(sorted(texts))}
 

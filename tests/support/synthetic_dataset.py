@@ -1,4 +1,4 @@
-"""A dataset that baselines can learn by heart."""
+"""Dataset that a baseline can memorize."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from robocas_ms3.datasets.conversion.settings import ConversionSettings
 
 
 def synthetic_dataset(folder: Path) -> Path:
-    """Six episodes of seven steps, 64 x 48 images, made-up embeddings; five are to train on."""
+    """Write six episodes of seven steps with 64 x 48 images and stub embeddings; five are for training."""
     trajectory = write_trajectory(folder / "F.h5", seeds=range(3, 9))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("robocas_ms3.datasets.conversion.convert.embed_texts", stub_embeddings)

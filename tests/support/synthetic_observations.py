@@ -1,4 +1,4 @@
-"""Observations and episodes for policies."""
+"""Synthetic observations and episodes for policies."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ def start(env=0, seed=0):
 
 
 def observe(envs=(0,), **values):
-    """Observations of some envs; zeros where no value is given, and a TCP that is not turned."""
+    """Return observations of some envs: zeros without a given value, and the identity as TCP rotation."""
     count = len(envs)
     robot = {
         "qpos": np.zeros((count, 12), np.float32),

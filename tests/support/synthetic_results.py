@@ -1,4 +1,4 @@
-"""Results that nobody measured, without a simulator."""
+"""Synthetic results, without a simulator."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RUN_OF = {
 
 
 def outcome(episode: int, came_to: int = 7, **others: Any) -> Outcome:
-    """An episode of pick that came to so many of the six stages and success, 10 steps of 0.05 s each."""
+    """Return the outcome of a pick episode that reached `came_to` of seven stages, each 10 steps of 0.05 s apart."""
     names = (*STAGES, "success")
     flags = {name: 10 * (at + 1) if at < came_to else None for at, name in enumerate(names)} | {"fail": None}
     success = flags["success"] is not None
@@ -52,7 +52,7 @@ def outcome(episode: int, came_to: int = 7, **others: Any) -> Outcome:
 
 
 def write(folder: Path, outcomes: Iterable[Outcome], **run: Any) -> Result:
-    """A folder of these episodes; what of ``run.json`` is other than usual by name."""
+    """Write a result with these outcomes; other arguments replace values of ``run.json``."""
     folder.mkdir(parents=True)
     (folder / RUN).write_text(json.dumps({**RUN_OF, **run}))
     (folder / OUTCOMES).write_text("".join(json.dumps(asdict(one)) + "\n" for one in outcomes))
@@ -60,7 +60,7 @@ def write(folder: Path, outcomes: Iterable[Outcome], **run: Any) -> Result:
 
 
 def of_protocol(folder: Path, protocol: LoadedProtocol) -> Result:
-    """A result with which nothing is wrong: every episode of a protocol succeeded."""
+    """Write a valid result in which every episode of a protocol succeeded."""
     outcomes = [
         outcome(one.episode, task=one.task, config=one.config, seed=one.seed, split=one.split, p_vis=one.p_vis)
         for one in protocol.episodes

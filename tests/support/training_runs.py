@@ -1,4 +1,4 @@
-"""Changes to training runs, and comparisons of them."""
+"""Change and compare training runs."""
 
 import csv
 import json
@@ -14,7 +14,7 @@ def train(name, data, out, changes=None, *, progress=None, device="cpu", **optio
 
 
 def stop_at(step, error):
-    """Progress that raises an error at a step."""
+    """Return a progress object that raises an error at a step."""
 
     def report(done, total):
         if done == step:
@@ -24,7 +24,7 @@ def stop_at(step, error):
 
 
 def read_log(folder, split=None):
-    """Lines of the log without the column of the clock."""
+    """Return the rows of the log without the column of times."""
     with (folder / "metrics.csv").open() as file:
         rows = [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
     return [row for row in rows if split in (None, row["split"])]
