@@ -169,9 +169,9 @@ def generated(out: Path, episodes: int) -> Path:
 
 def time_of(call: Callable[[], object]) -> tuple[float, float]:
     """Return the CPU and wall-clock seconds of a call."""
-    before, begun = cpu(), time.perf_counter()
+    before, start = cpu(), time.perf_counter()
     call()
-    return cpu() - before, time.perf_counter() - begun
+    return cpu() - before, time.perf_counter() - start
 
 
 def cpu() -> float:

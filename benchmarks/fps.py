@@ -171,17 +171,17 @@ def rate(env_id: str, count: int, mode: str, args: Args, kwargs: dict[str, Any])
         assert shape is not None
         device = env.unwrapped.device  # type: ignore[attr-defined]
         generator = torch.Generator(device).manual_seed(0)
-        steps, begun = 0, 0.0
+        steps, start = 0, 0.0
         for step in range(-10, args.steps):
             if step == 0:
                 _wait(device)
-                begun = time.perf_counter()
+                start = time.perf_counter()
             env.step(0.2 * (2 * torch.rand(shape, generator=generator, device=device) - 1))
             steps = step + 1
-            if step >= 0 and time.perf_counter() - begun > args.seconds:
+            if step >= 0 and time.perf_counter() - start > args.seconds:
                 break
         _wait(device)
-        return count * steps / (time.perf_counter() - begun)
+        return count * steps / (time.perf_counter() - start)
     finally:
         env.close()
 

@@ -46,9 +46,9 @@ def main(cfg: Benchmark) -> None:
         path, out = Path(folder) / "sample.yaml", Path(folder) / "out"
         path.write_text(yaml.safe_dump(sample_of(plan, cfg)), encoding="utf-8")
         command = [sys.executable, "-W", "ignore", "robocas_cli.py", "plan", "run", str(path), "--out", str(out)]
-        begun = time.monotonic()
+        start = time.monotonic()
         subprocess.run([*command, "--jobs", str(cfg.jobs)], check=True, stdout=subprocess.DEVNULL)
-        print(json.dumps(report(plan, cfg, read_status(out).parts, time.monotonic() - begun), indent=2))
+        print(json.dumps(report(plan, cfg, read_status(out).parts, time.monotonic() - start), indent=2))
 
 
 def sample_of(plan: Plan, cfg: Benchmark) -> dict[str, Any]:

@@ -93,9 +93,9 @@ def _one(trajectory: Path, ours: Path, size: tuple[int, int] | None) -> dict[str
 
 @contextmanager
 def _timed(report: dict[str, Any], name: str) -> Iterator[None]:
-    begun = time.perf_counter()
+    start = time.perf_counter()
     yield
-    report[name] = {"seconds": round(time.perf_counter() - begun, 1)}
+    report[name] = {"seconds": round(time.perf_counter() - start, 1)}
 
 
 def _compare(ours: Dataset, theirs: LeRobotDataset) -> dict[str, Any]:

@@ -63,11 +63,11 @@ def main(cfg: Benchmark) -> None:
         plan, out = Path(folder) / "soak.yaml", Path(folder) / "out"
         plan.write_text(yaml.safe_dump(plan_of(cfg)), encoding="utf-8")
         words = ["plan", "run", str(plan), "--out", str(out), "--jobs", str(cfg.jobs)]
-        begun = time.monotonic()
+        start = time.monotonic()
         process = subprocess.Popen([sys.executable, "-W", "ignore", "robocas_cli.py", *words], start_new_session=True)
         try:
-            memory = watch(process, begun + 60 * cfg.minutes)
-            wall = time.monotonic() - begun
+            memory = watch(process, start + 60 * cfg.minutes)
+            wall = time.monotonic() - start
             os.killpg(process.pid, signal.SIGINT)
             interrupted = time.monotonic()
             process.wait(60)

@@ -64,9 +64,9 @@ def main(args: Args) -> None:
         for _ in range(args.rounds):
             for name, (env, play, actions) in cases.items():
                 env.reset(seed=0)
-                begun = time.process_time()
+                start = time.process_time()
                 play(env, actions)
-                taken[name].append(1000 * (time.process_time() - begun) / args.steps)
+                taken[name].append(1000 * (time.process_time() - start) / args.steps)
     ratios = {
         f"{name} / {base}": round(float(np.median(np.divide(taken[name], taken[base]))), 2)
         for name, base in AGAINST.items()

@@ -119,10 +119,10 @@ def turn(env: Any, workers: Sequence[int], steps: int) -> tuple[float, float, fl
     env.reset(seed=0)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(steps)]
-    begun, own, before = time.perf_counter(), time.process_time(), [*map(cpu_of, workers)]
+    start, own, before = time.perf_counter(), time.process_time(), [*map(cpu_of, workers)]
     for action in actions:
         env.step(action)
-    wall, own = time.perf_counter() - begun, time.process_time() - own
+    wall, own = time.perf_counter() - start, time.process_time() - own
     spent = [cpu_of(pid) - earlier for pid, earlier in zip(workers, before, strict=True)]
     return wall, own, max(spent, default=0.0), sum(spent)
 

@@ -101,7 +101,7 @@ def _measure(dataset: Path, count: int) -> dict[str, float]:
     from browser import open_page  # pyright: ignore[reportMissingImports]
 
     with open_page() as page:
-        begun = time.perf_counter()
+        start = time.perf_counter()
         command = [sys.executable, str(ROOT / "robocas_cli.py"), "view", str(dataset), "--no-open"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
             assert server.stdout is not None
@@ -109,7 +109,7 @@ def _measure(dataset: Path, count: int) -> dict[str, float]:
             try:
                 address = re.search(r"http\S+", server.stdout.readline())
                 assert address, "robocas view printed no address"
-                found["server"] = time.perf_counter() - begun
+                found["server"] = time.perf_counter() - start
                 found.update(_page(page, address[0], count))
             finally:
                 server.terminate()
@@ -132,10 +132,10 @@ def _page(page: Any, url: str, count: int) -> dict[str, float]:
         "performance.getEntriesByType('resource').filter(entry => entry.name.includes('thumbnails'))"
         ".map(entry => entry.duration / 1000)"
     )
-    begun = time.perf_counter()
+    start = time.perf_counter()
     page.click(".row[data-episode='5']")
     wait(page, "document.querySelector('#summary').textContent.startsWith('Episode 5 ')")
-    opened = time.perf_counter() - begun
+    opened = time.perf_counter() - start
     wait(page, f"{CAMERAS}.every(img => img.src.includes('/images/5/')) && {CAMERAS}.{LOADED}")
     return {
         **{name.replace("-", "_"): seconds for name, seconds in paints},
@@ -145,7 +145,7 @@ def _page(page: Any, url: str, count: int) -> dict[str, float]:
         "a_thumbnail_median": statistics.median(loads),
         "a_thumbnail_slowest": max(loads),
         "click_to_episode": opened,
-        "click_to_images": time.perf_counter() - begun,
+        "click_to_images": time.perf_counter() - start,
     }
 
 

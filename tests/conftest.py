@@ -72,7 +72,7 @@ _DATA = pytest.StashKey[str]()
 
 @pytest.fixture(scope="session")
 def shared_dir() -> Path:
-    """Return the folder of reference material outside the project: $ROBOCAS_SHARED, or `shared` next to the checkout."""
+    """Return the folder of reference material: $ROBOCAS_SHARED, or `shared` next to the checkout."""
     folder = Path(os.environ.get("ROBOCAS_SHARED") or ROOT.parent / "shared")
     if not folder.is_dir():
         pytest.skip(f"no reference material: {folder} is not a folder (set ROBOCAS_SHARED)")

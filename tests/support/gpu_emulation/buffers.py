@@ -18,7 +18,7 @@ FROM_PACKED = [4, 5, 6, 0, 1, 2, 3, *range(7, BODY)]
 
 
 class Buffer:
-    """Stands in for SAPIEN's ``CudaArray``.
+    """Stand-in for SAPIEN's ``CudaArray``.
 
     Attributes:
         array: its memory on the host, which the emulated device shares and a CUDA device has a copy of.

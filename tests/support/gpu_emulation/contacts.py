@@ -12,7 +12,7 @@ from gpu_emulation.buffers import Buffer
 
 
 class ContactQuery:
-    """Stands in for SAPIEN's contact impulse queries.
+    """Stand-in for SAPIEN's contact impulse queries.
 
     Attributes:
         cuda_impulses: (Q, 3) N s, written by `Contacts.read`.

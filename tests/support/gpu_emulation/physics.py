@@ -29,7 +29,7 @@ _JOINT_BUFFERS = ("qpos", "qvel", "qf", "qacc", "target_qpos", "target_qvel")
 
 
 class EmulatedGpuSystem:
-    """Stands in for ``PhysxGpuSystem``.
+    """Stand-in for ``PhysxGpuSystem``.
 
     Attributes:
         cuda_rigid_body_data: (B + A L, `BODY`), dynamic bodies, then the links of each articulation.

@@ -40,7 +40,7 @@ class EmulatedScene(_Scene):
 
 
 class EmulatedDevice:
-    """Stands in for ``sapien.Device("cuda")``."""
+    """Stand-in for ``sapien.Device("cuda")``."""
 
     name, cuda_id = "emulated", 0
 
@@ -55,7 +55,7 @@ class EmulatedDevice:
 
 
 class EmulatedCameraGroup:
-    """Stands in for ``RenderCameraGroup``: cameras that render one after the other."""
+    """Stand-in for ``RenderCameraGroup``: cameras that render one after the other."""
 
     def __init__(self, cameras: Sequence[Any]) -> None:
         self._cameras = cameras
@@ -69,7 +69,7 @@ class EmulatedCameraGroup:
 
 
 class EmulatedRenderSystemGroup:
-    """Stands in for ``RenderSystemGroup``; it renders the poses of the CPU systems."""
+    """Stand-in for ``RenderSystemGroup``; it renders the poses of the CPU systems."""
 
     def __init__(self, scenes: Sequence[_Scene]) -> None:
         self._scenes = scenes
