@@ -1,4 +1,4 @@
-"""The benchmark's tasks: importing this package registers environments and robots with ManiSkill."""
+"""The tasks of the benchmark. Importing this package registers environments and robots with ManiSkill."""
 
 import logging
 from typing import Any
@@ -15,7 +15,7 @@ from robocas_ms3.tasks.select import RoboCASSelectEnv
 
 
 def env_class(name: str) -> Any:
-    """Return the environment class of a task, and register it with ManiSkill.
+    """Return the environment class of a task after registering it with ManiSkill.
 
     Raises:
         ExtensionError: the task is unknown, or its environment can't be loaded.
@@ -32,8 +32,8 @@ for _name in TASKS.builtin:
 for _robot in ROBOTS.builtin.values():
     load_object(_robot.agent)
 
-# Without a GPU each environment warns that rendering might be disabled, which a renderer on the CPU does as well.
-# The blank is in the logger's name.
+# Without a GPU ManiSkill warns for each environment that rendering might be disabled; software renderers work.
+# The name of ManiSkill's logger ends with a blank.
 logging.getLogger("mani_skill ").addFilter(
     lambda record: not record.getMessage().startswith("Requested to use render device")
 )

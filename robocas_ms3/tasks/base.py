@@ -1,4 +1,4 @@
-"""The environment of all tasks: the scene of a task configuration, whose target has to end up at a goal."""
+"""The base environment of all tasks: move the target in the scene of a task configuration to a goal."""
 
 from __future__ import annotations
 
@@ -41,29 +41,35 @@ STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "targ
 
 
 class RoboCASEnv(BaseEnv):
-    """Base of all tasks: move the target to the ``GOAL``, which is the basket unless a task says otherwise.
+    """Base class of all tasks: move the target to the ``GOAL``, by default the basket.
 
-    A task is a subclass with a ``SPEC``, which overrides ``evaluate``, ``reward_progress`` and
-    ``privileged_observations`` where it adds something. N envs, K object slots. A single env is rebuilt at each reset.
-    Several envs draw their objects once, and each reset draws a new layout and target.
+    A task is a subclass with a ``SPEC``. It may override ``evaluate``, ``reward_progress`` and
+    ``privileged_observations``. N envs, K object slots. A single env is rebuilt at each reset. Several envs draw their
+    objects when they are built; each reset draws a new layout and target.
 
     Args:
-        config: name, path or content of a task configuration; default: the task's own.
-        pack: name or folder of the pack of the objects; ``furniture_pack``: of room, furniture and basket.
-        visual_level: ``fast`` or ``full`` meshes to render.
-        layouts: where layouts come from; see `scenes.cache.layout_source`.
-        seeds: least and greatest seed that unseeded resets draw from; see `EpisodeSeeds`.
+        config: name, path or content of a task configuration; default: the task's default configuration.
+        pack: name or folder of the object pack.
+        furniture_pack: name or folder of the pack of room, furniture and basket.
+        visual_level: level of detail of the rendered meshes, ``fast`` or ``full``.
+        layouts: source of the layouts; see `scenes.cache.layout_source`.
+        seeds: least and greatest seed of unseeded resets; see `EpisodeSeeds`.
         robot_uids: name of the robot in `robots.registry`.
-        kwargs: passed to ``BaseEnv``; ``reconfiguration_freq`` is 1 for one env, 0 for several, unless it is given.
+        num_envs: N; more than 1 needs a GPU.
+        kwargs: arguments of ``BaseEnv``; ``reconfiguration_freq`` defaults to 1 for one env and 0 for several.
 
     Raises:
-        VectorEnvError: there are several envs and no GPU.
-        ConfigError: an argument is invalid; ExtensionError: the robot is unknown, or can't be loaded.
+        VectorEnvError: several envs were requested without a GPU.
+        ConfigError: an argument is invalid.
+        ExtensionError: the robot is unknown, or can't be loaded.
 
     Attributes:
-        present: (N, K) bool, which object slots are in use.
-        target_slot: (N,) slot of the target; ``is_target`` (N, K) bool has the same as flags.
-        start_poses: (N, K, 7) poses of the objects at the start of the episode; ``basket_start_poses`` (N, 7).
+        present: (N, K) bool, which object slots are used.
+        target_slot: (N,) slot of the target.
+        is_target: (N, K) bool, the same as flags.
+        start_poses: (N, K, 7) object poses at the start of the episode.
+        basket_start_poses: (N, 7) basket poses at the start of the episode.
+        renders_images: whether visual observations are rendered; otherwise images are zero.
     """
 
     SPEC: ClassVar[TaskSpec]
@@ -73,7 +79,7 @@ class RoboCASEnv(BaseEnv):
     SUPPORTED_REWARD_MODES = ("sparse", *DENSE, "none")  # the first is the default
 
     agent: MobileManipulator
-    renders_images = True  # else images are black
+    renders_images = True
 
     def __init__(
         self,
@@ -113,7 +119,7 @@ class RoboCASEnv(BaseEnv):
         return CameraConfig("render_camera", pose, 640, 480, np.pi / 3, 0.01, 20)
 
     def overview(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return a viewpoint of the task and the point to look at, (3,) each, world, m."""
+        """Return the position of the overview camera and the point at which it looks, (3,) each, world, m."""
         return over_the_shoulder(self.model)
 
     def _setup_sensors(self, options: dict) -> None:
@@ -123,7 +129,7 @@ class RoboCASEnv(BaseEnv):
 
     @property
     def scene_seeds(self) -> list[int]:
-        """The seed of each env's looks, which stay until the scene is rebuilt."""
+        """Seed of each env's appearance, which stays the same until the scene is rebuilt."""
         return [int(seed) for seed in cast("NDArray[np.int64]", self._episode_seed)]
 
     def _reconfigure(self, options: dict | None = None) -> None:
@@ -178,12 +184,15 @@ class RoboCASEnv(BaseEnv):
         self.gripper_contacts = Contacts(self.scene, gripper, self.objects)
 
     def reset(self, seed: int | list[int] | None = None, options: dict | None = None) -> tuple[Any, dict]:
-        """Reset; see ``BaseEnv``. The same seed gives the same layout, whichever envs are reset.
+        """Reset all envs or those of ``options["env_idx"]``; see ``BaseEnv``. A seed always gives the same layout.
 
-        With several envs a single seed is the first env's; the others take those after it, within the range of seeds.
+        Args:
+            seed: seed of each env; for a single seed, the first env gets it and the others get the next seeds within
+                the range of seeds. None: each env draws a seed.
+            options: options of ``BaseEnv.reset``.
 
         Raises:
-            LayoutError: there is no layout for a seed that was asked for, or for many that were drawn.
+            LayoutError: a requested seed, or each of many drawn seeds, has no layout.
             RobocasError: ``options`` has ``reset_to_env_states``.
         """
         options, envs = check_reset_options(options, self.num_envs, self.device)
@@ -227,16 +236,22 @@ class RoboCASEnv(BaseEnv):
         return self.seeds.layout(env)
 
     def get_state_dict(self) -> dict:
-        """Return the state in ManiSkill's form, from one read of all bodies, and `extra_state`."""
+        """Return the state of all bodies in ManiSkill's format, and `extra_state`."""
         return {**self.bodies.split(self.bodies.read().clone()), **self.extra_state()}
 
     def extra_state(self) -> dict:
-        """Return targets of controllers, and the ``stages`` (N, stages) bool that were reached so far."""
+        """Return the targets of the controllers, and the reached ``stages`` (N, stages) bool."""
         task = {"stages": self.success_check.reached.T.clone()}
         return {"controller": self.agent.controller.targets(), "task": task}
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
-        """Set the state. Without targets, the next action starts from where the robot is; without stages, they stay."""
+        """Set the state of some envs.
+
+        Args:
+            state: a state of `get_state_dict`. Without controller targets, the next action starts from the robot's
+                pose. Without stages, the reached stages stay unchanged.
+            env_idx: indices of the envs; None: all envs.
+        """
         super().set_state_dict(state, cast("torch.Tensor", env_idx))
         self.agent.controller.set_targets(state.get("controller"), env_idx)
         envs = slice(None) if env_idx is None else env_idx
@@ -245,7 +260,7 @@ class RoboCASEnv(BaseEnv):
 
     @property
     def object_states(self) -> torch.Tensor:
-        """(N, K, 13) states of the objects (`bodies.BODY`); don't write to it."""
+        """(N, K, 13) states of the objects (`bodies.BODY`); read only."""
         return self.bodies.objects(self.bodies.read())
 
     @property
@@ -255,7 +270,7 @@ class RoboCASEnv(BaseEnv):
 
     @property
     def basket_pose(self) -> torch.Tensor:
-        """(N, 7) pose of the basket in the world, where the scene has one; don't write to it."""
+        """(N, 7) pose of the basket in the world; read only. The scene must have a basket."""
         pose = self.bodies.basket(self.bodies.read())
         assert pose is not None, "there is no basket in this scene"
         return pose
@@ -271,18 +286,22 @@ class RoboCASEnv(BaseEnv):
         return self.object_assets[env][int(self.target_slot[env])]
 
     def gripper_forces(self) -> torch.Tensor:
-        """(N, 3, K, 3) N: force of each object on left finger, right finger and hand, world frame."""
+        """Return the forces (N, 3, K, 3) in N of each object on left finger, right finger and hand, world frame."""
         return as_tensor(self.gripper_contacts.forces())
 
     def grasped(self) -> torch.Tensor:
-        """(N, K) bool: which objects both fingers hold right now."""
+        """Return (N, K) bool, which objects both fingers hold."""
         return as_tensor(self.success_check.grasped(self.gripper_contacts.forces()))
 
     def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict]:
-        """Step; see ``BaseEnv``. Raises SimulationError where PhysX ran out of memory on a GPU and dropped contacts."""
+        """Execute an action; see ``BaseEnv``.
+
+        Raises:
+            SimulationError: PhysX ran out of memory on the GPU and dropped contacts.
+        """
         self._engine_errors.check()
         plain = self._obs_mode == "none" and self._reward_mode == "none" and isinstance(action, np.ndarray)
-        # BaseEnv's step takes longer on a CPU where neither observation nor reward is wanted
+        # without observation and reward, BaseEnv.step has an overhead on a CPU
         if not plain or self.gpu_sim_enabled or action.shape != self._orig_single_action_space.shape:
             return super().step(action)
         engine.step_without_observation(self, action)
@@ -297,7 +316,12 @@ class RoboCASEnv(BaseEnv):
         return self.success_check.success_conditions()
 
     def instruction(self, env: int = 0, target: str = "") -> Instruction:
-        """Return the instruction of an env; with ``target`` the one it would have if its target had that name."""
+        """Return the instruction of an env.
+
+        Args:
+            env: index of the env.
+            target: another name for the target; default: the name of its asset.
+        """
         name, seed = target or self.target_asset(env).asset.name, int(self.seeds.layout_seeds[env])
         return episode_instruction(self.task_config, self.layout(env), seed, name, self.object_names(env))
 
@@ -314,12 +338,12 @@ class RoboCASEnv(BaseEnv):
         return {**privileged, "tcp_pose": as_tensor(self.tcp_in_world())}
 
     def privileged_observations(self) -> dict[str, torch.Tensor]:
-        """Return privileged state, (N, D) each, in the order of the flat state; see docs/rl.md."""
+        """Return the privileged observations, (N, D) each, in the order of the flat state; see docs/rl.md."""
         return privileged_observations(self)
 
     def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
         last = self._last_obs.get("sensor_data") if isinstance(self._last_obs, dict) else None
-        if self.renders_images or last is None:  # None: point clouds, made of images
+        if self.renders_images or last is None:  # None: point clouds, which are computed from images
             return super()._get_obs_sensor_data(apply_texture_transforms)
         return {camera: {kind: torch.zeros_like(of) for kind, of in kinds.items()} for camera, kinds in last.items()}
 
@@ -342,7 +366,7 @@ class RoboCASEnv(BaseEnv):
         return self.dense_reward.compute(self.reward_progress(), penalties, action, info)
 
     def reward_progress(self) -> tuple[Array, dict[str, Array]]:
-        """Return how far the envs are; see `Goal.progress`."""
+        """Return the stage and the reward terms of each env; see `Goal.progress`."""
         return self.goal.progress(self.success_check.state, self.success_check.stages["target_lifted"], self.REWARDS)
 
     def compute_normalized_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Poses and velocities of all bodies, and contact forces, read from a scene at once, not actor by actor."""
+"""Read poses and velocities of all bodies, and contact forces, from a scene in one call instead of one per actor."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from robocas_ms3.core.arrays import Array, as_tensor
 from robocas_ms3.core.errors import RobocasError
 
 BODY = 13
-"""Numbers of a body: position m, quaternion wxyz, linear velocity m/s, angular velocity rad/s, all in the world."""
-_PACKED_BODY = [4, 5, 6, 0, 1, 2, 3, *range(7, BODY)]  # a body as SAPIEN packs it: the quaternion comes first
-_PACKED_PER_JOINT = 4  # the positions of all joints, then their velocities, and what is not read here
+"""Length of a body's state: position m, quaternion wxyz, linear velocity m/s, angular velocity rad/s, world frame."""
+_PACKED_BODY = [4, 5, 6, 0, 1, 2, 3, *range(7, BODY)]  # SAPIEN packs the quaternion before the position
+_PACKED_PER_JOINT = 4  # positions of all joints, then velocities, then values that are not read here
 
-# m between bodies that can't have touched in the last physics step, at whose beginning contacts are found: more than
-# they go in 10 ms, at 4 m/s, and where PhysX begins to look for contacts
+# Bodies with this distance in m can't have touched in the last physics step of 10 ms: it is more than the motion at
+# 4 m/s plus the distance at which PhysX creates contacts.
 _NEAR = 0.05
 
 _Boxes = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -28,21 +28,21 @@ _Batch = TypeVar("_Batch", torch.Tensor, NDArray[np.float32])
 
 
 class Bodies:
-    """Reads the state of all bodies of a scene, in the layout of ManiSkill's flat states.
+    """The states of all bodies of a scene, in the format of ManiSkill's flat states.
 
-    First come the A actors that can move, ``BODY`` numbers each, then of each articulation its root, qpos and qvel.
+    A state has ``BODY`` numbers for each of the A movable actors, then root state, qpos and qvel of each articulation.
 
-    On a CPU that is one call of SAPIEN's, and its result is kept while the scene's bytes stay the same, so it is
-    never out of date. On a GPU it is gathered from the buffers each time.
+    On a CPU one call of SAPIEN returns the packed state; the result is reused while the packed bytes are unchanged. On
+    a GPU the state is gathered from the buffers at each call.
 
     Args:
-        scene: ready to be simulated.
-        robot: what `others` leaves out.
-        objects: the actors that `objects` reads, built one after the other.
-        basket: the actor that `basket` reads, if there is one.
+        scene: a scene that is ready to be simulated.
+        robot: the articulation that `state_except_robot` omits.
+        objects: the actors that `objects` returns; they were built one after the other.
+        basket: the actor that `basket` returns, if the scene has one.
 
     Raises:
-        RobocasError: this version of SAPIEN packs states otherwise.
+        RobocasError: the installed version of SAPIEN packs states differently.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Bodies:
             self._state = torch.empty(0)
 
     def read(self) -> torch.Tensor:
-        """(N, D) float32: the state of each env. It stays as it is while the world moves on; don't write to it."""
+        """Return the states (N, D) float32 of all envs; read only. Later steps don't change the returned tensor."""
         if self._scene.gpu_sim_enabled:
             return self._gather()
         packed = self._px.pack()
@@ -88,33 +88,33 @@ class Bodies:
 
     @property
     def state_except_robot(self) -> tuple[bytes, bytes] | None:
-        """All but the robot at the last `read`, to be compared: the same means that nothing moved; None on a GPU."""
+        """Packed state of all bodies except the robot at the last `read`, for comparisons; None on a GPU."""
         if self._scene.gpu_sim_enabled:
             return None
         return self._packed[: self._robot.start], self._packed[self._robot.stop :]
 
     def actor_states(self, state: torch.Tensor) -> torch.Tensor:
-        """(N, A, 13) the actors' part of a state (N, D), in the order of ``actors``."""
+        """Return the states (N, A, 13) of the actors from a state (N, D), in the order of ``actors``."""
         count = len(self._actors)
         return state[:, : count * BODY].view(-1, count, BODY)
 
     def objects(self, state: torch.Tensor) -> torch.Tensor:
-        """(N, K, 13) the objects' part of a state (N, D); a view."""
+        """Return the states (N, K, 13) of the objects from a state (N, D); a view."""
         return self.actor_states(state)[:, self._objects]
 
     def basket(self, state: torch.Tensor) -> torch.Tensor | None:
-        """(N, 7) the basket's pose in a state (N, D), a view; None where there is no basket."""
+        """Return the pose (N, 7) of the basket from a state (N, D), a view; None if the scene has no basket."""
         return None if self._basket is None else self.actor_states(state)[:, self._basket, :7]
 
     def split(self, states: _Batch) -> dict[str, dict[str, _Batch]]:
-        """Name the parts of states (..., D), as ManiSkill does: ``{"actors": {name: (..., 13)}, ...}``; all views."""
+        """Split states (..., D) into ManiSkill's dictionary ``{"actors": {name: (..., 13)}, ...}`` of views."""
         return {
             kind: {name: states[..., columns] for name, columns in found.items()}
             for kind, found in self._columns.items()
         }
 
     def _packed_order(self, robot: Articulation) -> tuple[NDArray[np.int64], slice]:
-        """Which of SAPIEN's packed numbers each number of a state is, and which of its bytes are the robot's."""
+        """Return the index of each state component in SAPIEN's packed numbers, and the robot's slice of the bytes."""
         dynamic: list[Any] = self._px.rigid_dynamic_components
         first = {body: i * BODY for i, body in enumerate(dynamic)}
         order = [first[actor._bodies[0]] + k for actor in self._actors for k in _PACKED_BODY]
@@ -125,8 +125,9 @@ class Bodies:
                 start += BODY + _PACKED_PER_JOINT * link.articulation.dof
         found = len(self._px.pack())
         if found != 4 * start:
-            fix = "Install the version of sapien that requirements.lock names."
-            raise RobocasError("SAPIEN packs states otherwise", expected=f"{4 * start} bytes", found=found, fix=fix)
+            fix = "Install the version of sapien in requirements.lock."
+            what = "unexpected size of SAPIEN's packed state"
+            raise RobocasError(what, expected=f"{4 * start} bytes", found=f"{found} bytes", fix=fix)
         for articulation in self._articulations:
             start = starts[articulation._objs[0]]
             order += [start + k for k in (*_PACKED_BODY, *range(BODY, BODY + 2 * articulation.max_dof))]
@@ -134,7 +135,7 @@ class Bodies:
         return np.array(order), slice(4 * start, 4 * (start + BODY + _PACKED_PER_JOINT * robot.max_dof))
 
     def set_object_poses(self, envs: torch.Tensor, poses: torch.Tensor) -> None:
-        """Put the objects of some envs somewhere at once, on a GPU; `ManiSkillScene._gpu_apply_all` tells PhysX.
+        """Set the object poses of some envs on a GPU; `ManiSkillScene._gpu_apply_all` then applies them.
 
         Args:
             envs: (E,) indices.
@@ -146,7 +147,7 @@ class Bodies:
         self._px.cuda_rigid_body_data.torch()[self._rows[envs, self._objects], :7] = poses
 
     def stop(self, envs: torch.Tensor) -> None:
-        """Take all velocities from some envs (E,) at once, on a GPU; see `set_object_poses`."""
+        """Set all velocities of some envs (E,) to zero on a GPU; see `set_object_poses`."""
         self._px.cuda_rigid_body_data.torch()[self._rows[envs].flatten(), 7:BODY] = 0.0
         for articulation in self._articulations:
             self._px.cuda_articulation_qvel.torch()[articulation._data_index[envs], : articulation.max_dof] = 0.0
@@ -170,14 +171,14 @@ def link_poses(scene: ManiSkillScene, links: Sequence[Link]) -> Array:
 
 
 class Contacts:
-    """Reads the forces between a few bodies and many objects, all pairs at once.
+    """The contact forces between a few bodies and many objects, read for all pairs in one pass.
 
-    ManiSkill asks for one pair at a time and, on a CPU, walks over all contacts again for each.
+    ManiSkill reads one pair at a time and, on a CPU, iterates over all contacts for each pair.
 
     Args:
-        scene: ready to be simulated.
-        bodies: B of them.
-        objects: K of them.
+        scene: a scene that is ready to be simulated.
+        bodies: B bodies.
+        objects: K objects.
     """
 
     def __init__(self, scene: ManiSkillScene, bodies: Sequence[Actor | Link], objects: Sequence[Actor | Link]) -> None:
@@ -187,7 +188,7 @@ class Contacts:
         if scene.gpu_sim_enabled:
             pairs = [
                 pair for b in bodies for o in objects for pair in zip(b._bodies, o._bodies, strict=True)
-            ]  # one an env
+            ]  # one pair per env
             self._query = self._px.gpu_create_contact_pair_impulse_query(pairs)
         else:
             self._bodies = [body._bodies[0] for body in bodies]
@@ -198,13 +199,13 @@ class Contacts:
             self._columns: dict[Any, int] = {body: i for i, body in enumerate(self._objects)}
 
     def forces(self, still: object = None) -> Array:
-        """Force that each object exerts on each body, summed over their contact points, in the last physics step.
+        """Return the force of each object on each body in the last physics step, summed over contact points.
 
         Args:
-            still: what is the same as at the last call only if the objects have not moved since; None: not known.
+            still: a value that changes when an object moves, such as `Bodies.state_except_robot`; None: unknown.
 
         Returns:
-            (N, B, K, 3) N, world frame, native (`arrays`); don't write to it.
+            (N, B, K, 3) N, world frame, native (`arrays`); read only.
         """
         if self._scene.gpu_sim_enabled:
             self._px.gpu_query_contact_pair_impulses(self._query)
@@ -226,7 +227,7 @@ class Contacts:
         return impulses / np.float32(self._px.timestep)
 
     def _apart(self, still: object) -> bool:
-        """Whether no object is near any body, on a CPU: then there is no need to look through a heap's contacts."""
+        """Return whether no object is near any body (on a CPU), so that the contacts need not be read."""
         if self._boxes is None or still is None or self._boxes[0] != still:
             self._boxes = still, _bounds(self._objects)
         low, high = _bounds(self._bodies)
@@ -236,7 +237,7 @@ class Contacts:
 
 
 def _bounds(bodies: list[Any]) -> _Boxes:
-    """Least and greatest corners (B, 3) of boxes around bodies, world."""
+    """Return least and greatest corners (B, 3) of the bounding boxes of bodies, world."""
     boxes = np.array([body.get_global_aabb_fast() for body in bodies])
     return boxes[:, 0], boxes[:, 1]
 
@@ -244,5 +245,5 @@ def _bounds(bodies: list[Any]) -> _Boxes:
 def contact_forces(
     scene: ManiSkillScene, bodies: Sequence[Actor | Link], objects: Sequence[Actor | Link]
 ) -> torch.Tensor:
-    """`Contacts.forces` of bodies that are asked for once."""
+    """Return `Contacts.forces` for a single query."""
     return as_tensor(Contacts(scene, bodies, objects).forces())

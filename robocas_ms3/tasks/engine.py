@@ -1,4 +1,4 @@
-"""Renderer and physics engine of a process: what they keep, the memory they get, and the errors they only print."""
+"""Renderer and physics engine of a process: argument checks, memory limits, shader cache, errors of PhysX."""
 
 from __future__ import annotations
 
@@ -25,11 +25,10 @@ from robocas_ms3.core.text import format_error
 from robocas_ms3.scenes.config import TaskConfig
 from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ
 
-# What one env has at most, counted on a CPU (4 seeds of each shipped configuration, the arm moving about): 25 contact
-# points and 8 pairs of touching shapes per object, the robot's and the basket's included. Twice that, since PhysX drops
-# contacts when it runs out of memory.
+# Twice the greatest numbers of one env on a CPU (4 seeds of each bundled configuration, random arm motion): 25 contact
+# points and 8 pairs of touching shapes per object, robot and basket included. PhysX drops contacts without memory.
 CONTACTS_PER_OBJECT, PATCHES_PER_OBJECT = 50, 16
-CONTACTS_BESIDE, PATCHES_BESIDE = 100, 32  # of the robot, the furniture and the basket with each other
+BASE_CONTACTS, BASE_PATCHES = 100, 32  # between robot, furniture and basket
 STACK_PER_PATCH, TEMPORARY_PER_CONTACT = 512, 64  # bytes
 
 _OUT_OF_MEMORY = re.compile(
@@ -38,7 +37,7 @@ _OUT_OF_MEMORY = re.compile(
     re.IGNORECASE,
 )
 _FIX = (
-    "Contacts were lost, so results are worth nothing. Use fewer envs, or give what it names more room, such as "
+    "Contacts were dropped, so the results are invalid. Use fewer envs, or raise the limit that PhysX names, e.g. "
     "sim_config=dict(gpu_memory_config=dict(max_rigid_contact_count=2**23)); see docs/batched.md."
 )
 
@@ -51,34 +50,35 @@ def check_engine(
     obs_mode: str | None = None,
     **_: Any,
 ) -> None:
-    """Check arguments of an environment against what this machine and process can run.
+    """Check that this machine and process can run an environment with the given arguments.
 
     Raises:
-        VectorEnvError: there are several envs, and physics would run on a CPU, or PhysX does not start on the GPU.
-        ConfigError: there is no such level of detail, or images are observed and nothing is to be rendered.
+        VectorEnvError: several envs were requested and physics runs on a CPU, or PhysX does not start on the GPU.
+        ConfigError: the level of detail is unknown, or image observations were requested without a renderer.
     """
     if visual_level not in VISUALS:
         expected = f"one of {list(VISUALS)}"
         raise ConfigError("no such visual_level", where="visual_level", expected=expected, found=visual_level)
     if num_envs > 1 and (sim_backend in CPU_SIM_BACKENDS or not torch.cuda.is_available()):
         found = f"sim_backend={sim_backend!r}" if sim_backend in CPU_SIM_BACKENDS else "no CUDA device"
-        fix = "On a CPU use robocas_ms3.make_vec(env_id, num_envs), which runs them in processes."
+        fix = "On a CPU use robocas_ms3.make_vec(env_id, num_envs), which runs one environment per worker process."
         what = "several environments in one process need a GPU"
         raise VectorEnvError(what, where=f"num_envs={num_envs}", found=found, fix=fix)
     if num_envs > 1 or sim_backend.startswith(("physx_cuda", "cuda", "gpu")):
         _start_gpu_physics()
     if render_backend == "none" and obs_mode not in {None, "none", "state", "state_dict"}:
-        found, fix = f'"none", with obs_mode={obs_mode!r}', "Leave render_backend out."
+        found, fix = f'"none", with obs_mode={obs_mode!r}', "Remove the argument render_backend, or use a state mode."
         raise ConfigError("images need a renderer", where="render_backend", found=found, fix=fix)
 
 
 def _start_gpu_physics() -> None:
     try:
         sapien.physx.enable_gpu()
-    except Exception as error:  # requests' for a download, the driver's, or that PhysX runs on a CPU in this process
+    except Exception as error:  # of the download, of the driver, or because this process uses PhysX on a CPU
         fix = (
-            "SAPIEN downloads PhysX's library for GPUs once; offline, copy ~/.sapien/physx/ from another machine. "
-            'On the CPU: backend="processes" of make_vec, robocas eval --backend processes, robocas train --device cpu.'
+            "SAPIEN downloads PhysX's library for GPUs once; without a network copy ~/.sapien/physx/ from another "
+            'machine. To use the CPU: make_vec(backend="processes"), robocas eval --backend processes, '
+            "robocas train --device cpu."
         )
         what = "PhysX does not start on the GPU"
         raise VectorEnvError(what, where="sim_backend", found=format_error(error), fix=fix) from error
@@ -97,10 +97,10 @@ def sim_config(num_envs: int, config: TaskConfig) -> SimConfig:
 
 
 def gpu_memory(num_envs: int, objects: int) -> GPUMemoryConfig:
-    """Return the capacities of PhysX on a GPU for a number of envs with ``objects`` each; at least ManiSkill's."""
+    """Return the memory limits of PhysX on a GPU for ``num_envs`` envs with ``objects`` each; at least ManiSkill's."""
     least = GPUMemoryConfig()
-    contacts = num_envs * (CONTACTS_PER_OBJECT * objects + CONTACTS_BESIDE)
-    patches = num_envs * (PATCHES_PER_OBJECT * objects + PATCHES_BESIDE)
+    contacts = num_envs * (CONTACTS_PER_OBJECT * objects + BASE_CONTACTS)
+    patches = num_envs * (PATCHES_PER_OBJECT * objects + BASE_PATCHES)
     return GPUMemoryConfig(
         temp_buffer_capacity=max(least.temp_buffer_capacity, _power_of_2(TEMPORARY_PER_CONTACT * contacts)),
         max_rigid_contact_count=max(least.max_rigid_contact_count, _power_of_2(contacts)),
@@ -114,7 +114,7 @@ def _power_of_2(least: int) -> int:
 
 
 def step_without_observation(env: Any, action: NDArray[Any]) -> None:
-    """Make the control step of ``BaseEnv.step`` in a single env on a CPU, and nothing else."""
+    """Execute only the control step of ``BaseEnv.step``, in a single env on a CPU."""
     env.agent.set_action(torch.from_numpy(action.astype(np.float32, copy=False))[None])
     env._before_control_step()
     for _ in range(env._sim_steps_per_control):
@@ -127,15 +127,15 @@ def step_without_observation(env: Any, action: NDArray[Any]) -> None:
 
 
 def is_collection_due(device: sapien.Device | None, resets: int) -> bool:
-    """Return whether garbage is to be collected after a number of resets; a scene is 8 MB of it, 0.5 MB unrendered."""
+    """Return whether to collect garbage after a number of resets; a scene leaves 8 MB, without renderer 0.5 MB."""
     return resets % (20 if can_render(device) else 30) == 0
 
 
 def keep_renderer(device: sapien.Device | None) -> None:
-    """Keep SAPIEN's shaders and meshes in this process from one scene to the next, where a CPU renders.
+    """Keep SAPIEN's shaders and meshes in memory between scenes if a CPU renders.
 
-    With its last render system SAPIEN frees them: 6 s of CPU time for the first image of the next environment, 0.1 s
-    per scene.
+    SAPIEN frees them with its last render system. Loading them again takes 6 s of CPU time for the first image of the
+    next environment, and 0.1 s per scene.
     """
     if device is not None and device.is_cpu() and can_render(device):
         _render_system()
@@ -148,7 +148,7 @@ def _render_system() -> sapien.render.RenderSystem:
 
 
 class EngineErrors:
-    """Reads what this process writes to standard error: PhysX only prints there that it dropped contacts."""
+    """A monitor of standard error, to which PhysX prints that it dropped contacts without raising an error."""
 
     def __init__(self) -> None:
         self._log: IO[bytes] | None = None
@@ -159,10 +159,10 @@ class EngineErrors:
             self._log.seek(0, os.SEEK_END)
 
     def check(self) -> None:
-        """Check what was written since the last check.
+        """Check the output since the last check.
 
         Raises:
-            SimulationError: an engine of this process ran out of memory.
+            SimulationError: a physics engine of this process ran out of memory.
         """
         if self._log is None or os.fstat(self._log.fileno()).st_size == self._log.tell():
             return
@@ -180,10 +180,10 @@ _tees: list[tuple[subprocess.Popen, IO[bytes], os.stat_result]] = []  # each wit
 
 
 def _log_standard_error() -> str:
-    """Pass standard error on through ``tee``, which outlives a crash of this process; return the log file's name."""
+    """Copy standard error to a log file by ``tee``, which survives a crash of this process; return the file's name."""
     if not _tees or not os.path.samestat(os.fstat(2), _tees[-1][2]):
         log = tempfile.NamedTemporaryFile(prefix="robocas-stderr-")  # noqa: SIM115  (removed when the process ends)
-        # a session of its own: an interrupt is meant for this process
+        # a new session, so that Ctrl-C does not end tee
         tee = subprocess.Popen(
             ["tee", "-a", log.name], stdin=subprocess.PIPE, stdout=2, stderr=2, start_new_session=True
         )

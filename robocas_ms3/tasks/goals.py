@@ -1,7 +1,6 @@
-"""Where targets have to end up, one goal per task (`RoboCASEnv.GOAL`); that of the benchmark is the basket.
+"""Goals: where the target must be for success, one goal per task (`RoboCASEnv.GOAL`).
 
-N envs, K objects; all arrays native (`arrays`). ``basket`` is the pose (N, 7) of the scene's basket in the world; None
-where it has none.
+N envs, K objects; all arrays are native (`arrays`). ``basket`` is the pose (N, 7) of the basket in the world, or None.
 """
 
 from __future__ import annotations
@@ -15,22 +14,22 @@ from robocas_ms3.core import rotations
 from robocas_ms3.core.arrays import Array, known_all_true, to_native
 from robocas_ms3.tasks import rewards, terms
 
-_RIM = 0.05  # m around the basket's inside that still count as over it for a target that falls
-_DROP_HEIGHT, _LOWERING = 0.1, 0.25  # m above the basket's rim: where a carry leads; from where on lowering counts
-_FAR = 0.2  # m from there at which half of the carry is done
+_RIM = 0.05  # m around the basket's inside in which a falling target still counts as above the basket
+_DROP_HEIGHT, _LOWERING = 0.1, 0.25  # m above the basket's rim: end of the carry; start of the lowering
+_FAR = 0.2  # m from the end of the carry at which its reward is a half
 
 
 class TaskState(NamedTuple):
-    """What `RoboCASEnv.evaluate` found last.
+    """State of the task at the last `RoboCASEnv.evaluate`.
 
     Attributes:
-        objects: (N, K, 13) their states.
-        basket: (N, 7) its pose in the world; None where there is none.
-        held: (N,) bool, whether the target is held; so are the next ones.
-        touched: the gripper touches it.
-        at_goal: it is where it has to end up.
-        disturbed: (N, K) bool, which objects other than the target no longer stand as they stood.
-        forces: (N, 3, K, 3) N, of objects on left finger, right finger and hand, world frame.
+        objects: (N, K, 13) states of the objects.
+        basket: (N, 7) pose of the basket in the world; None if the scene has none.
+        held: (N,) bool, whether both fingers hold the target.
+        touched: (N,) bool, whether the gripper touches the target.
+        at_goal: (N,) bool, whether the target is at the goal.
+        disturbed: (N, K) bool, which objects other than the target were shifted or knocked over.
+        forces: (N, 3, K, 3) N, forces of objects on left finger, right finger and hand, world frame.
     """
 
     objects: Array
@@ -43,55 +42,55 @@ class TaskState(NamedTuple):
 
 
 class Goal(ABC):
-    """A goal of one environment, made when its scene is. Only ``holds`` is needed for sparse rewards.
+    """The goal of an environment, created with its scene. Sparse rewards need only ``is_at_goal``.
 
     Args:
         env: the `base.RoboCASEnv`.
     """
 
     NAME: ClassVar[str]
-    """Of its measure, ``in_basket``; the stage is ``target_in_basket``."""
+    """Name of its success condition, e.g. ``in_basket``; the stage is ``target_in_basket``."""
     REQUIRES_LIFT: ClassVar[bool] = True
     """Whether the target must have been lifted for success."""
     VECTOR_NAME: ClassVar[str] = "target_to_goal"
-    """Name of the observation of the way from the target's centre of mass to `point`."""
+    """Name of the observation of the vector from the target's centre of mass to `position`."""
 
     def __init__(self, env: Any) -> None:
         self.env = env
 
     @abstractmethod
     def is_at_goal(self, centers: Array, basket: Array | None) -> Array:
-        """Return which objects are at the goal, (N,) or (N, K), from their centres of mass (N, 3) or (N, K, 3)."""
+        """Return (N,) or (N, K) which objects are at the goal, from centres of mass (N, 3) or (N, K, 3)."""
 
     def success_conditions(self, basket: Array | None) -> dict[str, Array]:
-        """Return what else has to hold at the moment of success: (N,) bool each."""
+        """Return additional conditions of success by name, (N,) bool each."""
         return {}
 
     def is_lost(self, basket: Array | None, measures: dict[str, Array]) -> Array | None:
-        """Return in which envs (N,) the goal itself can't be reached any more; None: in none."""
+        """Return (N,) in which envs the goal can't be reached any more; None: in no env."""
         return None
 
     def is_over_goal(self, positions: Array, basket: Array | None) -> Array | None:
-        """Return which targets at (N, 3) m may be lower than where they stood, (N,) bool; None: none may."""
+        """Return (N,) which targets at positions (N, 3) m are above the goal and may fall into it; None: no target."""
         return None
 
     def position(self, basket: Array | None) -> Array | None:
-        """Return where the target's centre of mass is to be brought, (N, 3) m in the world; None: not at one point."""
+        """Return the position (N, 3) m, world, to which the target's centre of mass is carried; None: no fixed one."""
         return None
 
     def progress(self, now: TaskState, brought: Array, table: rewards.RewardTable) -> tuple[Array, dict[str, Array]]:
-        """Return how far an episode is, for dense rewards.
+        """Return the current stage and reward terms, for dense rewards.
 
         Args:
-            now: what `RoboCASEnv.evaluate` found.
+            now: state of the task.
             brought: (N,) bool, whether the target has been lifted.
-            table: the task's.
+            table: reward table of the task.
 
         Returns:
-            Stages (N,) of the table, and the terms that count in them by name, (N,) in [0, 1] each.
+            Stages (N,) as indices into ``table.stages``, and reward terms by name, (N,) in [0, 1] each.
 
         Raises:
-            NotImplementedError: the goal has no dense rewards; its task lists none in ``SUPPORTED_REWARD_MODES``.
+            NotImplementedError: the goal has no dense rewards; its task omits them in ``SUPPORTED_REWARD_MODES``.
         """
         raise NotImplementedError(f"{type(self).__name__} has no dense rewards")
 
@@ -103,7 +102,7 @@ class Goal(ABC):
 class InBasket(Goal):
     """The target's centre of mass is in the basket's inner volume, and the basket stands.
 
-    Lost where the basket has fallen: 10 cm lower, or tilted by 60 deg.
+    The goal is lost if the basket has fallen: it is 10 cm lower, or tilted by 60 deg.
     """
 
     NAME = "in_basket"
@@ -113,7 +112,7 @@ class InBasket(Goal):
         super().__init__(env)
         assert env.model.basket is not None, "the scene has no basket"
         inner = env.model.basket.asset.inner
-        assert inner is not None  # the model saw to it
+        assert inner is not None  # checked when the model is loaded
         low, high = (torch.tensor(corner, device=env.device) for corner in (inner.min, inner.max))
         aside = torch.tensor([_RIM, _RIM, torch.inf], device=env.device)
         self._inside = to_native(low), to_native(high)
@@ -124,7 +123,7 @@ class InBasket(Goal):
         return terms.is_inside_box(centers, *_split(basket), *self._inside)
 
     def position(self, basket: Array | None) -> Array:
-        """See `Goal`: over the middle of the basket's rim."""
+        """Return the position above the middle of the basket's rim; see `Goal`."""
         position, quaternion = _split(basket)
         return position + rotations.rotate(quaternion, self._drop)
 
@@ -140,11 +139,11 @@ class InBasket(Goal):
         return over & ~measures["basket_stands"]
 
     def is_over_goal(self, positions: Array, basket: Array | None) -> Array | None:
-        """See `Goal`: those above the basket."""
+        """Return which targets are above the basket; see `Goal`."""
         return terms.is_inside_box(positions, *_split(basket), *self._above)
 
     def progress(self, now: TaskState, brought: Array, table: rewards.RewardTable) -> tuple[Array, dict[str, Array]]:
-        """See `Goal`: grasp, lift, carry, place, release, rest."""
+        """Return the stage (grasp, lift, carry, place, release, rest) and the terms; see `Goal`."""
         env = self.env
         slot = to_native(env.target_slot)
         target, center = terms.select_target(now.objects, slot), env.target_center(now.objects)
@@ -157,7 +156,7 @@ class InBasket(Goal):
             0 * slot + table.index("grasp"),
             [
                 (now.held, table.index("lift")),
-                # a basket may stand lower than where the target stood
+                # the basket may be lower than the target's start
                 (now.held & brought, table.index("carry")),
                 (brought & over, table.index("place")),
                 (delivered, table.index("release")),

@@ -1,4 +1,4 @@
-"""Where everything is at the start of episodes, as tensors: from layouts one by one, or gathered from a table."""
+"""Initial states of episodes as tensors, converted from single layouts or gathered from a layout table."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from robocas_ms3.scenes.layout_table import LayoutTable, is_usable
 
 @dataclass(frozen=True)
 class InitialStates:
-    """Layouts of E envs. K object slots; world frame, metres, quaternions wxyz; on the envs' device.
+    """Layouts of E envs as tensors on the envs' device. K object slots; world frame, metres, quaternions wxyz.
 
     Attributes:
         object_poses: (E, K, 7) float32.
-        robot_poses: (E, 7) of the robot's root.
-        basket_poses: (E, 7); NaN where there is no basket.
-        targets: (E,) int64, slots.
-        present: (E, K) bool.
+        robot_poses: (E, 7) poses of the robot's root.
+        basket_poses: (E, 7); NaN if the scene has no basket.
+        targets: (E,) int64, slots of the targets.
+        present: (E, K) bool, which slots are used.
     """
 
     object_poses: torch.Tensor
@@ -36,6 +36,7 @@ class InitialStates:
 
     @classmethod
     def of(cls, layouts: Sequence[Layout], device: torch.device | str) -> InitialStates:
+        """Convert layouts to tensors on a device."""
 
         def poses(matrices: list[NDArray[np.float64]]) -> torch.Tensor:
             return torch.from_numpy(to_wxyz(np.stack(matrices)).astype(np.float32)).to(device)
@@ -50,7 +51,7 @@ class InitialStates:
         )
 
     def with_rows(self, rows: NDArray[np.bool_], others: InitialStates) -> InitialStates:
-        """Return these starts, in their order, where ``rows`` (E,) is True, and others elsewhere."""
+        """Return these states, in their order, in the rows (E,) that are True, and others in the remaining rows."""
         order = torch.from_numpy(np.argsort(np.argsort(~rows, kind="stable"))).to(self.targets.device)
         return InitialStates(
             **{
@@ -61,25 +62,30 @@ class InitialStates:
 
 
 class InitialStateTable:
-    """InitialStates of envs that keep their objects: a reset gathers them on the device.
+    """Initial states of envs that keep their objects; a reset gathers them on the device.
 
-    All layouts of these objects are in its memory, 0.4 kB each with ten objects. ``objects_seeds`` (N,) are the envs'.
+    The device holds all layouts of these objects, 0.4 kB per layout of ten objects.
+
+    Args:
+        table: the layout table.
+        objects_seeds: (N,) objects seed of each env.
+        device: device of the envs.
     """
 
     def __init__(self, table: LayoutTable, objects_seeds: NDArray[np.int64], device: torch.device | str) -> None:
         self._table, self._objects_seeds, self._device = table, objects_seeds, device
         there = table.find_records(objects_seeds, np.zeros_like(objects_seeds))[1]
         rows, self._row_of_env = np.unique(there, return_inverse=True)
-        taken = table.rows[rows]  # copied: records of any length, which tensors can't be made of
+        taken = table.rows[rows]  # a copy: torch can't convert the mapped records
         names = ("object_poses", "robot_pose", "basket_pose", "target", "present")
         self._kept = [torch.from_numpy(np.ascontiguousarray(taken[name])).to(device) for name in names]
 
     def is_usable(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which layouts (E,) of some envs, by their seeds (E,), exist and are good, as far as is known."""
+        """Return (E,) whether layouts exist and are not known to be unstable, by env (E,) and layout seed (E,)."""
         return is_usable(self._table.find_records(self._objects_seeds[envs], seeds)[0])
 
     def gather(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> InitialStates:
-        """Return the starts of some envs by the seeds (E,) of their layouts, all of which are good."""
+        """Return the initial states of some envs (E,) by their layout seeds (E,), which must be usable."""
         columns = self._table.find_records(self._objects_seeds[envs], seeds)[2]
         row, column = (torch.from_numpy(index).to(self._device) for index in (self._row_of_env[envs], columns))
         objects, robots, baskets, targets, present = (kept[row, column] for kept in self._kept)
@@ -87,7 +93,7 @@ class InitialStateTable:
 
 
 def place(env: Any, starts: InitialStates, envs: torch.Tensor) -> None:
-    """Put robot, furniture, basket and objects of some envs (E,) where their episodes start."""
+    """Set robot, furniture, basket and objects of some envs (E,) to their initial states."""
     with torch.device(env.device):
         qpos: Any = torch.as_tensor(env.agent.keyframes[env.task_config.robot_start].qpos, dtype=torch.float32)
         env.agent.reset(qpos.repeat(len(envs), 1))

@@ -1,4 +1,4 @@
-"""Whether objects stay where layouts put them, tried by the very engine that is to run them."""
+"""Check that the objects of layouts are stable in the physics engine that will run the episodes."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from robocas_ms3.scenes.layout_table import Engine, LayoutStatus, SeedPair
 from robocas_ms3.scenes.settle import CHECK_SECONDS, MAX_SHIFT
 from robocas_ms3.scenes.task_specs import TASKS
 
-_ENVS = {"cpu": 1, "gpu": 256}  # at once
+_ENVS = {"cpu": 1, "gpu": 256}  # number of envs that run at once
 _BACKENDS = {"cpu": "physx_cpu", "gpu": "physx_cuda"}
 
 
 def unchecked_layouts(cache: LayoutCache, engine: Engine) -> dict[int, list[int]]:
-    """Seeds of layouts that are to be tried, by objects seed."""
+    """Return the seeds of unchecked layouts by objects seed."""
     table = cache.table(engine)
     seeds: dict[int, list[int]] = {}
     for objects_seed, seed in table.pairs(LayoutStatus.UNCHECKED) if table else ():
@@ -29,21 +29,21 @@ def unchecked_layouts(cache: LayoutCache, engine: Engine) -> dict[int, list[int]
 def check_layouts(
     cache: LayoutCache, engine: Engine, seeds: dict[int, list[int]], **kwargs: Any
 ) -> Generator[tuple[SeedPair, float]]:
-    """Let an environment begin with each layout and do nothing for a second.
+    """Start an episode with each layout, hold the robot for one second, and measure the motion of the objects.
 
     Args:
-        cache: where the layouts are.
-        engine: that is to run them.
-        seeds: of layouts, by objects seed (`unchecked_layouts`).
-        kwargs: for ``gym.make``: the packs that the cache is of.
+        cache: cache of the layouts.
+        engine: physics engine to check.
+        seeds: layout seeds by objects seed (`unchecked_layouts`).
+        kwargs: arguments of ``gym.make``: the packs of the cache.
 
     Yields:
-        Objects seed and seed, and how far the object that moved farthest has moved then, m.
+        Seed pair, and the greatest shift of an object in m.
     """
     first_row = next(iter(seeds))
 
-    def layouts(objects_seed: int, seed: int) -> Layout:  # a cache as an env's own would tell what moves
-        known = objects_seed in seeds  # else the env is only being made
+    def layouts(objects_seed: int, seed: int) -> Layout:  # unlike the cache, it also returns unstable layouts
+        known = objects_seed in seeds  # otherwise the env is being built
         return cache.get(objects_seed, seed) if known else cache.get(first_row, first_row)
 
     count = min(_ENVS[engine], len(seeds))
@@ -79,5 +79,5 @@ def check_layouts(
 
 
 def status_of(moved: float) -> LayoutStatus:
-    """What is known of a layout whose objects moved that far, m."""
+    """Return the status of a layout from the greatest shift of its objects, m."""
     return LayoutStatus.STABLE if moved <= MAX_SHIFT else LayoutStatus.UNSTABLE

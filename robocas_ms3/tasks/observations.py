@@ -16,7 +16,7 @@ from robocas_ms3.scenes.model import SceneModel
 
 
 def privileged_observations(env: Any) -> dict[str, torch.Tensor]:
-    """Return the poses of objects and basket, and the target's position relative to TCP and goal, (N, D) each."""
+    """Return poses of objects and basket, and the target's position relative to TCP and goal, (N, D) each."""
     state, tcp = env.bodies.read(), env.tcp_in_world()
     objects, basket = env.bodies.objects(state), env.bodies.basket(state)
     center = env.target_center(to_native(objects))
@@ -36,7 +36,7 @@ def privileged_observations(env: Any) -> dict[str, torch.Tensor]:
 
 
 def in_tcp_frame(tcp: Array, vectors: Array) -> torch.Tensor:
-    """Return vectors (N, V, 3) of the world along the axes of poses (N, 7); both native (`arrays`)."""
+    """Rotate vectors (N, V, 3) from the world frame to the frames of poses (N, 7); both native (`arrays`)."""
     return as_tensor(vectors @ rotations.to_matrix(tcp[:, 3:]))
 
 
@@ -52,10 +52,10 @@ def over_the_shoulder(model: SceneModel) -> tuple[NDArray[np.float64], NDArray[n
 
 
 def place_camera(camera: CameraSpec, overview: tuple[NDArray[np.float64], NDArray[np.float64]]) -> CameraSpec:
-    """Return a camera as it is, or an overview camera at the viewpoint of the task."""
+    """Place an overview camera at the viewpoint of the task; return other cameras unchanged."""
     if not camera.overview:
         return camera
     eye, target = overview
-    eye = target + 0.75 * (eye - target)  # nearer than the render camera: it sees 90 deg instead of 60
+    eye = target + 0.75 * (eye - target)  # nearer than the render camera, since its field of view is 90 deg, not 60
     position, look_at = cast("list[Vec3]", [tuple(eye.tolist()), tuple(target.tolist())])
     return replace(camera, mount="world", position=position, look_at=look_at, overview=False)

@@ -1,9 +1,9 @@
-"""What lies on and around a target, as a camera above sees it: pure functions on batched tensors. N envs, K slots.
+"""Measure which objects hide or surround a target, seen from above. Pure functions on batched tensors; N envs, K slots.
 
-Objects are given as points on their surfaces, m. Each object's points are seen in a grid of square cells around the
-target, which keeps the highest one of each cell; comparing these height maps says what hides what. The camera is the
-one that p_vis is measured with (`scenes.visibility.top_down_camera`): it looks straight down, so that of the points on
-a ray the highest is the nearest.
+Objects are given as points on their surfaces, m. The points of each object are projected to a grid of square cells
+around the target; a height map keeps the highest point of each cell. Comparing height maps shows which object hides
+which. The camera is that of p_vis (`scenes.visibility.top_down_camera`). It looks straight down, so that the highest
+point on a ray is the nearest one.
 """
 
 from __future__ import annotations
@@ -14,26 +14,26 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-CELL = 0.005  # edge of a cell, m, where the target is
-CELLS = 64  # cells a side, so that what is seen within 0.16 m of the target's middle counts
-NEAREST = 0.05  # m below the camera; what is higher counts as if it were there
-MAX_HIDDEN_FRACTION = 0.2  # of a cleared target, the paper's
-MAX_OBSTACLES = 1  # around it, the same
-REACH = 2  # cells around the target's outline in which others count as neighbours: 1 cm
-LEAST_MOTION = 1e-4  # m, and of a quaternion's components: less changes nothing that counts in cells of 5 mm
-STAND_OFF = 0.02  # m between an obstacle and where its push begins
+CELL = 0.005  # edge of a cell at the target's depth, m
+CELLS = 64  # cells per side: the grid extends 0.16 m from the target's middle
+NEAREST = 0.05  # m below the camera; higher points are treated as if they were at this depth
+MAX_HIDDEN_FRACTION = 0.2  # greatest hidden fraction of a cleared target (paper)
+MAX_OBSTACLES = 1  # greatest number of obstacles around a cleared target (paper)
+REACH = 2  # cells (1 cm) around the target's outline in which objects count as neighbours
+LEAST_MOTION = 1e-4  # m and quaternion components; less motion has no effect in cells of 5 mm
+STAND_OFF = 0.02  # m between an obstacle and the start of its push
 
-_OUTSIDE = CELLS * CELLS  # number of the cell that takes what lies in none
-_NOTHING = -1e3  # height of an empty cell; finite, so that differences stay numbers
+_OUTSIDE = CELLS * CELLS  # index of the cell for points outside of the grid
+_NOTHING = -1e3  # height of an empty cell; finite, so that differences are finite
 
 
 class Clutter(NamedTuple):
-    """What is in the way of a target.
+    """Objects that hide or surround a target.
 
     Attributes:
-        hidden_fraction: (N,) share of the target's outline that others cover, 1 - p_vis.
-        obstacles: (N, K) bool, which others stick out above the target's mean height, visibly and within 1 cm of its
-            outline.
+        hidden_fraction: (N,) fraction of the target's outline that other objects cover, 1 - p_vis.
+        obstacles: (N, K) bool, which other objects are visible, higher than the target's mean height, and within 1 cm
+            of its outline.
     """
 
     hidden_fraction: Tensor
@@ -41,12 +41,12 @@ class Clutter(NamedTuple):
 
     @property
     def cleared(self) -> Tensor:
-        """(N,) bool, the paper's rule: at most a fifth is hidden, and fewer than two obstacles are left."""
+        """(N,) bool, the paper's rule: at most a fifth of the target is hidden, and at most one obstacle is left."""
         return (self.hidden_fraction <= MAX_HIDDEN_FRACTION) & (self.obstacles.sum(dim=1) <= MAX_OBSTACLES)
 
 
 def surface_points(poses: Tensor, points: Tensor) -> Tensor:
-    """Points fixed to objects, in the world.
+    """Transform points on objects to the world frame.
 
     Args:
         poses: (N, K, 7) position and unit quaternion wxyz.
@@ -66,29 +66,29 @@ def surface_points(poses: Tensor, points: Tensor) -> Tensor:
 
 
 def project_down(points: Tensor, eye: Tensor, depth: Tensor) -> Tensor:
-    """Where points appear to a camera that looks straight down.
+    """Project points to a horizontal plane, as seen by a camera that looks straight down.
 
     Args:
         points: (N, K, 3, P) in the world, m.
-        eye: (3,) the camera, world, m.
-        depth: (N,) m below the camera, where sizes are to stay as they are.
+        eye: (3,) position of the camera, world, m.
+        depth: (N,) m, depth of the plane below the camera.
 
     Returns:
-        (N, K, 2, P) along the world's x and y, from right below the camera, m at ``depth``.
+        (N, K, 2, P) m, coordinates in the plane along the world's x and y, relative to the camera.
     """
     below = (eye[2] - points[:, :, 2]).clamp(min=NEAREST)
     return (points[:, :, :2] - eye[:2, None]) * (depth[:, None, None] / below)[:, :, None]
 
 
 def has_moved_near(poses: Tensor, before: Tensor, radii: Tensor, target: Tensor, eye: Tensor) -> Tensor:
-    """Return whether anything that `clutter` looks at has moved, the targets included.
+    """Return whether an object that affects `clutter` has moved, targets included.
 
     Args:
-        poses: (N, K, 7) now.
-        before: the same, then.
-        radii: (N, K) of spheres about the objects' origins that hold them, m.
+        poses: (N, K, 7) current poses.
+        before: (N, K, 7) earlier poses.
+        radii: (N, K) radii of bounding spheres about the objects' origins, m.
         target: (N,) slots of the targets.
-        eye: (3,) the camera, world.
+        eye: (3,) position of the camera, world, m.
 
     Returns:
         (N,) bool.
@@ -97,26 +97,26 @@ def has_moved_near(poses: Tensor, before: Tensor, radii: Tensor, target: Tensor,
     near = torch.zeros_like(radii, dtype=torch.bool)
     for at in (poses, before):
         aside, below = at[..., :2] - eye[:2], (eye[2] - at[..., 2]).clamp(min=NEAREST)
-        above = (below - radii).clamp(min=NEAREST)  # where the camera would see the sphere farthest out
+        above = (below - radii).clamp(min=NEAREST)  # depth at which the sphere appears largest
         seen = aside / below[..., None]
         size = (aside.abs() + radii[..., None]) / above[..., None] - seen.abs()
-        # the target's outline, the cells around it, and one for where in its cell a point lies
+        # the target's outline, the cells around it, and one cell for rounding
         reach = size + size[env, target][:, None] + ((REACH + 1) * CELL / above[env, target])[:, None, None]
         near |= ((seen - seen[env, target][:, None]).abs() <= reach).all(dim=-1)
     return (((poses - before).abs() > LEAST_MOTION).any(dim=-1) & near).any(dim=-1)
 
 
 def clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor) -> Clutter:
-    """Measure what hides and surrounds the targets.
+    """Measure the hidden fraction of the targets, and find the obstacles around them.
 
-    A cell of the target is hidden where another object's highest point is above the target's. Gaps of one cell between
-    an object's points are closed.
+    A cell of the target is hidden if the highest point of another object is above the target's. Gaps of one cell
+    between the points of an object are closed.
 
     Args:
-        points: (N, K, 3, P) on the objects' surfaces, world.
-        present: (N, K) bool, slots that take part.
+        points: (N, K, 3, P) points on the objects' surfaces, world, m.
+        present: (N, K) bool, which slots are used.
         target: (N,) slots of the targets.
-        eye: (3,) the camera, world.
+        eye: (3,) position of the camera, world, m.
     """
     env = torch.arange(len(target), device=points.device)
     own = points[env, target]  # (N, 3, P)
@@ -125,7 +125,7 @@ def clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor) -> Clu
     outline = seen[env, target]
     middle = (outline.amin(dim=-1) + outline.amax(dim=-1)) / 2
     cells, heights = _cells(seen, middle), points[:, :, 2]
-    others = present.scatter(1, target[:, None], False)  # a number put at indices makes the host wait for a GPU
+    others = present.scatter(1, target[:, None], False)  # assigning by index would synchronise with a GPU
     others_cells = torch.where(others[..., None], cells, _OUTSIDE).flatten(1)
     top = _height_map(others_cells, heights.flatten(1))
 
@@ -136,7 +136,7 @@ def clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor) -> Clu
 
     around = _widened(filled.float(), REACH) > 0
     sticks_out = around & (top > at_target) & (top > own[:, 2].mean(dim=-1)[:, None, None])
-    # an object is an obstacle where one of its points is the highest of a cell that sticks out
+    # an object is an obstacle if one of its points is the highest of a cell that sticks out
     limit = torch.where(sticks_out, top, -_NOTHING).flatten(1)
     limit = pad(limit, (0, 1), value=-_NOTHING)
     highest = heights >= limit.gather(1, others_cells).view_as(heights)
@@ -144,15 +144,15 @@ def clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor) -> Clu
 
 
 def pairwise_occlusion(points: Tensor, present: Tensor, eye: Tensor) -> Tensor:
-    """How much of each object every other one would hide from the camera, if there were but these two.
+    """Return which fraction of each object is hidden by each other object alone.
 
     Args:
-        points: (N, K, 3, P) on the objects' surfaces, world.
-        present: (N, K) bool, slots that take part.
-        eye: (3,) the camera, world.
+        points: (N, K, 3, P) points on the objects' surfaces, world, m.
+        present: (N, K) bool, which slots are used.
+        eye: (3,) position of the camera, world, m.
 
     Returns:
-        (N, K, K) share, by row of the object that covers, by column of the one that is covered.
+        (N, K, K) hidden fractions; rows: the object that hides, columns: the object that is hidden.
     """
     count, slots = present.shape
     heights, shares = points[:, :, 2], []
@@ -170,11 +170,11 @@ def pairwise_occlusion(points: Tensor, present: Tensor, eye: Tensor) -> Tensor:
 
 
 def push_point(points: Tensor, obstacles: Tensor, target: Tensor) -> Tensor:
-    """Where the paper's push of the highest obstacle begins: clear of it, on the target's side, level with its middle.
+    """Return the start of the paper's push of the highest obstacle: clear of it, on the target's side, at mid-height.
 
     Args:
-        points: (N, K, 3, P) on the objects' surfaces, world.
-        obstacles: (N, K) bool, see `Clutter`; where there are none, the target's own middle is given.
+        points: (N, K, 3, P) points on the objects' surfaces, world, m.
+        obstacles: (N, K) bool, see `Clutter`; without obstacles the middle of the target is returned.
         target: (N,) slots of the targets.
 
     Returns:
@@ -192,24 +192,24 @@ def push_point(points: Tensor, obstacles: Tensor, target: Tensor) -> Tensor:
 
 
 def _cells(points: Tensor, middle: Tensor) -> Tensor:
-    """Number of the cell around ``middle`` (N, 2) that each of points (N, K, 2, P) lies in, (N, K, P)."""
+    """Return (N, K, P) the index of the cell of each point (N, K, 2, P) in the grid around ``middle`` (N, 2)."""
     cell = torch.floor((points - middle[:, None, :, None]) / CELL).long() + CELLS // 2
     inside = (cell >= 0) & (cell < CELLS)
     return torch.where(inside[:, :, 0] & inside[:, :, 1], cell[:, :, 0] * CELLS + cell[:, :, 1], _OUTSIDE)
 
 
 def _height_map(cells: Tensor, heights: Tensor) -> Tensor:
-    """Highest of points (N, P) in each cell, (N, CELLS, CELLS); ``_NOTHING``: none."""
+    """Return the height (N, CELLS, CELLS) of the highest point (N, P) in each cell; ``_NOTHING``: no point."""
     empty = torch.full((len(cells), _OUTSIDE + 1), _NOTHING, device=cells.device)
     return empty.scatter_reduce(1, cells, heights, "amax")[:, :_OUTSIDE].unflatten(1, (CELLS, CELLS))
 
 
 def _closed(maps: Tensor) -> Tensor:
-    """Close the holes that sampling leaves in height maps (N, M, CELLS, CELLS): dilated, then eroded."""
+    """Close holes between the sampled points in height maps (N, M, CELLS, CELLS): dilate, then erode."""
     return -_widened(-_widened(maps, 1), 1)
 
 
 def _widened(maps: Tensor, reach: int) -> Tensor:
-    """Greatest value within ``reach`` cells, along and across; on a CPU faster than `max_pool2d` by far."""
+    """Return the greatest value within ``reach`` cells in both directions; much faster than `max_pool2d` on a CPU."""
     across = pad(maps, (reach, reach), value=-torch.inf).unfold(-1, 2 * reach + 1, 1).amax(dim=-1)
     return pad(across, (0, 0, reach, reach), value=-torch.inf).unfold(-2, 2 * reach + 1, 1).amax(dim=-1)

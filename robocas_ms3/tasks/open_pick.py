@@ -17,9 +17,10 @@ from robocas_ms3.tasks.observations import in_tcp_frame
 
 
 class RoboCASOpenPickEnv(RoboCASEnv):
-    """Open and pick. The stages begin with ``furniture_opened``: the joint was past ``opening.opened_at`` of its range.
+    """Open a door or drawer and pick an object behind it.
 
-    Success is pick's: how the object got out is up to the policy.
+    The first stage is ``furniture_opened``: the joint was past ``opening.opened_at`` of its range. Success is that of
+    pick; it does not depend on how the policy took the object out.
     """
 
     SPEC = OPEN_PICK
@@ -27,7 +28,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
     REWARDS = rewards.OPEN_PICK
 
     def overview(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return a viewpoint above the basket's side, where an opening door does not hide the gripper."""
+        """Return a viewpoint above the basket's side, from which an opening door does not hide the gripper."""
         model, opening = self.model, self.task_config.opening
         assert opening is not None  # checked by the configuration
         assert model.basket_pose is not None
@@ -50,33 +51,33 @@ class RoboCASOpenPickEnv(RoboCASEnv):
         assert isinstance(furniture, Articulation)
         self._opening = furniture, [active.name for active in furniture.active_joints].index(joint.name)
         handle = self.model.furniture[opening.furniture].asset.handles[opening.handle]
-        # the frames of all parts coincide while everything is shut
+        # the frames of all parts coincide while the furniture is closed
         self._handle = furniture.links_map[handle.link], to_native(torch.tensor([handle.position], device=self.device))
 
     def opening_position(self) -> torch.Tensor:
-        """Return the position (N,) m or rad of the joint that has to be opened."""
+        """Return the position (N,) of the joint to open, m or rad."""
         furniture, joint = self._opening
         return furniture.get_qpos()[:, joint]
 
     def handle_in_world(self) -> Array:
-        """Return where the handle is, (N, 3) m, native (`arrays`)."""
+        """Return the position (N, 3) m of the handle in the world, native (`arrays`)."""
         link, position = self._handle
         pose = link_poses(self.scene, [link])[:, 0]
         return pose[:, :3] + rotations.rotate(pose[:, 3:], position)
 
     def furniture_opened(self) -> torch.Tensor:
-        """Return whether the furniture is open now, (N,) bool."""
+        """Return (N,) bool, whether the furniture is currently open."""
         goal, position = self.model.opened_position, self.opening_position()
         return position >= goal if goal > 0 else position <= goal
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Return what `RoboCASEnv.evaluate` does, and ``furniture_opened``."""
+        """Return the result of `RoboCASEnv.evaluate`, and ``furniture_opened`` (N,) bool."""
         found = super().evaluate()
         opened = self.success_check.reach("furniture_opened", to_native(self.furniture_opened()))
         return {**found, "furniture_opened": opened}
 
     def reward_progress(self) -> tuple[Array, dict[str, Array]]:
-        """See `RoboCASEnv`; the furniture must have been opened before the target may be grasped."""
+        """Return stage and terms; see `RoboCASEnv`. The stage ``open`` comes before the stage ``grasp``."""
         stage, found = super().reward_progress()
         shut = (stage == self.REWARDS.index("grasp")) & ~self.success_check.stages["furniture_opened"]
         if not known_all_false(shut):
@@ -89,7 +90,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
         return rewards.progress_fraction(to_native(self.opening_position()), 0.0, self.model.opened_position)
 
     def privileged_observations(self) -> dict[str, torch.Tensor]:
-        """Return those of `RoboCASEnv`, how far it is open (N, 1), 1 where that is enough, and where the handle is."""
+        """Return those of `RoboCASEnv`, ``opened_fraction`` (N, 1) of the required opening, and ``tcp_to_handle``."""
         tcp = self.tcp_in_world()
         return {
             **super().privileged_observations(),

@@ -7,6 +7,6 @@ from robocas_ms3.tasks.base import RoboCASEnv
 
 
 class RoboCASPickEnv(RoboCASEnv):
-    """Pick: the instruction names one of the objects on the support; it has to end up in the basket."""
+    """Pick the object named by the instruction and put it into the basket."""
 
     SPEC = PICK

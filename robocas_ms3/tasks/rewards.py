@@ -1,8 +1,8 @@
-"""Dense rewards: named terms in [0, 1], weighed by a task's table. Pure functions on arrays, as `terms`. N envs.
+"""Dense rewards: named terms in [0, 1], weighted by a task's table. Pure functions on arrays, as in `terms`. N envs.
 
-A task is a row of stages, and each env is in one of them at a time. The terms of the stages before it count in full,
-those of its own stage as far as they have come, those of later ones not at all. So whatever is in a later stage is
-worth at least as much as anything in an earlier one, and going back and forth within a stage earns nothing.
+A task is a sequence of stages, and each env is in one stage at a time. Terms of earlier stages count in full, terms of
+the current stage count with their values, terms of later stages don't count. So a later stage always has at least the
+reward of an earlier one.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from robocas_ms3.core.arrays import Array, as_float, as_tensor, clamp, norm, to_
 from robocas_ms3.tasks.occlusion import MAX_HIDDEN_FRACTION, MAX_OBSTACLES
 from robocas_ms3.tasks.terms import BASKET_SHIFT
 
-_MANY_OBSTACLES = 5  # more than a cleared target may have: counts as the worst
+_MANY_OBSTACLES = 5  # obstacles in addition to those of a cleared target at which the fraction is 0
 DENSE = ("normalized_dense", "dense", "progress")  # reward modes whose terms are computed
 
 
 @dataclass(frozen=True)
 class RewardTable:
-    """What a task's reward is made of.
+    """Stages, weights and penalties of a task's dense reward.
 
     Attributes:
-        stages: by name, in the order in which they are passed: the terms that count in each, and their weights.
-        penalties: by name, what share of the present stage's terms each takes off at most; they add up to less than 1.
+        stages: weights of the terms of each stage; stages by name, in their order.
+        penalties: greatest fraction of the current stage's terms that each penalty subtracts; the sum is below 1.
     """
 
     stages: dict[str, dict[str, float]]
@@ -64,16 +64,16 @@ OPEN_PICK = RewardTable({"open": {"handle": 1.0, "open": 3.0}, **_TRANSFER}, TRA
 def weigh(
     table: RewardTable, stage: Array, terms: dict[str, Array], penalties: dict[str, Array]
 ) -> tuple[Array, dict[str, Array]]:
-    """Return the reward of envs from the stages that they are in.
+    """Return the weighted reward of envs from their stages and terms.
 
     Args:
-        table: of the task.
-        stage: (N,) whole numbers, places in ``table.stages``; their count where the task has succeeded.
-        terms: by name, (N,) in [0, 1], how far each has come; what is missing has not come anywhere in its own stage.
-        penalties: by name, (N,) in [0, 1].
+        table: reward table of the task.
+        stage: (N,) indices into ``table.stages``; the number of stages for envs that have succeeded.
+        terms: values (N,) in [0, 1] of the terms by name; a missing term is 0 in its own stage.
+        penalties: values (N,) in [0, 1] of the penalties by name.
 
     Returns:
-        (N,) in [0, ``table.total``], and all terms by name as they count, (N,) in [0, 1].
+        Rewards (N,) in [0, ``table.total``], and the counted values (N,) in [0, 1] of all terms by name.
     """
     none = 0.0 * as_float(stage)
     kept = 1.0 - sum((share * penalties[name] for name, share in table.penalties.items()), none)
@@ -87,7 +87,7 @@ def weigh(
 
 
 def furthest_stage(first: Array, conditions: list[tuple[Array, int]]) -> Array:
-    """(N,) stages: that of the last condition (N,) that holds, and where none does, ``first`` (N,)."""
+    """Return (N,) the stage of the last condition (N,) that is true, or ``first`` (N,) if none is."""
     stage = first
     for condition, place in conditions:
         stage = where(condition, 0 * stage + place, stage)
@@ -95,53 +95,54 @@ def furthest_stage(first: Array, conditions: list[tuple[Array, int]]) -> Array:
 
 
 def closeness(points: Array, goals: Array, *, half: float = 0.1) -> Array:
-    """(N,) in (0, 1]: 1 where points (N, 3) are at their goals, a half where they are ``half`` metres away."""
+    """Return (N,) in (0, 1]: 1 for points (N, 3) at their goals, 0.5 at a distance of ``half`` metres."""
     return half / (half + norm(goals - points))
 
 
 def progress_fraction(value: Array, start: Array | float, by: float) -> Array:
-    """(N,) in [0, 1]: how much of the way from its start a value (N,) has risen, of a way of ``by``."""
+    """Return (N,) in [0, 1]: change of a value (N,) since its start, as a fraction of the change ``by``."""
     return clamp((value - start) / by, 0.0, 1.0)
 
 
 def clear_fraction(hidden_fraction: Array, obstacles: Array) -> Array:
-    """(N,) in [0, 1]: 1 where a target is cleared, less the more of it is hidden (N,) and the more obstacles (N,)."""
+    """Return (N,) in [0, 1]: 1 for a cleared target, less for larger hidden fractions (N,) and more obstacles (N,)."""
     hidden = clamp((hidden_fraction - MAX_HIDDEN_FRACTION) / (1 - MAX_HIDDEN_FRACTION), 0.0, 1.0)
     around = clamp((as_float(obstacles) - MAX_OBSTACLES) / _MANY_OBSTACLES, 0.0, 1.0)
     return 1 - (hidden + around) / 2
 
 
 def release_fraction(held: Array, touched: Array) -> Array:
-    """(N,) in [0, 1]: 0 while the gripper holds the target, a half while it only touches it, 1 after that."""
+    """Return (N,): 0 while the gripper holds the target, 0.5 while it only touches it, 1 without contact."""
     return 1 - (as_float(held) + as_float(held | touched)) / 2
 
 
 def stillness(linear_velocity: Array, angular_velocity: Array) -> Array:
-    """(N,) in [0, 1]: 1 at rest, 0 at velocities (N, 3) of 0.3 m/s or 5 rad/s and more."""
+    """Return (N,) in [0, 1]: 1 at rest, 0 at velocities (N, 3) of at least 0.3 m/s or 5 rad/s."""
     return 1 - clamp(norm(linear_velocity) / 0.3 + norm(angular_velocity) / 5.0, 0.0, 1.0)
 
 
 def count_fraction(count: Array) -> Array:
-    """(N,) in [0, 1]: a number of things (N,), 1 from 3 on."""
+    """Return (N,) in [0, 1]: a count (N,) divided by 3, at most 1."""
     return clamp(as_float(count) / 3, 0.0, 1.0)
 
 
 def shift_fraction(position: Array, position_before: Array) -> Array:
-    """(N,) in [0, 1]: how far a body at (N, 3) was shifted, 1 from 0.1 m on, as far as a basket may go."""
+    """Return (N,) in [0, 1]: shift of a body at (N, 3), relative to the 0.1 m that a basket may be moved."""
     return clamp(norm(position - position_before) / BASKET_SHIFT, 0.0, 1.0)
 
 
 def action_rate(action: Array, before: Array) -> Array:
-    """(N,) in [0, 1]: mean change of an action's components (N, A) since the last one, 1 from 2 on."""
+    """Return (N,) in [0, 1]: half the mean change of an action's components (N, A) since the last action."""
     return clamp(abs(action - before).mean(-1) / 2.0, 0.0, 1.0)
 
 
 class DenseReward:
-    """Weighs terms and penalties, and remembers the last action and reward.
+    """The dense reward of an environment, with the last action and reward.
 
     Attributes:
-        last_action: (N, A), NaN where there was none since the reset; None: none yet.
-        last_level: (N,) last normalized reward of the mode ``progress``, NaN where there was none since the reset.
+        last_action: (N, A) last action since the reset, NaN: none; None before the first action.
+        last_level: (N,) last normalized reward since the reset in the mode ``progress``, NaN: none; None before the
+            first reward.
     """
 
     def __init__(self, table: RewardTable, num_envs: int, device: torch.device) -> None:
@@ -158,7 +159,7 @@ class DenseReward:
         self.last_action = torch.as_tensor(action, device=self._device).reshape(self._num_envs, -1).clone()
 
     def increase(self, level: torch.Tensor) -> torch.Tensor:
-        """Return how much a reward (N,) has risen since the last step; 0 in the first one."""
+        """Return the change of a reward (N,) since the last step; 0 in the first step."""
         before = level if self.last_level is None else self.last_level
         self.last_level = level.clone()
         return (level - before).nan_to_num()
@@ -166,13 +167,13 @@ class DenseReward:
     def weigh(
         self, progress: tuple[Array, dict[str, Array]], penalties: dict[str, Array], action: Any, info: dict[str, Any]
     ) -> torch.Tensor:
-        """Return the reward (N,) in [0, total of the table], and add ``reward_terms`` to the info.
+        """Return the reward (N,) in [0, ``table.total``], and add ``reward_terms`` to the info.
 
         Args:
             progress: stages and terms, see `Goal.progress`.
-            penalties: by name, (N,) in [0, 1] each, native (`arrays`); the action's rate is added.
-            action: of this step.
-            info: of this step, from `RoboCASEnv.evaluate`.
+            penalties: values (N,) in [0, 1] by name, native (`arrays`); ``action_rate`` is added to them.
+            action: action of this step.
+            info: info of this step, from `RoboCASEnv.evaluate`.
         """
         stage, found = progress
         penalties = {**penalties, "action_rate": self._action_rate(action)}

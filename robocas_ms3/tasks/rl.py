@@ -1,4 +1,4 @@
-"""Arguments of environments for reinforcement learning."""
+"""Keyword arguments of environments for reinforcement learning."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.scenes.config import TaskConfig, load_config_for
 from robocas_ms3.scenes.task_specs import TASKS
 
-CONTROL_FREQ = 5  # Hz: `pd_ee_delta_pose` was made for it
-DRIVING_SECONDS = 30  # more where the base drives
+CONTROL_FREQ = 5  # Hz, the rate for which `pd_ee_delta_pose` is scaled
+DRIVING_SECONDS = 30  # additional time if the base drives
 
 
 def rl_kwargs(task: str, config: str | Path | dict | TaskConfig | None = None) -> dict[str, Any]:
-    """Return keyword arguments for ``gym.make`` and `make_vec` to train with: states, dense rewards, 5 Hz.
+    """Return arguments of ``gym.make`` and `make_vec` for training: state observations, dense rewards, 5 Hz.
 
-    ``max_episode_steps`` holds a demonstration (docs/rl.md). Where the configuration lets the base drive
-    (``base_motion``), actions move it too, and there are more steps.
+    ``max_episode_steps`` is long enough for a demonstration (docs/rl.md). If the base may drive (``base_motion``),
+    actions include the base, and the horizon is longer.
 
     Args:
-        task: its name, ``pick``, or environment, ``RoboCASPick-v1``.
-        config: the environment's; None: the task's own.
+        task: name of the task, ``pick``, or of its environment, ``RoboCASPick-v1``.
+        config: task configuration; None: the task's default configuration.
 
     Raises:
-        ConfigError: there is no such task or configuration, or the task can't run it.
+        ConfigError: the task or configuration does not exist, or they don't belong together.
     """
     spec = next((spec for spec in TASKS.values() if task in (spec.name, spec.env_id)), None)
     if spec is None:

@@ -15,22 +15,23 @@ from robocas_ms3.tasks import occlusion, rewards, terms
 from robocas_ms3.tasks.base import STAGES, RoboCASEnv
 from robocas_ms3.tasks.rewards import DENSE
 
-# of each object's surface; hidden shares are then off ray casting by 0.03 on average, 0.08 at the 95th percentile
+# Points per object. Hidden fractions differ from ray casting by 0.03 on average and 0.08 at the 95th percentile.
 _POINTS = 512
-MEASUREMENTS_PER_SECOND = 5  # of the clutter
-ENVS_AT_ONCE = 512  # whose clutter is measured: a quarter of a GB with 15 objects each
+MEASUREMENTS_PER_SECOND = 5  # measurements of the clutter
+ENVS_AT_ONCE = 512  # envs per measurement of the clutter: 0.25 GB with 15 objects each
 
 
 class RoboCASSearchEnv(RoboCASEnv):
-    """Search: the target is hidden in part (p_vis from above below ``target.max_visible_share``, where one is given).
+    """Find a partly hidden object in a heap and put it into the basket.
 
-    The stages add ``obstacles_cleared``: to the camera above that p_vis is measured with, at most a fifth of the target
-    is hidden, and fewer than two other objects stick out next to it (`occlusion.clutter`). This is measured five times
-    per second. What counts is the heap while the target is in it: from the moment the gripper has held the target,
-    nothing is cleared any more, so pulling or dragging it out from under the heap does not reach this stage.
+    With ``target.max_visible_share``, the target's visible fraction p_vis from above is below this limit at the start.
 
-    ``cleared_at_reset`` (N,) bool says that the target was clear from the beginning: then the stage says nothing about
-    the policy.
+    The additional stage ``obstacles_cleared`` means: seen from above, at most a fifth of the target is hidden, and at
+    most one other object sticks out next to it (`occlusion.clutter`). It is measured five times per second until the
+    gripper has held the target, so pulling the target out from under the heap does not reach this stage.
+
+    ``cleared_at_reset`` (N,) bool tells whether the target was clear at the start of the episode; then the stage is no
+    achievement of the policy.
     """
 
     SPEC = SEARCH
@@ -61,36 +62,36 @@ class RoboCASSearchEnv(RoboCASEnv):
         self._measure_now[env_idx] = True
 
     def extra_state(self) -> dict:
-        """See `RoboCASEnv`; ``task`` also holds ``cleared_at_reset`` and ``hidden_fraction``, (N, 1) each."""
+        """Return the extra state of `RoboCASEnv`, ``cleared_at_reset`` (N, 1) and ``hidden_fraction`` (N, 1)."""
         state = super().extra_state()
         own = {"cleared_at_reset": self._cleared_at_reset, "hidden_fraction": self.hidden_fraction}
         return {**state, "task": {**state["task"], **{name: value[:, None].clone() for name, value in own.items()}}}
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
-        """Set the state; see `RoboCASEnv`. A heap that is not cleared is measured again at once."""
+        """Set the state; see `RoboCASEnv`. A heap that is not cleared is measured in the next step."""
         super().set_state_dict(state, env_idx)
         envs = slice(None) if env_idx is None else env_idx
         self._schedule.every_step(slice(None) if env_idx is None else env_idx.cpu().numpy())
-        self._measured = None  # else later results would depend on what was before
+        self._measured = None  # otherwise later results would depend on the state before
         self._just_reset[envs], self._measure_now[envs] = False, True
-        self._cleared_at_reset = self._cleared_at_reset.clone()  # infos hold it
+        self._cleared_at_reset = self._cleared_at_reset.clone()  # earlier infos refer to the old tensor
         own = {"cleared_at_reset": self._cleared_at_reset, "hidden_fraction": self.hidden_fraction}
         for name, value in state.get("task", {}).items():
             if name in own:
                 own[name][envs] = torch.as_tensor(value).to(own[name]).reshape(-1)
 
     def clutter(self, envs: Any = slice(None)) -> occlusion.Clutter:
-        """What hides and surrounds the targets of some envs right now."""
+        """Return the current `occlusion.Clutter` around the targets of some envs."""
         points = occlusion.surface_points(self.object_states[envs, :, :7], self._surface_points[envs])
         return occlusion.clutter(points, self.present[envs], self.target_slot[envs], self._eye)
 
     def pairwise_occlusion(self, envs: Any = slice(None)) -> torch.Tensor:
-        """(E, K, K) share of each object (column) that each other one (row) hides, as `occlusion.pairwise_occlusion`."""
+        """Return (E, K, K) the fraction of each object (column) that each other object (row) hides."""
         points = occlusion.surface_points(self.object_states[envs, :, :7], self._surface_points[envs])
         return occlusion.pairwise_occlusion(points, self.present[envs], self._eye)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Return what `RoboCASEnv.evaluate` does, ``obstacles_cleared`` and ``cleared_at_reset``."""
+        """Return the result of `RoboCASEnv.evaluate`, ``obstacles_cleared`` and ``cleared_at_reset``, (N,) bool."""
         found, measured = super().evaluate(), self._measured
         unchanged = (
             measured is not None and measured.others is not None and measured.others == self.bodies.state_except_robot
@@ -113,30 +114,30 @@ class RoboCASSearchEnv(RoboCASEnv):
 
     @property
     def _measure_period(self) -> int:
-        """Control steps from one measurement of the clutter to the next."""
+        """Number of control steps between two measurements of the clutter."""
         return max(1, self.control_freq // MEASUREMENTS_PER_SECOND)
 
     def _due(self) -> Array:
-        """(N,) bool, native: whose clutter is measured in this step."""
+        """Return (N,) bool, native: in which envs the clutter is measured in this step."""
         stages = self.success_check.stages
         settled = stages["target_grasped"] | stages["obstacles_cleared"]
         return ((to_native(self.elapsed_steps) % self._measure_period == 0) | to_native(self._measure_now)) & ~settled
 
     def _measure(self, due: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
-        """(N,) bool, which of the envs that are due are cleared; keeps their hidden shares and obstacles.
+        """Measure the clutter of the due envs, store hidden fractions and obstacles, and return (N,) bool: cleared.
 
         Args:
-            due: (N,) bool.
-            poses: (N, K, 7) of the objects.
+            due: (N,) bool, in which envs to measure.
+            poses: (N, K, 7) object poses.
         """
         others, measured = self.bodies.state_except_robot, self._measured
-        if others is not None and measured is not None:  # on a CPU it is known whether anything has moved
+        if others is not None and measured is not None:  # on a CPU, motion is detected by comparing states
             still = measured.others == others or not self._moved(poses, measured.poses)
             if still:
                 self._measured = measured._replace(others=others)
                 return measured.cleared
         cleared = torch.zeros_like(due)
-        # on a GPU more envs than are due, as finding these would wait for it; what is found of the others is dropped
+        # on a GPU more envs than necessary are measured, since selecting them would synchronise
         envs_to_measure = self._schedule.due() if self.gpu_sim_enabled else due.nonzero()[:, 0]
         for envs in envs_to_measure.split(ENVS_AT_ONCE):
             found, taken = self.clutter(envs), due[envs]
@@ -154,7 +155,7 @@ class RoboCASSearchEnv(RoboCASEnv):
         return bool(occlusion.has_moved_near(poses, before, self._radii, self.target_slot, self._eye).any())
 
     def reward_progress(self) -> tuple[Array, dict[str, Array]]:
-        """See `RoboCASEnv`; before the target may be grasped, it has to be cleared or held once."""
+        """Return stage and terms; see `RoboCASEnv`. The stage ``clear`` lasts until the target is cleared or held."""
         stage, found = super().reward_progress()
         stages = self.success_check.stages
         settled = stages["obstacles_cleared"] | stages["target_grasped"]
@@ -168,7 +169,7 @@ class RoboCASSearchEnv(RoboCASEnv):
         return stage, found
 
     def privileged_observations(self) -> dict[str, torch.Tensor]:
-        """Return those of `RoboCASEnv`, and ``hidden_fraction`` (N, 1), as last measured before the target was held."""
+        """Return those of `RoboCASEnv`, and the last measured ``hidden_fraction`` (N, 1)."""
         return {**super().privileged_observations(), "hidden_fraction": self.hidden_fraction[:, None].clone()}
 
 
@@ -176,9 +177,9 @@ class _Measured(NamedTuple):
     """The last measurement of the clutter.
 
     Attributes:
-        others: all but the robot as it was then, on a CPU.
-        poses: (N, K, 7) of the objects when it was last measured.
-        cleared: (N,) bool, what was found.
+        others: `Bodies.state_except_robot` at the measurement.
+        poses: (N, K, 7) object poses at the measurement.
+        cleared: (N,) bool, whether the target was cleared.
     """
 
     others: object
@@ -187,12 +188,12 @@ class _Measured(NamedTuple):
 
 
 def _sample(points: np.ndarray) -> np.ndarray:
-    """Return ``_POINTS`` of points (P, 3), evenly from the first to the last; some repeat where there are fewer."""
+    """Return ``_POINTS`` of points (P, 3) at even index distances; points repeat if P is smaller."""
     return points[np.linspace(0, len(points) - 1, _POINTS).round().astype(int)]
 
 
 class PeriodicSchedule:
-    """Counts the control steps of each env since its reset, modulo a period; `due` returns indices on the device."""
+    """A schedule that is due once per period of control steps, counted from each env's reset."""
 
     def __init__(self, num_envs: int, period: int, device: torch.device | str) -> None:
         self._period, self._device = period, device
@@ -202,12 +203,12 @@ class PeriodicSchedule:
         self._indices: list[torch.Tensor] = []  # by `_step` modulo the period; empty: to be made
 
     def reset(self, envs: NDArray[np.int64]) -> None:
-        """Note that some envs (E,) are reset: they are due before their first step, and every period from then on."""
+        """Restart the schedule of some envs (E,): they are due before their first step, then once per period."""
         self._reset_at[envs], self._always[envs] = self._step, False
         self._indices = []
 
     def every_step(self, envs: NDArray[np.int64] | slice) -> None:
-        """Let some envs be due in every step, until they are reset."""
+        """Make some envs due in every step until their next reset."""
         self._always[envs] = True
         self._indices = []
 
@@ -215,8 +216,8 @@ class PeriodicSchedule:
         self._step += 1
 
     def due(self) -> torch.Tensor:
-        """(D,) int64 indices of the envs that are due in the present step."""
-        if not self._indices:  # of all phases at once: a copy to the GPU waits for it, so none is made within a step
+        """Return the int64 indices (D,) of the envs that are due in the current step."""
+        if not self._indices:  # for all phases at once, since a copy to the GPU within a step would synchronise
             phases = np.arange(self._period)[:, None]
             due = ((phases - self._reset_at) % self._period == 0) | self._always
             self._indices = [torch.from_numpy(np.flatnonzero(row)).to(self._device) for row in due]

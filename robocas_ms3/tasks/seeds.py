@@ -1,4 +1,4 @@
-"""Seeds of the envs of a batch, and the layouts that follow from them."""
+"""Seeds and layouts of the envs of a batch."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from robocas_ms3.scenes.layout import Layout, LayoutSource, ObjectIds
 from robocas_ms3.scenes.layout_table import FrozenLayouts, LayoutStatus, LayoutTable, SeedPair
 from robocas_ms3.tasks.initial_states import InitialStates, InitialStateTable
 
-SEVERAL_ENVS_SEEDS = (0, 99)  # least and greatest seed of several envs' unseeded resets
-_OTHER_SEEDS = 20  # tried where a seed has no layout
-_FIRST_SEEDS = 2  # tried before any seed had one, so that a configuration without layouts fails early
+SEVERAL_ENVS_SEEDS = (0, 99)  # default range of unseeded resets of several envs
+_OTHER_SEEDS = 20  # number of other seeds to try after a seed without layout
+_FIRST_SEEDS = 2  # the same before any seed had a layout, so that a configuration without layouts fails early
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
 
 
 class _UnstableLayout(LayoutError):
-    """The engine moves the objects of a layout."""
+    """Error: the objects of a layout are not stable in the physics engine."""
 
 
 def consecutive_seeds(first: int, count: int, within: tuple[int, int] | None) -> list[int]:
-    """Return consecutive seeds. A first seed of the range ``within`` makes them wrap around in this range."""
+    """Return consecutive seeds; if the first one is in the range ``within``, they wrap around in this range."""
     if within is None or not within[0] <= first <= within[1]:
         return [first + i for i in range(count)]
     low, high = within
@@ -38,15 +38,16 @@ def consecutive_seeds(first: int, count: int, within: tuple[int, int] | None) ->
 def check_reset_options(
     options: dict[str, Any] | None, num_envs: int, device: torch.device
 ) -> tuple[dict[str, Any], list[int]]:
-    """Return options of ``BaseEnv.reset``, ``env_idx`` as indices, and the numbers of the envs that are reset.
+    """Return options of ``BaseEnv.reset`` with ``env_idx`` as indices, and the indices of the envs to reset.
 
     Raises:
-        RobocasError: ``reset_to_env_states`` was given.
+        RobocasError: the options have ``reset_to_env_states``.
     """
     options = dict(options or {})
     if "reset_to_env_states" in options:
         fix = "Reset with the seed of the recorded episode, then call set_state_dict."
-        raise RobocasError("a state lacks objects, target and stages", where="reset_to_env_states", fix=fix)
+        what = "unsupported option: a state does not contain objects, target and stages"
+        raise RobocasError(what, where="reset_to_env_states", fix=fix)
     if "env_idx" in options:
         index = torch.as_tensor(options["env_idx"], device=device)
         options["env_idx"] = index.nonzero()[:, 0] if index.dtype == torch.bool else index
@@ -56,31 +57,31 @@ def check_reset_options(
 
 
 class EpisodeSeeds:
-    """The seed of each env's objects and that of its layout.
+    """The objects seed and the layout seed of each env, and its layout.
 
-    Objects and looks follow from the seed that an env was built with, the layout from the seed of its episode. A single
-    env is rebuilt at each reset, so that both are the same. Several envs are built with consecutive seeds of their
+    The seed with which an env was built decides objects and appearance; the seed of an episode decides the layout. A
+    single env is rebuilt at each reset, so both seeds are equal. Several envs are built with consecutive seeds of their
     range and keep their objects.
 
     A requested seed without a layout is an error; an unseeded reset draws another seed.
 
     Args:
         num_envs: N.
-        layouts: where layouts come from.
-        seed_range: least and greatest seed of unseeded resets; default: that of frozen layouts, `SEVERAL_ENVS_SEEDS`
-            for several envs, any seed for one.
+        layouts: source of the layouts.
+        seed_range: least and greatest seed of unseeded resets; default: the range of frozen layouts,
+            `SEVERAL_ENVS_SEEDS` for several envs, any seed for one env.
         objects_stay: whether resets keep the objects.
 
     Raises:
         ConfigError: ``seed_range`` is invalid.
 
     Attributes:
-        layout_seeds: (N,) seed of each env's layout.
-        objects_seeds: (N,) seed of each env's objects.
-        object_ids: of each env.
-        table: all layouts of the cache, if it has a table.
-        tabled: starts gathered from that table.
-        first_reset: whether the next reset is that of making the environment, whose seed nobody asked for.
+        layout_seeds: (N,) layout seed of each env.
+        objects_seeds: (N,) objects seed of each env.
+        object_ids: object ids of each env.
+        table: layout table of the cache, if it has one.
+        initial_state_table: initial states from this table, on the envs' device.
+        first_reset: whether the next reset is the one that builds the environment, whose seed was not requested.
     """
 
     def __init__(
@@ -100,21 +101,21 @@ class EpisodeSeeds:
         self._num_envs = num_envs
         self._objects_stay = objects_stay
         self.first_reset = True
-        self._requested: set[int] = set()  # envs whose seeds were asked for
-        self._generators: Any = None  # a BatchedRNG, of the envs' episodes
+        self._requested: set[int] = set()  # envs whose seeds were requested
+        self._generators: Any = None  # BatchedRNG of the envs' episodes
         self._other_seeds = _FIRST_SEEDS
-        self._attempts = 0  # left to the present reset
-        self._before: tuple[NDArray[np.int64], dict[int, Layout]] = (self.layout_seeds, {})  # the present reset
+        self._attempts = 0  # remaining attempts of the current reset
+        self._before: tuple[NDArray[np.int64], dict[int, Layout]] = (self.layout_seeds, {})  # before the current reset
         self._found: dict[int, Layout] = {}  # by env
         self._built_with: dict[int, Layout] = {}  # by seed
-        self._failed: dict[SeedPair, LayoutError] = {}  # finding out takes long
+        self._failed: dict[SeedPair, LayoutError] = {}  # sampling again would take long
 
     def start_reset(self, seed: Any, envs: list[int]) -> Any:
         """Return the seeds of a reset of some envs.
 
         Args:
-            seed: of each env; a single one is the first env's, and the others take the seeds after it; or None.
-            envs: their numbers.
+            seed: seed of each env; a single seed is the first env's, and the others get the next seeds; None: drawn.
+            envs: indices of the envs.
         """
         first, self.first_reset = self.first_reset, False
         seeded = seed is not None and not first
@@ -132,16 +133,16 @@ class EpisodeSeeds:
         return seed
 
     def retry_reset(self, error: LayoutError) -> bool:
-        """Return whether to reset again, with a drawn seed; if not, all seeds are as they were before the reset."""
+        """Return whether to reset again with a drawn seed; if not, restore the seeds of before the reset."""
         if not self._attempts:
             self.layout_seeds[:], self._found = self._before
             return False
         self._attempts -= 1
-        _log.log(_level(error), "no layout for the seed of this reset, another is drawn: %s", error)
+        _log.log(_level(error), "no layout for the seed of this reset; drawing another seed: %s", error)
         return True
 
     def within_range(self, seed: Any) -> NDArray[np.int64]:
-        """Return the seeds (E,) of a reset, moved into the range if nobody asked for them."""
+        """Return the seeds (E,) of a reset, mapped into the range if they were not requested."""
         seed = np.atleast_1d(np.asarray(seed, dtype=np.int64))
         if self._requested or self.range is None:
             return seed
@@ -149,7 +150,7 @@ class EpisodeSeeds:
         return np.where((seed >= low) & (seed <= high), seed, low + seed % (high - low + 1))
 
     def set_layout_seeds(self, envs: NDArray[np.int64], seeds: NDArray[np.int64] | None, generators: Any) -> None:
-        """Set the layout seeds of some envs (E,); None: draw each with its env's generator of a ``BatchedRNG``."""
+        """Set the layout seeds of some envs (E,); None: draw each one with the env's generator of a ``BatchedRNG``."""
         self._generators = generators
         for i, env in enumerate(envs):
             self.layout_seeds[env] = self._draw(env) if seeds is None else seeds[i]
@@ -161,7 +162,7 @@ class EpisodeSeeds:
         return low + drawn % (high - low + 1)
 
     def choose_objects(self, seeds: NDArray[np.int64], device: torch.device, *, on_gpu: bool) -> None:
-        """Choose the objects that each env is built with from its seed (N,), which changes if it has no layout."""
+        """Choose the objects of each env from its seed (N,); a seed without a layout is replaced in place."""
         self._built_with = {}
         if isinstance(self.layouts, LayoutCache) and (self._objects_stay or on_gpu):
             self.table = self.layouts.table("gpu" if on_gpu else "cpu")
@@ -171,12 +172,12 @@ class EpisodeSeeds:
         self.initial_state_table = InitialStateTable(self.table, self.objects_seeds, device) if self.table else None
 
     def find_initial_states(self, envs: NDArray[np.int64], device: torch.device) -> InitialStates:
-        """Return where some envs' episodes start; gathered on their device if the cache's table holds them all."""
+        """Return the initial states of some envs' episodes; gathered on the device if the table has them all."""
         self.forget_layouts(envs)
         if self.initial_state_table is None:
             return InitialStates.of([self.layout(env) for env in envs.tolist()], device)
         for env in envs[~self.initial_state_table.is_usable(envs, self.layout_seeds[envs])].tolist():
-            self.layout(env)  # may draw another seed, which the table holds
+            self.layout(env)  # may draw another seed that is in the table
         tabled = self.initial_state_table.is_usable(envs, self.layout_seeds[envs])
         found = self.initial_state_table.gather(envs[tabled], self.layout_seeds[envs[tabled]])
         if tabled.all():
@@ -199,8 +200,8 @@ class EpisodeSeeds:
     def _objects_of(self, seed: int) -> ObjectIds:
         if self.table is not None and (tabled := self.table.object_ids(seed)) is not None:
             if not self.table.has_usable_layout(seed):
-                where, fix = f"objects seed {seed}", "Take another seed."
-                raise _UnstableLayout("no layout of these objects stays", where=where, fix=fix)
+                where, fix = f"objects seed {seed}", "Use another seed."
+                raise _UnstableLayout("no stable layout of these objects", where=where, fix=fix)
             return tabled
         if seed not in self._built_with:
             self._built_with[seed] = self._layout((seed, seed))
@@ -212,8 +213,8 @@ class EpisodeSeeds:
         if self.table is not None:
             if self.table.state(pair) == LayoutStatus.UNSTABLE:
                 where = f"objects seed {pair[0]}, seed {pair[1]}"
-                fix = "Take another seed."
-                raise _UnstableLayout("objects move as soon as this engine runs", where=where, fix=fix)
+                what, fix = "the objects of this layout are not stable in this physics engine", "Use another seed."
+                raise _UnstableLayout(what, where=where, fix=fix)
             if (tabled := self.table.layout(pair)) is not None:
                 return tabled
         if pair in self._failed:
@@ -227,18 +228,19 @@ class EpisodeSeeds:
         return layout
 
     def _first_possible(self, make: Callable[[int], _T], env: int, seeds: NDArray[np.int64]) -> _T:
-        """Return ``make`` of an env's seed. A seed without layout that nobody asked for is replaced by a drawn one."""
+        """Return ``make`` of an env's seed; replace a seed without layout by a drawn one if it was not requested."""
         for _ in range(self._other_seeds):
             try:
                 return make(int(seeds[env]))
             except LayoutError as error:
-                if env in self._requested or self._num_envs == 1:  # a single env starts over with other objects
+                if env in self._requested or self._num_envs == 1:  # a single env resets again, with other objects
                     raise
-                _log.log(_level(error), "env %d: no layout for seed %d, another is drawn: %s", env, seeds[env], error)
+                message = "env %d: no layout for seed %d; drawing another seed: %s"
+                _log.log(_level(error), message, env, seeds[env], error)
                 seeds[env] = self._draw(env)
         return make(int(seeds[env]))
 
 
 def _level(error: LayoutError) -> int:
-    """Return the level of the message that another seed is drawn; unstable layouts were reported when tried."""
+    """Return the log level for a replaced seed; unstable layouts were already reported when they were checked."""
     return logging.DEBUG if isinstance(error, _UnstableLayout) else logging.WARNING

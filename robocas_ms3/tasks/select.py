@@ -1,4 +1,4 @@
-"""RoboCASSelect-v1: grasp one of several identical objects, named by where it stands, and drop it into the basket."""
+"""RoboCASSelect-v1: grasp one of several identical objects, named by its position, and drop it into the basket."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from robocas_ms3.tasks.base import RoboCASEnv
 
 
 class RoboCASSelectEnv(RoboCASEnv):
-    """Select: "the nearest soap", "the second soda can from the left", seen from the robot. The others are wrong.
+    """Pick one of several identical objects by a relation, e.g. "the nearest soap", seen from the robot.
 
-    The relation is clear: what it compares differs from every other such object by at least 3 cm. Success asks for the
-    named one alone: none of the others may be in the basket too.
+    The relation is clear by at least 3 cm to every other object of the name. For success, no other object of the name
+    may be in the basket.
     """
 
     SPEC = SELECT
@@ -25,7 +25,7 @@ class RoboCASSelectEnv(RoboCASEnv):
         self._kinds = torch.tensor([[row.index(name) for name in row] for row in names], device=self.device)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Return what `RoboCASEnv.evaluate` does; ``success`` also asks that no object of the target's name is in."""
+        """Return the result of `RoboCASEnv.evaluate`; ``success`` requires ``others_out`` too."""
         found = super().evaluate()
         return {**found, "success": found["success"] & self._others_out()}
 
@@ -34,7 +34,7 @@ class RoboCASSelectEnv(RoboCASEnv):
         return {**super().success_conditions(), "others_out": self._others_out()}
 
     def _others_out(self) -> torch.Tensor:
-        """(N,) bool."""
+        """Return (N,) bool, whether no other object of the target's name is in the basket."""
         inside = self.goal.is_at_goal(
             self.success_check.centers(to_native(self.object_states)), to_native(self.basket_pose)
         )

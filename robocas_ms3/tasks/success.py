@@ -1,4 +1,4 @@
-"""Stages, success and failure of the envs: what `RoboCASEnv.evaluate` returns, but for what single tasks add."""
+"""Stages, success and failure of the envs, as returned by `RoboCASEnv.evaluate`."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from robocas_ms3.tasks.goals import TaskState
 
 
 class SuccessCheck:
-    """Checks stages, success and failure of all envs, and keeps the stages reached since the reset.
+    """Check of stages, success and failure of all envs; stores the stages reached since the reset.
 
-    On a CPU, the last result is returned again while nothing has moved or touches the gripper.
+    On a CPU, the last result is reused while no object moves or touches the gripper.
 
     Args:
-        env: the `base.RoboCASEnv`, whose scene is loaded.
-        stages: names, in the order of the recorded states.
+        env: the `base.RoboCASEnv` with a loaded scene.
+        stages: names of the stages, in the order of recorded states.
 
     Attributes:
-        reached: (stages, N) bool.
-        stages: its rows by name; views, native (`arrays`).
-        moment: what the last check found; the same object as before where nothing has changed since.
-        target_extents: (N, 3) m, since the reset.
-        surface: height of what objects stand on, m.
-        fallen_below: height below which an object counts as fallen off it, m.
+        reached: (stages, N) bool, stages reached since the reset.
+        stages: rows of ``reached`` by name; views, native (`arrays`).
+        state: the `TaskState` of the last check; the same object while nothing changes.
+        target_extents: (N, 3) m, size of the target.
+        surface: height of the surface on which objects stand, m.
+        fallen_below: height below which an object counts as fallen off the surface, m.
     """
 
-    moment: TaskState
+    state: TaskState
 
     def __init__(self, env: Any, stages: Sequence[str]) -> None:
         self._env = env
@@ -56,45 +56,45 @@ class SuccessCheck:
         self.fallen_below = self.surface - terms.FALLEN
 
     def reset(self, envs: torch.Tensor) -> None:
-        """Forget the stages of some envs (E,), whose targets may be others."""
+        """Clear the stages of some envs (E,), and update their targets."""
         self.reached[:, envs] = False
         self.target_extents = self._extents[torch.arange(len(self._extents), device=envs.device), self._env.target_slot]
         self._last = None
 
     def restore(self, reached: Any, envs: Any) -> None:
-        """Set the stages (E, stages) of some envs; None leaves them as they are."""
+        """Set the reached stages (E, stages) of some envs; None leaves them unchanged."""
         if reached is not None:
             reached = torch.as_tensor(reached, dtype=torch.bool, device=self.reached.device)
             self.reached[:, envs] = reached.reshape(-1, len(self.reached)).T
         self._last = None
 
     def reach(self, stage: str, now: Array) -> torch.Tensor:
-        """Note which envs are at a stage now, (N,) bool, native (`arrays`); return which have reached it, (N,) bool."""
+        """Mark a stage as reached in some envs (N,) bool, native (`arrays`); return (N,) bool, where it was reached."""
         row = self.stages[stage]
         row |= now
         return as_tensor(row).clone()
 
     def check(self) -> dict[str, torch.Tensor]:
-        """Return stages, ``success`` and ``fail`` (N,) bool and ``disturbed`` (N,) int; don't write to them."""
+        """Return stages, ``success`` and ``fail`` (N,) bool and ``disturbed`` (N,) int; read only."""
         env = self._env
         state = env.bodies.read()
         forces = env.gripper_contacts.forces(env.bodies.state_except_robot)
         depends_on = self._dependencies(forces)
         if self._last is not None and depends_on is not None and self._last[0] == depends_on:
             return dict(self._last[1])
-        # right after a reset the engine still reports the contacts of before
+        # directly after a reset the engine still reports the contacts of the last episode
         forces = forces * to_native(env.elapsed_steps > 0)[:, None, None, None]
         found = self._check(forces, *self._objects_and_basket(state))
         self._last = self._dependencies(forces), found
         return dict(found)
 
     def _dependencies(self, forces: Array) -> object:
-        """Return what the next result depends on, on a CPU while nothing touches the gripper; None: unknown."""
+        """Return a key of the next result: equal keys mean equal results; None: unknown (GPU, or gripper contact)."""
         others = self._env.bodies.state_except_robot
         return None if others is None or forces.any() else (others, self.reached.numpy().tobytes())
 
     def _check(self, forces: Array, objects: Array, basket: Array | None) -> dict[str, torch.Tensor]:
-        """Check from forces (N, 3, K, 3), states (N, K, 13) and the basket's pose (N, 7) or None, all native."""
+        """Check forces (N, 3, K, 3), object states (N, K, 13) and the basket's pose (N, 7) or None, all native."""
         env = self._env
         slot, goal = to_native(env.target_slot), env.goal
         grasped, touched = self.grasped(forces), terms.is_touched(forces)
@@ -133,9 +133,9 @@ class SuccessCheck:
         return target[:, :3] + rotations.rotate(target[:, 3:7], center)
 
     def grasped(self, forces: Array) -> Array:
-        """Return which objects (N, K) both fingers hold, from forces (N, 3, K, 3) N on the gripper; native."""
+        """Return (N, K) which objects both fingers hold, from forces (N, 3, K, 3) in N on the gripper; native."""
         pressed = terms.is_pressed(forces[:, 0], forces[:, 1])
-        if known_all_false(pressed):  # as most of the time: no need to ask in which direction
+        if known_all_false(pressed):  # the usual case: the directions need not be checked
             return pressed
         finger = link_poses(self._env.scene, [self._env.agent.finger1_link])[:, 0]
         # the left finger opens along its own +y
@@ -143,18 +143,18 @@ class SuccessCheck:
         return terms.is_grasped(forces[:, 0], forces[:, 1], opening)
 
     def success_conditions(self) -> dict[str, torch.Tensor]:
-        """Return what has to hold at the same moment for success, besides the lift: (N,) bool each."""
+        """Return the conditions that success requires at the same time, in addition to the lift, (N,) bool each."""
         touched = terms.is_touched(self._env.gripper_contacts.forces())
         found = self._measures(touched, *self._objects_and_basket(self._env.bodies.read()))
         return {name: as_tensor(measure) for name, measure in found.items()}
 
     def _objects_and_basket(self, state: torch.Tensor) -> tuple[Array, Array | None]:
-        """States of the objects (N, K, 13) and pose of the basket (N, 7) or None, native, from that of all bodies."""
+        """Return object states (N, K, 13) and basket pose (N, 7) or None, native, from the state of all bodies."""
         basket = self._env.bodies.basket(state)
         return to_native(self._env.bodies.objects(state)), None if basket is None else to_native(basket)
 
     def _measures(self, touched: Array, objects: Array, basket: Array | None) -> dict[str, Array]:
-        """`measures`, native, from which objects the gripper touches (N, K), their states and the basket's pose."""
+        """Return the native `success_conditions` from touched objects (N, K), object states and the basket's pose."""
         goal, slot = self._env.goal, to_native(self._env.target_slot)
         target = terms.select_target(objects, slot)
         return {
@@ -165,9 +165,9 @@ class SuccessCheck:
         }
 
     def fallen_objects(self) -> Array:
-        """Return which other objects (N, K) lay 5 cm below the surface in `moment`, outside of the goal; native.
+        """Return (N, K) which objects other than the target have fallen off the surface and not into the goal; native.
 
-        The target is carried to the goal, and if it falls, that is ``fail``.
+        They are at least 5 cm below the surface in `state`. The fall of the target is ``fail``.
         """
         env, objects = self._env, self.state.objects
         low = (objects[..., 2] < self.fallen_below) & to_native(env.present & ~env.is_target)
@@ -176,7 +176,7 @@ class SuccessCheck:
         return low & ~env.goal.is_at_goal(self.centers(objects), self.state.basket)
 
     def _has_failed(self, measures: dict[str, Array], objects: Array, basket: Array | None) -> Array:
-        """(N,) bool of ``fail``, native, from the measures, states (N, K, 13) and the basket's pose."""
+        """Return ``fail`` (N,) bool from success conditions, object states (N, K, 13) and the basket's pose; native."""
         goal, slot = self._env.goal, to_native(self._env.target_slot)
         height = terms.select_target(objects[..., 2], slot)
         low, lost = height < self.fallen_below, goal.is_lost(basket, measures)
@@ -189,7 +189,7 @@ class SuccessCheck:
         return fell if lost is None else fell | lost
 
     def _disturbed(self, poses: Array) -> Array:
-        """(N, K) bool: which objects other than the target no longer stand as they stood, from poses (N, K, 7)."""
+        """Return (N, K) bool, which objects other than the target are disturbed, from poses (N, K, 7)."""
         env, undo = self._env, None
         support = env.fixtures.furniture[env.task_config.surface.furniture]
         if isinstance(support, Articulation) and env.model.support_link:

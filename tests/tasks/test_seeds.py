@@ -184,7 +184,7 @@ def test_one_env_starts_over_with_another_seed_unless_it_was_asked_for(monkeypat
 
     monkeypatch.setattr(cache, "sample_layout", fussy)
     env = gym.make("RoboCASPick-v1", layouts=None, **STATE_ONLY)
-    assert failed[0] == 2022 and "another is drawn" in caplog.text
+    assert failed[0] == 2022 and "drawing another seed" in caplog.text
     failed.clear()
     env.reset()
     base = env.unwrapped

@@ -74,7 +74,7 @@ def test_what_moves_where_it_would_run_is_drawn_no_more_and_an_error_where_it_is
         env.reset()
         assert env.seeds.find_initial_states(np.arange(2), env.device).targets.shape == (2,)
         assert 1 not in env.seeds.layout_seeds
-    with pytest.raises(LayoutError, match="objects seed 0, seed 1: objects move as soon as this engine runs"):
+    with pytest.raises(LayoutError, match="objects seed 0, seed 1: the objects of this layout are not stable"):
         env.reset(seed=[1, 0])
 
 
