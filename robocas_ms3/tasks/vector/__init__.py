@@ -1,4 +1,4 @@
-"""Several environments at once, as a vector environment: in worker processes on a CPU, batched on a GPU."""
+"""Vector environments: several environments in worker processes on a CPU, or in one batch on a GPU."""
 
 from __future__ import annotations
 
@@ -35,33 +35,33 @@ def make_vec(
     limits: Limits = NO_LIMITS,
     **kwargs: Any,
 ) -> VectorEnv:
-    """Make several environments as one vector environment, with the conventions of `RoboCASVectorEnv`.
+    """Make a vector environment with the conventions of `RoboCASVectorEnv`.
 
-    In processes, what an env does follows from its seeds and actions alone, not from ``num_envs`` or ``workers``, and
-    is what ``gym.make`` gives; with ``reconfiguration_freq=0`` env i keeps the objects of seed 2022 + i. Close it, or
-    let it be collected: its processes end with it, and with this one.
+    In processes, an env depends on its seeds and actions only, not on ``num_envs`` or ``workers``, and equals the
+    environment of ``gym.make``. With ``reconfiguration_freq=0`` env i keeps the objects of seed 2022 + i. The worker
+    processes end when the vector environment is closed or deleted, and when this process ends.
 
     Args:
-        env_id: gymnasium's, such as ``RoboCASPick-v1``; ``module:Id-v1`` imports the module first.
+        env_id: gymnasium id, such as ``RoboCASPick-v1``; ``module:Id-v1`` imports the module first.
         num_envs: N.
-        backend: ``processes`` on the CPU, ``gpu`` in one batch, or ``auto``: the GPU where there is one.
-        workers: number of processes; default: an env each, at most one per core.
+        backend: ``processes`` on the CPU, ``gpu`` in one batch, or ``auto``: a GPU if there is one.
+        workers: number of processes; default: one per env, at most one per core.
         arrays: ``torch`` for tensors, or ``numpy``.
-        wrappers: put around each env, the first one first; on a GPU around the batch.
-        limits: of what a process may take for a step or a reset of its envs; it is killed where it takes more.
-        kwargs: ``auto_reset``, ``ignore_terminations`` and ``record_metrics`` of `RoboCASVectorEnv`; all others are for
-            ``gym.make``, such as ``obs_mode``, ``control_mode``, ``config``, ``max_episode_steps``.
+        wrappers: functions that wrap each env (on a GPU the batch); the first one is the innermost.
+        limits: time and memory limits of a process for a step or a reset; a process that exceeds them is killed.
+        kwargs: ``auto_reset``, ``ignore_terminations`` and ``record_metrics`` of `RoboCASVectorEnv`; other arguments
+            are passed to ``gym.make``, such as ``obs_mode``, ``control_mode``, ``config``, ``max_episode_steps``.
 
     Raises:
-        VectorEnvError: there is no such environment or backend, or no GPU for it.
+        VectorEnvError: the environment or backend does not exist, or the backend needs a GPU and there is none.
         VectorEnvCrashError: a process died.
         Exception: whatever making an environment raises.
     """
     for name, value in (("num_envs", num_envs), ("workers", 1 if workers is None else workers)):
         if not isinstance(value, int) or value < 1:
-            raise VectorEnvError("invalid number", where=name, expected="an integer from 1 on", found=repr(value))
+            raise VectorEnvError("invalid number", where=name, expected="an integer of at least 1", found=repr(value))
     if arrays not in ("torch", "numpy"):
-        raise VectorEnvError("no such arrays", where="make_vec", expected='"torch" or "numpy"', found=repr(arrays))
+        raise VectorEnvError("invalid value", where="arrays", expected='"torch" or "numpy"', found=repr(arrays))
     _check_id(env_id)
     options = {name: kwargs.pop(name) for name in _VECTOR_OPTIONS if name in kwargs}
     if choose_backend(backend, kwargs.get("sim_backend", "auto")) == "gpu":
@@ -75,14 +75,14 @@ def make_vec(
 
 
 def choose_backend(backend: str, sim_backend: str = "auto") -> Literal["processes", "gpu"]:
-    """Return what several environments are made with.
+    """Return the backend of a vector environment.
 
     Args:
-        backend: what was asked for; ``auto``: a GPU if there is one and ``sim_backend`` does not say otherwise.
-        sim_backend: ManiSkill's argument, ``auto`` or where physics runs.
+        backend: requested backend; ``auto``: a GPU if there is one and ``sim_backend`` is not a CPU.
+        sim_backend: ManiSkill's argument: ``auto``, or the device of the physics.
 
     Raises:
-        VectorEnvError: there is no such backend, it contradicts ``sim_backend``, or it needs a GPU and there is none.
+        VectorEnvError: the backend is unknown, contradicts ``sim_backend``, or needs a GPU and there is none.
     """
     if backend not in get_args(Backend):
         expected = f"one of {list(get_args(Backend))}"
@@ -90,7 +90,7 @@ def choose_backend(backend: str, sim_backend: str = "auto") -> Literal["processe
     on_cpu = sim_backend in CPU_SIM_BACKENDS
     if (backend == "gpu" and on_cpu) or (backend == "processes" and sim_backend != "auto" and not on_cpu):
         found = f"backend={backend!r} and sim_backend={sim_backend!r}"
-        fix = "Leave one of them out: with processes physics runs on the CPU, otherwise on the GPU."
+        fix = "Remove one of them: physics runs on the CPU with processes, and on the GPU otherwise."
         raise VectorEnvError("backend and sim_backend contradict each other", where="make_vec", found=found, fix=fix)
     if backend == "processes" or on_cpu:
         return "processes"
@@ -98,23 +98,24 @@ def choose_backend(backend: str, sim_backend: str = "auto") -> Literal["processe
         return "gpu"
     if backend == "auto" and sim_backend == "auto":
         return "processes"
-    fix = 'Pass backend="processes", which runs on the CPU.'
-    raise VectorEnvError("needs a GPU", where="make_vec", found="no CUDA device", fix=fix)
+    fix = 'Pass backend="processes" to use the CPU.'
+    what = "this backend needs a GPU"
+    raise VectorEnvError(what, where="make_vec", expected="a CUDA device", found="none", fix=fix)
 
 
 class RoboCASVectorEnv(ManiSkillVectorEnv):
-    """ManiSkill's vector environment, over one batched environment: on a GPU, or a `ProcessEnv`.
+    """ManiSkill's vector environment around a batched environment: on a GPU, or a `ProcessEnv`.
 
-    The last observations and infos of episodes are named as gymnasium's ``AutoresetMode.SAME_STEP`` names them:
+    The last observations and infos of episodes have the names of gymnasium's ``AutoresetMode.SAME_STEP``:
     ``final_obs`` and ``final_info``, with the flags ``_final_obs`` and ``_final_info`` (N,). ``info["episode"]`` and
     ``info["final_info"]["episode"]`` have ``return``, ``episode_len``, ``reward`` per step, ``success_once`` and
     ``success_at_end``. ``reset(seed=..., options={"env_idx": ...})`` resets some envs.
 
     Args:
         env: the batched environment.
-        arrays: of observations, rewards, flags and infos, ``torch`` or ``numpy``.
+        arrays: type of observations, rewards, flags and infos, ``torch`` or ``numpy``.
         auto_reset: whether an env is reset in the step in which it ends; default: True.
-        ignore_terminations: whether an env goes on after success, until its time is up; default: False.
+        ignore_terminations: whether an episode continues after success until the time limit; default: False.
         record_metrics: whether infos have ``episode``; default: True.
     """
 
@@ -132,16 +133,16 @@ class RoboCASVectorEnv(ManiSkillVectorEnv):
             info["final_obs"] = info.pop("final_observation")
             info["_final_obs"] = info.pop("_final_observation")
         at_end = info.get("final_info", info)
-        if self.record_metrics and "success" in at_end:  # ManiSkill has it with ``ignore_terminations`` only
+        if self.record_metrics and "success" in at_end:  # ManiSkill adds it with ``ignore_terminations`` only
             at_end["episode"]["success_at_end"] = at_end["success"].clone()
         found: Any = obs, reward, terminated, truncated, info
         return _as_numpy(found) if self._in_numpy else found
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
-        """Return the result of a method, or an attribute: in processes a tuple of each env's, on a GPU the batch's."""
+        """Call a method or read an attribute: in processes of each env (a tuple), on a GPU of the batch."""
         if isinstance(self._env, ProcessEnv):
             return self._env.call(name, *args, **kwargs)
-        found = self._env.get_wrapper_attr(name)  # ManiSkill's own does not look behind the outermost wrapper
+        found = self._env.get_wrapper_attr(name)  # ManiSkill's method checks the outermost wrapper only
         return found(*args, **kwargs) if callable(found) else found
 
 
@@ -161,4 +162,4 @@ def _check_id(env_id: str) -> None:
     except (gym.error.Error, ModuleNotFoundError) as error:
         raise VectorEnvError("no such environment", where=env_id, expected=expected, found=error) from error
     if not known:
-        raise VectorEnvError("no environment of ManiSkill's kind", where=env_id, expected=expected)
+        raise VectorEnvError("not a ManiSkill environment", where=env_id, expected=expected)

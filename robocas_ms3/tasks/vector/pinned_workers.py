@@ -1,4 +1,4 @@
-"""Worker processes that each keep their own worker and work at the same time."""
+"""Worker processes that run in parallel, each with its own worker object."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ _POLL_MILLISECONDS = 200  # between two checks of signals and limits
 
 
 class PinnedWorkers(Generic[Task, Result]):
-    """Worker processes with a worker each, which get a task each; none is replaced.
+    """Worker processes with one worker each. Each gets one task at a time; a crashed process is not replaced.
 
-    Unlike in a `WorkerPool`, the calling thread talks to the processes itself: steps of environments are short. They
-    start with the first tasks.
+    Unlike in a `WorkerPool`, the calling thread communicates with the processes, since steps of environments are short.
+    The processes start with the first tasks.
 
     Args:
-        make_workers: called in a process each; sent by cloudpickle.
-        limits: of each task.
+        make_workers: functions that create the workers, one per process; sent by cloudpickle.
+        limits: time and memory limits of a task.
 
     Attributes:
-        pids: of the processes, once they have started.
+        pids: ids of the processes, after they have started.
     """
 
     def __init__(self, make_workers: Sequence[Callable[[], Worker[Task, Result]]], limits: Limits) -> None:
@@ -48,7 +48,7 @@ class PinnedWorkers(Generic[Task, Result]):
 
     @property
     def closed(self) -> bool:
-        """Whether the processes were ended, or are those of the process that this one is a fork of."""
+        """Whether the processes have ended, or belong to the parent process of a fork."""
         return not self._end.alive or self._owner != os.getpid()
 
     @property
@@ -57,7 +57,7 @@ class PinnedWorkers(Generic[Task, Result]):
         return bool(self._unread)
 
     def ask(self, tasks: Sequence[Task]) -> list[Result]:
-        """Give each worker its task, and wait for all results; first for those of an interrupted call.
+        """Send each worker its task, and return all results; results of an interrupted call are read first.
 
         Raises:
             ProcessCrashError: a process died, or exceeded a limit.
@@ -76,7 +76,7 @@ class PinnedWorkers(Generic[Task, Result]):
         return self._exchange(tasks, self._seconds)
 
     def close(self) -> None:
-        """End the processes; those that are busy are killed. A fork of this process ends none."""
+        """End the processes; busy ones are killed. In a fork of this process, do nothing."""
         self._end()
 
     def _launch(self) -> None:
@@ -88,15 +88,15 @@ class PinnedWorkers(Generic[Task, Result]):
         self._numbers = {process.connection.fileno(): i for i, process in enumerate(self._processes)}
         for descriptor in self._numbers:
             self._poll.register(descriptor, select.POLLIN)
-        self._unread.update(range(len(self._processes)))  # each says when it reads
+        self._unread.update(range(len(self._processes)))  # each process reports that it is ready
 
     def _exchange(self, messages: Sequence[Any], seconds: float) -> list[Any]:
-        """Send each process a message, or none; return the answers that are still to come, by number."""
+        """Send a message to each process, or none; return the outstanding answers by process number."""
         answers: list[Any] = [None] * len(self._processes)
         errors: dict[int, Exception] = {}
         deadline = time.monotonic() + seconds
         while messages or self._unread:
-            with deferred_interrupts() as signals:  # no message stays half sent, or half read
+            with deferred_interrupts() as signals:  # no message is sent or read in part
                 for number, message in enumerate(messages):
                     self._processes[number].send(message)
                     self._unread.add(number)
@@ -105,7 +105,7 @@ class PinnedWorkers(Generic[Task, Result]):
                     ready = {self._numbers[descriptor] for descriptor, _ in self._poll.poll(_POLL_MILLISECONDS)}
                     for number in self._unread - ready:
                         self._processes[number].check_limits(deadline)
-                    for number in ready:  # also where it has answered, and died since
+                    for number in ready:  # a process may have answered and crashed since
                         self._processes[number].check_limits(math.inf)
                         self._unread.discard(number)
                         try:
@@ -127,7 +127,7 @@ def _launch(processes: list[WorkerProcess[Any, Any]], launched: Future[None], en
         launched.set_result(None)
     except BaseException as error:  # noqa: BLE001  (raised by the future)
         launched.set_exception(error)
-    ended.wait()  # Linux kills a process when the thread that started it ends
+    ended.wait()  # the processes are killed when the thread that started them ends
 
 
 def _end(processes: list[WorkerProcess[Any, Any]], busy: set[int], ended: threading.Event, owner: int) -> None:

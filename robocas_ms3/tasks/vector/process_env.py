@@ -1,4 +1,4 @@
-"""Environments in worker processes, which look like one of ManiSkill's batched environments on a GPU."""
+"""Environments in worker processes, with the interface of ManiSkill's batched environment on a GPU."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from robocas_ms3.tasks.vector.worker import EnvSettings, EnvWorker, Rows, join_r
 
 
 class ProcessEnv(gym.Env):
-    """Several environments, each of one env on the CPU, in worker processes; batched as ``BaseEnv`` is on a GPU.
+    """Several single CPU environments in worker processes, batched like ``BaseEnv`` on a GPU.
 
-    What an env does follows from its seeds and actions alone, whatever the others do and whichever process it is in.
-    Without a seed, env i's stream of seeds begins with 2022 + i, as ManiSkill's. gymnasium's ``AsyncVectorEnv`` takes a
-    process for each env: benchmarks/vector.py compares them.
+    An env depends on its seeds and actions only, not on other envs or on its process. Without a seed, the random stream
+    of env i starts with 2022 + i, as in ManiSkill. benchmarks/vector.py compares this class with gymnasium's
+    ``AsyncVectorEnv``, which uses one process per env.
 
     Args:
-        env_id: gymnasium's, of a ManiSkill environment.
-        num_envs: how many.
-        workers: processes, each with as many envs as the others, or one more.
-        kwargs: for ``gym.make``; pickled, with what the main program defines.
-        wrappers: put around each env, the first one first; pickled the same way.
-        limits: of what a process may take for a step or a reset of its envs; it is killed where it takes more.
+        env_id: gymnasium id of a ManiSkill environment.
+        num_envs: number of envs.
+        workers: number of processes; their numbers of envs differ by at most one.
+        kwargs: arguments of ``gym.make``; pickled by cloudpickle.
+        wrappers: functions that wrap each env, the first one is the innermost; pickled by cloudpickle.
+        limits: time and memory limits of a process for a step or a reset; a process that exceeds them is killed.
 
     Raises:
-        VectorEnvError: they can't be sent to processes.
+        VectorEnvError: the arguments can't be sent to processes.
         VectorEnvCrashError: a process died.
         Exception: whatever making an environment raises.
 
     Attributes:
         pids: ids of the worker processes.
-        elapsed_steps: (N,) int32 control steps since each env's reset; don't write to it.
+        elapsed_steps: (N,) int32 control steps since each env's reset; read only.
     """
 
     single_observation_space: gym.Space
@@ -62,19 +62,20 @@ class ProcessEnv(gym.Env):
         limits: Limits = NO_LIMITS,
     ) -> None:
         self.num_envs, self.device = num_envs, torch.device("cpu")
-        self.reconfiguration_freq = 0  # of the batch; what a reset builds anew is each env's own affair
+        self.reconfiguration_freq = 0  # of the batch; each env has its own value
         self.spec = copy(gym.spec(env_id))
-        if kwargs.get("max_episode_steps") is not None:  # which ManiSkill's helpers read here
+        if kwargs.get("max_episode_steps") is not None:  # ManiSkill's helpers read it from the spec
             self.spec.max_episode_steps = kwargs["max_episode_steps"]
         self._seed_range: tuple[int, int] | None = kwargs.get("seeds")
-        self._must_reset: set[int] = set()  # envs that an interrupted or failed call left in an unknown state
-        self._parts: list[tuple[int, Rows]] = []  # what each worker returned last, with the number of its envs
+        self._must_reset: set[int] = set()  # envs in an unknown state after an interrupted or failed call
+        self._parts: list[tuple[int, Rows]] = []  # last result of each worker, with its number of envs
         self.elapsed_steps = torch.zeros(num_envs, dtype=torch.int32)
-        registered = REGISTERED_ENVS.get(self.spec.id)  # ours are there once they are loaded
+        registered = REGISTERED_ENVS.get(self.spec.id)
         module = registered.cls.__module__ if registered else "robocas_ms3"
         if module == "__main__":
-            fix = f'Put it into a module, and pass "the_module:{self.spec.id}".'
-            raise VectorEnvError("registered in the program itself, which processes don't know", where=env_id, fix=fix)
+            fix = f'Register it in a module, and pass "my_module:{self.spec.id}".'
+            what = "worker processes can't import an environment that is registered in the main program"
+            raise VectorEnvError(what, where=env_id, fix=fix)
         cuts = [num_envs * worker // workers for worker in range(workers + 1)]
         self._shares = [range(*cut) for cut in zip(cuts, cuts[1:], strict=False)]
         with tempfile.NamedTemporaryFile(prefix="robocas-envs-") as at_work:
@@ -92,28 +93,31 @@ class ProcessEnv(gym.Env):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset all envs, or those of ``options["env_idx"]``; the others stay as they are.
+        """Reset all envs, or those of ``options["env_idx"]``; the other envs stay unchanged.
 
         Args:
-            seed: of each env that is reset; a single one is the first one's, and the others take those after it, within
-                the range ``seeds`` if it is of the range. None: the next of each env's own stream.
-            options: of ``BaseEnv``.
+            seed: seed of each env; for a single seed, the first env gets it and the others get the next seeds, within
+                the range ``seeds`` if it is in this range. None: each env draws from its random stream.
+            options: options of ``BaseEnv``.
 
         Raises:
-            VectorEnvError: seeds or envs don't fit.
-            LayoutError: there is no layout for a seed that was asked for, or for many that were drawn.
+            VectorEnvError: the number of seeds or the env indices are invalid.
+            LayoutError: a requested seed, or each of many drawn seeds, has no layout.
         """
         options = dict(options or {})
         envs = self._numbers(options.pop("env_idx")) if "env_idx" in options else list(range(self.num_envs))
         seeds = dict(zip(envs, self._seeds(seed, len(envs)), strict=True))
         if not self._parts and len(envs) < self.num_envs:
-            raise VectorEnvError("no observation of the other environments yet", fix="Reset all of them first.")
+            what = "the other environments have not been reset yet"
+            raise VectorEnvError(what, found=f"a reset of {name_envs(envs)}", fix="Reset all environments first.")
         self._must_reset |= set(envs)
         shares = [{env: seeds[env] for env in share if env in seeds} for share in self._shares]
         new = [row for rows in self._ask([("reset", share, options) for share in shares]) for row in rows]
         self._must_reset -= set(envs)
         if new:
-            paths = dict.fromkeys(path for row in new for path in row)  # what a reset does not return is dropped
+            paths = dict.fromkeys(
+                path for row in new for path in row
+            )  # entries that a reset does not return are dropped
             rows = dict(enumerate(row for part in self._parts for row in split_rows(*part)))
             rows |= zip(sorted(envs), new, strict=True)
             self._parts = [(1, {path: rows[i][path] for path in paths if path in rows[i]}) for i in sorted(rows)]
@@ -124,18 +128,19 @@ class ProcessEnv(gym.Env):
         """Step every env; see ``BaseEnv``.
 
         Args:
-            action: (N, A) array or tensor, for one env (A,) too.
+            action: (N, A) array or tensor; for one env also (A,).
 
         Raises:
-            VectorEnvError: it is of another shape, or envs have to be reset first.
+            VectorEnvError: the action has an invalid shape, or envs must be reset first.
         """
         if self._must_reset:
             envs = name_envs(sorted(self._must_reset))
-            raise VectorEnvError("an earlier call was interrupted or failed", where=envs, fix="Reset them first.")
+            what = "the environments are in an unknown state, since an earlier call was interrupted or failed"
+            raise VectorEnvError(what, where=envs, fix="Reset them first.")
         action = action.cpu().numpy() if isinstance(action, torch.Tensor) else np.asarray(action)
         expected = self.action_space.shape
         if action.shape not in (expected, expected[1:] if self.num_envs == 1 else expected):  # pyright: ignore[reportOptionalSubscript]
-            raise VectorEnvError("actions don't fit", expected=expected, found=action.shape)
+            raise VectorEnvError("invalid shape of actions", expected=expected, found=action.shape)
         action = action.astype(self.action_space.dtype).reshape(expected)
         self._must_reset = set(range(self.num_envs))
         answers = self._ask([("step", action[share.start : share.stop]) for share in self._shares])
@@ -145,7 +150,7 @@ class ProcessEnv(gym.Env):
         return found.get("obs", {}), found["reward"], found["terminated"], found["truncated"], found["info"]
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Return what a method of each env returns, or the attribute of that name; it is pickled."""
+        """Call a method of each env, or read an attribute; return the results, which are pickled."""
         answers = self._ask([("call", name, args, kwargs)] * len(self._shares))
         return tuple(pickle.loads(result) for results in answers for result in results)
 
@@ -153,12 +158,12 @@ class ProcessEnv(gym.Env):
         return [text for texts in self.call("get_language_instruction") for text in texts]
 
     def render(self) -> Any:
-        """Return images (N, H, W, 3) of all envs, as ``render_mode`` says."""
+        """Return images (N, H, W, 3) of all envs in the mode ``render_mode``."""
         images = self.call("render")
         return None if any(image is None for image in images) else torch.cat([*map(torch.as_tensor, images)])
 
     def close(self) -> None:
-        """Close all environments and end their processes; those that are at work are killed."""
+        """Close all environments and end their processes; busy processes are killed."""
         if self._workers.closed:
             return
         try:
@@ -178,14 +183,14 @@ class ProcessEnv(gym.Env):
             Exception: whatever the first env that failed raised.
         """
         if self._workers.closed:
-            raise VectorEnvError("these environments are closed", fix="Make them again.")
+            raise VectorEnvError("the environments are closed", fix="Make a new vector environment.")
         try:
             answers = self._workers.ask(commands)
         except ProcessCrashError as crash:
             share = self._shares[self._workers.pids.index(crash.pid)]
             envs = [env for env in share if self._at_work[env]] or list(share)
-            fix = "See its output above, and robocas doctor; make the environments again."
-            died = VectorEnvCrashError("its process died", where=name_envs(envs), found=crash.found, fix=fix)
+            fix = "Read the output above, run robocas doctor, and make a new vector environment."
+            died = VectorEnvCrashError("its worker process crashed", where=name_envs(envs), found=crash.found, fix=fix)
             died.envs = tuple(envs)
             self._must_reset.clear()
             self._workers.close()
@@ -214,23 +219,23 @@ class ProcessEnv(gym.Env):
         numbers = envs.tolist()
         if envs.ndim != 1 or len(set(numbers)) < len(numbers) or not set(numbers) <= set(range(self.num_envs)):
             expected = f"different numbers from 0 to {self.num_envs - 1}"
-            raise VectorEnvError("no such environments", where="env_idx", expected=expected, found=numbers)
+            raise VectorEnvError("invalid indices of environments", where="env_idx", expected=expected, found=numbers)
         return numbers
 
     def _seeds(self, seed: Any, count: int) -> list[tuple[int | None, bool]]:
-        """Return seeds, and whether another may be drawn where one has no layout: if only the first was asked for."""
-        if seed is None:  # each env looks for a possible one itself
+        """Return seeds, and whether another seed may replace one without layout because it was not requested."""
+        if seed is None:  # each env draws until a seed has a layout
             return [(None, False)] * count
         if np.ndim(seed) == 0:
             seeds = consecutive_seeds(int(seed), count, self._seed_range)
             return [(one, i > 0) for i, one in enumerate(seeds)]
         if len(seed) != count:
-            raise VectorEnvError("seeds don't fit", expected=f"{count}, or a single one", found=len(seed))
+            raise VectorEnvError("invalid number of seeds", expected=f"{count}, or a single seed", found=len(seed))
         return [(None if one is None else int(one), False) for one in seed]
 
 
 def name_envs(envs: Sequence[int]) -> str:
-    """Return words for some environments, such as "envs 0, 2"."""
+    """Return the name of some environments for messages, such as "envs 0, 2"."""
     return f"env{'s' * (len(envs) > 1)} {', '.join(map(str, envs))}"
 
 

@@ -1,4 +1,4 @@
-"""A worker of `ProcessEnv`: some of its environments, in a process of their own."""
+"""The worker of `ProcessEnv`: runs some of the environments in a process."""
 
 from __future__ import annotations
 
@@ -22,32 +22,31 @@ from robocas_ms3.core.worker_process import worker_error
 from robocas_ms3.core.workers import use_one_torch_thread
 from robocas_ms3.tasks.base import RoboCASEnv
 
-FIRST_SEED = 2022  # of env 0's resets without a seed, as in ManiSkill; env 1 has the next
+FIRST_SEED = 2022  # start of env 0's random stream, as in ManiSkill; env i has FIRST_SEED + i
 Rows = dict[tuple[str, ...], Any]
-"""By path in nested dictionaries: an array (E, ...) of all envs, or a list of E where an env has none of that shape."""
+"""Path in nested dictionaries -> array (E, ...) of all envs, or a list of E values if their shapes differ."""
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class EnvSettings:
-    """What all environments are made with."""
+    """Arguments from which all environments are made."""
 
     env_id: str
-    module: str  # that registers the environment
-    kwargs: dict[str, Any]  # for `gym.make`
+    module: str  # module that registers the environment
+    kwargs: dict[str, Any]  # arguments of `gym.make`
     wrappers: tuple[Callable[[gym.Env], gym.Env], ...]  # the first one is the innermost
-    at_work: str  # file of (num_envs,) bytes, 1 while an env works, for when a process dies
+    at_work: str  # file of (num_envs,) bytes: 1 while an env is busy; read after a crash
 
 
 class EnvWorker:
-    """Runs commands, ``(method, *arguments)``; returns a pair of what was found, and the first error if any.
+    """A worker that runs commands ``(method, *arguments)``, and returns the results and the first error, if any.
 
-    After an error the other envs have their turn all the same, so that what becomes of an environment does not depend
-    on which others are in its process.
+    After an error in one env the command still runs in the others, so that an env does not depend on its process.
 
     Args:
         settings: pickled `EnvSettings`.
-        envs: numbers of the environments.
+        envs: indices of the environments.
     """
 
     def __init__(self, settings: bytes, envs: range) -> None:
@@ -77,7 +76,7 @@ class EnvWorker:
     def reset(
         self, seeds: dict[int, tuple[int | None, bool]], options: dict[str, Any]
     ) -> tuple[list[Rows], RemoteError | None]:
-        """Reset some environments: of each its seed or None, and whether another may replace it without a layout."""
+        """Reset some environments, by index: its seed or None, and whether another seed may replace it."""
         return self._each(seeds, lambda env: self._reset(env, *seeds[env], dict(options)))
 
     def call(self, name: str, args: tuple, kwargs: dict[str, Any]) -> tuple[list[bytes], RemoteError | None]:
@@ -85,7 +84,7 @@ class EnvWorker:
 
         def call(env: int) -> bytes:
             found: Any = self._envs[env].get_wrapper_attr(name)
-            # not by the connection: there torch's tensors would share memory
+            # pickled here, since the connection would put torch's tensors into shared memory
             return pickle.dumps(found(*args, **kwargs) if callable(found) else found)
 
         return self._each(self._envs, call)
@@ -106,11 +105,11 @@ class EnvWorker:
         made: Any = gym.make(self._settings.env_id, **self._settings.kwargs)
         self._envs[env] = made
         base = made.unwrapped
-        if env > 0:  # ManiSkill makes each with the first one's seed
+        if env > 0:  # ManiSkill makes every env with seed 2022
             base._set_main_rng([FIRST_SEED + env])
-            if base.reconfiguration_freq == 0:  # its scene stays
+            if base.reconfiguration_freq == 0:  # its scene is built once
                 if isinstance(base, RoboCASEnv):
-                    base.seeds.first_reset = True  # nobody asked for this seed either
+                    base.seeds.first_reset = True  # this seed was not requested either
                 base.reset(seed=[FIRST_SEED + env], options={"reconfigure": True})
         for wrap in self._settings.wrappers:
             made = self._envs[env] = wrap(made)
@@ -126,13 +125,13 @@ class EnvWorker:
         except LayoutError as error:
             if not replaceable:
                 raise
-            _log.warning("env %d: no layout for seed %d, another is drawn: %s", env, seed, error)
+            _log.warning("env %d: no layout for seed %d; drawing another seed: %s", env, seed, error)
             obs, info = self._envs[env].reset(options=options)
         return as_rows({"obs": obs, "info": info})
 
 
 def as_rows(nested: dict[str, Any], path: tuple[str, ...] = ()) -> Rows:
-    """Return nested dictionaries of one env as rows; arrays pickle in a thirtieth of the time of tensors."""
+    """Return nested dictionaries of one env as rows of arrays, which pickle 30 times faster than tensors."""
     rows: Rows = {}
     for name, value in nested.items():
         rows |= as_rows(value, (*path, name)) if isinstance(value, dict) else {(*path, name): _as_row(value)}
@@ -146,13 +145,13 @@ def _as_row(leaf: Any) -> Any:
 
 
 def join_rows(parts: Sequence[tuple[int, Rows]]) -> Rows:
-    """Return rows of several (number of envs, rows) as rows of all envs; None where an env has none."""
+    """Join several (number of envs, rows) to rows of all envs; a missing value is None."""
     paths = dict.fromkeys(path for _, rows in parts for path in rows)
     return {path: _join([rows.get(path, [None] * count) for count, rows in parts]) for path in paths}
 
 
 def _join(pieces: Sequence[Any]) -> Any:
-    """Join pieces into one array, which is a copy; where that is impossible, into a list of an entry per env."""
+    """Join pieces into one new array or, if their types or shapes differ, into a list with one entry per env."""
     kinds = [isinstance(piece, np.ndarray) and (piece.dtype, piece.shape[1:]) for piece in pieces]
     if kinds[0] and kinds.count(kinds[0]) == len(kinds):
         return np.concatenate(pieces)
@@ -161,5 +160,5 @@ def _join(pieces: Sequence[Any]) -> Any:
 
 
 def split_rows(count: int, rows: Rows) -> list[Rows]:
-    """Return rows of several envs as rows of each env, which are views."""
+    """Split rows of several envs into rows of single envs, which are views."""
     return [{path: piece[i : i + 1] for path, piece in rows.items()} for i in range(count)]

@@ -117,7 +117,7 @@ def test_what_goes_wrong_in_a_process(capfd):
         env.step(doing(1, 1, 1, 1))
         # killed
         pids = env.unwrapped.pids
-        with pytest.raises(VectorEnvCrashError, match=r"env 3: its process died \(found SIGKILL"):
+        with pytest.raises(VectorEnvCrashError, match=r"env 3: its worker process crashed \(found SIGKILL"):
             env.step(doing(7, 0, 0, 4))  # without waiting for the first one
         assert gone(pids)
         with pytest.raises(VectorEnvError, match="closed"):
@@ -133,7 +133,7 @@ def test_a_process_that_is_killed_between_two_steps_is_not_replaced():
         env.reset(seed=0)
         pids = env.unwrapped.pids
         os.kill(pids[1], signal.SIGKILL)
-        with pytest.raises(VectorEnvCrashError, match="env 1: its process died") as died:
+        with pytest.raises(VectorEnvCrashError, match="env 1: its worker process crashed") as died:
             env.step(doing(0, 0))
         assert died.value.envs == (1,)
         assert gone(pids)
