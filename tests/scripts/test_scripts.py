@@ -1,4 +1,4 @@
-"""Scripts name no host; those of `small` call commands that there are, in an order in which each finds its input."""
+"""Scripts: valid syntax, no host names; scripts of `small` call valid commands whose inputs exist at that time."""
 
 import os
 import re
@@ -36,7 +36,8 @@ def test_no_script_names_a_host_and_shell_scripts_are_valid(path):
         subprocess.run(["bash", "-n", path], check=True)
 
 
-def called(tmp_path, script, *more, **settings):
+def run_with_stub(tmp_path, script, *more, **settings):
+    """Run a script with a stub of `robocas`; return its process and the words of the calls."""
     stub = tmp_path / "robocas"
     stub.write_text(STUB)
     stub.chmod(0o755)
@@ -48,13 +49,13 @@ def called(tmp_path, script, *more, **settings):
 
 
 @pytest.mark.parametrize("words", STEPS)
-def test_they_call_what_there_is(tmp_path, words):
+def test_scripts_call_valid_commands(tmp_path, words):
     folder = tmp_path / "out"
     (folder / "run").mkdir(parents=True)
     (folder / "run" / "weights.safetensors").touch()
     (folder / "eval").mkdir()
     (folder / "eval" / "report.md").touch()
-    done, calls = called(tmp_path, *words.split(), str(folder), EPISODES="100")
+    done, calls = run_with_stub(tmp_path, *words.split(), str(folder), EPISODES="100")
     assert done.returncode == 0, done.stderr
     assert " ".join(call[0] for call in calls) == STEPS[words]
     made = {str(folder / "run"), str(folder / "data")}
@@ -70,8 +71,8 @@ def test_they_call_what_there_is(tmp_path, words):
     assert sum(counts) == 100
 
 
-def reproduced(tmp_path, episodes):
-    """A folder as the trainings of a study need it."""
+def make_dataset(tmp_path, episodes):
+    """Return the folder of a reproduction with an empty dataset, the input of a study."""
     data = tmp_path / "out" / "data"
     data.mkdir(parents=True)
     (data / "data_info.json").touch()
@@ -81,26 +82,26 @@ def reproduced(tmp_path, episodes):
 
 
 @pytest.mark.parametrize("what", STUDY)
-def test_a_study_trains_on_what_is_there_and_on_parts_of_it(tmp_path, what):
-    folder = reproduced(tmp_path, 100)
-    done, calls = called(tmp_path, "study_small.sh", str(folder), what, EPISODES="7", STEPS="9")
+def test_study_trains_on_the_dataset_or_on_a_fraction(tmp_path, what):
+    folder = make_dataset(tmp_path, 100)
+    done, calls = run_with_stub(tmp_path, "study_small.sh", str(folder), what, EPISODES="7", STEPS="9")
     assert done.returncode == 0, done.stderr
     assert [call[0] for call in calls] == STUDY[what]
     for call in calls:
         cli.parse(call)
-    train, played = calls[-2:]
+    train, evaluation = calls[-2:]
     whole = what != "25"
     assert Path(train[train.index("--data") + 1]) == folder / ("data" if whole else "study/25/data/part_0")
     assert train[train.index("--steps") + 1] == "9"
-    assert played[played.index("--policy") + 1] == train[train.index("--out") + 1]
-    assert played[played.index("--episodes") + 1] == "7"
+    assert evaluation[evaluation.index("--policy") + 1] == train[train.index("--out") + 1]
+    assert evaluation[evaluation.index("--episodes") + 1] == "7"
     if not whole:
         shares = [float(share) for share in calls[0][calls[0].index("--fractions") + 1 :][:2]]
         assert shares == [0.25, 0.75]
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["study_small.sh", "nowhere"], "nowhere: no data; bash scripts/reproduce_small.sh pick nowhere makes it"),
         (["reproduce_small.sh"], "which task?"),
@@ -111,7 +112,7 @@ def test_a_study_trains_on_what_is_there_and_on_parts_of_it(tmp_path, what):
         ),
     ],
 )
-def test_what_they_refuse(tmp_path, words, said):
-    done, calls = called(tmp_path, *words)
+def test_scripts_refuse_invalid_arguments(tmp_path, words, message):
+    done, calls = run_with_stub(tmp_path, *words)
     assert (done.returncode, calls) == (2, [])
-    assert said in done.stderr
+    assert message in done.stderr
