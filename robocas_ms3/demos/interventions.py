@@ -81,4 +81,4 @@ def _plan_shortest_retreat(arm: Arm, tcp_in_base: Array) -> Trajectory:
                 continue
             if arm.planner.is_free(line.qpos[-1:], arm.planner.finger_width).all():
                 return line
-    raise PlanningError("intervention", "stuck")
+    raise PlanningError("intervention", "no_free_retreat")

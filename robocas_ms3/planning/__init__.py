@@ -1,1 +1,1 @@
-"""Motion planning: the planner protocol and its backends, skills, and one scripted solver a task."""
+"""Motion planning: planner protocol and backends, skills, and one scripted policy (solver) per task."""

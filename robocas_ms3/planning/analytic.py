@@ -1,11 +1,10 @@
-"""Closed-form inverse kinematics of the Panda for many poses at once, given joint 7.
+"""Batched closed-form inverse kinematics of the Panda for given positions of joint 7.
 
-An arm whose joints stand otherwise to each other brings a class of its own with this ``solve``, and names it in its
-description (``inverse_kinematics``).
+An arm with another kinematic structure needs a class with the same ``solve``, named by ``inverse_kinematics`` of its
+description.
 
-The geometry is that of Y. He and S. Liu, "Analytical Inverse Kinematics for Franka Emika Panda" (2021): with joint 7
-given, the wrist is known, the elbow lies on a circle that the fixed elbow angle cuts at up to two places, and each of
-them has two shoulders.
+The geometry follows Y. He and S. Liu, "Analytical Inverse Kinematics for Franka Emika Panda" (2021). Joint 7 determines
+the wrist. The elbow then has up to two positions on a circle, and each of them has two shoulder configurations.
 """
 
 from __future__ import annotations
@@ -16,11 +15,11 @@ from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.planning.kinematics import ArmChain
 from robocas_ms3.planning.protocol import Array
 
-UPRIGHT = 1 - 1e-9  # cosine between the upper arm and the vertical beyond which joints 1 and 3 turn about one axis
+UPRIGHT = 1 - 1e-9  # cosine between upper arm and vertical; above it joints 1 and 3 are collinear (singular)
 
 
 class PandaGeometry:
-    """The Panda's lengths, read from its chain; a chain of another geometry raises ``RobocasError``."""
+    """Link lengths of the Panda, read from its chain; raises RobocasError if the chain has another structure."""
 
     def __init__(self, chain: ArmChain) -> None:
         one, two, three, four, five, six, seven, tcp = chain.links
@@ -36,19 +35,19 @@ class PandaGeometry:
         )
         if not (rotations_fit and places_fit and np.allclose(seven[:3, 3], (self.a7, 0, 0))):
             raise RobocasError(
-                "this closed form is not for this arm",
+                "closed-form inverse kinematics do not fit the arm",
                 where=chain.robot.uid,
-                expected="joints as the Panda's stand to each other",
-                fix="Name one of its own as inverse_kinematics of its description.",
+                expected="the joint axes of the Panda",
+                fix="Set inverse_kinematics in the robot description to a class for this arm.",
             )
         self.link7_in_tcp = np.linalg.inv(tcp)
         self.lower, self.upper = chain.lower, chain.upper
 
     def solve(self, tcp_in_base: Array, joint7: Array) -> Array:
-        """Return all configurations that reach poses (M, 4, 4) with given turns of joint 7 (M,), rad.
+        """Return all configurations that reach TCP poses (M, 4, 4) with given positions of joint 7 (M,), rad.
 
         Returns:
-            (M, 4, 7) rad, or another number of branches; NaN where a branch doesn't exist or breaks a joint limit.
+            (M, 4, 7) rad, one configuration per branch; NaN if a branch does not exist or violates a joint limit.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             return self._solve(
@@ -91,7 +90,7 @@ class PandaGeometry:
             y3 = -_cross(to_wrist, to_meeting)
             y3 /= _norm(y3)[:, None]
             x3 = _cross(y3, z3)
-            # Copies: numpy's arctan2 of strided numbers differs in the last bit by where in memory they lie.
+            # copies, since the last bit of arctan2 of strided arrays depends on their memory alignment
             x, y = z3[:, 0].copy(), z3[:, 1].copy()
             lean = np.arccos(np.clip(z3[:, 2], -1, 1))
             elbow_at = self.d3 * z3 + self.a4 * x3 - to_wrist + self.d5 * forearm

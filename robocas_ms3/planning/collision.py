@@ -1,7 +1,7 @@
 """Check an arm for collisions with itself, with obstacles and with a held object, in the arm's base frame.
 
-Whole batches of configurations pass a broad phase in numpy, which compares axis-aligned boxes around parts and
-obstacles. Only the pairs whose boxes overlap are given to FCL (python-fcl).
+A broad phase in NumPy compares axis-aligned boxes of parts and obstacles for whole batches of configurations. FCL
+(python-fcl) checks only the pairs whose boxes overlap.
 """
 
 from __future__ import annotations
@@ -21,21 +21,22 @@ from robocas_ms3.planning.shapes import CollisionShapes, ConvexPieces
 from robocas_ms3.robots.description import RobotDescription
 
 CLOUD, ATTACHED = "cloud", "attached"
-REACH = 1.5  # m; obstacle points further from the arm's base never matter
-BASE_MARGIN = 0.015  # m around the parts that never move within which points of the cloud are cut out
-SPARSE = 12  # every so manieth configuration of a path is checked before all others
-CHUNK = 128  # configurations of a path checked at once
+REACH = 1.5  # m from the arm's base; obstacle points beyond it are ignored
+BASE_MARGIN = 0.015  # m around the fixed parts; points of a cloud closer than this are removed
+SPARSE = 12  # every SPARSE-th configuration of a path is checked first
+CHUNK = 128  # configurations of a path per batch
 
 
 class CollisionChecker:
-    """The arm, the obstacles and the held object; see `protocol.Planner` for methods without a docstring.
+    """Collision model of the arm, the obstacles and the held object.
 
-    Every instance owns all FCL objects that it moves, so that instances in several threads are independent.
+    `protocol.Planner` documents the methods without a docstring. Each instance owns its FCL objects, so instances in
+    different threads are independent.
 
     Args:
-        urdf: the arm alone, rooted at its base.
-        srdf: pairs of its links that need no check.
-        robot: that carries the arm.
+        urdf: URDF of the arm alone, rooted at its base.
+        srdf: SRDF with the link pairs that need no check.
+        robot: description of the robot.
 
     Raises:
         RobotDescriptionError: a file is missing or unusable, or a geometry is not supported.
@@ -48,8 +49,8 @@ class CollisionChecker:
         self._request, self._result = fcl.CollisionRequest(), fcl.CollisionResult()
         self._held = False
         self._pieces: list[tuple[ConvexPieces, int, Array]] = []
-        self._obstacles: dict[int, Any] = {}  # FCL object by index of the piece, placed when it is first needed
-        # The held object is the last part, with no geometry until it is attached.
+        self._obstacles: dict[int, Any] = {}  # FCL object by index of the piece, created when first needed
+        # the held object is the last part, without a geometry until it is attached
         parts = read_collision_parts(urdf, self.chain)
         held, pairs = len(parts), read_link_pairs(urdf, srdf, parts)
         self._names = [*(part.link for part in parts), ATTACHED]
@@ -62,7 +63,7 @@ class CollisionChecker:
         self._closed_bounds = np.array([*(part.bounds(0.0) for part in parts), empty])  # (P, 2, 3)
         self._open_bounds = np.array([*(part.bounds(open_finger) for part in parts), empty])
         self._moving = np.flatnonzero(self._frames != BASE)
-        # Link 7, the hand and the fingers are rigid with the held object, whose hull may touch them.
+        # the held object is fixed to link 7, hand and fingers, and its hull may touch them
         others = (robot.arm_base_link, robot.base_link, *robot.arm_links[:-1])
         self._own_pairs = len(pairs)  # without the held object
         self._pairs = np.array([*pairs, *((i, held) for i, part in enumerate(parts) if part.link in others)], dtype=int)
@@ -86,7 +87,7 @@ class CollisionChecker:
             points = np.ascontiguousarray(points[self.is_obstacle_point(points)])
             if len(points):
                 bodies = [(CLOUD, self._shapes.cloud(points), np.eye(4))]
-        else:  # not checked against the robot's own base
+        else:  # bodies are not checked against the robot base
             bodies = [(o.name, self._shapes.obstacle(o.shape, o.clearance), o.pose_in_base) for o in obstacles]
         for index, placed in self._obstacles.items():
             pieces, piece, _ = self._pieces[index]
@@ -103,7 +104,7 @@ class CollisionChecker:
         self._low, self._high = np.concatenate(low), np.concatenate(high)
 
     def is_obstacle_point(self, points: Array) -> NDArray[np.bool_]:
-        """Return which points (P, 3) count as obstacles: within reach and outside of the robot's own base."""
+        """Return a mask (P,) of the points (P, 3) that count as obstacles: within reach and outside the robot base."""
         keep = np.einsum("ij,ij->i", points, points) <= REACH**2
         for low, high in self._closed_bounds[self._frames == BASE]:
             keep &= ~np.all((points >= low - BASE_MARGIN) & (points <= high + BASE_MARGIN), axis=1)
@@ -127,7 +128,7 @@ class CollisionChecker:
         return np.array([next(found, None) is None for found in self._pairs_in_contact(qpos, width, True)], dtype=bool)
 
     def count_free(self, qpos: Array, *, obstacles: bool = True) -> int:
-        """Return how many configurations of a path (M, 7) are free before the first one that is not."""
+        """Return the number of collision-free configurations of a path (M, 7) before the first collision."""
         for first in range(0, len(qpos), CHUNK):
             chunk = qpos[first : first + CHUNK]
             for row, found in enumerate(self._pairs_in_contact(chunk, self.finger_width, obstacles)):
@@ -136,7 +137,7 @@ class CollisionChecker:
         return len(qpos)
 
     def all_free(self, qpos: Array, *, obstacles: bool = True) -> bool:
-        """Return whether all configurations of a path (M, 7) are free. Sparse ones are checked first."""
+        """Return whether all configurations of a path (M, 7) are collision-free; every SPARSE-th is checked first."""
         if len(qpos) > 2 * SPARSE:
             qpos = np.concatenate([qpos[i::SPARSE] for i in (SPARSE - 1, *range(SPARSE - 1))])
             first = len(qpos) // SPARSE
@@ -151,8 +152,8 @@ class CollisionChecker:
         return sorted({name for pair in found for name in pair})
 
     def _pairs_in_contact(self, qpos: Array, width: float, obstacles: bool) -> Iterator[Iterator[tuple[str, str]]]:
-        """Yield for each configuration (M, 7) an iterator over the names of its colliding pairs, checked one by one."""
-        assert np.isfinite(qpos).all(), "comparisons with NaN would pass as free"
+        """Yield for each configuration (M, 7) a lazy iterator over the names of its colliding pairs."""
+        assert np.isfinite(qpos).all(), "NaN would compare as collision-free"
         if not len(qpos):
             return
         rotations, positions = self.chain.frames(qpos)
@@ -170,12 +171,12 @@ class CollisionChecker:
     def _narrow_phase(
         self, links: list[int], others: list[list[int]], rotations: Array, positions: Array
     ) -> Iterator[tuple[str, str]]:
-        """Yield the names of the pairs that FCL finds in collision, for parts at (P, 3, 3) and (P, 3)."""
+        """Yield the names of colliding pairs (FCL), for parts at rotations (P, 3, 3) and positions (P, 3)."""
         names, placed = self._names, set()
 
         def part(index: int) -> Any:
             found = self._parts[index]
-            if index not in placed and self._frames[index] != BASE:  # placing takes as long as a check
+            if index not in placed and self._frames[index] != BASE:  # setting a transform takes as long as a check
                 placed.add(index)
                 found.setTransform(fcl.Transform(rotations[index], positions[index]))
             return found
@@ -191,7 +192,7 @@ class CollisionChecker:
     def _collide(self, a: Any, b: Any) -> bool:
         if not fcl.collide(a, b, self._request, self._result):
             return False
-        self._result.contacts.clear()  # python-fcl adds each contact to the result
+        self._result.contacts.clear()  # python-fcl appends to the contacts of earlier checks
         return True
 
     def _obstacle(self, index: int) -> Any:
@@ -203,8 +204,8 @@ class CollisionChecker:
         return self._obstacles[index]
 
     def _part_poses(self, rotations: Array, positions: Array, width: float) -> tuple[Array, Array]:
-        """Return rotations (P, M, 3, 3) and positions (P, M, 3) of the parts for those of frames (8, M, ...)."""
-        turned = rotations[self._frames]  # parts of the base get the last frame's pose, which nothing reads
+        """Return rotations (P, M, 3, 3) and positions (P, M, 3) of the parts, given those of the frames (8, M, ...)."""
+        turned = rotations[self._frames]  # BASE indexes the last frame; its values are not used
         offsets = self._poses[:, :3, 3] + self._slides * (width / 2)
         placed = np.einsum("pmij,pj->pmi", turned, offsets) + positions[self._frames]
         return np.einsum("pmij,pjk->pmik", turned, self._poses[:, :3, :3]), placed
@@ -214,7 +215,8 @@ class CollisionChecker:
     ) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
         """Return the pairs whose boxes overlap, for frames at rotations (8, M, 3, 3) and positions (8, M, 3).
 
-        They are (n, 2) configuration and pair of parts, and (m, 3) configuration, part and obstacle's piece.
+        Returns:
+            Indices (n, 2) of configuration and pair of parts, and (m, 3) of configuration, part and obstacle piece.
         """
         bounds = self._closed_bounds + (self._open_bounds - self._closed_bounds) * (width / self._open_width)
         moving = self._moving if self._held else self._moving[:-1]

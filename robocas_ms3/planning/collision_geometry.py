@@ -1,4 +1,4 @@
-"""Read the collision geometry of an arm from its URDF, and the pairs of links to check from its SRDF."""
+"""Read the collision geometry of an arm from its URDF and the link pairs to check from its SRDF."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.shapes import convex_hull, fcl_convex
 from robocas_ms3.robots.description_file import Joint, RobotXml
 
-BASE, TCP = -1, 7  # frames of parts, next to 0 to 6 of links 1 to 7
-HULL_SUFFIX = ".convex.stl"  # a file of this suffix next to a mesh holds the mesh's convex hull
+BASE, TCP = -1, 7  # frames of parts; 0 to 6 are links 1 to 7
+HULL_SUFFIX = ".convex.stl"  # suffix of the file with the convex hull of a mesh, next to the mesh
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class CollisionPart:
     """One convex collision geometry of a link.
 
     Attributes:
-        frame: that the part moves with: ``BASE``, 0 to 6 (links 1 to 7), or ``TCP``.
-        pose: (4, 4) of the part in that frame, with closed fingers.
-        slide: (3,) displacement in that frame per metre of its finger joint; zero where no finger moves it.
+        frame: frame that the part moves with: ``BASE``, 0 to 6 (links 1 to 7), or ``TCP``.
+        pose: (4, 4) pose of the part in that frame with closed fingers.
+        slide: (3,) displacement in that frame per metre of the finger joint; zero for parts that no finger moves.
         corners: (V, 3) points whose convex hull contains the part, in the part's frame, m.
     """
 
@@ -43,15 +43,15 @@ class CollisionPart:
     corners: Array
 
     def bounds(self, finger: float) -> Array:
-        """Return the lower and upper corner (2, 3) of a box around the part in its frame, at a finger position in m."""
+        """Return the bounding box (2, 3) of the part in its frame for a finger position in m."""
         points = self.corners @ self.pose[:3, :3].T + self.pose[:3, 3] + finger * self.slide
         return np.array([points.min(axis=0), points.max(axis=0)])
 
 
 def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPart]:
-    """Read the collision parts of all links from the arm's base link downwards; raises `RobotDescriptionError`.
+    """Read the collision parts of all links below the arm's base link; raise `RobotDescriptionError` on bad files.
 
-    A joint that is neither an arm joint nor a finger joint is taken at its zero position.
+    Joints other than arm and finger joints are at their zero position.
     """
     robot, file = chain.robot, RobotXml(urdf)
     links = {file.attribute(link, "name"): link for link in file.root.iterfind("link")}
@@ -62,7 +62,7 @@ def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPar
 
     def visit(name: str, frame: int, pose: Array, slide: Array) -> Iterator[CollisionPart]:
         if name not in links:
-            raise file.error("missing link", f'<link name="{name}">, which a joint names', "none")
+            raise file.error("missing link", f'<link name="{name}">, the child of a joint', "none")
         for geometry, corners, origin in _collision_geometries(links[name], name, file):
             yield CollisionPart(name, frame, pose @ origin, slide, geometry, corners)
         if frame == 6:  # links that hang from link 7 are rigid with the TCP
@@ -75,7 +75,7 @@ def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPar
             child_slide = slide
             if joint.name in robot.finger_joints:
                 if joint.kind != "prismatic":
-                    raise file.error(f"finger joint {joint.name!r} does not slide", "type prismatic", joint.kind)
+                    raise file.error(f"wrong type of finger joint {joint.name!r}", "type prismatic", joint.kind)
                 child_slide = slide + child_pose[:3, :3] @ joint.axis
             yield from visit(joint.child, frame, child_pose, child_slide)
 
@@ -83,7 +83,7 @@ def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPar
 
 
 def read_link_pairs(urdf: Path | str, srdf: Path | str, parts: list[CollisionPart]) -> list[tuple[int, int]]:
-    """Return the pairs of part indices (i < j) to check: of links neither adjacent nor disabled in the SRDF."""
+    """Return pairs of part indices (i < j) to check: links that are neither adjacent nor disabled in the SRDF."""
     ignored = {frozenset((joint.parent, joint.child)) for joint in RobotXml(urdf).joints()}
     file = RobotXml(srdf)
     for pair in file.root.iterfind("disable_collisions"):
@@ -119,7 +119,7 @@ def _geometry(shape: Element, link: str, file: RobotXml) -> tuple[Any, Array]:
     if shape.tag == "sphere":
         (radius,) = file.numbers(shape, "radius", 1)
         return fcl.Sphere(radius), _box_corners(2 * radius, 2 * radius, 2 * radius)
-    raise file.error(f"unsupported geometry of link {link!r}", "mesh, box, cylinder or sphere", shape.tag)
+    raise file.error(f"unsupported collision geometry of link {link!r}", "mesh, box, cylinder or sphere", shape.tag)
 
 
 def _box_corners(x: float, y: float, z: float) -> Array:
@@ -132,12 +132,12 @@ def _read_hull(path: Path, scale: Array, link: str) -> tuple[Array, NDArray[np.i
     try:
         mesh: Any = trimesh.load(path, force="mesh", process=False)
         corners, faces, _ = convex_hull(np.asarray(mesh.vertices, dtype=np.float64) * scale)
-    except Exception as error:  # each of trimesh's loaders raises errors of its own; qhull refuses flat meshes
+    except Exception as error:  # the loaders of trimesh raise different types; qhull rejects flat meshes
         raise RobotDescriptionError(
             f"unusable collision mesh of link {link!r}",
             where=path,
-            expected="a mesh with a volume in a format that trimesh loads, such as STL or OBJ",
+            expected="a mesh with positive volume in a format that trimesh reads, such as STL or OBJ",
             found=format_error(error),
-            fix="Export the mesh again, as STL.",
+            fix="Export the mesh again as STL.",
         ) from error
     return corners, faces

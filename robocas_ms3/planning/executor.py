@@ -1,4 +1,4 @@
-"""Run planned motions in an environment and keep what was done since the reset."""
+"""Run planned motions in an environment and store the actions since the reset."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OPEN, CLOSED = 1.0, -1.0
 
 @dataclass
 class Segment:
-    """A part of the demonstration with one sub-goal, from the action of index ``first`` on."""
+    """A sub-goal of the demonstration, valid from action index ``first`` on."""
 
     goal_type: str
     goal_description: str
@@ -27,17 +27,17 @@ class Segment:
 
 @dataclass
 class Executor:
-    """Steps one environment (``pd_joint_pos`` or ``pd_joint_pos_base``, one env); keeps all actions since the reset.
+    """Executor of motions in one environment with control mode ``pd_joint_pos`` or ``pd_joint_pos_base``.
 
     Attributes:
-        env: may be wrapped by a recorder.
-        actions: every action since the reset, (8,) each, or (11,) where the base is driven.
-        segments: the sub-goals so far.
-        info: of the last step or reset.
-        gripper: last command of the gripper.
+        env: environment with ``num_envs`` = 1, possibly wrapped by a recorder.
+        actions: actions since the reset, (8,) each, or (11,) with base joints.
+        segments: sub-goals since the reset.
+        info: info of the last step or reset.
+        gripper: last gripper command.
         base: (3,) last command of the base joints: x m, y m, yaw rad.
-        facts: counters of the policy for the record, e.g. ``pushes``.
-        check_open_loop: replays the actions so far open loop; raises ``UnrecoverableError`` where the outcome differs.
+        facts: counters of the policy that are recorded, e.g. ``pushes``.
+        check_open_loop: replays the actions so far open loop; raises UnrecoverableError if the result differs.
     """
 
     env: gym.Env
@@ -68,9 +68,9 @@ class Executor:
         self.facts = {}
 
     def follow(self, trajectory: Trajectory, *, until: str | None = None) -> bool:
-        """Send a trajectory's rows to the arm, holding the gripper's command.
+        """Send the rows of a trajectory to the arm with the last gripper command.
 
-        It stops as soon as the flag ``until`` of ``info`` is set; returns whether it is, or True without one.
+        Stop as soon as the flag ``until`` of ``info`` is set; return whether it is set, or True without ``until``.
         """
         for qpos in trajectory.qpos:
             if until and self.flag(until):
@@ -79,17 +79,21 @@ class Executor:
         return until is None or self.flag(until)
 
     def move_gripper(self, command: float, hold: Array, *, seconds: float) -> None:
-        """Command the gripper (``OPEN`` or ``CLOSED``) for some seconds, with the arm held at (7,) rad."""
+        """Command the gripper (``OPEN`` or ``CLOSED``) for some seconds; the arm holds a configuration (7,)."""
         self.gripper = command
         for _ in range(max(1, round(seconds / self.dt))):
             self._step(self._action(hold))
 
     @property
     def drives_base(self) -> bool:
+        """Whether actions include the base joints."""
         return self.base_env.control_mode.endswith("_base")
 
     def drive(self, waypoints: Array, hold: Array) -> None:
-        """Send base joint targets (T, 3), x m, y m, yaw rad, one per control step, with the arm held at (7,) rad."""
+        """Send base joint targets (T, 3), one per control step, while the arm holds a configuration (7,).
+
+        Targets are x m, y m, yaw rad.
+        """
         for base in waypoints:
             self.base = base
             self._step(self._action(hold))
@@ -99,7 +103,7 @@ class Executor:
         return np.concatenate([qpos, [self.gripper], base]).astype(np.float32)
 
     def start_subgoal(self, goal_type: str, goal_description: str) -> None:
-        """Begin a sub-goal with the next action; a label that repeats the last one changes nothing."""
+        """Start a sub-goal with the next action; starting the current sub-goal again has no effect."""
         if self.segments and self.segments[-1].first == len(self.actions):
             self.segments.pop()
         if not self.segments or (self.segments[-1].goal_type, self.segments[-1].goal_description) != (
@@ -109,6 +113,7 @@ class Executor:
             self.segments.append(Segment(goal_type, goal_description, len(self.actions)))
 
     def flag(self, name: str) -> bool:
+        """Return a flag of the last ``info``, e.g. ``success``."""
         return bool(self.info[name][0])
 
     def _step(self, action: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""Which annotated grasps an arm should try, and in what order: geometry only, no simulator."""
+"""Filter, score and order the annotated grasps of an object. Geometry only, no simulator."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from robocas_ms3.scenes.grasp_checks import (
 
 Array = NDArray[np.float64]
 
-# What lies between the pads, in the TCP's frame, and how a robot may miss: across the pads, and not deep enough, m
+# Volume between the pads in the TCP frame, and offsets of an imprecise grasp: across the pads, along the approach (m)
 PAD_HALF_WIDTH, PAD_BEHIND_TCP, PAD_BEFORE_TCP = 0.009, -0.012, 0.008
 GRIP_SHIFTS = ((0.0, 0.0), (0.006, 0.0), (-0.006, 0.0), (0.0, -0.006), (0.004, -0.004), (-0.004, -0.004))
-PAD_POINTS = 10  # of a surface at 5 mm: a third of what fits
-FINGER_CLEARANCE = 0.006  # m between an object and each open finger
+PAD_POINTS = 10  # surface points (5 mm apart) between the pads of a firm grasp; about 30 fit
+FINGER_CLEARANCE = 0.006  # m between the object and each open finger
 MARGIN_WEIGHT = 1.0
 TURN_WEIGHT = 0.4  # per rad
 TEMPERATURE = 0.15
@@ -31,11 +31,13 @@ TEMPERATURE = 0.15
 
 @dataclass(frozen=True)
 class Grasps:
-    """Grasps that a robot could try; the second half are the first half with the wrist turned by 180 deg.
+    """Candidate grasps; the second half repeats the first half with the wrist turned by 180 deg.
 
     Attributes:
-        widths: (2K,) opening the object needs there, m.
-        index: (2K,) of each one among the annotated grasps.
+        tcp_in_world: (2K, 4, 4) TCP poses.
+        widths: (2K,) gripper opening at the object, m.
+        qualities: (2K,) annotated qualities, greater is better.
+        index: (2K,) indices of the annotated grasps.
     """
 
     tcp_in_world: Array
@@ -50,7 +52,7 @@ class Grasps:
 def filter_grasps(
     annotations: Annotations, object_in_world: Array, arm_base_in_world: Array, approach: Approach = "top"
 ) -> Grasps:
-    """Return the annotated grasps that a robot standing there could try, from above or from the front."""
+    """Return the annotated grasps that a robot with this base pose can try, from above or from the front."""
     poses = object_in_world @ annotations.grasps_tcp_in_object
     base_to_object = object_in_world[:3, 3] - arm_base_in_world[:3, 3]
     passed = annotations.grasp_widths <= MAX_WIDTH
@@ -64,14 +66,15 @@ def filter_grasps(
 
 
 def grip_margins(tcp: Array, widths: Array, surface: Array) -> Array:
-    """Return how much (N,) of an object is between the pads even where a grasp misses a little, 0 to 1.
+    """Return the margin (N,) of grasps against position errors, 0 to 1.
 
-    1: at least ``PAD_POINTS`` lie between the pads of each of several shifted grasps, and ``FINGER_CLEARANCE`` is left
-    beside the object while the gripper is open.
+    A grasp has margin 1 if at least ``PAD_POINTS`` surface points are between the pads for each offset in
+    ``GRIP_SHIFTS``, and each open finger has at least ``FINGER_CLEARANCE`` to the object.
 
     Args:
-        tcp: (N, 4, 4) grasps, in the frame of ``surface`` (P, 3), points of the object 5 mm apart, m.
-        widths: (N,) of the object there, m.
+        tcp: (N, 4, 4) TCP poses in the frame of ``surface``.
+        widths: (N,) widths of the object at the grasps, m.
+        surface: (P, 3) surface points of the object, 5 mm apart, m.
     """
     margin = np.clip((MAX_WIDTH - np.asarray(widths)) / 2 / FINGER_CLEARANCE, 0, 1)
     widest, deepest = np.abs(GRIP_SHIFTS).max(axis=0)
@@ -93,15 +96,17 @@ def grip_margins(tcp: Array, widths: Array, surface: Array) -> Array:
 def score_grasps(
     tcp: Array, qualities: Array, margins: Array, turns: Array, object_center: Array, approach: Approach = "top"
 ) -> Array:
-    """Return a score (N,) of each grasp, more is better.
+    """Return scores (N,) of grasps; greater is better.
 
-    The score adds quality (relative to the best), nearness of the TCP to the object's centre (falls by e every 3 cm),
-    steepness (1 straight down, 0 level; from the front the other way round), nearness in joint space, and the margin.
+    The score is the weighted sum of the quality relative to the best, the proximity of the TCP to the object's centre
+    (falls by a factor e per 3 cm), the steepness (1 straight down, 0 horizontal; reversed for a front approach), the
+    proximity in joint space and the margin.
 
     Args:
-        tcp: (N, 4, 4) in any upright frame, which ``object_center`` (3,) is in too.
-        qualities, margins: (N,), more is better.
-        turns: (N,) rad, of the joint that turns most on the way there, which sets the time.
+        tcp: (N, 4, 4) TCP poses in any frame with a vertical z axis.
+        qualities, margins: (N,), greater is better.
+        turns: (N,) largest joint displacement on the way to the grasp, rad, which determines the duration.
+        object_center: (3,) centre of the object in the frame of ``tcp``.
     """
     quality = qualities / max(float(np.abs(qualities).max()), 1e-9)
     distance = np.linalg.norm(tcp[:, :3, 3] - object_center, axis=1)
@@ -111,6 +116,6 @@ def score_grasps(
 
 
 def sample_order(rng: np.random.Generator, scores: Array) -> NDArray[np.int_]:
-    """Order grasps by score (N,), with some chance: one overtakes one that is 0.15 better about one time in four."""
-    # Gumbel noise turns scores into draws without replacement, weighted by exp(score / TEMPERATURE).
+    """Order grasps randomly by scores (N,): a grasp precedes one with a score 0.15 greater with probability 0.27."""
+    # Gumbel noise gives draws without replacement, weighted by exp(score / TEMPERATURE)
     return np.argsort(-(scores + TEMPERATURE * rng.gumbel(size=len(scores))), kind="stable")

@@ -1,7 +1,7 @@
-"""The arm as a chain of links, its inverse kinematics for many poses, and straight lines of its TCP.
+"""Forward and inverse kinematics of an arm for batches of poses, and straight lines of its TCP.
 
-Batches are computed without BLAS: its threads take longer to start than products of 3 x 3 matrices take, and the last
-bits of its results depend on the number of threads.
+The module does not use BLAS. Starting its threads takes longer than products of 3 x 3 matrices, and the last bits of
+its results depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -19,35 +19,35 @@ from robocas_ms3.planning.protocol import Array
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.description_file import RobotXml
 
-LIMIT_MARGIN = 0.02  # rad kept from every joint limit
-JOINT7_STEP = 0.25  # rad between turns of joint 7 that are tried for many poses
-JOINT7_FINE_STEP = 0.1  # the same for one pose
-MIN_SOLUTION_DISTANCE = 0.3  # rad (norm over the joints) between two solutions that count as different
-MAX_SOLUTIONS = 40  # solutions of one pose
-LINE_STEP = 0.01  # m between two poses of a straight line
-LINE_TURN = np.deg2rad(3)  # rad between two poses of a straight line
-MAX_JUMP = 0.15  # rad that a joint may turn between two poses of a straight line
-ESTIMATE_STRIDE = 4  # poses between two first estimates
-LINE_ITERATIONS = 8  # Newton steps of all poses of a line together
-POSE_ITERATIONS = 60  # Newton steps of one pose
-TOLERANCE = 1e-7  # accepted pose error, m and rad together
-HALF_TURN = -0.99  # cosine below which a rotation counts as nearly a half turn
-DAMPING = 1e-8  # added to the diagonal of J J^T, so that it can be inverted at singularities
+LIMIT_MARGIN = 0.02  # rad to each joint limit
+JOINT7_STEP = 0.25  # rad between sampled positions of joint 7, for batches of poses
+JOINT7_FINE_STEP = 0.1  # rad, for a single pose
+MIN_SOLUTION_DISTANCE = 0.3  # rad (norm over joints) between distinct solutions
+MAX_SOLUTIONS = 40  # distinct solutions per pose
+LINE_STEP = 0.01  # m between poses of a straight line
+LINE_TURN = np.deg2rad(3)  # rad between poses of a straight line
+MAX_JUMP = 0.15  # rad, maximum joint displacement between poses of a straight line
+ESTIMATE_STRIDE = 4  # poses between initial estimates
+LINE_ITERATIONS = 8  # Newton steps for all poses of a line at once
+POSE_ITERATIONS = 60  # Newton steps for a single pose
+TOLERANCE = 1e-7  # accepted pose error, norm over m and rad
+HALF_TURN = -0.99  # cosine below which a rotation is treated as a half turn
+DAMPING = 1e-8  # added to the diagonal of J J^T, so that it is invertible at singularities
 
 
 class ArmChain:
-    """Seven joints that turn about z of their own links, and the TCP fixed to the last.
+    """Kinematic chain of seven revolute joints about z of their links, with the TCP fixed to the last link.
 
-    `robots.kinematics.SerialChain` serves controllers on a GPU; this class gives the frames of all links, in NumPy
-    without BLAS, so that plans repeat exactly.
+    The class computes the frames of all links in NumPy without BLAS, so that plans are reproducible to the bit.
+    Controllers on a GPU use `robots.kinematics.SerialChain` instead.
 
     Attributes:
-        links: eight fixed transforms 4x4: from each link to the next one at 0 rad, the last to the TCP.
-        hand_in_tcp: 4x4.
-        limits: (7, 2) lower and upper joint limits, rad; ``lower`` and ``upper`` (7,) are these with a margin.
+        links: eight fixed transforms (4x4): from each link to the next one at 0 rad, the last one to the TCP.
+        hand_in_tcp: (4x4) pose of the hand link in the TCP frame.
+        limits: (7, 2) lower and upper joint limits, rad; ``lower`` and ``upper`` (7,) include ``LIMIT_MARGIN``.
 
     Raises:
-        RobotDescriptionError: the URDF of the arm is missing or malformed, or it does not describe that arm.
+        RobotDescriptionError: the URDF is missing or malformed, or describes another arm.
     """
 
     def __init__(self, arm_urdf: Path | str, robot: RobotDescription) -> None:
@@ -58,7 +58,7 @@ class ArmChain:
         names = tuple(joint.name for joint in turning)
         if names != robot.arm_joints or not all(joint.axis.tolist() == [0, 0, 1] for joint in turning):
             expected = f"{', '.join(robot.arm_joints)}, each about z"
-            raise file.error(f"not the arm of {robot.uid}", expected, ", ".join(names))
+            raise file.error(f"wrong arm joints for {robot.uid}", expected, ", ".join(names))
         self.links, self.hand_in_tcp = [], np.eye(4)
         pending, after_hand = np.eye(4), False
         for joint in chain:
@@ -73,24 +73,27 @@ class ArmChain:
         self.hand_in_tcp = np.linalg.inv(self.hand_in_tcp)
         without = [joint.name for joint in turning if joint.limits is None]
         if without:
-            raise file.error("joints without limits", "a <limit> in each joint of the arm", ", ".join(without))
+            raise file.error("arm joints without limits", "a <limit> element in each arm joint", ", ".join(without))
         self.limits = np.array([joint.limits for joint in turning])
         self.lower, self.upper = self.limits[:, 0] + LIMIT_MARGIN, self.limits[:, 1] - LIMIT_MARGIN
 
     def with_tool_offset(self, distance: float) -> ArmChain:
-        """Return the same arm with its end a distance (m) behind the TCP, against the approach."""
+        """Return a copy whose end is shifted from the TCP by ``distance`` (m) against the approach axis."""
         chain, back = copy(self), np.eye(4)
         back[2, 3] = -distance
         chain.links = [*self.links[:-1], self.links[-1] @ back]
         return chain
 
     def frames(self, qpos: Array) -> tuple[Array, Array]:
-        """Give rotations (8, M, 3, 3) and positions (8, M, 3) of links 1 to 7 and the TCP in the base at (M, 7)."""
+        """Compute rotations (8, M, 3, 3) and positions (8, M, 3) of links 1 to 7 and the TCP at (M, 7).
+
+        They are in the arm's base frame.
+        """
         count, qpos = len(qpos), np.ascontiguousarray(qpos)
         rotations, positions = np.empty((8, count, 3, 3)), np.empty((8, count, 3))
         fixed = np.array(self.links)[:, None, :3, :3]
         cosine, sine = np.cos(qpos).T[:, :, None], np.sin(qpos).T[:, :, None]
-        # each link in the one before
+        # pose of each link in the previous one
         local = np.empty((8, count, 3, 3))
         local[:7, ..., 0] = fixed[:7, ..., 0] * cosine + fixed[:7, ..., 1] * sine
         local[:7, ..., 1] = fixed[:7, ..., 1] * cosine - fixed[:7, ..., 0] * sine
@@ -103,12 +106,12 @@ class ArmChain:
         return rotations, positions
 
     def tcp(self, qpos: Array) -> Array:
-        """Give TCP poses (M, 4, 4) in the base frame at (M, 7)."""
+        """Compute TCP poses (M, 4, 4) in the base frame at configurations (M, 7)."""
         rotations, positions = self.frames(qpos)
         return _poses(rotations[7], positions[7])
 
     def jacobian(self, qpos: Array) -> tuple[Array, Array]:
-        """Give TCP poses (M, 4, 4) and Jacobians (M, 6, 7), linear rows first, in the base frame, at (M, 7)."""
+        """Compute TCP poses (M, 4, 4) and Jacobians (M, 6, 7) in the base frame, linear rows first."""
         rotations, positions = self.frames(qpos)
         axes = rotations[:7, :, :, 2].transpose(1, 2, 0)
         arm = (positions[7] - positions[:7]).transpose(1, 2, 0)
@@ -120,7 +123,10 @@ class ArmChain:
 
 
 def joint_distance(qpos: Array, near: Array) -> Array:
-    """Return how far apart configurations (..., 7) are: the largest turn, which sets the time, and some of all."""
+    """Return the distance of configurations (..., 7): the largest joint displacement plus 0.2 of the norm.
+
+    The largest displacement determines the duration of a motion.
+    """
     away = np.abs(qpos - near)
     return away.max(axis=-1) + 0.2 * np.sqrt((away * away).sum(axis=-1))
 
@@ -132,7 +138,7 @@ def _poses(rotation: Array, position: Array) -> Array:
 
 
 class Reachability:
-    """Inverse kinematics of one arm by the closed form that its description names; collisions do not count."""
+    """Inverse kinematics of an arm by the closed form in its description, without collision checks."""
 
     def __init__(self, chain: ArmChain) -> None:
         self.chain = chain
@@ -140,10 +146,10 @@ class Reachability:
         self._geometry = load_object(self.chain.robot.inverse_kinematics)(self.chain)
 
     def nearest_solutions(self, tcp_in_base: Array, near: Array) -> tuple[NDArray[np.bool_], Array]:
-        """Find for each pose (N, 4, 4) the solution that is nearest to a configuration (7,).
+        """Find the solution nearest to a configuration (7,) for each pose (N, 4, 4).
 
         Returns:
-            (N,) whether there is one inside the joint limits, and (N, 7) that one, NaN where none.
+            A mask (N,) of the poses with a solution within the joint limits, and the solutions (N, 7), NaN elsewhere.
         """
         poses, near = np.asarray(tcp_in_base, dtype=np.float64).reshape(-1, 4, 4), np.asarray(near, dtype=np.float64)
         if len(poses) == 0:
@@ -155,13 +161,13 @@ class Reachability:
         return np.isfinite(qpos[:, 0]), qpos
 
     def all_solutions(self, tcp_in_base: Array, near: Array) -> tuple[Array, NDArray[np.intp]]:
-        """Give all configurations (M, 7) that reach many poses (N, 4, 4), and of which pose each is one (M,)."""
+        """Find all solutions (M, 7) for poses (N, 4, 4), and the index of the pose of each solution (M,)."""
         found = self._solve(np.asarray(tcp_in_base, dtype=np.float64), np.asarray(near, dtype=np.float64), JOINT7_STEP)
         exists = np.isfinite(found[..., 0])
         return found[exists], np.nonzero(exists)[0]
 
     def distinct_solutions(self, tcp_in_base: Array, near: Array) -> list[Array]:
-        """Give distinct configurations (7,) that reach one pose (4x4), nearest to ``near`` first."""
+        """Find distinct solutions (7,) for one pose (4x4), the nearest to ``near`` first."""
         found = self._solve(np.asarray(tcp_in_base, dtype=np.float64)[None], near, JOINT7_FINE_STEP)[0]
         found = found[np.isfinite(found[:, 0])]
         kept: list[Array] = []
@@ -171,7 +177,7 @@ class Reachability:
         return kept[:MAX_SOLUTIONS]
 
     def _solve(self, poses: Array, near: Array, step: float) -> Array:
-        """Return solutions (N, K, 7) of poses (N, 4, 4) over joint 7, which is also tried at its value in ``near``."""
+        """Solve poses (N, 4, 4) for sampled positions of joint 7, including that of ``near``; return (N, K, 7)."""
         first, last = np.ceil((self.lower[6] - near[6]) / step), np.floor((self.upper[6] - near[6]) / step)
         turns = np.clip(near[6] + step * np.arange(first, last + 1), self.lower[6], self.upper[6])
         solved = self._geometry.solve(np.repeat(poses, len(turns), axis=0), np.tile(turns, len(poses)))
@@ -179,22 +185,22 @@ class Reachability:
 
 
 def rotation_vector(rotations: Array) -> Array:
-    """Return the rotation vectors (M, 3) in rad, of length up to pi, of rotation matrices (M, 3, 3)."""
+    """Return rotation vectors (M, 3), rad, of norm at most pi, for rotation matrices (M, 3, 3)."""
     twice_sine_axis = rotations[:, (2, 0, 1), (1, 2, 0)] - rotations[:, (1, 2, 0), (2, 0, 1)]
     sine = np.sqrt(np.einsum("mi,mi->m", twice_sine_axis, twice_sine_axis)) / 2
     cosine = (np.einsum("mii->m", rotations) - 1) / 2
     angle = np.arctan2(sine, cosine)
     vectors = twice_sine_axis * (angle / (2 * np.maximum(sine, 1e-300)))[:, None]
-    half_turns = cosine < HALF_TURN  # the sine vanishes there, and the axis with it
+    half_turns = cosine < HALF_TURN  # the axis is ill-conditioned there
     if half_turns.any():
         vectors[half_turns] = Rotation.from_matrix(rotations[half_turns]).as_rotvec()
     return vectors
 
 
 def newton_step(chain: ArmChain, qpos: Array, goals: Array) -> tuple[Array, Array]:
-    """Move each configuration by one damped Newton step towards its own TCP pose, within the joint limits.
+    """Apply one damped Newton step towards a TCP pose to each configuration, within the joint limits.
 
-    The step has the smallest norm over the joints. It is computed without BLAS and LAPACK, whose last bits depend on
+    The step has minimum norm. It is computed without BLAS and LAPACK, since the last bits of their results depend on
     the processor and on the number of threads.
 
     Args:
@@ -202,7 +208,7 @@ def newton_step(chain: ArmChain, qpos: Array, goals: Array) -> tuple[Array, Arra
         goals: (M, 4, 4) TCP poses in the base frame.
 
     Returns:
-        The next configurations (M, 7), and the pose errors (M,) of the given ones: the norm over m and rad.
+        The next configurations (M, 7), and the pose errors (M,) of ``qpos``: norm over m and rad.
     """
     poses, jacobian = chain.jacobian(qpos)
     error = np.empty((len(qpos), 6))
@@ -215,7 +221,7 @@ def newton_step(chain: ArmChain, qpos: Array, goals: Array) -> tuple[Array, Arra
 
 
 def solve_positive(matrices: Array, values: Array) -> Array:
-    """Solve positive definite systems (M, N, N) for (M, N) by Gauss-Jordan elimination without pivoting."""
+    """Solve positive definite systems (M, N, N) with right-hand sides (M, N) by Gauss-Jordan elimination."""
     rows = np.concatenate([matrices, values[:, :, None]], axis=2)
     for pivot in range(rows.shape[1]):
         rows[:, pivot] /= rows[:, pivot, pivot, None]
@@ -226,13 +232,15 @@ def solve_positive(matrices: Array, values: Array) -> Array:
 
 
 def follow_line(chain: ArmChain, start: Array, tcp_in_base: Array, *, stage: str) -> Array:
-    """Follow a straight line of the TCP from a configuration (7,) to a pose (4, 4): linear position, shortest rotation.
+    """Compute configurations along a straight line of the TCP from a configuration (7,) to a pose (4x4).
+
+    The position is interpolated linearly, the orientation along the shortest rotation.
 
     Returns:
-        (n, 7) configurations whose TCP poses are at most 1 cm and 3 deg apart; the first is ``start``.
+        (n, 7) configurations whose TCP poses are at most 1 cm and 3 deg apart; the first one is ``start``.
 
     Raises:
-        PlanningError: ``line_unreachable``, or ``line_joint_jump``.
+        PlanningError: reason ``line_unreachable`` or ``line_joint_jump``.
     """
     start = np.asarray(start, dtype=np.float64)
     goals = _line_poses(chain.tcp(start[None])[0], tcp_in_base)
@@ -247,7 +255,10 @@ def follow_line(chain: ArmChain, start: Array, tcp_in_base: Array, *, stage: str
 
 
 def _solve_simultaneously(chain: ArmChain, start: Array, goals: Array) -> Array | None:
-    """Return a path (n + 1, 7) along poses (n, 4, 4): one step to every few poses, then steps of all poses together."""
+    """Solve all poses (n, 4, 4) of a line at once; return the path (n + 1, 7), or None without convergence.
+
+    Initial estimates come from one Newton step to every ``ESTIMATE_STRIDE``-th pose.
+    """
     path = np.empty((len(goals) + 1, 7))
     path[0] = start
     for before in range(0, len(goals), ESTIMATE_STRIDE):

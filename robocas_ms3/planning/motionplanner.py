@@ -1,7 +1,7 @@
-"""The methods of ManiSkill's motion-planning solvers on top of this package's planners.
+"""Drop-in replacement of ManiSkill's motion-planning solver that uses the planners of this package.
 
-``mani_skill.examples.motionplanning`` has the original, which needs mplib. Solutions written for it run with this class
-after a change of the import, unless they continue after a failed plan; docs/motion_planning.md lists the differences.
+The original in ``mani_skill.examples.motionplanning`` needs mplib. Solutions written for it run with this class after a
+change of the import, unless they continue after a failed plan. docs/motion_planning.md lists the differences.
 """
 
 from __future__ import annotations
@@ -37,32 +37,32 @@ MIN_LIMIT = 1e-3  # rad/s, rad/s^2
 IGNORED = frozenset({"debug", "visualize_target_grasp_pose", "print_env_info"})
 
 Step = tuple[Any, Any, Any, Any, dict[str, Any]]
-"""What ``env.step`` returns: observation, reward, terminated, truncated, info."""
+"""Return value of ``env.step``: observation, reward, terminated, truncated, info."""
 
 
 class PandaArmMotionPlanningSolver:
-    """Plan motions of a Panda arm and execute them in one environment.
+    """Solver that plans motions of a Panda arm and executes them in one environment.
 
-    The class has the methods of ManiSkill's solver of the same name. All poses and points are in the world frame. A
-    method that can't plan raises ``PlanningError`` and does not step the environment, where ManiSkill's prints a
-    status and returns -1. Methods that step return the last step: observation, reward, terminated, truncated, info.
+    The class has the methods of ManiSkill's solver of the same name. Poses and points are in the world frame. If
+    planning fails, a method raises ``PlanningError`` and does not step the environment; ManiSkill's solver prints a
+    status and returns -1. Methods that step return the result of the last step.
 
     Args:
         env: one environment (``num_envs`` = 1) with control mode ``pd_joint_pos`` or ``pd_joint_pos_vel`` and with
             ManiSkill's ``panda`` or ``panda_wristcam`` or a robot of this package; wrappers are stepped too.
         base_pose: pose of the robot's root link; default: the pose in the simulation at each call.
         vis: whether to show every step in ManiSkill's viewer, which needs a display.
-        joint_vel_limits, joint_acc_limits: of every arm joint, rad/s and rad/s^2.
+        joint_vel_limits, joint_acc_limits: limits of each arm joint, rad/s and rad/s^2.
         backend: name of the motion planner.
-        ignored: arguments of ManiSkill's solver without effect here, see ``IGNORED``.
+        ignored: arguments of ManiSkill's solver that have no effect here, see ``IGNORED``.
 
     Attributes:
         planner: the motion planner; its poses are in the frame of the arm's base.
-        gripper_state: gripper command that motions hold, 1 open to -1 closed.
+        gripper_state: gripper command during motions, 1 open to -1 closed.
 
     Raises:
-        RobocasError: the environment does not fit, a limit is not positive, or a pose or point is NaN or infinite.
-        ExtensionError: no motion planner has this name.
+        RobocasError: unsupported environment, a limit is not positive, or a pose or point is NaN or infinite.
+        ExtensionError: unknown motion planner.
     """
 
     OPEN, CLOSED = 1.0, -1.0
@@ -82,11 +82,12 @@ class PandaArmMotionPlanningSolver:
             raise TypeError(f"unexpected arguments: {', '.join(sorted(unknown))}")
         self.env, self.base_env, self.vis = env, cast("BaseEnv", env.unwrapped), vis
         if self.base_env.num_envs != 1:
-            what, fix = "the solver plans for one environment", "Make the environment with num_envs=1."
+            what, fix = "the solver supports one environment only", "Create the environment with num_envs=1."
             raise RobocasError(what, where="num_envs", expected=1, found=self.base_env.num_envs, fix=fix)
         self.control_mode = str(self.base_env.control_mode)
         if self.control_mode not in CONTROL_MODES:
-            what, fix = "the solver sends joint positions", "Make the environment with control_mode='pd_joint_pos'."
+            what = "unsupported control mode of the motion-planning solver"
+            fix = "Create the environment with control_mode='pd_joint_pos'."
             expected = " or ".join(CONTROL_MODES)
             raise RobocasError(what, where="control_mode", expected=expected, found=self.control_mode, fix=fix)
         check_number("joint_vel_limits", joint_vel_limits, MIN_LIMIT)
@@ -113,65 +114,66 @@ class PandaArmMotionPlanningSolver:
     def move_to_pose_with_RRTConnect(
         self, pose: sapien.Pose | Pose, dry_run: bool = False, refine_steps: int = 0
     ) -> Any:
-        """Move the TCP to a pose on any collision-free path, and send the last target ``refine_steps`` times again.
+        """Move the TCP to a pose on a collision-free path; repeat the last target for ``refine_steps`` steps.
 
         Returns:
-            The last step; the planned trajectory of a ``dry_run``, which does not step the environment.
+            The last step; with ``dry_run`` the planned trajectory, and the environment is not stepped.
         """
         start, goal = self._prepare(pose)
         result = self.planner.plan_to_pose(start, goal, stage="move_to_pose_with_RRTConnect")
         return result if dry_run else self.follow_path(result, refine_steps)
 
     def move_to_pose_with_screw(self, pose: sapien.Pose | Pose, dry_run: bool = False, refine_steps: int = 0) -> Any:
-        """Do the same on a straight line with the shortest rotation."""
+        """Move the TCP to a pose on a straight line with the shortest rotation; see the RRT-Connect method."""
         start, goal = self._prepare(pose)
         result = self.planner.plan_straight(start, goal, stage="move_to_pose_with_screw")
         return result if dry_run else self.follow_path(result, refine_steps)
 
     def follow_path(self, result: Trajectory, refine_steps: int = 0) -> Step:
-        """Send the joint targets of a planned trajectory, one per control step, and hold the gripper command."""
+        """Send the joint targets of a trajectory, one per control step, with the last gripper command."""
         qpos = np.concatenate([result.qpos, np.repeat(result.qpos[-1:], refine_steps, axis=0)])
         qvel = np.gradient(np.concatenate([self._arm_qpos[None], qpos]), result.dt, axis=0)[1:]
         qvel[len(result.qpos) - 1 :] = 0
         return self._run(qpos, qvel)
 
     def open_gripper(self, t: int = 6, gripper_state: float = OPEN) -> Step:
-        """Open the gripper for ``t`` control steps while the arm holds its position; later motions hold the command."""
+        """Command the gripper to open for ``t`` control steps; later motions keep the command."""
         return self._move_gripper(t, gripper_state)
 
     def close_gripper(self, t: int = 6, gripper_state: float = CLOSED) -> Step:
         return self._move_gripper(t, gripper_state)
 
     def add_box_collision(self, extents: Array, pose: sapien.Pose | Pose) -> None:
-        """Add a box with edge lengths (3,) m and its centre at a pose to the obstacles."""
+        """Add a box to the obstacles: edge lengths (3,) m, pose of its centre."""
         edges = np.asarray(extents, dtype=np.float64)
         if not ((edges > 0) & (edges < np.inf)).all():
-            what, expected = "invalid extents of a box", "three positive edge lengths in m"
-            fix = "Give a flat box a thickness, such as 0.001."
+            what, expected = "invalid box extents", "three positive edge lengths in m"
+            fix = "Use a small thickness for flat boxes, e.g. 0.001."
             raise RobocasError(what, where="add_box_collision", expected=expected, found=edges.tolist(), fix=fix)
         corners = np.array(list(product((-0.5, 0.5), repeat=3))) * edges
         self.add_obstacles([Obstacle("box", Shape(hulls=(corners,)), _matrix(pose, "add_box_collision"))])
 
     def add_collision_pts(self, pts: Array) -> None:
-        """Add surface points (P, 3) m, about 5 mm apart, to the obstacles; no points add no obstacle."""
+        """Add surface points (P, 3) m, about 5 mm apart, to the obstacles; an empty array adds nothing."""
         points = np.asarray(pts, dtype=np.float64)
-        if points.size and points.shape[-1] != 3:  # by columns it would be other points, without an error
-            raise RobocasError("invalid points", where="add_collision_pts", expected="(P, 3)", found=points.shape)
+        if points.size and points.shape[-1] != 3:  # a transposed array would be reshaped to wrong points
+            what, where = "invalid shape of points", "add_collision_pts"
+            raise RobocasError(what, where=where, expected="(P, 3)", found=points.shape)
         points = points.reshape(-1, 3)
         _require_finite(points, "add_collision_pts", "Remove the points, e.g. pts[np.isfinite(pts).all(axis=1)].")
         if len(points):
             self.add_obstacles([Obstacle("points", Shape(points=points), np.eye(4))])
 
     def add_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
-        """Add bodies whose ``pose_in_base`` is in the world frame, as ``PlanningScene.obstacles_in_world`` returns."""
+        """Add bodies with world poses in ``pose_in_base``, as returned by ``PlanningScene.obstacles_in_world``."""
         self._obstacles += obstacles
 
     def clear_collisions(self) -> None:
-        """Remove all obstacles; the arm's own links still count."""
+        """Remove all obstacles; self-collisions are still checked."""
         self._obstacles = []
 
     def close(self) -> None:
-        """Do nothing; solutions written for ManiSkill call it at their end."""
+        """Do nothing; solutions written for ManiSkill call this method at the end."""
 
     @property
     def _arm_qpos(self) -> Array:
@@ -182,7 +184,7 @@ class PandaArmMotionPlanningSolver:
         return qpos[[self._joints.index(name) for name in joints]]
 
     def _prepare(self, pose: sapien.Pose | Pose) -> tuple[Array, Array]:
-        """Give the planner the present scene; return the start (7,) and the goal in the arm's base frame (4x4)."""
+        """Update the planner's scene; return the start (7,) and the goal (4x4) in the arm's base frame."""
         base = self.arm_base_in_world
         goal = inverse(base) @ _matrix(pose, "pose")
         self.planner.set_scene(to_arm_base_frame(self._obstacles, base))
@@ -197,8 +199,8 @@ class PandaArmMotionPlanningSolver:
     def _run(self, qpos: Array, qvel: Array) -> Step:
         arm = (qpos, qvel) if self.control_mode == "pd_joint_pos_vel" else (qpos,)
         gripper = np.full((len(qpos), 1), self.gripper_state)
-        *before, last = np.hstack([*arm, gripper]).astype(np.float32)
-        for action in before:
+        *first, last = np.hstack([*arm, gripper]).astype(np.float32)
+        for action in first:
             self._step(action)
         return self._step(last)
 
@@ -215,23 +217,23 @@ def _matrix(pose: sapien.Pose | Pose, where: str) -> Array:
     return matrix
 
 
-def _require_finite(values: Array, where: str, fix: str = "Check how the numbers were computed.") -> None:
+def _require_finite(values: Array, where: str, fix: str = "Check the computation of these values.") -> None:
     finite = np.isfinite(values)
     if not finite.all():
-        found = f"{np.size(finite) - np.count_nonzero(finite)} of {np.size(finite)} are not finite"
-        raise RobocasError("NaN or infinite numbers", where=where, expected="finite numbers", found=found, fix=fix)
+        found = f"{np.size(finite) - np.count_nonzero(finite)} of {np.size(finite)} values not finite"
+        raise RobocasError("NaN or infinite values", where=where, expected="finite values", found=found, fix=fix)
 
 
 def _robot_spec(agent: BaseAgent) -> RobotSpec:
-    """Return what a planner needs of an agent; ManiSkill's fixed Pandas are planned for with ManiSkill's own URDF."""
+    """Return the robot specification of an agent; for ManiSkill's fixed Pandas, with ManiSkill's URDF."""
     if isinstance(agent, MobileManipulator):
         return agent.spec
     uid, description = str(agent.uid), replace(MOBILE_PANDA, uid=str(agent.uid), finger_extension=0.0, envelope=None)
     joints = {joint.name for joint in agent.robot.active_joints}
     if not joints.issuperset(description.arm_joints + description.finger_joints):
         expected = "panda, panda_wristcam or a robot of robocas_ms3"
-        fix = "Make the environment with robot_uids='panda'."
-        raise RobocasError("not a Panda arm with two fingers", where="robot", expected=expected, found=uid, fix=fix)
+        fix = "Create the environment with robot_uids='panda'."
+        raise RobocasError("unsupported robot", where="robot_uids", expected=expected, found=uid, fix=fix)
     urdf = Path(str(agent.urdf_path))
     files = RobotFiles(urdf=urdf, arm_urdf=urdf, arm_srdf=urdf.with_suffix(".srdf"), folder=urdf.parent)
     return RobotSpec(description, lambda: files, f"{type(agent).__module__}:{type(agent).__qualname__}")

@@ -1,6 +1,6 @@
-"""RRT-Connect and shortcutting with a fixed budget of collision checks.
+"""RRT-Connect and path shortcutting with a budget of collision checks.
 
-The same seed gives the same path. A time limit would make the result depend on the machine's load.
+A budget of checks instead of a time limit makes paths depend on the seed only, not on the load of the machine.
 """
 
 from __future__ import annotations
@@ -14,14 +14,16 @@ from robocas_ms3.planning.protocol import Array
 CountFree = Callable[[Array], int]
 
 
-SPARSE = 8  # every so manieth configuration of an edge is checked before all others
+SPARSE = 8  # every SPARSE-th configuration of an edge is checked first
 
 
 class BudgetExceeded(Exception):
-    """The planner has made all the collision checks it was given."""
+    """The budget of collision checks is used up."""
 
 
 class _Tree:
+    """Search tree of configurations."""
+
     def __init__(self, roots: list[Array]) -> None:
         self.qpos = np.empty((256, len(roots[0])))
         self.parent: list[int] = []
@@ -49,39 +51,39 @@ class _Tree:
 
 
 class PathSearch:
-    """Search in joint space.
+    """RRT-Connect path search in joint space.
 
     Args:
-        free_until: says how many of some configurations (M, n) are free before the first one that is not.
+        count_free: function that returns the number of free configurations (M, n) before the first collision.
         lower, upper: (n,) joint limits, rad.
-        step: longest extension of a tree, rad (norm over the joints).
-        spacing: distance of checks along an edge, rad (norm).
+        step: maximum extension of a tree, rad (norm over joints).
+        spacing: distance between checks along an edge, rad (norm over joints).
     """
 
     def __init__(self, count_free: CountFree, lower: Array, upper: Array, *, step: float, spacing: float) -> None:
         self._free_until, self._lower, self._upper = count_free, lower, upper
         self._step, self.spacing = step, spacing
-        self._left = 0
+        self._remaining_checks = 0
 
-    def _checked(self, a: Array, b: Array) -> Array:
-        """Return configurations (M, n) along the edge from ``a`` (assumed free) to ``b``, and count them as checks."""
+    def _edge_points(self, a: Array, b: Array) -> Array:
+        """Return configurations (M, n) on the edge from ``a`` (assumed free) to ``b``; charge them to the budget."""
         count = max(1, int(np.ceil(np.linalg.norm(b - a) / self.spacing)))
-        if self._left < count:
+        if self._remaining_checks < count:
             raise BudgetExceeded
-        self._left -= count
+        self._remaining_checks -= count
         return a + (b - a) * (np.arange(1, count + 1) / count)[:, None]
 
-    def edge_free(self, a: Array, b: Array) -> bool:
-        """Check the straight edge from ``a`` (assumed free) to ``b``; sparse ones first, where failures show early."""
-        points = self._checked(a, b)
+    def is_edge_free(self, a: Array, b: Array) -> bool:
+        """Check the edge from ``a`` (assumed free) to ``b``, every SPARSE-th configuration first."""
+        points = self._edge_points(a, b)
         points = np.concatenate([points[i::SPARSE] for i in (SPARSE - 1, *range(SPARSE - 1))])
         return self._free_until(points) == len(points)
 
     def connect(
         self, start: Array, goals: list[Array], rng: np.random.Generator, *, max_checks: int
     ) -> list[Array] | None:
-        """Return waypoints from ``start`` to one of ``goals`` (all free), or None when the budget is spent."""
-        self._left = max_checks
+        """Return waypoints from ``start`` to one of ``goals`` (all free), or None if the budget is used up."""
+        self._remaining_checks = max_checks
         trees = (_Tree([start]), _Tree(goals))
         grow, other = 0, 1
         try:
@@ -100,7 +102,7 @@ class PathSearch:
             return None
 
     def _sample(self, start: Array, goals: list[Array], rng: np.random.Generator) -> Array:
-        """Sample half of the configurations around start and a goal, since most detours are small."""
+        """Sample a configuration; half of the samples are near start and goal, since most detours are small."""
         if rng.random() < 0.5:
             return rng.uniform(self._lower, self._upper)
         goal = goals[int(rng.integers(len(goals)))]
@@ -108,14 +110,18 @@ class PathSearch:
         return rng.uniform(np.maximum(low, self._lower), np.minimum(high, self._upper))
 
     def _extend(self, tree: _Tree, target: Array, *, greedy: bool) -> tuple[int | None, bool]:
-        """Grow a tree towards ``target``, by a step or all the way, as far as it is free."""
+        """Extend a tree towards ``target``, by one step or (``greedy``) as far as the edge is free.
+
+        Returns:
+            Index of the last new node, None without one; and whether the target is reached.
+        """
         node = tree.nearest(target)
         here = tree.qpos[node].copy()
         distance = float(np.linalg.norm(target - here))
         if distance <= 1e-9:
             return node, True
         arrives = greedy or distance <= self._step
-        points = self._checked(here, target if arrives else here + (target - here) * (self._step / distance))
+        points = self._edge_points(here, target if arrives else here + (target - here) * (self._step / distance))
         free = self._free_until(points)
         every = max(1, round(self._step / self.spacing))
         for index in [*range(every, free, every), free] if free else []:
@@ -123,8 +129,8 @@ class PathSearch:
         return (node if free else None), arrives and free == len(points)
 
     def shorten(self, path: list[Array], rng: np.random.Generator, *, tries: int, max_checks: int) -> list[Array]:
-        """Cut corners: first drop waypoints greedily, then join random points of the path by straight edges."""
-        self._left = max_checks
+        """Shorten a path: drop waypoints greedily, then connect random points of the path by straight edges."""
+        self._remaining_checks = max_checks
         try:
             path = self._drop_waypoints(path)
             for _ in range(tries):
@@ -136,13 +142,13 @@ class PathSearch:
         return path
 
     def _drop_waypoints(self, path: list[Array]) -> list[Array]:
-        """Go straight from each waypoint to the furthest one that can be reached, by halving."""
+        """Connect each waypoint to the furthest one with a free straight edge, found by halving."""
         kept, index = [path[0]], 0
         while index < len(path) - 1:
             reach = len(path) - 1
             while reach > index + 1:
                 try:
-                    if self.edge_free(path[index], path[reach]):
+                    if self.is_edge_free(path[index], path[reach]):
                         break
                 except BudgetExceeded:
                     return kept + path[index + 1 :]
@@ -163,6 +169,6 @@ class PathSearch:
         b = points[second] + (points[second + 1] - points[second]) * (
             (high - ends[second]) / max(lengths[second], 1e-12)
         )
-        if np.linalg.norm(b - a) > 0.98 * (high - low) or not self.edge_free(a, b):
+        if np.linalg.norm(b - a) > 0.98 * (high - low) or not self.is_edge_free(a, b):
             return path
         return [*path[: first + 1], a, b, *path[second + 1 :]]

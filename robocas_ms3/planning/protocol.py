@@ -1,7 +1,7 @@
-"""The small interface between scripted policies and a motion planner.
+"""Interface between scripted policies and motion planners.
 
-Everything is in the arm's base frame, so the mobile base never matters to a backend. Poses are 4x4
-float64 matrices in metres; ``tcp_in_base`` is ManiSkill's TCP (z approach, y closing). ``qpos`` are the 7 arm joints in
+All poses are in the arm's base frame, so a backend is independent of the mobile base. Poses are 4x4 float64 matrices in
+m; ``tcp_in_base`` is the pose of ManiSkill's TCP (z approach axis, y closing axis). ``qpos`` are the 7 arm joints in
 rad.
 """
 
@@ -19,20 +19,20 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Joint positions (T, 7) in rad, ``dt`` seconds apart; row 0 is reached after ``dt``, the last row is the goal."""
+    """Joint positions (T, 7) in rad at times ``dt``, 2 ``dt``, ... in s; the last row is the goal."""
 
     qpos: Array
     dt: float
 
     @property
     def duration(self) -> float:
-        """Seconds from the start to the last row."""
+        """Time from the start to the last row, s."""
         return len(self.qpos) * self.dt
 
 
 @dataclass(frozen=True)
 class AttachedBody:
-    """An object in the gripper: the convex hull of vertices (V, 3) m in its frame, which is 4x4 in the TCP's."""
+    """Object in the gripper: vertices (V, 3) of its convex hull, m, and its pose (4x4) in the TCP frame."""
 
     vertices: Array
     object_in_tcp: Array
@@ -40,11 +40,11 @@ class AttachedBody:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """The form of a rigid body in its own frame: hulls or points. Backends keep what they make of it while it lives.
+    """Shape of a rigid body in its own frame: convex hulls or points. Backends cache geometries per shape.
 
     Attributes:
-        hulls: vertices (V, 3) of its convex pieces, m.
-        points: (P, 3) samples at 5 mm of surfaces that no hulls describe, m.
+        hulls: vertices (V, 3) of the convex pieces, m.
+        points: (P, 3) surface points 5 mm apart, m, for surfaces without hulls.
     """
 
     hulls: tuple[Array, ...] = ()
@@ -53,7 +53,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A rigid body that must not be touched, the pose of its frame (4x4), and how much room to keep to it, m."""
+    """Obstacle: name, shape, pose (4x4) of its frame, and clearance to keep, m."""
 
     name: str
     shape: Shape
@@ -62,9 +62,9 @@ class Obstacle:
 
 
 class Planner(Protocol):
-    """What a backend offers. Every planning method raises ``PlanningError(stage, reason)``, never a sentinel.
+    """Interface of a motion planner. Planning methods raise ``PlanningError(stage, reason)`` if they fail.
 
-    ``RRTConnectPlanner`` lists its reasons at each method.
+    ``RRTConnectPlanner`` documents its reasons at each method.
     """
 
     @property
@@ -76,64 +76,71 @@ class Planner(Protocol):
     def finger_width(self, width: float) -> None: ...
 
     def seed(self, seed: int) -> None:
-        """Make everything that follows repeat exactly for the same calls."""
+        """Set the seed; the same seed and calls give the same results."""
         ...
 
     def set_scene(self, obstacles: Sequence[Obstacle] | Array) -> None:
-        """Replace the obstacles by rigid bodies, which costs little, or by a point cloud (P, 3) of surfaces at 5 mm.
+        """Replace the obstacles by rigid bodies (fast), or by a cloud (P, 3) of surface points 5 mm apart.
 
-        Points inside the robot's own base are cut out.
+        Points inside the robot base are ignored.
         """
         ...
 
     def attach(self, body: AttachedBody | None) -> None:
-        """Attach a held object to the TCP, or nothing."""
+        """Attach a held object to the TCP; None detaches it."""
         ...
 
     def tcp(self, qpos: Array) -> Array:
-        """Return the TCP (4x4) in the arm's base frame at a configuration (7,)."""
+        """Return the TCP pose (4x4) in the arm's base frame at a configuration (7,)."""
         ...
 
     def collisions(self, qpos: Array, finger_width: float | None = None) -> list[str]:
-        """Return what touches at a configuration (7,): links, obstacles ('cloud': of points), 'attached'; empty: free.
+        """Return the names of colliding bodies at a configuration (7,); an empty list means free.
 
-        ``finger_width`` is in m; default: of the open gripper.
+        Names are links, obstacles, 'cloud' (points) and 'attached' (the held object). ``finger_width`` is in m;
+        default: open gripper.
         """
         ...
 
     def is_free(self, qpos: Array, finger_width: float | None = None) -> NDArray[np.bool_]:
-        """Say which configurations (M, 7) touch nothing: (M,). Far cheaper than one at a time."""
+        """Return a mask (M,) of the collision-free configurations (M, 7); much faster than single checks."""
         ...
 
     def ik(self, tcp_in_base: Array, near: Array, *, avoid_collisions: bool = True) -> list[Array]:
-        """Return distinct configurations (7,) that reach a pose (4x4), nearest to ``near`` (7,) first, or none.
+        """Return distinct configurations (7,) for a TCP pose (4x4), the nearest to ``near`` (7,) first.
 
-        With ``avoid_collisions`` only those free of collisions.
+        With ``avoid_collisions``, only collision-free configurations. The list may be empty.
         """
         ...
 
     def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str, search: bool = True) -> Trajectory:
-        """Plan a collision-free motion to the best of several configurations; without ``search`` a straight one."""
+        """Plan a collision-free motion to one of several configurations.
+
+        Without ``search``, only straight motions in joint space are tried.
+        """
         ...
 
     def plan_to_pose(self, start: Array, tcp_in_base: Array, *, stage: str) -> Trajectory:
-        """Plan a collision-free motion that ends with the TCP at a pose."""
+        """Plan a collision-free motion of the TCP to a pose (4x4)."""
         ...
 
     def plan_straight(
         self, start: Array, tcp_in_base: Array, *, stage: str, check_collisions: bool = True, speed: float = 1.0
     ) -> Trajectory:
-        """Move the TCP on a straight line (and shortest rotation) from where ``start`` (7,) has it to a pose (4x4).
+        """Plan a straight line of the TCP, with the shortest rotation, from ``start`` (7,) to a pose (4x4).
 
         Args:
-            check_collisions: whether obstacles may not be touched (self-collisions always count).
+            start: initial configuration.
+            tcp_in_base: goal of the TCP.
+            stage: stage of a ``PlanningError``.
+            check_collisions: whether to check obstacles; self-collisions are always checked.
             speed: fraction of the velocity and acceleration limits.
         """
         ...
 
     def join(self, start: Array, first: Trajectory, second: Trajectory) -> Trajectory:
-        """Join two motions, the first from ``start`` (7,), without a stop where the scene allows it.
+        """Join two motions, the first from ``start`` (7,), without a stop in between if that is collision-free.
 
-        The corner between them is cut within the last second of the first and the first second of the second.
+        The blend starts in the last second of the first motion and ends in the first second of the second one.
         """
         ...

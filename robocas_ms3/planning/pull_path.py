@@ -1,7 +1,7 @@
-"""Arm configurations that move a gripped handle along the motion of its joint. Pure maths.
+"""Compute arm configurations that move a grasped handle along the motion of its joint. Geometry only, no simulator.
 
-The handle is a bar along the TCP's x axis. The fingers may turn about it: a hinged door turns by far more than the
-wrist can follow, and friction on a bar a centimetre thick hardly resists.
+The handle is a bar along the TCP's x axis. The fingers may rotate about the bar, since a hinged door rotates more than
+the wrist can follow and friction on a bar of 1 cm is small.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from threadpoolctl import ThreadpoolController
 from robocas_ms3.planning.kinematics import ArmChain
 from robocas_ms3.planning.protocol import Array
 
-MAX_SLIP = np.deg2rad(50)  # of the gripper about the bar, from straight in; further on the palm meets the front
-MAX_JUMP = 0.2  # rad a joint may turn between two poses of the handle
+MAX_SLIP = np.deg2rad(50)  # maximum rotation of the gripper about the bar; beyond it the palm touches the front
+MAX_JUMP = 0.2  # rad, maximum joint displacement between two poses of the handle
 ITERATIONS = 14
-NULLSPACE_ITERATIONS = 6  # iterations in which the free motion is used to leave joint limits
+NULLSPACE_ITERATIONS = 6  # iterations that use the null space to move away from joint limits
 POSITION_TOLERANCE, ROTATION_TOLERANCE = 2e-4, 2e-3  # m, rad
 
-# OpenBLAS starts threads even for 6 x 6 matrices: ten times slower, and the last bits hang on their number.
+# OpenBLAS starts threads even for 6 x 6 matrices: ten times slower, and the last bits depend on their number
 _BLAS = ThreadpoolController()
 
 
 def rotate_about_bar(tcp: Array, angle: float) -> Array:
-    """Return TCP poses (..., 4, 4) turned about their own x axis by an angle, rad."""
+    """Rotate TCP poses (..., 4, 4) about their x axis by an angle in rad."""
     turn = np.eye(4)
     turn[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     return tcp @ turn
@@ -32,14 +32,14 @@ def rotate_about_bar(tcp: Array, angle: float) -> Array:
 
 @_BLAS.wrap(limits=1, user_api="blas")
 def track_handle(chain: ArmChain, starts: Array, goals: Array) -> Array:
-    """Follow poses of a bar with the TCP, free to turn about the bar by up to ``MAX_SLIP``.
+    """Track poses of a bar with the TCP, which may rotate about the bar by up to ``MAX_SLIP``.
 
     Args:
-        starts: (N, 7) configurations at (or near) the first pose.
+        starts: (N, 7) configurations at or near the first pose.
         goals: (T, 4, 4) or (T, N, 4, 4) TCP poses in the arm's base frame that hold the bar squarely, about 1 cm apart.
 
     Returns:
-        (T, N, 7) rad; NaN from where a start leads no further: out of reach, a joint limit, or a jump.
+        (T, N, 7) rad; NaN after a pose that is out of reach, violates a joint limit or needs a jump.
     """
     qpos = np.array(starts, dtype=np.float64)
     path = np.full((len(goals), len(qpos), 7), np.nan)
@@ -56,12 +56,12 @@ def track_handle(chain: ArmChain, starts: Array, goals: Array) -> Array:
 
 
 def count_reached(path: Array) -> NDArray[np.int_]:
-    """Return how many poses (N,) of a ``track_handle`` (T, N, 7) were reached."""
+    """Count the poses (N,) reached by paths (T, N, 7) of `track_handle`."""
     return np.isfinite(path[:, :, 0]).sum(axis=0)
 
 
 def _solve(chain: ArmChain, starts: Array, goals: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Solve (M, 7) for poses (M, 4, 4) by damped least squares; return (M, 7), and whether (M,) they were reached."""
+    """Solve poses (M, 4, 4) by damped least squares; return configurations (M, 7) and a success mask (M,)."""
     qpos, lower, upper = starts.copy(), chain.lower, chain.upper
     middle, half = (lower + upper) / 2, (upper - lower) / 2
     solved = np.zeros(len(qpos), dtype=bool)
@@ -72,7 +72,7 @@ def _solve(chain: ArmChain, starts: Array, goals: Array) -> tuple[Array, NDArray
         lag = (error[:, 3:] * bar).sum(axis=1)
         free = np.abs(lag) <= MAX_SLIP
         error[:, 3:] -= bar * np.clip(lag, -MAX_SLIP, MAX_SLIP)[:, None]
-        along = (bar[:, :, None] * jacobian[:, 3:]).sum(axis=1)  # what the joints add about the bar
+        along = (bar[:, :, None] * jacobian[:, 3:]).sum(axis=1)  # angular velocity about the bar
         jacobian[:, 3:] -= np.where(free, 1.0, 0.0)[:, None, None] * bar[:, :, None] * along[:, None]
         solved = (np.linalg.norm(error[:, :3], axis=1) <= POSITION_TOLERANCE) & (
             np.linalg.norm(error[:, 3:], axis=1) <= ROTATION_TOLERANCE
@@ -91,7 +91,7 @@ def _solve(chain: ArmChain, starts: Array, goals: Array) -> tuple[Array, NDArray
 
 
 def pose_difference(pose: Array, goal: Array) -> Array:
-    """Return position differences and rotation vectors (M, 6) from poses to goals (M, 4, 4), in the base frame."""
+    """Return the differences (M, 6) from poses to goals (M, 4, 4): position, rotation vector; base frame."""
     turn = np.einsum("mij,mkj->mik", goal[:, :3, :3], pose[:, :3, :3])
     axis = 0.5 * np.stack(
         [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1

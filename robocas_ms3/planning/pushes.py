@@ -1,4 +1,4 @@
-"""Which pushes of an object there are: geometry only, no simulator. Everything is in the arm's base frame."""
+"""Generate candidate pushes of an object, in the arm's base frame. Geometry only, no simulator."""
 
 from __future__ import annotations
 
@@ -11,27 +11,24 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.planning.protocol import Array
 
-STAND_OFF = 0.02  # m between the tool and the object before the push (upstream's)
+STAND_OFF = 0.02  # m between tool and object before the push (RoboCAS-v0)
 TOOL_RADIUS = 0.012  # m, half the width of the closed fingers
-TIP_BELOW_TCP = 0.0085  # m, by which the pads reach beyond the TCP
-TIP_CLEARANCE = 0.012  # m kept between the finger tips and the surface
-BELOW_TOP = 0.02  # m; nearer to an object's top the tool would slide over it
-PUSH_BEYOND_CENTER = (
-    0.1  # m that the tool goes past where the object's middle was (upstream's; the paper: 2 d_ext in all)
-)
-EDGE_MARGIN = 0.08  # m that a pushed object keeps from the surface's edge
-WALL_MARGIN = 0.02  # m that it keeps from furniture and basket
-PUSHED_THINNED = 5  # every fifth point of an object will do for that: they are 5 mm apart
-COINCIDENT_DISTANCE = (
-    0.01  # m; an object whose centre is closer than this to the target's has no direction of its own (upstream's)
-)
-TURNS_DEG = (0.0, 20.0, -20.0, 40.0, -40.0, 65.0, -65.0, 90.0, -90.0)  # directions tried, off the paper's one
-YAWS = 4  # turns of the tool about the vertical, of half a turn
+TIP_BELOW_TCP = 0.0085  # m from the TCP to the finger tips
+TIP_CLEARANCE = 0.012  # m between finger tips and surface
+BELOW_TOP = 0.02  # m below the top of the object; higher the tool would slide over it
+# m from the original centre of the object to the end of the push (RoboCAS-v0; the paper: total length 2 d_ext)
+PUSH_BEYOND_CENTER = 0.1
+EDGE_MARGIN = 0.08  # m from a pushed object to the edge of the surface
+WALL_MARGIN = 0.02  # m from a pushed object to furniture and basket
+PUSHED_THINNED = 5  # stride over surface points, which are 5 mm apart
+COINCIDENT_DISTANCE = 0.01  # m between centres below which the push direction is random (RoboCAS-v0)
+TURNS_DEG = (0.0, 20.0, -20.0, 40.0, -40.0, 65.0, -65.0, 90.0, -90.0)  # offsets from the paper's direction
+YAWS = 4  # yaw angles of the tool, over half a turn
 
 
 @dataclass(frozen=True)
 class Push:
-    """A push to try: the TCP's start (4x4), its direction (3,), level and of length 1, and the length of its way, m."""
+    """Candidate push: start pose of the TCP (4x4), horizontal unit direction (3,) and length, m."""
 
     start: Array
     direction: Array
@@ -39,6 +36,7 @@ class Push:
 
     @property
     def end(self) -> Array:
+        """End pose (4x4) of the TCP."""
         pose = self.start.copy()
         pose[:3, 3] += self.length * self.direction
         return pose
@@ -53,18 +51,18 @@ def push_candidates(
     fixed: Array,
     turn_deg: float = 0.0,
 ) -> Iterator[Push]:
-    """Yield pushes of an object that begin clear of all else and end on the surface; the paper's direction first.
+    """Yield pushes of an object that start collision-free and end on the surface, the paper's direction first.
 
-    The object may be pushed against other objects, but neither over the edge nor against furniture or basket. The tool
-    touches at the target's height, or at the nearest height above it at which there is room for it.
+    The object may be pushed against other objects, but not over the edge or against furniture or basket. The tool
+    touches the object at the height of the target, or at the nearest free height above it.
 
     Args:
-        points: (P, 3) surface of the object, upright frame, m.
-        target: (3,) middle of the target.
-        others: (Q, 3) surfaces of everything else.
-        surface: of `surface_in_base`.
-        fixed: (R, 3) surfaces of furniture and basket.
-        turn_deg: by which the paper's direction is turned.
+        points: (P, 3) surface points of the object, m; z is up.
+        target: (3,) centre of the target.
+        others: (Q, 3) surface points of all other bodies.
+        surface: frame and half size of the surface, see `surface_in_base`.
+        fixed: (R, 3) surface points of furniture and basket.
+        turn_deg: rotation of the paper's direction about the vertical.
     """
     frame, half = surface
     walls = fixed[(fixed[:, 2] > frame[2, 3] + 0.01) & (fixed[:, 2] < points[:, 2].max())][:, :2]
@@ -97,16 +95,17 @@ def push_candidates(
                 start[:3, :3] = (Rotation.from_euler("z", yaw + k * np.pi / YAWS) * _DOWN).as_matrix()
                 start[:3, 3] = tool
                 yield Push(start, direction, length)
-            break  # higher up it would tip rather than slide
+            break  # a push higher up would tip the object
 
 
 _DOWN = Rotation.from_euler("x", np.pi)
 
 
 def push_direction(rng: np.random.Generator, center: Array, target: Array) -> Array:
-    """Return the paper's v_push: (3,) level unit vector from the target to the obstacle.
+    """Return v_push of the paper: (3,) horizontal unit vector from the target to the obstacle.
 
-    Where they are less than 1 cm apart: within 30 deg of towards the robot, which stands at the origin.
+    If their centres are less than 1 cm apart, return a random direction within 30 deg of the direction to the robot at
+    the origin.
     """
     away = np.append((center - target)[:2], 0.0)
     if np.linalg.norm(away) < COINCIDENT_DISTANCE:
@@ -116,9 +115,10 @@ def push_direction(rng: np.random.Generator, center: Array, target: Array) -> Ar
 
 
 def extent_behind(points: Array, center: Array, direction: Array, height: float) -> float | None:
-    """Return the paper's d_ext: how far an object reaches from its middle against the push at a height, or None.
+    """Return d_ext of the paper: the extent of an object from its centre against the push direction, m, or None.
 
-    Only what the tool would meet counts: points within its width of the line, 1 cm above or below the height.
+    Only points that the tool can touch count: within the tool radius of the line and 1 cm of the height. None: there is
+    no such point.
     """
     relative = points - center
     across = np.abs(relative[:, :2] @ np.array([-direction[1], direction[0]]))

@@ -28,31 +28,33 @@ from robocas_ms3.planning.time_parameterization import (
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.registry import RobotSpec
 
-BUDGET = 20_000  # collision checks of one search, about 2 s; a limit by the clock would depend on the machine's load
-RRT_RANGE = 0.25  # rad, longest extension of a tree
-SPACING = 0.03  # rad between checks while searching
+BUDGET = 20_000  # collision checks per search, about 2 s; a time limit would depend on the load of the machine
+RRT_RANGE = 0.25  # rad, maximum extension of a tree
+SPACING = 0.03  # rad between checks during the search
 FINE_SPACING = 0.01  # rad between checks of the final path
-CORNER_RADII = (0.3, 0.1, 0.03)  # rad; smaller ones are tried when a rounded corner touches something
-DETOUR = 1.5  # a straight motion to another goal is taken when not longer than this times the nearest (+ 0.5 rad)
-BLENDS = (0.9, 0.5)  # s by which the end of a motion and the beginning of the next overlap
-BLEND_SPACING = 0.05  # rad between the points that a blended motion's spline goes through
+CORNER_RADII = (0.3, 0.1, 0.03)  # rad; smaller radii are tried if a rounded corner collides
+DETOUR = 1.5  # maximum length of a straight motion to another goal, relative to the nearest goal (+ 0.5 rad)
+BLENDS = (0.9, 0.5)  # s, overlap of a motion and the next one
+BLEND_SPACING = 0.05  # rad between spline points of a blended motion
 SHORTCUTS = 40
-MIN_MOTION = 1e-6  # rad; a shorter motion is none
-TCP_SPEED_LIMIT = 0.45  # m/s: at 5 Hz pd_ee_delta_pose moves 0.1 m a step at most, with some lag to catch up
+MIN_MOTION = 1e-6  # rad; a shorter motion has a single row
+TCP_SPEED_LIMIT = 0.45  # m/s; pd_ee_delta_pose at 5 Hz moves at most 0.1 m per step and has to catch up its lag
 
 Timed = TypeVar("Timed", Trajectory, Trajectory | None)
 
 
 class RRTConnectPlanner(CollisionChecker):
-    """Plan for the arm in its base frame; see `protocol.Planner` for methods without a docstring.
+    """Motion planner for an arm: RRT-Connect, straight lines and TOPP-RA, in the arm's base frame.
+
+    `protocol.Planner` documents the methods without a docstring.
 
     Args:
         urdf, srdf, robot: see `CollisionChecker`.
-        dt: seconds between rows of a trajectory.
+        dt: time between rows of a trajectory, s.
     """
 
     def __init__(self, urdf: Path | str, srdf: Path | str, *, robot: RobotDescription, dt: float) -> None:
-        import toppra  # noqa: F401  (0.2 s: before this process forks)
+        import toppra  # noqa: F401  (takes 0.2 s; import before this process forks)
 
         super().__init__(urdf, srdf, robot)
         self._reachability = Reachability(self.chain)
@@ -73,14 +75,18 @@ class RRTConnectPlanner(CollisionChecker):
         return [qpos for qpos, ok in zip(found, self.is_free(np.array(found), self.finger_width), strict=True) if ok]
 
     def plan_to_pose(self, start: Array, tcp_in_base: Array, *, stage: str) -> Trajectory:
-        """Plan as `plan_to_qpos` does to the configurations of a pose (4x4); reasons: ``no_ik``, or as there."""
+        """Plan a collision-free motion of the TCP to a pose (4x4).
+
+        Raises:
+            PlanningError: ``no_ik``, or a reason of `plan_to_qpos`.
+        """
         goals = self.ik(tcp_in_base, start, avoid_collisions=False)
         if not goals:
             raise PlanningError(stage, "no_ik")
         return self.plan_to_qpos(start, goals, stage=stage)
 
     def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str, search: bool = True) -> Trajectory:
-        """Plan a collision-free motion to the nearest of several configurations that can be reached.
+        """Plan a collision-free motion to the nearest reachable configuration of several.
 
         Raises:
             PlanningError: ``start_in_collision``, ``start_outside_limits``, ``no_goals`` (the list is empty),
@@ -108,8 +114,8 @@ class RRTConnectPlanner(CollisionChecker):
         if not search:
             raise PlanningError(stage, "not_straight")
         reason = "rrt_timeout"
-        # The nearest goal alone gets a quick try, then all of them the full budget; a path that slips through something
-        # between two checks is searched again with the spacing of the final check.
+        # First the nearest goal with a small budget, then all goals with the full budget. If a path collides between
+        # checks, search again with the spacing of the final check.
         for roots, budget, spacing in (
             (free[:1], BUDGET // 10, SPACING),
             (free, BUDGET, SPACING),
@@ -131,7 +137,7 @@ class RRTConnectPlanner(CollisionChecker):
     def plan_straight(
         self, start: Array, tcp_in_base: Array, *, stage: str, check_collisions: bool = True, speed: float = 1.0
     ) -> Trajectory:
-        """Move the TCP on a straight line.
+        """Plan a straight line of the TCP.
 
         Raises:
             PlanningError: ``start_in_collision``, ``start_outside_limits``, ``line_unreachable``, ``line_joint_jump``,
@@ -159,8 +165,8 @@ class RRTConnectPlanner(CollisionChecker):
             points = blend_motions(a, b, rows)
             path = fit_spline(thin_path(points, BLEND_SPACING))
             driven, end = path.dense(FINE_SPACING), points[min(len(a), len(points) - 1)]
-            lower, upper = self.chain.limits.T  # the sum of two motions may leave what either keeps to
-            # up to the end of the corner: what follows was planned among other obstacles
+            lower, upper = self.chain.limits.T  # the sum of two motions may exceed the limits
+            # check up to the end of the corner; the rest was planned with other obstacles
             corner = int(np.linalg.norm(driven - end, axis=1).argmin()) + 1
             if not np.all((lower <= driven) & (driven <= upper)) or not self.all_free(driven[:corner]):
                 continue
@@ -185,7 +191,7 @@ class RRTConnectPlanner(CollisionChecker):
         return self.all_free(path.dense(FINE_SPACING), obstacles=obstacles)
 
     def _finish(self, waypoints: list[Array]) -> Trajectory | None:
-        """Round corners, check the very path that will be driven, and time it; none when it touches something."""
+        """Round the corners of a path, check the rounded path, and time it; None if it collides."""
         points = [waypoints[0]]
         points += [b for a, b in zip(waypoints[:-1], waypoints[1:], strict=True) if np.linalg.norm(b - a) > 1e-4]
         points[-1] = waypoints[-1]
@@ -201,14 +207,14 @@ class RRTConnectPlanner(CollisionChecker):
         return self._timed(partial(time_with_stops, corners)) if self.all_free(_dense(corners)) else None
 
     def _timed(self, time: Callable[..., Timed], speed: float = 1.0) -> Timed:
-        """Time a motion within a fraction of the limits, and slower where the TCP would be faster than its limit."""
+        """Time a motion within a fraction of the limits; slow it down if the TCP exceeds its speed limit."""
         limits = {name: value * speed for name, value in self._limits.items()}
         trajectory = time(**limits, dt=self._dt)
         if trajectory is not None and len(trajectory.qpos) > 1:
-            places = self.chain.tcp(trajectory.qpos)[:, :3, 3]
-            fastest = float(np.linalg.norm(np.diff(places, axis=0), axis=1).max()) / self._dt
+            positions = self.chain.tcp(trajectory.qpos)[:, :3, 3]
+            fastest = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).max()) / self._dt
             if fastest > TCP_SPEED_LIMIT:
-                # Slower by s: velocities by s, accelerations by its square. Then all of the motion is, ramps too.
+                # scale velocities by s and accelerations by s^2, which slows down the whole motion
                 slower = TCP_SPEED_LIMIT / fastest
                 limits = {"velocity": limits["velocity"] * slower, "acceleration": limits["acceleration"] * slower**2}
                 trajectory = time(**limits, dt=self._dt)
@@ -227,10 +233,10 @@ DEFAULT_PLANNER = "rrt_connect"
 PLANNERS: Registry[Callable[..., Planner]] = Registry(
     "planner", "robocas_ms3.planners", Callable, {DEFAULT_PLANNER: RRTConnectPlanner}
 )
-"""Motion planners by name; other packages add theirs by entry points ``robocas_ms3.planners``."""
+"""Registry of motion planners; other packages add planners by entry points ``robocas_ms3.planners``."""
 
 
 def make_planner(name: str, robot: RobotSpec, *, dt: float) -> Planner:
-    """Make the planner of a name for a robot's arm, with trajectories of time step ``dt`` (s)."""
+    """Create a registered planner for the arm of a robot, with trajectories of time step ``dt`` in s."""
     backend, files = PLANNERS.find(name, where="planner"), robot.files()
     return backend(files.arm_urdf, files.arm_srdf, robot=robot.description, dt=dt)

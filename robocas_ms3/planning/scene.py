@@ -1,4 +1,4 @@
-"""What a planner has to know of an environment: obstacles as bodies and as clouds, poses as matrices."""
+"""Read obstacles (as bodies and as point clouds) and poses of an environment for a planner."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from robocas_ms3.core.poses import from_wxyz, inverse, transform_points
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape
 from robocas_ms3.tasks.base import RoboCASEnv
 
-# Upstream's: samples of the meshes at 5 mm, none farther than 1.5 m from the robot
+# m between surface points; RADIUS: m from the robot, both as in RoboCAS-v0
 SPACING = 0.005
-# Of furniture, which is large: a cupboard has a million points at 5 mm, half a second for each of a plan's many clouds;
-# no link fits between two points a centimetre apart.
+# m between surface points of furniture: a cupboard has a million points at 5 mm, which takes 0.5 s per cloud, and no
+# link fits between points 1 cm apart
 FURNITURE_SPACING = 0.01
 RADIUS = 1.5
-BASKET = "basket"  # its name among obstacles
+BASKET = "basket"  # name of the basket as an obstacle
 
 
-_SHAPES: dict[int, tuple[BodyFiles, Shape]] = {}  # by the part's id, which stays its own since the part is kept
+_SHAPES: dict[int, tuple[BodyFiles, Shape]] = {}  # by id of the body, which is unique since the body is kept
 
 
 def part_shape(part: BodyFiles) -> Shape:
-    """Return the shape of an asset's part, always the same object in a process."""
+    """Return the shape of a body; the same object for each call in a process."""
     if id(part) not in _SHAPES:
         _SHAPES[id(part)] = part, Shape(tuple(part.hulls))
     return _SHAPES[id(part)][1]
@@ -39,15 +39,15 @@ def _size(part: BodyFiles) -> float:
 
 
 def to_arm_base_frame(obstacles_in_world: Iterable[Obstacle], arm_base_in_world: Array) -> list[Obstacle]:
-    """Return bodies with world poses in the frame of an arm's base (4x4)."""
+    """Transform obstacles with world poses to the frame of an arm's base (4x4)."""
     to_base = inverse(arm_base_in_world)
     return [replace(body, pose_in_base=to_base @ body.pose_in_base) for body in obstacles_in_world]
 
 
 class PlanningScene:
-    """Reads one environment (``num_envs`` = 1) as a planner sees it: poses (4x4) and clouds in the arm's base frame.
+    """View of one environment (``num_envs`` = 1) for planning: poses (4x4) and clouds in the arm's base frame.
 
-    Bodies (`obstacles`) are for planners, clouds (`points_in_base`) for whatever reasons about surfaces.
+    Planners use bodies (`obstacles`); geometric tests use clouds of surface points (`points_in_base`).
     """
 
     def __init__(self, env: RoboCASEnv) -> None:
@@ -56,7 +56,7 @@ class PlanningScene:
     def _bodies(
         self, excluded: Collection[int], exclude_link: tuple[str, str] | None
     ) -> Iterator[tuple[str, BodyFiles, float, Array]]:
-        """Yield name, part, spacing of its samples (m) and pose in the world (4x4) of all that is there."""
+        """Yield name, body, spacing of its surface points (m) and world pose (4x4) of all bodies."""
         for name, asset in self.env.model.furniture.items():
             frame = self.env.model.furniture_poses[name]
             yield name, asset, FURNITURE_SPACING, frame
@@ -71,7 +71,7 @@ class PlanningScene:
                 yield asset.asset.id, asset, SPACING, from_wxyz(poses[slot])
 
     def sample_surfaces(self) -> None:
-        """Sample now, once for each asset of a process, what clouds are made of; a branch would lose its samples."""
+        """Sample the surface points of all bodies once per process; samples drawn in a forked process are lost."""
         for _, part, spacing, _ in self._bodies((), None):
             part.surface_points(spacing)
 
@@ -97,7 +97,7 @@ class PlanningScene:
         return inverse(self.arm_base_in_world) @ from_wxyz(self.env.object_states[0, slot, :7])
 
     def object_points(self, slot: int) -> Array:
-        """Return samples (P, 3) of an object's surface."""
+        """Return surface points (P, 3) of an object."""
         return transform_points(self.object_in_base(slot), self.env.object_assets[0][slot].surface_points(SPACING))
 
     @property
@@ -111,7 +111,13 @@ class PlanningScene:
         exclude_link: tuple[str, str] | None = None,
         clearance: float = 0.0,
     ) -> list[Obstacle]:
-        """Return furniture, basket and present objects as bodies, with ``clearance`` (m) to furniture and basket."""
+        """Return furniture, basket and present objects as obstacles.
+
+        Args:
+            exclude: slots of objects to leave out.
+            exclude_link: furniture and link to leave out.
+            clearance: clearance to furniture and basket, m.
+        """
         bodies = self.obstacles_in_world(exclude=exclude, exclude_link=exclude_link)
         objects = {asset.asset.id for asset in self.env.object_assets[0]}
         bodies = [body if body.name in objects else replace(body, clearance=clearance) for body in bodies]
@@ -123,7 +129,7 @@ class PlanningScene:
         exclude: int | Collection[int] = (),
         exclude_link: tuple[str, str] | None = None,
     ) -> list[Obstacle]:
-        """Return the bodies of `obstacles` with their poses in the world (`to_arm_base_frame`)."""
+        """Return the same bodies as `obstacles`, with ``pose_in_base`` in the world frame (see `to_arm_base_frame`)."""
         excluded = {exclude} if isinstance(exclude, int) else exclude
         return [Obstacle(name, part_shape(part), pose) for name, part, _, pose in self._bodies(excluded, exclude_link)]
 
@@ -134,9 +140,9 @@ class PlanningScene:
         radius: float = RADIUS,
         around: Array | None = None,
     ) -> Array:
-        """Return samples (P, 3) of the collision surfaces of furniture, basket and present objects.
+        """Return surface points (P, 3) of furniture, basket and present objects, without the excluded objects.
 
-        They are at most ``radius`` m from ``around`` (3,), by default the arm's base.
+        Points are within ``radius`` m of ``around`` (3,), by default of the arm's base.
         """
         to_base = inverse(self.arm_base_in_world)
         center = np.zeros(3) if around is None else around
@@ -145,7 +151,7 @@ class PlanningScene:
         for _, part, spacing, pose in self._bodies(excluded, None):
             in_base, points = to_base @ pose, part.surface_points(spacing)
             middle = (center - in_base[:3, 3]) @ in_base[:3, :3]
-            if np.linalg.norm(middle) + _size(part) > radius:  # not all of it is there
+            if np.linalg.norm(middle) + _size(part) > radius:  # the body may extend beyond the radius
                 away = points - middle
                 points = points[np.einsum("ij,ij->i", away, away) <= radius**2]
             if len(points):

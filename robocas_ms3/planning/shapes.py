@@ -1,4 +1,4 @@
-"""Build FCL geometries of obstacles: convex hulls with a margin, and octrees of points. Each is built once."""
+"""Build and cache FCL geometries of obstacles: convex hulls with a margin, and octrees of points."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from scipy.spatial import ConvexHull
 
 from robocas_ms3.planning.protocol import Array, Shape
 
-MARGIN = 0.0025  # m that obstacles are larger than they are: about what voxels of 5 mm add on average
+MARGIN = 0.0025  # m added to hulls, about the mean error of voxels of 5 mm
 VOXEL = 0.005  # m, edge of the voxels of point clouds, equal to the spacing of their points
-CACHE_SIZE = 16  # trees of the last clouds and hulls of the last held objects
+CACHE_SIZE = 16  # number of cached octrees and hulls of held objects
 DEPTH = 16  # levels of an octree
-OCCUPIED, INNER = 2, 3  # bits per child in octomap's stream; 0: unknown
+OCCUPIED, INNER = 2, 3  # bits per child in a stream of octomap; 0: unknown
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class ConvexPieces:
     Attributes:
         vertices: (V, 3) of all pieces, in the shape's frame, m.
         first: (H,) index of each piece's first vertex.
-        spares: unused FCL objects of each piece. They are kept, because python-fcl leaks memory with each object.
+        unused: unused FCL objects of each piece, kept for reuse because python-fcl leaks memory per object.
     """
 
     geometries: list[Any]
@@ -41,25 +41,25 @@ class ConvexPieces:
 
 
 class CollisionShapes:
-    """Builds FCL geometries and caches them."""
+    """Factory and cache of FCL geometries."""
 
     def __init__(self) -> None:
         self._shapes: WeakKeyDictionary[Shape, dict[float, ConvexPieces]] = WeakKeyDictionary()
         self._recent: OrderedDict[bytes, ConvexPieces] = OrderedDict()
 
     def obstacle(self, shape: Shape, clearance: float) -> ConvexPieces:
-        """Return the pieces of an obstacle's shape, its hulls enlarged by ``clearance`` (m) and a margin."""
+        """Return the pieces of a shape, with hulls enlarged by ``clearance`` (m) and the margin."""
         sizes = self._shapes.setdefault(shape, {})
         if clearance not in sizes:
             sizes[clearance] = self._pieces(shape, clearance)
         return sizes[clearance]
 
     def cloud(self, points: Array) -> ConvexPieces:
-        """Return an octree of points (P, 3), or no piece where all of them are too far away for one."""
-        return self._remember(points, self._tree)
+        """Return an octree of points (P, 3); no piece if all points are outside its range."""
+        return self._get_cached(points, self._tree)
 
     def hull(self, vertices: Array) -> ConvexPieces:
-        return self._remember(np.ascontiguousarray(vertices, dtype=np.float64), self._hull)
+        return self._get_cached(np.ascontiguousarray(vertices, dtype=np.float64), self._hull)
 
     def _pieces(self, shape: Shape, clearance: float) -> ConvexPieces:
         if shape.points is not None:
@@ -81,7 +81,7 @@ class CollisionShapes:
         corners, faces, _ = convex_hull(vertices)
         return ConvexPieces([fcl_convex(corners, faces)], corners, np.zeros(1, dtype=int))
 
-    def _remember(self, points: Array, make: Callable[[Array], ConvexPieces]) -> ConvexPieces:
+    def _get_cached(self, points: Array, make: Callable[[Array], ConvexPieces]) -> ConvexPieces:
         key = hashlib.blake2b(points.data).digest() + make.__name__.encode()
         made = self._recent.pop(key, None) or make(points)
         self._recent[key] = made
@@ -91,14 +91,14 @@ class CollisionShapes:
 
 
 def fcl_convex(corners: Array, faces: NDArray[np.integer]) -> Any:
-    counted = np.concatenate([np.full((len(faces), 1), 3), faces], axis=1)  # each polygon starts with its size
-    return fcl.Convex(np.ascontiguousarray(corners, dtype=np.float64), len(faces), counted.ravel().tolist())
+    polygons = np.concatenate([np.full((len(faces), 1), 3), faces], axis=1)  # size, corners
+    return fcl.Convex(np.ascontiguousarray(corners, dtype=np.float64), len(faces), polygons.ravel().tolist())
 
 
 def convex_hull(vertices: Array) -> tuple[Array, NDArray[np.int32], Array]:
-    """Return the corners (V, 3) of the convex hull of points, its triangles (F, 3) and their outward normals (F, 3).
+    """Return corners (V, 3), triangles (F, 3) and outward normals (F, 3) of the convex hull of points.
 
-    The corners of a triangle are in counter-clockwise order as seen from outside.
+    The corners of a triangle are in counter-clockwise order seen from outside.
     """
     hull = ConvexHull(vertices)
     outward = np.einsum("ij,ij->i", _normals(vertices, hull.simplices), hull.equations[:, :3]) > 0
@@ -108,10 +108,10 @@ def convex_hull(vertices: Array) -> tuple[Array, NDArray[np.int32], Array]:
 
 
 def inflate_hull(vertices: Array, margin: float) -> tuple[Array, NDArray[np.int32]]:
-    """Return corners and triangles of a convex hull with its faces moved out by ``margin`` (m), sharp edges less."""
+    """Return corners and triangles of a convex hull with faces moved out by ``margin`` (m), less at sharp edges."""
     corners, faces, normals = convex_hull(vertices)
     square, total = np.tile(1e-3 * np.eye(3), (len(corners), 1, 1)), np.zeros((len(corners), 3))
-    for corner in faces.T:  # all faces that meet in a corner move out; all but parallel ones along themselves
+    for corner in faces.T:  # least squares over the faces that meet at a corner
         np.add.at(square, corner, normals[:, :, None] * normals[:, None, :])
         np.add.at(total, corner, normals)
     out = margin * np.linalg.solve(square, total[:, :, None])[:, :, 0]
@@ -126,16 +126,16 @@ def _normals(vertices: Array, faces: NDArray[np.integer]) -> NDArray[np.floating
 
 
 def encode_octree(points: Array, voxel: float) -> list[int]:
-    """Encode the voxels that contain points (P, 3) as octomap's stream, in signed bytes as python-fcl wants it.
+    """Encode the voxels that contain points (P, 3) as a stream of octomap, in signed bytes for python-fcl.
 
-    A tree holds 2^16 voxels along each axis, centred at the origin; points outside of it are dropped. The stream lists
-    the inner nodes depth first; each is 16 bits, two for each of its 8 children.
+    A tree has 2^16 voxels per axis and is centred at the origin; points outside are dropped. The stream lists the inner
+    nodes depth first, each with 16 bits: two per child.
     """
     keys = np.floor(points / voxel) + (1 << (DEPTH - 1))
     keys = keys[np.all((keys >= 0) & (keys < 1 << DEPTH), axis=1)].astype(np.int64)
     if not len(keys):
         return []
-    codes = np.zeros(len(keys), dtype=np.int64)  # Morton order is the order of a depth-first traversal
+    codes = np.zeros(len(keys), dtype=np.int64)  # Morton order equals depth-first order
     for bit in range(DEPTH):
         for axis in range(3):
             codes |= ((keys[:, axis] >> bit) & 1) << (3 * bit + axis)
@@ -145,7 +145,7 @@ def encode_octree(points: Array, voxel: float) -> list[int]:
         parents, first_child = np.unique(children >> 3, return_index=True)
         state = OCCUPIED if depth == DEPTH - 1 else INNER
         masks.append(np.bitwise_or.reduceat(np.int64(state) << (2 * (children & 7)), first_child))
-        codes_of_nodes.append(parents << (3 * (DEPTH - depth)))  # code of the node's first voxel
+        codes_of_nodes.append(parents << (3 * (DEPTH - depth)))  # code of the first voxel of the node
         depths.append(np.full(len(parents), depth))
         children = parents
     order = np.lexsort((np.concatenate(depths), np.concatenate(codes_of_nodes)))

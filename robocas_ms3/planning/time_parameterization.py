@@ -1,8 +1,7 @@
-"""From waypoints to joint positions at exact control steps, within velocity and acceleration limits.
+"""Time-parameterise paths: joint positions at control steps within velocity and acceleration limits.
 
-A joint path is a polyline whose corners are rounded by parabolas, so that its shape is known exactly and never
-overshoots as a spline through sparse waypoints does; a line of the TCP is a spline through dense configurations.
-TOPP-RA finds the fastest timing of either.
+A joint path is a polyline with corners rounded by parabolas, which does not overshoot, unlike a spline through sparse
+waypoints. A line of the TCP is a spline through dense configurations. TOPP-RA computes the fastest timing of both.
 """
 
 from __future__ import annotations
@@ -17,22 +16,22 @@ from scipy.interpolate import CubicSpline, PPoly
 from robocas_ms3.planning.protocol import Array, Trajectory
 
 GRID = 0.04  # rad between grid points of TOPP-RA
-SAFETY = 0.98  # limits hold between grid points too
+SAFETY = 0.98  # fraction of the limits at grid points, so that they also hold in between
 
 
 class JointPath:
-    """A path through joint space by (nearly) its own length, an `AbstractGeometricPath` of TOPP-RA.
+    """Path in joint space parameterised by (nearly) its length, an `AbstractGeometricPath` of TOPP-RA.
 
     Args:
-        curve: piecewise polynomial over [0, length], values (n,).
-        goal: (n,) the last configuration, to the last bit.
+        curve: piecewise polynomial over [0, length] with values (n,).
+        goal: (n,) exact last configuration.
     """
 
     def __init__(self, curve: PPoly, goal: Array) -> None:
         self._curve, self.goal = curve, goal
 
     def __call__(self, path_positions: Array | float, order: int = 0) -> Array:
-        """Evaluate positions (m,) or one, or a derivative by the path's length."""
+        """Evaluate the path, or its derivative of an order, at one or more positions (m,)."""
         return self._curve(path_positions, order)
 
     @property
@@ -52,20 +51,20 @@ class JointPath:
         return float(self._curve.x[-1])
 
     def dense(self, spacing: float) -> Array:
-        """Give configurations (m, n) at most ``spacing`` rad apart, both ends included."""
+        """Sample configurations (m, n) at most ``spacing`` rad apart, both ends included."""
         return self(np.linspace(0, self.length, max(2, int(np.ceil(self.length / spacing)) + 1), dtype=np.float64))
 
     def grid(self) -> Array:
-        """Give grid points for TOPP-RA: even ones, and both sides of every joint of the pieces."""
+        """Return grid points for TOPP-RA: evenly spaced ones, and both sides of each breakpoint."""
         even = np.linspace(0, self.length, max(20, int(np.ceil(self.length / GRID))) + 1, dtype=np.float64)
         inner = self._curve.x[1:-1] if len(self._curve.x) < 40 else self._curve.x[:0]
-        beside = np.concatenate([inner - 1e-4 * self.length, inner + 1e-4 * self.length])
-        points = np.sort(np.concatenate([even, beside[(beside > 0) & (beside < self.length)]]))
+        near_breaks = np.concatenate([inner - 1e-4 * self.length, inner + 1e-4 * self.length])
+        points = np.sort(np.concatenate([even, near_breaks[(near_breaks > 0) & (near_breaks < self.length)]]))
         return points[np.concatenate([[True], np.diff(points) > 1e-6 * self.length])]
 
 
 def round_corners(waypoints: Array, radius: float) -> JointPath:
-    """Round the corners of a polyline (m, n) by parabolas that begin at most ``radius`` rad before each corner."""
+    """Round the corners of a polyline (m, n) by parabolas that start at most ``radius`` rad before a corner."""
     points = np.asarray(waypoints, dtype=np.float64)
     steps = np.diff(points, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
@@ -87,22 +86,22 @@ def round_corners(waypoints: Array, radius: float) -> JointPath:
 
 
 def fit_spline(waypoints: Array) -> JointPath:
-    """Lay a cubic spline through dense configurations (m, n) of a smooth motion."""
+    """Fit a cubic spline to dense configurations (m, n) of a smooth motion."""
     points = np.asarray(waypoints, dtype=np.float64)
     ends = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     return JointPath(CubicSpline(ends, points, bc_type="not-a-knot" if len(points) > 3 else "natural"), points[-1])
 
 
 def blend_motions(first: Array, second: Array, rows: int) -> Array:
-    """Lay the end of a motion over the beginning of the next, which cuts the corner between them.
+    """Blend the end of a motion with the start of the next one, which cuts the corner between them.
 
     Args:
-        first: (T, n) configurations, evenly in time, that come to rest where the next motion begins.
-        second: (U, n) of that next motion, the same time apart.
-        rows: how many of either overlap, at least 1.
+        first: (T, n) configurations at equal time steps, at rest where the second motion starts.
+        second: (U, n) configurations of the second motion at the same time step.
+        rows: number of overlapping rows.
 
     Returns:
-        (T + U - rows, n): both motions' own configurations before and after.
+        (T + U - rows, n) configurations, those of the two motions outside of the overlap.
     """
     if not rows:
         return np.concatenate([first, second])
@@ -110,18 +109,18 @@ def blend_motions(first: Array, second: Array, rows: int) -> Array:
 
 
 def thin_path(points: Array, spacing: float) -> Array:
-    """Return configurations (T, n) about ``spacing`` rad apart, first and last included."""
+    """Select configurations of (T, n) about ``spacing`` rad apart, first and last included."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     kept = np.unique(np.searchsorted(along, np.arange(0, max(along[-1] - spacing / 2, spacing / 2), spacing)))
     return points[[*kept, len(points) - 1]]
 
 
 def time_path(path: JointPath, *, velocity: float, acceleration: float, dt: float) -> Trajectory | None:
-    """Time a path as fast as the limits of every joint allow, from rest to rest; None if TOPP-RA fails.
+    """Time a path as fast as the joint limits allow, from rest to rest; return None if TOPP-RA fails.
 
-    The motion is stretched to a whole number of steps, so that row i lies exactly at ``(i + 1) * dt``.
+    The motion is stretched to a whole number of steps, so that row i is at time ``(i + 1) * dt`` s.
     """
-    from toppra.algorithm import TOPPRA  # imports matplotlib (0.2 s), which checks of settings do not need
+    from toppra.algorithm import TOPPRA  # imports matplotlib (0.2 s)
 
     bounds = _bounds(path.dof, velocity, acceleration)
     solver = TOPPRA(bounds, path, gridpoints=path.grid(), parametrizer="ParametrizeConstAccel")
@@ -132,7 +131,7 @@ def time_path(path: JointPath, *, velocity: float, acceleration: float, dt: floa
     return sample_motion(motion, duration, path.goal, dt) if np.isfinite(duration) else None
 
 
-@lru_cache(maxsize=64)  # making them takes a quarter of the time that timing takes: TOPP-RA words what it prints
+@lru_cache(maxsize=64)  # TOPP-RA formats a description of each, a quarter of the time of timing
 def _bounds(dof: int, velocity: float, acceleration: float) -> list[Any]:
     from toppra.constraint import JointAccelerationConstraint, JointVelocityConstraint
 
@@ -144,10 +143,10 @@ def _bounds(dof: int, velocity: float, acceleration: float) -> list[Any]:
 
 
 def time_with_stops(waypoints: Array, *, velocity: float, acceleration: float, dt: float) -> Trajectory:
-    """Time a polyline (m, n) as straight segments that each begin and end at rest: slow, and exactly on the path."""
+    """Time a polyline (m, n) as straight segments with a stop at each waypoint: slow, but exactly on the path."""
     points = np.asarray(waypoints, dtype=np.float64)
     steps = np.diff(points, axis=0)
-    largest = np.abs(steps).max(axis=1)  # the joint that moves most sets the time
+    largest = np.abs(steps).max(axis=1)  # the joint with the largest displacement determines the time
     cruise = np.minimum(SAFETY * velocity, np.sqrt(largest * SAFETY * acceleration))
     ramp = cruise / (SAFETY * acceleration)
     spans = largest / cruise + ramp
@@ -168,7 +167,7 @@ def time_with_stops(waypoints: Array, *, velocity: float, acceleration: float, d
 
 
 def sample_motion(motion: Callable[[Array], Array], duration: float, goal: Array, dt: float) -> Trajectory:
-    """Sample a motion at exact steps; the last row is ``goal``, a vanishing motion has that row alone."""
+    """Sample a motion at time steps ``dt``; the last row is ``goal``."""
     count = max(1, int(np.ceil(duration / dt - 1e-9)))
     qpos = np.array(motion(np.arange(1, count + 1, dtype=np.float64) * (duration / count)), dtype=np.float64)
     qpos[-1] = goal

@@ -103,5 +103,5 @@ def test_pull_continues_from_the_position_of_the_joint(towards, monkeypatch):
     part = standing_at(towards * 0.35, joint, monkeypatch)
     assert part.min_pull(None) == pytest.approx(0.03)  # a quarter of the range is more than what is left
     for position in (0.37, 0.38, 0.4):
-        with pytest.raises(PlanningError, match="at_the_end"):
+        with pytest.raises(PlanningError, match="already_open"):
             standing_at(towards * position, joint, monkeypatch).pull_positions(None)

@@ -109,7 +109,7 @@ def test_push_that_moves_nothing_is_a_failure(generator, monkeypatch):
         monkeypatch.setattr(heap, "push_away", move)
         heap.execute(Move("push", slots[0], 30))
 
-    with pytest.raises(PlanningError, match="in_vain"):
+    with pytest.raises(PlanningError, match="not_moved"):
         push(0.015)
     assert facts == {"pushes": 0, "removals": 0}
     push(0.025)

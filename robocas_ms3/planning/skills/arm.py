@@ -1,4 +1,4 @@
-"""The tools of a skill: environment, planner, executor, and the last commanded position of the arm."""
+"""Context of the skills (`Arm`): environment, planner, executor, and basic motions."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from robocas_ms3.tasks.base import RoboCASEnv
 
 T = TypeVar("T")
 Plan = TypeVar("Plan")
-GRIPPER_SECONDS = 0.5  # a dataset at 5 Hz may give its command 0.2 s later
-# m kept to furniture and basket where there is a way that does, as a robot may be off: on straight ways, while carrying
+GRIPPER_SECONDS = 0.5  # s; in a dataset at 5 Hz the command may start 0.2 s later
+# m to furniture and basket, if such a path exists, against position errors: on straight lines, while carrying
 CLEARANCE, CARRY_CLEARANCE = 0.012, 0.024
-RISE, MAX_RISES = 0.04, 4  # m a step, steps
+RISE, MAX_RISES = 0.04, 4  # m per step, number of steps
 RECOVERY_RISE = 0.10  # m
-RETREAT_DISTANCES = (0.25, 0.15, 0.10, 0.06)  # m against the approach; the first one to which the way is free
-MAX_TOP_APPROACH_Z = -0.7  # upright component of an approach that is rather from above than level
+RETREAT_DISTANCES = (0.25, 0.15, 0.10, 0.06)  # m against the approach axis; the first free one is used
+MAX_TOP_APPROACH_Z = -0.7  # z component of the approach axis below which a grasp counts as from above
 
 
 @dataclass
 class Arm:
-    """One attempt's tools. All poses are in the arm's base frame.
+    """Context of one attempt: the arm with planner and executor. Poses are in the arm's base frame.
 
     Attributes:
-        reachability: batched inverse kinematics of the same arm.
-        decisions: plays what `choose` is given.
-        path: the attempt's number, and which candidate was taken at each decision since.
-        rng: source of all randomness, made anew for each candidate: what was tried before must not matter.
-        qpos: (7,) rad, last commanded position of the arm; at first its position.
+        reachability: batched inverse kinematics of the arm.
+        decisions: search that plays the candidates of `choose`.
+        path: number of the attempt, and the index of the candidate taken at each decision since.
+        rng: random generator, seeded from ``path``, so that results do not depend on earlier candidates.
+        qpos: (7,) last commanded configuration, rad; initially the actual one.
     """
 
     planner: Planner
@@ -55,7 +55,7 @@ class Arm:
         self.qpos = self.scene.arm_qpos
         self.clear_attached()
         self._seed()
-        with self.planning_time():  # before the first decision: what is kept for as long as the process runs
+        with self.planning_time():  # fill the caches before the first fork
             self.scene.sample_surfaces()
             for clearance in (CARRY_CLEARANCE, CLEARANCE, 0.0):
                 self.planner.set_scene(self.scene.obstacles(clearance=clearance))
@@ -66,6 +66,7 @@ class Arm:
         self.rng = np.random.default_rng(entropy)
 
     def choose(self, candidates: Iterable[T], play: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE) -> T:
+        """Choose a candidate, see `Decisions.choose`; each candidate gets its own random seed."""
         path = self.path
 
         def play_one(numbered: tuple[int, T]) -> float:
@@ -77,7 +78,7 @@ class Arm:
         return self.decisions.choose(enumerate(candidates), play_one, limits)[1]
 
     def add_backtracking_point(self) -> None:
-        """Let what comes next begin again from here when it fails, with other random numbers."""
+        """Add a decision whose candidates differ in the random seed only; later failures backtrack to it."""
         self.choose(range(MAX_CONTINUED), lambda _: 0.0)
 
     @property
@@ -98,13 +99,16 @@ class Arm:
         return self.env.task_config.target.approach
 
     def start_subgoal(self, goal_type: str) -> None:
+        """Start a sub-goal of a type, with its text for the target."""
         words = self.env.target_asset().asset.name, self.env.task_config.support
         self.executor.start_subgoal(**subgoal(goal_type, *words))
 
     def planning_time(self):
+        """Count the CPU time of a ``with`` block as planning."""
         return self.executor.seconds.measure("planning")
 
     def follow(self, *motions: Trajectory, until: str | None = None) -> bool:
+        """Run motions one after the other, see `Executor.follow`."""
         reached = True
         for motion in motions:
             reached = self.executor.follow(motion, until=until)
@@ -118,17 +122,18 @@ class Arm:
         self.executor.move_gripper(CLOSED, self.qpos, seconds=GRIPPER_SECONDS)
 
     def clear_attached(self) -> None:
-        """Tell the planner that the gripper is empty and open."""
+        """Detach the held object in the planner and set the fingers to open."""
         self.planner.attach(None)
         self.planner.finger_width = self.robot.open_width
 
     def is_holding(self, slot: int) -> bool:
-        """Whether both fingers press on an object right now."""
+        """Return whether both fingers press on an object."""
         return bool(self.env.grasped()[0, slot])
 
     def plan_first_line(
         self, start: Array, goals: Iterable[Array], *, stage: str, check_collisions: bool = True
     ) -> Trajectory:
+        """Plan a straight line to the first feasible TCP pose of ``goals``."""
         return first_plan(
             goals,
             lambda goal: self.planner.plan_straight(start, goal, stage=stage, check_collisions=check_collisions),
@@ -139,19 +144,19 @@ class Arm:
         return self.planner.plan_to_qpos(start, [np.array(self.robot.arm_rest)], stage="home")
 
     def rise_until_free(self, *, exclude: int | Collection[int] = ()) -> None:
-        """Rise in small steps, through whatever is touched, until arm and held object (``exclude``) touch nothing."""
+        """Rise in small steps until the arm and the held object (``exclude``) are collision-free."""
         for rises in range(MAX_RISES + 1):
             with self.planning_time():
                 self.planner.set_scene(self.scene.obstacles(exclude=exclude))
                 if not self.planner.collisions(self.qpos, self.planner.finger_width):
                     return
                 if rises == MAX_RISES:
-                    raise PlanningError("rise", "still_touching")
+                    raise PlanningError("rise", "in_contact")
                 motion = self.plan_rise(self.planner.tcp(self.qpos), RISE, stage="rise")
             self.follow(motion)
 
     def plan_rise(self, tcp_in_base: Array, height: float, *, stage: str) -> Trajectory:
-        """Plan straight up, through whatever is touched; at the end of its reach the arm rises towards the robot."""
+        """Plan a line straight up, or up and towards the robot at the limit of reach; obstacles are ignored."""
         up = shift_up(tcp_in_base, height)
         inward = up.copy()
         inward[:2, 3] *= 1 - height / np.linalg.norm(up[:2, 3])
@@ -159,7 +164,7 @@ class Arm:
 
 
 def first_plan(candidates: Iterable[T], plan: Callable[[T], Plan], failure: PlanningError) -> Plan:
-    """Return the first plan of a candidate that succeeds, or raise the last failure; without candidates ``failure``."""
+    """Return the plan of the first feasible candidate; raise the last error, or ``failure`` without candidates."""
     for candidate in candidates:
         try:
             return plan(candidate)
@@ -169,26 +174,26 @@ def first_plan(candidates: Iterable[T], plan: Callable[[T], Plan], failure: Plan
 
 
 def shift_up(tcp_in_base: Array, height: float) -> Array:
-    """Return poses (..., 4, 4) moved straight up by ``height`` metres (the arm's base stands upright)."""
+    """Shift poses (..., 4, 4) straight up by ``height`` m."""
     result = tcp_in_base.copy()
     result[..., 2, 3] += height
     return result
 
 
 def shift_back(tcp_in_base: Array, distance: float) -> Array:
-    """Return poses (..., 4, 4) moved against their approach by ``distance`` metres."""
+    """Shift poses (..., 4, 4) by ``distance`` m against their approach axis."""
     result = tcp_in_base.copy()
     result[..., :3, 3] -= distance * tcp_in_base[..., :3, 2]
     return result
 
 
 def plan_retreat(arm: Arm, start: Array, goals: list[Array]) -> Trajectory:
-    """Plan a straight line to the first of several TCP poses (best first), through whatever is touched."""
+    """Plan a straight line to the first feasible TCP pose (best first); obstacles are ignored."""
     return arm.plan_first_line(start, goals, stage="retreat", check_collisions=False)
 
 
 def plan_free_retreat(arm: Arm, goals: list[Array]) -> Trajectory:
-    """Plan a straight line to the first of several TCP poses (best first), free of all but the target."""
+    """Plan a straight line to the first feasible TCP pose (best first); only the target may be touched."""
     try:
         return arm.plan_first_line(arm.qpos, goals, stage="retreat")
     except PlanningError:
@@ -197,10 +202,10 @@ def plan_free_retreat(arm: Arm, goals: list[Array]) -> Trajectory:
 
 
 def recover(arm: Arm) -> None:
-    """Open the gripper and leave, after a failed attempt that stays in the record.
+    """Open the gripper and retreat after a failed attempt that stays in the recording.
 
-    Above an open surface the arm rises, through what it touches. Where it reached in level, as into a shelf or for a
-    handle, it steps straight back on a way that is free of all but the target.
+    After an approach from above the arm rises, and obstacles are ignored. After a horizontal approach, as into a shelf
+    or to a handle, it moves straight back on a line that may touch only the target.
     """
     arm.clear_attached()
     arm.open_gripper()

@@ -1,6 +1,6 @@
-"""Where the mobile base stands: to reach an object, to pull at a handle, to let go above the basket.
+"""Choose base poses to grasp an object, to pull a handle and to release an object above the basket.
 
-The base drives only where the configuration lets policies drive.
+The base drives only in configurations with ``base_motion: true``.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ from robocas_ms3.scenes.grasp_checks import (
     is_gripper_clear,
 )
 
-GRASP_KINDS = 4  # of grasps that attempts take one after the other
-MAX_BASE_POSES = 3  # to do one thing from
-GRASPS_SAMPLED = 10  # grasps that stand for all when reach is judged
-GRASPS_THOROUGH = 40  # the same where none of those can be reached from anywhere
-GRASPS_TESTED = 250
+GRASP_KINDS = 4  # kinds of grasps that consecutive attempts use
+MAX_BASE_POSES = 3  # base poses tried for one skill
+GRASPS_SAMPLED = 10  # grasps from which the reachable fraction is estimated
+GRASPS_THOROUGH = 40  # the same, if no base pose reaches enough of those
+GRASPS_TESTED = 250  # grasps whose gripper is tested for collisions
 SIDE = "from_the_robots_side"
-# shares that are comfortable: of an object's grasps, of the way of a pull, of poses above the basket
+# minimum reachable fractions: of the grasps of an object, of a pull, of drop poses
 MIN_GRASP_FRACTION, MIN_PULL_FRACTION, MIN_DROP_FRACTION = 0.3, 1.0, 0.1
 
 
 def drive_and_grasp(arm: Arm, slot: int) -> None:
-    """Grasp an object from a place within comfortable reach, or from another place if no grasp can be planned there."""
-    kind = arm.path[-1] % GRASP_KINDS  # not again what has failed before
+    """Drive within comfortable reach of an object and grasp it; try other base poses if planning fails."""
+    kind = arm.path[-1] % GRASP_KINDS  # skip the kinds of earlier attempts
     _try_base_poses(
         arm,
         lambda relocate: drive_to_object(arm, slot, relocate=relocate),
@@ -58,25 +58,25 @@ def drive_and_grasp(arm: Arm, slot: int) -> None:
 
 
 def drive_and_open(arm: Arm) -> None:
-    """Open what the task wants opened, from where its handle is within comfortable reach all the way."""
+    """Drive to where the handle is reachable during the whole pull, and open the door or drawer."""
     _try_base_poses(arm, lambda relocate: drive_to_handle(arm, relocate=relocate), lambda: open_furniture_part(arm))
 
 
-def _try_base_poses(arm: Arm, go: Callable[[bool], None], act: Callable[[], None]) -> None:
-    """Go and act; where acting fails before anything moves, go elsewhere and act again."""
-    for place in range(MAX_BASE_POSES):
-        go(place > 0)
+def _try_base_poses(arm: Arm, drive_to: Callable[[bool], None], act: Callable[[], None]) -> None:
+    """Drive and act; if acting fails before anything moves, drive to another base pose and act again."""
+    for number in range(MAX_BASE_POSES):
+        drive_to(number > 0)
         length = len(arm.executor.actions)
         try:
             act()
             return
         except PlanningError:
-            if len(arm.executor.actions) > length or not arm.executor.drives_base or place == MAX_BASE_POSES - 1:
+            if len(arm.executor.actions) > length or not arm.executor.drives_base or number == MAX_BASE_POSES - 1:
                 raise
 
 
 def drive_to_object(arm: Arm, slot: int, *, relocate: bool = False) -> None:
-    """Fold the arm and drive within comfortable reach of an object; if already there, only with ``relocate``."""
+    """Fold the arm and drive within comfortable reach of an object; skip this in reach unless ``relocate``."""
     if not arm.executor.drives_base:
         return
     with arm.planning_time():
@@ -90,30 +90,29 @@ def drive_to_object(arm: Arm, slot: int, *, relocate: bool = False) -> None:
         seen = np.array([len(_graspable_from(arm, arm_base_in_world(arm, goal), grasps)) for goal in goals])
         goals = goals[seen >= max(1, 0.3 * seen.max(initial=0))]
 
-        def route_to(judged: tuple[bool, float]) -> list[Array]:
-            thorough, enough = judged
+        def route_to(mode: tuple[bool, float]) -> list[Array]:
+            thorough, enough = mode
 
             def fraction(goal: Array) -> float:
                 return reachable_fraction(arm, goal, grasps, others, thorough=thorough)
 
             return find_best_route(arm, goals, around, fraction, enough=enough)
 
-        # where the elbow is in the way of the nearest configurations, others are judged too
-        route = first_plan(
-            ((False, 2 * MIN_GRASP_FRACTION), (True, MIN_GRASP_FRACTION)), route_to, PlanningError("drive", "nowhere")
-        )
+        # if the nearest configurations collide, evaluate all configurations
+        modes = (False, 2 * MIN_GRASP_FRACTION), (True, MIN_GRASP_FRACTION)
+        route = first_plan(modes, route_to, PlanningError("drive", "no_base_pose"))
     drive(arm, *route)
 
 
 def drive_to_handle(arm: Arm, *, relocate: bool = False) -> None:
-    """Fold the arm and drive to where it can pull the handle far enough; if it can already, only with ``relocate``."""
+    """Fold the arm and drive to where it can pull the handle; skip this in reach unless ``relocate``."""
     if not arm.executor.drives_base:
         return
     part = MovingPart.of(arm)
 
     def fraction(goal: Array) -> float:
         frame = arm_base_in_world(arm, goal)
-        if not is_body_clear(arm.robot, frame, swept):  # what opens would run into it
+        if not is_body_clear(arm.robot, frame, swept):  # the opening part would hit the robot
             return 0.0
         return pull_fraction(arm, part, frame, to_arm_base_frame(others, frame))
 
@@ -131,6 +130,7 @@ def drive_to_handle(arm: Arm, *, relocate: bool = False) -> None:
 
 
 def place_in_basket(arm: Arm, slot: int) -> None:
+    """Carry a held object to the basket, driving if necessary, and release it there."""
     arm.start_subgoal("transfer object")
     drive_to_basket(arm, slot)
     carry_to_basket(arm, slot)
@@ -138,10 +138,9 @@ def place_in_basket(arm: Arm, slot: int) -> None:
 
 
 def drive_to_basket(arm: Arm, slot: int) -> None:
-    """Drive back to the start of the episode, an object in the gripper.
+    """Drive with a held object to where the basket is in reach.
 
-    Where there is no free way, or the basket is out of reach from there, stay if it is in reach, else drive to where it
-    is.
+    The first choice is the base pose at the start of the episode, then the current one, then any other.
     """
     if not arm.executor.drives_base:
         return
@@ -161,7 +160,7 @@ def drive_to_basket(arm: Arm, slot: int) -> None:
             return
         if route is None:
             basket = arm.env.fixtures.basket
-            assert basket is not None  # the task has one
+            assert basket is not None  # required by the task
             center = basket.pose.p[0].cpu().numpy()
             route = find_best_route(arm, sample_base_poses(arm, center), around, fraction, enough=MIN_DROP_FRACTION)
     drive(arm, *route)
@@ -179,7 +178,7 @@ def _fold(arm: Arm) -> Surroundings:
 
 
 def find_clear_grasps(arm: Arm, slot: int) -> Array:
-    """Return an object's grasps (G, 4, 4) in the world with a clear way in, from any side."""
+    """Return grasps (G, 4, 4) of an object in the world, from all sides, whose gripper approach is clear."""
     base, object_in_base = arm.scene.arm_base_in_world, arm.scene.object_in_base(slot)
     object_in_world = base @ object_in_base
     notes = arm.env.object_assets[0][slot].annotations
@@ -193,12 +192,14 @@ def find_clear_grasps(arm: Arm, slot: int) -> Array:
 def reachable_fraction(
     arm: Arm, base: Array, grasps: Array, others: list[Obstacle], *, thorough: bool = False
 ) -> float:
-    """Return the share of grasps (with pre-grasps) that the arm reaches from a base pose (3,) without collisions.
+    """Return the fraction of grasps (with pre-grasps) that the arm reaches from a base pose without collisions.
 
     Args:
-        grasps: (G, 4, 4) from ``find_clear_grasps``; those that come from the far side count as out of reach.
-        others: everything but the object, in the world.
-        thorough: judge more grasps, by all configurations instead of the nearest; far slower.
+        arm: context of the attempt.
+        base: (3,) base pose.
+        grasps: (G, 4, 4) grasps of ``find_clear_grasps``; grasps from the far side count as unreachable.
+        others: all other bodies, in the world frame.
+        thorough: evaluate more grasps and all configurations instead of the nearest ones; much slower.
     """
     frame = arm_base_in_world(arm, base)
     poses = _sample_grasp_poses(arm, frame, grasps, GRASPS_THOROUGH if thorough else GRASPS_SAMPLED)
@@ -211,12 +212,12 @@ def reachable_fraction(
         qpos, of_pose = nearest[solved], np.flatnonzero(solved)
     arm.planner.set_scene(to_arm_base_frame(others, frame))
     possible = np.bincount(of_pose[arm.planner.is_free(qpos)], minlength=len(poses)) > 0
-    held, entered = possible.reshape(2, 2, -1)  # grasp or pre-grasp; as annotated or its twin; which
-    return float((held & entered).any(axis=0).mean())
+    at_grasp, at_pregrasp = possible.reshape(2, 2, -1)  # axes: grasp or pre-grasp; annotated or half turn; grasp
+    return float((at_grasp & at_pregrasp).any(axis=0).mean())
 
 
 def _sample_grasp_poses(arm: Arm, frame: Array, grasps: Array, count: int) -> Array:
-    """Return poses (4K, 4, 4) in an arm's base frame: K <= count grasps and their twins, then their pre-grasps."""
+    """Return poses (4K, 4, 4) in an arm's base frame: K <= ``count`` grasps, their half turns, and pre-grasps."""
     chosen = _graspable_from(arm, frame, grasps)
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(count, len(chosen))).round().astype(int)]
     poses = inverse(frame) @ np.concatenate([chosen, chosen @ HALF_TURN])

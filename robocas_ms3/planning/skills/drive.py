@@ -1,6 +1,6 @@
-"""Drive the mobile base with the arm held still: candidate base poses and collision-free routes to them.
+"""Drive the mobile base with a fixed arm: candidate base poses and collision-free routes.
 
-Base poses are joint positions (3,): x m, y m, yaw rad, in the frame of the robot's root, which stands on the floor.
+Base poses are joint positions (3,): x m, y m, yaw rad, in the frame of the robot's root on the floor.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from robocas_ms3.scenes import robot_placement
 SPEED, ACCELERATION = 0.25, 0.4  # m/s and rad/s; m/s^2 and rad/s^2
 SETTLE_SECONDS = 0.4
 MAX_BASE_ERROR = 0.01  # m, rad
-CHECK_STEP = 0.08  # m or rad between poses at which a drive is checked
-THINNED = 3  # every third point of the clouds will do: nothing thinner than 2 cm could slip between them
+CHECK_STEP = 0.08  # m or rad between collision checks of a drive
+THINNED = 3  # stride over points of clouds; gaps stay below 2 cm
 LIMIT_MARGIN = 0.01  # m, rad
 MAX_YAW = 0.6  # rad
-SAMPLES, POSES_SCORED = 400, 14  # base poses drawn; those of them that are judged
-DISTANCES = (0.45, 0.80)  # m from the arm's base to what it reaches for, level
+SAMPLES, POSES_SCORED = 400, 14  # base poses drawn, and scored
+DISTANCES = (0.45, 0.80)  # m, minimum and maximum horizontal distance from the arm's base to the goal
 BEST_DISTANCE = 0.58
-BACK_DISTANCES = (0.15, 0.30)  # m straight back first
+BACK_DISTANCES = (0.15, 0.30)  # m straight back before or after the rest of the route
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is around a drive, in the world: bodies for the arm, samples (P, 3) for the body on the floor, m."""
+    """Obstacles of a drive in the world frame: bodies for the arm, points (P, 3) for the mobile base, m."""
 
     obstacles: list[Obstacle]
     cloud: Array
@@ -51,13 +51,13 @@ def current_base_pose(arm: Arm) -> Array:
 
 
 def arm_base_in_world(arm: Arm, base: Array) -> Array:
-    """Return the arm's base (4x4) with the base joints at a pose."""
+    """Return the world pose (4x4) of the arm's base for a base pose (3,)."""
     root = from_wxyz(arm.env.agent.robot.pose.raw_pose[0])
     return root @ from_xyz_yaw(float(base[0]), float(base[1]), arm.robot.arm_base_height, float(base[2]))
 
 
 def drive(arm: Arm, *goals: Array) -> None:
-    """Drive straight to one base pose after the other and let the base settle."""
+    """Drive straight to base poses one after the other and wait until the base settles."""
     for goal in goals:
         if np.abs(goal - current_base_pose(arm)).max() < 1e-6:
             continue
@@ -66,13 +66,13 @@ def drive(arm: Arm, *goals: Array) -> None:
         )
         wait = np.repeat(goal[None], max(1, round(SETTLE_SECONDS / arm.executor.dt)), axis=0)
         arm.executor.drive(np.concatenate([motion.qpos, wait]), arm.qpos)
-        now = arm.env.agent.robot.get_qpos()[0, :3].cpu().numpy()
-        if np.abs(now - goal).max() > MAX_BASE_ERROR:
-            raise PlanningError("drive", "held_up")
+        actual = arm.env.agent.robot.get_qpos()[0, :3].cpu().numpy()
+        if np.abs(actual - goal).max() > MAX_BASE_ERROR:
+            raise PlanningError("drive", "blocked")
 
 
 def sample_base_poses(arm: Arm, center: Array) -> Array:
-    """Return base poses (N, 3) in front of a point (3,) in the world, the most promising first."""
+    """Sample base poses (N, 3) that face a point (3,) in the world, the most promising first."""
     low, high = np.array(arm.robot.base_limits).T + np.array([[LIMIT_MARGIN], [-LIMIT_MARGIN]])
     high[2], low[2] = MAX_YAW, -MAX_YAW
     goals = arm.rng.uniform(low, high, (SAMPLES, 3))
@@ -87,32 +87,38 @@ def sample_base_poses(arm: Arm, center: Array) -> Array:
 def find_best_route(
     arm: Arm, goals: Array, around: Surroundings, score_pose: Callable[[Array], float], *, enough: float
 ) -> list[Array]:
-    """Return base poses that lead to the best of the first few goals (N, 3) where the body is free.
+    """Return a route to the best of the first collision-free base poses in ``goals`` (N, 3).
 
-    ``score_pose`` returns the value of a base pose (3,), 0: useless; at a value of ``enough`` no other goal is judged.
+    Args:
+        arm: context of the attempt.
+        goals: candidate base poses, the most promising first.
+        around: obstacles.
+        score_pose: function that returns the score of a base pose (3,); 0 means unusable.
+        enough: score from which on no further pose is evaluated.
     """
     best: tuple[float, list[Array]] = (0.0, [])
-    tried = 0
+    scored = 0
     for goal in goals:
         if not is_body_clear(arm.robot, arm_base_in_world(arm, goal), around.cloud):
             continue
-        tried += 1
-        if tried > POSES_SCORED:
+        scored += 1
+        if scored > POSES_SCORED:
             break
-        share = score_pose(goal)
-        if share > best[0] and (route := find_free_route(arm, current_base_pose(arm), goal, around, leaving=False)):
-            best = share, route
-            if share >= enough:
+        score = score_pose(goal)
+        if score > best[0] and (route := find_free_route(arm, current_base_pose(arm), goal, around, leaving=False)):
+            best = score, route
+            if score >= enough:
                 break
     if not best[1]:
-        raise PlanningError("drive", "nowhere_to_go")
+        raise PlanningError("drive", "no_base_pose")
     return best[1]
 
 
 def find_free_route(arm: Arm, start: Array, goal: Array, around: Surroundings, *, leaving: bool) -> list[Array] | None:
-    """Return base poses to drive to one after the other: straight, or by way of a place behind the narrower end.
+    """Return base poses of a free route, straight or via a pose behind its narrow end; None without a free route.
 
-    With ``leaving``, ``start`` is the narrower end, so that the robot backs out first; else it moves up last.
+    With ``leaving``, the narrow end is ``start``, and the robot drives back first. Else it is ``goal``, and the robot
+    drives forward last.
     """
     for route in _routes(start, goal, leaving, arm.robot.base_limits):
         poses = [start, *route]
@@ -144,7 +150,7 @@ def _leg_is_free(arm: Arm, start: Array, goal: Array, around: Surroundings) -> b
 
 
 def is_body_clear(robot: RobotDescription, arm_base_in_world: Array, cloud: Array) -> bool:
-    """Whether none of the points (P, 3), world, is where the body on the floor would be."""
+    """Return whether no point (P, 3) in the world is inside the mobile base."""
     root = arm_base_in_world.copy()
     root[2, 3] -= robot.arm_base_height  # on the floor
     return robot_placement.is_body_clear(root, cloud)

@@ -1,6 +1,7 @@
-"""Grasp an object by one of its annotated grasps and take it out of its surroundings.
+"""Grasp an object with one of its annotated grasps and move it out of its surroundings.
 
-From above: lift it. From the front: lift it a little, then withdraw straight back, so that neighbours stay standing.
+After a grasp from above the arm lifts the object. After a grasp from the front it lifts the object slightly and
+withdraws straight back, so that neighbouring objects stay upright.
 """
 
 from __future__ import annotations
@@ -19,30 +20,30 @@ from robocas_ms3.planning.scene import SPACING
 from robocas_ms3.planning.skills.arm import CLEARANCE, Arm, shift_back, shift_up
 from robocas_ms3.scenes.grasp_checks import NEIGHBOURHOOD, PREGRASP_DISTANCE, is_gripper_clear
 
-GRASPS_CHECKED = 48  # grasps of which a check of collisions says whether to try them early
-CLEARED_AT_ONCE = 12
-MAX_PREGRASPS = 4  # pre-grasp configurations of one grasp
-MAX_PREGRASP_GOALS = 6  # pre-grasp configurations that are searched for together
-GRASPS_COMPARED = 96  # of which kinds are told apart
-KIND_TOLERANCES = 0.02, np.deg2rad(30)  # m, rad between two grasps of a kind
-GRASPS_PLANNED = 12  # grasps that motions are planned for before an attempt gives up
-# m; the least makes a stage of the tasks (3 cm), the others go over what stands in front: the first with a way out
+GRASPS_CHECKED = 48  # grasps that are ordered by a collision check of the arm
+CLEARED_AT_ONCE = 12  # grasps per batch of gripper checks
+MAX_PREGRASPS = 4  # pre-grasp configurations per grasp
+MAX_PREGRASP_GOALS = 6  # pre-grasp configurations that are goals of one path search
+GRASPS_COMPARED = 96  # grasps that are grouped into kinds
+KIND_TOLERANCES = 0.02, np.deg2rad(30)  # m, rad between grasps of the same kind
+GRASPS_PLANNED = 12  # maximum number of grasps to plan motions for
+# m; the first height with a free exit path is used. The smallest one completes the lift stage (3 cm)
 FRONT_LIFTS = (0.04, 0.08, 0.14, 0.2)
-WITHDRAWALS = (0.25, 0.18, 0.12)  # m, straight back; the first one that can be reached
+WITHDRAWALS = (0.25, 0.18, 0.12)  # m straight back; the first reachable one is used
 
 ExitMotions = tuple[Trajectory, ...]
 
 
 def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, skip_kinds: int = 0) -> None:
-    """Plan a grasp of an object, run it, and lift (from the front: lift and withdraw) the object.
+    """Plan and run a grasp of an object, then lift it (front approach: lift and withdraw).
 
     Args:
-        lift_height: when grasping from above, m (RoboCAS-v0: 0.10 when picking, 0.15 when searching).
-        other_than: how many kinds of grasps to leave out, the best first.
+        lift_height: lift after a grasp from above, m (RoboCAS-v0: 0.10 for pick, 0.15 for search).
+        skip_kinds: number of kinds of grasps to skip, the best first.
     """
     with arm.planning_time():
-        way_in, out = plan_grasp(arm, slot, lift_height, skip_kinds)
-    arm.follow(way_in)
+        approach, out = plan_grasp(arm, slot, lift_height, skip_kinds)
+    arm.follow(approach)
     arm.close_gripper()
     if not arm.is_holding(slot):
         raise PlanningError("grasp", "missed")
@@ -52,24 +53,24 @@ def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, skip_kinds: int = 0
 
 
 def plan_grasp(arm: Arm, slot: int, lift_height: float, skip_kinds: int = 0) -> tuple[Trajectory, ExitMotions]:
-    """Plan from where the arm is to the best grasp that has a way in and out, and out of the object's surroundings."""
+    """Plan motions to the best feasible grasp and out of the object's surroundings; return approach and exit."""
     planner, failure = arm.planner, PlanningError("grasp_sampling", "no_feasible_grasp")
     everything, others = arm.scene.obstacles(), arm.scene.obstacles(exclude=slot)
     with_room = arm.scene.obstacles(clearance=CLEARANCE)
-    ways: list[tuple[Array, Trajectory, ExitMotions]] = []  # pre-grasp configuration, way in, way out
+    ways: list[tuple[Array, Trajectory, ExitMotions]] = []  # pre-grasp configuration, approach, exit
 
-    def finished(reach: Trajectory, inward: Trajectory, out: ExitMotions) -> tuple[Trajectory, ExitMotions]:
+    def join_approach(reach: Trajectory, inward: Trajectory, out: ExitMotions) -> tuple[Trajectory, ExitMotions]:
         planner.set_scene(everything)
         return planner.join(arm.qpos, reach, inward), out
 
-    def searched() -> tuple[Trajectory, ExitMotions]:
+    def search_path() -> tuple[Trajectory, ExitMotions]:
         planner.set_scene(everything)
         reach = planner.plan_to_qpos(arm.qpos, [way[0] for way in ways], stage="reach")
         _, inward, out = min(ways, key=lambda way: float(np.abs(way[0] - reach.qpos[-1]).max()))
-        return finished(reach, inward, out)
+        return join_approach(reach, inward, out)
 
     for tcp_in_base in grasp_candidates(arm, slot, skip_kinds):
-        # in and out of the target's surroundings, where the target itself is no obstacle; it is one on the way there
+        # the object is an obstacle on the way to the pre-grasp only
         planner.set_scene(others)
         starts = planner.ik(shift_back(tcp_in_base, PREGRASP_DISTANCE), arm.qpos)[:MAX_PREGRASPS]
         failure = failure if starts else PlanningError("approach", "no_ik")
@@ -81,26 +82,26 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, skip_kinds: int = 0) -> 
                 reach = None
             try:
                 planner.set_scene(others)
-                inward, out = _plan_way_in_and_out(arm, slot, start, tcp_in_base, lift_height)
+                inward, out = _plan_approach_and_exit(arm, slot, start, tcp_in_base, lift_height)
             except PlanningError as error:
                 failure = error
                 continue
             if reach is not None:
-                return finished(reach, inward, out)
+                return join_approach(reach, inward, out)
             ways.append((start, inward, out))
-        # a search for a way round costs as much as all else, and takes several goals at once
+        # a path search costs as much as everything else and accepts several goals
         if len(ways) >= MAX_PREGRASP_GOALS:
             try:
-                return searched()
+                return search_path()
             except PlanningError as error:
                 failure, ways = error, []
     if ways:
-        return searched()
+        return search_path()
     raise failure
 
 
 def grasp_candidates(arm: Arm, slot: int, skip_kinds: int) -> Iterator[Array]:
-    """Yield grasps worth planning for, best first, as TCP poses 4x4; without the best few kinds (``skip_kinds``)."""
+    """Yield promising grasps as TCP poses (4x4), best first, without the best ``skip_kinds`` kinds."""
     notes = arm.env.object_assets[0][slot].annotations
     base, object_in_base = arm.scene.arm_base_in_world, arm.scene.object_in_base(slot)
     kept = filter_grasps(notes, base @ object_in_base, base, arm.approach)
@@ -124,15 +125,15 @@ def grasp_candidates(arm: Arm, slot: int, skip_kinds: int) -> Iterator[Array]:
     ranks = sample_order(arm.rng, scores)
     near = arm.scene.points_in_base(exclude=slot, radius=NEIGHBOURHOOD, around=object_in_base[:3, 3])
     clear = _filter_clear(tcp_in_base, reachable[ranks], near)
-    if arm.approach == "front":  # where it is narrow, first those whose arm is free as inverse kinematics found it
-        looked_at = list(islice(clear, GRASPS_CHECKED))
+    if arm.approach == "front":  # first grasps whose arm configurations are collision-free
+        first_grasps = list(islice(clear, GRASPS_CHECKED))
         arm.planner.set_scene(arm.scene.obstacles(exclude=slot))
-        ways = np.stack([qpos_before[looked_at], qpos[looked_at]], axis=1)
+        ways = np.stack([qpos_before[first_grasps], qpos[first_grasps]], axis=1)
         free = arm.planner.is_free(ways.reshape(-1, 7)).reshape(-1, 2).all(axis=1)
-        clear = iter([looked_at[i] for i in np.argsort(~free, kind="stable")])
+        clear = iter([first_grasps[i] for i in np.argsort(~free, kind="stable")])
     if skip_kinds:
-        looked_at = list(islice(clear, GRASPS_COMPARED))
-        clear = (looked_at[i] for i in _skip_kinds(tcp_in_base[looked_at], skip_kinds))
+        first_grasps = list(islice(clear, GRASPS_COMPARED))
+        clear = (first_grasps[i] for i in _skip_kinds(tcp_in_base[first_grasps], skip_kinds))
     found = False
     for index in islice(clear, GRASPS_PLANNED):
         found = True
@@ -142,26 +143,26 @@ def grasp_candidates(arm: Arm, slot: int, skip_kinds: int) -> Iterator[Array]:
 
 
 def _skip_kinds(tcp: Array, count: int) -> list[int]:
-    """Return indices of the grasps (N, 4, 4) without the first few kinds; tolerances: KIND_TOLERANCES."""
+    """Return the indices of grasps (N, 4, 4) without the first ``count`` kinds; see ``KIND_TOLERANCES``."""
     left = np.ones(len(tcp), dtype=bool)
     for _ in range(count):
         if not left.any():
             break
         first = tcp[int(np.argmax(left))]
         near = np.linalg.norm(tcp[:, :3, 3] - first[:3, 3], axis=1) <= KIND_TOLERANCES[0]
-        turned = [np.abs(tcp[:, :3, axis] @ first[:3, axis]) for axis in (1, 2)]  # the closing axis has no sign
+        turned = [np.abs(tcp[:, :3, axis] @ first[:3, axis]) for axis in (1, 2)]  # the closing axis is symmetric
         left &= ~(near & (np.min(turned, axis=0) >= np.cos(KIND_TOLERANCES[1])))
     return np.flatnonzero(left).tolist()
 
 
 def _filter_clear(tcp_in_base: Array, order: NDArray[np.int_], points_in_base: Array) -> Iterator[int]:
-    """Yield the grasps, in their order, whose gripper meets no point on its way in; a few are tested at a time."""
+    """Yield grasps in ``order`` whose gripper touches no point during the approach; tested in small batches."""
     for first in range(0, len(order), CLEARED_AT_ONCE):
         some = order[first : first + CLEARED_AT_ONCE]
         yield from some[is_gripper_clear(tcp_in_base[some], points_in_base)].tolist()
 
 
-def _plan_way_in_and_out(
+def _plan_approach_and_exit(
     arm: Arm, slot: int, qpos: Array, tcp_in_base: Array, lift_height: float
 ) -> tuple[Trajectory, ExitMotions]:
     inward = arm.planner.plan_straight(qpos, tcp_in_base, stage="approach")
@@ -171,8 +172,8 @@ def _plan_way_in_and_out(
 
 
 def _plan_withdrawal(arm: Arm, slot: int, start: Array, tcp_in_base: Array) -> tuple[Trajectory, Trajectory]:
-    """Plan straight up, as little as leaves a way out, and from there straight and level back with the object."""
-    failure = PlanningError("withdraw", "no_way_out")
+    """Plan the smallest lift with a free exit, and a horizontal line straight back with the object."""
+    failure = PlanningError("withdraw", "no_exit")
     vertices = np.concatenate(arm.env.object_assets[0][slot].hulls)
     held = AttachedBody(vertices, inverse(tcp_in_base) @ arm.scene.object_in_base(slot))
     back = -tcp_in_base[:2, 2] / np.linalg.norm(tcp_in_base[:2, 2])
@@ -196,11 +197,11 @@ def _plan_withdrawal(arm: Arm, slot: int, start: Array, tcp_in_base: Array) -> t
 
 
 def _lift_poses(tcp_in_base: Array, lift_height: float) -> list[Array]:
-    """Return where to lift to: straight up, or between that and back the way the gripper came in."""
+    """Return lift goals: straight up, back along the approach, and halfway between."""
     up, back = np.array([0, 0, 1.0]), -tcp_in_base[:3, 2]
     goals = []
-    for share in (0.0, 0.5, 1.0):
-        direction = (1 - share) * up + share * back
+    for fraction in (0.0, 0.5, 1.0):
+        direction = (1 - fraction) * up + fraction * back
         if direction[2] > 0.2:
             goals.append(tcp_in_base.copy())
             goals[-1][:3, 3] += lift_height / direction[2] * direction

@@ -1,6 +1,6 @@
-"""Open a door or drawer by its handle: take hold of it, pull along its joint, let go, step back.
+"""Open a door or drawer by its handle: grasp the handle, pull along the joint, release, retreat.
 
-The gripper only presses on the bar; what moves the door is contact.
+Only contact forces between gripper and handle move the door.
 """
 
 from __future__ import annotations
@@ -28,28 +28,28 @@ from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.bodies import contact_forces
 from robocas_ms3.tasks.open_pick import RoboCASOpenPickEnv
 
-MAX_PULLS = 3  # with a new hold each, where one doesn't open far enough
-COMFORT_FRACTION = 0.15  # of the way from where it counts as opened to where a pull ends at most
-HANDLE_RADIUS = 0.15  # m around the handle, in which what the fingers take hold of is looked for
-PAD_HALF_EXTENT = (0.008, 0.01)  # m from the TCP along x and z: what is between the pads
-HOLDS_CHECKED = 4  # ways to hold the handle that are checked for collisions where only reach is judged
-DEPTH_OFFSET = 0.012  # m by which the bar is farther in than the TCP, where it fits: the pads end 8 mm before the TCP
+MAX_PULLS = 3  # pulls, each with a new grasp of the handle
+COMFORT_FRACTION = 0.15  # extra range beyond "opened", as a fraction of the range up to the longest pull
+HANDLE_RADIUS = 0.15  # m around the handle; surface points within it can be between the fingers
+PAD_HALF_EXTENT = (0.008, 0.01)  # m from the TCP along x and z: volume between the pads
+HOLDS_CHECKED = 4  # handle grasps that are checked for collisions to estimate reach
+DEPTH_OFFSET = 0.012  # m by which the bar is deeper in the gripper than the TCP, if it fits
 SHIFTS = (0.0, -0.03, 0.03)  # m along the bar
 TURNS = np.deg2rad((0, -20, 20, -40, 40))  # about the bar
-TURN_WEIGHT = 1.0  # rad of a joint that a rad about the bar is worth: pads that lean push a bar aside as they close
-STANDOFF = 0.08  # m that the gripper comes in straight
-RETREATS = (0.15, 0.10, 0.06)  # m straight back; the first one that can be reached
-HANDLE_CLEARANCE = 0.06  # m around the place held, within which the gripper may be near the part it pulls
-PULLS_PLANNED = 8  # ways to hold the handle that motions are planned for
-POSITIONS_CHECKED = 6  # positions of the part at which the arm is checked against it
-SPEED = 0.8  # share of the arm's limits
-MIN_RANGE_FRACTION = 0.25  # of the joint's range; a pull that can't even do this is not worth it
+TURN_WEIGHT = 1.0  # cost of a rotation about the bar relative to a joint displacement; tilted pads push the bar aside
+STANDOFF = 0.08  # m, straight approach
+RETREATS = (0.15, 0.10, 0.06)  # m straight back; the first reachable one is used
+HANDLE_CLEARANCE = 0.06  # m around the handle, without collision checks against the pulled part
+PULLS_PLANNED = 8  # handle grasps to plan motions for
+POSITIONS_CHECKED = 6  # joint positions of the part at which the arm is checked against it
+SPEED = 0.8  # fraction of the arm's limits
+MIN_RANGE_FRACTION = 0.25  # minimum length of a pull, as a fraction of the joint range
 STEP = {"prismatic": 0.015, "revolute": 0.03}  # m, rad between poses of a pull
 
 
 @dataclass(frozen=True)
 class MovingPart:
-    """What is opened: a moving part of a piece of furniture."""
+    """The moving part of furniture that a task opens: a door or a drawer, with its handle and joint."""
 
     furniture: str
     handle: Handle
@@ -59,33 +59,34 @@ class MovingPart:
     def of(cls, arm: Arm) -> MovingPart:
         model = arm.env.model
         opening, joint = model.config.opening, model.opened_joint
-        assert opening is not None  # the task has one
+        assert opening is not None  # required by the task
         assert joint is not None
         return cls(opening.furniture, model.furniture[opening.furniture].asset.handles[opening.handle], joint)
 
     @property
     def open_limit(self) -> float:
-        """Limit of the joint that it opens towards, m or rad."""
+        """Joint limit in the opening direction, m or rad."""
         return max(self.joint.limits, key=abs)
 
     def position(self, arm: Arm) -> float:
+        """Return the joint position, m or rad."""
         return arm.scene.joint_positions(self.furniture)[self.joint.name]
 
     def pull_positions(self, arm: Arm) -> Array:
-        """Return joint positions (T,) of a pull, from the present one to the greatest at which a pull ends."""
+        """Return joint positions (T,) of a pull, from the current position to the maximum of a pull."""
         start, far = self.position(arm), MAX_OPENED_FRACTION[self.joint.kind] * self.open_limit
         left = (far - start) * np.sign(far)
         if left < STEP[self.joint.kind]:
-            raise PlanningError("pull", "at_the_end")
+            raise PlanningError("pull", "already_open")
         return np.linspace(start, far, int(np.ceil(left / STEP[self.joint.kind])) + 1, dtype=np.float64)
 
     def min_pull(self, arm: Arm) -> float:
-        """Return the least useful length of a pull, m or rad."""
-        way = self.pull_positions(arm)
-        return min(MIN_RANGE_FRACTION * abs(self.open_limit), abs(way[-1] - way[0]))
+        """Return the minimum length of a pull, m or rad."""
+        positions = self.pull_positions(arm)
+        return min(MIN_RANGE_FRACTION * abs(self.open_limit), abs(positions[-1] - positions[0]))
 
     def in_world(self, arm: Arm, positions: Array) -> Array:
-        """Return poses (T, 4, 4) of the part's frame in the world, at joint positions (T,)."""
+        """Return world poses (T, 4, 4) of the part at joint positions (T,)."""
         frame = arm.env.model.furniture_poses[self.furniture]
         return np.array([frame @ joint_motion(self.joint, float(q)) for q in positions])
 
@@ -98,13 +99,14 @@ class MovingPart:
 
     @property
     def grasp_in_part(self) -> Array:
-        """4x4 TCP that holds the handle squarely, in the part's frame."""
+        """TCP pose (4x4) in the part's frame that holds the handle squarely."""
         w, x, y, z = self.handle.wxyz
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), self.handle.position
         return pose
 
     def is_grasped(self, arm: Arm) -> bool:
+        """Return whether both fingers press on the part."""
         env = arm.env
         furniture = env.fixtures.furniture[self.furniture]
         assert isinstance(furniture, Articulation)
@@ -116,6 +118,7 @@ class MovingPart:
 
 
 def open_furniture_part(arm: Arm) -> None:
+    """Open the door or drawer of the task, with up to ``MAX_PULLS`` pulls."""
     part = MovingPart.of(arm)
     for _ in range(MAX_PULLS):
         pull_handle(arm, part)
@@ -125,17 +128,18 @@ def open_furniture_part(arm: Arm) -> None:
 
 
 def is_opened(arm: Arm) -> bool:
+    """Return whether the door or drawer of the task is open."""
     env = arm.env
     assert isinstance(env, RoboCASOpenPickEnv)
     return bool(env.furniture_opened()[0])
 
 
 def pull_handle(arm: Arm, part: MovingPart) -> None:
-    """Take hold of the handle, pull as far as the arm leads, let go and step back."""
+    """Grasp the handle, pull as far as the arm reaches, release it and retreat."""
     with arm.planning_time():
-        way_in, opening = plan_pull(arm, part)
+        approach, opening = plan_pull(arm, part)
         before, least = part.position(arm), 0.5 * part.min_pull(arm)
-    arm.follow(way_in)
+    arm.follow(approach)
     arm.close_gripper()
     if not part.is_grasped(arm):
         raise PlanningError("handle", "missed")
@@ -147,17 +151,17 @@ def pull_handle(arm: Arm, part: MovingPart) -> None:
         arm.clear_attached()
         arm.planner.set_scene(arm.scene.obstacles())
         goals = [shift_back(arm.planner.tcp(arm.qpos), distance) for distance in RETREATS]
-        lines = (True, False)  # if possible without touching anything
+        check_collisions = (True, False)  # collision-free if possible
         back = first_plan(
-            lines,
-            lambda free: arm.plan_first_line(arm.qpos, goals, stage="retreat", check_collisions=free),
+            check_collisions,
+            lambda check: arm.plan_first_line(arm.qpos, goals, stage="retreat", check_collisions=check),
             PlanningError("retreat", "no_goal"),
         )
     arm.follow(back)
 
 
 def plan_pull(arm: Arm, part: MovingPart) -> tuple[Trajectory, Trajectory]:
-    """Plan to the hold that leads furthest, with the bar deep between the fingers where it fits, and the pull."""
+    """Plan the approach to the handle and the longest pull, with the bar deep in the gripper if possible."""
     failure = PlanningError("pull", "no_plan")
     return first_plan((DEPTH_OFFSET, 0.0), lambda depth_offset: _plan_pull(arm, part, depth_offset), failure)
 
@@ -167,7 +171,7 @@ def _plan_pull(arm: Arm, part: MovingPart, depth_offset: float) -> tuple[Traject
     frames = inverse(arm.scene.arm_base_in_world) @ part.in_world(arm, positions)
     paths, ends, turned = _paths(arm, part, frames, depth_offset)
     least = part.min_pull(arm) / abs(positions[-1] - positions[0]) * len(positions)
-    # the furthest first, in coarse steps; of those the squarest, and nearest to where the arm is
+    # the longest pull first, in coarse steps; then the squarest grasp nearest to the current configuration
     cost = np.abs(paths[0] - arm.qpos).max(axis=1) + TURN_WEIGHT * turned + arm.rng.uniform(0, 0.3, len(ends))
     order = np.lexsort((cost, -ends // 5))
     order = [i for i in order if ends[i] >= least]
@@ -195,7 +199,7 @@ def _plan_pull(arm: Arm, part: MovingPart, depth_offset: float) -> tuple[Traject
 
 
 def pull_fraction(arm: Arm, part: MovingPart, arm_base_in_world: Array, others: list[Obstacle]) -> float:
-    """Return how far towards open the arm could pull a part in one go with its base elsewhere; 1: comfortably open."""
+    """Return the fraction of a pull that the arm can make from another base pose; 1: opened with a margin."""
     positions = part.pull_positions(arm)
     opened = arm.env.model.opened_position
     enough = 1 + int(np.sum(np.abs(positions) < abs(opened + COMFORT_FRACTION * (positions[-1] - opened))))
@@ -216,10 +220,11 @@ def pull_fraction(arm: Arm, part: MovingPart, arm_base_in_world: Array, others: 
 def _paths(
     arm: Arm, part: MovingPart, frames: Array, depth_offset: float = 0.0
 ) -> tuple[Array, NDArray[np.int_], Array]:
-    """Return ways to hold the handle and follow it.
+    """Compute paths of the arm for N grasps of the handle.
 
     Returns:
-        Configurations (T, N, 7); how many of the part's T poses (N,) each reaches; rad (N,) turned about the bar.
+        Configurations (T, N, 7); the number of poses (N,) of the part that each path reaches; the rotation (N,) about
+        the bar, rad.
     """
     goals, starts, beyond = [], [], np.eye(4)
     beyond[2, 3] = depth_offset
@@ -248,7 +253,7 @@ def _filter_holds(
     others: list[Obstacle],
     depth_offset: float = 0.0,
 ) -> list[int]:
-    """Return the ways in the order that have the handle between the open fingers and touch nothing."""
+    """Return the grasps of ``order`` with the handle between the open fingers and without collisions."""
     surface = transform_points(frames[0], part.surface(arm))
     near = surface[np.linalg.norm(surface - (frames[0] @ part.grasp_in_part)[:3, 3], axis=1) < HANDLE_RADIUS]
     arm.planner.set_scene([*others, part.obstacle(arm, frames[0])])
@@ -265,7 +270,7 @@ def _filter_holds(
 
 
 def _free_length(arm: Arm, part: MovingPart, path: Array, frames: Array, others: list[Obstacle]) -> int:
-    """Return how many configurations of a path (T, 7) are clear of all else, and of the part at its poses (T, 4, 4)."""
+    """Return the length of the collision-free start of a path (T, 7), with the part at poses (T, 4, 4)."""
     planner, width = arm.planner, part.handle.width
     planner.set_scene(others)
     blocked = np.flatnonzero(~planner.is_free(path[::3], width))
@@ -282,7 +287,7 @@ def _free_length(arm: Arm, part: MovingPart, path: Array, frames: Array, others:
 
 
 def _retreatable_length(arm: Arm, path: Array, least: int) -> int:
-    """Return the length of a pull (T, 7) after which the gripper can step back, at least ``least``."""
+    """Return the longest start of a pull (T, 7), at least ``least``, after which the gripper can retreat."""
     for length in range(len(path), max(least, 1) - 1, -3):
         tcp = arm.planner.tcp(path[length - 1])
         try:
@@ -290,7 +295,7 @@ def _retreatable_length(arm: Arm, path: Array, least: int) -> int:
             return length
         except PlanningError:
             continue
-    raise PlanningError("pull", "no_way_back")
+    raise PlanningError("pull", "no_retreat")
 
 
 def _timed(path: Array, robot: RobotDescription, dt: float) -> Trajectory:

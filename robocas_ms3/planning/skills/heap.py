@@ -1,4 +1,4 @@
-"""Make room around a target: which moves of obstacles there are, and how well one has done."""
+"""Clear a heap around a target: candidate moves of obstacles and their cost."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from robocas_ms3.tasks.occlusion import MAX_HIDDEN_FRACTION
 from robocas_ms3.tasks.search import RoboCASSearchEnv
 from robocas_ms3.tasks.terms import FALLEN
 
-COUNTERS = ("pushes", "removals")  # what is counted
-MAX_MOVES = 8  # pushes and removals a demonstration may hold
-MIN_DISPLACEMENT = 0.02  # m by which a push moves its object at least; less is one in vain
-MAX_OBSTACLES = 4  # obstacles, of those that are highest
-TURNS_DEG = (30.0, -30.0)  # off the paper's direction of a push, where that one does not do
-EDGE_MARGIN = 0.01  # m from the surface's edge, nearer than which no object may come
+COUNTERS = ("pushes", "removals")  # recorded counters
+MAX_MOVES = 8  # maximum number of pushes and removals per demonstration
+MIN_DISPLACEMENT = 0.02  # m, minimum displacement of a pushed object
+MAX_OBSTACLES = 4  # obstacles that are considered, the highest first
+TURNS_DEG = (30.0, -30.0)  # offsets from the paper's push direction
+EDGE_MARGIN = 0.01  # m from every object to the edge of the surface
 
-# What a move is worth, in seconds of the demonstration that it makes needless or costs
-COST_PER_OBSTACLE, PER_HIDDEN_SHARE, COST_WITHOUT_GRASP, COST_PER_METRE_OF_TARGET = 10.0, 30.0, 8.0, 400.0
-COST_PER_PUSH = 8.0  # what is pushed comes to lie elsewhere each time, and so may all that it meets
+# costs of the state after a move, in s of the demonstration
+COST_PER_OBSTACLE, COST_PER_HIDDEN_FRACTION, COST_WITHOUT_GRASP, COST_PER_METRE_OF_TARGET = 10.0, 30.0, 8.0, 400.0
+COST_PER_PUSH = 8.0  # s; the result of a push is less repeatable than that of a removal
 
 
 @dataclass(frozen=True)
 class Move:
-    """A way to get an object out of the way; ``turn_deg`` turns a push off the paper's direction."""
+    """Candidate move of an obstacle; ``turn_deg`` rotates a push from the paper's direction."""
 
     skill: Literal["push", "lift"]
     slot: int
@@ -42,7 +42,7 @@ class Move:
 
 @dataclass(frozen=True)
 class Heap:
-    """The objects around a target, as they lie now."""
+    """Current state of the objects around a target."""
 
     arm: Arm
     target: int
@@ -55,25 +55,27 @@ class Heap:
 
     @property
     def moves_made(self) -> int:
+        """Number of pushes and removals so far."""
         return sum(self.arm.executor.facts[fact] for fact in COUNTERS)
 
     @property
     def target_visible(self) -> bool:
-        """Whether the gripper's camera sees most of the target."""
+        """Whether the gripper camera sees most of the target."""
         with self.arm.planning_time():
             return hidden_fraction(self.arm, self.target) <= MAX_HIDDEN_FRACTION
 
     @property
     def target_uncovered(self) -> bool:
-        """Whether the target is free, by the paper's rule, as the camera above sees it."""
+        """Whether the target is cleared by the paper's rule, seen from the camera above."""
         return bool(self.env.clutter().cleared[0])
 
     @property
     def target_cleared(self) -> bool:
+        """Whether the target is cleared and visible to the gripper camera."""
         return self.target_uncovered and self.target_visible
 
     def candidate_moves(self) -> Iterator[Move]:
-        """Yield moves of the highest obstacles, then of those that block grasps; pushes first, as they are faster."""
+        """Yield moves of the highest obstacles, then of those that block grasps; pushes first (faster)."""
         if self.moves_made >= MAX_MOVES:
             raise UnrecoverableError("horizon", "too_many_obstacles")
         with self.arm.planning_time():
@@ -82,11 +84,11 @@ class Heap:
         yield from (Move("push", slot) for slot in slots[2:])
         yield from (Move("push", slot, turn) for slot in slots[:2] for turn in TURNS_DEG)
         yield from (Move("lift", slot) for slot in slots[2:])
-        if not slots:  # no grasp comes from above as it lies: it has to lie otherwise
+        if not slots:  # no grasp from above is possible: change the pose of the target
             yield from (Move("push", self.target, turn) for turn in (0.0, 90.0, -90.0, 180.0))
 
     def _find_obstacles(self) -> list[int]:
-        """Return slots of what hides or surrounds the target, the highest first, then of what blocks its grasps."""
+        """Return slots of objects that hide or surround the target, the highest first, then of grasp blockers."""
         obstacles = np.flatnonzero(self.env.clutter().obstacles[0].cpu().numpy()).tolist()
         obstacles.sort(key=lambda slot: -self.arm.scene.object_points(slot)[:, 2].max())
         order = dict.fromkeys(obstacles[:MAX_OBSTACLES])
@@ -96,17 +98,17 @@ class Heap:
         return [slot for slot in order if slot != self.target][:MAX_OBSTACLES]
 
     def execute(self, move: Move) -> float:
-        """Make a move; return its value in seconds."""
+        """Run a move and return its score: minus the cost in s."""
         arm, facts = self.arm, self.arm.executor.facts
         before, target, start = self.centroid(move.slot), self.centroid(self.target), len(arm.executor.actions)
         arm.rise_until_free()
         if move.skill == "push":
             push_away(arm, move.slot, self.target, turn_deg=move.turn_deg)
             if np.linalg.norm(self.centroid(move.slot) - before) <= MIN_DISPLACEMENT:
-                raise PlanningError("push", "in_vain")
+                raise PlanningError("push", "not_moved")
             facts["pushes"] += 1
         else:
-            arm.executor.gripper = OPEN  # it opens on the way
+            arm.executor.gripper = OPEN  # opens during the motion
             remove_object(arm, move.slot)
             facts["removals"] += 1
         self.check_objects_on_surface()
@@ -118,23 +120,25 @@ class Heap:
         )
 
     def remaining_cost(self) -> float:
-        """Return the time that the remaining obstacles may take, s."""
+        """Return the estimated cost of the remaining work, s."""
         with self.arm.planning_time():
             clutter = self.env.clutter()
             hidden, obstacles = float(clutter.hidden_fraction[0]), int(clutter.obstacles[0].sum())
-            work = COST_PER_OBSTACLE * max(0, obstacles - 1) + PER_HIDDEN_SHARE * max(0.0, hidden - MAX_HIDDEN_FRACTION)
-            return work + COST_WITHOUT_GRASP * (not count_clear_grasps(self.arm, self.target))
+            cost = COST_PER_OBSTACLE * max(0, obstacles - 1)
+            cost += COST_PER_HIDDEN_FRACTION * max(0.0, hidden - MAX_HIDDEN_FRACTION)
+            return cost + COST_WITHOUT_GRASP * (not count_clear_grasps(self.arm, self.target))
 
     def check_objects_on_surface(self) -> None:
-        """See that nothing has been moved to the edge, or over it."""
+        """Raise an error if an object is at the edge of the surface or has fallen off."""
         frame, half = surface_in_base(self.arm)
         present = np.flatnonzero(self.env.present[0].cpu().numpy()).tolist()
-        places = np.stack([self.arm.scene.object_in_base(slot)[:3, 3] for slot in present])
-        if (places[:, 2] < frame[2, 3] - FALLEN).any():
+        positions = np.stack([self.arm.scene.object_in_base(slot)[:3, 3] for slot in present])
+        if (positions[:, 2] < frame[2, 3] - FALLEN).any():
             raise UnrecoverableError("clear", "fell_off_table")
-        local = (places - frame[:3, 3]) @ frame[:3, :3]
+        local = (positions - frame[:3, 3]) @ frame[:3, :3]
         if (np.abs(local[:, :2]) > half - EDGE_MARGIN).any():
-            raise PlanningError("clear", "at_the_edge")
+            raise PlanningError("clear", "object_at_edge")
 
     def centroid(self, slot: int) -> Array:
+        """Return the mean (3,) of the surface points of an object."""
         return self.arm.scene.object_points(slot).mean(axis=0)

@@ -1,4 +1,4 @@
-"""Look at a place with the gripper's camera."""
+"""Point the gripper camera at an object, and compute the visible fraction of the object."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.scenes.randomise import draw_camera_shift
 from robocas_ms3.scenes.visibility import MeshScene, PinholeCamera, object_mesh, ray_scene
 
-FAR, NEAR = (0.4, 0.5), (0.2, 0.3)  # m from the camera to what it looks at: at first; between two removals (upstream's)
-ELEVATION_DEG = (60.0, 90.0)  # of the camera above what it looks at (upstream's)
+FAR, NEAR = (0.4, 0.5), (0.2, 0.3)  # m from camera to target: first view, later views (RoboCAS-v0)
+ELEVATION_DEG = (60.0, 90.0)  # elevation of the camera above the target (RoboCAS-v0)
 VIEWS_SAMPLED, VIEWS_PLANNED = 96, 6
 
 
 def look_at(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> None:
-    """Move the gripper's camera to where it looks at a point (3,) from above, at a least and greatest distance (m)."""
+    """Move the gripper camera to a view of a point (3,) from above, within a range of distances, m."""
     arm.rise_until_free()
     with arm.planning_time():
         motion = plan_view(arm, point_in_base, distance)
@@ -28,9 +28,9 @@ def look_at(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> No
 
 
 def plan_view(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> Trajectory:
-    """Plan to one of the nearest views of a point; arguments as in `look_at`."""
+    """Plan a motion to one of the nearest views of a point; arguments as in `look_at`."""
     tcp_in_camera = inverse(inverse(arm.scene.tcp_in_base) @ camera_in_base(arm))
-    for least, greatest in (distance, (NEAR[0], FAR[1])):  # where a high table leaves no such view, any other
+    for least, greatest in (distance, (NEAR[0], FAR[1])):  # any distance, if a high table allows no such view
         views = sample_views(arm.rng, point_in_base, (least, greatest), VIEWS_SAMPLED)
         solved, qpos = arm.reachability.nearest_solutions(views @ tcp_in_camera, arm.qpos)
         if solved.any():
@@ -48,7 +48,7 @@ def plan_view(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> 
 
 
 def load_object_meshes(arm: Arm) -> None:
-    """Read the objects' meshes before the first decision: each branch that looks would read them again."""
+    """Load the object meshes before the first decision; otherwise each forked process loads them again."""
     for asset, present in zip(arm.env.object_assets[0], arm.env.present[0].tolist(), strict=True):
         if present:
             ray_scene(object_mesh(asset))
@@ -61,7 +61,7 @@ def hidden_fraction(arm: Arm, slot: int) -> float:
     """
     env = arm.env
     config = _camera_config(arm)
-    scale = 2  # half the camera's resolution is enough
+    scale = 2  # half the resolution of the camera is sufficient
     pose = arm.scene.arm_base_in_world @ camera_in_base(arm)
     camera = PinholeCamera(pose, config.width // scale, config.height // scale, float(config.fov or np.pi / 2))
     slots = np.flatnonzero(env.present[0].cpu().numpy()).tolist()
@@ -72,7 +72,10 @@ def hidden_fraction(arm: Arm, slot: int) -> float:
 
 
 def camera_in_base(arm: Arm) -> Array:
-    """Return the gripper's camera (4x4) in the arm's base frame, with its random shift: x forward, y left, z up."""
+    """Return the pose (4x4) of the gripper camera in the arm's base frame: x forward, y left, z up.
+
+    The pose includes the random shift of the camera.
+    """
     config = _camera_config(arm)
     link = arm.env.agent.robot.links_map[str(config.entity_uid)]
     camera_in_link = from_wxyz(config.pose.raw_pose[0]) @ _shift(arm)
@@ -95,13 +98,13 @@ def _camera_config(arm: Arm) -> CameraConfig:
 
 
 def sample_views(rng: np.random.Generator, point: Array, distance: tuple[float, float], count: int) -> Array:
-    """Sample camera poses (count, 4, 4) that look at a point (3,) from above: x forward, y left, z up.
+    """Sample camera poses (count, 4, 4) that view a point (3,) from above: x forward, y left, z up.
 
-    They are turned freely about the line of sight. ``distance`` is the least and the greatest, m.
+    The roll about the line of sight is random. ``distance`` is the minimum and maximum distance, m.
     """
     elevation = np.deg2rad(rng.uniform(*ELEVATION_DEG, count))
     azimuth, roll = rng.uniform(-np.pi, np.pi, (2, count))
-    # forward = x: turned down by the elevation, about the vertical by the azimuth
+    # x (forward) is rotated down by the elevation and about the vertical by the azimuth
     turn = Rotation.from_euler("ZYX", np.column_stack([azimuth, elevation, roll]))
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3] = turn.as_matrix()

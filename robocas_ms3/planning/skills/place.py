@@ -1,4 +1,4 @@
-"""Carry a held object above the basket, let go of it, step back."""
+"""Carry a held object above the basket, release it, and retreat."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.skills.arm import CARRY_CLEARANCE, Arm, first_plan, plan_retreat, shift_back, shift_up
 
 DROPS_SAMPLED, DROPS_CHECKED, DROPS_PLANNED = 192, 64, 10
-DROP_MARGIN = 0.045  # m, as far as a robot may be off by then
-LEAN_WEIGHT = 0.7  # rad of a joint that a rad of the gripper's is worth
-ELBOW, STRETCHED, STRETCH_WEIGHT = 3, -0.7, 5.0  # joint; rad from which on the arm is nearly straight
-RETREAT_HEIGHT = 0.05  # m, upstream's
-RIM_CLEARANCE = (0.03, 0.07)  # m, least and greatest height of the object's lowest point above the rim
+DROP_MARGIN = 0.045  # m, expected position error of a robot at the drop
+LEAN_WEIGHT = 0.7  # cost of the gripper's tilt relative to a joint displacement
+ELBOW, STRETCHED, STRETCH_WEIGHT = 3, -0.7, 5.0  # joint index; rad of a nearly straight arm; cost per rad
+RETREAT_HEIGHT = 0.05  # m (RoboCAS-v0)
+RIM_CLEARANCE = (0.03, 0.07)  # m, minimum and maximum height of the object's lowest point above the rim
 MAX_TILT_DEG = 70.0  # RoboCAS-v0: 30 to 70
-MAX_OFFSET_FRACTION = 0.25  # of the inside's half size: how far from the middle the centre of mass may be
+MAX_OFFSET_FRACTION = 0.25  # maximum offset of the centre of mass from the middle, as a fraction of the half size
 
 
 @dataclass(frozen=True)
 class ContainerInterior:
-    """The box inside a container, from ``low`` to ``high`` (3,) m in the container's frame, which is 4x4."""
+    """Interior box of a container: corners ``low`` and ``high`` (3,), m, in the frame of the container (4x4)."""
 
     container_in_base: Array
     low: Array
@@ -34,6 +34,7 @@ class ContainerInterior:
 
 
 def carry_to_basket(arm: Arm, slot: int) -> None:
+    """Carry a held object to a pose above the basket."""
     with arm.planning_time():
         motion = plan_carry(arm, slot)
     arm.follow(motion)
@@ -42,6 +43,7 @@ def carry_to_basket(arm: Arm, slot: int) -> None:
 
 
 def release_into_basket(arm: Arm, slot: int) -> None:
+    """Release the object above the basket, retreat, and move home until the task succeeds."""
     start = arm.qpos
     arm.open_gripper()
     with arm.planning_time():
@@ -50,15 +52,15 @@ def release_into_basket(arm: Arm, slot: int) -> None:
         retreat = plan_retreat(arm, start, _retreat_poses(arm.planner.tcp(start)))
         home = arm.plan_home(retreat.qpos[-1])
     arm.follow(retreat)
-    # The object settles while the arm goes home; the demonstration ends as soon as it lies still.
+    # the object settles while the arm moves home; the demonstration ends as soon as it is at rest
     if not arm.follow(home, until="success"):
         raise PlanningError("release", _failure_reason(arm))
 
 
 def plan_carry(arm: Arm, slot: int) -> Trajectory:
-    """Plan to a pose above the basket from which the arm can also step back.
+    """Plan a motion to a pose above the basket from which the arm can retreat.
 
-    Where possible it keeps off basket and furniture by the error of a robot: both may be pushed away.
+    If possible, the motion keeps ``CARRY_CLEARANCE`` to basket and furniture.
     """
     drops = sample_drop_poses(arm, slot, arm.scene.arm_base_in_world)
     solved, qpos = arm.reachability.nearest_solutions(drops, arm.qpos)
@@ -76,9 +78,9 @@ def plan_carry(arm: Arm, slot: int) -> Trajectory:
 
 
 def _rank_drops(arm: Arm, slot: int, drops: Array, qpos: Array) -> NDArray[np.int_]:
-    """Return the order of drops (N, 4, 4), reached at (N, 7): those that fit through the opening first.
+    """Rank drop poses (N, 4, 4) with configurations (N, 7): objects that fit through the opening first.
 
-    Of those the near and steep ones, since an object slides off a leaning gripper, and none at the end of the reach.
+    Then near and steep poses are preferred, since objects slide off a tilted gripper, and stretched arms are avoided.
     """
     inside = _inside_basket(arm, arm.scene.arm_base_in_world)
     overhang = compute_overhang(drops, inside, transform_points(*held_object(arm, slot)), DROP_MARGIN)
@@ -89,16 +91,16 @@ def _rank_drops(arm: Arm, slot: int, drops: Array, qpos: Array) -> NDArray[np.in
 
 
 def _plan_to_one_of(arm: Arm, drops: Array, qpos: Array) -> Trajectory:
-    """Plan to the first of several drops (N, 4, 4), reached at (N, 7), that is free."""
+    """Plan a motion to the first feasible drop pose (N, 4, 4) with configurations (N, 7)."""
     start = arm.qpos
     chosen = np.flatnonzero(arm.planner.is_free(qpos[:DROPS_CHECKED], arm.planner.finger_width))[:DROPS_PLANNED]
     if not len(chosen):
-        raise PlanningError("transfer", "no_free_place")
+        raise PlanningError("transfer", "no_free_drop")
     drops, qpos = drops[chosen], qpos[chosen]
     for drop, goal in zip(drops, qpos, strict=True):
         try:
             carry = arm.planner.plan_to_qpos(start, [goal], stage="transfer", search=False)
-            plan_retreat(arm, carry.qpos[-1], _retreat_poses(drop))  # no way up from there: no place to let go
+            plan_retreat(arm, carry.qpos[-1], _retreat_poses(drop))  # a drop pose needs a retreat
             return carry
         except PlanningError:
             continue
@@ -115,19 +117,20 @@ def _plan_to_one_of(arm: Arm, drops: Array, qpos: Array) -> Trajectory:
 
 
 def held_object(arm: Arm, slot: int) -> tuple[Array, Array]:
-    """Return an object's pose (4x4) in the frame of the TCP that holds it, and the vertices (V, 3) of its hulls, m."""
+    """Return the pose (4x4) of a held object in the TCP frame and the vertices (V, 3) of its hulls, m."""
     vertices = np.concatenate(arm.env.object_assets[0][slot].hulls)
     return inverse(arm.scene.tcp_in_base) @ arm.scene.object_in_base(slot), vertices
 
 
 def attach_held(arm: Arm, slot: int) -> None:
+    """Attach a held object to the arm in the planner, with the current finger width."""
     object_in_tcp, vertices = held_object(arm, slot)
     arm.planner.attach(AttachedBody(vertices, object_in_tcp))
     arm.planner.finger_width = float(arm.env.agent.gripper_width[0])
 
 
 def sample_drop_poses(arm: Arm, slot: int, arm_base_in_world: Array) -> Array:
-    """Return TCP poses (N, 4, 4) that bring the held object above the basket, in the frame of an arm's base (4x4)."""
+    """Sample TCP poses (N, 4, 4) that hold an object above the basket, in the frame of an arm's base (4x4)."""
     object_in_tcp, vertices = held_object(arm, slot)
     center_of_mass = np.array([arm.env.object_assets[0][slot].asset.center_of_mass])
     return sample_drops(
@@ -141,9 +144,9 @@ def sample_drop_poses(arm: Arm, slot: int, arm_base_in_world: Array) -> Array:
 
 def _inside_basket(arm: Arm, arm_base_in_world: Array) -> ContainerInterior:
     basket = arm.env.model.basket
-    assert basket is not None  # the task has one
+    assert basket is not None  # required by the task
     inner = basket.asset.inner
-    assert inner is not None  # the model saw to it
+    assert inner is not None  # checked by the scene model
     basket_in_base = inverse(arm_base_in_world) @ from_wxyz(arm.env.basket_pose[0])
     return ContainerInterior(basket_in_base, np.array(inner.min), np.array(inner.max))
 
@@ -163,10 +166,17 @@ def _failure_reason(arm: Arm) -> str:
 def sample_drops(
     rng: np.random.Generator, count: int, inside: ContainerInterior, vertices: Array, center_of_mass: Array
 ) -> Array:
-    """Sample TCP poses (count, 4, 4) at which a held object hangs above a container, its lowest point clear of the rim.
+    """Sample TCP poses (count, 4, 4) with a held object above a container, clear of its rim.
 
-    The approach axis is tilted from straight down, away from the arm, so that far containers are within reach; half of
-    the samples are steep, for near ones. The object's hull has vertices (V, 3) in the TCP frame, m.
+    The approach axis is tilted away from the arm, so that far containers are within reach; half of the samples are
+    steep, for near containers.
+
+    Args:
+        rng: random generator.
+        count: number of poses.
+        inside: interior of the container.
+        vertices: (V, 3) vertices of the object's hulls in the TCP frame, m.
+        center_of_mass: (3,) of the object in the TCP frame, m.
     """
     middle, half = (inside.low + inside.high) / 2, (inside.high - inside.low) / 2
     local = np.column_stack(
@@ -179,7 +189,7 @@ def sample_drops(
     tilt = np.deg2rad(MAX_TILT_DEG) * rng.uniform(0, 1, count) ** 2
     outward = np.arctan2(above[:, 1], above[:, 0]) + rng.uniform(-0.6, 0.6, count)
     roll = rng.uniform(-np.pi, np.pi, count)
-    # straight down (z of the TCP = -z of the base) with a free turn, then tilted about the axis across ``outward``
+    # straight down (z of the TCP = -z of the base) with a random roll, then tilted about the axis across ``outward``
     down = Rotation.from_euler("x", np.pi) * Rotation.from_euler("z", roll[:, None])
     across = np.column_stack([-np.sin(outward), np.cos(outward), np.zeros(count)])
     rotation = Rotation.from_rotvec(-across * tilt[:, None]) * down
@@ -193,12 +203,13 @@ def sample_drops(
 
 
 def compute_overhang(tcp_in_base: Array, inside: ContainerInterior, vertices: Array, margin: float = 0.0) -> Array:
-    """Return how far (n,) a held object sticks out sideways of the opening below it, m; 0 where it falls straight in.
+    """Compute how far (n,) a held object extends sideways beyond the opening below it, m; 0: it fits.
 
     Args:
-        tcp_in_base: (n, 4, 4) poses of the TCP.
-        vertices: (V, 3) the object's hull in the TCP frame, m.
-        margin: by which the opening is narrower at each side, m.
+        tcp_in_base: (n, 4, 4) TCP poses.
+        inside: interior of the container.
+        vertices: (V, 3) vertices of the object's hulls in the TCP frame, m.
+        margin: reduction of the opening on each side, m.
     """
     rotation, origin = inside.container_in_base[:3, :3], inside.container_in_base[:3, 3]
     points = np.einsum("nij,vj->nvi", tcp_in_base[:, :3, :3], vertices) + tcp_in_base[:, None, :3, 3]

@@ -1,4 +1,4 @@
-"""Push an object aside with the closed gripper, tool pointing down."""
+"""Push an object aside with the closed gripper pointing down."""
 
 from __future__ import annotations
 
@@ -15,52 +15,52 @@ from robocas_ms3.planning.protocol import Array, Obstacle, Trajectory
 from robocas_ms3.planning.pushes import STAND_OFF, YAWS, Push, push_candidates
 from robocas_ms3.planning.skills.arm import Arm, shift_up
 
-APPROACH_HEIGHT = 0.08  # m above the start of the push, from where the tool comes straight down
-LIFT = 0.05  # m after the push (upstream's)
-SPEED = 0.6  # of the arm's limits while pushing: what is pushed neither rolls far nor jumps
+APPROACH_HEIGHT = 0.08  # m above the start of the push; the tool moves straight down from there
+LIFT = 0.05  # m after the push (RoboCAS-v0)
+SPEED = 0.6  # fraction of the arm's limits during a push, so that objects neither roll far nor jump
 PUSHES_TRIED, PUSHES_PLANNED = 24, 6
-MAX_FORCE = 30.0  # N; pushed harder, objects wedged against others are shot out of the heap
-RESISTED_SECONDS = 0.1  # of more than that after which a push is cut short
+MAX_FORCE = 30.0  # N; a greater force ejects wedged objects from the heap
+RESISTED_SECONDS = 0.1  # s above MAX_FORCE after which a push is stopped
 SETTLE_SECONDS = 0.3
 
 
 @dataclass(frozen=True)
 class PushPlan:
-    """Motions from where the arm is to clear of the pushed object."""
+    """Motions of a push: approach, push and lift, with the push direction (3,)."""
 
-    way_in: Trajectory
+    approach: Trajectory
     push: Trajectory
     lift: Trajectory
     direction: Array
 
 
 def push_away(arm: Arm, slot: int, target: int, *, turn_deg: float = 0.0) -> None:
-    """Push an object away from the target until it has moved far enough or resists, then rise."""
+    """Push an object away from the target, stop early if it resists, then rise."""
     arm.rise_until_free()
     with arm.planning_time():
         plan = plan_push(arm, slot, target, turn_deg)
-    arm.executor.gripper = CLOSED  # it closes on the way
-    arm.follow(plan.way_in)
+    arm.executor.gripper = CLOSED  # closes during the approach
+    arm.follow(plan.approach)
     lift = plan.lift if _execute_push(arm, plan.push, plan.direction) else _plan_lift(arm, plan.direction)
     arm.follow(lift)
     arm.executor.move_gripper(CLOSED, arm.qpos, seconds=SETTLE_SECONDS)
 
 
 def _execute_push(arm: Arm, push: Trajectory, direction: Array) -> bool:
-    """Run a push step by step; False where it was cut short, since what was pushed resisted."""
+    """Run a push step by step; return False if it was stopped because the object resisted."""
     resisted = 0
     ahead = torch.as_tensor(arm.scene.arm_base_in_world[:3, :3] @ direction, dtype=torch.float32)
     for qpos in push.qpos:
         arm.follow(Trajectory(qpos[None], push.dt))
-        against = -(arm.env.gripper_forces()[0] @ ahead)  # what each object does to each part of the gripper
-        resisted = resisted + 1 if float(against.clamp(min=0).sum()) > MAX_FORCE else 0
+        resistance = -(arm.env.gripper_forces()[0] @ ahead)  # force of each object on each part of the gripper
+        resisted = resisted + 1 if float(resistance.clamp(min=0).sum()) > MAX_FORCE else 0
         if resisted * push.dt >= RESISTED_SECONDS - 1e-9:
             return False
     return True
 
 
 def _plan_lift(arm: Arm, direction: Array) -> Trajectory:
-    """Plan up and back, or straight up, from where a push was cut short, clear of furniture and basket."""
+    """Plan up and back, or straight up, after a stopped push, clear of furniture and basket."""
     width, arm.planner.finger_width = arm.planner.finger_width, 0.0
     try:
         arm.planner.set_scene(_fixed_bodies(arm))
@@ -81,10 +81,10 @@ def _fixed_bodies(arm: Arm) -> list[Obstacle]:
 
 
 def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPlan:
-    """Plan the first push that has a way in; one that would move other objects only where there is no other.
+    """Plan the first feasible push; pushes that move other objects are the second choice.
 
-    The way to the object is clear of everything, the way along of furniture, basket and target, and the way up of
-    furniture and basket.
+    The approach avoids all bodies, the push avoids furniture, basket and target, and the lift avoids furniture and
+    basket.
     """
     planner = arm.planner
     width, planner.finger_width = planner.finger_width, 0.0
@@ -99,9 +99,9 @@ def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPl
 
 
 def _plan_starts(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tuple[Push, Array, Trajectory]]:
-    """Return pushes with a free way down to the object: with a configuration (7,) above, and that way."""
+    """Return pushes with a free line down to their start: push, configuration (7,) above, and line."""
     arm.planner.set_scene(arm.scene.obstacles())
-    failure, starts = PlanningError("push", "no_room"), []
+    failure, starts = PlanningError("push", "no_free_push"), []
     for push, qpos in reachable_pushes(arm, slot, target, arm.scene.points_in_base(exclude=slot), turn_deg):
         try:
             starts.append((push, qpos, arm.planner.plan_straight(qpos, push.start, stage="push")))
@@ -115,8 +115,8 @@ def _plan_starts(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tupl
 
 
 def _plan_along(arm: Arm, starts: list[tuple[Push, Array, Trajectory]], movable: set[int]) -> PushPlan:
-    """Plan on from where pushes begin, with some objects that may be moved on the way along."""
-    planner, failure = arm.planner, PlanningError("push", "no_room")
+    """Plan push and lift for the first direction with a feasible push; ``movable`` objects may be touched."""
+    planner, failure = arm.planner, PlanningError("push", "no_free_push")
     along_scene, fixed = arm.scene.obstacles(exclude=movable), _fixed_bodies(arm)
     ways: list[tuple[Array, Trajectory, Trajectory, Trajectory]] = []
     first = np.zeros(3)
@@ -124,7 +124,7 @@ def _plan_along(arm: Arm, starts: list[tuple[Push, Array, Trajectory]], movable:
         if ways and push.direction @ first < 1 - 1e-6:
             break
         try:
-            planner.set_scene(along_scene)  # what may move is no obstacle on the way along
+            planner.set_scene(along_scene)  # movable objects are no obstacles during the push
             along = planner.plan_straight(down.qpos[-1], push.end, stage="push", speed=SPEED)
             planner.set_scene(fixed)  # the pushed object may lean on the tool
             lift = planner.plan_straight(along.qpos[-1], _lift_pose(push.end, push.direction), stage="push")
@@ -135,7 +135,7 @@ def _plan_along(arm: Arm, starts: list[tuple[Push, Array, Trajectory]], movable:
     if not ways:
         raise failure
     planner.set_scene(arm.scene.obstacles())
-    # one direction, several turns of the tool: the one that is nearest
+    # same direction, several yaw angles of the tool: use the nearest
     reach = planner.plan_to_qpos(arm.qpos, [way[0] for way in ways], stage="push")
     _, down, along, lift = min(ways, key=lambda way: float(np.abs(way[0] - reach.qpos[-1]).max()))
     return PushPlan(planner.join(arm.qpos, reach, down), along, lift, direction=first)
@@ -144,7 +144,7 @@ def _plan_along(arm: Arm, starts: list[tuple[Push, Array, Trajectory]], movable:
 def reachable_pushes(
     arm: Arm, slot: int, target: int, others: Array, turn_deg: float = 0.0
 ) -> Iterator[tuple[Push, Array]]:
-    """Yield pushes within reach and a configuration (7,) above each start: the paper's direction first."""
+    """Yield reachable pushes with a configuration (7,) above the start, the paper's direction first."""
     points, middle = arm.scene.object_points(slot), arm.scene.object_points(target).mean(axis=0)
     fixed = arm.scene.points_in_base(exclude=range(len(arm.env.objects)))
     pushes = list(push_candidates(arm.rng, points, middle, others, surface_in_base(arm), fixed, turn_deg))
@@ -160,7 +160,7 @@ def reachable_pushes(
 
 
 def surface_in_base(arm: Arm) -> tuple[Array, Array]:
-    """Return the middle (4x4) of the surface that objects are on, and its half size (2,) m."""
+    """Return the pose (4x4) of the centre of the objects' surface and its half size (2,), m."""
     model = arm.env.model
     config = model.config.surface
     surface = model.furniture[config.furniture].asset.surfaces[config.name]

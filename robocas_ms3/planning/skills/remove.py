@@ -1,4 +1,4 @@
-"""Lift an object and put it down on a free place of the surface."""
+"""Grasp an obstacle and place it at a free position on the surface."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from robocas_ms3.planning.skills.place import attach_held
 from robocas_ms3.planning.skills.push import surface_in_base
 from robocas_ms3.scenes.grasp_checks import MAX_WIDTH, check_directions, is_gripper_clear
 
-GRID = 0.04  # m between places tried
-TURNS = 8  # of the object about the vertical
-PLACEMENT_CLEARANCE = 0.03  # m kept to everything else, seen from above
-EDGE_MARGINS = (0.1, 0.03)  # m kept from the surface's edge, where there is room for it
-RELEASE_HEIGHT = 0.012  # m of the object's lowest point above the surface when let go
-PLACE_APPROACH_HEIGHT = 0.06  # m above that, from where it comes straight down
+GRID = 0.04  # m between candidate positions
+TURNS = 8  # yaw angles of the object
+PLACEMENT_CLEARANCE = 0.03  # m to all other bodies, horizontally
+EDGE_MARGINS = (0.1, 0.03)  # m to the edge of the surface; the first feasible one is used
+RELEASE_HEIGHT = 0.012  # m from the object's lowest point to the surface at the release
+PLACE_APPROACH_HEIGHT = 0.06  # m above that; the object moves straight down from there
 RETREAT = 0.08  # m
 ARM_REACH = 0.8  # m from its base
-LIFT_RANGE = (0.08, 0.2)  # m, least and greatest
-GRASPS_TESTED = 150
-RIM_SPACING = 0.015  # m
+LIFT_RANGE = (0.08, 0.2)  # m, minimum and maximum lift
+GRASPS_TESTED = 150  # grasps whose gripper is tested for collisions
+OUTLINE_SPACING = 0.015  # m
 PLACES_SOLVED, PLACES_PLANNED = 96, 12
 
 
 def remove_object(arm: Arm, slot: int) -> None:
-    """Grasp an object, put it down on a free place of the surface, step back."""
+    """Grasp an object, place it at a free position on the surface, and retreat."""
     grasp(arm, slot, lift_height=lift_height(arm, slot))
     raise_held_object(arm, slot)
     with arm.planning_time():
@@ -50,12 +50,13 @@ def remove_object(arm: Arm, slot: int) -> None:
 
 
 def raise_held_object(arm: Arm, slot: int) -> None:
+    """Raise a held object until it is collision-free."""
     attach_held(arm, slot)
     arm.rise_until_free(exclude=slot)
 
 
 def lift_height(arm: Arm, slot: int) -> float:
-    """Return how far to lift an object so that it hangs above everything around it, m."""
+    """Return the lift after which an object is above all bodies around it, m."""
     points = transform_points(arm.scene.object_in_base(slot), np.concatenate(arm.env.object_assets[0][slot].hulls))
     middle = points.mean(axis=0)
     radius = float(np.linalg.norm((points - middle)[:, :2], axis=1).max())
@@ -65,20 +66,20 @@ def lift_height(arm: Arm, slot: int) -> float:
 
 
 def count_clear_grasps(arm: Arm, slot: int) -> int:
-    """Return how many of an object's (sampled) grasps from above are clear."""
+    """Count the sampled grasps from above of an object whose gripper is collision-free."""
     grasps = _grasps_from_above(arm, slot)
     near = arm.scene.points_in_base(exclude=slot)
     return int(is_gripper_clear(grasps, near).sum())
 
 
 def find_grasp_blockers(arm: Arm, slot: int) -> list[int]:
-    """Return slots of what blocks an object's grasps from above, those first that alone block most of them."""
-    grasps, in_the_way = _grasps_from_above(arm, slot), {}
+    """Return slots of objects that block grasps from above, first those that alone block most grasps."""
+    grasps, blocked_by = _grasps_from_above(arm, slot), {}
     for other, used in enumerate(arm.env.present[0].tolist()):
         if used and other != slot:
-            in_the_way[other] = ~is_gripper_clear(grasps, arm.scene.object_points(other))
-    count = np.sum(list(in_the_way.values()), axis=0)
-    score = {other: float(np.sum(blocked / np.maximum(count, 1) ** 2)) for other, blocked in in_the_way.items()}
+            blocked_by[other] = ~is_gripper_clear(grasps, arm.scene.object_points(other))
+    count = np.sum(list(blocked_by.values()), axis=0)
+    score = {other: float(np.sum(blocked / np.maximum(count, 1) ** 2)) for other, blocked in blocked_by.items()}
     return sorted((other for other in score if score[other] > 0), key=lambda other: -score[other])
 
 
@@ -87,15 +88,15 @@ def _grasps_from_above(arm: Arm, slot: int) -> Array:
     grasps = frame @ notes.grasps_tcp_in_object
     passed = np.logical_and.reduce(list(check_directions(grasps, frame[:3, 3]).values()))
     grasps = grasps[passed & (notes.grasp_widths <= MAX_WIDTH)]
-    # evenly spread, not drawn: a look must not change what comes after it
+    # evenly spaced instead of drawn, so that this query does not change the random state
     return grasps[np.linspace(0, len(grasps) - 1, min(len(grasps), GRASPS_TESTED)).astype(int)]
 
 
 def plan_place(arm: Arm, slot: int) -> Trajectory:
-    """Plan to above a free place and down to it.
+    """Plan a motion to above a free position and down to it.
 
-    In a heap an object leans, and would fall over if put down so. It is turned as little as makes it stand, and put
-    down as it is held only where that can't be done.
+    Objects in a heap are tilted and would fall over. The object is rotated to its nearest stable orientation, or placed
+    as it is held if that is not feasible.
     """
     scene, asset, held = arm.scene, arm.env.object_assets[0][slot], arm.scene.object_in_base(slot)
     vertices = transform_points(held, np.concatenate(asset.hulls))
@@ -110,15 +111,15 @@ def plan_place(arm: Arm, slot: int) -> Trajectory:
             if len(motions):
                 yield motions @ scene.tcp_in_base
 
-    failure = PlanningError("remove", "no_free_place")
+    failure = PlanningError("remove", "no_free_position")
     return first_plan(free_poses(), lambda places: _plan_to_one_of(arm, places), failure)
 
 
 def _plan_to_one_of(arm: Arm, places: Array) -> Trajectory:
-    """Plan to above one of several TCP poses (N, 4, 4), in the arm's base frame, and down to it."""
+    """Plan a motion to above one of several TCP poses (N, 4, 4) and down to it."""
     start = arm.qpos
     nearest = np.argsort(np.linalg.norm(places[:, :2, 3] - arm.scene.tcp_in_base[:2, 3], axis=1), kind="stable")
-    # near and far ones: all of them would take inverse kinematics seconds
+    # near and far poses; inverse kinematics of all poses would take seconds
     places = places[nearest[:: max(1, len(places) // PLACES_SOLVED)]]
     above = shift_up(places, PLACE_APPROACH_HEIGHT)
     solved, qpos = arm.reachability.nearest_solutions(above, start)
@@ -135,10 +136,10 @@ def _plan_to_one_of(arm: Arm, places: Array) -> Trajectory:
 
 
 def upright_rotation(vertices: Array, center_of_mass: Array) -> Array:
-    """Return the least turn (4x4) after which a body with vertices (V, 3), z up, stands on level ground and stays."""
+    """Return the smallest rotation (4x4) to a stable orientation of a body with vertices (V, 3), z up."""
     corners, faces, normals = convex_hull(vertices)
     a, b, c = corners[faces.T]
-    # it stays on a face that its centre of mass lies above
+    # a face is stable if the centre of mass is above it
     above = [np.einsum("ij,ij->i", np.cross(q - p, center_of_mass - p), normals) for p, q in ((a, b), (b, c), (c, a))]
     stable = normals[np.all(np.array(above) >= -1e-9, axis=0)]
     down = stable[np.argmin(stable[:, 2])]
@@ -153,13 +154,13 @@ def upright_rotation(vertices: Array, center_of_mass: Array) -> Array:
 def find_free_places(
     vertices: Array, others: Array, frame: Array, half: Array, margin: float = EDGE_MARGINS[-1]
 ) -> Array:
-    """Return motions (n, 4, 4) that bring a held object above a free place of a surface, turned about the vertical.
+    """Return transforms (n, 4, 4) of a held object to free positions on a surface, with several yaw angles.
 
     Args:
-        vertices: (V, 3) of the object where it is held, in the arm's base frame, m.
-        others: (P, 3) surfaces of everything else.
-        frame, half: middle (4x4) and half size (2,) of the surface, m.
-        margin: kept from its edge, m.
+        vertices: (V, 3) vertices of the held object in the arm's base frame, m.
+        others: (P, 3) surface points of all other bodies.
+        frame, half: pose (4x4) of the centre and half size (2,) of the surface, m.
+        margin: distance to the edge, m.
     """
     middle = (vertices.max(axis=0) + vertices.min(axis=0)) / 2
     outline = (vertices - middle)[:, :2]
@@ -171,7 +172,7 @@ def find_free_places(
     standing = others[others[:, 2] > frame[2, 3] + 0.005]
     tree = KDTree(standing[:, :2])
     distance, _ = tree.query(spots)
-    spots = spots[distance >= PLACEMENT_CLEARANCE]  # nothing stands in the middle of the place at least
+    spots = spots[distance >= PLACEMENT_CLEARANCE]  # the centre of the position is free
     rise = frame[2, 3] + RELEASE_HEIGHT - vertices[:, 2].min()
     motions = []
     for turn in np.arange(TURNS) * 2 * np.pi / TURNS:
@@ -190,12 +191,12 @@ def find_free_places(
 
 
 def _outline_points(outline: Array) -> Array:
-    """Return points (n, 2) along the convex hull of an outline (V, 2), and its middle."""
+    """Return points (n, 2) along the convex hull of an outline (V, 2), and its centre."""
     corners = outline[ConvexHull(outline).vertices]
     points = [np.zeros((1, 2))]
     for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         points.append(
-            a + np.linspace(0, 1, 1 + int(np.linalg.norm(b - a) / RIM_SPACING), endpoint=False)[:, None] * (b - a)
+            a + np.linspace(0, 1, 1 + int(np.linalg.norm(b - a) / OUTLINE_SPACING), endpoint=False)[:, None] * (b - a)
         )
     return np.concatenate(points)
 

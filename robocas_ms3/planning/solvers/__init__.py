@@ -1,1 +1,1 @@
-"""Scripted policies: one solver a task."""
+"""Scripted policies: one solver per task."""

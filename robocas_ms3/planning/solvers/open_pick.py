@@ -1,4 +1,4 @@
-"""Scripted policy of open-pick: open the door or drawer, then as pick."""
+"""Scripted policy of open_pick: open the door or drawer, then run the policy of pick."""
 
 from __future__ import annotations
 

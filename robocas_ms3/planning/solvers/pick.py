@@ -1,4 +1,4 @@
-"""Scripted policy of pick: grasp the target, lift it, carry it above the basket, let go, step back."""
+"""Scripted policy of pick: grasp the target, lift it, carry it above the basket, release it, retreat."""
 
 from __future__ import annotations
 

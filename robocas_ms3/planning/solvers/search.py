@@ -1,6 +1,6 @@
-"""Scripted policy of search: look, clear what covers and surrounds the target, grasp it, carry it to the basket.
+"""Scripted policy of search: look, clear occluders, grasp the target, carry it to the basket.
 
-What to move, and how, is decided by trying a few ways and taking the one after which least is left to do.
+The policy plays several candidate moves and continues from the move with the lowest remaining cost.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from robocas_ms3.planning.skills.look import FAR, NEAR, load_object_meshes, look
 from robocas_ms3.planning.skills.place import carry_to_basket, release_into_basket
 from robocas_ms3.planning.skills.remove import raise_held_object
 
-LIFT_HEIGHT = 0.15  # m, upstream's
-AHEAD = 3  # moves that are compared
-ENOUGH = -18.0  # s; a move after which nothing is left to do, and which took no longer, is not compared with others
-GRASPS = 3  # kinds of grasps of the target that are tried
+LIFT_HEIGHT = 0.15  # m (RoboCAS-v0)
+MOVES_COMPARED = 3  # candidate moves that are compared
+SUFFICIENT_SCORE = -18.0  # s; a move with this score is not compared with others: no work left and at most 18 s
+GRASP_KINDS = 3  # kinds of grasps of the target to try
 
 
 def attempt(arm: Arm) -> None:
@@ -37,11 +37,12 @@ def attempt(arm: Arm) -> None:
             arm.start_subgoal("find the object")
         done = len(arm.executor.actions)
         try:
-            arm.choose(heap.candidate_moves(), heap.execute, SearchLimits(AHEAD, tries(heap.moves_made), ENOUGH))
+            limits = SearchLimits(MOVES_COMPARED, max_continued(heap.moves_made), SUFFICIENT_SCORE)
+            arm.choose(heap.candidate_moves(), heap.execute, limits)
         except PlanningError:
             if len(arm.executor.actions) > done:
                 raise
-            # nothing can be moved: perhaps it can be grasped as things stand
+            # no move is feasible: try to grasp the target now
             arm.start_subgoal("move and grasp")
             if not heap.target_visible or not _grasp(arm, slot):
                 raise
@@ -56,23 +57,23 @@ def attempt(arm: Arm) -> None:
     release_into_basket(arm, slot)
 
 
-def tries(moves_made: int) -> int:
-    """Return how many moves to continue from: fewer after more moves, whose failures tend to lie further back."""
+def max_continued(moves_made: int) -> int:
+    """Return the number of moves to continue from; fewer later on, when failures have earlier causes."""
     return max(1, 3 - moves_made // 2)
 
 
 def _grasp(arm: Arm, slot: int) -> bool:
-    """Grasp the target and lift it; False where it can't be done, with nothing moved."""
+    """Grasp the target and lift it; return False if planning fails before anything moves."""
     done = len(arm.executor.actions)
 
     def play(kind: int) -> float:
-        arm.executor.gripper = OPEN  # it opens on the way
+        arm.executor.gripper = OPEN  # opens during the approach
         grasp(arm, slot, lift_height=LIFT_HEIGHT, skip_kinds=kind)
         raise_held_object(arm, slot)
         return 0.0
 
     try:
-        arm.choose(range(GRASPS), play)
+        arm.choose(range(GRASP_KINDS), play)
     except PlanningError:
         if len(arm.executor.actions) > done:
             raise
