@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.core.poses import transform_points
 from robocas_ms3.planning import pushes as pushing
 from robocas_ms3.planning.skills.look import sample_views
-from robocas_ms3.planning.skills.remove import free_places, turn_to_stand
+from robocas_ms3.planning.skills.remove import find_free_places, upright_rotation
 
 SURFACE = 0.1  # height of the table, in the arm's base frame
 TABLE = np.eye(4)
@@ -97,7 +97,7 @@ def test_an_object_is_not_pushed_against_a_wall_it_does_not_pass_under():
 def test_free_places_are_on_the_surface_and_clear_of_everything():
     held = box((0.5, 0.6), (0.0, 0.04), (0.4, 0.45))
     standing = box((0.55, 0.65), (-0.2, 0.2), (SURFACE, 0.2))
-    motions = free_places(held, standing, TABLE, HALF)
+    motions = find_free_places(held, standing, TABLE, HALF)
     assert len(motions) > 20
     tree = KDTree(standing[:, :2])
     for motion in motions[:: len(motions) // 20]:
@@ -107,7 +107,7 @@ def test_free_places_are_on_the_surface_and_clear_of_everything():
         assert tree.query(placed[:, :2])[0].min() >= 0.02
         assert motion[2, :3] == pytest.approx([0, 0, 1])  # it keeps standing as it was held
     full = box((0.3, 0.9), (-0.5, 0.5), (SURFACE, 0.2), step=0.02)
-    assert len(free_places(held, full, TABLE, HALF)) == 0
+    assert len(find_free_places(held, full, TABLE, HALF)) == 0
 
 
 def test_views_look_at_the_point_from_above():
@@ -133,20 +133,20 @@ def corners(shift):
 def test_leaning_object_is_turned_upright_about_level_axes(turned_deg):
     leant = Rotation.from_euler("xyz", turned_deg, degrees=True)
     expected = leant.inv().as_matrix() if turned_deg[2] == 0 else np.eye(3)
-    turn = turn_to_stand(leant.apply(BRICK), np.zeros(3))
+    turn = upright_rotation(leant.apply(BRICK), np.zeros(3))
     np.testing.assert_allclose(turn[:3, :3], expected, atol=1e-9)
     np.testing.assert_array_equal(turn[:3, 3], 0)
 
 
 def test_beyond_half_of_a_right_angle_it_is_laid_on_the_next_side():
     leant = Rotation.from_euler("x", 50, degrees=True)
-    turn = turn_to_stand(leant.apply(BRICK), np.zeros(3))
+    turn = upright_rotation(leant.apply(BRICK), np.zeros(3))
     np.testing.assert_allclose(turn[:3, :3], Rotation.from_euler("x", 40, degrees=True).as_matrix(), atol=1e-9)
 
 
 def test_face_beside_the_centre_of_mass_is_not_a_standing_face():
     # its foot reaches to x = 2 cm, its middle is at 1.5 cm, then at 2.5 cm: it falls onto the side (3, 4) cm long
-    np.testing.assert_array_equal(turn_to_stand(corners(0.01), corners(0.01).mean(axis=0)), np.eye(4))
-    turn = turn_to_stand(corners(0.03), corners(0.03).mean(axis=0))
+    np.testing.assert_array_equal(upright_rotation(corners(0.01), corners(0.01).mean(axis=0)), np.eye(4))
+    turn = upright_rotation(corners(0.03), corners(0.03).mean(axis=0))
     expected = Rotation.from_rotvec([0, np.arccos(0.6), 0]).as_matrix()
     np.testing.assert_allclose(turn[:3, :3], expected, atol=1e-9)
