@@ -161,3 +161,13 @@ def test_examples_and_docs_import_public_names_from_their_package():
         if imported in PACKAGES and module.startswith(f"{PACKAGES[imported]}.")
     ]
     assert wrong == []
+
+
+def test_docs_name_public_classes_by_their_package():
+    paths = [
+        (page.name, *match)
+        for page in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+        for match in re.findall(r"\b(robocas_ms3(?:\.\w+)*)\.([A-Z]\w+)", page.read_text(encoding="utf-8"))
+    ]
+    wrong = [path for path in paths if path[2] in PACKAGES and path[1].startswith(f"{PACKAGES[path[2]]}.")]
+    assert wrong == []

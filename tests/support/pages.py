@@ -72,7 +72,7 @@ def printed_outputs(page: Path) -> list[tuple[str, list[str]]]:
 
 
 def normalize(text: str, folder: Path | None = None) -> list[str]:
-    """Return the lines of an output with `TIME` for durations and speeds, and without trailing blanks.
+    """Return the lines of an output with `TIME` for durations and rates, and without trailing blanks.
 
     Args:
         folder: working folder of the command, whose path is left out.
@@ -80,8 +80,8 @@ def normalize(text: str, folder: Path | None = None) -> list[str]:
     if folder is not None:
         text = text.replace(f"{folder}/", "")
     number = r"\d+(?:\.\d+)?"
+    text = re.sub(rf"\b{number} ?(?:s/it|it/s|episodes/h)", "TIME", text)
     text = re.sub(rf"\b{number} (?:ms|s|min|h|days)(?: {number} min)?\b", "TIME", text)
-    text = re.sub(rf"\b{number} (?:episodes per hour|a second|per second)\b", "TIME", text)
     return [line.rstrip() for line in text.strip("\n").splitlines()]
 
 
