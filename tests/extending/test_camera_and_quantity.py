@@ -1,4 +1,4 @@
-"""A fourth camera is a block of YAML, a recorded quantity is one entry: all that reads or writes data has them."""
+"""A fourth camera (YAML) and new recorded quantities (one entry each) work in all readers and writers of data."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import subprocess
 import sys
 
 import pytest
-from strangers import ROOT
+from example_packages import ROOT
 
-# runs when Python starts, in workers too; in the package these are entries of the list
+# runs when Python starts, also in workers; in the package, these are entries of the list
 ENTRY = """
 from robocas_ms3.robots import quantities
 
@@ -89,14 +89,14 @@ def main():
         "eval --policy sees:Sees --protocol tiny --out result --backend processes --envs 1",
     ):
         assert run(words.split()) == 0, words
-    older = Path(shutil.copytree("robocas", "older")) / "episode_0000000" / "episode_info.npz"  # before it was added
+    older = Path(shutil.copytree("robocas", "older")) / "episode_0000000" / "episode_info.npz"  # without `gap`
     arrays = dict(np.load(older))
     assert arrays.pop("gap").max() > 0.03
     np.savez(older, **arrays)
     for words in (
         "validate older",
         "merge older --out merged",
-        "convert older --to lerobot --out of_older",
+        "convert older --to lerobot --out from_older",
         "convert lerobot --to lerobot --out again",  # LeRobot holds no gap
         "validate again",
     ):

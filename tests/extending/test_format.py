@@ -1,4 +1,4 @@
-"""A dataset format of another package: the page's code, installed, through every command that takes datasets."""
+"""The dataset format of docs/extending.md, installed, in all commands that read datasets."""
 
 import json
 import sys
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from strangers import install
+from example_packages import install
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.cli.main import run
@@ -21,20 +21,20 @@ from robocas_ms3.datasets.training.options import SampleOptions
 
 
 @pytest.fixture
-def stranger(tmp_path, monkeypatch):
-    """Its package is installed; nothing of it is left behind."""
+def toy_package(tmp_path, monkeypatch):
+    """Install the package of the format, and remove it after the test."""
     folder = install("A dataset format", tmp_path / "site")
     monkeypatch.syspath_prepend(folder)
     monkeypatch.setattr("robocas_ms3.datasets.conversion.env_renderer.EnvRenderer", RayCaster)
-    table = Registry("dataset format", formats.GROUP, formats.Format, formats.FORMATS.builtin)
-    monkeypatch.setattr(formats, "FORMATS", table)  # as if the process had begun now
+    registry = Registry("dataset format", formats.GROUP, formats.Format, formats.FORMATS.builtin)
+    monkeypatch.setattr(formats, "FORMATS", registry)  # entry points are read again
     yield folder
     sys.modules.pop("toy_format", None)
 
 
 @pytest.fixture
-def both(stranger, tmp_path, capsys):
-    """The same recordings as a toy, by the command line, and as a RoboCAS folder."""
+def datasets(toy_package, tmp_path, capsys):
+    """Convert the same recordings to the toy format, by the command line, and to a RoboCAS folder."""
     file = write_trajectory(tmp_path / "F.h5", seeds=(3, 4, 5))
     assert run(["convert", str(file), "--to", "toy", "--out", str(tmp_path / "toy")]) == 0
     assert "3 episodes, 21 steps" in capsys.readouterr().out
@@ -44,33 +44,32 @@ def both(stranger, tmp_path, capsys):
     return tmp_path / "toy", tmp_path / "folder"
 
 
-def test_it_is_three_files_and_known_by_them(both):
-    toy, folder = both
+def test_dataset_is_three_files_and_detected(datasets):
+    toy, folder = datasets
     assert sorted(path.name for path in toy.iterdir()) == ["about.json", "arrays.npz", "images.npz"]
     assert (detect_format(toy).name, detect_format(folder).name) == ("toy", "robocas")
 
 
-def test_it_trains_as_a_robocas_folder_does(both):
-    ours, theirs = (
-        RoboCASDataset(root, SampleOptions(split="all", size=None, depth=True, subgoals=True)) for root in both[::-1]
-    )
-    assert len(theirs) == len(ours) > 0
-    for one, other in zip(ours, theirs, strict=True):
+def test_training_samples_equal_those_of_a_robocas_folder(datasets):
+    options = SampleOptions(split="all", size=None, depth=True, subgoals=True)
+    robocas, toy = (RoboCASDataset(root, options) for root in datasets[::-1])
+    assert len(toy) == len(robocas) > 0
+    for one, other in zip(robocas, toy, strict=True):
         for key, value in one.items():
             assert torch.equal(value, other[key]) if torch.is_tensor(value) else value == other[key], key
-    split = {root: (open_source(root).split("train"), open_source(root).split("val")) for root in both}
-    assert split[both[0]] == split[both[1]]  # by the seeds
-    ranges = [open_source(root).action_space()["relative_position"] for root in both]
+    split = {root: (open_source(root).split("train"), open_source(root).split("val")) for root in datasets}
+    assert split[datasets[0]] == split[datasets[1]]  # by the seeds
+    ranges = [open_source(root).action_space()["relative_position"] for root in datasets]
     np.testing.assert_allclose(*ranges)
 
 
-def test_it_is_counted_checked_shown_and_converted(both, tmp_path, capsys):
-    toy, folder = both
-    counted = {}
+def test_stats_validate_video_and_convert(datasets, tmp_path, capsys):
+    toy, folder = datasets
+    statistics = {}
     for root in (folder, toy):
         assert run(["stats", str(root), "--json"]) == 0
-        counted[root] = {**json.loads(capsys.readouterr().out), "path": "", "split": {}}
-    assert counted[toy] == counted[folder]
+        statistics[root] = {**json.loads(capsys.readouterr().out), "path": "", "split": {}}
+    assert statistics[toy] == statistics[folder]
     assert run(["validate", str(toy)]) == 0
     assert "3 episodes, 21 steps, valid" in capsys.readouterr().out
     assert run(["video", str(toy), "--out", str(tmp_path / "video")]) == 0
@@ -84,8 +83,8 @@ def test_it_is_counted_checked_shown_and_converted(both, tmp_path, capsys):
     assert files[0] == files[1] != {}
 
 
-def test_what_is_wrong_with_it_is_said(both, capsys):
-    toy, _ = both
+def test_validate_reports_a_violation(datasets, capsys):
+    toy, _ = datasets
     with np.load(toy / "arrays.npz") as content:
         arrays = dict(content)
     arrays["1/rel_pos"] = arrays["1/rel_pos"][:-1]
@@ -94,7 +93,7 @@ def test_what_is_wrong_with_it_is_said(both, capsys):
     assert "arrays.npz/1, rel_pos: expected shape (7, 3), found shape (6, 3)" in capsys.readouterr().out
 
 
-def test_a_format_that_there_is_not(stranger, tmp_path, capsys):
+def test_unknown_format_and_option(toy_package, tmp_path, capsys):
     file = write_trajectory(tmp_path / "F.h5")
     assert run(["convert", str(file), "--to", "rlds", "--out", str(tmp_path / "out")]) == 2
     assert "expected one of ['lerobot', 'robocas', 'toy']" in capsys.readouterr().err
@@ -102,9 +101,9 @@ def test_a_format_that_there_is_not(stranger, tmp_path, capsys):
     assert "--append: this option does not apply to a toy dataset" in capsys.readouterr().err
 
 
-def test_a_format_that_fails_at_a_path_holds_it_not(both, monkeypatch):
-    """One that looks for files in what is no folder, say."""
+def test_format_whose_detection_raises_is_not_chosen(datasets, monkeypatch):
+    """For example, a format that lists the files of a path that is no folder."""
     toy = formats.FORMATS["toy"]
     monkeypatch.setitem(formats.FORMATS._loaded, "toy", replace(toy, matches=lambda path: any(path.iterdir())))
-    trajectory = both[0].with_name("F.h5")
+    trajectory = datasets[0].with_name("F.h5")
     assert detect_format(trajectory).name == "trajectory"

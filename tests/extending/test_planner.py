@@ -1,11 +1,11 @@
-"""The planner of a stranger's package, as docs/extending.md has it, used from outside."""
+"""The planner of docs/extending.md, installed as a package."""
 
 from __future__ import annotations
 
 import json
 
 import pytest
-from strangers import PAGE, install, python, robocas
+from example_packages import PAGE, install, python, robocas
 
 from robocas_ms3.planning.protocol import Planner
 
@@ -17,9 +17,9 @@ def site(tmp_path_factory):
     return install("A task", folder)
 
 
-def test_it_is_a_planner_by_name(site):
+def test_planner_is_found_by_name(site):
     members = [name for name in vars(Planner) if not name.startswith("_")]
-    said = python(
+    output = python(
         site,
         "-c",
         f"""
@@ -37,18 +37,18 @@ away = np.cross(points - goal[:3, 3], (goal - planner.tcp(start))[:3, 3] / 0.15)
 print(motion.dt, np.abs(points[-1] - goal[:3, 3]).max() < 1e-4, np.linalg.norm(away, axis=1).max() < 2e-3)
 """,
     )
-    assert said.splitlines() == ["['rrt_connect', 'straight'] True", "0.05 True True"]
+    assert output.splitlines() == ["['rrt_connect', 'straight'] True", "0.05 True True"]
 
 
 @pytest.mark.slow
-def test_demonstrations_are_recorded_with_it(site, tmp_path):
+def test_generate_records_with_the_planner(site, tmp_path):
     robocas(site, "generate", "push_zone", "-n", 1, "--planner", "straight", "--out", tmp_path / "out")
     assert json.loads((tmp_path / "out" / "run.json").read_text())["settings"]["planner"] == "straight"
     (episode,) = json.loads((tmp_path / "out" / "trajectory.json").read_text())["episodes"]
     assert episode["success"]
 
 
-def test_without_its_package_it_is_unknown(tmp_path):
+def test_planner_is_unknown_without_its_package(tmp_path):
     with pytest.raises(AssertionError, match=r"error: planner: no such planner .*'rrt_connect'.*'straight'"):
         robocas(tmp_path, "generate", "pick", "--planner", "straight", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()

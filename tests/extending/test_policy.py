@@ -1,4 +1,4 @@
-"""A policy of a stranger's package, as docs/extending.md has it: installed beside this one, nothing touched in it."""
+"""The policy of docs/extending.md, installed as a package."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import shutil
 import sys
 
 import pytest
-from strangers import PAGE, install, robocas
+from example_packages import PAGE, install, robocas
 
 from robocas_ms3.cli.list import list_all
 from robocas_ms3.core.errors import EvaluationError, ExtensionError
@@ -29,7 +29,7 @@ def site(tmp_path, monkeypatch):
     return folder
 
 
-def test_it_is_found_and_listed_by_its_name(site):
+def test_policy_is_found_and_listed_by_name(site):
     assert type(make_policy("descend")).__module__ == "my_policies"
     listed = {row["name"]: row for row in list_all()["policies"]}
     assert listed["descend"] == {"name": "descend", "package": "my-policies", "of": "my_policies:Descend"}
@@ -43,7 +43,7 @@ def test_it_is_found_and_listed_by_its_name(site):
     [("def (", ExtensionError), ("It = 7", ExtensionError)]
     + [("def It(size): ...", EvaluationError), ("It = object", EvaluationError)],
 )
-def test_a_broken_one_is_an_error_only_when_it_is_chosen(site, module, error):
+def test_policy_with_an_import_error_fails_only_when_it_is_used(site, module, error):
     about = site / "spoilt_policies-1.0.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: spoilt-policies\nVersion: 1.0\n")
@@ -56,7 +56,7 @@ def test_a_broken_one_is_an_error_only_when_it_is_chosen(site, module, error):
 
 
 @pytest.mark.slow
-def test_it_is_measured_by_its_name(site, tmp_path):
+def test_policy_is_evaluated_by_name(site, tmp_path):
     protocol = tmp_path / "short"
     shutil.copytree(load_protocol("smoke").folder, protocol)
     rules = protocol / "protocol.yaml"

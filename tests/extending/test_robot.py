@@ -1,4 +1,4 @@
-"""The robot of a stranger's package, as docs/extending.md has it, used from outside: every name of it is another."""
+"""The robot of docs/extending.md, installed as a package: its joints and links have other names than the Panda's."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import h5py
 import pytest
-from strangers import PAGE, fresh_python, install, python, robocas
+from example_packages import PAGE, install, new_python, python, robocas
 
 SUPPORT = Path(__file__).resolve().parents[1] / "support"
 TWIN = "import sys; from robocas_ms3.robots.registry import find_robot; twin = find_robot('twin')\n"
@@ -23,24 +23,24 @@ def site(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def recorded(site, tmp_path_factory):
-    """Two episodes of its, and what the generator printed."""
+    """Record two episodes; return the path of the trajectory file."""
     out = tmp_path_factory.mktemp("recorded") / "out"
     robocas(site, "generate", "pick", "-n", 2, "--robot", "twin", "--out", out)
     return out / "trajectory.h5"
 
 
-def test_it_is_listed_and_read_without_a_simulator(site):
+def test_robot_is_listed_without_importing_the_simulator(site):
     robots = {row["name"]: row for row in json.loads(robocas(site, "list", "--json"))["robots"]}
     assert list(robots) == ["robocas_mobile_panda", "robocas_mobile_panda_stock_fingers", "twin"]
     assert robots["twin"]["agent"] == "robocas_twin.agent:Twin"
-    said = fresh_python(
+    output = new_python(
         site, "-c", TWIN + "print(twin.files().urdf.is_file(), {'sapien', 'mani_skill'} & sys.modules.keys())"
     )
-    assert said.strip() == "True set()"
+    assert output.strip() == "True set()"
 
 
-def test_its_environment_has_no_name_of_the_pandas(site):
-    said = python(
+def test_environment_uses_the_names_of_the_robot(site):
+    output = python(
         site,
         "-c",
         TWIN
@@ -58,7 +58,7 @@ print(agent.keyframes["rest"].qpos[3:10].tolist(), sorted({c.entity_uid for c in
 print(sorted(env.unwrapped.get_state_dict()["articulations"]))
 """,
     )
-    uid, joints, rest, states = said.splitlines()
+    uid, joints, rest, states = output.splitlines()
     assert uid.startswith("twin True")
     assert joints == "True"
     assert rest == "[0.1, -0.9, 0.0, -2.4, 0.1, 1.4, 0.7] ['twin_base_link', 'twin_panda_hand']"
@@ -66,8 +66,8 @@ print(sorted(env.unwrapped.get_state_dict()["articulations"]))
 
 
 @pytest.mark.parametrize("name", ["rrt_connect", "straight"])
-def test_planners_plan_for_its_arm(site, name):
-    said = python(
+def test_planners_plan_for_the_arm(site, name):
+    output = python(
         site,
         "-c",
         TWIN
@@ -82,8 +82,10 @@ tip = chain(twin.files().urdf, twin.description.arm_base_link, twin.description.
 print(np.abs(planner.tcp(motion.qpos[-1]) - tip).max() < 1e-9, planner.collisions(rest))
 """,
     )
-    fastest, rest = said.splitlines()
-    assert float(fastest) == pytest.approx({"rrt_connect": 0.7, "straight": 0.5}[name], abs=0.03)  # the Panda's is 0.5
+    fastest, rest = output.splitlines()
+    assert float(fastest) == pytest.approx(
+        {"rrt_connect": 0.7, "straight": 0.5}[name], abs=0.03
+    )  # the limit of the Panda is 0.5
     assert rest == "True []"
 
 
@@ -95,21 +97,21 @@ def test_demonstrations_are_recorded_and_replayed(site, recorded):
     assert [episode["success"] for episode in data["episodes"]] == [True, True]
     with h5py.File(recorded) as file:
         assert list(file["traj_0/env_states/articulations"]) == ["twin"]
-    assert "2 of 2 episodes succeed" in (said := robocas(site, "replay", recorded))
-    assert "final state: 0\n" in said
+    assert "2 of 2 episodes succeed" in (output := robocas(site, "replay", recorded))
+    assert "final state: 0\n" in output
     assert "2 of 2 episodes succeed" in robocas(site, "replay", recorded, "--control-mode", "pd_ee_delta_pose")
 
 
 @pytest.mark.slow
-def test_a_run_does_not_resume_with_another_robot(site, recorded):
+def test_run_does_not_resume_with_another_robot(site, recorded):
     with pytest.raises(AssertionError, match=r"run\.json: .*settings\.robot.*twin.*robocas_mobile_panda"):
         robocas(site, "generate", "pick", "-n", 3, "--out", recorded.parent)
 
 
 @pytest.mark.slow
-def test_datasets_hold_what_it_did(site, recorded, tmp_path):
-    """Arrays are the recorded states', and where the simulator has its links; LeRobot is told its name."""
-    said = python(
+def test_datasets_contain_the_recorded_states(site, recorded, tmp_path):
+    """Arrays equal the recorded states and the link poses of the simulator; LeRobot datasets contain the name."""
+    output = python(
         site,
         "-c",
         f"""
@@ -151,7 +153,7 @@ actions = stored_actions(*(arrays[name] for name in ("rel_pos", "rel_orn", "grip
 print(world.replay(actions[:-1]).success)
 """,
     )
-    robot, same, near, again = said.splitlines()
+    robot, same, near, again = output.splitlines()
     assert robot == "twin"
     assert same == "True True"
     assert near == "True True"
@@ -160,14 +162,14 @@ print(world.replay(actions[:-1]).success)
 
 
 @pytest.mark.slow
-def test_without_its_package_a_recording_says_what_is_missing(recorded, tmp_path):
+def test_recording_without_the_package_is_an_error(recorded, tmp_path):
     for command in (["replay", recorded], ["stats", recorded]):
         with pytest.raises(AssertionError, match=r"robot_uids: no such robot .*found 'twin'.*Install the package"):
             robocas(tmp_path, *command)
 
 
 @pytest.mark.slow
-def test_an_evaluation_is_of_the_robot_that_its_protocol_names(site, tmp_path):
+def test_evaluation_uses_the_robot_of_the_protocol(site, tmp_path):
     from robocas_ms3.evaluation import results
     from robocas_ms3.evaluation.protocol import load_protocol
 
@@ -181,7 +183,7 @@ def test_an_evaluation_is_of_the_robot_that_its_protocol_names(site, tmp_path):
     assert outcome.success
 
 
-def test_what_is_no_robot_is_refused(site, tmp_path):
+def test_unknown_robot_is_an_error(site, tmp_path):
     with pytest.raises(AssertionError, match="error: robot: no such robot .*'twin'.*Did you mean twin"):
         robocas(site, "generate", "pick", "--robot", "twins", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -1,11 +1,11 @@
-"""The task of a stranger's package, as docs/extending.md has it, used from outside."""
+"""The task of docs/extending.md, installed as a package."""
 
 from __future__ import annotations
 
 import json
 
 import pytest
-from strangers import PAGE, install, python, robocas
+from example_packages import PAGE, install, python, robocas
 
 MAKE = """
 import gymnasium as gym, robocas_ms3, numpy as np, torch
@@ -22,15 +22,15 @@ def site(tmp_path_factory):
     return install("A task", tmp_path_factory.mktemp("site"))
 
 
-def test_it_is_listed(site):
+def test_task_is_listed(site):
     tasks = {row["name"]: row for row in json.loads(robocas(site, "list", "--json"))["tasks"]}
     assert list(tasks) == ["pick", "select", "search", "open_pick", "push_zone"]
     assert tasks["push_zone"]["env_id"] == "RoboCASPushZone-v1"
     assert "push_zone" in robocas(site, "generate", "--help")
 
 
-def test_its_environment_is_made_without_a_basket(site):
-    said = python(
+def test_environment_without_a_basket(site):
+    output = python(
         site,
         "-c",
         MAKE
@@ -41,7 +41,7 @@ print(sorted(obs["extra"]), sorted(base.STAGES), gym.spec("RoboCASPushZone-v1").
 print(0 < float(reward) < 0.3, list(info["reward_terms"]), sorted(base.success_conditions()))
 """,
     )
-    assert said.splitlines() == [
+    assert output.splitlines() == [
         "['push the soap box on the table into the zone on the left']",
         "['object_poses', 'target', 'target_extents', 'target_to_goal', 'tcp_pose', 'tcp_to_target'] "
         "['picked_any', 'reached_any', 'reached_target', 'target_grasped', 'target_in_zone', 'target_lifted'] 400",
@@ -49,8 +49,8 @@ print(0 < float(reward) < 0.3, list(info["reward_terms"]), sorted(base.success_c
     ]
 
 
-def test_its_goal_decides_success_and_fail(site):
-    said = python(
+def test_goal_decides_success_and_fail(site):
+    output = python(
         site,
         "-c",
         MAKE
@@ -69,11 +69,11 @@ for place in (base.goal.middle[0], base.goal.middle[0] + [0.0, 0.2, 0.0], [0.9, 
     print(*(bool(info[name]) for name in ("success", "fail", "target_in_zone")))
 """,
     )
-    assert said.splitlines() == ["True False True", "False False True", "False True True"]
+    assert output.splitlines() == ["True False True", "False False True", "False True True"]
 
 
-def test_several_at_once_and_to_train_with(site):
-    said = python(
+def test_vector_environment_with_rl_settings(site):
+    output = python(
         site,
         "-c",
         """
@@ -86,7 +86,7 @@ print(tuple(obs.shape)[0], tuple(reward.shape), kwargs["max_episode_steps"])
 env.close()
 """,
     )
-    assert said.split("\n")[0] == "2 (2,) 100"
+    assert output.split("\n")[0] == "2 (2,) 100"
 
 
 @pytest.mark.slow
@@ -102,8 +102,8 @@ def test_demonstrations_are_recorded(site, tmp_path):
     assert "1" in replayed
 
 
-def test_a_configuration_with_a_mistyped_task_is_told_its_name(site):
-    said = python(
+def test_mistyped_task_of_a_configuration_suggests_the_name(site):
+    output = python(
         site,
         "-c",
         """
@@ -117,12 +117,12 @@ except ConfigError as error:
     print(error)
 """,
     )
-    assert "invalid value for 'task'" in said
-    assert said.strip().endswith("Did you mean push_zone?")
+    assert "invalid value for 'task'" in output
+    assert output.strip().endswith("Did you mean push_zone?")
 
 
-def test_an_evaluation_measures_it_where_upstreams_rule_has_no_basket(site):
-    said = python(
+def test_metrics_without_a_basket(site):
+    output = python(
         site,
         "-c",
         MAKE
@@ -137,14 +137,14 @@ read = metrics.read()
 print(tuple(read["sums"].shape), bool(read["sums"][0, 4]), sorted(read))
 """,
     )
-    assert said.strip() == "(1, 5) False ['sums']"
+    assert output.strip() == "(1, 5) False ['sums']"
 
 
 @pytest.fixture(scope="module")
-def measured(site, tmp_path_factory):
-    """A folder where the page's commands were run, with fewer episodes; and what they said, by their words."""
-    folder = tmp_path_factory.mktemp("measured")
-    plan = site / "push-zone-v1.yaml"  # beside the package: it names a file of that
+def evaluated(site, tmp_path_factory):
+    """A folder where the page's commands were run, with fewer episodes; and what they output, by their words."""
+    folder = tmp_path_factory.mktemp("evaluated")
+    plan = site / "push-zone-v1.yaml"  # next to the package, whose file it names
     plan.write_text(plan.read_text().replace("count: 200", "count: 2"))
     lines = [line.split()[1:] for line in PAGE.splitlines() if line.startswith("robocas eval") and "push-zone" in line]
     lines += [line.split()[1:] for line in PAGE.splitlines() if line.startswith("robocas eval compare")]
@@ -154,8 +154,8 @@ def measured(site, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_protocol_of_its_own_is_frozen_and_measured_with(measured):
-    folder, (frozen, scripted, noop, verified, compared) = measured
+def test_protocol_is_frozen_and_evaluated(evaluated):
+    folder, (frozen, scripted, noop, verified, compared) = evaluated
     assert "2 episodes" in frozen
     assert "| push_zone | 2 | 100 % (16 to 100) | 100 % |  | 100 % | 0 % | 100 % |  |" in scripted
     assert "| configuration | n | failed | an object touched |" in noop
@@ -168,8 +168,8 @@ def test_a_protocol_of_its_own_is_frozen_and_measured_with(measured):
 
 
 @pytest.mark.slow
-def test_its_results_are_measured_in_parts_and_merged(site, measured):
-    folder, _ = measured
+def test_shards_of_a_result_are_merged(site, evaluated):
+    folder, _ = evaluated
     words = ("eval", "push_zone", "--protocol", "protocols/push-zone-v1", "--policy", "scripted")
     for number in (0, 1):
         robocas(site, *words, "--shard", f"{number}/2", "--out", f"eval/{number}", cwd=folder)
@@ -184,6 +184,6 @@ def test_its_results_are_measured_in_parts_and_merged(site, measured):
 ELSEWHERE = r"no episodes of this task .*found push_zone\)\. Choose another protocol .*robocas eval freeze"
 
 
-def test_a_protocol_that_has_not_the_task_says_what_to_do(site):
+def test_protocol_without_the_task_is_an_error(site):
     with pytest.raises(AssertionError, match=ELSEWHERE):
         robocas(site, "eval", "push_zone", "--policy", "noop", "--protocol", "smoke")

@@ -222,7 +222,7 @@ def live_processes(group):
 
 def lines_without_progress(stderr):
     """Return the lines of stderr without progress lines."""
-    progress = re.compile(r"([a-z ]+: )?\d+/\d+(,|$)")
+    progress = re.compile(r"[a-z ]+: \d+/\d+( \(|,|$)")
     return [line for line in stderr.splitlines() if line.strip() and not progress.match(line)]
 
 

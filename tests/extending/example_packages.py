@@ -1,4 +1,4 @@
-"""Packages of strangers, installed from the code blocks of docs/extending.md."""
+"""Packages that are installed from the code blocks of docs/extending.md."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
 
 
 def install(section: str, site: Path) -> Path:
-    """Do with a section's package as pip does: its files and its metadata in a folder of packages."""
+    """Install the package of a section as pip does: write its files and metadata to a folder; return the folder."""
     text = PAGE.split(f"## {section}\n")[1].split("\n## ")[0]
     files = dict(re.findall(r"^```\w+\n# (\S+)\n(.*?)^```", text, re.DOTALL | re.MULTILINE))
     project = tomllib.loads(files.pop("pyproject.toml"))["project"]
-    about = site / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
-    about.mkdir(parents=True)
-    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    metadata = site / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+    metadata.mkdir(parents=True)
+    header = f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    (metadata / "METADATA").write_text(header)
     groups = project["entry-points"].items()
     lines = [f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in points.items()) for group, points in groups]
-    (about / "entry_points.txt").write_text("\n".join(lines))
+    (metadata / "entry_points.txt").write_text("\n".join(lines))
     for name, content in files.items():
         (site / name).parent.mkdir(exist_ok=True)
         (site / name).write_text(content)
@@ -39,23 +40,23 @@ def install(section: str, site: Path) -> Path:
 
 @cache
 def server(site: Path) -> ForkServer:
-    """Python with a folder of packages."""
+    """Return a server that forks Python processes with a folder of packages."""
     return ForkServer(site, ROOT)
 
 
 def python(site: Path, *words: object, cwd: Path | None = None) -> str:
-    """Run Python with a folder of packages, and in a folder; what it says."""
+    """Run Python with a folder of packages, in a working directory; return its output."""
     done = server(site).run(*words, cwd=cwd)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
-def fresh_python(site: Path, *words: object) -> str:
-    """The same of one that has imported nothing."""
+def new_python(site: Path, *words: object) -> str:
+    """Run a new Python process, which has imported nothing; return its output."""
     env = os.environ | {"PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])}
     return subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True, env=env).stdout
 
 
 def robocas(site: Path, *words: object, cwd: Path | None = None) -> str:
-    """Run the command line with a folder of packages, and in a folder; what it says."""
+    """Run `robocas` with a folder of packages, in a working directory; return its output."""
     return python(site, ROOT / "robocas_cli.py", *words, cwd=cwd)
