@@ -27,7 +27,7 @@ BLACK = 0.02  # linear; darker base colours show nothing
 
 
 @dataclass(frozen=True)
-class Mapping:
+class TextureMapping:
     """How an image is laid over a surface.
 
     Attributes:
@@ -57,7 +57,7 @@ class MappedImage:
     """An image, and where it is shown."""
 
     image: Image.Image
-    mapping: Mapping
+    mapping: TextureMapping
 
 
 class Materials:
@@ -73,9 +73,9 @@ class Materials:
     def __init__(self, model: schema.Gltf, buffers: Buffers, notes: list[str], ignored: set[str]) -> None:
         self._model, self._buffers, self._notes, self._ignored = model, buffers, notes, ignored
         self._images: dict[int, Image.Image] = {}
-        self._materials: dict[tuple[int, frozenset[int]], tuple[Material, Mapping]] = {}
+        self._materials: dict[tuple[int, frozenset[int]], tuple[Material, TextureMapping]] = {}
 
-    def material(self, index: int | None, uv_sets: frozenset[int]) -> tuple[Material, Mapping]:
+    def material(self, index: int | None, uv_sets: frozenset[int]) -> tuple[Material, TextureMapping]:
         """Return a material, and how its image is laid over a mesh.
 
         Args:
@@ -83,12 +83,12 @@ class Materials:
             uv_sets: that the mesh has; an image on another one is left out.
         """
         if index is None:
-            return Material(), Mapping(0)
+            return Material(), TextureMapping(0)
         if (index, uv_sets) not in self._materials:
             self._materials[index, uv_sets] = self._read(entry(self._model.materials, index, "materials"), uv_sets)
         return self._materials[index, uv_sets]
 
-    def _read(self, material: schema.Material, uv_sets: frozenset[int]) -> tuple[Material, Mapping]:
+    def _read(self, material: schema.Material, uv_sets: frozenset[int]) -> tuple[Material, TextureMapping]:
         shading = material.pbrMetallicRoughness
         factor, info = shading.baseColorFactor, shading.baseColorTexture
         if "KHR_materials_pbrSpecularGlossiness" in material.extensions:
@@ -114,17 +114,17 @@ class Materials:
 
     def _combined(
         self, base: MappedImage | None, color: Array, light: MappedImage | None, glow: Array
-    ) -> tuple[Material, Mapping]:
+    ) -> tuple[Material, TextureMapping]:
         """Return the sum of base colour and emitted light; each is an image (None: white) times a linear colour."""
         if light is not None and color.max() < BLACK:
             return Material(_triple(glow), light.image), light.mapping
         if not glow.any() or (base is not None and light is not None and base.mapping != light.mapping):
             if glow.any():
                 self._ignored.add("an emissive texture laid out in another way than the base colour")
-            return Material(_triple(color), base and base.image), base.mapping if base else Mapping(0)
+            return Material(_triple(color), base and base.image), base.mapping if base else TextureMapping(0)
         shown = base or light
         if shown is None:
-            return Material(_triple(color + glow)), Mapping(0)
+            return Material(_triple(color + glow)), TextureMapping(0)
         total: Array | float = 0.0
         for mapped, tint in ((base, color), (light, glow)):
             pixels = None if mapped is None else np.asarray(mapped.image.resize(shown.image.size))
@@ -159,16 +159,16 @@ class Materials:
         return MappedImage(self._images[source], mapping)
 
 
-def _mapping(info: schema.TextureInfo) -> Mapping:
+def _mapping(info: schema.TextureInfo) -> TextureMapping:
     extension = info.extensions.get("KHR_texture_transform")
     if extension is None:
-        return Mapping(info.texCoord)
+        return TextureMapping(info.texCoord)
     found = schema.Transform.model_validate(extension)
     cos, sin = float(np.cos(found.rotation)), float(np.sin(found.rotation))
     (u, v), (across, down) = found.offset, found.scale
     # counter-clockwise as seen, v downward: as three.js and Khronos's viewer have it
     rows = (cos * across, sin * down, u), (-sin * across, cos * down, v)
-    return Mapping(info.texCoord if found.texCoord is None else found.texCoord, rows)
+    return TextureMapping(info.texCoord if found.texCoord is None else found.texCoord, rows)
 
 
 def _triple(color: Array) -> tuple[float, float, float]:

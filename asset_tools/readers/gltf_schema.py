@@ -115,7 +115,7 @@ class Transform(Schema):
     texCoord: NonNegativeInt | None = None
 
 
-class Shading(Schema):
+class MetallicRoughness(Schema):
     """The metallic-roughness material."""
 
     baseColorFactor: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
@@ -139,7 +139,7 @@ class EmissiveStrength(Schema):
 class Material(Schema):
     """A material."""
 
-    pbrMetallicRoughness: Shading = Shading()
+    pbrMetallicRoughness: MetallicRoughness = MetallicRoughness()
     emissiveFactor: tuple[float, float, float] = (0.0, 0.0, 0.0)
     emissiveTexture: TextureInfo | None = None
     normalTexture: Any = None

@@ -43,7 +43,7 @@ class Training:
 
 
 @dataclass(kw_only=True)
-class FromData(Training):
+class DatasetBaseline(Training):
     """Options of a baseline that learns from demonstrations."""
 
     data: Path
@@ -51,7 +51,7 @@ class FromData(Training):
 
 
 @dataclass(kw_only=True)
-class Small(FromData):
+class Small(DatasetBaseline):
     """Train `small`: base and gripper camera, language; action chunks by a small transformer. Trains on two CPU cores.
 
     Example: robocas train small --data datasets/pick --out runs/pick
@@ -70,7 +70,7 @@ class BCState(Training):
 
 
 @dataclass(kw_only=True)
-class RT1(FromData):
+class RT1(DatasetBaseline):
     """Train `rt1`, RT-1 as in the RoboCAS paper: base and gripper camera, language; action tokens.
 
     Example: robocas train rt1 --data datasets/pick --set train.workers=4
@@ -86,7 +86,7 @@ class PPO(Training):
 
 
 @dataclass(kw_only=True)
-class Other(Training):
+class PluginBaseline(Training):
     """Train a baseline that another package registers."""
 
     data: Maybe[Path] = None
@@ -108,7 +108,7 @@ COMMANDS = {
     "bc-state": command("bc-state", BCState),
     "rt1": command("rt1", RT1),
     "ppo": command("ppo", PPO),
-    **{name: command(name, Other) for name in BASELINES.entry_points},
+    **{name: command(name, PluginBaseline) for name in BASELINES.entry_points},
 }
 DEFAULT = "small"
 

@@ -17,7 +17,7 @@ from robocas_ms3.planning.decisions import FIRST_FEASIBLE, SearchLimits
 T = TypeVar("T")
 
 
-class CandidatesExhausted(Exception):  # noqa: N818
+class CandidatesExhaustedError(Exception):
     """The episode failed after each candidate of a decision; backtrack to the previous decision.
 
     The failures are in the result of the episode already.
@@ -39,7 +39,7 @@ def order_candidates(
         result: result of the episode so far.
 
     Raises:
-        CandidatesExhausted: the episode has continued from as many candidates as the limits or its attempts allow.
+        CandidatesExhaustedError: the episode has continued from as many candidates as the limits or its attempts allow.
         PlanningError: no candidate could be played; the error of the last one.
     """
     failure, continued, remaining = PlanningError("decision", "no_candidate"), 0, iter(candidates)
@@ -61,7 +61,7 @@ def order_candidates(
             continued += 1
             if continued == limits.max_continued or result.out_of_attempts:
                 break
-    raise CandidatesExhausted if continued else failure
+    raise CandidatesExhaustedError if continued else failure
 
 
 class _RestartAttempt(Exception):  # noqa: N818
@@ -88,7 +88,7 @@ class _Decision:
         self.chosen: int | None = None
         try:
             self.next: tuple[int, bool] | Exception = self._order.send(outcome)
-        except (PlanningError, CandidatesExhausted) as error:
+        except (PlanningError, CandidatesExhaustedError) as error:
             self.next = error
 
 
@@ -111,7 +111,7 @@ class ResimulatedDecisions:
                 continue
             except PlanningError as error:
                 self._result.add_failure(error)
-            except CandidatesExhausted:
+            except CandidatesExhaustedError:
                 self._decisions.pop()
             # backtrack to the last decision that the episode continued from
             while self._decisions and self._decisions[-1].chosen is None:

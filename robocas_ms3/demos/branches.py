@@ -29,7 +29,7 @@ import torch
 from robocas_ms3.core.errors import PlanningError, RobocasError
 from robocas_ms3.core.remote_errors import RemoteError
 from robocas_ms3.core.signals import die_with_parent
-from robocas_ms3.demos.backtracking import CandidatesExhausted, order_candidates
+from robocas_ms3.demos.backtracking import CandidatesExhaustedError, order_candidates
 from robocas_ms3.demos.failures import EpisodeResult
 from robocas_ms3.planning.decisions import FIRST_FEASIBLE, SearchLimits
 
@@ -39,11 +39,11 @@ CANDIDATE_TIMEOUT, EPISODE_TIMEOUT = 300.0, 3600.0  # s of wall-clock time: one 
 _log = logging.getLogger(__name__)
 
 
-class ProcessFailed(Exception):  # noqa: N818
+class ForkedProcessError(Exception):
     """A forked process crashed or exceeded its time limit."""
 
 
-class ProcessCrashed(ProcessFailed):
+class ForkedProcessCrashError(ForkedProcessError):
     """A forked process ended without sending a result."""
 
 
@@ -58,16 +58,16 @@ class ForkedProcess:
         try:
             self.pipe.send(message)
         except OSError as error:
-            raise ProcessCrashed("crashed") from error
+            raise ForkedProcessCrashError("crashed") from error
 
     def receive(self, limit: float) -> Any:
-        """Return the next message of the process; raise ProcessFailed if none arrives within ``limit`` seconds."""
+        """Return the next message of the process; raise ForkedProcessError if none arrives within ``limit`` seconds."""
         try:
             if not self.pipe.poll(limit):
-                raise ProcessFailed("timed_out")
+                raise ForkedProcessError("timed_out")
             return self.pipe.recv()
         except (EOFError, OSError) as error:  # it ended before or while it sent a message
-            raise ProcessCrashed("crashed") from error
+            raise ForkedProcessCrashError("crashed") from error
 
     def kill(self) -> None:
         self.pipe.close()
@@ -146,7 +146,7 @@ class ForkedDecisions:
             attempt()
         except _Success:
             pass
-        except CandidatesExhausted:
+        except CandidatesExhaustedError:
             succeeded = False
         except PlanningError as error:
             self._result.failed(error)
@@ -196,9 +196,9 @@ class ForkedDecisions:
                 return None, 0.0
             try:
                 outcome = self._receive(child, CANDIDATE_TIMEOUT)
-            except ProcessFailed as error:
+            except ForkedProcessError as error:
                 outcome = PlanningError("branch", str(error))
-                if isinstance(error, ProcessCrashed) and not last:
+                if isinstance(error, ForkedProcessCrashError) and not last:
                     self._kill(child)
                     continue
             break
@@ -230,9 +230,9 @@ class ForkedDecisions:
         try:
             child.send(self._result)
             succeeded = self._receive(child, EPISODE_TIMEOUT)
-        except ProcessCrashed:
+        except ForkedProcessCrashError:
             return False
-        except ProcessFailed as error:
+        except ForkedProcessError as error:
             self._result.failed(PlanningError("branch", str(error)))
             return True
         finally:

@@ -17,7 +17,7 @@ CountFree = Callable[[Array], int]
 SPARSE = 8  # every SPARSE-th configuration of an edge is checked first
 
 
-class BudgetExceeded(Exception):
+class BudgetExceededError(Exception):
     """The budget of collision checks is used up."""
 
 
@@ -69,7 +69,7 @@ class PathSearch:
         """Return configurations (M, n) on the edge from ``a`` (assumed free) to ``b``; charge them to the budget."""
         count = max(1, int(np.ceil(np.linalg.norm(b - a) / self.spacing)))
         if self._remaining_checks < count:
-            raise BudgetExceeded
+            raise BudgetExceededError
         self._remaining_checks -= count
         return a + (b - a) * (np.arange(1, count + 1) / count)[:, None]
 
@@ -98,7 +98,7 @@ class PathSearch:
                         forward, backward = trees[0].branch(ends[0]), trees[1].branch(ends[1])
                         return forward + backward[::-1][1:]
                 grow, other = other, grow
-        except BudgetExceeded:
+        except BudgetExceededError:
             return None
 
     def _sample(self, start: Array, goals: list[Array], rng: np.random.Generator) -> Array:
@@ -137,7 +137,7 @@ class PathSearch:
                 if len(path) <= 2:
                     break
                 path = self._shortcut(path, rng)
-        except BudgetExceeded:
+        except BudgetExceededError:
             pass
         return path
 
@@ -150,7 +150,7 @@ class PathSearch:
                 try:
                     if self.is_edge_free(path[index], path[reach]):
                         break
-                except BudgetExceeded:
+                except BudgetExceededError:
                     return kept + path[index + 1 :]
                 reach = index + (reach - index) // 2
             kept.append(path[reach])

@@ -10,7 +10,7 @@ from synthetic_dataset import synthetic_dataset
 from training_runs import train
 
 from robocas_ms3.baselines.registry import BASELINES
-from robocas_ms3.cli.train import COMMANDS, Other, command
+from robocas_ms3.cli.train import COMMANDS, PluginBaseline, command
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def made_up(monkeypatch):
         monkeypatch.setitem(BASELINES.builtin, "made-up", lambda: replace(MADE_UP, **values))
 
     change()
-    monkeypatch.setitem(COMMANDS, "made-up", command("made-up", Other))
+    monkeypatch.setitem(COMMANDS, "made-up", command("made-up", PluginBaseline))
     return change
 
 

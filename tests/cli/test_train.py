@@ -9,13 +9,13 @@ from stub_baseline import MADE_UP
 
 from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.cli.main import run
-from robocas_ms3.cli.train import COMMANDS, Other, Training, command, config_changes
+from robocas_ms3.cli.train import COMMANDS, PluginBaseline, Training, command, config_changes
 
 
 @pytest.fixture
 def made_up(monkeypatch):
     monkeypatch.setitem(BASELINES.builtin, "made-up", lambda: MADE_UP)
-    monkeypatch.setitem(COMMANDS, "made-up", command("made-up", Other))
+    monkeypatch.setitem(COMMANDS, "made-up", command("made-up", PluginBaseline))
 
 
 def test_options_override_the_file_and_later_options_earlier_ones(tmp_path):

@@ -6,7 +6,7 @@ import pytest
 from branch_notes import Notes
 
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.demos.backtracking import CandidatesExhausted, ResimulatedDecisions, order_candidates
+from robocas_ms3.demos.backtracking import CandidatesExhaustedError, ResimulatedDecisions, order_candidates
 from robocas_ms3.demos.branches import ForkedDecisions
 from robocas_ms3.planning.decisions import IrreversibleDecisions, SearchLimits
 
@@ -140,7 +140,7 @@ def test_candidates_are_taken_as_they_are_needed():
     order = order_candidates(candidates(), SearchLimits(max_continued=1), Notes())
     assert order.send(None) == ("a", False)
     assert order.send(0.0) == ("a", True)
-    with pytest.raises(CandidatesExhausted):
+    with pytest.raises(CandidatesExhaustedError):
         order.send(None)
 
 
@@ -148,5 +148,5 @@ def test_attempts_are_counted():
     order = order_candidates("abc", SearchLimits(), notes := Notes(max_attempts=1))
     assert (next(order), order.send(0.0)) == (("a", False), ("a", True))
     notes.add_failure(PlanningError("end", "a"))
-    with pytest.raises(CandidatesExhausted):
+    with pytest.raises(CandidatesExhaustedError):
         order.send(None)

@@ -21,7 +21,7 @@ from robocas_ms3.datasets.checks.violation import read_object
 from robocas_ms3.datasets.conversion.workers import EpisodeWriter, InputEpisode
 from robocas_ms3.datasets.images.image_files import ImageOptions, write_image
 from robocas_ms3.datasets.images.image_headers import check_ends
-from robocas_ms3.datasets.images.preview_frames import EpisodeDrawing
+from robocas_ms3.datasets.images.preview_frames import EpisodeDrawer
 from robocas_ms3.datasets.images.video import open_preview
 from robocas_ms3.datasets.sources.arrays import add_embeddings, read_arrays
 from robocas_ms3.datasets.sources.episode_source import CameraModel, StepImages
@@ -53,7 +53,7 @@ class FolderWriter(EpisodeWriter):
                 (folder / camera / kind).mkdir(parents=True)
         with ExitStack() as stack:
             if self.sheet is not None:
-                drawing = EpisodeDrawing(wanted.number, arrays, wanted.given.source.rate_hz)
+                drawing = EpisodeDrawer(wanted.number, arrays, wanted.given.source.rate_hz)
                 preview = stack.enter_context(open_preview(self.out, drawing, row=wanted.number in self.sheet))
             encode = stack.enter_context(_encoder())
             in_order = stack.enter_context(_encoder(1))  # frames of a video

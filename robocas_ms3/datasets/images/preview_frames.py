@@ -25,8 +25,8 @@ _LEFT, _CAPTION, _GAP, _BELOW = 110, 30, 3, 10  # of a row
 _INK, _FAINT, _PAPER = (245, 245, 245), (170, 180, 190), (24, 26, 30)
 
 
-class EpisodeDrawing:
-    """Drawing of the images of an episode with its instruction, sub-goals and gripper state."""
+class EpisodeDrawer:
+    """Drawer of the images of an episode with its instruction, sub-goals and gripper state."""
 
     def __init__(self, number: int, arrays: Mapping[str, NDArray], rate_hz: float) -> None:
         self.number, self.rate_hz = number, rate_hz

@@ -16,7 +16,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import atomic_file, make_folder
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.images.png import encode_png
-from robocas_ms3.datasets.images.preview_frames import EpisodeDrawing, Images
+from robocas_ms3.datasets.images.preview_frames import EpisodeDrawer, Images
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource, ImageKind, iter_images
 
 PANEL, PREVIEW_PANEL = (426, 320), (320, 240)
@@ -61,7 +61,7 @@ def write_video(
         raise DatasetError("invalid speed", where="speed", expected="> 0", found=speed)
     path = Path(path)
     episode = dataset.episode(number)
-    drawing = EpisodeDrawing(number, episode.arrays, dataset.rate_hz)
+    drawing = EpisodeDrawer(number, episode.arrays, dataset.rate_hz)
     with (
         atomic_file(path) as tmp,
         open_video(tmp, dataset.rate_hz * speed) as video,
@@ -83,7 +83,7 @@ def contact_sheet(
 class Preview:
     """Video and contact sheet row of an episode that is being converted; see `open_preview`."""
 
-    def __init__(self, video: Any, drawing: EpisodeDrawing, *, row: bool) -> None:
+    def __init__(self, video: Any, drawing: EpisodeDrawer, *, row: bool) -> None:
         self.row: NDArray[np.uint8] | None = None
         """Row of the contact sheet, (H, W, 3) RGB; set after the last frame, if requested."""
         self._video, self._drawing, self._wanted = video, drawing, drawing.row_steps if row else []
@@ -99,7 +99,7 @@ class Preview:
 
 
 @contextmanager
-def open_preview(root: Path, drawing: EpisodeDrawing, *, row: bool) -> Iterator[Preview]:
+def open_preview(root: Path, drawing: EpisodeDrawer, *, row: bool) -> Iterator[Preview]:
     """Open the preview of an episode; ``row``: with a row of the contact sheet."""
     path = make_folder(root / schema.PREVIEW_FOLDER) / f"{schema.episode_folder(drawing.number)}.mp4"
     with atomic_file(path) as tmp, open_video(tmp, drawing.rate_hz, *_PREVIEW_OPTIONS, quality=6) as video:
@@ -121,7 +121,7 @@ def finish_previews(dataset: EpisodeSource, rows: dict[int, NDArray[np.uint8]]) 
 
 def _row(dataset: EpisodeSource, number: int, kind: ImageKind = "rgb") -> NDArray[np.uint8]:
     episode, shown = dataset.episode(number), {}
-    drawing = EpisodeDrawing(number, episode.arrays, dataset.rate_hz)
+    drawing = EpisodeDrawer(number, episode.arrays, dataset.rate_hz)
     image = episode.rgb if kind == "rgb" else episode.depth
     for step in drawing.row_steps:
         shown[step] = _coloured({camera: image(camera, step) for camera in episode.cameras}, kind)

@@ -94,8 +94,8 @@ class _Recovery(_Part):
     reason: str
 
 
-class Recorded(_Part):
-    """``recorded``."""
+class RecordedDetails(_Part):
+    """Details of the recording, the key ``recorded`` of scene.json."""
 
     instruction_template: str | None = None
     relation: str | None = None
@@ -191,7 +191,7 @@ class SceneRecord(_Part):
     source: _Source = Field(
         description="{trajectory, episode_id, recording: SHA-256 of seed, control mode, instruction and actions}"
     )
-    recorded: Recorded | None = Field(
+    recorded: RecordedDetails | None = Field(
         description="what the generator said of the episode: template, relation, facts, attempts, seconds"
     )
     versions: dict[str, Any] | None = Field(description="{package: version} the episode was generated with")

@@ -17,7 +17,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import ACTION_ARRAYS, ACTION_NAMES, require_actions
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.sources.episode_source import SourceEpisode
-from robocas_ms3.datasets.sources.file_models import Layout, Recorded, SceneRecord, read_scene
+from robocas_ms3.datasets.sources.file_models import Layout, RecordedDetails, SceneRecord, read_scene
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.provenance import task_of
 from robocas_ms3.datasets.statistics.layouts import LayoutMap, Placement, layout_map, round_values, surface_of
@@ -60,7 +60,7 @@ class Stats:
         """Count what ``scene.json`` has of an episode; return its configuration, and where its objects stood."""
         where = f"{episode.where}/{schema.SCENE_FILE}"
         scene = read_scene(episode.scene, where)
-        recorded, target, config = scene.recorded or Recorded(), scene.target, _config_name(scene)
+        recorded, target, config = scene.recorded or RecordedDetails(), scene.target, _config_name(scene)
         try:
             layout, surface = Layout.model_validate(episode.layout), surface_of(scene.config or {})
         except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:

@@ -12,7 +12,7 @@ from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.conversion import convert as conversion
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.images import video
-from robocas_ms3.datasets.images.preview_frames import EpisodeDrawing
+from robocas_ms3.datasets.images.preview_frames import EpisodeDrawer
 from robocas_ms3.datasets.images.video import PREVIEW_PANEL, contact_sheet
 from robocas_ms3.datasets.sources.reader import Dataset
 
@@ -48,7 +48,7 @@ def test_shows_what_the_dataset_holds(trajectory, tmp_path, monkeypatch):
         episode = dataset.episode(number)
         for step, frame in enumerate(frames):
             images = {camera: episode.rgb(camera, step) for camera in episode.cameras}
-            drawn = EpisodeDrawing(number, episode.arrays, 5).frame(step, images, PREVIEW_PANEL)
+            drawn = EpisodeDrawer(number, episode.arrays, 5).frame(step, images, PREVIEW_PANEL)
             assert frame.shape == drawn.shape == (PREVIEW_PANEL[1] + 64, 3 * PREVIEW_PANEL[0], 3)
             assert np.abs(frame.astype(int) - drawn).mean() < 4, "H.264 loses little"
     of_images = np.asarray(Image.open(contact_sheet(Dataset(out), tmp_path / "sheet.png")))

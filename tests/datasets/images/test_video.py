@@ -6,14 +6,14 @@ from PIL import Image
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import atomic_file
-from robocas_ms3.datasets.images.preview_frames import THUMBNAIL, EpisodeDrawing
+from robocas_ms3.datasets.images.preview_frames import THUMBNAIL, EpisodeDrawer
 from robocas_ms3.datasets.images.video import PANEL, colour_depth, contact_sheet, open_video, write_video
 from robocas_ms3.datasets.sources.reader import Dataset
 
 
 def video_frame(episode, step, number=0):
     images = {camera: episode.rgb(camera, step) for camera in episode.cameras}
-    return EpisodeDrawing(number, episode.arrays, 5).frame(step, images, PANEL)
+    return EpisodeDrawer(number, episode.arrays, 5).frame(step, images, PANEL)
 
 
 def test_videos_show_every_step_in_real_time(made, tmp_path):
@@ -82,7 +82,7 @@ def test_depth_colours():
 def test_steps_of_a_row(made):
     arrays = Dataset(made).episode(0).arrays
     for count, steps in ((65, [0, 9, 18, 27, 37, 46, 55, 64]), (3, [0, 0, 1, 1, 1, 1, 2, 2])):
-        assert EpisodeDrawing(0, arrays | {"step_lang_goals": np.array(["x"] * count)}, 5).row_steps == steps
+        assert EpisodeDrawer(0, arrays | {"step_lang_goals": np.array(["x"] * count)}, 5).row_steps == steps
 
 
 def test_errors(made, tmp_path):
