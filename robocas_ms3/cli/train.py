@@ -135,7 +135,7 @@ def train(baseline: str, cfg: Training) -> int:
             baseline,
             data,
             out.absolute(),
-            config_changes(cfg),
+            layers=config_layers(cfg),
             init_from=init_from,
             device=cfg.device,
             overwrite=cfg.overwrite,
@@ -154,15 +154,15 @@ def _default_out(baseline: str, data: Path | None) -> Path:
     return Path("runs") / f"{baseline}-{data.parent.name if data.is_file() else data.name}"
 
 
-def config_changes(cfg: Training) -> dict[str, Any]:
-    """Return the configuration values of --config and of the options; options override the file."""
+def config_layers(cfg: Training) -> list[tuple[str, dict[str, Any]]]:
+    """Return (source, values) of the file of --config and of the options, which override the file."""
     from robocas_ms3.baselines.training.session import merge_configs
     from robocas_ms3.core.checks import check_number
     from robocas_ms3.core.documents import load_yaml
     from robocas_ms3.core.errors import TrainingError
     from robocas_ms3.scenes.config.compose import parse_override
 
-    found: dict[str, Any] = {}
+    layers: list[tuple[str, dict[str, Any]]] = []
     if cfg.config is not None:
         try:
             read = load_yaml(cfg.config)
@@ -174,11 +174,12 @@ def config_changes(cfg: Training) -> dict[str, Any]:
             raise TrainingError(
                 "invalid configuration", where=cfg.config, expected="a mapping", found=type(read).__name__
             )
-        found = read
+        layers.append((str(cfg.config), read))
+    found: dict[str, Any] = {}
     for text in cfg.set:
         found = merge_configs(found, parse_override(text, TrainingError, "train.seed=1"))
     for key, least in {"steps": 1, "batch_size": 1, "seed": 0}.items():
         if (value := getattr(cfg, key)) is not None:
             check_number(f"--{key.replace('_', '-')}", value, least)
             found = merge_configs(found, {"train": {key: value}})
-    return found
+    return [*layers, ("--set", found)]

@@ -23,6 +23,8 @@ class RobocasError(Exception):
     ) -> None:
         self.what, self.where, self.expected, self.found, self.fix = what, where, expected, found, fix
         head = f"{where}: {what}" if str(where) else what
+        if isinstance(found, OSError) and found.strerror:  # without the number
+            found = f"{found.strerror}: {found.filename}" if found.filename else found.strerror
         parts = [f"{name} {value}" for name, value in (("expected", expected), ("found", found)) if str(value)]
         message = head + (f" ({', '.join(parts)})" if parts else "") + (f". {fix}" if fix else "")
         super().__init__(message)

@@ -249,7 +249,8 @@ def _read(folder: Path) -> Result:
         run = parse(RunRecord, record, EvaluationError, where=folder / RUN, about=_NO_RESULT)
         return Result(folder, run, dict(sorted(_outcomes(folder).items())))
     except (OSError, ValueError) as error:
-        raise EvaluationError(_NO_RESULT, where=folder, found=error) from error
+        fix = "" if (folder / RUN).exists() else "Pass the --out folder of robocas eval."
+        raise EvaluationError(_NO_RESULT, where=folder, found=error, fix=fix) from error
 
 
 def _outcomes(folder: Path) -> dict[int, Outcome]:

@@ -9,7 +9,7 @@ from stub_baseline import MADE_UP
 
 from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.cli.main import run
-from robocas_ms3.cli.train import COMMANDS, PluginBaseline, Training, command, config_changes
+from robocas_ms3.cli.train import COMMANDS, PluginBaseline, Training, command, config_layers
 
 
 @pytest.fixture
@@ -22,12 +22,11 @@ def test_options_override_the_file_and_later_options_earlier_ones(tmp_path):
     file = tmp_path / "c.yaml"
     file.write_text("chunk: 4\ntrain: {steps: 10, seed: 1, ema: 0.5}\nviews: {gripper_camera: null}\n")
     values = ("chunk=5", "train.seed=2", "train.learning_rate=3e-4", "chunk=6")
-    found = config_changes(Training(config=file, set=values, steps=20, batch_size=8, seed=3))
-    assert found == {
-        "chunk": 6,
-        "views": {"gripper_camera": None},
-        "train": {"steps": 20, "seed": 3, "ema": 0.5, "learning_rate": 3e-4, "batch_size": 8},
-    }
+    layers = config_layers(Training(config=file, set=values, steps=20, batch_size=8, seed=3))
+    assert layers == [
+        (str(file), {"chunk": 4, "train": {"steps": 10, "seed": 1, "ema": 0.5}, "views": {"gripper_camera": None}}),
+        ("--set", {"chunk": 6, "train": {"steps": 20, "seed": 3, "learning_rate": 3e-4, "batch_size": 8}}),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -36,7 +35,7 @@ def test_options_override_the_file_and_later_options_earlier_ones(tmp_path):
         (None, "c.yaml: no such file"),
         ("a: [", "c.yaml: unreadable file"),
         ("- a", "invalid configuration.*a mapping.*list"),
-        ("widht: 3", "Did you mean width"),
+        ("widht: 3", "c.yaml: unknown key 'widht'.*Did you mean width"),
     ],
 )
 def test_invalid_configuration_files(made_up, tmp_path, capsys, content, expected):
@@ -51,12 +50,21 @@ def test_invalid_configuration_files(made_up, tmp_path, capsys, content, expecte
     assert not (tmp_path / "run").exists()
 
 
-def test_a_training_from_the_command_line(made_up, tmp_path, monkeypatch, capsys):
+def test_unknown_key_of_set_exits_with_2(made_up, tmp_path, capsys):
+    data, file = tmp_path / "data.h5", tmp_path / "c.yaml"
+    data.write_text("demonstrations")
+    file.write_text("width: 3\n")
+    words = ["train", "made-up", "--data", str(data), "--out", str(tmp_path / "run"), "--config", str(file)]
+    assert run([*words, "--set", "widht=4"]) == 2
+    assert "error: --set: unknown key 'widht'" in capsys.readouterr().err
+
+
+def test_training_from_the_command_line(made_up, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("data.h5").write_text("demonstrations")
     options = ["--steps", "8", "--batch-size", "2", "--seed", "5", "--set", "width=3", "--device", "cpu"]
     assert run(["train", "made-up", "--data", "data.h5", *options]) == 0
-    made = Path("runs") / f"made-up-{tmp_path.name}"  # a trajectory's folder says more than its name
+    made = Path("runs") / f"made-up-{tmp_path.name}"  # named by the folder of the trajectory
     record = json.loads((made / "run.json").read_text())
     assert record["config"]["width"] == 3
     assert [record["config"]["train"][key] for key in ("steps", "batch_size", "seed")] == [8, 2, 5]

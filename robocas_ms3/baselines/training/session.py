@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -51,6 +51,7 @@ class RunOptions:
         data: dataset folder or trajectory.h5; None for a baseline that learns in simulation.
         out: folder of the run.
         changes: nested values that differ from the default configuration; a run that continues needs none.
+        layers: (source, nested values) of files and options, below ``changes``; errors name the source.
         init_from: folder of a run with the initial weights; also its scales and, below ``changes``, its configuration.
         device: ``auto``, ``cpu`` or ``cuda``.
         overwrite: start again; the run in ``out`` is replaced when the data is read.
@@ -60,6 +61,7 @@ class RunOptions:
     data: Path | None
     out: Path
     changes: Mapping[str, Any] = field(default_factory=dict)
+    layers: Sequence[tuple[str, Mapping[str, Any]]] = ()
     init_from: Path | None = None
     device: str = "auto"
     overwrite: bool = False
@@ -100,9 +102,11 @@ def train_run(options: RunOptions, progress: Progress | None = None) -> RunRecor
         recorded = _read_recorded(output, baseline)
         initial = load_initial_weights(baseline, options.init_from, recorded, options.out)
         base = recorded or (initial.record if initial else None)
-        below = base.config if base else baseline.Config().model_dump(mode="json")
-        changed = merge_configs(below, options.changes)
-        config = parse(baseline.Config, changed, TrainingError, where=baseline.name)
+        values = base.config if base else baseline.Config().model_dump(mode="json")
+        config: Any = None
+        for source, changes in (*options.layers, (baseline.name, options.changes)):
+            values = merge_configs(values, changes)
+            config = parse(baseline.Config, values, TrainingError, where=source)
         settings: dict[str, Any] = {"config": config.model_dump(mode="json")}
         output.check_settings(settings | ({"init_from": initial.name} if initial else {}))
         accelerator = make_accelerator(options.device, _precision(config.train.precision, recorded))
