@@ -1,5 +1,5 @@
-"""LeRobot's own policies (ACT, diffusion, ...) on our data and in our evaluation; docs/baselines_lerobot.md.
+"""LeRobot's policies (ACT, diffusion, ...), trained on exported datasets and evaluated over the policy socket.
 
-``prepare`` narrows a dataset to what the policy socket sends, and runs here; ``serve`` runs in LeRobot's environment
-and serves a checkpoint; ``policy`` has the observations that both use.
+``prepare`` reduces a dataset to what the policy socket sends. ``serve`` serves a checkpoint, in LeRobot's environment.
+``policy`` has the observations that both use. More: docs/baselines_lerobot.md.
 """

@@ -1,4 +1,4 @@
-"""A LeRobot policy as one of ours; runs in LeRobot's environment, and uses nothing but the policy's methods."""
+"""Adapter from a LeRobot policy to `Policy`; runs in LeRobot's environment and uses only the policy's methods."""
 
 from __future__ import annotations
 
@@ -20,72 +20,78 @@ from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH, STATE
 
 EMBEDDING, ACTION = "observation.environment_state", "action"
-"""Keys of LeRobot. Its policies take what is no robot's as the environment's state; ours holds the instruction."""
+"""Keys of LeRobot; here the environment's state is the embedding of the instruction."""
 STATE_NAMES = (
     *("x", "y", "z"),
     *("xx", "xy", "xz", "yx", "yy", "yz"),
     *(f"joint_{number}" for number in range(1, 8)),
     GRIPPER_WIDTH,
 )
-"""TCP in the arm's base, m; its x and y axes there; rad; m."""
-DIMENSIONS = 384  # of an embedding
+"""TCP position in the arm's base frame, m; its x and y axes there; joints, rad; gripper width, m."""
+DIMENSIONS = 384  # size of an embedding
 _IMAGES = "observation.images."
 Processor = Callable[[Any], Any]
 
 
-def state_of(position: NDArray, xyzw: NDArray, joints: NDArray, width: NDArray) -> NDArray[np.float32]:
-    """Return the state (N, 17) of `STATE_NAMES`.
+def make_state(position: NDArray, xyzw: NDArray, joints: NDArray, width: NDArray) -> NDArray[np.float32]:
+    """Return states (N, 17) as in `STATE_NAMES`.
 
-    Axes stand for the orientation, as the sign of the quaternion of a gripper that points down is random. The pose of
-    the base is left out: the policy socket does not send it.
+    Axes represent the orientation, because the sign of a quaternion of a gripper that points down is random. The pose
+    of the base is not included: the policy socket does not send it.
 
     Args:
-        position: (N, 3) m, of the TCP in the arm's base.
-        xyzw: (N, 4) its orientation there.
+        position: (N, 3) TCP position in the arm's base frame, m.
+        xyzw: (N, 4) TCP orientation in the arm's base frame.
         joints: (N, 7) rad.
-        width: (N, 1) m.
+        width: (N, 1) gripper width, m.
     """
-    turns = Rotation.from_quat(np.asarray(xyzw, np.float64)).as_matrix()
-    return np.concatenate([position, turns[:, :, 0], turns[:, :, 1], joints, width], axis=1).astype(np.float32)
+    axes = Rotation.from_quat(np.asarray(xyzw, np.float64)).as_matrix()
+    return np.concatenate([position, axes[:, :, 0], axes[:, :, 1], joints, width], axis=1).astype(np.float32)
 
 
 def scale_embeddings(embeddings: NDArray) -> NDArray[np.float32]:
-    """Scale embeddings (N, 384) so that a number of them is about 1: LeRobot does not normalise them."""
+    """Scale embeddings (N, 384) to components of about 1: LeRobot does not normalise them."""
     return (np.asarray(embeddings) * np.sqrt(DIMENSIONS)).astype(np.float32)
 
 
 class LeRobotPolicy:
-    """Asks a LeRobot policy for one action per step and env, as LeRobot's own rollouts do.
+    """Policy that calls a LeRobot policy once per step and env, as LeRobot's rollouts do.
 
-    A LeRobot policy holds its history and the rest of its chunk itself, for one batch of envs that start together.
-    Our envs start at any time, so each has a copy of the policy that shares the weights and has its own queues.
+    A LeRobot policy stores its history and the rest of a chunk, for one batch of envs that start together. Envs of an
+    evaluation start at any time, so each env has a copy of the policy with shared weights and its own queues.
 
     Args:
-        model: with ``reset`` and ``select_action``.
-        before: LeRobot's preprocessor: one observation to a normalised batch of one.
-        after: its postprocessor: an action (1, 7) back in m, rad and the gripper's opening.
-        inputs: shape by key, as in the checkpoint's configuration; images are (3, H, W).
+        model: LeRobot policy, with ``reset`` and ``select_action``.
+        preprocessor: LeRobot's preprocessor, from one observation to a normalised batch of one.
+        postprocessor: LeRobot's postprocessor, to an action (1, 7) in m, rad and gripper command.
+        inputs: shape of each input, as in the checkpoint's configuration; images are (3, H, W).
         rate_hz: actions per second.
-        about: what results record about the policy.
+        description: entries of `describe`.
+
+    Raises:
+        EvaluationError: the inputs are not those of a dataset that `prepare` made.
     """
 
     def __init__(
         self,
         model: Any,
-        before: Processor,
-        after: Processor,
+        preprocessor: Processor,
+        postprocessor: Processor,
         inputs: Mapping[str, tuple[int, ...]],
         rate_hz: float,
-        about: Mapping[str, Any] | None = None,
+        description: Mapping[str, Any] | None = None,
     ) -> None:
-        self._model, self._before, self._after, self._about = model, before, after, dict(about or {})
+        self._model, self._preprocessor, self._postprocessor = model, preprocessor, postprocessor
+        self._description = dict(description or {})
         self._inputs, cameras = dict(inputs), {}
         for key, shape in self._inputs.items():
             if re.fullmatch(f"{_IMAGES}{CAMERA_NAME}", key) and len(shape) == 3:
                 cameras[key.removeprefix(_IMAGES)] = (shape[2], shape[1])
             elif {STATE: (len(STATE_NAMES),), EMBEDDING: (DIMENSIONS,)}.get(key) != tuple(shape):
-                fix = "Train on a dataset that robocas_ms3.baselines.lerobot.prepare made."
-                raise EvaluationError("a policy of another dataset", where=key, found=list(shape), fix=fix)
+                fix = "Train on a dataset of `python -m robocas_ms3.baselines.lerobot.prepare`."
+                raise EvaluationError(
+                    "the policy has other inputs than prepared datasets", where=key, found=list(shape), fix=fix
+                )
         self.spec = PolicySpec(
             convention="robocas",
             reference="tcp",
@@ -97,30 +103,32 @@ class LeRobotPolicy:
         self._draws: dict[int, np.random.Generator] = {}
 
     def describe(self) -> dict[str, Any]:
-        return self._about
+        return self._description
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
-        """Start episodes: queues are emptied, noise episodes with the episode's seed."""
+        """Start episodes: empty the queues, and seed the noise with the episode's seed."""
         for episode in episodes:
             self._models[episode.env] = _copy_with_queues(self._model)
             self._draws[episode.env] = np.random.default_rng([episode.seed, episode.episode])
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Return actions (E, 7), of each env by itself, so that they do not depend on the other envs."""
+        """Return actions (E, 7), computed per env, so that they do not depend on the other envs."""
         return np.stack([self._act(env, observations, row) for row, env in enumerate(observations.envs.tolist())])
 
     def _act(self, env: int, observations: Observations, row: int) -> NDArray[np.float32]:
-        torch.manual_seed(int(self._draws[env].integers(2**63)))  # diffusion draws noise
+        torch.manual_seed(int(self._draws[env].integers(2**63)))  # for the noise of diffusion policies
         with torch.inference_mode():
-            action = self._after(self._models[env].select_action(self._before(self._item(observations, row))))
+            action = self._postprocessor(
+                self._models[env].select_action(self._preprocessor(self._item(observations, row)))
+            )
         return action.reshape(-1).to("cpu", torch.float32).numpy()
 
     def _item(self, observations: Observations, row: int) -> dict[str, Any]:
-        """Return an observation like an item of LeRobot's datasets: no batch axis, images (3, H, W) from 0 to 1."""
+        """Return an observation as an item of a LeRobot dataset: no batch axis, images (3, H, W) in 0..1."""
         one = slice(row, row + 1)
         tcp = observations.tcp_in_base[one]
         joints = observations.qpos[one, RobotDescription.arm_slice]
-        state = state_of(tcp[:, :3], tcp[:, [4, 5, 6, 3]], joints, observations.robot[GRIPPER_WIDTH][one])
+        state = make_state(tcp[:, :3], tcp[:, [4, 5, 6, 3]], joints, observations.robot[GRIPPER_WIDTH][one])
         item: dict[str, Any] = {"task": observations.instructions[row], STATE: torch.from_numpy(state[0])}
         if EMBEDDING in self._inputs:
             assert observations.embeddings is not None
@@ -134,7 +142,7 @@ class LeRobotPolicy:
 def _copy_with_queues(model: Any) -> Any:
     copied = copy.copy(model)
     for name, value in vars(model).items():
-        if hasattr(value, "reset"):  # such as ACT's ensembler, which is no module and is reset in place
+        if hasattr(value, "reset"):  # such as ACT's temporal ensembler, which is reset in place
             setattr(copied, name, copy.copy(value))
         elif isinstance(value, deque | dict) and name.endswith(("queue", "queues")):
             setattr(copied, name, copy.deepcopy(value))

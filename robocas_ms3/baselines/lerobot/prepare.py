@@ -1,10 +1,10 @@
-"""Make of a LeRobot export what LeRobot's policies train on: what the socket sends, and the instruction as numbers.
+"""Reduce a LeRobot export to what the policy socket sends, with the instruction's embedding, for LeRobot's training.
 
     python -m robocas_ms3.baselines.lerobot.prepare DATASET OUT [--no-language]
 
-Images and episodes stay as they are (videos are hard links). The state is that of `policy.STATE_NAMES`;
-``observation.environment_state`` is the sentence embedding of a frame's instruction, as LeRobot's ACT and diffusion
-policy read no text. Of the actions only ``action`` is left.
+Images and episodes do not change (videos are hard links). The state is that of `policy.STATE_NAMES`.
+``observation.environment_state`` is the sentence embedding of the frame's instruction, because LeRobot's ACT and
+diffusion policy do not read text. Other actions than ``action`` are removed.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from robocas_ms3.baselines.lerobot.policy import (
     DIMENSIONS,
     EMBEDDING,
     STATE_NAMES,
+    make_state,
     scale_embeddings,
-    state_of,
 )
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import atomic_folder, write_json
@@ -47,21 +47,25 @@ from robocas_ms3.robots.quantities import GRIPPER_WIDTH, STATE
 
 Embed = Callable[[Sequence[str]], NDArray[np.float32]]
 _NOT_COPIED = ("data", "episodes", "robocas", "depth", ".parts", STAGING)
-"""Folders that are written here, or that the policies do not need."""
+"""Folders that `prepare` writes, or that the policies do not need."""
 
 
 def prepare(source: Path, out: Path, embed: Embed | None) -> None:
-    """Write the dataset; the folder appears when all is written.
+    """Write the reduced dataset atomically.
 
     Args:
-        source: of ``robocas convert --to lerobot``.
-        out: to make.
-        embed: texts to (N, 384) of unit length; None: no instruction, which policies then do not know.
+        source: dataset folder of ``robocas convert --to lerobot``.
+        out: output folder.
+        embed: function from texts to embeddings (N, 384) of unit length; None: no embeddings.
+
+    Raises:
+        DatasetError: the source is not such a dataset, or its base moves.
+        OutputExistsError: the output folder is in use.
     """
     check_replaceable(out)
     dataset = _open(source)
     features = dataset.info["features"]
-    depths = [key for key, feature in features.items() if is_depth(feature)]  # policies would take it for RGB
+    depths = [key for key, feature in features.items() if is_depth(feature)]  # policies would read them as RGB
     with atomic_folder(out) as part:
         ignored = shutil.ignore_patterns(*_NOT_COPIED, *depths)
         shutil.copytree(source, part, ignore=ignored, copy_function=_link, dirs_exist_ok=True)
@@ -79,7 +83,9 @@ def prepare(source: Path, out: Path, embed: Embed | None) -> None:
                 tables.append(pa.table({**{key: as_column(values) for key, values in columns.items()}, **indices}))
             _write(pa.concat_tables(tables), part / path.relative_to(source))
         for path in sorted((source / "meta" / "episodes").rglob("*.parquet")):
-            table = pq.read_table(path)  # LeRobot reads no statistics of episodes, and these are of other columns
+            table = pq.read_table(
+                path
+            )  # statistics per episode: LeRobot does not read them, and they are of other columns
             left_out = ("stats/", *(f"videos/{key}/" for key in depths))
             names = [name for name in table.column_names if not name.startswith(left_out)]
             _write(table.select(names), part / path.relative_to(source))
@@ -87,13 +93,15 @@ def prepare(source: Path, out: Path, embed: Embed | None) -> None:
 
 
 def _open(source: Path) -> LeRobotDataset:
-    what, fix = "not a LeRobot dataset that this package wrote", "Make one: robocas convert F.h5 --to lerobot --out DIR"
+    what = "not a LeRobot dataset of this package"
+    fix = "Convert a trajectory: robocas convert TRAJECTORY --to lerobot --out DIR"
     try:
         dataset = LeRobotDataset(source)
     except DatasetError as error:
         raise DatasetError(what, where=source, found=error, fix=fix) from error
     if dataset.layout is not V3 or not dataset.is_robocas or not dataset.cameras:
-        expected, version = f"{V3.codebase_version}, our columns, a camera", dataset.info["codebase_version"]
+        expected = f"{V3.codebase_version}, columns of robocas convert, a camera"
+        version = dataset.info["codebase_version"]
         raise DatasetError(what, where=source, expected=expected, found=version, fix=fix)
     return dataset
 
@@ -102,7 +110,7 @@ def _columns(episode: LeRobotEpisode, vectors: dict[str, NDArray[np.float32]]) -
     arrays, steps = episode.arrays, episode.steps
     check_base_is_fixed(arrays["rel_agv_pose"], episode.where)
     parts = (arrays[key].reshape(steps, -1) for key in ("ee_pos", "ee_orn", "robot_joints", GRIPPER_WIDTH))
-    columns: dict[str, NDArray] = {STATE: state_of(*parts), ACTION: episode.columns[ACTION].astype(np.float32)}
+    columns: dict[str, NDArray] = {STATE: make_state(*parts), ACTION: episode.columns[ACTION].astype(np.float32)}
     if vectors:
         columns[EMBEDDING] = np.tile(vectors[episode.instruction], (steps, 1))
     return columns
@@ -127,17 +135,19 @@ def _write(table: pa.Table, path: Path) -> None:
 
 
 def _link(source: str, target: str) -> None:
-    with suppress(OSError):  # another disk, or one without links
+    with suppress(OSError):  # another disk, or a disk without hard links
         if source.endswith(".mp4"):
             return os.link(source, target)
     shutil.copyfile(source, target)
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description="Make a LeRobot export fit for LeRobot's policies on our socket.")
-    parser.add_argument("dataset", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--no-language", action="store_true", help="leave the instruction out")
+    parser = argparse.ArgumentParser(
+        description="Reduce a LeRobot export to what the policy socket sends, for the training of LeRobot's policies."
+    )
+    parser.add_argument("dataset", type=Path, help="dataset folder of `robocas convert --to lerobot`")
+    parser.add_argument("out", type=Path, help="output folder")
+    parser.add_argument("--no-language", action="store_true", help="leave out the embedding of the instruction")
     cfg = parser.parse_args(words)
     try:
         embed = None

@@ -1,4 +1,4 @@
-"""LeRobot policies around a stub model: what they are shown, queues of envs, what is refused. LeRobot is not needed."""
+"""LeRobotPolicy with a stub model: observations, queues per env, refused inputs. LeRobot is not needed."""
 
 from collections import deque
 
@@ -7,8 +7,8 @@ import pytest
 import torch
 from synthetic_observations import observe, start
 
-from robocas_ms3.baselines.lerobot.policy import EMBEDDING, LeRobotPolicy, scale_embeddings, state_of
-from robocas_ms3.baselines.lerobot.serve import main, open_checkpoint, rate_of
+from robocas_ms3.baselines.lerobot.policy import EMBEDDING, LeRobotPolicy, make_state, scale_embeddings
+from robocas_ms3.baselines.lerobot.serve import load_policy, main, read_rate
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policy import describe
 from robocas_ms3.robots.quantities import STATE
@@ -18,7 +18,7 @@ HALF = float(np.sqrt(0.5))
 
 
 class Chunks(torch.nn.Module):
-    """Plays chunks of three, as LeRobot's ACT does: width of the gripper when asked, how many are left, noise."""
+    """Model with chunks of three actions, as LeRobot's ACT: gripper width at the prediction, actions left, noise."""
 
     def __init__(self):
         super().__init__()
@@ -47,16 +47,16 @@ class Ensembler:
         self.count = 0
 
 
-def before(item):
+def preprocess(item):
     return {key: value[None] if isinstance(value, torch.Tensor) else value for key, value in item.items()}
 
 
 def made(model=None, inputs=None):
-    return LeRobotPolicy(model or Chunks(), before, lambda action: 2 * action, inputs or INPUTS, 5.0)
+    return LeRobotPolicy(model or Chunks(), preprocess, lambda action: 2 * action, inputs or INPUTS, 5.0)
 
 
-def shown(widths):
-    """Widths of grippers by env."""
+def observations(widths):
+    """Return observations for gripper widths by env."""
     count = len(widths)
     images = np.zeros((count, 2, 4, 3), np.uint8)
     images[:, 0, 1] = 255, 0, 51
@@ -75,13 +75,13 @@ def test_the_spec_follows_from_the_checkpoint():
     assert (spec.convention, spec.reference, spec.rate_hz, spec.language) == ("robocas", "tcp", 5.0, "embedding")
     assert spec.cameras == {"base_camera": (4, 2)}
     assert made(inputs={STATE: (17,)}).spec.language == "text"
-    policy = LeRobotPolicy(Chunks(), before, before, INPUTS, 5.0, {"weights": "abc"})
+    policy = LeRobotPolicy(Chunks(), preprocess, preprocess, INPUTS, 5.0, {"weights": "abc"})
     assert describe(policy)["weights"] == "abc"
 
 
 @pytest.mark.parametrize("key, shape", [(STATE, (18,)), (EMBEDDING, (7,)), ("observation.images.wrist", (3, 2, 4))])
-def test_a_policy_of_another_dataset_is_refused(key, shape):
-    with pytest.raises(EvaluationError, match=f"{key}: a policy of another dataset"):
+def test_other_inputs_are_refused(key, shape):
+    with pytest.raises(EvaluationError, match=f"{key}: the policy has other inputs"):
         made(inputs={**INPUTS, key: shape})
 
 
@@ -89,9 +89,9 @@ def test_an_observation_is_an_item_of_the_dataset():
     model = Chunks()
     policy = made(model)
     policy.reset([start(0)])
-    policy.act(shown({0: 0.07}))
+    policy.act(observations({0: 0.07}))
     seen = model.seen[0]  # the list is shared by copies
-    expected = [0.1, 0.2, 0.3, 0, 1, 0, -1, 0, 0, 3, 4, 5, 6, 7, 8, 9, 0.07]  # x axis is y's, y axis is -x's
+    expected = [0.1, 0.2, 0.3, 0, 1, 0, -1, 0, 0, 3, 4, 5, 6, 7, 8, 9, 0.07]  # x axis along y, y axis along -x
     np.testing.assert_allclose(seen[STATE][0], expected, atol=1e-6)
     assert seen["observation.images.base_camera"].shape == (1, 3, 2, 4)
     np.testing.assert_allclose(seen["observation.images.base_camera"][0, :, 0, 1], [1, 0, 0.2])
@@ -103,49 +103,49 @@ def test_an_observation_is_an_item_of_the_dataset():
 def made_without_embedding(model):
     policy = made(model, {STATE: (17,)})
     policy.reset([start(0)])
-    policy.act(shown({0: 0.07}))
+    policy.act(observations({0: 0.07}))
     return model.seen[-1]
 
 
-def test_envs_play_chunks_of_their_own():
+def test_each_env_has_its_own_chunks():
     policy = made()
     policy.reset([start(0), start(5)])
-    assert policy.act(shown({0: 1, 5: 50}))[:, :2].tolist() == [[2, 4], [100, 4]]
-    policy.reset([start(5)])  # begins anew while env 0 goes on with its chunk
-    assert policy.act(shown({0: 2, 5: 60}))[:, :2].tolist() == [[2, 2], [120, 4]]
-    assert policy.act(shown({5: 61}))[:, :2].tolist() == [[120, 2]]
-    actions = policy.act(shown({0: 3, 5: 62}))
+    assert policy.act(observations({0: 1, 5: 50}))[:, :2].tolist() == [[2, 4], [100, 4]]
+    policy.reset([start(5)])  # starts again while env 0 continues its chunk
+    assert policy.act(observations({0: 2, 5: 60}))[:, :2].tolist() == [[2, 2], [120, 4]]
+    assert policy.act(observations({5: 61}))[:, :2].tolist() == [[120, 2]]
+    actions = policy.act(observations({0: 3, 5: 62}))
     assert actions[:, :2].tolist() == [[2, 0], [120, 0]]
-    assert actions[:, 3].tolist() == [6, 6]  # three of each: nor is what is reset in place shared
-    assert policy.act(shown({0: 4}))[0, 0] == 8  # the next chunk
+    assert actions[:, 3].tolist() == [6, 6]  # three calls each: the ensembler is not shared
+    assert policy.act(observations({0: 4}))[0, 0] == 8  # the next chunk
 
 
-def test_noise_is_the_episode_s_own():
+def test_noise_depends_on_the_episode_seed_only():
     def noise(policy, env, others=()):
-        return policy.act(shown({**dict.fromkeys(others, 1.0), env: 1.0}))[-1, 2]
+        return policy.act(observations({**dict.fromkeys(others, 1.0), env: 1.0}))[-1, 2]
 
-    alone, beside = made(), made()
+    alone, among_others = made(), made()
     alone.reset([start(0, seed=7)])
-    beside.reset([start(1, seed=8), start(2, seed=7)])
+    among_others.reset([start(1, seed=8), start(2, seed=7)])
     first = noise(alone, 0)
-    assert noise(beside, 2, others=[1]) == first
-    assert noise(beside, 1) != first
+    assert noise(among_others, 2, others=[1]) == first
+    assert noise(among_others, 1) != first
 
 
-def test_a_quaternion_s_sign_does_not_matter():
+def test_sign_of_a_quaternion_does_not_matter():
     parts = np.zeros((1, 3)), np.array([[0.1, 0.2, 0.3, 0.4]]), np.zeros((1, 7)), np.zeros((1, 1))
-    np.testing.assert_array_equal(state_of(*parts), state_of(parts[0], -parts[1], *parts[2:]))
+    np.testing.assert_array_equal(make_state(*parts), make_state(parts[0], -parts[1], *parts[2:]))
     assert np.sqrt(np.mean(scale_embeddings(np.full((1, 384), 384**-0.5)) ** 2)) == pytest.approx(1)
 
 
-def test_what_is_no_run_is_one_line(tmp_path, capsys):
-    with pytest.raises(EvaluationError, match="no checkpoint of LeRobot"):
-        open_checkpoint(tmp_path, 5, "cpu", None)
+def test_missing_checkpoint_is_a_one_line_error(tmp_path, capsys):
+    with pytest.raises(EvaluationError, match="no LeRobot checkpoint"):
+        load_policy(tmp_path, 5, "cpu", None)
     (tmp_path / "info.json").write_text('{"fps": 5}')
-    assert rate_of(tmp_path / "info.json") == 5
+    assert read_rate(tmp_path / "info.json") == 5
     with pytest.raises(EvaluationError, match=r"Pass --rate HZ"):
-        rate_of(tmp_path / "nothing.json")
+        read_rate(tmp_path / "nothing.json")
     assert main([str(tmp_path), "--rate", "5"]) == 1
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "train_lerobot.sh" in said
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "train_lerobot.sh" in error
