@@ -13,7 +13,7 @@ def replaced_stages():
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
-    """Two nodes of Ray on this machine."""
+    """A Ray cluster of two nodes on this machine."""
     pytest.importorskip("ray", reason="needs the ray extra: plans on a cluster of Ray are NOT tested")
     from ray.cluster_utils import Cluster
 
@@ -46,7 +46,7 @@ def done(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def undisturbed(done, tmp_path_factory):
-    """The made-up plan as one job on this machine makes it, to compare with; nobody may change it."""
+    """The output of the synthetic plan without faults, for comparison; read-only."""
     out = shutil.copytree(done, tmp_path_factory.mktemp("plan") / "out")
     run_here(out)
     return out
@@ -54,5 +54,5 @@ def undisturbed(done, tmp_path_factory):
 
 @pytest.fixture
 def out(done, tmp_path):
-    """A folder of the plan, all of whose units are done and nothing is joined."""
+    """The folder of a plan whose work units are complete and not joined."""
     return shutil.copytree(done, tmp_path / "out")

@@ -1,4 +1,4 @@
-"""What every executor promises: the dataset of the local executor, whatever happens to its jobs."""
+"""All executors write the dataset of the local executor, also when their jobs are killed."""
 
 import os
 import signal
@@ -29,7 +29,7 @@ def jobs(request, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("units_per_job", ["1", "2"])
-def test_two_jobs_make_what_one_makes(jobs, undisturbed, tmp_path, units_per_job):
+def test_two_jobs_write_the_same_dataset_as_one(jobs, undisturbed, tmp_path, units_per_job):
     if jobs.name == "local":
         pytest.skip("see test_run_plan.py")
     jobs.run(tmp_path / "out", units_per_job=units_per_job)
@@ -40,7 +40,7 @@ def test_two_jobs_make_what_one_makes(jobs, undisturbed, tmp_path, units_per_job
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGUSR2])
-def test_a_job_that_ends_costs_nothing_and_blames_no_seed(jobs, undisturbed, tmp_path, number):
+def test_killed_job_loses_no_episode_and_fails_no_seed(jobs, undisturbed, tmp_path, number):
     if jobs.name == "local":
         pytest.skip("its jobs are threads of the program")
     if jobs.name == "ray" and number != signal.SIGKILL:
@@ -58,7 +58,7 @@ def test_a_job_that_ends_costs_nothing_and_blames_no_seed(jobs, undisturbed, tmp
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGKILL])
-def test_a_run_that_is_ended_leaves_no_harm_and_continues_later(jobs, undisturbed, tmp_path, ending):
+def test_interrupted_run_continues(jobs, undisturbed, tmp_path, ending):
     out = tmp_path / "out"
     runner = jobs.start(out)
     wait_for(lambda: list(out.glob("units/a/*/[0-9]*")))
@@ -76,7 +76,7 @@ def test_a_run_that_is_ended_leaves_no_harm_and_continues_later(jobs, undisturbe
     assert crashes_of(out) == []
 
 
-def test_a_unit_that_kills_its_jobs_again_and_again_ends_the_run(jobs, tmp_path):
+def test_work_unit_that_kills_its_jobs_ends_the_run(jobs, tmp_path):
     if jobs.name == "local":
         pytest.skip("its jobs are threads of this process")
     out = tmp_path / "out"
@@ -88,7 +88,7 @@ def test_a_unit_that_kills_its_jobs_again_and_again_ends_the_run(jobs, tmp_path)
         assert any(Path(word.rstrip(";")).is_file() for word in str(error.value.fix).split())  # the job's log
 
 
-def test_an_error_of_all_seeds_ends_the_run(jobs, undisturbed, tmp_path):
+def test_error_of_all_seeds_ends_the_run(jobs, undisturbed, tmp_path):
     out = tmp_path / "out"
     plan_faults(out, {13: ["refuse"]})
     with pytest.raises(MissingExtraError):
@@ -110,7 +110,7 @@ def test_an_error_of_all_seeds_ends_the_run(jobs, undisturbed, tmp_path):
         ("ray", "ray", {"gather": "perhaps"}),
     ],
 )
-def test_invalid_options_are_refused(name, module, options):
+def test_invalid_options_are_errors(name, module, options):
     pytest.importorskip(module)
     with pytest.raises(PlanError) as error:
         open_executor(name, PlanFolder(PLAN, Path()), 1, options)

@@ -1,4 +1,4 @@
-"""What is joined is whole before what it was joined from goes, whatever a power cut or a disk left of it."""
+"""Joined files are checked before their sources are deleted; damaged files are joined again."""
 
 import os
 import shutil
@@ -15,7 +15,7 @@ from robocas_ms3.plans.folder import PlanFolder, WorkUnit
     "name",
     ["demos/a/trajectory.h5", "datasets/robocas/conversion.json", "datasets/robocas/data_info.json", "report.json"],
 )
-def test_a_file_that_a_power_cut_left_empty_is_joined_again(undisturbed, out, name):
+def test_empty_file_is_joined_again(undisturbed, out, name):
     (out / name).parent.mkdir(parents=True, exist_ok=True)
     (out / name).write_bytes(b"")
     run_here(out)
@@ -27,7 +27,7 @@ def test_a_file_that_a_power_cut_left_empty_is_joined_again(undisturbed, out, na
     "name",
     ["demos/a/trajectory.h5", "demos/a/trajectory.json", "datasets/robocas/conversion.json"],
 )
-def test_what_was_cut_off_while_joining_is_joined_again(undisturbed, out, monkeypatch, name):
+def test_truncated_file_is_joined_again(undisturbed, out, monkeypatch, name):
     with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
         patch.setattr("robocas_ms3.plans.join._report", lambda *_: {"x": 1})
         patch.setattr("robocas_ms3.plans.join.flush_to_disk", lambda path: (out / "demos").exists() and 1 / 0)
@@ -37,14 +37,14 @@ def test_what_was_cut_off_while_joining_is_joined_again(undisturbed, out, monkey
     assert_same(undisturbed, out)
 
 
-def test_a_report_that_is_damaged_after_all_is_deleted_is_made_again(undisturbed, tmp_path):
+def test_damaged_report_is_written_again(undisturbed, tmp_path):
     out = shutil.copytree(undisturbed, tmp_path / "out")
     (out / "report.json").write_bytes(b"")
     assert run_here(out)["episodes"] == 7
     assert_same(undisturbed, out)
 
 
-def test_what_is_damaged_and_has_no_sources_any_more_is_an_error(undisturbed, tmp_path):
+def test_damaged_file_without_sources_is_an_error(undisturbed, tmp_path):
     out = shutil.copytree(undisturbed, tmp_path / "out")
     (out / "report.json").unlink()
     os.truncate(out / "demos/b/trajectory.h5", 2000)
@@ -52,20 +52,20 @@ def test_what_is_damaged_and_has_no_sources_any_more_is_an_error(undisturbed, tm
         run_here(out)
 
 
-def test_nothing_is_deleted_where_the_disk_does_not_keep_what_is_joined(out, monkeypatch):
-    def without_one(shards, path):
+def test_sources_are_kept_if_the_joined_file_is_damaged(out, monkeypatch):
+    def merge_without_last(shards, path):
         with h5py.File(path, "w"):
             shutil.copy(shards[0].with_suffix(".json"), path.with_suffix(".json"))
 
     before = {path for path in (out / "units").rglob("*.h5")}
-    monkeypatch.setattr("robocas_ms3.plans.join.merge", without_one)
+    monkeypatch.setattr("robocas_ms3.plans.join.merge", merge_without_last)
     with pytest.raises(PlanError, match="demos/a/trajectory.h5: damaged after writing .found other episodes"):
         run_here(out)
     assert before == {path for path in (out / "units").rglob("*.h5")}
     assert not (out / "report.json").exists()
 
 
-def test_what_is_left_of_a_finished_plan_is_not_deleted_for_damaged_demonstrations(undisturbed, tmp_path, monkeypatch):
+def test_remaining_sources_are_kept_if_demonstrations_are_damaged(undisturbed, tmp_path, monkeypatch):
     out = shutil.copytree(undisturbed, tmp_path / "out")
     left = PlanFolder(PLAN, out).files(WorkUnit(0, 0), 10).recording
     left.parent.mkdir()
@@ -76,7 +76,7 @@ def test_what_is_left_of_a_finished_plan_is_not_deleted_for_damaged_demonstratio
     assert left.exists()
 
 
-def test_all_that_is_joined_is_on_the_disk_before_it_has_its_name(out, monkeypatch):
+def test_joined_files_are_flushed_before_they_are_renamed(out, monkeypatch):
     synced, named = set(), []
     sync, replace = os.fsync, os.replace
     monkeypatch.setattr("os.fsync", lambda fd: (synced.add(os.fstat(fd).st_ino), sync(fd)))
@@ -91,7 +91,7 @@ def test_all_that_is_joined_is_on_the_disk_before_it_has_its_name(out, monkeypat
     assert set(named) >= {"trajectory.h5", "trajectory.json", "conversion.json", "scene.json", "report.json"}
 
 
-def test_nothing_is_joined_twice(undisturbed, tmp_path):
+def test_second_run_joins_nothing(undisturbed, tmp_path):
     out = shutil.copytree(undisturbed, tmp_path / "out")
     said = []
     run_here(out, on_stage=said.append)

@@ -1,4 +1,4 @@
-"""The stage of layouts keeps the scenes that environments have."""
+"""The stage `layouts` stores the layouts that environments sample."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def files(tmp_path):
     return files
 
 
-def test_layouts_alone_are_made_and_joined(files, tmp_path):
+def test_stage_layouts_alone(files, tmp_path):
     found = Recorder(ALONE).run(files)
     assert (found["success"], set(found)) == (True, {"success", "record_seconds"})
     assert [path.name for path in files.folder.iterdir()] == [files.layout.name]
@@ -38,7 +38,7 @@ def test_layouts_alone_are_made_and_joined(files, tmp_path):
     assert not (tmp_path / "demos").exists()
 
 
-def test_a_seed_without_a_layout_is_one_that_failed(files, monkeypatch):
+def test_seed_without_a_layout_fails(files, monkeypatch):
     def nothing(*_):
         raise LayoutError("no room for all objects")
 

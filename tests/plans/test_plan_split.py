@@ -1,4 +1,4 @@
-"""A plan says which episodes validate: of a part as a whole, by a rule, or as conversions do."""
+"""Training and validation episodes of a plan: by part, by rule, or as `robocas convert`."""
 
 import json
 
@@ -25,7 +25,7 @@ def plan_of(*splits, split=None):
 
 @pytest.fixture
 def of(monkeypatch):
-    """Sides of a plan whose dataset says what its episodes' seeds, targets and tasks are."""
+    """Return a function that splits a plan, with given seeds, targets and tasks of its episodes."""
 
     def groups(root, by):
         numbers = range(sum(COUNTS))
@@ -37,20 +37,20 @@ def of(monkeypatch):
     return lambda plan: splits.split_episodes(plan, "somewhere")
 
 
-def test_without_a_word_it_is_what_conversions_do(of):
+def test_default_is_the_split_of_convert(of):
     plan = plan_of(None, None, None)
     assert of(plan) == splits.split_by_seed({n: 7 * n for n in range(35)})
     assert len(of(plan)[1]) == 4  # round(3.5)
     assert splits.split_rule(plan) == SPLIT_RULE
 
 
-def test_a_part_may_validate_as_a_whole(of):
+def test_split_of_a_part(of):
     plan = plan_of("train", "val", "train")
     assert of(plan) == ([*range(20), *range(25, 35)], [*range(20, 25)])
     assert splits.split_rule(plan) == "a: train; b: val; c: train"
 
 
-def test_other_parts_go_by_the_rule(of):
+def test_other_parts_are_split_by_the_rule(of):
     plan = plan_of(None, "val", None, split={"val_fraction": 0.2, "group_by": "target"})
     train, val = of(plan)
     assert sorted(train + val) == [*range(35)]
@@ -60,7 +60,7 @@ def test_other_parts_go_by_the_rule(of):
     assert splits.split_rule(plan) == f"b: val; {split.SplitOptions(0.2, 'target').rule}"
 
 
-def test_all_of_one_kind_train(of, caplog):
+def test_episodes_of_a_single_group_are_for_training(of, caplog):
     plan = plan_of(None, "val", None, split={"group_by": "seed"})
     plan = plan.model_copy(
         update={"split": plan.split.model_copy(update={"group_by": "task"})}

@@ -1,4 +1,4 @@
-"""Plans on a cluster of Ray: two nodes on this machine make what one process makes, whatever befalls them."""
+"""Plans on a Ray cluster of two nodes on this machine, also when a task or node fails."""
 
 import os
 import signal
@@ -25,7 +25,7 @@ RUNNER = Path(__file__).resolve().parents[1] / "support" / "plan_runner.py"
 
 @pytest.fixture
 def nodes(cluster):
-    """Two nodes, whatever a test did to them."""
+    """Return a cluster of two nodes; restart a node that a test has stopped."""
     while len([node for node in ray_nodes(cluster) if node["Alive"]]) < 2:
         cluster.second = cluster.add_node(num_cpus=1)
     return cluster
@@ -52,7 +52,7 @@ def run(nodes, out, gather):
 
 
 def once(out, happen):
-    """Have something happen as soon as an episode is there, in a thread."""
+    """Call a function in a thread as soon as an episode is complete."""
 
     def wait():
         until = time.monotonic() + 60
@@ -70,7 +70,7 @@ GATHER = pytest.mark.parametrize("gather", [False, True], ids=["shared", "gather
 
 
 @GATHER
-def test_a_node_that_is_lost_costs_nothing(nodes, undisturbed, tmp_path, gather):
+def test_lost_node_loses_no_episode(nodes, undisturbed, tmp_path, gather):
     out = tmp_path / "out"
     thread = once(out, lambda: nodes.remove_node(nodes.second, allow_graceful=False))
     run(nodes, out, gather)
@@ -78,8 +78,8 @@ def test_a_node_that_is_lost_costs_nothing(nodes, undisturbed, tmp_path, gather)
     assert_same(undisturbed, out)
 
 
-def test_a_task_that_is_cut_off_and_lives_does_no_harm(nodes, undisturbed, tmp_path):
-    """Its node is frozen, so that the cluster gives it up; the task goes on, while another one does its units."""
+def test_task_on_a_disconnected_node_does_no_harm(nodes, undisturbed, tmp_path):
+    """The node is frozen, so Ray starts another task; then the first task continues with the same work units."""
     out, node = tmp_path / "out", raylet(nodes)
     thread = once(out, node.suspend)
     try:
@@ -98,19 +98,19 @@ def raylet(cluster):
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1"])
-def test_a_cluster_that_is_not_there_is_an_error(tmp_path, address):
+def test_missing_cluster_is_an_error(tmp_path, address):
     with pytest.raises(PlanError, match=address), RayExecutor(PlanFolder(PLAN, tmp_path), 1, {"address": address}):
         pass
 
 
-def test_a_node_that_does_not_see_the_folder_is_an_error(tmp_path, monkeypatch):
+def test_node_without_access_to_the_folder_is_an_error(tmp_path, monkeypatch):
     monkeypatch.setattr("robocas_ms3.plans.executors.ray._FOLDER_TIMEOUT", 0.0)
     with pytest.raises(PlanError, match="gather=yes"):
         run_units(PlanFolder(PLAN, tmp_path / "elsewhere"), [WorkUnit(0, 0)])
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGKILL])
-def test_a_cluster_of_its_own_ends_with_the_run(undisturbed, tmp_path, ending):
+def test_cluster_started_for_the_run_ends_with_it(undisturbed, tmp_path, ending):
     out = tmp_path / "out"
     before = {found.pid for found in psutil.process_iter()}
     environment = {**os.environ, **env_of_jobs()}

@@ -1,4 +1,4 @@
-"""Plans over made-up episodes: the dataset follows from the plan, whoever does the units and whatever fails."""
+"""Plans with synthetic episodes: the dataset depends only on the plan, also after crashes and interruptions."""
 
 import json
 import os
@@ -39,7 +39,7 @@ def shard(out, text, plan=PLAN):
     return run_shard(LocalExecutor(PlanFolder(plan, out)), parse_shard(text, PlanError))
 
 
-def test_a_plan_makes_demonstrations_and_one_dataset_of_all_parts(undisturbed):
+def test_demonstrations_and_one_dataset_of_all_parts(undisturbed):
     report = json.loads((undisturbed / "report.json").read_text())
     assert report["episodes"] == 7
     assert report["parts"]["a"]["seeds"] == [10, 11, 12, 13, 14]
@@ -61,7 +61,7 @@ def test_a_plan_makes_demonstrations_and_one_dataset_of_all_parts(undisturbed):
     assert not list((undisturbed / "units").rglob("*.h5"))  # nothing is kept twice
 
 
-def test_two_jobs_make_the_same_and_a_lerobot_dataset_of_the_version_of_the_plan(undisturbed, tmp_path):
+def test_two_jobs_and_a_lerobot_dataset(undisturbed, tmp_path):
     out, lerobot = tmp_path / "out", tmp_path / "out" / "datasets" / "lerobot"
     run_here(out, PLAN.model_copy(update={"formats": ["robocas", "lerobot"], "lerobot_version": "2.1"}), jobs=2)
     info = json.loads((lerobot / "meta" / "info.json").read_text())
@@ -70,7 +70,7 @@ def test_two_jobs_make_the_same_and_a_lerobot_dataset_of_the_version_of_the_plan
     assert_same(undisturbed, out)
 
 
-def test_shards_in_any_order_make_the_same(undisturbed, tmp_path):
+def test_shards_in_any_order_write_the_same_dataset(undisturbed, tmp_path):
     out = tmp_path / "out"
     assert not shard(out, "1/2")
     assert not (out / "units" / "a" / "00000").exists()
@@ -84,12 +84,12 @@ def test_shards_in_any_order_make_the_same(undisturbed, tmp_path):
 
 
 @pytest.mark.parametrize("text", ["2/2", "1", "-1/2", "1/2/3"])
-def test_an_invalid_shard_is_refused(text):
+def test_invalid_shard_is_an_error(text):
     with pytest.raises(PlanError):
         parse_shard(text, PlanError)
 
 
-def test_two_shards_may_be_the_same_at_the_same_time(undisturbed, tmp_path):
+def test_same_shard_may_run_twice_at_the_same_time(undisturbed, tmp_path):
     out = tmp_path / "out"
     with ThreadPoolExecutor(2) as threads:
         assert list(threads.map(lambda text: shard(out, text), ["0/1", "0/1"])) == [True, True]
@@ -97,7 +97,7 @@ def test_two_shards_may_be_the_same_at_the_same_time(undisturbed, tmp_path):
     assert_same(undisturbed, out)
 
 
-def test_the_first_folder_of_a_seed_is_kept(tmp_path):
+def test_first_folder_of_a_seed_is_kept(tmp_path):
     files = PlanFolder(PLAN, tmp_path).files(WorkUnit(0, 0), 10)
     with files.temporary_files() as late, files.temporary_files() as first:
         for tmp in (late, first):
@@ -107,7 +107,7 @@ def test_the_first_folder_of_a_seed_is_kept(tmp_path):
     assert [path.name for path in files.folder.parent.iterdir()] == [files.folder.name]
 
 
-def test_a_seed_whose_outcome_is_damaged_is_done_again(undisturbed, out):
+def test_seed_with_damaged_outcome_runs_again(undisturbed, out):
     unit = PlanFolder(PLAN, out).unit_folder(WorkUnit(0, 0))
     (unit / "seeds.jsonl").unlink()
     os.truncate(unit / "0000000011" / "outcome.json", 20)
@@ -115,7 +115,7 @@ def test_a_seed_whose_outcome_is_damaged_is_done_again(undisturbed, out):
     assert_same(undisturbed, out)
 
 
-def test_a_process_that_dies_once_costs_nothing(undisturbed, tmp_path):
+def test_process_that_crashes_once_loses_no_episode(undisturbed, tmp_path):
     out = tmp_path / "out"
     plan_faults(out, {10: ["crash"], 12: ["grow"], 13: ["bug"], 3: ["hang"]})
     limits = PLAN.limits.model_copy(update={"record_seconds": 4, "memory_gb": 0.5})
@@ -129,7 +129,7 @@ def test_a_process_that_dies_once_costs_nothing(undisturbed, tmp_path):
     ]
 
 
-def test_a_seed_that_kills_twice_is_left_out_and_another_takes_its_place(tmp_path):
+def test_seed_that_crashes_twice_is_skipped_and_replaced(tmp_path):
     out = tmp_path / "out"
     plan_faults(out, {11: ["crash", "crash", "crash"], 12: ["fail"], 13: ["damaged", "damaged"]})
     report = run_here(out)
@@ -141,7 +141,7 @@ def test_a_seed_that_kills_twice_is_left_out_and_another_takes_its_place(tmp_pat
     assert crashes_of(out) == [(11, "record: SIGSEGV")] * 2 + [(13, damaged)] * 2
 
 
-def test_a_machine_that_cannot_open_a_part_does_no_seed(tmp_path):
+def test_machine_that_cannot_open_a_part_fails_no_seed(tmp_path):
     plan = PLAN.model_copy(update={"parts": [PLAN.parts[0].model_copy(update={"pack": "mine"})]})
     shard(tmp_path / "out", "4/5")
     (tmp_path / "out" / "plan.json").write_text(
@@ -154,7 +154,7 @@ def test_a_machine_that_cannot_open_a_part_does_no_seed(tmp_path):
     assert seeds_done(tmp_path / "out") == 0
 
 
-def test_hardly_any_success_is_an_error(tmp_path):
+def test_too_many_failures_are_an_error(tmp_path):
     plan = PLAN.model_copy(update={"block": 8})
     plan_faults(tmp_path / "out", {seed: ["fail"] for seed in range(200)})
     with pytest.raises(PlanError) as error:
@@ -162,7 +162,7 @@ def test_hardly_any_success_is_an_error(tmp_path):
     assert error.value.found == "25 of 25, most of them: grasp: slipped"
 
 
-def test_episodes_whose_files_were_cut_off_are_made_again(undisturbed, out):
+def test_episodes_with_truncated_files_are_recorded_again(undisturbed, out):
     folders = [PlanFolder(PLAN, out).files(WorkUnit(0, 0), seed).folder for seed in (10, 11, 12)]
     image = sorted(folders[1].rglob("*.png"))[0]
     for path, length in ((folders[0] / "recording.h5", 1000), (image, 50), (folders[2] / "recording.json", 0)):
@@ -173,7 +173,7 @@ def test_episodes_whose_files_were_cut_off_are_made_again(undisturbed, out):
     assert_same(undisturbed, out)
 
 
-def test_a_disk_that_damages_files_again_and_again_ends_the_run(out, monkeypatch):
+def test_disk_that_damages_files_twice_ends_the_run(out, monkeypatch):
     monkeypatch.setattr("robocas_ms3.plans.progress.Progress.delete_damaged", lambda _: {WorkUnit(1, 0): [4]})
     with pytest.raises(PlanError, match="files change their size") as error:
         run_here(out)
@@ -181,7 +181,7 @@ def test_a_disk_that_damages_files_again_and_again_ends_the_run(out, monkeypatch
     assert not (out / "datasets").exists()
 
 
-def test_a_folder_of_something_else_is_refused(tmp_path):
+def test_folder_with_other_files_is_an_error(tmp_path):
     (tmp_path / "thesis").write_text("")
     for flags in ({}, {"overwrite": True}):
         with pytest.raises(OutputExistsError):
@@ -191,7 +191,7 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["thesis"]
 
 
-def test_another_plan_is_refused_unless_it_is_to_overwrite_but_limits_and_description_may_change(undisturbed, out):
+def test_other_plan_needs_overwrite_except_for_limits_and_description(undisturbed, out):
     other = PLAN.model_copy(update={"block": 4})
     for start in (run_here, lambda out, plan: shard(out, "1/2", plan)):
         with pytest.raises(RobocasError, match="block: 3 -> 4"):
@@ -214,14 +214,14 @@ def record_other_versions(out):
     (out / "plan.json").write_text(json.dumps(record))
 
 
-def test_a_machine_with_other_versions_joins_nothing(out):
+def test_machine_with_other_versions_cannot_join(out):
     record_other_versions(out)
     with pytest.raises(OutputExistsError, match=r"versions\.sapien: .*2\.2\.2"):
         join_plan(out)
     assert not (out / "report.json").exists()
 
 
-def test_a_machine_with_other_versions_does_no_unit(tmp_path):
+def test_machine_with_other_versions_runs_no_work_unit(tmp_path):
     out = tmp_path / "out"
     shard(out, "4/5")
     record_other_versions(out)
@@ -232,7 +232,7 @@ def test_a_machine_with_other_versions_does_no_unit(tmp_path):
     assert not (out / "units").exists()
 
 
-def test_a_worker_of_an_older_plan_keeps_nothing_in_the_folder_of_a_new_one(tmp_path):
+def test_worker_of_a_replaced_plan_writes_nothing(tmp_path):
     out = tmp_path / "out"
     shard(out, "4/5")
     worker = WorkUnitWorker(PlanFolder(PLAN, out))
@@ -245,7 +245,7 @@ def test_a_worker_of_an_older_plan_keeps_nothing_in_the_folder_of_a_new_one(tmp_
     assert seeds_done(out) == 8
 
 
-def test_a_process_that_cannot_begin_ends_the_run_and_blames_no_seed(tmp_path):
+def test_process_that_cannot_start_ends_the_run_and_fails_no_seed(tmp_path):
     with pytest.raises(PlanError, match="no such library"):
         run_here(tmp_path / "out", render=FailingStage)
     assert seeds_done(tmp_path / "out") == 0

@@ -1,4 +1,4 @@
-"""What is asked of Slurm's commands, which are shell scripts here, and what their answers mean."""
+"""Calls of the commands of Slurm, which are replaced by shell scripts, and reactions to their output."""
 
 import os
 import time
@@ -14,7 +14,7 @@ from robocas_ms3.plans.executors import open_executor
 from robocas_ms3.plans.folder import PlanFolder
 
 
-def test_without_slurm_the_executor_says_so(tmp_path, monkeypatch):
+def test_missing_slurm_is_an_error(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(PlanError) as error:
         open_executor("slurm", PlanFolder(PLAN, tmp_path), 1, {})
@@ -23,7 +23,7 @@ def test_without_slurm_the_executor_says_so(tmp_path, monkeypatch):
 
 @pytest.fixture
 def slurm(tmp_path, monkeypatch):
-    """Made-up commands of Slurm; sets what one does, in the words of a shell."""
+    """Replace the commands of Slurm; return a function that sets the shell script of a command."""
     folder = tmp_path / "bin"
     folder.mkdir()
     monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
@@ -46,7 +46,7 @@ def executor(slurm, tmp_path):
     return executor
 
 
-def test_a_queue_that_does_not_answer_changes_nothing(executor, slurm, caplog):
+def test_squeue_without_answer_ends_no_job(executor, slurm, caplog):
     jobs = executor.submit([["one"], ["two"]])
     slurm("squeue", "exit 1")
     assert not any(job.done() for job in jobs)
@@ -55,14 +55,14 @@ def test_a_queue_that_does_not_answer_changes_nothing(executor, slurm, caplog):
     assert [job.done() for job in jobs] == [False, True]
 
 
-def test_jobs_that_slurm_refuses_are_an_error_at_first_and_wait_later(executor, slurm):
+def test_rejected_jobs_are_an_error_at_first_and_retried_later(executor, slurm):
     slurm("sbatch", "exit 1")
     with pytest.raises(PlanError) as error:
         executor.submit([["one"]])
     assert error.value.where == "sbatch"
 
 
-def test_a_held_job_that_can_never_start_is_cancelled(executor, slurm, tmp_path):
+def test_held_job_is_cancelled(executor, slurm, tmp_path):
     jobs = executor.submit([["one"], ["two"]])
     slurm("squeue", "echo '7_0|None'; echo '7_1|launch failed requeued held'")
     slurm("scancel", f"echo \"$@\" >>'{tmp_path}/cancelled'")
@@ -70,7 +70,7 @@ def test_a_held_job_that_can_never_start_is_cancelled(executor, slurm, tmp_path)
     assert (tmp_path / "cancelled").read_text().split()[0] == "7_1"
 
 
-def test_a_slow_scancel_is_not_cut_off(executor, slurm, tmp_path):
+def test_slow_scancel_is_not_killed(executor, slurm, tmp_path):
     slurm("scancel", f"sleep 2.5; touch '{tmp_path}/cancelled'")
     executor.__exit__()
     assert not (tmp_path / "cancelled").exists()

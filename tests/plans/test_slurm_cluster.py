@@ -1,4 +1,4 @@
-"""Plans by a real Slurm whose jobs, nodes and daemons are killed: the dataset is that of the local executor."""
+"""Plans on a real Slurm cluster, also when jobs, nodes and daemons are killed: the dataset of the local executor."""
 
 import os
 import signal
@@ -17,7 +17,7 @@ from robocas_ms3.core.errors import PlanError
 
 CONF = Path("/etc/slurm/slurm.conf")
 STARTS = Path(__file__).resolve().parents[2] / "scripts" / "slurm_here.sh"
-OURS = CONF.is_file() and "Written by scripts/slurm_here.sh" in CONF.read_text() and os.getuid() == 0
+IS_TEST_CLUSTER = CONF.is_file() and "Written by scripts/slurm_here.sh" in CONF.read_text() and os.getuid() == 0
 JOBS = Jobs("slurm", time="10", mem_gb="1")
 
 
@@ -39,7 +39,7 @@ def jobs_know_the_made_up_episodes(monkeypatch):
 
 
 class Running:
-    """A run, one job of which hangs in the middle of a unit."""
+    """A run with a job that hangs in the middle of a work unit."""
 
     def __init__(self, out):
         self.out = out
@@ -69,7 +69,7 @@ def running(tmp_path):
     one.process.wait()
 
 
-def say(*command):
+def output_of(*command):
     return subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
 
 
@@ -86,12 +86,12 @@ def start_daemons():
     subprocess.run(["bash", STARTS], check=True, capture_output=True, timeout=120)
 
 
-def test_jobs_make_what_this_machine_makes(undisturbed, tmp_path):
+def test_jobs_write_the_dataset_of_the_local_executor(undisturbed, tmp_path):
     JOBS.run(tmp_path / "out", units_per_job="2")
     assert_same(undisturbed, tmp_path / "out")
 
 
-def test_what_sbatch_refuses_is_said(tmp_path):
+def test_rejection_by_sbatch_is_an_error(tmp_path):
     with pytest.raises(PlanError, match="partition"):
         JOBS.run(tmp_path / "out", partition="none_of_this_name")
 
@@ -104,10 +104,10 @@ def kill_processes(running):
 
 
 def make_room(running):
-    if "PartitionName=first" not in say("scontrol", "show", "partition", "--oneliner"):
+    if "PartitionName=first" not in output_of("scontrol", "show", "partition", "--oneliner"):
         pytest.skip("this Slurm has no partition that preempts: preemption is NOT tested")
     before = running.job()[0]
-    say("sbatch", "--partition=first", "--exclusive", "--output=/dev/null", "--wrap", "sleep 1")
+    output_of("sbatch", "--partition=first", "--exclusive", "--output=/dev/null", "--wrap", "sleep 1")
     before.wait(60)
 
 
@@ -144,14 +144,14 @@ def interrupt_the_command(running):
     running.process.send_signal(signal.SIGINT)
     assert running.process.wait(10) != 0
     wait_for(lambda: not JOBS.processes(running.out), 30)
-    wait_for(lambda: "robocas-out" not in say("squeue", "--noheader", "--format=%j"), 30)
+    wait_for(lambda: "robocas-out" not in output_of("squeue", "--noheader", "--format=%j"), 30)
     running.process = JOBS.start(running.out)
 
 
 FAULTS = {
     "processes killed": kill_processes,
-    "scancel": lambda running: say("scancel", running.job()[1]),
-    "requeue": lambda running: say("scontrol", "requeue", running.job()[1]),
+    "scancel": lambda running: output_of("scancel", running.job()[1]),
+    "requeue": lambda running: output_of("scontrol", "requeue", running.job()[1]),
     "preempted": make_room,
     "command killed": kill_the_command,
     "Ctrl-C": interrupt_the_command,
@@ -160,13 +160,13 @@ OF_DAEMONS = {"slurmd": kill_slurmd, "node": lose_the_node, "slurmctld": kill_th
 
 
 @pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
-def test_a_fault_costs_nothing(running, undisturbed, fault):
+def test_fault_loses_no_episode(running, undisturbed, fault):
     fault(running)
     running.ends_well(undisturbed)
 
 
-@pytest.mark.skipif(not OURS, reason="this Slurm is not that of scripts/slurm_here.sh: its daemons live on")
+@pytest.mark.skipif(not IS_TEST_CLUSTER, reason="this Slurm is not that of scripts/slurm_here.sh: its daemons live on")
 @pytest.mark.parametrize("fault", OF_DAEMONS.values(), ids=OF_DAEMONS)
-def test_a_fault_of_daemons_costs_nothing(running, undisturbed, fault):
+def test_fault_of_daemons_loses_no_episode(running, undisturbed, fault):
     fault(running)
     running.ends_well(undisturbed)

@@ -1,4 +1,4 @@
-"""The status of a plan is read from its folder alone, by whoever sees it."""
+"""The status of a plan is read from its folder."""
 
 import time
 
@@ -13,7 +13,7 @@ from robocas_ms3.plans.status import PartStatus, read_status, seconds_left
 
 @pytest.fixture
 def started(tmp_path):
-    """A plan that was started, and what writes an outcome."""
+    """Start a plan; return its folder and a function that writes outcomes."""
     path, out = tmp_path / "plan.yaml", make_folder(tmp_path / "out")
     path.write_text("block: 4\nparts:\n  - {task: pick, episodes: 6, name: a}\n")
     folder = PlanFolder(load_plan(path), out)
@@ -33,7 +33,7 @@ def good(seed, at=0.0):
     return Outcome(seed, True, 100, record_seconds=1.0, render_seconds=3.0, size=10**6, end_time=at)
 
 
-def test_status_is_read_from_the_folder_alone(started, tmp_path, capsys):
+def test_status_before_and_after_a_work_unit_is_complete(started, tmp_path, capsys):
     assert run(["plan", "status", str(tmp_path)]) == 1
     out, write = started
     assert read_status(out).seconds_left is None
@@ -60,7 +60,7 @@ def test_status_shows_reasons_with_brackets(started, capsys):
     assert "KeyError: [/red] x1" in capsys.readouterr().out
 
 
-def test_what_is_left_costs_what_its_part_costs():
+def test_seconds_left_use_the_cost_per_part():
     def part(name, requested, done, seconds):
         return PartStatus(name, requested, done, done, {}, seconds, 0.0, 0)
 
@@ -72,7 +72,7 @@ def test_what_is_left_costs_what_its_part_costs():
     assert seconds_left(free, [0, 0], 4.0) == pytest.approx(12.0)
 
 
-def test_the_rate_is_of_the_last_ten_minutes_by_clocks_that_are_right(started):
+def test_rate_ignores_old_episodes_and_wrong_clocks(started):
     out, write = started
     now = time.time()
     write(good(0, now - 5000), good(1, now - 100), good(2, now), good(4, now + 86400))
