@@ -63,6 +63,7 @@ PUBLIC = {
         "convert",
         "convert_lerobot",
         "open_source",
+        "to_joint_positions",
         "validate",
     ],
     "robocas_ms3.demos": [

@@ -1,4 +1,4 @@
-"""RoboCAS and LeRobot datasets: read, convert, validate, draw statistics, and load samples for training.
+"""RoboCAS and LeRobot datasets: read, convert, validate, statistics, and samples for training.
 
 Public names are imported from this package at first use; without the names of `training`, PyTorch is not loaded.
 """
@@ -9,6 +9,7 @@ from robocas_ms3.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from robocas_ms3.datasets.actions import ActionScale as ActionScale
+    from robocas_ms3.datasets.actions import to_joint_positions as to_joint_positions
     from robocas_ms3.datasets.checks.dataset import ValidationReport as ValidationReport
     from robocas_ms3.datasets.checks.dataset import validate as validate
     from robocas_ms3.datasets.checks.violation import Violation as Violation
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
-        "robocas_ms3.datasets.actions": ["ActionScale"],
+        "robocas_ms3.datasets.actions": ["ActionScale", "to_joint_positions"],
         "robocas_ms3.datasets.checks.dataset": ["ValidationReport", "validate"],
         "robocas_ms3.datasets.checks.violation": ["Violation"],
         "robocas_ms3.datasets.conversion.convert": ["convert"],

@@ -40,6 +40,15 @@ def require_actions(arrays: Mapping[str, NDArray], where: str) -> NDArray[np.flo
         raise DatasetError(what, where=where, found=found, fix=SEE_VALIDATE) from error
 
 
+def to_joint_positions(actions: NDArray) -> NDArray[np.float32]:
+    """Convert ``action.joint`` of a dataset (..., 8) to actions of the convention ``joint_positions``.
+
+    The seven joint targets in rad stay. The gripper is 0 (closed) to 1 (open) in datasets, and -1 (closed) to 1 (open)
+    in ``joint_positions``.
+    """
+    return np.concatenate([actions[..., :7], 2 * actions[..., 7:] - 1], axis=-1).astype(np.float32)
+
+
 def check_finite(arrays: Mapping[str, NDArray], where: str) -> None:
     """Raise DatasetError if an array of floats holds NaN or infinite values."""
     for key, array in arrays.items():

@@ -1,1 +1,1 @@
-"""`robocas view`: trajectories and datasets in a browser, served on this machine or written as a folder."""
+"""``robocas view``: a viewer of trajectory files and datasets in a browser."""

@@ -1,4 +1,4 @@
-"""What the page shows of an `EpisodeSource`: the table, an episode, its images."""
+"""Content of the page for an `EpisodeSource`: table, episodes, images."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from robocas_ms3.viewer.episode_table import Failures, Row, describe, stages
 from robocas_ms3.viewer.images import EncodedImage, encode_jpeg
 
 CAMERA_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")
-"""Names of cameras that are shown: names become addresses and folders."""
+"""Pattern of the camera names that are shown; names become parts of URLs and paths."""
 
 
 class PageContent:
-    """Episodes as the page shows them, for several threads. Damaged values are left out, and the row says so.
+    """Content of the page, thread-safe. Damaged values are omitted and reported in the row of the episode.
 
-    Subclasses add what a format, whose name is ``kind``, has beyond `EpisodeSource`.
+    Subclasses add content of one format; ``kind`` is the title of the format.
     """
 
     scene_name = schema.SCENE_FILE
-    """File that holds ``scene`` of an episode, for messages."""
+    """Name of the file with the scene of an episode, in messages."""
     entry_name = schema.CONVERSION_FILE
-    """File that holds ``entry`` of the source, for messages."""
+    """Name of the file with the entries of the source, in messages."""
 
     def __init__(self, source: EpisodeSource, kind: str, notes: Sequence[str] = ()) -> None:
         self.root, self.source, self._kind = source.root, source, kind
@@ -44,11 +44,11 @@ class PageContent:
         self._reading = threading.Lock()
 
     def index(self) -> dict[str, Any]:
-        """Return what the table shows; arrays are read only for episodes whose length is not listed.
+        """Return the content of the table; arrays are read only for episodes without a listed length.
 
-        Seeds without an episode, from ``failures.jsonl``, come last.
+        Skipped seeds, from ``failures.jsonl``, come last.
         """
-        source, split = self.source, self._sides()
+        source, split = self.source, self._splits()
         lengths, _ = read_or_default(lambda: source.lengths, {})
         found = [self._row(number, lengths.get(number, 0), split.get(number, "")) for number in source.numbers]
         rows = [row for row, _ in found]
@@ -65,9 +65,10 @@ class PageContent:
         }
 
     def episode(self, number: int) -> dict[str, Any]:
+        """Return the content of the page of an episode; raise DatasetError if it is damaged."""
         where = f"{self.root.name}, episode {number}"
         with as_dataset_error(where):
-            scene, _ = self._scene(number)  # the table says what is wrong
+            scene, _ = self._scene(number)  # the table reports errors
             shown = {"facts": facts_of(scene), **self._show(number, scene)}
             if shown["steps"] < 1:
                 raise DatasetError("this episode has no steps", where=where)
@@ -81,13 +82,15 @@ class PageContent:
             }
 
     def rgb(self, number: int, camera: str, step: int) -> EncodedImage:
+        """Return an RGB image."""
         return encode_jpeg(self._image(number, camera, "rgb", step))
 
     def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
+        """Return a depth image (H, W) in mm."""
         return self._image(number, camera, "depth", step)
 
     def _row(self, number: int, steps: int, split: str) -> tuple[Row, Any]:
-        """Return the row of an episode, and its environment as far as it is known."""
+        """Return the row of an episode, and its ``env_info`` if known."""
         scene, wrong = self._scene(number)
         entry, wrong_entry = read_scene(lambda: self._entry(number), self.entry_name)
         wrong_steps = ""
@@ -113,7 +116,7 @@ class PageContent:
         return row, scene.get("env_info")
 
     def _scene(self, number: int) -> tuple[dict[str, Any], str]:
-        """Return the valid values of how an episode was made, and what is wrong with the others."""
+        """Return the valid values of the scene of an episode, and a text on invalid values."""
         return read_scene(lambda: self.source.episode(number).scene, self.scene_name)
 
     def _entry(self, number: int) -> Any:
@@ -121,7 +124,7 @@ class PageContent:
         known = ("seed", "success", "target")
         return {key: entry[key] for key in known if key in entry} if isinstance(entry, Mapping) else entry
 
-    def _sides(self) -> Mapping[int, str]:
+    def _splits(self) -> Mapping[int, str]:
         train, _ = read_or_default(lambda: self.source.split("train"), [])
         val, _ = read_or_default(lambda: self.source.split("val"), [])
         return {**dict.fromkeys(train, "train"), **dict.fromkeys(val, "val")}
@@ -130,7 +133,7 @@ class PageContent:
         return self.failures.of_seed(one_seed(scene.get("seed")), scene.get("env_info"))
 
     def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what is shown of an episode, see `show_arrays`; may replace ``facts``."""
+        """Return the content of an episode, see `show_arrays`; it may replace ``facts``."""
         return show_arrays(self.source.episode(number).arrays, scene)
 
     def _image(self, number: int, camera: str, kind: ImageKind, step: int) -> NDArray:

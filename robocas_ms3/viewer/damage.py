@@ -1,4 +1,4 @@
-"""Read what may be damaged: what can be used of it, and what is wrong with the rest, for people."""
+"""Reading of data that may be damaged: usable content, and a text on the damage."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 
 T = TypeVar("T")
 _WRONG = (*DAMAGED_FILE_ERRORS, ArithmeticError, AttributeError, AssertionError, LookupError, RecursionError, TypeError)
-"""Errors that values of another kind than expected raise."""
+"""Errors that damaged files and invalid values raise."""
 
 
 @contextmanager
 def as_dataset_error(where: object) -> Iterator[None]:
-    """Turn any error that damage may raise into a DatasetError that says where it is."""
+    """Convert errors of damaged data to DatasetError with the place ``where``."""
     try:
         yield
     except _WRONG as error:
-        what, found = "damaged, can't be shown", format_error(error)
+        what, found = "damaged data", format_error(error)
         raise DatasetError(what, where=where, found=found, fix=SEE_VALIDATE) from error
 
 
 def read_or_default(read: Callable[[], T], otherwise: T) -> tuple[T, str]:
-    """Return the result and an empty text; if it can't be read, the other value and what is wrong."""
+    """Return the result of ``read`` and an empty text, or ``otherwise`` and the reason of the failure."""
     try:
         with as_dataset_error(""):
             return read(), ""
@@ -37,25 +37,26 @@ def read_or_default(read: Callable[[], T], otherwise: T) -> tuple[T, str]:
 
 
 def reason(error: DatasetError) -> str:
-    """Return what is wrong according to an error, without the place."""
+    """Return the message of an error without the place."""
     return f"{error.what}, {error.found}" if str(error.found) else error.what
 
 
 def join_reasons(*reasons: str) -> str:
+    """Join distinct, non-empty reasons to one text."""
     return "; ".join(dict.fromkeys(filter(None, reasons)))
 
 
 def read_object(read: Callable[[], Any], name: str) -> tuple[dict[Any, Any], str]:
-    """Return a JSON object of a dataset, and a note; an empty object if it is damaged."""
+    """Return a JSON object of a dataset and an empty note; for a damaged one an empty object and a note."""
     try:
         with as_dataset_error(name):
             found = read()
     except DatasetError as error:
         return {}, f"`{name}` is damaged: {error.found}."
-    return (found, "") if isinstance(found, dict) else ({}, f"`{name}` is damaged: it holds no object.")
+    return (found, "") if isinstance(found, dict) else ({}, f"`{name}` is damaged: not a JSON object.")
 
 
 def read_scene(read: Callable[[], Any], name: str) -> tuple[dict[str, Any], str]:
-    """Return the valid values of a ``scene.json``, or of what has some of its keys, and what is wrong with the rest."""
+    """Return the valid values of an object with keys of ``scene.json``, and a text on invalid values."""
     (found, wrong), failed = read_or_default(lambda: valid_values(read(), name), ({}, ""))
     return found, f"{name}: {failed}" if failed else wrong

@@ -1,4 +1,4 @@
-"""What the page shows of an episode: plots, sub-goals, the path of the TCP among the objects, facts."""
+"""Content of an episode on the page: plots, sub-goals, 3-D paths of the TCP and the objects, facts."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ def show_arrays(
     actions: list[Plot] | None = None,
     moving: list[dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
-    """Return what is shown of the arrays of an episode, by the keys of the schema.
+    """Return the content of an episode from its arrays, by the keys of the schema.
 
-    ``actions`` are plots of recorded actions; by default the motion of the TCP is plotted. ``moving`` objects are
-    {name, target, path}, with paths in the world (T, 3), or (1, 3) of one that does not move; by default they are where
-    the scene has them at the start.
+    ``actions`` are plots of recorded actions; the default plots the motion of the TCP. ``moving`` are objects {name,
+    target, path} with paths in the world frame, (T, 3), or (1, 3) without motion; the default shows the objects at
+    their start positions.
 
     Raises:
         LookupError: an array is missing.
@@ -49,8 +49,8 @@ def show_arrays(
     if actions is None:
         turns = np.degrees(Rotation.from_quat(a["rel_orn"]).as_euler("xyz"))
         actions = [
-            plot("Action: TCP translation a step", "mm", XYZ, a["rel_pos"] * 1000),
-            plot("Action: TCP rotation a step", "deg", ROLL_PITCH_YAW, turns),
+            plot("Action: TCP translation per step", "mm", XYZ, a["rel_pos"] * 1000),
+            plot("Action: TCP rotation per step", "deg", ROLL_PITCH_YAW, turns),
         ]
     goals = subgoal_runs([str(v) for v in a["step_goal_type"]], [str(v) for v in a["step_lang_goals"]])
     base = from_xyzw(a["base_pos"].astype(float), a["base_orn"].astype(float))
@@ -93,7 +93,7 @@ def _objects(scene: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def facts_of(scene: Mapping[str, Any]) -> dict[str, Any]:
-    """Return facts on an episode that the table does not show, by their title."""
+    """Return facts on an episode that the table does not show, by title."""
     recorded, source = scene.get("recorded") or {}, scene.get("source") or {}
     recording = f"{source['trajectory']}, episode {source.get('episode_id')}" if source.get("trajectory") else None
     kwargs = (scene.get("env_info") or {}).get("env_kwargs") or {}
@@ -109,7 +109,7 @@ def facts_of(scene: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def continuous(xyzw: NDArray) -> NDArray:
-    """Return quaternions (T, 4) of the same orientations, with signs that do not jump."""
+    """Return quaternions (T, 4) xyzw of the same orientations with continuous signs."""
     if len(xyzw) and xyzw[0][np.abs(xyzw[0]).argmax()] < 0:
         xyzw = -xyzw
     flips = np.cumsum(np.sum(xyzw[1:] * xyzw[:-1], axis=1) < 0) % 2
@@ -117,6 +117,7 @@ def continuous(xyzw: NDArray) -> NDArray:
 
 
 def gripper_plot(width: NDArray, is_open: NDArray | None) -> Plot:
+    """Return a plot of the gripper width (T,) in m and the commanded width."""
     columns: dict[str, NDArray] = {"width": np.ravel(width)}
     if is_open is not None:
         columns["command"] = np.where(np.asarray(is_open, bool), _OPEN_WIDTH, 0.0)
@@ -124,21 +125,21 @@ def gripper_plot(width: NDArray, is_open: NDArray | None) -> Plot:
 
 
 def base_plot(pose: NDArray) -> list[Plot]:
-    """Plot the pose of the mobile base (T, 3): x, y in m, yaw in rad. No plot if it does not move."""
+    """Return a plot of the mobile base (T, 3), x, y in m and yaw in rad; none if it does not move."""
     pose = np.column_stack([pose[:, :2], np.unwrap(pose[:, 2])])
     moves = len(pose) > 0 and np.ptp(pose, axis=0).max() > 1e-3
     return [plot("Mobile base, world", "m, rad", ("x", "y", "yaw"), pose)] if moves else []
 
 
 def plot(title: str, unit: str, names: Sequence[str], values: NDArray, *, steps: bool = False) -> Plot:
-    """Return a plot of (T, N) values; ``steps`` draws each value until the next one."""
+    """Return a plot of (T, N) values; ``steps`` draws a step function."""
     columns = np.atleast_2d(np.asarray(values, float).T)
     series = [{"name": name, "values": round_values(column)} for name, column in zip(names, columns, strict=True)]
     return {"title": title, "unit": unit, "series": series, "steps": steps}
 
 
 def round_values(values: Any) -> list:
-    """Return nested lists of round_values numbers; NaN and infinity, which JSON does not have, become None."""
+    """Return nested lists of rounded numbers; NaN and infinity become None, as JSON lacks them."""
     array = np.round(np.asarray(values, float), 5) + 0.0  # + 0.0: no -0.0
     if np.isfinite(array).all():
         return array.tolist()

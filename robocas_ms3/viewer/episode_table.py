@@ -1,4 +1,4 @@
-"""Rows of the table: episodes, and seeds without an episode according to ``failures.jsonl``."""
+"""Rows of the table: episodes, and skipped seeds according to ``failures.jsonl``."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from robocas_ms3.demos.failures import FAILURES_FILE, FailedAttempt
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table.
+    """Row of the table.
 
-    ``n`` is None for a seed without an episode, ``stages`` are where attempts failed, ``damage`` is what is not shown.
+    ``n`` is the episode number, None for a skipped seed. ``stages`` are the stages at which attempts failed. ``damage``
+    is a text on values that can't be shown.
     """
 
     n: int | None
@@ -35,7 +36,7 @@ class Row:
 
 @dataclass(frozen=True)
 class TaskFailedAttempt(FailedAttempt):
-    """A line of ``failures.jsonl``, with the task and environment of the run; None: unknown."""
+    """A line of ``failures.jsonl``, with task and environment of the run, None: unknown."""
 
     task: str | None = None
     environment: str | None = None
@@ -48,7 +49,7 @@ class TaskFailedAttempt(FailedAttempt):
 
 @dataclass(frozen=True)
 class Failures:
-    """The lines of ``failures.jsonl`` by seed, and a note on damaged ones."""
+    """Lines of ``failures.jsonl`` by seed, and a note on damaged lines."""
 
     by_seed: Mapping[int, list[TaskFailedAttempt]] = field(default_factory=dict)
     note: str = ""
@@ -65,19 +66,19 @@ class Failures:
                 found[line.record.seed].append(line.record)
         damaged = [str(line.number) for line in lines if line.record is None]
         listed = ", ".join(damaged[:5]) + (", ..." if len(damaged) > 5 else "")
-        return cls(dict(found), f"Damaged and left out: line {listed} of `{FAILURES_FILE}`." if damaged else "")
+        return cls(dict(found), f"Damaged lines are not shown: {listed} of `{FAILURES_FILE}`." if damaged else "")
 
     def of_seed(self, seed: int | None, env_info: Any = None) -> list[TaskFailedAttempt]:
-        """Return the failures of a seed in an environment; none if the seed is unknown."""
+        """Return the failed attempts of a seed in an environment; none if the seed is unknown."""
         return [] if seed is None else [failure for failure in self.by_seed.get(seed, []) if failure.is_of(env_info)]
 
     def skipped_seeds(self, rows: Sequence[Row], env_infos: Sequence[Any]) -> list[Row]:
-        """Return rows of the seeds that were given up and have no episode."""
+        """Return the rows of skipped seeds, which have no episode."""
         environments: dict[int | None, list[Any]] = defaultdict(list)
         for row, env_info in zip(rows, env_infos, strict=True):
             environments[row.seed].append(env_info)
         tasks = {row.task for row in rows}
-        task = tasks.pop() if len(tasks) == 1 else ""  # if the file does not name it
+        task = tasks.pop() if len(tasks) == 1 else ""  # if the file lacks it
         lost = []
         for seed, of_seed in sorted(self.by_seed.items()):
             runs: dict[str | None, list[TaskFailedAttempt]] = defaultdict(list)
@@ -88,7 +89,7 @@ class Failures:
                 if recorded or not any(failure.skipped for failure in of_run):
                     continue
                 tried = [failure for failure in of_run if not failure.skipped]
-                named = stages(tried, {}) or ["given up"]
+                named = stages(tried, {}) or ["skipped"]
                 of_task = of_run[0].task or task
                 lost.append(Row(None, task=of_task, seed=seed, success=False, stages=named, attempts=len(tried)))
         return lost

@@ -1,4 +1,4 @@
-"""Write the viewer as a folder that opens from disk, without a server."""
+"""Export of the viewer as a folder that opens from disk, without a server."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def export(
     depth: bool = True,
     on_episode: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[int, dict[int, str]]:
-    """Write ``index.html`` and all it needs; an existing folder is replaced, so the caller checks that it may be.
+    """Write ``index.html`` and its files; an existing folder is replaced without a check.
 
-    Return the number of episodes, and what is wrong with the damaged ones, which the table of the page says too.
-    Raise DatasetError if an episode that was asked for does not exist.
+    Return the number of episodes, and a text on each damaged episode by number. Raise DatasetError if a requested
+    episode does not exist. ``on_episode`` is called with (done, total).
     """
     index = source.index()
     known = [entry["n"] for entry in index["episodes"] if entry["n"] is not None]
@@ -75,7 +75,7 @@ def _write_episode(source: PageContent, index: dict[str, Any], number: int, fold
 
 
 def _write(path: Path, make: Callable[[], EncodedImage]) -> str:
-    """Write an image, or return why there is none."""
+    """Write an image; return the reason if that fails, an empty text otherwise."""
     try:
         with as_dataset_error(path.name):
             image = make()

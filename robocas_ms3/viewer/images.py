@@ -1,4 +1,4 @@
-"""Images as the page wants them: depth in colours, and small ones for the table."""
+"""Images of the page: depth in colours, thumbnails, JPEG encoding."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from robocas_ms3.datasets.images.video import colour_depth
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 
 THUMBNAIL = (96, 72)
-"""Width and height: twice what the table shows, for dense screens."""
+"""Width and height in pixels: twice the shown size, for high-resolution screens."""
 _QUALITY = 85
 
 
 @dataclass(frozen=True)
 class EncodedImage:
-    """An image as a file."""
+    """Encoded image with its media type."""
 
     media_type: str
     data: bytes
 
 
 def check_inside(path: Path, root: Path) -> Path:
-    """Return the path of an image, if it is no link that leads out of the dataset."""
+    """Return a path; raise DatasetError if it is a link to a file outside the dataset."""
     if not path.resolve().is_relative_to(root.resolve()):
-        raise DatasetError("this link leads out of the dataset", where=path)
+        raise DatasetError("link to a file outside the dataset", where=path)
     return path
 
 
 def depth_image(depth: NDArray[np.uint16], width: int | None = None) -> EncodedImage:
-    """Return depth in colours on a logarithmic scale, at most this wide: near is red, far is blue, nothing is black."""
+    """Return depth in colours on a log scale, at most ``width`` pixels wide: near red, far blue."""
     return encode_jpeg(_shrink(colour_depth(depth), width))
 
 
@@ -50,7 +50,7 @@ def thumbnail(image: EncodedImage) -> EncodedImage:
 def decode(image: EncodedImage, flags: int = cv2.IMREAD_COLOR) -> NDArray[np.uint8]:
     pixels = cv2.imdecode(np.frombuffer(image.data, np.uint8), flags) if image.data else None
     if pixels is None:
-        raise DatasetError("this image is damaged", fix=SEE_VALIDATE)
+        raise DatasetError("damaged image", fix=SEE_VALIDATE)
     return np.asarray(pixels[..., ::-1], np.uint8)
 
 

@@ -1,15 +1,15 @@
-"""Responses of the viewer. No part of an address ever becomes a path: numbers and known names only.
+"""Responses of the viewer by URL. URLs contain only numbers and known names, never paths.
 
 ::
 
     /                                        the page
     /page/NAME                               its scripts and style
     /data/index.js, /data/episode_12.js      robocas.put("index", {...})
-    /images/12/base_camera/rgb/30.jpg      an image; depth in colours
+    /images/12/base_camera/rgb/30.jpg        an image; depth in colours
     /thumbnails/12.jpg
 
-Data are scripts, so that the page also works from files, where a browser fetches nothing. The page asks for images with
-a query that tells this server from others: a browser caches them, and this port may serve another dataset later.
+Data are scripts, so that the page also works from disk, where browsers block requests. URLs of images have a query
+that identifies the server, because browsers cache images and another dataset may use the same port later.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _CONTROL = re.compile(  # of `text.escape_controls`, but for surrogates, of whic
 
 @dataclass(frozen=True)
 class Response:
-    """What to send; ``max_age``: for how many seconds a browser may cache it."""
+    """HTTP response; ``max_age``: seconds for which a browser may cache it."""
 
     status: int
     media_type: str
@@ -56,7 +56,7 @@ class Response:
 
 
 class Routes:
-    """Responses for one dataset; may be asked by several threads."""
+    """Responses for one dataset, thread-safe."""
 
     def __init__(self, source: PageContent) -> None:
         self.source = source
@@ -74,11 +74,12 @@ class Routes:
         return self.source.index()
 
     def respond(self, path: str) -> Response:
+        """Return the response for the path of a URL."""
         name = "index.html" if path in ("/", "/index.html") else path.removeprefix("/page/")
         if name in PAGE_FILES and (path.startswith("/page/") or name == "index.html"):
             return Response(200, PAGE_FILES[name], page_file(name))
         try:
-            return self._data(path) or _not_found("nothing here")
+            return self._data(path) or _not_found("not found")
         except DatasetError as error:
             return _not_found(str(error))
 
@@ -101,18 +102,18 @@ class Routes:
 
 
 def make_thumbnail(source: PageContent, index: dict[str, Any], number: int) -> EncodedImage:
-    """Return the first image of the camera that shows most: the static one if there is one."""
+    """Return a thumbnail of the first image of an episode, of the static camera if there is one."""
     cameras = index["cameras"]
     if not cameras:
-        raise DatasetError("no images", where=source.root)
+        raise DatasetError("this dataset has no images", where=source.root)
     camera = next((name for name in cameras if "static" in name), cameras[0])
     return images.thumbnail(source.rgb(number, camera, 0))
 
 
 def script(name: str, content: Any) -> bytes:
-    r"""Return content as a script that hands it to the page.
+    r"""Return content as a script that passes it to the page.
 
-    It is ASCII, and the page shows control characters as escapes: ``\u202e`` becomes ``\\u202e``.
+    The script is ASCII. Control characters are escaped for display: ``\u202e`` becomes ``\\u202e``.
     """
     text = json.dumps(content, ensure_ascii=True, separators=(",", ":"), default=str)
     shown = _CONTROL.sub(r"\1\\\\\2", text)

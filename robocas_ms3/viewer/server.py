@@ -1,4 +1,4 @@
-"""Serve the viewer to browsers on this machine, and to nobody else."""
+"""HTTP server of the viewer, for browsers on this machine only."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _POLICY = "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancest
 
 
 class Viewer(ThreadingHTTPServer):
-    """The server, for a ``with`` statement and ``serve_forever``; raises RobocasError if the port is taken.
+    """HTTP server of a dataset, for a ``with`` statement; raises RobocasError if the port is used.
 
-    All its threads end with it: the interpreter would crash if it ended one inside OpenCV.
+    Closing waits for all threads, because the interpreter would crash if it stopped a thread inside OpenCV.
     """
 
     daemon_threads = False
@@ -36,18 +36,19 @@ class Viewer(ThreadingHTTPServer):
             super().__init__((HOST, port), _Handler)
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or str(error)
-            fix = "Choose another, or leave --port out for a free one."
-            raise RobocasError("can't listen on this port", where=port, found=reason, fix=fix) from error
+            fix = "Choose another port, or omit --port."
+            raise RobocasError("the port can't be used", where=port, found=reason, fix=fix) from error
 
     @property
     def url(self) -> str:
         return f"http://{HOST}:{self.server_port}/"
 
     def warm_up(self) -> None:
+        """Compute the table in a thread, before the first request."""
         self._warming.start()
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Keep the connection, which a browser keeps open; refuse too many, as each has a thread."""
+        """Keep the connection; refuse it if there are too many, as each has a thread."""
         if len(self._connections) >= MAX_CONNECTIONS:
             return self.shutdown_request(request)
         self._connections.add(request)
@@ -75,7 +76,7 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version = "robocas"
     sys_version = ""
-    timeout = 60  # s: idle connections end
+    timeout = 60  # s, for idle connections
 
     def do_GET(self) -> None:
         self._answer(body=True)
@@ -105,14 +106,14 @@ class _Handler(BaseHTTPRequestHandler):
                 self.close_connection = True  # the browser moved on to another step
 
     def _respond(self, server: Viewer) -> Response:
-        # A page elsewhere whose name was made to point here (DNS rebinding) must not read the dataset.
+        # against DNS rebinding: pages of other hosts must not read the dataset
         if self.headers.get("Host") not in {f"{name}:{server.server_port}" for name in (HOST, "localhost")}:
-            return Response(403, "text/plain; charset=utf-8", b"for this machine only\n")
+            return Response(403, "text/plain; charset=utf-8", b"only available on this machine\n")
         try:
             return server.routes.respond(urlsplit(self.path).path)
-        except Exception as error:  # a broken episode must not end the connection of all others
+        except Exception as error:  # a damaged episode must not close the connection
             text = escape_controls(f"{type(error).__name__}: {error}") + "\n"
             return Response(500, "text/plain; charset=utf-8", text.encode())
 
     def log_message(self, format: str, *args: object) -> None:
-        """Log nothing: a page asks for thousands of images."""
+        """Log nothing: a page requests thousands of images."""

@@ -1,4 +1,4 @@
-"""Open a trajectory file or a dataset of any format for the page."""
+"""Page content of trajectory files and datasets of all formats."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from robocas_ms3.viewer.episode import ARM, ROLL_PITCH_YAW, XYZ, Plot, facts_of,
 from robocas_ms3.viewer.images import EncodedImage, check_inside
 
 MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".webp": "image/webp"}
-_NO_IMAGES = "A trajectory file holds states, no images: `robocas convert {name} --to robocas --out DIR` renders them."
-_STILL = 0.002  # m: an object that moves less is drawn as one point
-_PARKED = 5.0  # m from the arm: objects there take no part
-_AT_ONCE = 8  # images decoded together: a video opens and seeks slowly, and the next step is asked for next
+_NO_IMAGES = "A trajectory file has no images. Render them with `robocas convert {name} --to robocas --out DIR`."
+_STILL = 0.002  # m; objects that move less are drawn as a point
+_PARKED = 5.0  # m from the arm; objects beyond are not in the scene
+_AT_ONCE = 8  # images decoded together, because opening and seeking a video is slow
 _CACHE_BYTES = 128e6  # of decoded images
 
 
 def open_content(path: Path | str) -> PageContent:
-    """Open a trajectory file or its folder, a RoboCAS folder, a LeRobot folder, or another package's format."""
+    """Open a trajectory file or its folder, or a dataset of any format, as page content."""
     path = Path(path)
     inside = path / "trajectory.h5"
     path = inside if inside.is_file() else path
@@ -43,9 +43,9 @@ def open_content(path: Path | str) -> PageContent:
     other_file = found is None or (found.name == "trajectory" and path.suffix not in (".h5", ".hdf5"))
     if other_file and not path.is_dir():
         raise DatasetError(
-            "nothing to view here",
+            "nothing to view",
             where=path,
-            expected="a trajectory.h5 of robocas generate, a RoboCAS folder or a LeRobot folder",
+            expected="a trajectory.h5, a RoboCAS folder or a LeRobot dataset",
             found="no such file or folder" if not path.exists() else "another kind of file",
         )
     if found is None or found.name == "robocas":
@@ -58,22 +58,22 @@ def open_content(path: Path | str) -> PageContent:
 
 
 class FolderContent(PageContent):
-    """A RoboCAS folder, of this package or of RoboCAS-v0; images are sent as they are stored."""
+    """Page content of a RoboCAS folder, also of RoboCAS-v0; images are sent as stored."""
 
     def __init__(self, root: Path) -> None:
         self.dataset = dataset = Dataset(root)
-        # damaged values of the overviews are left out from here on
+        # damaged overviews are replaced by empty ones
         dataset.settings, wrong_settings = read_object(lambda: dataset.settings, schema.CONVERSION_FILE)
         dataset.info, wrong_info = read_object(lambda: dataset.info, schema.DATA_INFO_FILE)
         dataset.rate_hz, wrong = read_or_default(lambda: dataset.rate_hz, DEFAULT_RATE)
-        assumed = f"`rate_hz` of `{schema.CONVERSION_FILE}`: {wrong}; {DEFAULT_RATE:g} Hz is assumed."
+        assumed = f"`rate_hz` of `{schema.CONVERSION_FILE}`: {wrong}; {DEFAULT_RATE:g} Hz is used."
         dataset.cameras, _ = read_or_default(lambda: dataset.cameras, dataset.episode(dataset.numbers[0]).cameras)
         notes = wrong_settings, assumed if wrong else "", wrong_info
         super().__init__(dataset, "RoboCAS folder", notes)
 
-    def _sides(self) -> Mapping[int, str]:
-        sides, _ = read_or_default(lambda: self.dataset.splits, ([], []))  # also of episodes that are not there
-        return {number: side for side, listed in zip(("train", "val"), sides, strict=True) for number in listed}
+    def _splits(self) -> Mapping[int, str]:
+        splits, _ = read_or_default(lambda: self.dataset.splits, ([], []))  # includes missing episodes
+        return {number: name for name, listed in zip(("train", "val"), splits, strict=True) for number in listed}
 
     def rgb(self, number: int, camera: str, step: int) -> EncodedImage:
         path = check_inside(self.dataset.episode(number).image_path(camera, "rgb", step), self.root)
@@ -81,7 +81,7 @@ class FolderContent(PageContent):
             return EncodedImage(MEDIA_TYPES[path.suffix], read_image_bytes(path))
         except (OSError, ValueError) as error:
             found = getattr(error, "strerror", None) or error
-            raise DatasetError("can't read this image", where=path, found=found) from error
+            raise DatasetError("the image can't be read", where=path, found=found) from error
 
     def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
         episode = self.dataset.episode(number)
@@ -90,9 +90,9 @@ class FolderContent(PageContent):
 
 
 class TrajectoryContent(PageContent):
-    """A trajectory file at its control frequency: no images, but recorded actions and the motion of the objects."""
+    """Page content of a trajectory file at its control frequency, with recorded actions and object paths."""
 
-    scene_name = entry_name = "its entry of the JSON"
+    scene_name = entry_name = "JSON entry"
 
     def __init__(self, path: Path) -> None:
         with as_dataset_error(path):
@@ -107,7 +107,7 @@ class TrajectoryContent(PageContent):
     def _entry(self, number: int) -> dict[str, Any]:
         return {key: self._entries[number][key] for key in ("task", "seed", "success", "target")}
 
-    def _sides(self) -> Mapping[int, str]:
+    def _splits(self) -> Mapping[int, str]:
         return {}
 
     def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
@@ -116,11 +116,11 @@ class TrajectoryContent(PageContent):
         base = from_xyzw(arrays["base_pos"][:1].astype(float), arrays["base_orn"][:1].astype(float))[0]
         objects = _object_paths(recording, scene, self.recordings.objects(number), base)
         shown = show_arrays(arrays, scene, actions=_action_plots(recording), moving=objects)
-        return {**shown, "facts": facts_of({**scene, "source": None})}  # which is this file
+        return {**shown, "facts": facts_of({**scene, "source": None})}  # the source is this file
 
 
 class LeRobotContent(PageContent):
-    """A LeRobot dataset; images are decoded from its videos, damaged additions of ours are left out with a note."""
+    """Page content of a LeRobot dataset; images are decoded from its videos."""
 
     def __init__(self, root: Path) -> None:
         from robocas_ms3.datasets.lerobot import schema as lerobot  # needs the extra `lerobot`
@@ -135,10 +135,12 @@ class LeRobotContent(PageContent):
         dataset.scene_texts, wrong_scenes = read_object(lambda: dataset.scene_texts, lerobot.SCENES_FILE)
         notes = wrong_scenes, wrong_settings
         super().__init__(dataset, "LeRobot dataset", notes)
-        self._decoded: OrderedDict[tuple[int, str, ImageKind, int], NDArray] = OrderedDict()  # the last used is last
+        self._decoded: OrderedDict[tuple[int, str, ImageKind, int], NDArray] = (
+            OrderedDict()
+        )  # least recently used first
 
     def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
-        """Show ours like a RoboCAS folder, others by a plot per numeric column."""
+        """Return the content of an episode; datasets of other tools get one plot per numeric column."""
         if self.dataset.is_robocas:
             return super()._show(number, scene)
         episode = self.dataset.episode(number)
@@ -182,7 +184,10 @@ def _names(feature: dict[str, Any], width: int) -> list[str]:
 
 
 def _action_plots(recording: Recording) -> list[Plot]:
-    """Plot recorded actions: arm, gripper, and base if it moves. The last state has none; it shows the one before."""
+    """Return plots of the recorded actions: arm, gripper, and base if it moves.
+
+    The last state has no action; its plot repeats the one before.
+    """
     values = np.concatenate([recording.actions, recording.actions[-1:]])
     arm = {7: 6, 8: 7, 10: 6, 11: 7}.get(values.shape[1])  # 6: end-effector deltas
     if arm is None:
@@ -191,7 +196,7 @@ def _action_plots(recording: Recording) -> list[Plot]:
     unit = "rad" if recording.control_mode == "pd_joint_pos" else ""
     plots = [
         plot(f"Action: arm, {recording.control_mode}", unit, names, values[:, :arm], steps=True),
-        plot("Action: gripper, 1 opens", "", ("gripper",), values[:, arm : arm + 1], steps=True),
+        plot("Action: gripper, 1 = open", "", ("gripper",), values[:, arm : arm + 1], steps=True),
     ]
     base = values[:, arm + 1 :]
     return plots + ([plot("Action: mobile base", "", ("x", "y", "yaw"), base, steps=True)] if base.any() else [])
@@ -200,7 +205,7 @@ def _action_plots(recording: Recording) -> list[Plot]:
 def _object_paths(
     recording: Recording, scene: Mapping[str, Any], ids: Any, base_in_world: NDArray
 ) -> list[dict[str, Any]]:
-    """Return the objects with their paths, thinned to one point if they stand still, without those that are parked."""
+    """Return the objects of the scene with their paths, (T, 3) or, without motion, (1, 3)."""
     target = scene.get("target") or {}
     target_actor = f"object_{target['slot']}" if target else ""
     names = {thing["slot"]: thing["name"] for thing in scene.get("objects") or ()}

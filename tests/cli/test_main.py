@@ -94,7 +94,7 @@ MISTAKES = {  # arguments -> text of the error, printed before anything heavy is
     "validate missing": "missing: no such dataset folder",
     "stats missing": "missing: no dataset here",
     "video missing": "missing: no dataset here",
-    "view missing": "missing: nothing to view here",
+    "view missing": "missing: nothing to view",
     "merge missing other --out o": "missing: no dataset here",
     "split missing": "--out: choose one way to split",
     "import-robocas missing": "missing: no dataset here",

@@ -83,7 +83,7 @@ def test_damaged_arrays_are_an_error_of_that_episode_alone(spoilt):
     source = open_content(spoilt)
     index, statuses = shown(source)
     assert statuses == [404, 404, 200]
-    assert index["episodes"][0]["damage"].startswith("scene.json: this JSON is damaged")
+    assert index["episodes"][0]["damage"].startswith("scene.json: damaged JSON file")
     assert [row["damage"] for row in index["episodes"][1:]] == ["", "", ""]
     for number in (0, 1):
         with pytest.raises(DatasetError):
@@ -108,7 +108,7 @@ def test_a_damaged_trajectory(run_folder, tmp_path):
     assert row["instruction"].startswith("grasp the cube 4")
     write({"instruction": 3, "target": said["target"]})
     (_, row, *_) = shown(open_content(folder), [0, 1])[0]["episodes"]
-    assert row["damage"].startswith("its entry of the JSON: the JSON's entry: ")
+    assert row["damage"].startswith("JSON entry: the JSON's entry: ")
     assert (row["object"], row["seed"], row["success"], row["stages"]) == ("cube 4 (cube)", 4, False, ["grasp"])
     for spoilt in ({"episodes": 3}, {"episodes": ["x"]}, {"env_info": {"env_id": 3, "env_kwargs": 4}}, {"robocas": []}):
         path.write_text(json.dumps({**whole, **spoilt}))
@@ -181,11 +181,11 @@ def test_damaged_lines_of_failures_are_left_out_with_a_note(tmp_path, spoilt):
     (tmp_path / "failures.jsonl").write_bytes("\n".join([LINE, *wrong, "", LINE, LINE[:30]]).encode("latin-1"))
     read = Failures.read(tmp_path)
     assert [len(failures) for failures in read.by_seed.values()] == [2]
-    assert read.note == "Damaged and left out: line 2, 3, 4, 5, 6, ... of `failures.jsonl`."
+    assert read.note == "Damaged lines are not shown: 2, 3, 4, 5, 6, ... of `failures.jsonl`."
     with (spoilt / "failures.jsonl").open("a") as file:
         file.write('{"seed": 12, "att')
     index = open_content(spoilt).index()
-    assert index["note"] == "Damaged and left out: line 4 of `failures.jsonl`."
+    assert index["note"] == "Damaged lines are not shown: 4 of `failures.jsonl`."
     assert [row["seed"] for row in index["episodes"]] == [3, 4, 5, 9]
     (spoilt / "failures.jsonl").unlink()
     (spoilt / "failures.jsonl").mkdir()

@@ -101,8 +101,8 @@ def wait_for_images(page, number, kind, at):
 def test_it_opens_with_the_table_and_the_first_episode(any_page):
     page = any_page
     assert page.evaluate(ROWS) == "0,1,2,none"
-    assert page.text_content("#count") == "3 episodes, 1 seed given up"
-    assert page.text_content(".row.gone .what").startswith("seed 9, given upfailed at reach")
+    assert page.text_content("#count") == "3 episodes, 1 seed skipped"
+    assert page.text_content(".row.skipped .what").startswith("seed 9, skippedfailed at reach")
     assert page.text_content("#instruction") == "grasp the cube 3 on the table and move it to the basket"
     assert page.text_content("#summary").startswith("Episode 0 \u00b7 pick \u00b7 seed 3 \u00b7 7 steps, 1.2 s")
     wait_for_images(page, 0, "rgb", 0)
@@ -113,10 +113,10 @@ def test_it_opens_with_the_table_and_the_first_episode(any_page):
 
 def test_filters_and_sorting(page):
     for field, value, rows, count in (
-        ("#f-success", "failure", "1,none", "1 of 3 episodes, 1 seed given up"),
-        ("#f-stage", "grasp", "1", "1 of 3 episodes, 0 of 1 seed given up"),
-        ("#f-stage", "reach", "none", "0 of 3 episodes, 1 seed given up"),
-        ("#f-object", "cube 5 (cube)", "2", "1 of 3 episodes, 0 of 1 seed given up"),
+        ("#f-success", "failure", "1,none", "1 of 3 episodes, 1 seed skipped"),
+        ("#f-stage", "grasp", "1", "1 of 3 episodes, 0 of 1 seed skipped"),
+        ("#f-stage", "reach", "none", "0 of 3 episodes, 1 seed skipped"),
+        ("#f-object", "cube 5 (cube)", "2", "1 of 3 episodes, 0 of 1 seed skipped"),
     ):
         page.select_option(field, value)
         wait_for_rows(page, rows)
@@ -238,7 +238,7 @@ def test_a_trajectory_shows_traces_and_says_how_to_get_images(opened, serve, run
     assert "robocas convert trajectory.h5" in page.text_content("#note")
     assert page.evaluate("document.querySelector('#cameras').hidden && document.querySelector('#views').hidden")
     assert page.evaluate(ROWS) == "0,1,2,none"
-    assert "seed 9, given up" in page.text_content(".row.gone")
+    assert "seed 9, skipped" in page.text_content(".row.skipped")
     page.keyboard.press("End")
     assert page.text_content("#clock").startswith("step 22 / 22")
 
@@ -252,7 +252,7 @@ def test_a_damaged_episode_is_shown_as_such(opened, serve, folder, tmp_path):
     (spoilt / "episode_0000002/episode_info.npz").write_bytes(b"PK")
     page = load(opened, serve(open_content(spoilt)).url)
     assert page.text_content("#damage") == (
-        "Damaged and left out: scene.json, layout.poses: expected a list, found 3;"
+        "Not shown (damaged): scene.json, layout.poses: expected a list, found 3;"
         ' scene.json, recorded: expected an object, found "x"'
     )
     assert page.is_visible("#damage")
@@ -267,7 +267,7 @@ def test_a_damaged_episode_is_shown_as_such(opened, serve, folder, tmp_path):
     assert page.errors == []
     page.keyboard.press("ArrowDown")
     wait(page, "document.querySelector('#episode').hidden")
-    assert page.text_content("#message").startswith("Episode 2 can't be shown: scene.json: this JSON is damaged")
+    assert page.text_content("#message").startswith("Episode 2 can't be shown: scene.json: damaged JSON file")
     page.errors.clear()  # the episode could not be loaded
 
 

@@ -160,7 +160,7 @@ def test_a_port_that_is_taken(folder):
     with socket.socket() as taken:
         taken.bind((HOST, 0))
         taken.listen()
-        with pytest.raises(RobocasError, match="can't listen"):
+        with pytest.raises(RobocasError, match="can't be used"):
             Viewer(open_content(folder), taken.getsockname()[1])
-    with pytest.raises(RobocasError, match="can't listen"):
+    with pytest.raises(RobocasError, match="can't be used"):
         Viewer(open_content(folder), 70_000)

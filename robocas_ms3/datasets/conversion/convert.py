@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import write_json
 from robocas_ms3.core.output_folder import OutputFolder, remove_leftovers
+from robocas_ms3.core.strict_model import parse
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.conversion.conversion_input import ConversionInput, open_trajectory
 from robocas_ms3.datasets.conversion.data_info import add_failures, write_info
@@ -33,6 +35,8 @@ from robocas_ms3.datasets.conversion.rendered_source import RenderedSource
 from robocas_ms3.datasets.conversion.settings import Conversion, ConversionSettings, WrittenEpisode
 from robocas_ms3.datasets.conversion.workers import PendingEpisodes, write_episodes
 from robocas_ms3.datasets.images.video import MAX_PREVIEWS, finish_previews, sheet_episodes
+from robocas_ms3.datasets.sources.file_models import SettingsRecord
+from robocas_ms3.datasets.sources.files import read_json
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.recordings.trajectory_json import versions
 
@@ -62,6 +66,7 @@ def convert(
         MissingExtraError: embeddings are requested and the extra ``language`` is not installed.
     """
     start, out = time.perf_counter(), settings.out
+    settings = _inherit_settings(settings)
     with ExitStack() as stack:
         source = stack.enter_context(closing(open_trajectory(settings)))
         image_options = source.image_options
@@ -106,6 +111,18 @@ def convert(
         if missing_names := missing_episodes(out, content):
             _log.warning("%s: %s are missing; convert them with --append", out, " and ".join(missing_names))
     return Conversion(written, len(tasks) - len(missing), time.perf_counter() - start, previews=sheet is not None)
+
+
+def _inherit_settings(settings: ConversionSettings) -> ConversionSettings:
+    """Return settings whose cameras and size are those of the dataset to append to, if they are not given."""
+    path = settings.out / schema.CONVERSION_FILE
+    stored = read_json(path) if settings.append else {}
+    if not stored:
+        return settings
+    schema.check_version(stored.get("schema_version", 1), path)
+    dataset = parse(SettingsRecord, stored, DatasetError, where=path)
+    size = (dataset.image_size[0], dataset.image_size[1]) if dataset.image_size else None
+    return replace(settings, cameras=settings.cameras or tuple(dataset.cameras), size=settings.size or size)
 
 
 def _previous_split(out: Path) -> tuple[list[int], list[int]]:

@@ -33,8 +33,8 @@ MARKS = (schema.CONVERSION_FILE, schema.DATA_INFO_FILE)
 def add_versions(record: dict[str, Any]) -> dict[str, Any]:
     """Return a record with the current versions if some are missing, as in merged datasets."""
     now, made_with = versions(), record.get("made_with")
-    is_whole = isinstance(made_with, dict) and now.keys() <= made_with.keys()
-    return record if is_whole else {**record, "made_with": now}
+    is_complete = isinstance(made_with, dict) and now.keys() <= made_with.keys()
+    return record if is_complete else {**record, "made_with": now}
 
 
 DATASET = FolderKind("robocas convert", (schema.CONVERSION_FILE,), "rate_hz", markers=MARKS, upgrade=add_versions)

@@ -1,1 +1,1 @@
-"""LeRobot datasets v3.0: written, read and checked without ``lerobot``; see docs/lerobot.md."""
+"""LeRobot datasets: writer, reader and checks without the package ``lerobot``; see docs/lerobot.md."""

@@ -15,13 +15,13 @@ from robocas_ms3.robots.quantities import feature_columns, lerobot_features
 
 
 def frame_columns(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
-    """Return the numeric features (T, D) of an episode, from the arrays of ``episode_info.npz``."""
-    turn = Rotation.from_quat(arrays["rel_orn"].astype(np.float64)).as_euler("xyz")
+    """Return the numeric features (T, D) of an episode from the arrays of ``episode_info.npz``."""
+    euler = Rotation.from_quat(arrays["rel_orn"].astype(np.float64)).as_euler("xyz")
     status = arrays["gripper_status"].astype(np.float32)[:, None]
     command, joints = _next(status), _next(arrays["robot_joints"])
     parts = {
         **{key: [arrays[one.name] for one in quantities] for key, quantities in lerobot_features().items()},
-        "action": (arrays["rel_pos"], turn, command),
+        "action": (arrays["rel_pos"], euler, command),
         "action.joint": (joints, command),
         "action.base": (arrays["rel_agv_pose"],),
     }
@@ -32,7 +32,7 @@ def frame_columns(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
 def robocas_arrays(
     columns: dict[str, NDArray], instruction: str, subgoals: list[str], types: list[str]
 ) -> dict[str, NDArray]:
-    """Return the arrays of ``episode_info.npz`` without embeddings, the inverse of `frame_columns`."""
+    """Return the arrays of ``episode_info.npz`` without embeddings: the inverse of `frame_columns`."""
     values: dict[str, Any] = {
         "rel_pos": columns["action"][:, :3],
         "rel_agv_pose": columns["action.base"],

@@ -1,4 +1,4 @@
-"""Checks a LeRobot dataset against its own declarations: lengths, numbers, times, videos, texts, statistics."""
+"""Check a LeRobot dataset: totals, lengths, times, videos, texts, statistics and checksums."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from robocas_ms3.datasets.lerobot.stats import QUANTILES
 from robocas_ms3.datasets.lerobot.video import packet_times, read_frames
 from robocas_ms3.datasets.sources.file_models import SceneRecord
 
-_MILLISECONDS = 0.6e-3  # Matroska rounds to them
+_MATROSKA_TOLERANCE = 0.6e-3  # s; Matroska rounds to milliseconds
 _STATISTICS = ("min", "max", "mean", "std", "count")
 _MOST = {"total_episodes": MAX_EPISODES, "total_tasks": MAX_EPISODES, "total_frames": MAX_FRAMES}
 
@@ -29,21 +29,23 @@ _MOST = {"total_episodes": MAX_EPISODES, "total_tasks": MAX_EPISODES, "total_fra
 def check_lerobot(
     root: str | Path, *, decode: bool = False, on_episode: Callable[[int, int], None] | None = None
 ) -> ValidationReport:
-    """Check a dataset; datasets made elsewhere are checked as far as they have what ours have.
+    """Check a LeRobot dataset; checks of RoboCAS features apply only to datasets that have them.
 
-    ``decode`` decodes every frame; otherwise frames are counted. FFmpeg's decoders conceal damage inside a video, which
-    shows by the checksums that datasets made here have.
+    ``decode`` decodes all frames; otherwise frames are counted. The decoders of FFmpeg conceal damage inside a video,
+    which the checksums of datasets of ``robocas convert`` reveal.
 
     Raises:
-        MissingExtraError: the ``lerobot`` extra is not installed.
+        MissingExtraError: the extra ``lerobot`` is not installed.
     """
     schema.require_lerobot()
     root = Path(root)
     info, wrong = read_object(root, schema.INFO_FILE, InfoRecord, absent="JSON")
     features = {} if wrong else info["features"]
-    for own in schema.FEATURES if set(schema.ROBOCAS_KEYS) <= set(features) else ():
-        if (shape := features[own.key]["shape"]) != [own.width]:
-            wrong.append(Violation(schema.INFO_FILE, f"features.{own.key}.shape", str([own.width]), str(shape)))
+    for declared in schema.FEATURES if set(schema.ROBOCAS_KEYS) <= set(features) else ():
+        if (shape := features[declared.key]["shape"]) != [declared.width]:
+            wrong.append(
+                Violation(schema.INFO_FILE, f"features.{declared.key}.shape", str([declared.width]), str(shape))
+            )
     if wrong:
         return ValidationReport(0, 0, wrong)
     try:
@@ -60,16 +62,16 @@ def check_lerobot(
         *data,
         *(wrong for key in dataset.videos for wrong in _check_videos(dataset, key, decode)),
         *_check_statistics(dataset, ranges),
-        *_check_our_files(dataset),
+        *_check_robocas_files(dataset),
         *_check_checksums(root),
     ]
     return ValidationReport(len(dataset.rows), dataset.info["total_frames"], violations)
 
 
 def _check_totals(dataset: LeRobotDataset) -> Iterator[Violation]:
-    """Check ``info.json`` and the rows of episodes; from here on the totals are those of the tables."""
+    """Check ``info.json`` against the rows of episodes; set the totals of ``info`` to those of the tables."""
     declared = {key: dataset.info[key] for key in _MOST}
-    dataset.info.update(_MOST)  # which limit what is read
+    dataset.info.update(_MOST)  # limits of what is read
     rows, tasks = dataset.rows, dataset.tasks
     start = 0
     for index, row in enumerate(rows):
@@ -84,11 +86,11 @@ def _check_totals(dataset: LeRobotDataset) -> Iterator[Violation]:
             yield Violation(schema.INFO_FILE, key, str(found), str(declared[key]))
     if len(set(tasks)) != len(tasks):
         name = schema.TASKS_LINES if dataset.layout.one_file_per_episode else schema.TASKS_FILE
-        yield Violation(name, "", "each text once", "some twice")
+        yield Violation(name, "", "each text once", "repeated texts")
 
 
 def _check_videos(dataset: LeRobotDataset, key: str, decode: bool) -> Iterator[Violation]:
-    """Check the videos of a feature, and the depth videos of the camera that LeRobot does not read."""
+    """Check the videos of a feature, and the FFV1 depth videos of its camera."""
     root, layout, fps = dataset.root, dataset.layout, dataset.info["fps"]
     size, extra = dataset.info["features"][key]["shape"][:2], f"depth/{schema.camera_of(key)}"
     has_extra = any(f"{extra}/file_index" in row for row in dataset.rows)
@@ -97,7 +99,7 @@ def _check_videos(dataset: LeRobotDataset, key: str, decode: bool) -> Iterator[V
         for path, inside in by_file.items():
             yield from _check_times(inside, prefix, fps)
             frames, name = sum(row["length"] for row in inside), str(path.relative_to(root))
-            yield from (Violation(name, *fault) for fault in _video_violations(path, frames, fps, size, decode))
+            yield from (Violation(name, *violation) for violation in _video_violations(path, frames, fps, size, decode))
         folder = layout.path(root, prefix, 0, 0).parent  # chunk-000, or below it
         chunks = folder.parent.parent.glob(f"*/{folder.name}") if layout.one_file_per_episode else [folder.parent]
         yield from unexpected_files(root, chunks, by_file)
@@ -128,7 +130,7 @@ def _video_violations(path: Path, frames: int, fps: int, size: list[int], decode
     if len(times) != frames:
         yield "frames", str(frames), str(len(times))
         return
-    tolerance = _MILLISECONDS if path.suffix == ".mkv" else TOLERANCE
+    tolerance = _MATROSKA_TOLERANCE if path.suffix == ".mkv" else TOLERANCE
     late = [index for index, time in enumerate(times) if abs(float(time) - index / fps) > tolerance]
     if late:
         yield f"time of frame {late[0]}", f"{late[0] / fps} s", f"{float(times[late[0]])} s"
@@ -137,7 +139,7 @@ def _video_violations(path: Path, frames: int, fps: int, size: list[int], decode
 def _check_statistics(dataset: LeRobotDataset, ranges: Ranges) -> Iterator[Violation]:
     if dataset.layout.one_file_per_episode:
         yield from _check_lines(dataset)
-        if not (dataset.root / schema.STATS_FILE).exists():  # of an older format, and optional
+        if not (dataset.root / schema.STATS_FILE).exists():  # optional in this format
             return
     stats, wrong = read_object(dataset.root, schema.STATS_FILE, absent="JSON")
     yield from wrong
@@ -148,7 +150,7 @@ def _check_statistics(dataset: LeRobotDataset, ranges: Ranges) -> Iterator[Viola
 
 
 def _statistics_violations(found: Any, feature: Mapping[str, Any], seen: Any) -> Iterator[KeyViolation]:
-    """Yield name, expected and found of wrong statistics of a feature; ``seen`` is its entry in the ranges."""
+    """Yield name, expected and found of invalid statistics; ``seen`` is the range in the data."""
     try:
         values = {name: np.asarray(found[name], np.float64) for name in (*_STATISTICS, *QUANTILES)}
     except (LookupError, TypeError, ValueError) as error:
@@ -161,7 +163,7 @@ def _statistics_violations(found: Any, feature: Mapping[str, Any], seen: Any) ->
             yield name, f"shape {shape}", str(array.shape)
             return
     low, high = values["min"], values["max"]
-    slack = 1e-3 * (1 + np.abs(low) + np.abs(high))  # of others' histograms and float32
+    slack = 1e-3 * (1 + np.abs(low) + np.abs(high))  # for histograms of other writers, and float32
     for name, array in values.items():
         least, most = (0, high - low + slack) if name == "std" else (low - slack, high + slack)
         if not ((least <= array) & (array <= most)).all():  # NaN too
@@ -182,16 +184,16 @@ def _check_lines(dataset: LeRobotDataset) -> Iterator[Violation]:
         yield Violation(schema.STATS_LINES, "", "readable lines", one_line(error))
         return
     if sorted(line.episode_index for line in lines) != sorted(dataset.row_of):
-        yield Violation(schema.STATS_LINES, "episode_index", "each episode once", "others")
+        yield Violation(schema.STATS_LINES, "episode_index", "each episode once", "other episodes")
     for line in lines:
         missing = sorted(key for key in features if not set(line.stats.get(key, {})) >= set(_STATISTICS))
         if missing:
             where = f"episode {line.episode_index}, {missing[0]}"
-            yield Violation(schema.STATS_LINES, where, ", ".join(_STATISTICS), "some are missing")
+            yield Violation(schema.STATS_LINES, where, ", ".join(_STATISTICS), "missing statistics")
 
 
-def _check_our_files(dataset: LeRobotDataset) -> Iterator[Violation]:
-    """Check how the dataset was made, and scenes and cameras of the episodes, where the dataset says so."""
+def _check_robocas_files(dataset: LeRobotDataset) -> Iterator[Violation]:
+    """Check split, scenes and cameras in the RoboCAS files of a dataset, if it has them."""
     name, scene_texts = schema.SCENES_FILE, {}
     try:
         _ = dataset.split("train"), dataset.split("val")
@@ -203,7 +205,7 @@ def _check_our_files(dataset: LeRobotDataset) -> Iterator[Violation]:
         yield Violation(name, "", "valid content", one_line(error))
     if scene_texts and scene_texts.keys() != dataset.row_of.keys():
         found = sorted(scene_texts.keys() ^ dataset.row_of.keys())[:5]
-        yield Violation(name, "episode_index", "the episodes of the dataset", f"{found} more or missing")
+        yield Violation(name, "episode_index", "the episodes of the dataset", f"{found} added or missing")
     for number in sorted(scene_texts.keys() & dataset.row_of.keys()):
         try:
             episode = dataset.episode(number)
@@ -228,4 +230,4 @@ def _check_checksums(root: Path) -> Iterator[Violation]:
         except (OSError, DocumentError) as error:
             found = one_line(error)
         if found != expected:
-            yield Violation(name, "", f"the bytes that were written, SHA-256 {expected}", found)
+            yield Violation(name, "", f"the written content, SHA-256 {expected}", found)

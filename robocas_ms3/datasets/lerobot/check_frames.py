@@ -1,4 +1,4 @@
-"""Checks the frames of a LeRobot dataset: lengths, indices, times, texts, and that features agree with each other."""
+"""Check the frames of a LeRobot dataset: lengths, indices, times, texts, and consistency of features."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from robocas_ms3.datasets.lerobot.tables import column_violations, numbers, open
 from robocas_ms3.datasets.sources.arrays import EpisodeArrays
 
 TOLERANCE = 1e-4
-"""Of times, s: what LeRobot tolerates."""
+"""Tolerance of timestamps in s, as in LeRobot."""
 Ranges = dict[str, tuple[NDArray, NDArray, int]]
-"""Feature -> minimum and maximum of each of its numbers, and the number of frames."""
+"""Minimum, maximum and number of frames, by feature."""
 Texts = Mapping[str, list[str]]
-"""Name of an index column, such as ``task_index`` -> the texts that it numbers."""
+"""Texts by the name of their index column, such as ``task_index``."""
 Columns = Mapping[str, NDArray]
 KeyViolation = tuple[str, str, str]
-"""Key, expected and found."""
+"""Violation of one file: key, expected and found."""
 _PERSISTENT_STYLES = {"subtask", "plan", "memory", "motion", "task_aug"}
 _EVENT_STYLES = {"interjection", "vqa", "trace", None}
 _CAMERA_STYLES = {"vqa", "trace"}
@@ -41,7 +41,7 @@ _CAMERA_STYLES = {"vqa", "trace"}
 def check_data(
     dataset: LeRobotDataset, texts: Texts, on_episode: Callable[[int, int], None]
 ) -> tuple[list[Violation], Ranges]:
-    """Return the violations in all frames, and the ranges of their numbers."""
+    """Return the violations in all frames, and the ranges of the numeric features."""
     root, features, by_file = dataset.root, dataset.info["features"], dataset.files("data")
     violations: list[Violation] = []
     ranges: Ranges = {}
@@ -50,11 +50,11 @@ def check_data(
         name = str(path.relative_to(root))
         try:
             wrong = list(_file_violations(path, rows, features))
-            violations += [Violation(name, *fault) for fault in wrong]
-            for row in [] if wrong else rows:  # one at a time: memory does not grow with the file
+            violations += [Violation(name, *violation) for violation in wrong]
+            for row in [] if wrong else rows:  # one at a time, to bound memory
                 table, where = read_rows(path, row["episode_index"]), f"episode {row['episode_index']}"
                 if wrong := list(column_violations(table, declared_columns(features))):
-                    violations += [Violation(name, *fault) for fault in wrong]
+                    violations += [Violation(name, *violation) for violation in wrong]
                     break
                 numeric = [key for key, feature in features.items() if feature["dtype"] not in schema.NOT_NUMERIC]
                 columns = {key: numbers(table.column(key)) for key in numeric}
@@ -74,9 +74,10 @@ def check_data(
 
 
 def unexpected_files(root: Path, folders: Iterable[Path], known: Container[Path]) -> Iterator[Violation]:
+    """Yield the files in some folders that are not known files of the dataset."""
     for path in sorted(path for folder in folders for path in folder.rglob("*") if path.is_file()):
         if path not in known:
-            yield Violation(str(path.relative_to(root)), "", "files of episodes only", "of none")
+            yield Violation(str(path.relative_to(root)), "", "files of episodes only", "a file of no episode")
 
 
 def _file_violations(path: Path, rows: list[dict[str, Any]], features: Mapping[str, Any]) -> Iterator[KeyViolation]:
@@ -126,7 +127,7 @@ def _check_episode(
     }
     for key, values in expected.items():
         if not np.array_equal(columns[key][:, 0], values):
-            yield key, f"{values[0]} to {values[-1]}", "others"
+            yield key, f"{values[0]} to {values[-1]}", "other values"
     late = np.abs(columns["timestamp"][:, 0] - steps / info["fps"])
     if not (late < TOLERANCE).all():
         step = int(late.argmax())
@@ -146,11 +147,11 @@ def _check_outcome(columns: Columns) -> Iterator[KeyViolation]:
     reward, success, done = (columns[feature.key][:, 0] for feature in schema.OUTCOME)
     last = np.arange(len(done)) == len(done) - 1
     if not np.array_equal(done != 0, last):
-        yield schema.DONE.key, "true in the last frame only", "another"
+        yield schema.DONE.key, "true in the last frame only", "other values"
     if (success[~last] != 0).any():
-        yield schema.SUCCESS.key, "true in the last frame only", "true before"
+        yield schema.SUCCESS.key, "true in the last frame only", "true in an earlier frame"
     if not np.array_equal(reward, success.astype(np.float64)):
-        yield schema.REWARD.key, "1 where next.success, else 0", "another"
+        yield schema.REWARD.key, "1 where next.success, else 0", "other values"
 
 
 def _check_texts(columns: Columns, tasks: list[str], texts: Texts) -> Iterator[KeyViolation]:
@@ -163,7 +164,7 @@ def _check_texts(columns: Columns, tasks: list[str], texts: Texts) -> Iterator[K
 
 
 def _check_content(columns: Columns, types: list[Any], instruction: str) -> Iterator[KeyViolation]:
-    """Check the values by the rules for RoboCAS folders, and that each action leads to the next state."""
+    """Check values by the rules of RoboCAS folders, and that each action leads to the next state."""
     arrays: dict[str, NDArray] = {"step_goal_type": np.array([str(kind) for kind in types], np.str_)}
     if set(schema.ROBOCAS_KEYS) <= set(columns):
         try:
@@ -173,9 +174,9 @@ def _check_content(columns: Columns, types: list[Any], instruction: str) -> Iter
             return
         again, command = frame_columns(arrays), columns["action"]
         if not np.array_equal(command[:, -1], again["action"][:, -1]):
-            yield "action", "the gripper's command of the next step", "another"
+            yield "action", "the gripper command of the next step", "other values"
         if not np.array_equal(columns["action.joint"], again["action.joint"]):
-            yield "action.joint", "the next step's joints and gripper", "others"
+            yield "action.joint", "joints and gripper of the next step", "other values"
         arrays["rel_orn"] = Rotation.from_euler("xyz", command[:, 3:6]).as_quat()
     for wrong in array_checks.violations_of(
         EpisodeArrays(Path(), arrays), (array_checks.check_units, *array_checks.CONTENT)
@@ -185,10 +186,10 @@ def _check_content(columns: Columns, types: list[Any], instruction: str) -> Iter
 
 
 def check_language(table: pa.Table, file: str, info: Mapping[str, Any]) -> Iterator[KeyViolation]:
-    """Check the language rows of an episode, those of ``lerobot-annotate`` too."""
+    """Check the language rows of an episode, including those of ``lerobot-annotate``."""
     persistent, events = (read_rows_of(table, key, file) for key in (PERSISTENT, EVENTS))
     if any(rows != persistent[0] for rows in persistent[1:]):
-        yield PERSISTENT, "the same rows in each frame", "others"
+        yield PERSISTENT, "the same rows in each frame", "different rows"
         return
     for key, expected, found in _check_persistent(persistent[0] if persistent else [], len(table), info["fps"]):
         yield f"{PERSISTENT}, {key}", expected, found
@@ -203,12 +204,12 @@ def _check_persistent(rows: list[Row], count: int, fps: int) -> Iterator[KeyViol
             yield "style", ", ".join(sorted(_PERSISTENT_STYLES)), str(row["style"])
         step = row["timestamp"] * fps
         if abs(step - round(step)) > TOLERANCE * fps or not 0 <= round(step) < count:
-            yield "timestamp", f"that of a frame, 0 to {(count - 1) / fps:g} s", f"{row['timestamp']:g} s"
+            yield "timestamp", f"the time of a frame, 0 to {(count - 1) / fps:g} s", f"{row['timestamp']:g} s"
     starts = [row["timestamp"] for row in rows if row["style"] == "subtask"]
     if starts and min(starts) > TOLERANCE:
-        yield "subtask", "one from the first frame on", f"the first at {min(starts):g} s"
+        yield "subtask", "a subtask at the first frame", f"the first at {min(starts):g} s"
     if len(set(starts)) < len(starts):
-        yield "subtask", "one at a time", "several at once"
+        yield "subtask", "one subtask at a time", "several at one time"
 
 
 def _check_events(rows: list[Row], features: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

@@ -1,4 +1,4 @@
-"""Converts a trajectory, or a dataset of another format, to a LeRobot dataset."""
+"""Convert a trajectory file, or a dataset of another format, to a LeRobot dataset."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.recordings.trajectory_json import versions
 
 FILE_LIMITS = FileLimits()
-_PARTS, _JOINED = ".parts", ".joined"  # the finished episodes; the dataset that is being made of them
+_PARTS, _JOINED = ".parts", ".joined"  # folders of finished episodes, and of the dataset being joined
 _OUTPUT = FolderKind(
     "robocas convert --to lerobot",
     (f"{_PARTS}/plan.json", CONVERSION_FILE),
@@ -46,8 +46,8 @@ _OUTPUT = FolderKind(
     markers=(INFO_FILE, _PARTS),
     upgrade=add_versions,
 )
-_FOLDERS = (*CONTENT, STAGING, "meta")  # meta comes last: where it is, the dataset is whole
-_FIX = "The same command tries again; with --skip-errors, the others make the dataset where that fails."
+_FOLDERS = (*CONTENT, STAGING, "meta")  # meta is last: its presence marks a complete dataset
+_FIX = "Run the same command to retry, or pass --skip-errors to make the dataset without them."
 _log = logging.getLogger(__name__)
 
 
@@ -57,17 +57,19 @@ def convert_lerobot(
     on_start: Callable[[int], None] | None = None,
     on_episode: Callable[[WrittenEpisode], None] | None = None,
 ) -> Conversion:
-    """Write a LeRobot dataset; ``on_start`` is called with the number of episodes to write, ``on_episode`` after each.
+    """Write a LeRobot dataset from a trajectory file or a dataset with images.
 
-    Episodes are written one by one into ``out/.parts`` and joined at the end, without encoding again. Called
-    again after a kill, it continues, with the same result; until it is done there is no ``meta`` folder.
+    Episodes are written into ``out/.parts`` and joined at the end, without encoding again. The same call continues an
+    interrupted conversion, with the same result. The folder ``meta`` appears last. ``on_start`` is called with the
+    number of episodes to write, ``on_episode`` after each episode.
 
     Raises:
-        DatasetError: the input is unusable, nothing to convert, no render device, no such version or rate.
-        IncompleteDatasetError: episodes can't be written; all others are, and the same call tries again.
-        OutputExistsError: ``out`` is a dataset of other settings, versions or episodes, or none.
-        RobocasError: another conversion is running.
-        MissingExtraError: the ``lerobot`` extra is not installed.
+        DatasetError: the input is damaged or has no episodes to convert, the version or rate is invalid, or there is
+            no render device.
+        IncompleteDatasetError: some episodes can't be written; the same call tries them again.
+        OutputExistsError: ``out`` is not a LeRobot dataset, or has other settings, versions or episodes.
+        RobocasError: another conversion writes to ``out``.
+        MissingExtraError: the extra ``lerobot`` is not installed.
     """
     require_lerobot()
     check_video_size(settings.image_options.size)
@@ -78,11 +80,11 @@ def convert_lerobot(
         plan = _plan(given, settings.codec, variant)
         recorded_settings = {key: plan[key] for key in ("settings", "made_with")}
         with OutputFolder(out, _OUTPUT, recorded_settings, overwrite=settings.overwrite) as output:
-            _check_episodes(output, plan)  # everything that may fail comes before the output is touched
+            _check_episodes(output, plan)  # everything that may fail runs before the output changes
             settings.check_device()
             if output.recorded is None or not (out / INFO_FILE).is_file():
                 output.start(plan)
-                for name in (_JOINED, *_FOLDERS):  # left half joined by a conversion that was killed
+                for name in (_JOINED, *_FOLDERS):  # incomplete, from an interrupted conversion
                     if os.path.lexists(out / name):
                         remove(out / name)
                 remove_leftovers(out / _PARTS)
@@ -104,10 +106,10 @@ def convert_lerobot(
 def _plan(given: ConversionInput, codec: str, variant: Variant) -> dict[str, Any]:
     entries, image_options = given.entries(), given.image_options
     place = {entry["source"]: i for i, entry in enumerate(entries)}
-    # a dataset keeps its split, a trajectory has none
-    before = [given.source.split(side) if given.sizes else [] for side in ("train", "val")]
-    before_train, before_val = ([place[n] for n in side if n in place] for side in before)
-    train, val = split_by_seed({i: entry["seed"] for i, entry in enumerate(entries)}, (before_train, before_val))
+    # a dataset keeps its split, a trajectory file has none
+    previous = [given.source.split(name) if given.sizes else [] for name in ("train", "val")]
+    previous_train, previous_val = ([place[n] for n in numbers if n in place] for numbers in previous)
+    train, val = split_by_seed({i: entry["seed"] for i, entry in enumerate(entries)}, (previous_train, previous_val))
     plan = {
         "format": "lerobot",
         "made_with": versions(),
@@ -127,7 +129,7 @@ def _plan(given: ConversionInput, codec: str, variant: Variant) -> dict[str, Any
 
 
 def _check_episodes(output: OutputFolder, plan: Mapping[str, Any]) -> None:
-    """Check that a dataset that is continued is of the same episodes; recordings may have been repaired."""
+    """Check that the output has the same episodes; unreadable recordings may have become readable."""
     from robocas_ms3.datasets.lerobot.file_models import ConversionRecord
 
     if output.recorded is None:
@@ -136,7 +138,7 @@ def _check_episodes(output: OutputFolder, plan: Mapping[str, Any]) -> None:
     recorded, now = output.recorded.get("episodes", []), plan["episodes"]
     listed = sorted([*recorded, *output.recorded.get(SKIPPED, [])], key=lambda entry: entry.get("source") or 0)
     if len(listed) != len(now) or not all(map(_is_same, listed, now)):
-        what, expected = "a dataset of other episodes", format_count(len(recorded), "episode")
+        what, expected = "this dataset has other episodes", format_count(len(recorded), "episode")
         fix = "Choose another folder, or pass --overwrite to start again."
         raise OutputExistsError(what, where=output.path, expected=expected, found=f"{len(now)}", fix=fix)
 
@@ -155,8 +157,8 @@ def _missing_parts(settings: ConversionSettings, variant: Variant, episodes: lis
     missing = []
     for number, entry in enumerate(episodes):
         folder = writer.folder(number)
-        if folder.is_dir() and not EpisodePart(folder).is_whole:
-            _log.warning("%s: damaged since it was written; it is written again", folder)
+        if folder.is_dir() and not EpisodePart(folder).is_complete:
+            _log.warning("%s is damaged; its episode is written again", folder)
             shutil.rmtree(folder)
         if not folder.is_dir():
             missing.append((number, entry["source"]))
@@ -164,14 +166,14 @@ def _missing_parts(settings: ConversionSettings, variant: Variant, episodes: lis
 
 
 def _without_missing(plan: dict[str, Any], parts: Path, incomplete: IncompleteDatasetError) -> dict[str, Any]:
-    """Return the plan of the parts that are there; the other episodes are in ``skipped``, with the reason."""
+    """Return the plan of the existing parts; missing episodes are under ``skipped`` with the reason."""
     episodes = list(enumerate(plan["episodes"]))
-    there = [number for number, _ in episodes if (parts / episode_folder(number)).is_dir()]
-    place = {number: new for new, number in enumerate(there)}
-    sides = {side: [place[number] for number in plan[side] if number in place] for side in ("train_eps", "val_eps")}
+    present = [number for number, _ in episodes if (parts / episode_folder(number)).is_dir()]
+    place = {number: new for new, number in enumerate(present)}
+    split = {key: [place[number] for number in plan[key] if number in place] for key in ("train_eps", "val_eps")}
     reasons = incomplete.reasons
     skipped = [{**entry, "reason": reasons.get(episode_folder(n))} for n, entry in episodes if n not in place]
-    return {**plan, **sides, "episodes": [entry for n, entry in episodes if n in place], SKIPPED: skipped}
+    return {**plan, **split, "episodes": [entry for n, entry in episodes if n in place], SKIPPED: skipped}
 
 
 def _join(out: Path, plan: Mapping[str, Any]) -> None:
@@ -180,7 +182,7 @@ def _join(out: Path, plan: Mapping[str, Any]) -> None:
     joined = make_folder(out / _JOINED)
     with add_path_to_errors(joined):
         join_parts(sorted((out / _PARTS).glob("episode_*")), plan, joined, FILE_LIMITS)
-        flush_to_disk(joined)  # before the parts go
+        flush_to_disk(joined)  # before the parts are removed
     for name in _FOLDERS:
         if (joined / name).is_dir():
             os.replace(joined / name, out / name)

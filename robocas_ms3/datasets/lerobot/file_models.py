@@ -1,4 +1,4 @@
-"""Declared forms of the JSON files and tables of a LeRobot dataset; writer, reader and checks share them."""
+"""Models of the JSON files and tables of a LeRobot dataset, shared by writer, reader and checks."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ from robocas_ms3.robots.cameras import Parent, standard_camera_parent
 MAX_EPISODES = 10**6
 MAX_FRAMES = 10**9
 _MAX_FILES = 10**6
-_MAX_SECONDS = 1e6  # of a video's timestamps
+_MAX_SECONDS = 1e6  # largest timestamp in a video
 
 Name = Annotated[str, StringConstraints(pattern=r"^[^\x00-\x1f\x7f/\\.][^\x00-\x1f\x7f/\\]*$", max_length=200)]
-"""Key of a feature, which is part of paths."""
+"""Key of a feature; it is part of paths."""
 Dtype = Annotated[
     str, StringConstraints(pattern=r"^(video|image|string|language|bool|float(16|32|64)|u?int(8|16|32|64))$")
 ]  # fmt: skip
@@ -43,13 +43,13 @@ _Four = Annotated[list[Annotated[float, Field(allow_inf_nan=False)]], Field(min_
 
 
 class _Record(BaseModel):
-    """Values of the declared types; keys of other writers are allowed."""
+    """Model with strict types; other writers may add keys."""
 
     model_config = ConfigDict(strict=True, extra="allow")
 
 
 class FeatureRecord(_Record):
-    """A feature in ``info.json``."""
+    """Feature in ``info.json``."""
 
     dtype: Dtype
     shape: Annotated[list[Annotated[int, Field(ge=1, le=2**14)]], Field(min_length=1, max_length=4)]
@@ -64,7 +64,7 @@ def _check_version(version: str) -> str:
 
 
 class InfoRecord(_Record):
-    """``meta/info.json``. Paths have LeRobot's own patterns: a pattern of a file could lead anywhere."""
+    """Content of ``meta/info.json``; only the path patterns of LeRobot are accepted."""
 
     codebase_version: Annotated[str, AfterValidator(_check_version)]
     robot_type: str | None = None
@@ -86,21 +86,21 @@ class InfoRecord(_Record):
         if missing:
             raise ValueError(f"features: expected {', '.join(schema.INDICES)}, found no {', '.join(missing)}")
         if self.video_path is None and any(feature.dtype == "video" for feature in self.features.values()):
-            raise ValueError("video_path: expected a pattern, as there are videos")
+            raise ValueError("video_path: expected a pattern, found none although there are videos")
         layout = LAYOUTS[self.codebase_version]
-        for key, pattern, own in (
+        for key, pattern, expected in (
             ("data_path", self.data_path, layout.data),
             ("video_path", self.video_path, layout.video),
         ):
-            if pattern not in (own, None):
-                raise ValueError(f"{key}: expected {own}, found {pattern}")
+            if pattern not in (expected, None):
+                raise ValueError(f"{key}: expected {expected}, found {pattern}")
         if layout.one_file_per_episode and self.chunks_size != CHUNK_FILES:
             raise ValueError(f"chunks_size: expected {CHUNK_FILES}, found {self.chunks_size}")
         return self
 
 
 class EpisodeLine(_Record):
-    """A line of ``meta/episodes.jsonl``."""
+    """Line of ``meta/episodes.jsonl``."""
 
     episode_index: Annotated[int, Field(ge=0, lt=MAX_EPISODES)]
     tasks: list[str]
@@ -108,14 +108,14 @@ class EpisodeLine(_Record):
 
 
 class TaskLine(_Record):
-    """A line of ``meta/tasks.jsonl``."""
+    """Line of ``meta/tasks.jsonl``."""
 
     task_index: Annotated[int, Field(ge=0, lt=MAX_EPISODES)]
     task: str
 
 
 class StatsLine(_Record):
-    """A line of ``meta/episodes_stats.jsonl``."""
+    """Line of ``meta/episodes_stats.jsonl``."""
 
     episode_index: Annotated[int, Field(ge=0, lt=MAX_EPISODES)]
     stats: dict[str, dict[str, Any]]
@@ -125,14 +125,14 @@ _Line = TypeVar("_Line", bound=_Record)
 
 
 def read_lines(path: Path, form: type[_Line], most: int) -> list[_Line]:
-    """Read a file of at most so many JSON lines."""
+    """Read the JSON lines of a file as models; raise DatasetError for more than ``most`` lines."""
     try:
         lines = [line for line in read_text(path, JSON_LIMIT).split("\n") if line.strip()]
         if len(lines) > most:
-            raise DatasetError("too many lines", where=path, expected=f"{most} at most", found=len(lines))
+            raise DatasetError("too many lines", where=path, expected=f"at most {most}", found=len(lines))
         values = [decode_json(line) for line in lines]
     except (OSError, ValueError) as error:
-        raise DatasetError("these JSON lines can't be read", where=path, found=one_line(error)) from error
+        raise DatasetError("the JSON lines can't be read", where=path, found=one_line(error)) from error
     return [parse(form, found, DatasetError, where=f"{path}, line {n}") for n, found in enumerate(values, 1)]
 
 
@@ -143,7 +143,7 @@ class SourceEntryRecord(EntryRecord):
 
 
 class ConversionRecord(_Record):
-    """``meta/robocas/conversion.json``, and the plan of a conversion that was interrupted."""
+    """Content of ``meta/robocas/conversion.json``, and plan of an interrupted conversion."""
 
     made_with: dict[str, str] = {}
     settings: dict[str, Any] = {}
@@ -154,11 +154,11 @@ class ConversionRecord(_Record):
 
 
 class CameraRecord(_Record):
-    """A camera of an episode in ``meta/robocas/episodes.parquet``; see `CameraModel`."""
+    """Camera of an episode in ``meta/robocas/episodes.parquet``; see `CameraModel`."""
 
     intrinsic: _Four
     camera_in_parent: Annotated[list[_Four], Field(min_length=4, max_length=4)]
-    parent: Parent | None = Field(default=None, description="None: that of the standard camera of this name")
+    parent: Parent | None = Field(default=None, description="None: parent frame of the standard camera with this name")
 
     @classmethod
     def from_model(cls, name: str, model: CameraModel) -> CameraRecord:
@@ -168,18 +168,18 @@ class CameraRecord(_Record):
 
 
 class CamerasText(RootModel[dict[Name, CameraRecord]]):
-    """The cameras of an episode, by name."""
+    """Cameras of an episode, by name."""
 
 
 class SceneText(RootModel[dict[str, Any]]):
-    """The content of an episode's ``scene.json``."""
+    """Content of the ``scene.json`` of an episode."""
 
 
 SCENES: Mapping[str, Column] = {"episode_index": Column(INTEGER), "scene": Column(TEXT), "cameras": Column(TEXT)}
 
 
 def episode_columns(names: Iterable[str], features: Mapping[str, Any]) -> dict[str, Column]:
-    """Return the columns of ``meta/episodes``; those of depth are optional, by the ``names`` that are there."""
+    """Return the columns of ``meta/episodes``; ``names`` are the existing ones (depth is optional)."""
     columns = {
         "episode_index": Column(INTEGER, greatest=MAX_EPISODES - 1),
         "tasks": Column(TEXTS),
@@ -190,9 +190,9 @@ def episode_columns(names: Iterable[str], features: Mapping[str, Any]) -> dict[s
         "data/file_index": Column(INTEGER, greatest=_MAX_FILES),
     }
     videos = [key for key, feature in features.items() if feature["dtype"] == "video"]
-    there = {name.rpartition("/")[0] for name in names}
+    present = {name.rpartition("/")[0] for name in names}
     depth = [f"depth/{schema.camera_of(key)}" for key in videos]
-    for prefix in (*(f"videos/{key}" for key in videos), *(name for name in depth if name in there)):
+    for prefix in (*(f"videos/{key}" for key in videos), *(name for name in depth if name in present)):
         for name in ("chunk_index", "file_index"):
             columns[f"{prefix}/{name}"] = Column(INTEGER, greatest=_MAX_FILES)
         for name in ("from_timestamp", "to_timestamp"):
@@ -201,6 +201,7 @@ def episode_columns(names: Iterable[str], features: Mapping[str, Any]) -> dict[s
 
 
 def declared_columns(features: Mapping[str, Any]) -> dict[str, Column]:
+    """Return the columns of the data tables, by the features of ``info.json``."""
     columns: dict[str, Column] = {}
     for key, dtype in ((key, feature["dtype"]) for key, feature in features.items()):
         if dtype not in ("image", "video", "language"):

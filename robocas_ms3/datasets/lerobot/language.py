@@ -1,15 +1,15 @@
-"""Rows of LeRobot's language columns (LeRobot 0.6 and later): sub-goals, paraphrases and boxes in images.
+"""Rows of the language columns of LeRobot 0.6 and later: sub-goals, paraphrases and bounding boxes.
 
 ==========  ====================  =========  ===================================================  =========
 style       column                role       content                                              timestamp
 ==========  ====================  =========  ===================================================  =========
-task_aug    language_persistent   user       an instruction that means the same                   0
-subtask     language_persistent   assistant  text of the sub-goal that begins at this time        its start
-vqa         language_events       user       question: where the target is; per camera            the frame
-vqa         language_events       assistant  JSON: box of the target's visible pixels             the frame
+task_aug    language_persistent   user       instruction or paraphrase                            0
+subtask     language_persistent   assistant  text of the sub-goal that starts at this time        its start
+vqa         language_events       user       question about the target, per camera                the frame
+vqa         language_events       assistant  JSON: bounding box of the visible target             the frame
 ==========  ====================  =========  ===================================================  =========
 
-The persistent rows of an episode are the same in each of its frames. A sub-goal holds until the next one begins.
+The persistent rows of an episode are the same in each of its frames. A sub-goal lasts until the next one starts.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ PERSISTENT_TYPE = pa.list_(
     pa.struct([*_TEXTS, pa.field("timestamp", pa.float32(), nullable=False), _CAMERA, _TOOL_CALLS])
 )
 EVENTS_TYPE = pa.list_(pa.struct([*_TEXTS, _CAMERA, _TOOL_CALLS]))
-"""Arrow types of the columns, LeRobot's."""
+"""Arrow types of the columns, as in LeRobot."""
 
 
 def persistent_rows(goals: Sequence[SubGoal], instructions: Iterable[str], fps: int) -> list[Row]:
-    """Return the persistent rows of an episode, in LeRobot's order; repeated instructions are left out."""
+    """Return the persistent rows of an episode in the order of LeRobot; repeated instructions are dropped."""
     rows = [_row("user", text, "task_aug", timestamp=0.0) for text in dict.fromkeys(instructions)]
     starts = [(goal, float(np.float32(goal.first / fps))) for goal in goals]
     rows += [_row("assistant", goal.goal_description, "subtask", timestamp=start) for goal, start in starts]
@@ -63,7 +63,7 @@ def persistent_rows(goals: Sequence[SubGoal], instructions: Iterable[str], fps: 
 
 
 def event_rows(boxes: Mapping[str, Box], target: str) -> list[Row]:
-    """Return the event rows of a frame, in LeRobot's order: question and answer per camera that sees the target."""
+    """Return the event rows of a frame: question and answer per camera that sees the target."""
     question = f"Where {'are' if is_plural(target) else 'is'} the {target}?"
     rows = []
     for camera, box in boxes.items():
@@ -82,10 +82,10 @@ def _row(role: str, content: str, style: str, *, timestamp: float | None = None,
 
 
 def paraphrases(scene: Mapping[str, Any], text: str) -> list[str]:
-    """Return the instruction and its paraphrases in plain names: one per template of the split ``train``.
+    """Return the instruction and a paraphrase with plain names per template of the split ``train``.
 
-    Templates of the split ``held_out`` are for evaluation and are never used. Where ``scene.json`` does not say what
-    the instruction was made of, the list is empty.
+    Templates of the split ``held_out`` are for evaluation and are never used. The list is empty if ``scene.json`` lacks
+    the task, target or support of the instruction.
     """
     known, _ = valid_values(scene)
     task, target, recorded = known.get("task"), known.get("target") or {}, known.get("recorded") or {}
@@ -98,13 +98,18 @@ def paraphrases(scene: Mapping[str, Any], text: str) -> list[str]:
             task, target["name"], recorded["support"], relation=recorded.get("relation") or None, part=part
         )
         texts = [make_instruction(slots, template).text for template in template_ids(task, "train")]
-    except (RobocasError, LookupError, AttributeError, TypeError):  # another version's task, relation or configuration
+    except (
+        RobocasError,
+        LookupError,
+        AttributeError,
+        TypeError,
+    ):  # a task, relation or configuration of another version
         return []
     return list(dict.fromkeys([text, *texts])) if texts else []
 
 
 def goals_of(rows: Sequence[Row], count: int, fps: int) -> list[str]:
-    """Return the text of the sub-goal of each frame, from persistent rows; empty before the first."""
+    """Return the sub-goal text of each frame from persistent rows; empty before the first sub-goal."""
     starts = sorted((row["timestamp"], row["content"] or "") for row in rows if row["style"] == "subtask")
     times = (np.arange(count) + 0.5) / fps
     places = np.searchsorted([time for time, _ in starts], times, side="right") - 1
@@ -112,7 +117,7 @@ def goals_of(rows: Sequence[Row], count: int, fps: int) -> list[str]:
 
 
 def boxes_of(rows: Sequence[Row]) -> dict[str, Box]:
-    """Return the box of the target in a frame's event rows, by camera; answers of other forms are ignored."""
+    """Return the bounding box of the target by camera from the event rows of a frame."""
     boxes = {}
     for row in rows:
         if row["style"] == "vqa" and row["role"] == "assistant" and row["camera"] and (box := box_in(row["content"])):
@@ -129,7 +134,7 @@ class _Answer(BaseModel):
 
 
 def box_in(answer: str | None) -> Box | None:
-    """Return the box in an answer; None where it is not JSON of one detection whose box is four integers."""
+    """Return the bounding box in an answer; None if it is not the JSON of one detection."""
     try:
         (detection,) = validate_json(_Answer, answer or "").detections
     except ValidationError:
@@ -138,12 +143,12 @@ def box_in(answer: str | None) -> Box | None:
 
 
 def read_rows_of(table: pa.Table, key: str, where: object) -> list[list[Row]]:
-    """Return the rows of a language column, those of each frame; raise DatasetError if it is not of that type."""
+    """Return the rows of a language column per frame; raise DatasetError for another type."""
     kind = PERSISTENT_TYPE if key == PERSISTENT else EVENTS_TYPE
     try:
         frames = table.column(key).cast(kind).to_pylist()
     except (LookupError, ValueError, pa.ArrowException) as error:
-        what = "no language column"
+        what = "invalid language column"
         raise DatasetError(what, where=f"{where}, {key}", expected=str(kind), found=one_line(error)) from error
     found = [frame or [] for frame in frames]
     if not all(row is not None and np.isfinite(row.get("timestamp", 0)) for rows in found for row in rows):

@@ -1,4 +1,4 @@
-"""Reads the folder ``meta`` of a LeRobot dataset of format v3.0 or v2.1."""
+"""Reader of the folder ``meta`` of a LeRobot dataset, format v3.0 or v2.1."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from robocas_ms3.datasets.sources.files import read_json
 
 
 class Metadata:
-    """The ``meta`` folder of a dataset; each file is read at its first use."""
+    """Content of the folder ``meta``; each file is read at first use."""
 
     def __init__(self, root: Path) -> None:
         schema.require_lerobot()
@@ -46,14 +46,14 @@ class Metadata:
     def info(self) -> dict[str, Any]:
         path = self.root / schema.INFO_FILE
         if not path.is_file():
-            raise DatasetError("no LeRobot dataset here", where=path, found="no file")
+            raise DatasetError("not a LeRobot dataset", where=path, found="no file")
         found = read_json(path)
-        parse(InfoRecord, found, DatasetError, where=path, about="not a LeRobot dataset of these versions")
+        parse(InfoRecord, found, DatasetError, where=path, about="unsupported or damaged LeRobot dataset")
         return found
 
     @cached_property
     def settings(self) -> dict[str, Any]:
-        """``meta/robocas/conversion.json``; empty where there is none."""
+        """Content of ``meta/robocas/conversion.json``; empty without that file."""
         path = self.root / schema.CONVERSION_FILE
         found = read_json(path)
         parse(ConversionRecord, found, DatasetError, where=path)
@@ -65,7 +65,7 @@ class Metadata:
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras, without those of native depth."""
+        """Names of the cameras."""
         features = self.info["features"]
         return tuple(schema.camera_of(key) for key in self.videos if not schema.is_depth(features[key]))
 
@@ -90,18 +90,18 @@ class Metadata:
 
     @property
     def is_robocas(self) -> bool:
-        """Whether it has all columns of a dataset that ``robocas convert`` writes."""
+        """Whether the dataset has all features of ``robocas convert``."""
         features = self.info["features"]
-        return all(features.get(own.key, {}).get("shape") == [own.width] for own in schema.FEATURES)
+        return all(features.get(feature.key, {}).get("shape") == [feature.width] for feature in schema.FEATURES)
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
         where, found = self.root / "meta/episodes", [row for table in self._tables() for row in table.to_pylist()]
         if len({row["episode_index"] for row in found}) < len(found):
-            raise DatasetError("two rows of one episode", where=where)
+            raise DatasetError("repeated rows of an episode", where=where)
         frames, most = sum(row["length"] for row in found), self.info["total_frames"]
         if frames > most:
-            expected = f"{most} frames at most"
+            expected = f"at most {most} frames"
             raise DatasetError("episodes are longer than the dataset", where=where, expected=expected, found=frames)
         return found
 
@@ -119,7 +119,7 @@ class Metadata:
             yield table
 
     def _table_of_lines(self, most: int) -> pa.Table:
-        """Return ``meta/episodes.jsonl`` as the table that format v3.0 has in its place."""
+        """Return ``meta/episodes.jsonl`` as a table of format v3.0."""
         fps, prefixes = self.info["fps"], ["data", *(f"videos/{key}" for key in self.videos)]
         if (self.root / "depth").is_dir():
             prefixes += [f"depth/{camera}" for camera in self.cameras]
@@ -136,7 +136,7 @@ class Metadata:
         return pa.Table.from_pylist(rows)
 
     def files(self, prefix: str) -> dict[Path, list[dict[str, Any]]]:
-        """Return the rows of the episodes in each file; ``prefix`` as in `Layout.path`."""
+        """Return the episode rows of each file; ``prefix`` as in `Layout.path`."""
         found: dict[Path, list[dict[str, Any]]] = {}
         for row in self.rows:
             found.setdefault(self.layout.path_of(self.root, prefix, row), []).append(row)
@@ -148,7 +148,7 @@ class Metadata:
 
     @cached_property
     def tasks(self) -> list[str]:
-        """Instructions, by ``task_index``."""
+        """Instructions by ``task_index``."""
         most = self.info["total_tasks"]
         if not self.layout.one_file_per_episode:
             return read_texts(self.root / schema.TASKS_FILE, "task_index", most)
@@ -162,7 +162,7 @@ class Metadata:
 
     @cached_property
     def scene_texts(self) -> dict[int, dict[str, str]]:
-        """Number -> ``scene`` and ``cameras``, JSON, by ``meta/robocas/episodes.parquet``; empty without."""
+        """Scene and cameras of each episode as JSON texts; empty for other LeRobot datasets."""
         path = self.root / schema.SCENES_FILE
         rows = read_objects(path, SCENES, most_rows=self.info["total_episodes"]).to_pylist() if path.exists() else []
         return {row.pop("episode_index"): row for row in rows}

@@ -1,4 +1,4 @@
-"""Parts of a conversion: each episode is written by itself, and read when all are joined. A folder appears whole."""
+"""Parts of a LeRobot conversion: one folder per episode, joined at the end."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ from robocas_ms3.datasets.sources.episode_source import ImageKind, StepImages
 from robocas_ms3.demos.recordings.subgoals import subgoal_runs
 
 FRAMES_FILE, EPISODE_FILE = "frames.parquet", "episode.json"
-SUBGOAL = "subgoal"  # column of texts, which become numbers when parts are joined
+SUBGOAL = "subgoal"  # column of texts; they become indices when parts are joined
 
 
 class EpisodeRecord(BaseModel):
-    """Content of ``episode.json``: ``levels`` are counts per video feature, ``sizes`` the bytes of the files."""
+    """Content of ``episode.json``: ``levels`` has counts per video feature, ``sizes`` bytes per file."""
 
     model_config = ConfigDict(strict=True)
 
@@ -58,6 +58,7 @@ class EpisodeRecord(BaseModel):
 
 
 def video_name(camera: str, kind: ImageKind, codec: str, variant: Variant) -> str:
+    """Return the file name of a video in a part."""
     return f"{kind}_{camera}{find_codec(kind, codec, variant).suffix}"
 
 
@@ -67,7 +68,7 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class PartWriter(EpisodeWriter):
-    """Writes the parts of a LeRobot dataset into the folder ``parts``; ``codec`` is that of RGB."""
+    """Writer of the parts of a LeRobot dataset into the folder ``parts``; ``codec`` is that of RGB videos."""
 
     parts: Path
     codec: str
@@ -79,7 +80,7 @@ class PartWriter(EpisodeWriter):
     def write_files(self, folder: Path, wanted: InputEpisode, frames: Generator[StepImages, None, None]) -> None:
         episode, arrays, image_options = wanted.episode, wanted.arrays, wanted.given.image_options
         fps, steps = schema.whole_rate(wanted.given.source.rate_hz), int(arrays["episode_length"])
-        encoders: dict[str, VideoEncoder] = {}  # opened with the first frame
+        encoders: dict[str, VideoEncoder] = {}  # opened at the first frame
         levels: dict[str, LevelHistogram] = {}
         boxes: list[dict[str, Box]] = []
         clipped = False
@@ -99,7 +100,7 @@ class PartWriter(EpisodeWriter):
                         encoders[name] = stack.enter_context(VideoEncoder(folder / name, coding, fps, size))
                     encoders[name].add(image)
         if len(boxes) != steps:
-            what = "images and arrays differ in length"
+            what = "images and arrays have different lengths"
             raise DatasetError(what, where=episode.where, expected=steps, found=len(boxes))
         scene = episode.scene
         pq.write_table(self._table(arrays, boxes, scene, fps), folder / FRAMES_FILE)
@@ -118,7 +119,7 @@ class PartWriter(EpisodeWriter):
     def _table(
         self, arrays: dict[str, NDArray], boxes: list[dict[str, Box]], scene: dict[str, Any], fps: int
     ) -> pa.Table:
-        """Return the frames, without the numbers that depend on other episodes."""
+        """Return the table of frames without the indices that depend on other episodes."""
         steps = int(arrays["episode_length"])
         columns: dict[str, Any] = {key: as_column(values) for key, values in frame_columns(arrays).items()}
         columns[schema.SUBGOAL_TYPE.key] = pa.array(arrays["step_goal_type"].tolist(), pa.string())
@@ -141,12 +142,12 @@ def _images(frame: StepImages) -> Iterator[tuple[str, ImageKind, NDArray]]:
 
 @dataclass(frozen=True)
 class EpisodePart:
-    """An episode that was written by itself."""
+    """Part of a LeRobot conversion: one episode in its own folder."""
 
     folder: Path
 
     @property
-    def is_whole(self) -> bool:
+    def is_complete(self) -> bool:
         try:
             return self.record.sizes == _sizes(self.folder)
         except (DatasetError, OSError):
@@ -175,4 +176,4 @@ class EpisodePart:
 
 
 def _damaged(path: Path) -> DatasetError:
-    return DatasetError("this part of a conversion is damaged", where=path, fix="Pass --overwrite.")
+    return DatasetError("damaged part of a conversion", where=path, fix="Pass --overwrite to start again.")

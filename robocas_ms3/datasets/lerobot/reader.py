@@ -1,4 +1,4 @@
-"""Reads LeRobot datasets without ``lerobot``; those made here have more than others."""
+"""Reader of LeRobot datasets, without the package ``lerobot``."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ _Text = TypeVar("_Text", SceneText, CamerasText)
 
 
 class LeRobotDataset(Metadata, EpisodeSource):
-    """A LeRobot dataset.
+    """LeRobot dataset; datasets of ``robocas convert`` also have arrays, scenes and camera models.
 
     Raises:
-        DatasetError: no LeRobot dataset there, or one of another version.
-        MissingExtraError: pyarrow or av is missing.
+        DatasetError: the folder is not a LeRobot dataset, or has an unsupported version.
+        MissingExtraError: the extra ``lerobot`` is not installed.
     """
 
     @property
@@ -53,16 +53,16 @@ class LeRobotDataset(Metadata, EpisodeSource):
     def lengths(self) -> dict[int, int]:
         return {number: int(row["length"]) for number, row in self.row_of.items()}
 
-    def split(self, side: Split) -> list[int]:
-        """Return the numbers of one side; all episodes of a dataset made elsewhere train."""
-        if side == "all" or (side == "train" and "train_eps" not in self.settings):
+    def split(self, name: Split) -> list[int]:
+        """Return the episode numbers of a split; other LeRobot datasets have training episodes only."""
+        if name == "all" or (name == "train" and "train_eps" not in self.settings):
             return self.numbers
-        key = f"{side}_eps"
+        key = f"{name}_eps"
         listed = self.settings.get(key, [])
         unknown = [number for number in listed if number not in self.row_of]
         if unknown:
             where = f"{self.root / schema.CONVERSION_FILE}, {key}"
-            raise DatasetError("episodes that are not there", where=where, found=unknown[:5])
+            raise DatasetError("unknown episodes in the split", where=where, found=unknown[:5])
         return list(listed)
 
     def entry(self, number: int) -> dict[str, Any]:
@@ -77,7 +77,7 @@ class LeRobotDataset(Metadata, EpisodeSource):
 
 @dataclass(frozen=True)
 class LeRobotEpisode(SourceEpisode):
-    """An episode of a LeRobot dataset."""
+    """Episode of a LeRobot dataset."""
 
     dataset: LeRobotDataset
     number: int
@@ -96,7 +96,7 @@ class LeRobotEpisode(SourceEpisode):
 
     @property
     def instruction(self) -> str:
-        """The first of its tasks; empty where it has none."""
+        """First task of the episode; empty without a task."""
         return str((self.row.get("tasks") or [""])[0])
 
     @property
@@ -108,7 +108,7 @@ class LeRobotEpisode(SourceEpisode):
         path = self.dataset.layout.path_of(self.dataset.root, "data", self.row)
         table = read_rows(path, self.number, self.dataset.info["total_frames"])
         if len(table) != self.steps:
-            what = "another number of rows than the table of episodes says"
+            what = "wrong number of rows in the data table"
             raise DatasetError(what, where=self.where, expected=self.steps, found=len(table))
         return table
 
@@ -120,21 +120,25 @@ class LeRobotEpisode(SourceEpisode):
     @cached_property
     def arrays(self) -> dict[str, NDArray]:
         if not self.dataset.is_robocas:
-            raise DatasetError("not of our columns", where=self.where, expected=", ".join(schema.ROBOCAS_KEYS))
+            raise DatasetError(
+                "this dataset lacks the features of robocas convert",
+                where=self.where,
+                expected=", ".join(schema.ROBOCAS_KEYS),
+            )
         types, texts = self._subgoals()
         for feature in schema.FEATURES:
             values = self.columns[feature.key]
             if values.shape[1] != feature.width or not (np.abs(values) <= np.finfo(np.float32).max).all():
                 where, expected = f"{self.where}, {feature.key}", f"{feature.width} finite numbers per step"
-                raise DatasetError("wrong numbers", where=where, expected=expected, fix=SEE_VALIDATE)
+                raise DatasetError("invalid values", where=where, expected=expected, fix=SEE_VALIDATE)
         try:
             return robocas_arrays(self.columns, self.instruction, texts, types)
-        except ValueError as error:  # a quaternion of length 0, a text that is not ASCII
-            raise DatasetError("wrong values", where=self.where, found=one_line(error), fix=SEE_VALIDATE) from error
+        except ValueError as error:  # a quaternion of length 0, or a text that is not ASCII
+            raise DatasetError("invalid values", where=self.where, found=one_line(error), fix=SEE_VALIDATE) from error
 
     @property
     def goals(self) -> list[SubGoal]:
-        """Sub-goals over the steps; empty for datasets made elsewhere."""
+        """Sub-goals and their steps; empty for other LeRobot datasets."""
         return subgoal_runs(*self._subgoals()) if self.dataset.is_robocas else []
 
     def _subgoals(self) -> tuple[list[str], list[str]]:
@@ -150,7 +154,7 @@ class LeRobotEpisode(SourceEpisode):
 
     @cached_property
     def target_boxes(self) -> Sequence[dict[str, Box]]:
-        """Box of the target in each step, by its ``vqa`` rows; empty without language columns."""
+        """Bounding box of the target per step from the ``vqa`` rows; empty without language columns."""
         if not self.dataset.has_language:
             return []
         return [boxes_of(rows) for rows in read_rows_of(self.table, EVENTS, self.where)]
@@ -169,7 +173,7 @@ class LeRobotEpisode(SourceEpisode):
 
     def _camera(self, name: str) -> CameraRecord:
         if name not in self._cameras:
-            raise DatasetError("no calibration of this camera", where=self.where, found=name)
+            raise DatasetError("no intrinsics and pose of this camera", where=self.where, found=name)
         return self._cameras[name]
 
     def intrinsic(self, camera: str) -> NDArray[np.float64]:
@@ -182,7 +186,7 @@ class LeRobotEpisode(SourceEpisode):
         return self._camera(camera).parent or standard_camera_parent(camera)
 
     def video(self, camera: str, kind: ImageKind) -> tuple[Path, int]:
-        """Return the file of a camera's video and the number of its first frame there."""
+        """Return the video file of a camera, and the index of the first frame of the episode in it."""
         prefix = f"videos/{schema.image_key(camera)}"
         if kind == "depth":
             is_native = self.dataset.depth_feature(camera) is not None
@@ -215,7 +219,7 @@ def _depths(levels: Generator[NDArray, None, None], info: dict[str, Any]) -> Gen
 
 
 def open_lerobot(root: Path, *, rate_hz: float | None = None, include_failed: bool = False) -> LeRobotDataset:
-    """Open a dataset; failed episodes are in it where it was made so."""
+    """Open a LeRobot dataset; ``include_failed`` has no effect."""
     dataset = LeRobotDataset(root)
     check_rate(dataset, rate_hz)
     return dataset

@@ -1,6 +1,7 @@
-"""The LeRobot datasets that are written here, declared once; docs/lerobot.md lists their files.
+"""Schema of LeRobot datasets of ``robocas convert``.
 
-Writer, reader, checks, documentation and tests read it. Metres and radians; quaternions are xyzw.
+Writer, reader, checks, documentation and tests share it. docs/lerobot.md lists the files. Metres and radians;
+quaternions are xyzw.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from robocas_ms3.robots.quantities import STATE, feature_columns
 from robocas_ms3.robots.quantities import lerobot_features as quantities_of_features
 from robocas_ms3.robots.registry import DEFAULT_ROBOT
 
-ROBOT_TYPE = "mobile_panda"  # of the default robot; another one's is its name
+ROBOT_TYPE = "mobile_panda"  # of the default robot; other robots have their own name
 INFO_FILE = "meta/info.json"
 STATS_FILE = "meta/stats.json"
 TASKS_FILE = "meta/tasks.parquet"
@@ -32,15 +33,15 @@ CONVERSION_FILE = "meta/robocas/conversion.json"
 SCENES_FILE = "meta/robocas/episodes.parquet"
 CHECKSUMS_FILE = "meta/robocas/checksums.json"
 CONTENT = ("data", "videos", "depth")
-"""Folders of the files that grow with the dataset."""
+"""Folders of tables and videos."""
 _FILE_LIMIT = 2**34  # bytes
 
 
 @dataclass(frozen=True)
 class FileLimits:
-    """Sizes in 2^20 bytes, LeRobot's own, and seconds beyond which a new file begins; an episode is never divided.
+    """Limits at which a new file starts, sizes in MiB as in LeRobot; an episode is never divided.
 
-    LeRobot finds frames by float32 seconds to 0.1 ms, which float32 resolves up to 1024 s.
+    LeRobot finds frames by float32 timestamps to 0.1 ms, which float32 resolves up to 1024 s.
     """
 
     data_mb: float = 100
@@ -50,7 +51,7 @@ class FileLimits:
 
 @dataclass(frozen=True)
 class Feature:
-    """One column of the data; without names, or with a single one, of numbers, not of lists."""
+    """Column of the data tables; with two or more names its values are lists, otherwise scalars."""
 
     key: str
     names: tuple[str, ...] = ()
@@ -70,30 +71,30 @@ FEATURES: tuple[Feature, ...] = (
         Feature(key, tuple(name for quantity in quantities for name in quantity.names))
         for key, quantities in quantities_of_features().items()
     ),
-    # rel_pos; rel_orn as Euler angles xyz about fixed axes; the gripper's command of the next step, 1 = open
+    # rel_pos; rel_orn as Euler angles about fixed axes x, y, z; gripper command of the next step, 1 = open
     Feature("action", ("dx", "dy", "dz", "roll", "pitch", "yaw", "gripper_open")),
-    Feature("action.joint", (*_JOINTS, "gripper_open")),  # joints at the next step, the last repeated
+    Feature("action.joint", (*_JOINTS, "gripper_open")),  # joints at the next step, last row repeated; gripper 0 to 1
     Feature("action.base", ("dx", "dy", "dyaw")),  # rel_agv_pose
 )
 """Numeric features, see docs/lerobot.md."""
 
 ROBOCAS_KEYS = tuple(feature.key for feature in FEATURES)
-"""A dataset with these keys was written here."""
+"""Keys that identify datasets of ``robocas convert``."""
 
 SUBGOAL_TYPE = Feature("subgoal_type", dtype="string")
-SUBTASK_INDEX = Feature("subtask_index", dtype="int64")  # row of meta/subtasks.parquet: text of the sub-goal
+SUBTASK_INDEX = Feature("subtask_index", dtype="int64")  # row of meta/subtasks.parquet
 REWARD = Feature("next.reward")
 SUCCESS = Feature("next.success", dtype="bool")
 DONE = Feature("next.done", dtype="bool")
 OUTCOME = (REWARD, SUCCESS, DONE)
 LANGUAGE_COLUMNS = ("language_persistent", "language_events")
 INDICES = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-"""LeRobot's own features: s, and numbers within the episode, of the episode, within the dataset, of the task."""
+"""Index features of LeRobot: time in s, frame in the episode, episode, frame in the dataset, task."""
 
 NOT_NUMERIC = ("string", "language", "video", "image")
-"""``dtype`` of features that are no columns of numbers."""
+"""``dtype`` of features without numeric columns."""
 MAX_DEPTH_MM = 4095
-"""Largest depth of a native depth video, mm: 12 bits, one level per millimetre. Farther pixels are stored as this."""
+"""Largest depth of a native depth video in mm (12 bits, one level per mm); larger depth is clipped to it."""
 
 
 def image_key(camera: str) -> str:
@@ -132,13 +133,13 @@ def features_json(variant: Variant, videos: dict[str, dict[str, Any]]) -> dict[s
 
 
 def single_features(variant: Variant) -> tuple[Feature, ...]:
-    """Return the features of a variant that have one value per frame, without LeRobot's own."""
+    """Return the features of a variant with one value per frame, without index features."""
     subtask = () if variant.language else (SUBTASK_INDEX,)
     return (SUBGOAL_TYPE, *subtask, *(OUTCOME if variant.outcome else ()))
 
 
 def modality_json(cameras: Sequence[str]) -> dict[str, Any]:
-    """Return ``meta/modality.json``, by which GR00T reads a dataset of format v2.1."""
+    """Return the content of ``meta/modality.json``, which GR00T needs for datasets of format v2.1."""
     action = {"rel_pos": slice(0, 3), "rel_orn": slice(3, 6), "gripper_open": slice(6, 7)}
     parts = {"state": feature_columns(STATE), "action": action}
     return {
@@ -152,16 +153,18 @@ def modality_json(cameras: Sequence[str]) -> dict[str, Any]:
 
 
 def whole_rate(rate_hz: float) -> int:
+    """Return a rate in Hz as an integer; raise DatasetError if it is not a whole number."""
     if rate_hz < 1 or abs(rate_hz - round(rate_hz)) > 1e-9:
-        what, expected = "LeRobot takes a whole number of frames a second", "1, 2, 4, 5, ..."
+        what, expected = "invalid rate for LeRobot", "a whole number of frames per second"
         raise DatasetError(what, where="rate", expected=expected, found=rate_hz)
     return round(rate_hz)
 
 
 def check_video_size(size: tuple[int, int] | None) -> None:
+    """Raise DatasetError if the width or height of a video is odd."""
     if size is not None and (size[0] % 2 or size[1] % 2):
         expected, found = "even width and height", f"{size[0]} x {size[1]}"
-        raise DatasetError("videos need even sizes", where="size", expected=expected, found=found)
+        raise DatasetError("invalid video size", where="size", expected=expected, found=found)
 
 
 def require_lerobot() -> None:
@@ -169,6 +172,7 @@ def require_lerobot() -> None:
 
 
 def checksum(path: Path) -> str:
+    """Return the SHA-256 of a file."""
     check_regular(path, _FILE_LIMIT)
     digest = hashlib.sha256()
     with path.open("rb") as file:

@@ -1,4 +1,4 @@
-"""Statistics of features, in LeRobot's form: min, max, mean, std, count and quantiles q01, q10, q50, q90, q99."""
+"""Statistics of features in the format of LeRobot: min, max, mean, std, count and quantiles."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
-_FINE = 300  # larger images are subsampled for statistics, as LeRobot does it
+_FINE = 300  # pixels; larger images are subsampled for statistics, as in LeRobot
 _THINNED = 150
 
 Stats = dict[str, Any]
@@ -31,16 +31,16 @@ def vector_stats(values: NDArray) -> Stats:
 
 
 def joined_stats(episodes: Sequence[NDArray]) -> Stats:
-    """Return the statistics of a feature over episodes, column by column, as a copy of all takes memory."""
+    """Return the statistics of a feature over episodes; columns are processed one by one to save memory."""
     columns = (np.concatenate([values[:, [n]] for values in episodes]) for n in range(episodes[0].shape[1]))
     found = [vector_stats(column) for column in columns]
     return {name: found[0][name] if name == "count" else [one[name][0] for one in found] for name in found[0]}
 
 
 class LevelHistogram:
-    """Counts (channels, levels) of the levels of a number of images: exact statistics, however many they are.
+    """Histogram (channels, levels) of the pixel values of images, for exact statistics.
 
-    RGB images have 3 channels, with statistics between 0 and 1; depth images have one, with statistics in mm.
+    RGB images have 3 channels and statistics between 0 and 1; depth images have one channel and statistics in mm.
     """
 
     def __init__(self, counts: ArrayLike, images: int = 0) -> None:
@@ -56,7 +56,7 @@ class LevelHistogram:
         return cls(np.zeros((1, 4096)))
 
     def add(self, image: NDArray) -> None:
-        """Add (H, W, C) or (H, W); of large images every few pixels."""
+        """Count the pixels of an image, (H, W, C) or (H, W); large images are subsampled."""
         longest = max(image.shape[:2])
         step = longest // _THINNED if longest >= _FINE else 1
         channels, levels = self.counts.shape
@@ -70,7 +70,7 @@ class LevelHistogram:
         self.images += other.images
 
     def stats(self) -> Stats:
-        """Return the statistics, each of shape (channels, 1, 1); ``count`` is that of images."""
+        """Return the statistics, each with shape (channels, 1, 1); ``count`` is the number of images."""
         values = np.arange(self.counts.shape[1]) * self._unit
         total = self.counts.sum(axis=1)
         mean = self.counts @ values / total
@@ -82,7 +82,7 @@ class LevelHistogram:
             "mean": mean,
             "std": np.sqrt(np.maximum(variance, 0)),
         }
-        for name, share in QUANTILES.items():
-            found[name] = values[(below < share * total[:, None]).sum(axis=1)]
+        for name, quantile in QUANTILES.items():
+            found[name] = values[(below < quantile * total[:, None]).sum(axis=1)]
         shaped = {name: row.reshape(-1, 1, 1).tolist() for name, row in found.items()}
         return {**shaped, "count": [self.images]}

@@ -1,4 +1,4 @@
-"""Tables in Parquet: columns of numbers, and files of unknown origin that are read within bounds."""
+"""Parquet tables: numeric columns, and reading of untrusted files within memory limits."""
 
 from __future__ import annotations
 
@@ -20,24 +20,25 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 
-_ARRAYS_LIMIT = 2**29  # bytes of arrays that are read at once: 40 million equal rows are a file of 1 MB
+_ARRAYS_LIMIT = 2**29  # bytes of arrays per read; a file of 1 MB can hold 40 million equal rows
 OBJECTS_LIMIT = 2**26
-"""Bytes of values that are read at once to become Python objects, which take about ten times as much."""
+"""Bytes of values per read as Python objects, which need about ten times as much memory."""
 INTEGER, NUMBER, TEXT = "integers", "numbers", "texts"
 INTEGERS, NUMBERS, TEXTS = "integers or lists of integers", "numbers or lists of numbers", "lists of texts"
-TEXT_INDEX = "__index_level_0__"  # pandas' name of an index without one
+TEXT_INDEX = "__index_level_0__"  # name of an unnamed index in pandas
 _EPISODE = "episode_index"
 
 
 @dataclass(frozen=True)
 class Column:
-    """Declaration of a column: a kind of values and, of integers and numbers, their range."""
+    """Declaration of a column: kind of values, and range of integers and numbers."""
 
     kind: str
     least: float = 0
     greatest: float = 2**53
 
     def violation(self, values: pa.ChunkedArray) -> tuple[str, str] | None:
+        """Return expected and found if a column violates the declaration, None otherwise."""
         if not _is_kind(values.type, self.kind):
             return self.kind, str(values.type)
         if values.null_count:
@@ -53,19 +54,19 @@ class Column:
 
 
 def column_violations(table: pa.Table, columns: Mapping[str, Column]) -> Iterator[tuple[str, str, str]]:
-    """Yield key, expected and found of columns that are missing or break their declaration."""
+    """Yield key, expected and found of columns that are missing or violate their declaration."""
     for key, column in columns.items():
         if key not in table.column_names:
-            yield key, "a column", "nothing"
-        elif fault := column.violation(table.column(key)):
-            yield key, *fault
+            yield key, "this column", "no such column"
+        elif violation := column.violation(table.column(key)):
+            yield key, *violation
 
 
 @contextmanager
 def open_table(path: Path, *, most_rows: float = np.inf) -> Iterator[pq.ParquetFile]:
-    """Open a Parquet file; texts are read as dictionaries, so that a repeated one takes no memory.
+    """Open a Parquet file; texts are read as dictionaries to save memory.
 
-    Damage, too many rows, and errors of Arrow inside of the ``with`` statement are raised as DatasetError.
+    A damaged file, too many rows, and errors of Arrow inside the ``with`` statement raise DatasetError.
     """
     try:
         check_regular(path)
@@ -73,13 +74,13 @@ def open_table(path: Path, *, most_rows: float = np.inf) -> Iterator[pq.ParquetF
         with pq.ParquetFile(path, metadata=footer, read_dictionary=texts) as file:
             names = file.schema_arrow.names
             if len(set(names)) < len(names):
-                raise DatasetError("two columns of this table have the same name", where=path, fix=SEE_VALIDATE)
+                raise DatasetError("repeated column names in this table", where=path, fix=SEE_VALIDATE)
             if footer.num_rows > most_rows:
-                what, expected = "this table has too many rows", f"{most_rows:g} at most"
+                what, expected = "too many rows in this table", f"at most {most_rows:g}"
                 raise DatasetError(what, where=path, expected=expected, found=footer.num_rows, fix=SEE_VALIDATE)
             yield file
     except (OSError, ValueError, LookupError, MemoryError, pa.ArrowException) as error:
-        what, found = "this table can't be read", one_line(error)
+        what, found = "the table can't be read", one_line(error)
         raise DatasetError(what, where=path, found=found, fix=SEE_VALIDATE) from error
 
 
@@ -98,7 +99,7 @@ def read_columns(
     groups: Sequence[int] | None = None,
     limit: int = _ARRAYS_LIMIT,
 ) -> pa.Table:
-    """Read columns of an open file, by default all, or raise DatasetError if they have more bytes than ``limit``."""
+    """Read columns of an open file, default all; raise DatasetError for more bytes than ``limit``."""
     footer = file.metadata
     groups = range(footer.num_row_groups) if groups is None else groups
     names = file.schema_arrow.names if columns is None else [key for key in file.schema_arrow.names if key in columns]
@@ -114,8 +115,10 @@ def read_columns(
             size += max(group.num_rows, chunk.num_values) * width + chunk.total_uncompressed_size
     table = file.read_row_groups(list(groups), columns=names) if size <= limit else None
     if table is None or (size := size + sum(map(_text_bytes, table.columns))) > limit:
-        what, expected = "this table is too large to be read at once", f"{limit >> 20} MB of values at most"
-        raise DatasetError(what, where=path, expected=expected, found=f"{size >> 20} MB", fix="Write shorter files.")
+        what, expected = "this table is too large", f"at most {limit >> 20} MB of values per file"
+        raise DatasetError(
+            what, where=path, expected=expected, found=f"{size >> 20} MB", fix="Split the dataset into more files."
+        )
     return table
 
 
@@ -128,7 +131,7 @@ def read_objects(path: Path, columns: Mapping[str, Column], *, most_rows: float 
 
 def check_columns(table: pa.Table, columns: Mapping[str, Column], path: Path) -> None:
     for key, expected, found in column_violations(table, columns):
-        what = "wrong column of a table"
+        what = "invalid column of a table"
         raise DatasetError(what, where=f"{path}, {key}", expected=expected, found=found, fix=SEE_VALIDATE)
 
 
@@ -152,7 +155,7 @@ def _is_kind(found: pa.DataType, kind: str) -> bool:
 
 
 def _text_bytes(values: pa.ChunkedArray | pa.Array) -> int:
-    """Return the bytes of texts that are stored as dictionaries, each counted as often as it occurs."""
+    """Return the bytes of texts stored as dictionaries, each counted as often as it occurs."""
     if isinstance(values, pa.ChunkedArray):
         return sum(map(_text_bytes, values.chunks))
     if pa.types.is_list(values.type) or pa.types.is_large_list(values.type):
@@ -166,22 +169,24 @@ def _text_bytes(values: pa.ChunkedArray | pa.Array) -> int:
 
 
 def numbers(values: pa.ChunkedArray | pa.Array) -> NDArray:
-    """Return a column as an array: (T, D) of lists of D numbers, (T, 1) of numbers; else raise DatasetError."""
+    """Return a numeric column as an array: lists of D numbers as (T, D), numbers as (T, 1)."""
     whole = values.combine_chunks() if isinstance(values, pa.ChunkedArray) else values
     if not is_numeric(whole.type):
-        raise DatasetError("no column of numbers", expected=NUMBERS, found=whole.type)
+        raise DatasetError("not a numeric column", expected=NUMBERS, found=whole.type)
     if not len(whole):
         return np.zeros((0, 1))
     flat = whole
     while not pa.types.is_primitive(flat.type):
         flat = flat.flatten()
     if len(flat) % len(whole):
-        raise DatasetError("no column of numbers", expected="lists of one length", found=f"{len(flat)} numbers in all")
+        raise DatasetError(
+            "not a numeric column", expected="lists of equal length", found=f"{len(flat)} numbers in all"
+        )
     return flat.to_numpy(zero_copy_only=False).reshape(len(whole), -1)
 
 
 def read_rows(path: Path, number: int, most_rows: float = np.inf) -> pa.Table:
-    """Read an episode's rows of a file of the data; only row groups that may hold some of them are read."""
+    """Read the rows of an episode in a data file; row groups without them are skipped."""
     with open_table(path, most_rows=most_rows) as file:
         _, _, spans = _footer(path, path.stat().st_mtime_ns)
         groups = [group for group, (low, high) in enumerate(spans) if low <= number <= high]
@@ -192,7 +197,7 @@ def read_rows(path: Path, number: int, most_rows: float = np.inf) -> pa.Table:
 
 @lru_cache(maxsize=8)
 def _footer(path: Path, _changed_ns: int) -> tuple[pq.FileMetaData, list[str], list[tuple[float, float]]]:
-    """Return the footer of a file, its columns of texts, and the span of episode numbers in each row group."""
+    """Return the footer of a file, its text columns, and the range of episode numbers per row group."""
     with pq.ParquetFile(path) as file:
         footer = file.metadata
     leaves = [footer.schema.column(number) for number in range(footer.num_columns)]
@@ -210,15 +215,15 @@ def read_texts(path: Path, name: str, most_rows: float = np.inf) -> list[str]:
 
 
 def in_order(places: list[int], texts: list[str], where: str) -> list[str]:
-    """Return texts in the order of their numbers, or raise DatasetError if these are not 0, 1, ..., each once."""
+    """Return texts in the order of their indices; raise DatasetError if these are not 0, 1, 2, ..."""
     if sorted(places) != list(range(len(places))):
         expected = f"0 to {len(places) - 1}, each once"
-        raise DatasetError("wrong numbers of texts", where=where, expected=expected, fix=SEE_VALIDATE)
+        raise DatasetError("invalid indices of texts", where=where, expected=expected, fix=SEE_VALIDATE)
     return [text for _, text in sorted(zip(places, texts, strict=True))]
 
 
 def write_texts(path: Path, name: str, texts: Sequence[str]) -> None:
-    """Write a table of texts and their numbers; the texts are the index of pandas, by which LeRobot finds them."""
+    """Write a table of texts and their indices; the texts are the pandas index, as LeRobot expects."""
     text = {"pandas_type": "unicode", "numpy_type": "object"}
     number = {"pandas_type": "int64", "numpy_type": "int64"}
     about = {

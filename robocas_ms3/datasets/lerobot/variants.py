@@ -1,4 +1,4 @@
-"""Layouts and features of LeRobot datasets, by the version of LeRobot that reads them."""
+"""File layouts and features of LeRobot datasets, by the LeRobot version that reads them."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _EPISODE_CHUNK = "chunk-{episode_chunk:03d}"
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the files of a format version are, by LeRobot's patterns of ``info.json``; LeRobot reads no ``depth``.
+    """File layout of a format version: path patterns as in ``info.json``; LeRobot does not read ``depth``.
 
-    With ``one_file_per_episode``, ``meta`` is JSON lines.
+    With ``one_file_per_episode``, tables in ``meta`` are JSON lines.
     """
 
     codebase_version: str
@@ -31,7 +31,7 @@ class Layout:
     one_file_per_episode: bool = False
 
     def path(self, root: Path, prefix: str, chunk: int, file: int) -> Path:
-        """Return the path of a file; ``prefix``: of its columns in ``meta/episodes``, as ``videos/KEY``."""
+        """Return the path of a file; ``prefix`` as of its columns in ``meta/episodes``: ``videos/KEY``."""
         kind, _, name = prefix.partition("/")
         pattern = {"data": self.data, "videos": self.video, "depth": self.depth, "meta": _EPISODES}[kind]
         numbers = {"chunk_index": chunk, "episode_chunk": chunk, "file_index": file}
@@ -51,14 +51,14 @@ V21 = Layout(
     one_file_per_episode=True,
 )
 LAYOUTS = {layout.codebase_version: layout for layout in (V3, V21)}
-"""By ``codebase_version``."""
+"""File layouts by ``codebase_version``."""
 
-Version = Literal["0.6", "0.5", "2.1"]  # a literal, because the command line and type checkers read it
+Version = Literal["0.6", "0.5", "2.1"]  # a literal for the command line and type checkers
 
 
 @dataclass(frozen=True)
 class Variant:
-    """What is written for a version of LeRobot.
+    """Features that are written for a LeRobot version.
 
     Attributes:
         language: sub-goals, paraphrases and boxes are language columns; otherwise sub-goals are ``subtask_index``.
@@ -85,6 +85,7 @@ NEWEST: Version = get_args(Version)[0]
 
 
 def find_variant(version: str) -> Variant:
+    """Return the variant of a LeRobot version; raise DatasetError if it is unknown."""
     if version not in VARIANTS:
         what, known = "unknown LeRobot version", ", ".join(VARIANTS)
         raise DatasetError(what, where="--lerobot-version", expected=known, found=version)

@@ -1,7 +1,7 @@
-"""Videos with PyAV: encoded per episode, joined without encoding again, read frame by frame; depth as a video.
+"""Videos with PyAV: encoding, joining without encoding again, reading by frame, depth videos.
 
-The native depth of LeRobot 0.6 and later has 12-bit levels of a range of depths. Levels written here are mm, so depths
-up to 4095 mm are exact and farther ones are stored as 4095 mm.
+The native depth of LeRobot 0.6 and later has 12-bit levels. Here a level is 1 mm: depth up to 4095 mm is exact, larger
+depth is stored as 4095 mm.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from robocas_ms3.datasets.sources.episode_source import ImageKind
 
 @dataclass(frozen=True)
 class VideoCodec:
-    """FFmpeg's encoder, pixel format, suffix of the file, options of the encoder."""
+    """Video codec: encoder of FFmpeg, pixel format, file suffix, encoder options."""
 
     encoder: str
     pixels: str
@@ -40,8 +40,8 @@ class VideoCodec:
     options: dict[str, str] = field(default_factory=dict)
 
 
-# A key frame every second one, as LeRobot has it: a random frame costs at most two. No B-frames, so that the order of
-# packets is that of frames and parts join without edit lists. Fixed threads: the same images give the same bytes.
+# Every second frame is a key frame, as in LeRobot: random access decodes at most two frames. No B-frames, so that
+# packets are in frame order and parts join without edit lists. A fixed number of threads makes encoding deterministic.
 VIDEO_CODECS = {
     "h264": VideoCodec(
         "libx264",
@@ -50,7 +50,7 @@ VIDEO_CODECS = {
         {"g": "2", "crf": "20", "preset": "veryfast", "bf": "0", "rc-lookahead": "0", "threads": "1"},
     ),
     "av1": VideoCodec("libsvtav1", "yuv420p", ".mp4", {"g": "2", "crf": "30", "preset": "10", "svtav1-params": "lp=1"}),
-    # Lossless, 12 bits, the codec of LeRobot's depth. Slower presets take three times as long for half the size.
+    # Lossless, 12 bits, codec of LeRobot depth. Slower presets take three times as long and halve the size.
     "depth12": VideoCodec(
         "libx265",
         "gray12le",
@@ -62,13 +62,13 @@ VIDEO_CODECS = {
             ":frame-threads=1:log-level=none",
         },
     ),
-    # Lossless, 16 bits, a checksum in every slice, every frame by itself.
+    # Lossless, 16 bits, a checksum per slice, only key frames.
     "depth": VideoCodec("ffv1", "gray16le", ".mkv", {"level": "3", "slices": "4", "slicecrc": "1", "g": "1"}),
 }
-_MAX_PIXELS = 2**26  # of a frame that is decoded: 8192 x 8192
+_MAX_PIXELS = 2**26  # per decoded frame: 8192 x 8192
 _GREY = ("gray16le", "gray12le")
-_BAD_VIDEO = (FFmpegError, OSError, DocumentError, IndexError, TypeError)  # no stream of video, or no times
-_CONTAINER = {"fflags": "+bitexact"}  # no dates and random numbers in the file
+_BAD_VIDEO = (FFmpegError, OSError, DocumentError, IndexError, TypeError)  # the last two: no video stream, or no times
+_CONTAINER = {"fflags": "+bitexact"}  # deterministic files
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
@@ -84,12 +84,12 @@ DEPTH_INFO: Mapping[str, Any] = {
     "video.preset": "ultrafast",
     "video.extra_options": {"x265-params": "lossless=1"},
 }
-"""Entries of a depth video in ``info.json``: range in m, and how LeRobot's tools encode it again."""
+"""Entries of a depth video in ``info.json``: range in m, and encoder options for the tools of LeRobot."""
 _Metres = Annotated[float, Field(gt=-1e6, lt=1e6, allow_inf_nan=False)]
 
 
 class _Range(BaseModel):
-    """Range of depth of a video; the defaults are LeRobot's."""
+    """Depth range of a video in m; defaults as in LeRobot."""
 
     model_config = ConfigDict(strict=True)
 
@@ -108,24 +108,25 @@ class _Range(BaseModel):
 
 
 def find_codec(kind: ImageKind, codec: str, variant: Variant) -> VideoCodec:
+    """Return the codec of the videos of a kind; ``codec`` is the name of that of RGB."""
     return VIDEO_CODECS[codec if kind == "rgb" else "depth12" if variant.native_depth else "depth"]
 
 
 class VideoEncoder:
-    """Writes one video of a width and height in pixels; use it in a ``with`` statement."""
+    """Encoder of one video with a width and height in pixels, for a ``with`` statement."""
 
     def __init__(self, path: Path, coding: VideoCodec, fps: int, size: tuple[int, int]) -> None:
         width, height = size
         if coding.pixels == "yuv420p":
             check_video_size(size)
-        os.environ.setdefault("SVT_LOG", "1")  # errors only; it would write a page of settings
+        os.environ.setdefault("SVT_LOG", "1")  # log errors only
         self.frames, self._coding = 0, coding
         self._container = av.open(str(path), "w", options=_CONTAINER)
         try:
             stream: Any = self._container.add_stream(coding.encoder, rate=fps, options=coding.options)
         except (FFmpegError, ValueError) as error:
             self._container.close()
-            raise DatasetError("this FFmpeg has no such encoder", where=coding.encoder, found=error) from error
+            raise DatasetError("encoder missing in this FFmpeg", where=coding.encoder, found=error) from error
         stream.width, stream.height, stream.pix_fmt = width, height, coding.pixels
         self._stream, self._time_base = stream, Fraction(1, fps)
 
@@ -136,14 +137,14 @@ class VideoEncoder:
         try:
             if kind is None:
                 self._container.mux(self._stream.encode(None))
-            elif self._stream.codec_context.is_open:  # else SVT-AV1 prints an error when it is freed
+            elif self._stream.codec_context.is_open:  # otherwise SVT-AV1 prints an error
                 with suppress(FFmpegError):
                     self._stream.encode(None)
         finally:
             self._container.close()
 
     def add(self, image: NDArray) -> None:
-        """Append (H, W, 3) uint8 RGB or (H, W) uint16."""
+        """Append a frame, (H, W, 3) uint8 RGB or (H, W) uint16."""
         layout = "rgb24" if image.ndim == 3 else self._coding.pixels
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format=layout)
         frame.pts, frame.time_base = self.frames, self._time_base
@@ -152,30 +153,30 @@ class VideoEncoder:
 
 
 class VideoJoiner:
-    """Copies videos one after the other into files ``path(chunk, number)``; only the one being written is open."""
+    """Joiner of videos into files ``path(chunk, number)`` without encoding; one file is open at a time."""
 
     def __init__(self, path: Callable[[int, int], Path], fps: int, limit_mb: float, limit_seconds: float) -> None:
         self._path, self._fps = path, fps
         self._limit_bytes, self._limit_frames = limit_mb * 2**20, limit_seconds * fps
-        self._count = self._bytes = self._frames = 0  # files; of the one being written
+        self._count = self._bytes = self._frames = 0  # number of files; size of the current file
         self._head: tuple[Any, ...] = ()
         self._out: Any = None
         self._stream: Any = None
 
     def add(self, part: Path, frames: int) -> tuple[int, int, int]:
-        """Append a video of so many frames; return chunk and file number, and its first frame there."""
+        """Append a video with ``frames`` frames; return chunk, file, and index of its first frame in the file."""
         size = part.stat().st_size
         try:
             with av.open(str(part)) as video:
                 stream = video.streams.video[0]
                 head = (stream.codec_context.name, stream.width, stream.height, stream.codec_context.extradata)
                 full = self._bytes + size > self._limit_bytes or self._frames + frames > self._limit_frames
-                # An encoder of another version, after an interruption, writes another head.
+                # After an interruption, an encoder of another version may write another header.
                 if self._out is None or full or head != self._head:
-                    self._begin(stream, head)
+                    self._start_file(stream, head)
                 first, found = self._frames, 0
                 for packet in video.demux(stream):
-                    if packet.dts is None:  # the end
+                    if packet.dts is None:  # end of the stream
                         continue
                     packet.pts = packet.dts = round(Fraction(first + found, self._fps) / packet.time_base)
                     packet.stream = self._stream
@@ -183,11 +184,11 @@ class VideoJoiner:
                     self._out.mux(packet)
                     found += 1
         except FFmpegError as error:
-            if error.errno in _FULL:  # it is the file that is written
+            if error.errno in _FULL:  # of the output file
                 raise
-            raise DatasetError("this video is damaged", where=part, found=error.strerror) from error
+            raise DatasetError("damaged video", where=part, found=error.strerror) from error
         if found != frames:
-            raise DatasetError("frames are missing in this video", where=part, expected=frames, found=found)
+            raise DatasetError("missing frames in this video", where=part, expected=frames, found=found)
         self._frames += frames
         self._bytes += size
         return *divmod(self._count - 1, CHUNK_FILES), first
@@ -197,20 +198,20 @@ class VideoJoiner:
             self._out.close()
             self._out = None
 
-    def _begin(self, template: Any, head: tuple[Any, ...]) -> None:
+    def _start_file(self, template: Any, head: tuple[Any, ...]) -> None:
         self.close()
         path = self._path(*divmod(self._count, CHUNK_FILES))
         path.parent.mkdir(parents=True, exist_ok=True)
         options = {**_CONTAINER, "movflags": "faststart"} if path.suffix == ".mp4" else _CONTAINER
         self._out = av.open(str(path), "w", options=options)
-        self._stream = self._out.add_stream_from_template(template, opaque=True)  # no decoder's name
+        self._stream = self._out.add_stream_from_template(template, opaque=True)  # keeps the codec parameters
         self._stream.time_base = template.time_base
         self._head, self._count = head, self._count + 1
         self._bytes = self._frames = 0
 
 
 def read_frames(path: Path, first: int, count: int, fps: int) -> Generator[NDArray, None, None]:
-    """Yield frames of a video, (H, W, 3) uint8 RGB or (H, W) uint16; the file is open until the generator is closed."""
+    """Yield frames, (H, W, 3) uint8 RGB or (H, W) uint16; close the generator to close the file."""
     given = 0
     try:
         check_regular(path)
@@ -222,7 +223,7 @@ def read_frames(path: Path, first: int, count: int, fps: int) -> Generator[NDArr
             for frame in video.decode(stream) if count > 0 else ():
                 place = round(frame.pts * stream.time_base * fps)
                 if place < first + given:
-                    continue  # between the key frame and the one asked for
+                    continue  # between the key frame and the first requested frame
                 if place != first + given:
                     break
                 yield frame.to_ndarray(format=layout)
@@ -230,13 +231,13 @@ def read_frames(path: Path, first: int, count: int, fps: int) -> Generator[NDArr
                 if given == count:
                     break
     except _BAD_VIDEO as error:
-        raise DatasetError("can't read this video", where=path, found=getattr(error, "strerror", error)) from error
+        raise DatasetError("the video can't be read", where=path, found=getattr(error, "strerror", error)) from error
     if given < count:
-        raise DatasetError("frames are missing in this video", where=path, expected=first + count, found=first + given)
+        raise DatasetError("missing frames in this video", where=path, expected=first + count, found=first + given)
 
 
 def packet_times(path: Path, most: int | None = None) -> tuple[list[Fraction], dict[str, Any]]:
-    """Return the times of the frames of a video in s, at most ``most`` and one more, and its ``info``."""
+    """Return the frame times of a video in s, at most ``most`` + 1, and its ``info`` for ``info.json``."""
     try:
         check_regular(path)
         with av.open(str(path)) as video:
@@ -245,7 +246,7 @@ def packet_times(path: Path, most: int | None = None) -> tuple[list[Fraction], d
             times = list(packets if most is None else islice(packets, most + 1))
             return sorted(times), _describe(stream)
     except _BAD_VIDEO as error:
-        raise DatasetError("can't read this video", where=path, found=getattr(error, "strerror", error)) from error
+        raise DatasetError("the video can't be read", where=path, found=getattr(error, "strerror", error)) from error
 
 
 def _describe(stream: Any) -> dict[str, Any]:
@@ -261,17 +262,18 @@ def _describe(stream: Any) -> dict[str, Any]:
 
 
 def to_levels(depth: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Return the 12-bit levels of depth in mm."""
     return np.minimum(depth, np.uint16(MAX_DEPTH_MM))
 
 
 def to_depth(levels: NDArray[np.uint16], info: Mapping[str, Any]) -> NDArray[np.uint16]:
-    """Return the depth in mm of an image of levels (H, W), 0 to 4095, by ``info`` of the video's feature."""
+    """Return depth in mm from levels (H, W), 0 to 4095, by the ``info`` of the video feature."""
     values = parse(_Range, dict(info), DatasetError, where="info", about="invalid range of a depth video")
     low, high, shift = values.depth_min, values.depth_max, values.shift
-    share = levels.astype(np.float64) / (_LEVELS - 1)
+    fraction = levels.astype(np.float64) / (_LEVELS - 1)
     if values.use_log:
         first, last = np.log(low + shift), np.log(high + shift)
-        metres = np.exp(first + share * (last - first)) - shift
+        metres = np.exp(first + fraction * (last - first)) - shift
     else:
-        metres = low + share * (high - low)
+        metres = low + fraction * (high - low)
     return np.clip(np.rint(metres * 1000), 0, 65535).astype(np.uint16)

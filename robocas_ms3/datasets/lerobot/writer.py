@@ -1,4 +1,4 @@
-"""Joins the parts of a conversion to a LeRobot dataset: tables and videos one after the other, not encoded again."""
+"""Join the parts of a conversion into a LeRobot dataset, without encoding again."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 
 def join_parts(folders: Sequence[Path], plan: Mapping[str, Any], root: Path, limits: FileLimits) -> None:
-    """Write a dataset into an empty folder from all parts of a plan, the content of ``conversion.json``."""
+    """Write a dataset into an empty folder from all parts of a plan (the content of ``conversion.json``)."""
     writer = LeRobotWriter(root, plan, limits, EpisodePart(folders[0]).record)
     with writer:
         for folder, entry in zip(folders, plan["episodes"], strict=True):
@@ -42,7 +42,7 @@ def join_parts(folders: Sequence[Path], plan: Mapping[str, Any], root: Path, lim
 
 
 class LeRobotWriter:
-    """Writes episodes, and at the end what ``meta`` says of all; cameras and robot are those of the first."""
+    """Writer of episodes and, at the end, of ``meta``; cameras and robot are those of the first episode."""
 
     def __init__(self, root: Path, plan: Mapping[str, Any], limits: FileLimits, first: EpisodeRecord) -> None:
         self._root, self._plan, self._limits, self._first = root, plan, limits, first
@@ -51,7 +51,7 @@ class LeRobotWriter:
         single = (feature.key for feature in schema.single_features(self._variant) if feature.dtype != "string")
         self._numbers: dict[str, list[NDArray]] = {
             key: [] for key in (*schema.ROBOCAS_KEYS, *single, *schema.INDICES)
-        }  # numeric features of each episode, about 300 bytes per frame
+        }  # numeric features per episode, about 300 bytes per frame
         self._tasks: dict[str, int] = {}
         self._subgoals: dict[str, int] = {}
         self._levels: dict[str, LevelHistogram] = {}
@@ -85,6 +85,7 @@ class LeRobotWriter:
                 yield _Stream(kind, prefix, video_name(camera, kind, codec, variant), joiner)
 
     def add_episode(self, part: EpisodePart, entry: Mapping[str, Any]) -> None:
+        """Append an episode to all tables and videos."""
         record, steps, variant, fps = part.record, len(part.table), self._variant, self._fps
         index, start = self._episodes_done, self._frames
         columns = self._columns(part, index, start, succeeded=entry.get("success") is True)
@@ -127,7 +128,7 @@ class LeRobotWriter:
         self._clipped += record.depth_clipped
 
     def _add_row(self, row: dict[str, Any], stats: Mapping[str, Stats]) -> None:
-        """Add a row of ``meta/episodes``; in format v2.1 a line of each of two files."""
+        """Add a row of ``meta/episodes``, in format v2.1 a line of two files."""
         if self._layout.one_file_per_episode:
             episode = {key: row[key] for key in ("episode_index", "tasks", "length")}
             _write_lines(self._root / schema.EPISODES_LINES, [episode], "a")
@@ -140,7 +141,7 @@ class LeRobotWriter:
             self._episodes.add(pa.Table.from_pylist([{**row, **places, **numbers}]))
 
     def _columns(self, part: EpisodePart, index: int, start: int, *, succeeded: bool) -> dict[str, NDArray]:
-        """Return the numeric features (T, D), with the numbers that depend on the episodes before."""
+        """Return the numeric features (T, D), with the indices that depend on earlier episodes."""
         steps, task = len(part.table), self._tasks.setdefault(part.record.instruction, len(self._tasks))
         last = np.arange(steps)[:, None] == steps - 1
         texts = part.table.column(SUBGOAL).to_pylist()
@@ -161,19 +162,20 @@ class LeRobotWriter:
         for key in (*schema.ROBOCAS_KEYS, *(feature.key for feature in schema.single_features(self._variant))):
             made[key] = as_column(columns[key]) if key in columns else part.table.column(key)
         if self._variant.language:
-            same = pa.array(np.zeros(len(part.table), np.int64))  # every frame has all rows of its episode
+            same = pa.array(np.zeros(len(part.table), np.int64))  # all frames have the same rows
             made[PERSISTENT] = pa.array([persistent], PERSISTENT_TYPE).take(same)
             made[EVENTS] = part.table.column(EVENTS).cast(EVENTS_TYPE)
         return pa.table(made | {key: as_column(columns[key]) for key in schema.INDICES})
 
     def _stage_rows(self, index: int, persistent: list[Row], events: list[list[Row]], times: list[float]) -> None:
-        """Write language rows where ``lerobot-annotate`` looks for rows to keep, at the table's float32 times."""
+        """Write language rows for ``lerobot-annotate``, at the float32 times of the table."""
         folder = self._root / schema.STAGING / f"episode_{index:06d}"
         timed = ({**row, "timestamp": time} for rows, time in zip(events, times, strict=True) for row in rows)
         for name, rows in (("plan", persistent), ("vqa", timed)):
             _write_lines(folder / f"{name}.jsonl", rows)
 
     def finalize(self) -> None:
+        """Write ``meta``: texts, statistics, ``info.json`` and checksums."""
         root, layout = self._root, self._layout
         if self._clipped:
             limit = schema.MAX_DEPTH_MM
@@ -230,7 +232,7 @@ class LeRobotWriter:
 
 @dataclass(frozen=True)
 class _Stream:
-    """The videos of a camera; ``prefix`` is that of the columns of ``meta/episodes``."""
+    """Videos of a camera; ``prefix`` is that of their columns in ``meta/episodes``."""
 
     kind: ImageKind
     prefix: str
@@ -239,9 +241,9 @@ class _Stream:
 
 
 class RollingTable:
-    """Writes tables to files ``path(chunk, number)``, ``group`` of them to a row group.
+    """Writer of tables to files ``path(chunk, number)``, with ``group`` tables per row group.
 
-    ``limit_mb`` is the size of a file in 2^20 bytes; 0: each table has a file of its own.
+    ``limit_mb`` is the size of a file in MiB; 0: one file per table.
     """
 
     def __init__(
@@ -255,8 +257,8 @@ class RollingTable:
         self._schema: pa.Schema | None = None
 
     def place(self, size: int = 0) -> tuple[int, int]:
-        """Return chunk and file number for the next rows, of about ``size`` bytes."""
-        if self._file is not None and self._file.tell() + size > self._limit and self._file.tell() > 4:  # its head
+        """Return chunk and file number of the next rows, of about ``size`` bytes."""
+        if self._file is not None and self._file.tell() + size > self._limit and self._file.tell() > 4:  # magic bytes
             self.close()
         number = self._count if self._file is None else self._count - 1
         return divmod(number, CHUNK_FILES)

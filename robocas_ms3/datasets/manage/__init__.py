@@ -1,1 +1,1 @@
-"""Datasets made of others: merging, splitting, importing from the format of RoboCAS-v0."""
+"""Merging and splitting of datasets, and import of the format of RoboCAS-v0."""

@@ -1,4 +1,4 @@
-"""Copies episodes of finished datasets into new ones; merging and splitting are such copies."""
+"""Copy episodes of finished datasets into new datasets, for merging and splitting."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ from robocas_ms3.datasets.sources.arrays import arrays_fingerprint, read_arrays
 from robocas_ms3.datasets.sources.file_models import ConversionRecord
 from robocas_ms3.datasets.sources.reader import Dataset
 
-KEEP_RULE = "every episode keeps the side it had in the dataset it is from"
+KEEP_RULE = "each episode keeps the split of its source dataset"
 _NO_LINKS = {errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.EOPNOTSUPP, errno.ENOSYS}
 
 
 @dataclass(frozen=True)
 class FinishedDataset:
-    """A dataset whose files all list the same episodes, its name, and its recordings; see `open_finished_dataset`."""
+    """Dataset with consistent files, its name, and its entries; see `open_finished_dataset`."""
 
     dataset: Dataset
     name: str
-    ledger: Mapping[int, dict[str, Any]]
+    entries: Mapping[int, dict[str, Any]]
 
     @property
     def root(self) -> Path:
         return self.dataset.root
 
     def identity(self, number: int) -> str:
-        """Return the fingerprint of the recording of an episode, or that of its arrays if the recording is unknown."""
-        recording = self.ledger[number].get("recording")
+        """Return the fingerprint of the recording of an episode; if unknown, that of its arrays."""
+        recording = self.entries[number].get("recording")
         return recording or f"arrays {arrays_fingerprint(self.dataset.episode(number).arrays)}"
 
 
@@ -58,44 +58,52 @@ def schema_version(dataset: Dataset) -> object:
 
 
 def open_finished_dataset(root: Path, name: str = "") -> FinishedDataset:
-    """Open a dataset to copy episodes from, or raise DatasetError if it is unfinished or contradicts itself."""
+    """Open a dataset to copy from; raise DatasetError if it is unfinished or inconsistent."""
     dataset = Dataset(root)
     schema.check_version(schema_version(dataset), root)
     if not dataset.info:
-        path, fix = root / schema.DATA_INFO_FILE, "Run the same robocas convert again first."
-        raise DatasetError("this dataset is not finished", where=path, found="no file", fix=fix)
-    listed = [number for side in dataset.splits for number in side]
+        path, fix = root / schema.DATA_INFO_FILE, "Run robocas convert again with the same arguments."
+        raise DatasetError("this dataset is unfinished", where=path, found="no file", fix=fix)
+    listed = [number for numbers in dataset.splits for number in numbers]
     if sorted(listed) != dataset.numbers:
-        found = f"{format_ranges(set(listed) ^ set(dataset.numbers)) or 'some'} missing, twice, or not on disk"
-        fix = "Finish it with robocas convert, or accept what is there with robocas split --in-place."
-        raise DatasetError("not the episodes on disk", where=root / schema.DATA_INFO_FILE, found=found, fix=fix)
+        found = (
+            f"{format_ranges(set(listed) ^ set(dataset.numbers)) or 'some episodes'} missing, repeated, or not on disk"
+        )
+        fix = "Finish it with robocas convert, or run robocas split --in-place to accept the episodes on disk."
+        raise DatasetError(
+            "listed episodes differ from those on disk", where=root / schema.DATA_INFO_FILE, found=found, fix=fix
+        )
     where = root / schema.CONVERSION_FILE
     parse(ConversionRecord, dataset.settings, DatasetError, where=where)
-    ledger = {int(number): entry for number, entry in dataset.settings.get("episodes", {}).items()}
-    unlisted = [number for number in dataset.numbers if number not in ledger]
+    entries = {int(number): entry for number, entry in dataset.settings.get("episodes", {}).items()}
+    unlisted = [number for number in dataset.numbers if number not in entries]
     if unlisted:
-        raise DatasetError("these episodes are not listed", where=where, found=format_ranges(unlisted))
+        raise DatasetError("episodes without an entry", where=where, found=format_ranges(unlisted))
     for number in dataset.numbers:
         episode = dataset.episode(number)
         found = episode.scene.get("schema_version", 1)
         schema.check_version(found, episode.folder / schema.SCENE_FILE, "an episode")
-    return FinishedDataset(dataset, name or root.resolve().name, ledger)
+    return FinishedDataset(dataset, name or root.resolve().name, entries)
 
 
 @dataclass(frozen=True)
 class CopiedEpisode:
-    """An episode of a dataset, and the side of the split on which its copy is."""
+    """Episode of a dataset to copy, and the split of the copy."""
 
     source: FinishedDataset
     number: int
-    side: Literal["train", "val"]
+    split: Literal["train", "val"]
 
 
 @dataclass(frozen=True)
 class CopyOptions:
-    """How episodes are copied; ``on_start`` is called with the number of episodes to write, ``on_episode`` with each.
+    """Options of copying episodes.
 
-    Hard links, where the file system allows, share files with the source, which an editor may change.
+    Attributes:
+        link: hard-link files if the file system allows it; edits of a linked file change the source too.
+        overwrite: start again instead of continuing.
+        on_start: called with the number of episodes to write.
+        on_episode: called with the number of each written episode.
     """
 
     link: bool = True
@@ -106,7 +114,7 @@ class CopyOptions:
 
 @dataclass(frozen=True)
 class CopyResult:
-    """Number of episodes of a new dataset, of those that were there already, of files, and of duplicates skipped."""
+    """Result of copying: numbers of episodes, existing episodes, files, and skipped duplicates."""
 
     out: Path
     episodes: int
@@ -116,18 +124,18 @@ class CopyResult:
     skipped: int = 0
 
     def __str__(self) -> str:
-        kept = f", {self.existing} of them were there" if self.existing else ""
+        existing = f" ({self.existing} already there)" if self.existing else ""
         linked = f"{format_count(self.linked, 'file')} linked, {self.copied} copied"
-        skipped = f", {format_count(self.skipped, 'duplicate')} left out" if self.skipped else ""
-        return f"{self.out}: {format_count(self.episodes, 'episode')}{kept}, {linked}{skipped}"
+        skipped = f", {format_count(self.skipped, 'duplicate')} skipped" if self.skipped else ""
+        return f"{self.out}: {format_count(self.episodes, 'episode')}{existing}, {linked}{skipped}"
 
 
 def copy_episodes(
     outs: Mapping[Path, Sequence[CopiedEpisode]], split_rule: str, options: CopyOptions
 ) -> list[CopyResult]:
-    """Write datasets of episodes with the same settings, numbered from 0 in the given order; see `CopyOptions`.
+    """Write datasets of episodes with equal settings, numbered from 0 in the given order.
 
-    Everything is checked before anything is written. Called again after a kill, it continues, with the same result.
+    All inputs are checked before the first write. The same call continues an interrupted one, with the same result.
     """
     numbers: dict[Path, list[int]] = {}
     for member in (member for members in outs.values() for member in members):
@@ -154,7 +162,7 @@ def _copy(out: Path, members: Sequence[CopiedEpisode], record: Mapping[str, Any]
                 placer.place_tree(member.source.root / schema.episode_folder(member.number), folder)
             if options.on_episode:
                 options.on_episode(number)
-        train, val = ([n for n, member in enumerate(members) if member.side == side] for side in ("train", "val"))
+        train, val = ([n for n, member in enumerate(members) if member.split == name] for name in ("train", "val"))
         write_info(out, (train, val))
     return CopyResult(out, len(members), len(members) - len(missing), placer.linked, placer.copied)
 
@@ -162,21 +170,21 @@ def _copy(out: Path, members: Sequence[CopiedEpisode], record: Mapping[str, Any]
 def _record(members: Sequence[CopiedEpisode], split_rule: str) -> dict[str, Any]:
     episodes = {}
     for number, member in enumerate(members):
-        entry = member.source.ledger[member.number]
-        before = {"from": entry["from"]} if "from" in entry else {}  # of an episode that was copied before
-        episodes[str(number)] = {**entry, "from": {"dataset": member.source.name, "episode": member.number, **before}}
+        entry = member.source.entries[member.number]
+        origin = {"from": entry["from"]} if "from" in entry else {}  # of an episode that is a copy itself
+        episodes[str(number)] = {**entry, "from": {"dataset": member.source.name, "episode": member.number, **origin}}
     settings = members[0].source.dataset.settings
     return {**copied_header({key: settings[key] for key in SETTINGS}, split_rule), "episodes": episodes}
 
 
 def copied_header(settings: Mapping[str, Any], split_rule: str) -> dict[str, Any]:
-    """Return ``conversion.json`` of a dataset made of others, without the episodes."""
+    """Return ``conversion.json`` of a merged or split dataset, without the episodes."""
     return {**header(settings, split_rule), "made_with": {"robocas_ms3": robocas_ms3.__version__}}
 
 
 @contextmanager
 def dataset_output(out: Path, record: Mapping[str, Any], overwrite: bool) -> Iterator[None]:
-    """Start or continue a dataset made of others: its ``conversion.json`` has to match, whatever the versions."""
+    """Start or continue a merged or split dataset; ``conversion.json`` must match except for versions."""
     with OutputFolder(out, DATASET, _settings_of(record), overwrite=overwrite) as output:
         output.start(record)
         yield
@@ -187,14 +195,17 @@ def _settings_of(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_apart(out: Path, inputs: Sequence[Path]) -> None:
+    """Raise DatasetError if the output folder is an input, or contains or is in one."""
     target = out.resolve()
     for path in (path.resolve() for path in inputs):
         if path == target or path in target.parents or target in path.parents:
-            raise DatasetError("the output is an input, or one is in the other", where=out, fix="Choose another --out.")
+            raise DatasetError(
+                "the output folder overlaps an input", where=out, found=path, fix="Choose another --out."
+            )
 
 
 def _check_episodes(root: Path, numbers: Iterable[int]) -> None:
-    """Check that episodes have all arrays, cameras and images; arrays that an imported episode lacks may be missing."""
+    """Check arrays, cameras and images of episodes; arrays missing since the import are accepted."""
     _, image_options, _ = read_settings(root)
     for folder in (root / schema.episode_folder(number) for number in numbers):
         stored = read_arrays(folder / schema.EPISODE_FILE)
@@ -214,19 +225,21 @@ def _check_episodes(root: Path, numbers: Iterable[int]) -> None:
 
 
 def damaged_episode_error(root: Path, wrong: Violation) -> DatasetError:
-    where, fix = root / wrong.where, f"robocas validate {root} lists all."
+    """Return an error for a violation in an episode."""
+    where, fix = root / wrong.where, f"Run robocas validate {root} for all violations."
     return DatasetError("this episode is damaged", where=where, expected=wrong.expected, found=wrong.found, fix=fix)
 
 
 @dataclass
 class FilePlacer:
-    """Links files into a dataset, or copies them where that is not possible or not wanted, and counts both."""
+    """Placer of files: links or copies them into a dataset, and counts both."""
 
     link: bool
     linked: int = 0
     copied: int = 0
 
     def place(self, source: Path, target: Path) -> None:
+        """Link a file, or copy it if linking is not possible or not requested."""
         if self.link and not source.is_symlink():
             try:
                 os.link(source, target)
@@ -235,13 +248,13 @@ class FilePlacer:
             except OSError as error:
                 if error.errno not in _NO_LINKS:
                     raise
-                self.link = error.errno == errno.EMLINK  # a limit of this file alone
+                self.link = error.errno == errno.EMLINK  # limit of this file only
         check_regular(source)
         shutil.copyfile(source, target)
         self.copied += 1
 
     def place_tree(self, source: Path, target: Path) -> None:
-        """Link or copy the files of a folder into a folder that exists, except hidden files."""
+        """Link or copy the files of a folder into an existing folder, except hidden files."""
         with os.scandir(source) as entries:
             for entry in sorted(entries, key=lambda entry: entry.name):
                 if entry.name.startswith("."):

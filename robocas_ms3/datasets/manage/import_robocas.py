@@ -1,4 +1,4 @@
-"""Imports a dataset in the format of RoboCAS-v0: repairs its episodes and writes them in the form of the schema."""
+"""Import of datasets in the format of RoboCAS-v0: episodes are repaired and written by the schema."""
 
 from __future__ import annotations
 
@@ -36,25 +36,25 @@ from robocas_ms3.datasets.sources.reader import Dataset, Episode
 
 Embed = Callable[[list[str]], NDArray[np.float32]]
 REPORT_FILE = "import_report.json"
-SPLIT_RULE = "as in the dataset it was imported from; episodes that were not listed there as by the writer's rule"
+SPLIT_RULE = "as in the imported dataset; episodes that it does not list are split by seed"
 
 
 def import_robocas(
     surveyed: Survey, out: Path, *, embed: Embed | None = None, options: CopyOptions | None = None
 ) -> int:
-    """Write a dataset of the episodes that can be imported; return how many were there already.
+    """Write a dataset of the importable episodes; return the number of episodes that existed already.
 
-    Episodes keep their numbers. Images are copied or linked, arrays, camera files and a report are written; the
-    source is not changed. Called again after a kill, it continues. ``embed`` is for episodes without embeddings.
+    Episodes keep their numbers. Images are copied or linked; arrays, camera files and a report are written. The source
+    does not change. The same call continues an interrupted import. ``embed`` computes missing embeddings.
 
     Raises:
-        DatasetError: no episode can be imported, or the output is the input.
-        OutputExistsError: ``out`` is another dataset, or none.
+        DatasetError: no episode can be imported, or the output overlaps the input.
+        OutputExistsError: ``out`` is another dataset, or not a dataset.
     """
     if not surveyed.importable or surveyed.image_options is None:
-        found = f"{format_count(surveyed.episodes, 'episode')}, nothing whole"
-        fix = "robocas import-robocas without --out says what is wrong."
-        raise DatasetError("no episode can be taken", where=surveyed.root, found=found, fix=fix)
+        found = f"{format_count(surveyed.episodes, 'episode')}, none importable"
+        fix = "Run robocas import-robocas without --out for the findings."
+        raise DatasetError("no episode can be imported", where=surveyed.root, found=found, fix=fix)
     dataset, options = Dataset(surveyed.root), options or CopyOptions(link=False)
     info, _ = read_info(dataset)
     embedded = surveyed.embeddings or embed is not None
@@ -68,7 +68,7 @@ def import_robocas(
             episode = read_episode(dataset, number, info, surveyed.rate_hz, surveyed.turn_eef)
             if not episode.usable:
                 where = surveyed.root / schema.episode_folder(number)
-                raise DatasetError("this episode changed meanwhile", where=where)
+                raise DatasetError("this episode changed during the import", where=where)
             episode.stored = _embedded(episode, embedded, embed)
             with atomic_folder(out / schema.episode_folder(number)) as folder:
                 _write(folder, dataset.episode(number), episode, surveyed, placer)
@@ -83,10 +83,10 @@ def _record(dataset: Dataset, surveyed: Survey, embedded: bool) -> dict[str, Any
     assert surveyed.image_options is not None
     unknown = dict.fromkeys(("trajectory", "trajectory_episode", "seed", "success", "target", "recording"))
     parse(EpisodesRecord, dataset.settings, DatasetError, where=dataset.root / schema.CONVERSION_FILE)
-    before = dataset.settings.get("episodes", {})
+    known = dataset.settings.get("episodes", {})
     name = surveyed.root.resolve().name
     episodes = {
-        str(n): {**unknown, **before.get(str(n), {}), "from": {"dataset": name, "episode": n}}
+        str(n): {**unknown, **known.get(str(n), {}), "from": {"dataset": name, "episode": n}}
         for n in surveyed.importable
     }
     return {
@@ -128,13 +128,13 @@ def _write(folder: Path, source: Episode, episode: ImportedEpisode, surveyed: Su
 
 
 def _scene(source: Episode, episode: ImportedEpisode, surveyed: Survey) -> dict[str, Any]:
-    """Return the content of ``scene.json``; most is unknown, unless the episode has such a file."""
-    before = source.scene if source.scene.get("schema_version") == schema.SCHEMA_VERSION else {}
+    """Return the content of ``scene.json``; values are unknown unless the episode has such a file."""
+    previous = source.scene if source.scene.get("schema_version") == schema.SCHEMA_VERSION else {}
     wanted = (spec.name for spec in schema.EPISODE_INFO if not spec.embedding)
     repaired = (found for found in episode.findings if found.outcome == "repaired")
     made = {
         "recording": None,
-        **(before.get("source") or {}),
+        **(previous.get("source") or {}),
         "format": f"robocas v{schema_version(source.dataset)}",
         "dataset": surveyed.root.resolve().name,
         "episode": episode.number,
@@ -143,4 +143,4 @@ def _scene(source: Episode, episode: ImportedEpisode, surveyed: Survey) -> dict[
         "repaired": [f"{found.violation.where.split('/', 1)[1]}: {found.problem}" for found in repaired],
     }
     known = {"schema_version": schema.SCHEMA_VERSION, "rate_hz": float(surveyed.rate_hz), "source": made}
-    return {key: known.get(key, before.get(key)) for key in SCENE_KEYS}
+    return {key: known.get(key, previous.get(key)) for key in SCENE_KEYS}

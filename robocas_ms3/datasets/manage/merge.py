@@ -1,4 +1,4 @@
-"""Merges several datasets into one."""
+"""Merge several datasets into one."""
 
 from __future__ import annotations
 
@@ -23,37 +23,37 @@ from robocas_ms3.datasets.manage.copy_episodes import (
 def merge(
     roots: Sequence[Path], out: Path, *, skip_duplicates: bool = False, options: CopyOptions | None = None
 ) -> CopyResult:
-    """Write a dataset of all episodes of others, in the given order; each keeps its side of the split.
+    """Write a dataset with all episodes of several datasets, in the given order; each keeps its split.
 
     Raises:
-        DatasetError: the datasets are not finished or have other settings or, without ``skip_duplicates``, the same
-            episodes, or an episode is damaged.
-        OutputExistsError: ``out`` is another dataset, or none.
+        DatasetError: a dataset is unfinished or damaged, the settings differ, or, without ``skip_duplicates``, an
+            episode is in several datasets.
+        OutputExistsError: ``out`` is another dataset, or not a dataset.
     """
     if not roots:
-        raise DatasetError("nothing to merge", expected="folders of datasets", fix="robocas merge A B --out C")
+        raise DatasetError("no datasets to merge", expected="folders of datasets", fix="Run robocas merge A B --out C.")
     sources = [open_finished_dataset(root, name) for root, name in zip(roots, _distinct_names(roots), strict=True)]
     _check_settings(sources)
     members: dict[str, CopiedEpisode] = {}
     duplicates: list[tuple[CopiedEpisode, CopiedEpisode]] = []
     for source in sources:
-        validates = set(source.dataset.splits[1])
+        validation = set(source.dataset.splits[1])
         for number in source.dataset.numbers:
-            member = CopiedEpisode(source, number, "val" if number in validates else "train")
+            member = CopiedEpisode(source, number, "val" if number in validation else "train")
             first = members.setdefault(source.identity(number), member)
             if first is not member:
                 duplicates.append((first, member))
     if duplicates and not skip_duplicates:
         pairs = [f"{a.source.name} {a.number} = {b.source.name} {b.number}" for a, b in duplicates]
         where, found = ", ".join(map(str, roots)), f"{len(duplicates)}: {', '.join(pairs[:4])}"
-        fix = "Pass --skip-duplicates to take each once."
-        raise DatasetError("the same recording twice", where=where, found=found, fix=fix)
+        fix = "Pass --skip-duplicates to keep one copy of each."
+        raise DatasetError("duplicate recordings", where=where, found=found, fix=fix)
     (written,) = copy_episodes({out: list(members.values())}, KEEP_RULE, options or CopyOptions())
     return replace(written, skipped=len(duplicates))
 
 
 def _distinct_names(roots: Sequence[Path]) -> list[str]:
-    """Return the shortest ends of paths that differ."""
+    """Return the shortest distinct ends of paths."""
     parts = [root.resolve().parts for root in roots]
     names: list[str] = []
     for length in range(1, max(map(len, parts)) + 1):
@@ -69,9 +69,9 @@ def _check_settings(sources: Sequence[FinishedDataset]) -> None:
         different = [key for key in SETTINGS if first.settings.get(key) != other.settings.get(key)]
         if different:
             raise DatasetError(
-                "these datasets have other settings",
+                "the settings of the datasets differ",
                 where=other.root / schema.CONVERSION_FILE,
-                expected=", ".join(f"{key} {first.settings.get(key)}" for key in different) + f" as {first.root}",
+                expected=", ".join(f"{key} {first.settings.get(key)}" for key in different) + f" as in {first.root}",
                 found=", ".join(f"{key} {other.settings.get(key)}" for key in different),
                 fix="Convert them with the same settings.",
             )

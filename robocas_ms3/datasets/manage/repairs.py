@@ -1,4 +1,4 @@
-"""Repairs of the arrays of an episode in the format of RoboCAS-v0; what can't be repaired leaves the episode out."""
+"""Repairs of the arrays of an episode in the format of RoboCAS-v0."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _ESSENTIAL = ("ee_pos", "ee_orn", "gripper_status", "language_goal", "step_lang_
 _CAMERA_OFFSET = (0.03, 0.07)  # m: the gripper camera is 0.05 m from the axis of the hand
 
 Outcome = Literal["skipped", "repaired", "warning"]
-"""The episode is skipped; the fault is repaired; the episode is taken with the fault."""
+"""skipped: the episode is not imported; repaired; warning: the episode is imported with the finding."""
 Keys = tuple[str, str, str, str]
 """One of ``schema.RELATIVE_PAIRS``."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A violation in an episode, or in the dataset, what the import does about it, and what was repaired."""
+    """Violation in an episode, or in the dataset, with the outcome of the import and the repair."""
 
     episode: int | None
     violation: Violation
@@ -39,7 +39,7 @@ class Finding:
 
     @property
     def problem(self) -> str:
-        """What is wrong, and what was done."""
+        """Found and expected value, and the repair."""
         wrong = f"found {self.violation.found}, expected {self.violation.expected}"
         return f"{wrong}: {self.repair}" if self.repair else wrong
 
@@ -50,7 +50,7 @@ class Finding:
 
 @dataclass
 class ImportedEpisode:
-    """An episode while it is checked and repaired; ``turn_deg``: angle about z by which its EEF frame was turned."""
+    """Episode during its check and repair; ``turn_deg``: rotation of its EEF frame about z, degrees."""
 
     number: int
     stored: EpisodeArrays
@@ -74,22 +74,22 @@ class ImportedEpisode:
 
 
 def add_key_findings(episode: ImportedEpisode, loaded: EpisodeArrays) -> None:
-    """Note missing, unreadable and unknown keys of what was read, before it was completed."""
+    """Add findings for missing, unreadable and unknown keys of the loaded arrays."""
     for wrong in (*array_checks.check_file(loaded), *array_checks.check_keys(loaded)):
         if wrong.kind == "unexpected":
-            episode.add_finding(wrong, "warning", "not taken")
+            episode.add_finding(wrong, "warning", "not imported")
         elif wrong.key in episode.stored.derived:
-            episode.add_finding(wrong, "repaired", f"made of {episode.stored.derived[wrong.key]}")
+            episode.add_finding(wrong, "repaired", f"derived from {episode.stored.derived[wrong.key]}")
         elif wrong.key in EMBEDDINGS:
-            episode.add_finding(wrong, "warning", "not taken")
+            episode.add_finding(wrong, "warning", "not imported")
         elif wrong.kind != "missing" or wrong.key in _ESSENTIAL:
             episode.add_finding(wrong, "skipped")
         else:
-            episode.add_finding(wrong, "warning", "it can't be made")
+            episode.add_finding(wrong, "warning", "can't be derived")
 
 
 def repair_arrays(episode: ImportedEpisode) -> None:
-    """Repair the arrays in three stages, of which each needs the one before."""
+    """Repair the arrays in three stages; an episode that fails one is skipped."""
     for stage in (_repair_shapes, _repair_units, _repair_content):
         if episode.usable:
             stage(episode)
@@ -111,13 +111,13 @@ def _repair_units(episode: ImportedEpisode) -> None:
 
 
 def _drop(episode: ImportedEpisode, wrong: Violation) -> None:
-    """Drop an embedding; without any other array the episode is left out."""
+    """Drop an invalid embedding; skip the episode if any other array is invalid."""
     if wrong.key not in EMBEDDINGS:
         episode.add_finding(wrong, "skipped")
         return
     arrays = {key: array for key, array in episode.stored.arrays.items() if key != wrong.key}
     episode.stored = replace(episode.stored, arrays=arrays)
-    episode.add_finding(wrong, "warning", "not taken")
+    episode.add_finding(wrong, "warning", "not imported")
 
 
 def _repair_content(episode: ImportedEpisode) -> None:
@@ -125,13 +125,13 @@ def _repair_content(episode: ImportedEpisode) -> None:
         _repair_motion(episode, keys)
     for wrong in [*array_checks.check_base_motion(episode.stored)]:
         episode.put({wrong.key: SPECS[wrong.key].cast(planar_motion(episode.stored.arrays["agv_pose"]))})
-        episode.add_finding(wrong, "repaired", "made of agv_pose")
+        episode.add_finding(wrong, "repaired", "derived from agv_pose")
     for wrong in array_checks.check_values(episode.stored):
         episode.add_finding(wrong, "skipped" if wrong.key == "language_goal" else "warning")
 
 
 def _repair_motion(episode: ImportedEpisode, keys: Keys) -> None:
-    """Convert relative motion from the convention by which it agrees with the poses."""
+    """Convert relative motion from the convention under which it agrees with the poses."""
     stored = episode.stored
     found = list(array_checks.check_pair(stored, keys))
     for repair, converted, repaired in _CONVENTIONS if found else ():
@@ -152,7 +152,7 @@ def _from_wxyz(arrays: Mapping[str, NDArray], keys: Keys) -> dict[str, NDArray]:
     return {key: np.ascontiguousarray(np.roll(arrays[key], -1, axis=1)) for key in (keys[1], keys[3])}
 
 
-def _from_a_step_later(arrays: Mapping[str, NDArray], keys: Keys) -> dict[str, NDArray]:
+def _from_next_step(arrays: Mapping[str, NDArray], keys: Keys) -> dict[str, NDArray]:
     return _with_identity_last({key: np.roll(arrays[key], -1, axis=0) for key in keys[2:]}, keys)
 
 
@@ -161,18 +161,18 @@ def _with_identity_last(arrays: Mapping[str, NDArray], keys: Keys) -> dict[str, 
     return {key: np.vstack([arrays[key][:-1], row]).astype(arrays[key].dtype) for key, row in last.items()}
 
 
-_CONVENTIONS = (  # repair for people, conversion to compare with the poses, repair
+_CONVENTIONS = (  # description, conversion to compare with the poses, repair
     ("converted from wxyz", _from_wxyz, _from_wxyz),
-    ("moved from one step later, where the paper has it", _from_a_step_later, motion_arrays),
+    ("moved by one step (convention of the paper)", _from_next_step, motion_arrays),
     ("the last row set to the identity", _with_identity_last, motion_arrays),
 )
 
 
 def eef_turn(camera_in_ee: NDArray) -> int:
-    """Return the turn about z from an EEF frame to the TCP of ManiSkill: 0, 90, 180 or -90 degrees.
+    """Return the rotation about z from an EEF frame to the TCP of ManiSkill: 0, 90, 180 or -90 degrees.
 
-    The gripper camera is 0.05 m from the axis of the hand, on the x side of ManiSkill's TCP; RoboCAS-v0 has a frame
-    turned by -90 degrees. If the camera is elsewhere, the frame stays.
+    The gripper camera is 0.05 m from the axis of the hand, in the x direction of the TCP of ManiSkill. The frame of
+    RoboCAS-v0 is rotated by -90 degrees. The result is 0 for other camera positions.
     """
     x, y = camera_in_ee[:2, 3]
     if not _CAMERA_OFFSET[0] < np.hypot(x, y) < _CAMERA_OFFSET[1]:
@@ -183,10 +183,11 @@ def eef_turn(camera_in_ee: NDArray) -> int:
 
 
 def turn_eef_frame(episode: ImportedEpisode, degrees: int) -> None:
+    """Rotate the EEF frame of an episode about z, and derive the relative motion again."""
     arrays = episode.stored.arrays
     turns = Rotation.from_quat(arrays["ee_orn"]) * Rotation.from_euler("z", degrees, degrees=True)
     arrays = {**arrays, "ee_orn": SPECS["ee_orn"].cast(continuous_xyzw(turns.as_matrix()))}
     episode.put({**arrays, **motion_arrays(arrays, schema.RELATIVE_PAIRS[0])})
     episode.turn_deg = degrees
     wrong = Violation(episode.stored.file, "ee_orn, rel_pos, rel_orn", "ManiSkill's TCP frame", "another frame")
-    episode.add_finding(wrong, "repaired", f"turned by {degrees} degrees about z")
+    episode.add_finding(wrong, "repaired", f"rotated by {degrees} degrees about z")

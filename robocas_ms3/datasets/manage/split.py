@@ -37,7 +37,7 @@ EpisodeSplit = tuple[list[int], list[int]]
 
 @dataclass(frozen=True)
 class SplitOptions:
-    """How to choose validation episodes: their fraction, and the key whose groups of episodes stay together."""
+    """Choice of validation episodes: their fraction, and the key whose groups stay together."""
 
     val_fraction: float
     group_by: GroupBy = "seed"
@@ -136,7 +136,7 @@ def resplit(root: Path, options: SplitOptions | None = None) -> EpisodeSplit:
 def split_train_val(
     source: FinishedDataset, options: SplitOptions | None, train: Path, val: Path
 ) -> dict[Path, EpisodeSplit]:
-    """Return the split of the episodes of two datasets: training and validation."""
+    """Return the episodes of two datasets, training and validation, by folder."""
     a, b = train.resolve(), val.resolve()
     if a == b or a in b.parents or b in a.parents:
         fix = "Choose two folders, neither inside the other."
@@ -148,14 +148,14 @@ def split_train_val(
 def split_by_fractions(
     dataset: Dataset, fractions: Sequence[float], group_by: GroupBy, options: SplitOptions | None
 ) -> dict[str, EpisodeSplit]:
-    """Return the split of the episodes of datasets ``part_0``, ``part_1``, ... with these fractions, by folder."""
+    """Return the episodes of the datasets ``part_0``, ``part_1``, ... with these fractions, by folder."""
     # Without a salt of its own, the last part would get all validation episodes.
     pieces = cut(group_episodes(dataset, group_by), fractions, salt="part ")
     return {f"part_{index}": _split_within(dataset, piece, options) for index, piece in enumerate(pieces)}
 
 
 def split_by_value(dataset: Dataset, group_by: GroupBy, options: SplitOptions | None) -> dict[str, EpisodeSplit]:
-    """Return the split of the episodes of one dataset per task or target object, by folder."""
+    """Return the episodes of one dataset per task or target object, by folder."""
     groups = group_episodes(dataset, group_by)
     pieces = {value: [n for n, group in groups.items() if group == value] for value in sorted(set(groups.values()))}
     names = folder_names(pieces)

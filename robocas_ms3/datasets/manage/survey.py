@@ -1,4 +1,4 @@
-"""Surveys a dataset in the format of RoboCAS-v0: which episodes can be imported, and what is wrong with the others."""
+"""Survey of a dataset in the format of RoboCAS-v0: importable episodes and findings."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _FULL_SIZE = (640, 480)
 
 @dataclass
 class Survey:
-    """Result of a survey: ``importable`` is number -> T of the episodes that can be imported, ``images`` are theirs."""
+    """Result of a survey; ``importable`` has the steps T of the importable episodes by number."""
 
     root: Path
     rate_hz: float
@@ -73,8 +73,9 @@ def survey(
 ) -> Survey:
     """Check each episode: arrays, cameras, and header and checksums of each image.
 
-    The rate is that of ``conversion.json`` by default, 5 without one. ``turn_eef`` turns the EEF frame to ManiSkill's
-    TCP if the pose of the gripper camera shows that it is turned. ``on_episode`` is called with (done, all).
+    The default rate is that of ``conversion.json``, or 5 Hz without that file. ``turn_eef`` rotates the EEF frame to
+    the TCP of ManiSkill if the pose of the gripper camera shows a rotation. ``on_episode`` is called with (done, total)
+    after each episode.
 
     Raises:
         DatasetError: there are no episodes, or the rate is not positive.
@@ -82,11 +83,11 @@ def survey(
     dataset = Dataset(root)
     rate_hz = dataset.rate_hz if rate_hz is None else rate_hz
     if rate_hz <= 0:
-        raise DatasetError("no such rate", where="rate", expected="> 0 Hz", found=rate_hz)
+        raise DatasetError("invalid rate", where="--rate", expected="> 0 Hz", found=rate_hz)
     info, findings = read_info(dataset)
     if not dataset.settings:
         wrong = Violation(schema.CONVERSION_FILE, "", "this file", NO_FILE)
-        findings.append(Finding(None, wrong, "repaired", f"made of the episodes, {rate_hz:g} steps a second"))
+        findings.append(Finding(None, wrong, "repaired", f"derived from the episodes, {rate_hz:g} Hz"))
     usable: list[ImportedEpisode] = []
     fingerprints: dict[int, str] = {}
     for done, number in enumerate(dataset.numbers, start=1):
@@ -96,7 +97,7 @@ def survey(
         if episode.usable:
             fingerprints[number] = arrays_fingerprint(episode.stored.arrays)
             embeddings = {key: episode.stored.arrays[key][:0] for key in EMBEDDINGS if key in episode.stored.arrays}
-            arrays = {"ee_pos": episode.stored.arrays["ee_pos"], **embeddings}  # the others take memory
+            arrays = {"ee_pos": episode.stored.arrays["ee_pos"], **embeddings}  # to save memory
             episode.stored = replace(episode.stored, arrays=arrays)
             usable.append(episode)
         else:
@@ -108,31 +109,31 @@ def survey(
     for episode in usable:
         name = schema.episode_folder(episode.number)
         if episode.image_options != most:
-            wrong = Violation(name, "", f"{_describe(most)}, as most", _describe(episode.image_options))
+            wrong = Violation(name, "", f"{_describe(most)}, as in most episodes", _describe(episode.image_options))
             episode.add_finding(wrong, "skipped")
         elif (other := first.setdefault(fingerprints[episode.number], episode.number)) != episode.number:
             episode.add_finding(Violation(name, "", "each episode once", f"the arrays of episode {other}"), "skipped")
         findings += episode.findings
-    taken = {episode.number: episode for episode in usable if episode.usable}
-    lacking = [number for number, episode in taken.items() if not episode.embedded]
-    if lacking and len(lacking) < len(taken):
+    importable = {episode.number: episode for episode in usable if episode.usable}
+    lacking = [number for number, episode in importable.items() if not episode.embedded]
+    if lacking and len(lacking) < len(importable):
         found = f"{format_count(len(lacking), 'episode')} without"
-        wrong = Violation(schema.EPISODE_FILE, "embeddings", "in all episodes or none", found)
-        findings.append(Finding(None, wrong, "repaired", "not taken"))
-    findings = sorted(_merged(findings, taken), key=lambda f: -1 if f.episode is None else f.episode)
-    lengths = {number: episode.stored.steps for number, episode in taken.items()}
-    embedded = bool(taken) and not lacking
+        wrong = Violation(schema.EPISODE_FILE, "embeddings", "in all episodes or in none", found)
+        findings.append(Finding(None, wrong, "repaired", "not imported"))
+    findings = sorted(_merged(findings, importable), key=lambda f: -1 if f.episode is None else f.episode)
+    lengths = {number: episode.stored.steps for number, episode in importable.items()}
+    embedded = bool(importable) and not lacking
     return Survey(root, rate_hz, turn_eef, len(dataset.numbers), lengths, most, embedded, findings)
 
 
-def _merged(findings: Sequence[Finding], taken: Mapping[int, ImportedEpisode]) -> Iterator[Finding]:
-    """Yield findings; those that all of several episodes share once, as of the dataset."""
-    shared = Counter(_in_dataset(found) for found in findings if found.episode in taken)
+def _merged(findings: Sequence[Finding], importable: Mapping[int, ImportedEpisode]) -> Iterator[Finding]:
+    """Yield findings; a finding of all importable episodes is reported once, for the dataset."""
+    shared = Counter(_in_dataset(found) for found in findings if found.episode in importable)
     for found in findings:
-        count = shared.get(_in_dataset(found), 0) if found.episode in taken else 0
-        if count < len(taken) or count < 2:
+        count = shared.get(_in_dataset(found), 0) if found.episode in importable else 0
+        if count < len(importable) or count < 2:
             yield found
-        elif found.episode == next(iter(taken)):
+        elif found.episode == next(iter(importable)):
             yield _in_dataset(found)
 
 
@@ -146,7 +147,7 @@ def read_episode(
     dataset: Dataset, number: int, info: Mapping[str, Any], rate_hz: float, turn_eef: bool
 ) -> ImportedEpisode:
     """Read and repair the arrays of an episode, and check its cameras; see `survey`."""
-    source, said = dataset.episode(number), episode_info(info, number)
+    source, listed = dataset.episode(number), episode_info(info, number)
     path = source.folder / schema.EPISODE_FILE
     episode = ImportedEpisode(number, EpisodeArrays(path, {}))
     try:
@@ -154,15 +155,15 @@ def read_episode(
     except DatasetError as error:
         episode.add_finding(_unreadable(f"{source.folder.name}/{path.name}", "a numpy archive", error), "skipped")
         return episode
-    episode.stored = derive_missing_arrays(loaded, said, rate_hz)
+    episode.stored = derive_missing_arrays(loaded, listed, rate_hz)
     add_key_findings(episode, loaded)
     repair_arrays(episode)
     if episode.usable:
         arrays, file = episode.stored.arrays, episode.stored.file
         for key, value in (("ep_length", episode.stored.steps), ("language_goal", str(arrays["language_goal"]))):
-            if said.get(key, value) != value:
-                wrong = Violation(file, key, f"{said[key]!r} ({schema.DATA_INFO_FILE})", repr(value))
-                episode.add_finding(wrong, "repaired", "the array counts")
+            if listed.get(key, value) != value:
+                wrong = Violation(file, key, f"{listed[key]!r} ({schema.DATA_INFO_FILE})", repr(value))
+                episode.add_finding(wrong, "repaired", "the array is used")
         _check_files(episode, source)
     if episode.usable and turn_eef and EE_CAMERA in source.cameras and not source.scene.get("env_info"):
         turn = eef_turn(source.camera_in_parent(EE_CAMERA))
@@ -176,7 +177,7 @@ def _unreadable(file: str, expected: str, error: DatasetError) -> Violation:
 
 
 def _check_files(episode: ImportedEpisode, source: Episode) -> None:
-    """Note cameras that can't be used, and files of today's schema that are missing."""
+    """Add findings for invalid cameras, and for missing files of the current schema."""
     name = source.folder.name
     if not source.cameras:
         episode.add_finding(Violation(name, "", "cameras", "none"), "skipped")
@@ -199,18 +200,18 @@ def _check_files(episode: ImportedEpisode, source: Episode) -> None:
                 episode.add_finding(wrong, "repaired", f"a copy of {other}")
     if not (source.folder / schema.SCENE_FILE).is_file():
         wrong = Violation(f"{name}/{schema.SCENE_FILE}", "", "this file", NO_FILE)
-        episode.add_finding(wrong, "warning", "seed, target, layout and configuration are not known")
+        episode.add_finding(wrong, "warning", "seed, target, layout and configuration are unknown")
 
 
 def _check_images(episode: ImportedEpisode, source: Episode) -> None:
-    """Check the images of an episode; each folder is one finding."""
+    """Check the images of an episode; add one finding per folder."""
     image_options = ImageOptions(source.cameras, None, source.has_depth, source.image_format)
     sizes: Sizes = {}
     folders: dict[tuple[str, bool], list[Violation]] = {}
     for wrong in check_images(source.folder, image_options, episode.stored.steps, sizes):
         folders.setdefault((wrong.file.rpartition("/")[0], wrong.kind == "unexpected"), []).append(wrong)
     for found in folders.values():
-        more = f"and {format_count(len(found) - 1, 'other')}" if len(found) > 1 else ""
+        more = f"and {len(found) - 1} more" if len(found) > 1 else ""
         episode.add_finding(found[0], "warning" if found[0].kind == "unexpected" else "skipped", more)
     different = set(sizes.values())
     size = None if len(different) != 1 or _FULL_SIZE in different else different.pop()
@@ -228,28 +229,30 @@ def _describe(image_options: ImageOptions | None) -> str:
 
 
 def read_info(dataset: Dataset) -> tuple[dict[str, Any], list[Finding]]:
-    """Return the usable content of ``data_info.json``, and what is wrong with it."""
+    """Return the usable content of ``data_info.json``, and its findings."""
     file = schema.DATA_INFO_FILE
     try:
         info = dataset.info
     except DatasetError as error:
-        return {}, [Finding(None, Violation(file, "", "JSON", str(error.found)), "repaired", "made of the episodes")]
+        return {}, [
+            Finding(None, Violation(file, "", "JSON", str(error.found)), "repaired", "derived from the episodes")
+        ]
     if not info:
-        repair = "made of the episodes, with a split of its own"
+        repair = "derived from the episodes, split by seed"
         return {}, [Finding(None, Violation(file, "", "this file", NO_FILE), "repaired", repair)]
-    there, train, val = set(dataset.numbers), _numbers(info.get("train_eps")), _numbers(info.get("val_eps"))
+    on_disk, train, val = set(dataset.numbers), _numbers(info.get("train_eps")), _numbers(info.get("val_eps"))
     listed = Counter([*train, *val])
     wrong = [
-        *((n, "the episodes on disk", "an episode without a folder", "removed") for n in sorted(set(listed) - there)),
-        *((n, "each episode once", "an episode twice", "it trains") for n in sorted(listed) if listed[n] > 1),
-        *((n, "the episodes on disk", "an episode that is not listed", "added") for n in sorted(there - set(listed))),
+        *((n, "the episodes on disk", "an episode without a folder", "removed") for n in sorted(set(listed) - on_disk)),
+        *((n, "each episode once", "a repeated episode", "used for training") for n in sorted(listed) if listed[n] > 1),
+        *((n, "the episodes on disk", "an unlisted episode", "added") for n in sorted(on_disk - set(listed))),
     ]
     findings = [
         Finding(n, Violation(file, "train_eps, val_eps", expected, found), "repaired", repair)
         for n, expected, found, repair in wrong
     ]
-    sides = {"train_eps": [n for n in train if n in there], "val_eps": [n for n in val if n in there - set(train)]}
-    return {**info, **sides}, findings
+    split = {"train_eps": [n for n in train if n in on_disk], "val_eps": [n for n in val if n in on_disk - set(train)]}
+    return {**info, **split}, findings
 
 
 def _numbers(values: Any) -> list[int]:

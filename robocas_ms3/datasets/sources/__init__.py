@@ -1,1 +1,1 @@
-"""Where episodes come from: a trajectory file or a dataset's folder, behind one protocol."""
+"""Sources of episodes: trajectory files and dataset folders, with one interface."""

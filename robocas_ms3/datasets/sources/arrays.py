@@ -1,4 +1,4 @@
-"""Arrays of an episode: made of a recording, or read, also of datasets with other types, missing keys, extra axes."""
+"""Arrays of an episode: computed from a recording, or read and cast to the schema."""
 
 from __future__ import annotations
 
@@ -29,12 +29,14 @@ _IDENTITY = ("ee_pos", "ee_orn", "robot_joints", "gripper_status", "language_goa
 
 @dataclass(frozen=True)
 class EpisodeArrays:
-    """What an ``episode_info.npz`` holds, as far as it could be read.
+    """Readable content of an ``episode_info.npz``.
 
     Attributes:
-        unreadable: key -> why it could not be read; "": the file as a whole.
-        derived: key -> what it was made of, see `derive_missing_arrays`.
-        ignored: keys that were not asked for.
+        path: path of the file.
+        arrays: arrays by key.
+        unreadable: errors by key; "": error of the file as a whole.
+        derived: for each derived array the keys it was computed from, see `derive_missing_arrays`.
+        ignored: keys that were not requested.
     """
 
     path: Path
@@ -45,22 +47,25 @@ class EpisodeArrays:
 
     @property
     def file(self) -> str:
+        """Path of the file within the dataset."""
         return f"{self.path.parent.name}/{self.path.name}"
 
     @property
     def steps(self) -> int:
+        """Number of steps T: the length of ``ee_pos``, or the most frequent length."""
         lengths = {key: len(array) for key, array in self.arrays.items() if array.ndim}
         most = Counter(lengths.values()).most_common(1)
         return lengths.get("ee_pos", most[0][0] if most else 0)
 
     def reason(self, key: str = "") -> str:
+        """Return why a key, or the file, is unreadable."""
         error = self.unreadable[key]
         text = getattr(error, "strerror", None) or one_line(error)
         pickled = PICKLED if key else f"another file, or {PICKLED}"
         return pickled if "pickle" in text else text
 
     def needed(self, keys: Iterable[str]) -> dict[str, NDArray]:
-        """Return the arrays of these keys; damage is an error."""
+        """Return the arrays of some keys; raise DatasetError if any array is unreadable or a key is missing."""
         for key, error in self.unreadable.items():
             where, found = f"{self.path}, {key}" if key else self.path, self.reason(key)
             raise DatasetError("this episode can't be read", where=where, found=found, fix=SEE_VALIDATE) from error
@@ -71,7 +76,7 @@ class EpisodeArrays:
 
 
 def read_arrays(path: Path, keys: Container[str] | None = None) -> EpisodeArrays:
-    """Read arrays as they are stored, all or those with some keys; damage is recorded, not raised."""
+    """Read arrays as stored, all or those of ``keys``; errors are stored in ``unreadable``, not raised."""
     arrays: dict[str, NDArray] = {}
     unreadable: dict[str, Exception] = {}
     ignored: list[str] = []
@@ -83,8 +88,8 @@ def read_arrays(path: Path, keys: Container[str] | None = None) -> EpisodeArrays
                     continue
                 try:
                     arrays[key] = content[key]
-                    if not isinstance(arrays[key], np.ndarray):  # a member that is no array is read as bytes
-                        unreadable[key] = ValueError("no array")
+                    if not isinstance(arrays[key], np.ndarray):  # other members of the archive are read as bytes
+                        unreadable[key] = ValueError("not an array")
                         del arrays[key]
                 except (*DAMAGED_FILE_ERRORS, MemoryError) as error:
                     unreadable[key] = error
@@ -94,13 +99,15 @@ def read_arrays(path: Path, keys: Container[str] | None = None) -> EpisodeArrays
 
 
 def load_arrays(path: Path) -> EpisodeArrays:
-    """Read the arrays that the schema knows, cast to its types; those that can't be are unreadable."""
+    """Read the arrays of the schema and cast them to its types; arrays that can't be cast are unreadable."""
     stored = read_arrays(path, SPECS)
     if "" in stored.unreadable:
         error = stored.unreadable[""]
         if isinstance(error, FileNotFoundError):
             raise DatasetError("no such file", where=path) from error
-        raise DatasetError("not a numpy archive, or a damaged one", where=path, found=stored.reason()) from error
+        raise DatasetError(
+            "damaged numpy archive, or another kind of file", where=path, found=stored.reason()
+        ) from error
     arrays: dict[str, NDArray] = {}
     unreadable = dict(stored.unreadable)
     for key, array in stored.arrays.items():
@@ -112,7 +119,7 @@ def load_arrays(path: Path) -> EpisodeArrays:
 
 
 def cast(spec: schema.ArraySpec, array: NDArray) -> NDArray:
-    """Return an array with the schema's type and number of axes; axes of length 1 too many are dropped."""
+    """Return an array with the type and number of axes of the schema; extra axes of length 1 are dropped."""
     for axis in reversed(range(array.ndim)):
         if array.ndim > len(spec.shape) and array.shape[axis] == 1:
             array = array.squeeze(axis)
@@ -131,11 +138,15 @@ def cast(spec: schema.ArraySpec, array: NDArray) -> NDArray:
 
 
 def is_declared(key: str, array: NDArray) -> bool:
+    """Return whether an array has the type and number of axes of the schema."""
     return SPECS[key].has_dtype(array) and array.ndim == len(SPECS[key].shape)
 
 
-def derive_missing_arrays(loaded: EpisodeArrays, said: Mapping[str, Any], rate_hz: float) -> EpisodeArrays:
-    """Return the arrays with what is missing made of others and of ``said``, the entries of ``data_info.json``."""
+def derive_missing_arrays(loaded: EpisodeArrays, info: Mapping[str, Any], rate_hz: float) -> EpisodeArrays:
+    """Return the arrays, with missing ones computed from others and from ``info``.
+
+    ``info`` has the entries of the episode in ``data_info.json``, see `files.episode_info`.
+    """
     arrays, derived = dict(loaded.arrays), dict(loaded.derived)
 
     def put(key: str, values: Any, source: str) -> None:
@@ -144,10 +155,10 @@ def derive_missing_arrays(loaded: EpisodeArrays, said: Mapping[str, Any], rate_h
             derived[key] = source
 
     if "ee_pos" in arrays:
-        put("episode_length", len(arrays["ee_pos"]), "the arrays' length")
-    if isinstance(said.get("language_goal"), str):
-        put("language_goal", said["language_goal"], schema.DATA_INFO_FILE)
-    goals = _goals_of_steps(said.get("step_goals"), len(arrays.get("ee_pos", ())))
+        put("episode_length", len(arrays["ee_pos"]), "the length of the arrays")
+    if isinstance(info.get("language_goal"), str):
+        put("language_goal", info["language_goal"], schema.DATA_INFO_FILE)
+    goals = _goals_of_steps(info.get("step_goals"), len(arrays.get("ee_pos", ())))
     if goals:
         put("step_goal_type", [kind for kind, _ in goals], schema.DATA_INFO_FILE)
         put("step_lang_goals", [text for _, text in goals], schema.DATA_INFO_FILE)
@@ -168,14 +179,14 @@ def derive_missing_arrays(loaded: EpisodeArrays, said: Mapping[str, Any], rate_h
 
 
 def motion_arrays(arrays: Mapping[str, NDArray], keys: tuple[str, str, str, str]) -> dict[str, NDArray]:
-    """Return the relative motion between absolute poses, for keys of ``schema.RELATIVE_PAIRS``."""
+    """Return the relative motion between absolute poses, for one tuple of ``schema.RELATIVE_PAIRS``."""
     poses = _poses(arrays, keys[0], keys[1])
     assert poses is not None
     return dict(zip(keys[2:], stored_motion(poses), strict=True))
 
 
 def arrays_fingerprint(arrays: Mapping[str, NDArray]) -> str:
-    """Return a SHA-256 of arrays, which distinguishes episodes whose recordings are not known."""
+    """Return a SHA-256 of arrays, which identifies an episode whose recording is unknown."""
     digest = hashlib.sha256()
     for key in _IDENTITY:
         if key in arrays:
@@ -186,7 +197,7 @@ def arrays_fingerprint(arrays: Mapping[str, NDArray]) -> str:
 
 
 def _poses(arrays: Mapping[str, NDArray], position: str, orientation: str) -> NDArray[np.float64] | None:
-    """Return poses (T, 4, 4), None where they are missing or no poses."""
+    """Return poses (T, 4, 4), None if they are missing or invalid."""
     if not {position, orientation} <= arrays.keys():
         return None
     p, q = (arrays[key].astype(np.float64) for key in (position, orientation))
@@ -198,7 +209,7 @@ def _poses(arrays: Mapping[str, NDArray], position: str, orientation: str) -> ND
 
 
 def _goals_of_steps(goals: Any, steps: int) -> list[tuple[str, str]]:
-    """Return (type, text) of each step from ``step_goals``, empty if they do not cover all steps."""
+    """Return (type, text) of each step from ``step_goals``, empty if it does not cover all steps."""
     found: list[tuple[str, str]] = []
     try:
         for goal in goals or []:
@@ -212,7 +223,7 @@ def _goals_of_steps(goals: Any, steps: int) -> list[tuple[str, str]]:
 
 
 def episode_arrays(motion: Motion, instruction: str, subgoals: Sequence[SubGoal]) -> dict[str, np.ndarray]:
-    """Return the arrays of ``episode_info.npz``, without embeddings, from the motion at the T sampled states."""
+    """Return the arrays of ``episode_info.npz`` without embeddings, from the motion at T sampled states."""
     of_steps = [goal for goal in subgoals for _ in range(goal.last - goal.first + 1)]
     values = {
         **{quantity.name: quantity.record(motion) for quantity in QUANTITIES if quantity.record},
@@ -225,7 +236,7 @@ def episode_arrays(motion: Motion, instruction: str, subgoals: Sequence[SubGoal]
 
 
 def add_embeddings(arrays: Mapping[str, NDArray], embed: Callable[[list[str]], NDArray]) -> dict[str, NDArray]:
-    """Return the arrays and the embeddings of their texts, by ``embed``: texts -> (N, 384)."""
+    """Return the arrays with the embeddings of their texts; ``embed`` maps N texts to (N, 384)."""
     made = {
         **arrays,
         "language_embedding": embed([str(arrays["language_goal"])])[0],

@@ -1,7 +1,7 @@
-"""Episodes to read, whatever they lie in: a trajectory file, a RoboCAS folder, a LeRobot folder, or another's format.
+"""Interface of episode sources: trajectory files, RoboCAS folders, LeRobot datasets and other formats.
 
-A source reads an overview when it is opened and everything else when it is asked for; it keeps no file open, so it may
-be pickled and forked.
+A source reads an overview when it is opened, and all other data on demand. It keeps no file open, so it can be pickled
+and forked.
 """
 
 from __future__ import annotations
@@ -25,14 +25,18 @@ from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
 from robocas_ms3.robots.cameras import Parent, standard_camera_parent
 
 Split = Literal["train", "val", "all"]
-"""Of the split into training and validation."""
+"""Name of a split: training or validation episodes, or all."""
 ImageKind = Literal["rgb", "depth"]
-"""Of image."""
+"""Kind of image."""
 
 
 @dataclass(frozen=True)
 class CameraModel:
-    """Intrinsics (4,) fx, fy, cx, cy in pixels, and pose (4, 4) of the OpenCV camera frame in its parent frame."""
+    """Intrinsics and pose of a camera.
+
+    ``intrinsic`` is (4,) fx, fy, cx, cy in pixels, ``camera_in_parent`` (4, 4) the pose of the OpenCV camera frame in
+    its parent frame.
+    """
 
     intrinsic: NDArray[np.float64]
     camera_in_parent: NDArray[np.float64]
@@ -41,7 +45,7 @@ class CameraModel:
 
 @dataclass(frozen=True)
 class StepImages:
-    """The images of one step: camera -> (H, W, 3) uint8, (H, W) uint16 in mm, box of the target's visible pixels."""
+    """Images of one step by camera: RGB (H, W, 3), depth (H, W) in mm, bounding box of the visible target."""
 
     rgb: dict[str, NDArray[np.uint8]]
     depth: dict[str, NDArray[np.uint16]]
@@ -49,11 +53,11 @@ class StepImages:
 
 
 class SourceEpisode(ABC):
-    """An episode; what is read raises ``DatasetError`` where it is missing or damaged.
+    """Episode of a source; reading missing or damaged data raises ``DatasetError``.
 
     Attributes:
-        where: path or name, for messages.
-        cameras: names of those with images.
+        where: path or name of the episode in error messages.
+        cameras: names of the cameras with images.
     """
 
     where: Any
@@ -66,16 +70,16 @@ class SourceEpisode(ABC):
 
     @property
     def instruction(self) -> str:
-        """Text that the robot is told."""
+        """Instruction to the robot."""
         return str(self.read(["language_goal"])["language_goal"])
 
     @property
     @abstractmethod
     def arrays(self) -> dict[str, NDArray]:
-        """Arrays of ``schema.EPISODE_INFO`` that are there."""
+        """Available arrays of ``schema.EPISODE_INFO``, by key."""
 
     def read(self, keys: Sequence[str]) -> dict[str, NDArray]:
-        """Return some of the arrays, which have to be there."""
+        """Return some of the arrays; raise DatasetError if one is missing."""
         arrays = self.arrays
         missing = [key for key in keys if key not in arrays]
         if missing:
@@ -84,46 +88,46 @@ class SourceEpisode(ABC):
 
     @property
     def goals(self) -> list[SubGoal]:
-        """Sub-goals over the steps; empty where they are not known."""
+        """Sub-goals and their steps; empty if unknown."""
         arrays = self.read(("step_goal_type", "step_lang_goals"))
         return subgoal_runs(arrays["step_goal_type"].tolist(), arrays["step_lang_goals"].tolist())
 
     @property
     def scene(self) -> dict[str, Any]:
-        """How it was made, by the keys of `records.SceneRecord` that are known; empty where none is."""
+        """Description of the recording, known keys of `file_models.SceneRecord`; empty if unknown."""
         return {}
 
     @property
     def layout(self) -> dict[str, Any]:
-        """What stood where at its beginning, as ``layout`` of `records.SceneRecord`; empty where it is not known."""
+        """Layout at the start, as in `file_models.SceneRecord`; empty if unknown."""
         return self.scene.get("layout") or {}
 
     @property
     def target_boxes(self) -> Sequence[dict[str, Box]]:
-        """Box of the target in each step, by the cameras that see it; empty where they are not known."""
+        """Bounding box of the target per step, by the cameras that see it; empty if unknown."""
         return []
 
     def rgb(self, camera: str, step: int) -> NDArray[np.uint8]:
-        """(H, W, 3) RGB."""
+        """Return an RGB image (H, W, 3)."""
         raise _no_images(self)
 
     def depth(self, camera: str, step: int) -> NDArray[np.uint16]:
-        """(H, W) mm, 0 = nothing."""
+        """Return a depth image (H, W) in mm, 0 = no depth."""
         raise _no_images(self)
 
     def frames(
         self, camera: str, kind: ImageKind = "rgb", first: int = 0, count: int | None = None
     ) -> Generator[NDArray, None, None]:
-        """Yield the images of ``count`` steps; close the generator unless it is read to the end.
+        """Yield the images of a camera from step ``first`` on; close the generator if it is not exhausted.
 
-        Here they are read one by one; a format that is quicker in a run, as a video is, overrides this.
+        ``count`` None: up to the last step. The default reads image by image; formats with videos override it.
         """
         image = self.rgb if kind == "rgb" else self.depth
         for step in range(first, self.steps if count is None else first + count):
             yield image(camera, step)
 
     def images(self, image_options: ImageOptions) -> Generator[StepImages, None, None]:
-        """Yield the images of every step; close the generator unless it is read to the end."""
+        """Yield the images of each step; close the generator if it is not exhausted."""
         boxes = self.target_boxes if image_options.boxes else []
         with closing(iter_images(self, image_options.cameras, "rgb")) as rgb, ExitStack() as stack:
             depth = (
@@ -135,30 +139,31 @@ class SourceEpisode(ABC):
                 yield StepImages(images, next(depth) if depth else {}, boxes[step] if boxes else {})
 
     def intrinsic(self, camera: str) -> NDArray[np.float64]:
-        """(4,) fx, fy, cx, cy in pixels."""
+        """Return the intrinsics of a camera, (4,) fx, fy, cx, cy in pixels."""
         raise _no_images(self)
 
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
-        """(4, 4) OpenCV camera frame in its parent."""
+        """Return the pose (4, 4) of the OpenCV camera frame in its parent frame."""
         raise _no_images(self)
 
     def camera_parent(self, camera: str) -> Parent:
-        """Return the frame that the pose of a camera is in; here by the names of the standard cameras."""
+        """Return the parent frame of the pose of a camera; default: that of the standard camera."""
         return standard_camera_parent(camera)
 
     def camera(self, name: str) -> CameraModel:
+        """Return intrinsics and pose of a camera."""
         return CameraModel(self.intrinsic(name), self.camera_in_parent(name), self.camera_parent(name))
 
 
 def _no_images(episode: SourceEpisode) -> DatasetError:
-    fix = "Convert it with robocas convert."
+    fix = "Render them with robocas convert."
     return DatasetError("this episode has no images", where=episode.where, fix=fix)
 
 
 def iter_images(
     episode: SourceEpisode, cameras: Sequence[str], kind: ImageKind = "rgb"
 ) -> Generator[dict[str, NDArray], None, None]:
-    """Yield the images of every step, by camera; close the generator unless it is read to the end."""
+    """Yield the images of each step by camera; close the generator if it is not exhausted."""
     steps = episode.steps
     with ExitStack() as stack:
         runs = {camera: stack.enter_context(closing(episode.frames(camera, kind, 0, steps))) for camera in cameras}
@@ -167,13 +172,13 @@ def iter_images(
 
 
 class EpisodeSource(ABC):
-    """Episodes by number; what is read raises ``DatasetError`` where it is missing or damaged.
+    """Source of episodes by number; reading missing or damaged data raises ``DatasetError``.
 
     Attributes:
-        root: the folder or file.
+        root: path of the folder or file.
         rate_hz: steps per second.
-        numbers: of its episodes, sorted.
-        cameras: names of those with images.
+        numbers: sorted episode numbers.
+        cameras: names of the cameras with images.
         has_depth: whether there are depth images.
         has_embeddings: whether there are embeddings of the texts.
     """
@@ -187,27 +192,27 @@ class EpisodeSource(ABC):
 
     @cached_property
     def lengths(self) -> Mapping[int, int]:
-        """Number -> T."""
+        """Number of steps T by episode number."""
         return {number: self.episode(number).steps for number in self.numbers}
 
-    def split(self, side: Split) -> list[int]:
-        """Return the numbers of the episodes of one side; here by seed, or by number where there is none."""
-        if side == "all":
+    def split(self, name: Split) -> list[int]:
+        """Return the episode numbers of a split; default: by seed, or by number without a seed."""
+        if name == "all":
             return self.numbers
-        return split_by_seed({number: self.entry(number).get("seed") for number in self.numbers})[side == "val"]
+        return split_by_seed({number: self.entry(number).get("seed") for number in self.numbers})[name == "val"]
 
     def entry(self, number: int) -> Mapping[str, Any]:
-        """Return the recording of an episode, see ``provenance.recording_entry``; empty where it is not known."""
+        """Return the recording of an episode, see `provenance.recording_entry`; empty if unknown."""
         return {}
 
     def action_space(self) -> dict[str, Any]:
-        """Return the range of the motion, as in ``data_info.json``; here all episodes are read for it."""
-        parts = [self.episode(number).read(("rel_pos", "rel_orn")) for number in self.numbers]
-        return action_space([part["rel_pos"] for part in parts], [part["rel_orn"] for part in parts])
+        """Return the range of the motion, as in ``data_info.json``; the default reads all episodes."""
+        episodes = [self.episode(number).read(("rel_pos", "rel_orn")) for number in self.numbers]
+        return action_space([arrays["rel_pos"] for arrays in episodes], [arrays["rel_orn"] for arrays in episodes])
 
     @abstractmethod
     def episode(self, number: int) -> SourceEpisode:
         """Open an episode."""
 
     def close(self) -> None:  # noqa: B027  (most sources keep nothing open)
-        """Free what is open."""
+        """Release open resources."""

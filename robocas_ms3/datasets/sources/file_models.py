@@ -1,4 +1,4 @@
-"""Declared forms of the JSON files of a RoboCAS folder; writers, readers, checks and the viewer share them."""
+"""Models of the JSON files of a RoboCAS folder, shared by writers, readers, checks and the viewer."""
 
 from __future__ import annotations
 
@@ -35,23 +35,23 @@ def _seed(value: Any) -> Any:
 RateHz = Annotated[FiniteFloat, Field(gt=0)]
 CameraName = Annotated[str, StringConstraints(pattern=f"^{CAMERA_NAME}$")]
 EpisodeNumber = Annotated[str, StringConstraints(pattern=r"^[0-9]{1,7}$")]
-"""A key of JSON."""
+"""Episode number as a JSON key."""
 Pose = Annotated[list[FiniteFloat], Field(min_length=7, max_length=7)]
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(strict=True, extra="allow")  # further keys are their writer's
+    model_config = ConfigDict(strict=True, extra="allow")  # other writers may add keys
 
 
 class EnvInfo(_Part):
-    """``env_info``."""
+    """Content of ``env_info``."""
 
     env_id: str
     env_kwargs: dict[str, Any]
 
 
 class Layout(_Part):
-    """``layout``: poses [x, y, z, qw, qx, qy, qz] in the world."""
+    """Content of ``layout``: poses [x, y, z, qw, qx, qy, qz] in the world frame."""
 
     object_ids: list[str] = []
     poses: list[Pose] = []
@@ -64,7 +64,7 @@ class Layout(_Part):
     def _check_lengths(self) -> Layout:
         for values in (self.poses, self.present):
             if len(values) not in (0, len(self.object_ids)):
-                raise ValueError("as many poses and values of present as object_ids")
+                raise ValueError("one pose and one value of present per object id")
         return self
 
 
@@ -75,7 +75,7 @@ class _Object(_Part):
 
 
 class Target(_Part):
-    """``target``."""
+    """Content of ``target``."""
 
     slot: NonNegativeInt
     asset_id: str
@@ -94,8 +94,8 @@ class _Recovery(_Part):
     reason: str
 
 
-class RecordedDetails(_Part):
-    """Details of the recording, the key ``recorded`` of scene.json."""
+class Recorded(_Part):
+    """Content of ``recorded``."""
 
     instruction_template: str | None = None
     relation: str | None = None
@@ -108,7 +108,7 @@ class RecordedDetails(_Part):
 
 
 class EntryRecord(_Part):
-    """The recording that an episode is of, in ``conversion.json``; see `provenance.recording_entry`."""
+    """Recording of an episode in ``conversion.json``; see `provenance.recording_entry`."""
 
     trajectory: str | None = None
     trajectory_episode: int | None = None
@@ -118,7 +118,7 @@ class EntryRecord(_Part):
 
 
 class EpisodesRecord(_Part):
-    """The episodes of ``conversion.json``; those left out could not be written, with ``reason``."""
+    """Episodes of ``conversion.json``; ``skipped`` ones could not be written, each has a ``reason``."""
 
     made_with: dict[str, str] = {}
     episodes: dict[EpisodeNumber, EntryRecord] = {}
@@ -126,7 +126,7 @@ class EpisodesRecord(_Part):
 
 
 class SettingsRecord(_Part):
-    """The settings of ``conversion.json``, which all episodes of a dataset share."""
+    """Settings of ``conversion.json``, which all episodes of a dataset share."""
 
     rate_hz: RateHz
     cameras: Annotated[list[CameraName], Field(min_length=1)]
@@ -137,7 +137,7 @@ class SettingsRecord(_Part):
 
 
 class ConversionRecord(EpisodesRecord, SettingsRecord):
-    """``conversion.json``."""
+    """Content of ``conversion.json``."""
 
 
 _Row = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
@@ -150,12 +150,10 @@ class _ActionSpace(_Part):
 
 
 class DataInfoRecord(_Part):
-    """``data_info.json``. JSON turns the episode numbers of ``{number: ...}`` into strings."""
+    """Content of ``data_info.json``; episode numbers as JSON keys are strings."""
 
     train_eps: list[int] = Field(description="list of episode numbers")
-    val_eps: list[int] = Field(
-        description="list of episode numbers: 10 % of the seeds, at least one where there are two"
-    )
+    val_eps: list[int] = Field(description="list of episode numbers: 10 % of the seeds, at least one if there are two")
     ep_length: dict[EpisodeNumber, int] = Field(description="{number: T}")
     language_goal: dict[EpisodeNumber, str] = Field(description="{number: instruction}")
     step_goals: dict[EpisodeNumber, list[SubGoal]] = Field(
@@ -163,38 +161,38 @@ class DataInfoRecord(_Part):
     )
     action_space: _ActionSpace = Field(
         description="{relative_position: [1st percentile (3), 99th percentile (3)] of rel_pos in m,"
-        " relative_rotation: the same of rel_orn as Euler xyz angles in rad}; last rows left out"
+        " relative_rotation: percentiles of rel_orn as Euler angles about fixed axes x, y, z in rad}; without last rows"
     )
 
 
 class SceneRecord(_Part):
-    """``scene.json``. None is what nobody knows, as of datasets made elsewhere."""
+    """Content of ``scene.json``; None: unknown, as in imported datasets."""
 
     schema_version: Literal[schema.SCHEMA_VERSION] = Field(  # pyright: ignore[reportInvalidTypeForm]
         description=f"{schema.SCHEMA_VERSION}"
     )
     task: str | None = Field(description="pick, select, search or open_pick")
-    env_info: EnvInfo | None = Field(description="{env_id, env_kwargs}: what makes the environment")
-    seed: Annotated[Any, PlainValidator(_seed)] = Field(description="of `env.reset`")
-    reset_options: dict[str, Any] | None = Field(description="further options of `env.reset`")
-    config: dict[str, Any] | None = Field(description="the whole configuration")
+    env_info: EnvInfo | None = Field(description="{env_id, env_kwargs}: arguments of `gym.make`")
+    seed: Annotated[Any, PlainValidator(_seed)] = Field(description="seed of `env.reset`")
+    reset_options: dict[str, Any] | None = Field(description="other options of `env.reset`")
+    config: dict[str, Any] | None = Field(description="the complete task configuration")
     layout: Layout | None = Field(
         description="{object_ids, poses [x, y, z, qw, qx, qy, qz] in the world, present, robot_pose, basket_pose,"
         " relation}"
     )
-    objects: list[_Object] | None = Field(description="[{slot, id, name}] those that take part")
+    objects: list[_Object] | None = Field(description="[{slot, id, name}] of the objects in the scene")
     target: Target | None = Field(description="{slot, asset_id, name}")
     success: bool | None = Field(description="whether the recording ended in success")
-    control_mode: str | None = Field(description="of the recorded actions")
-    control_freq: RateHz | None = Field(description="of the recorded actions, Hz")
-    rate_hz: RateHz = Field(description="of this dataset")
+    control_mode: str | None = Field(description="control mode of the recorded actions")
+    control_freq: RateHz | None = Field(description="control frequency of the recorded actions, Hz")
+    rate_hz: RateHz = Field(description="rate of this dataset, Hz")
     source: _Source = Field(
         description="{trajectory, episode_id, recording: SHA-256 of seed, control mode, instruction and actions}"
     )
-    recorded: RecordedDetails | None = Field(
-        description="what the generator said of the episode: template, relation, facts, attempts, seconds"
+    recorded: Recorded | None = Field(
+        description="reported by the generator: template, relation, facts, attempts, seconds"
     )
-    versions: dict[str, Any] | None = Field(description="{package: version} the episode was generated with")
+    versions: dict[str, Any] | None = Field(description="{package: version} at the time of the recording")
 
 
 SCENE_KEYS = tuple(SceneRecord.model_fields)
@@ -202,16 +200,16 @@ _UNKNOWN = {**dict.fromkeys(SCENE_KEYS), "schema_version": schema.SCHEMA_VERSION
 
 
 def fill_unknown_keys(scene: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of ``scene.json`` with the keys that an older or foreign file lacks."""
+    """Return the content of ``scene.json`` with None for missing keys."""
     return {**_UNKNOWN, **scene}
 
 
 def read_scene(scene: Mapping[str, Any], where: object) -> SceneRecord:
-    """Return the content of ``scene.json`` as a record, or raise DatasetError; keys may be missing."""
+    """Return ``scene.json`` as a model, keys may be missing; raise DatasetError if it is invalid."""
     try:
         return SceneRecord.model_validate(fill_unknown_keys(scene))
     except ValidationError as problem:
-        about = "this description of a scene is damaged"
+        about = "invalid description of a scene"
         raise error_from_validation(
             problem, SceneRecord, DatasetError, where=where, about=about, fix=SEE_VALIDATE
         ) from problem

@@ -1,4 +1,4 @@
-"""Reads files of a dataset, with errors that say where."""
+"""Read files of a dataset; errors name the path."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets import schema
 
 CAMERA_LIMIT = 2**22
-"""Bytes of an array of intrinsics or poses; a pose has 128."""
-SEE_VALIDATE = "robocas validate lists all that is wrong."
+"""Largest file of intrinsics or poses in bytes; a pose has 128."""
+SEE_VALIDATE = "Run robocas validate for all violations."
 
 
 def no_dataset_error(root: Path, expected: str) -> DatasetError:
-    """Return an error for a folder that is no dataset, with what may have been meant."""
+    """Return an error for a path without a dataset; it suggests a nearby dataset or trajectory file."""
     if (root / "meta" / "info.json").is_file():
-        return DatasetError("a LeRobot dataset; this takes RoboCAS folders", where=root)
-    # a plan has its datasets in datasets/
+        return DatasetError("this is a LeRobot dataset", where=root, expected="a RoboCAS folder")
+    # the output folder of a plan has its datasets in datasets/
     places = [
         f"{folder}*/{name}" for folder in ("", "datasets/") for name in (schema.CONVERSION_FILE, schema.DATA_INFO_FILE)
     ]
@@ -34,30 +34,30 @@ def no_dataset_error(root: Path, expected: str) -> DatasetError:
 
 
 def episode_info(info: Mapping[str, Any], number: int | None) -> dict[str, Any]:
-    """Return the entries of an episode in ``data_info.json``, by their keys."""
+    """Return the entries of an episode in ``data_info.json``, by key."""
     tables = {key: info.get(key) for key in ("ep_length", "language_goal", "step_goals")}
     return {k: table[str(number)] for k, table in tables.items() if isinstance(table, dict) and str(number) in table}
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return a JSON object, empty if there is no such file."""
+    """Return the JSON object in a file, empty if the file does not exist."""
     try:
         content = load_json(path)
     except FileNotFoundError:
         return {}
     except (OSError, ValueError) as error:
-        raise DatasetError("this JSON is damaged", where=path, found=one_line(error)) from error
+        raise DatasetError("damaged JSON file", where=path, found=one_line(error)) from error
     if not isinstance(content, dict):
-        raise DatasetError("this JSON is damaged", where=path, expected="an object", found=type(content).__name__)
+        raise DatasetError("damaged JSON file", where=path, expected="an object", found=type(content).__name__)
     return content
 
 
 def read_array(path: Path) -> NDArray[np.float64]:
-    """Read an array of numbers that describes a camera."""
+    """Read an array of numbers, such as intrinsics or a pose."""
     try:
         array = load_array(path, CAMERA_LIMIT)
         if array.dtype.kind not in "fiu":
-            raise ValueError("no array of numbers")
+            raise ValueError("not an array of numbers")
     except DAMAGED_FILE_ERRORS as error:
         raise DatasetError("this array can't be read", where=path, found=one_line(error), fix=SEE_VALIDATE) from error
     return array

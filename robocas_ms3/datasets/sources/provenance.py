@@ -1,4 +1,4 @@
-"""``scene.json``: how an episode was made, so that it can be made, judged and replayed again."""
+"""Provenance of an episode: ``scene.json`` and the recording in ``conversion.json``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from robocas_ms3.demos.recordings.trajectory_file import Recording, TrajectoryFi
 
 
 def fingerprint(recording: Recording) -> str:
-    """SHA-256 of what makes a recording: seed, control mode, instruction, actions. The same one is never twice here."""
+    """Return the SHA-256 of seed, control mode, instruction and actions, which identifies a recording."""
     digest = hashlib.sha256()
     digest.update(f"{recording.seed} {recording.control_mode} {recording.instruction}\n".encode())
     digest.update(np.ascontiguousarray(recording.actions).tobytes())
@@ -24,40 +24,40 @@ def fingerprint(recording: Recording) -> str:
 
 
 def recording_entry(file: TrajectoryFile, index: int) -> dict[str, Any]:
-    """Which recording an episode is of, as ``conversion.json`` has it."""
+    """Return the recording of an episode, as stored in ``conversion.json``."""
     return {**entry_without_fingerprint(file, index), "recording": fingerprint(file.recording(index, bodies=False))}
 
 
 def entry_without_fingerprint(file: TrajectoryFile, index: int) -> dict[str, Any]:
-    """The same of one that can't be read, which has no fingerprint."""
+    """Return `recording_entry` without the fingerprint, for which the actions are read."""
     episode = file.episodes[index]
-    said = episode.get("robocas")
+    recorded = episode.get("robocas")
     return {
         "trajectory": file.path.name,
         "trajectory_episode": episode["episode_id"],
         "seed": episode.get("episode_seed"),
         "success": is_success(episode),
-        "target": said.get("target") if isinstance(said, dict) else None,
+        "target": recorded.get("target") if isinstance(recorded, dict) else None,
         "recording": None,
     }
 
 
 def recorded_scene(file: TrajectoryFile, index: int) -> dict[str, Any]:
-    """What the JSON beside a trajectory says of how an episode was made, by `SCENE_KEYS`."""
-    entry, said = file.entry(index), file.episodes[index].get("robocas", {})
-    known = {"target", "instruction", "subgoals", "objects"}  # said elsewhere
+    """Return the content of ``scene.json`` that the JSON of a trajectory file has, by `SCENE_KEYS`."""
+    entry, recorded = file.entry(index), file.episodes[index].get("robocas", {})
+    known = {"target", "instruction", "subgoals", "objects"}  # stored under other keys
     return {
         "schema_version": schema.SCHEMA_VERSION,
         "task": task_of(file.env_info["env_id"]),
         "env_info": {key: file.env_info[key] for key in ("env_id", "env_kwargs")},
         "seed": entry.seed,
         "reset_options": entry.reset_options,
-        "target": said.get("target"),
+        "target": recorded.get("target"),
         "success": is_success(file.episodes[index]),
         "control_mode": entry.control_mode,
         "control_freq": file.control_freq,
         "source": {"trajectory": file.path.name, "episode_id": entry.episode_id},
-        "recorded": {key: value for key, value in said.items() if key not in known},
+        "recorded": {key: value for key, value in recorded.items() if key not in known},
         "versions": file.versions,
     }
 
@@ -65,25 +65,26 @@ def recorded_scene(file: TrajectoryFile, index: int) -> dict[str, Any]:
 def scene_record(
     file: TrajectoryFile, index: int, recording: Recording, scene: dict[str, Any], rate_hz: float
 ) -> dict[str, Any]:
-    """Return ``scene.json`` of a recording, with task, config, layout and objects of the rebuilt ``scene``."""
+    """Return ``scene.json`` of a recording; ``scene``: task, config, layout and objects as rebuilt."""
     record = {**recorded_scene(file, index), **scene, "rate_hz": rate_hz}
     record["source"]["recording"] = fingerprint(recording)
     return {key: record.get(key) for key in SCENE_KEYS}
 
 
 def is_success(episode: dict[str, Any]) -> bool:
+    """Return whether a recorded episode was successful, by its JSON entry."""
     found = episode.get("success", False)
     return found is True or (isinstance(found, list) and bool(found) and all(one is True for one in found))
 
 
 def task_of(env_id: str | None) -> str | None:
-    """Name of the task of an environment, by its id; the registry itself would bring the simulator."""
+    """Return the task name of an environment id, without importing the simulator."""
     match = re.fullmatch(r"(?:\w+:)?RoboCAS(\w+)-v\d+", env_id or "")
     return "_".join(re.findall("[A-Z][a-z]*", match[1])).lower() if match else None
 
 
 def environment_id(env_info: Mapping[str, Any] | None) -> str:
-    """What tells an environment from others of another task, configuration or pack; empty where it is not known."""
+    """Return an identifier of the task, configuration and pack of an environment; empty if unknown."""
     if not env_info or not env_info.get("env_id"):
         return ""
     known = [env_info["env_id"], env_info.get("env_kwargs") or {}]

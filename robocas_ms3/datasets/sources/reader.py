@@ -1,7 +1,7 @@
-"""Opens a RoboCAS folder: its overviews, and its episodes by number.
+"""Reader of RoboCAS folders: overviews, and episodes by number.
 
-Episodes in the format of RoboCAS-v0 open too: other types are cast to the schema's, what is missing is made of what is
-there (`arrays.derive_missing_arrays`), and either name of a camera's pose will do.
+It also reads the format of RoboCAS-v0: types are cast to the schema, missing arrays are derived
+(`arrays.derive_missing_arrays`), and both names of the pose file of a camera are accepted.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from robocas_ms3.datasets.sources.files import SEE_VALIDATE, episode_info, no_da
 from robocas_ms3.demos.recordings.subgoals import SubGoal, read_subgoals
 from robocas_ms3.robots.cameras import Parent
 
-DEFAULT_RATE = 5.0  # upstream's, Hz
-_SPLIT = "robocas split --in-place --val-fraction 0.1 makes a new one."
+DEFAULT_RATE = 5.0  # Hz, of RoboCAS-v0
+_SPLIT = "Run robocas split --in-place --val-fraction 0.1 to split again."
 
 
 def _number(value: Any) -> int:
@@ -46,7 +46,7 @@ _NUMBERS, _LENGTHS = TypeAdapter(list[EpisodeIndex]), TypeAdapter(dict[int, int]
 
 @dataclass(frozen=True)
 class Episode(SourceEpisode):
-    """The folder of an episode; ``dataset`` says what is not in it."""
+    """Episode of a RoboCAS folder."""
 
     folder: Path
     dataset: Dataset = field(repr=False, compare=False)
@@ -56,7 +56,7 @@ class Episode(SourceEpisode):
         path = self.folder / schema.EPISODE_FILE
         loaded = load_arrays(path)
         if any(spec.name not in loaded.arrays for spec in schema.EPISODE_INFO if not spec.embedding):
-            loaded = derive_missing_arrays(loaded, self._said(), self.dataset.rate_hz)
+            loaded = derive_missing_arrays(loaded, self._info(), self.dataset.rate_hz)
         for key in set(loaded.unreadable) - set(loaded.derived):
             where, found = f"{path}, {key}", loaded.reason(key)
             raise DatasetError("this array can't be read", where=where, found=found, fix=SEE_VALIDATE)
@@ -66,14 +66,14 @@ class Episode(SourceEpisode):
         found = read_arrays(self.folder / schema.EPISODE_FILE, keys)
         if found.unreadable or all(key in found.arrays and is_declared(key, found.arrays[key]) for key in keys):
             return found.needed(keys)
-        return replace(found, arrays=self.arrays).needed(keys)  # slower; casts and completes what was made elsewhere
+        return replace(found, arrays=self.arrays).needed(keys)  # slower: casts types and derives missing arrays
 
     @property
     def goals(self) -> list[SubGoal]:
         where = f"{self.folder.parent / schema.DATA_INFO_FILE}, step_goals.{schema.episode_number(self.folder.name)}"
-        return read_subgoals(self._said().get("step_goals", []), where)
+        return read_subgoals(self._info().get("step_goals", []), where)
 
-    def _said(self) -> dict[str, Any]:
+    def _info(self) -> dict[str, Any]:
         return episode_info(self.dataset.info, schema.episode_number(self.folder.name))
 
     @property
@@ -86,8 +86,8 @@ class Episode(SourceEpisode):
 
     @property
     def instruction(self) -> str:
-        said = self._said().get("language_goal")
-        return said if isinstance(said, str) else str(self.read(["language_goal"])["language_goal"])
+        listed = self._info().get("language_goal")
+        return listed if isinstance(listed, str) else str(self.read(["language_goal"])["language_goal"])
 
     @cached_property
     def scene(self) -> dict[str, Any]:
@@ -103,7 +103,7 @@ class Episode(SourceEpisode):
 
     @cached_property
     def image_format(self) -> schema.ImageFormat:
-        """Format of RGB, by the first image that is there."""
+        """Format of RGB images, by the first existing image."""
         for camera in self.cameras:
             for image_format in schema.IMAGE_FORMATS:
                 if schema.image_path(self.folder, camera, "rgb", 0, image_format).is_file():
@@ -111,6 +111,7 @@ class Episode(SourceEpisode):
         return "png"
 
     def image_path(self, camera: str, kind: str, step: int) -> Path:
+        """Return the path of an image."""
         return schema.image_path(self.folder, camera, kind, step, self.image_format)
 
     def rgb(self, camera: str, step: int) -> NDArray[np.uint8]:
@@ -128,14 +129,14 @@ class Episode(SourceEpisode):
         for name in names:
             if (self.folder / camera / name).is_file():
                 return read_array(self.folder / camera / name)
-        raise DatasetError("no pose of this camera", where=self.folder / camera, expected=" or ".join(names))
+        raise DatasetError("missing pose of a camera", where=self.folder / camera, expected=" or ".join(names))
 
     def camera_parent(self, camera: str) -> Parent:
         return schema.camera_parent(self.folder / camera)
 
 
 class Dataset(EpisodeSource):
-    """A dataset's folder."""
+    """RoboCAS folder."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -145,7 +146,7 @@ class Dataset(EpisodeSource):
     def _found(self) -> Iterator[int]:
         if not self.root.is_dir():
             return
-        with os.scandir(self.root) as entries:  # which tells folders without asking for each
+        with os.scandir(self.root) as entries:  # faster than a stat call per entry
             for entry in entries:
                 number = schema.episode_number(entry.name)
                 if number is not None and entry.is_dir():
@@ -168,18 +169,18 @@ class Dataset(EpisodeSource):
         return read_json(self.root / schema.DATA_INFO_FILE)
 
     def _value(self, file: str, key: str, form: TypeAdapter[Any], default: Any, fix: str = SEE_VALIDATE) -> Any:
-        """Return a value of an overview, checked; the default if there is none."""
+        """Return a validated value of an overview file; the default if the key is missing."""
         content = self.settings if file == schema.CONVERSION_FILE else self.info
         try:
             return form.validate_python(content[key]) if key in content else default
         except ValidationError as error:
             where, found = f"{self.root / file}, {key}", str(content[key])[:80]
             expected = error.errors()[0]["msg"]
-            raise DatasetError("this value is damaged", where=where, expected=expected, found=found, fix=fix) from error
+            raise DatasetError("invalid value", where=where, expected=expected, found=found, fix=fix) from error
 
     @cached_property
     def splits(self) -> tuple[list[int], list[int]]:
-        """Training and validation episodes, as ``data_info.json`` lists them; numbers written as texts count too."""
+        """Numbers of the training and validation episodes, as listed in ``data_info.json``."""
         train, val = (self._value(schema.DATA_INFO_FILE, key, _NUMBERS, [], _SPLIT) for key in ("train_eps", "val_eps"))
         return train, val
 
@@ -204,17 +205,17 @@ class Dataset(EpisodeSource):
     def lengths(self) -> dict[int, int]:
         if not self.info:
             if self.settings:
-                fix = "Run the same robocas convert again."
-                raise DatasetError("this dataset is not finished", where=self.root, fix=fix)
+                fix = "Run robocas convert again with the same arguments."
+                raise DatasetError("the conversion of this dataset is unfinished", where=self.root, fix=fix)
             raise no_dataset_error(self.root, f"a folder with {schema.DATA_INFO_FILE}, or a trajectory.h5")
         missing = [key for key in ("ep_length", "train_eps", "val_eps") if key not in self.info]
         if missing:
             where, expected = self.root / schema.DATA_INFO_FILE, ", ".join(missing)
-            raise DatasetError("this overview lacks keys", where=where, expected=expected, fix=SEE_VALIDATE)
+            raise DatasetError("missing keys", where=where, expected=expected, fix=SEE_VALIDATE)
         return self._value(schema.DATA_INFO_FILE, "ep_length", _LENGTHS, {})
 
-    def split(self, side: Split) -> list[int]:
-        numbers = sorted(self.lengths) if side == "all" else self.splits[side == "val"]
+    def split(self, name: Split) -> list[int]:
+        numbers = sorted(self.lengths) if name == "all" else self.splits[name == "val"]
         unknown = [number for number in numbers if number not in self.lengths]
         if unknown:
             raise DatasetError("episodes of unknown length", where=self.root / schema.DATA_INFO_FILE, found=unknown[:5])
@@ -236,14 +237,14 @@ class Dataset(EpisodeSource):
 
 
 def open_folder(path: Path, *, rate_hz: float | None = None, include_failed: bool = False) -> Dataset:
-    """Open a folder; it has its failed episodes or not."""
+    """Open a RoboCAS folder; ``include_failed`` has no effect."""
     dataset = Dataset(path)
     check_rate(dataset, rate_hz)
     return dataset
 
 
 def check_rate(source: EpisodeSource, rate_hz: float | None) -> None:
-    """Raise DatasetError for another rate than that of a dataset."""
+    """Raise DatasetError if a requested rate is not the rate of a dataset."""
     if rate_hz is not None and rate_hz != source.rate_hz:
-        what, fix = "the dataset has another rate", "Convert the trajectory again with this --rate."
+        what, fix = "the dataset has another rate", "Convert the trajectory file with this --rate."
         raise DatasetError(what, where=source.root, expected=f"{source.rate_hz:g} Hz", found=f"{rate_hz:g}", fix=fix)

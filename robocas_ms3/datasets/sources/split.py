@@ -1,4 +1,4 @@
-"""How episodes are divided into training and validation."""
+"""Split of episodes into training and validation."""
 
 from __future__ import annotations
 
@@ -9,28 +9,27 @@ from typing import Any
 from robocas_ms3.demos.recordings.trajectory_json import one_seed
 
 SPLIT_RULE = (
-    "seeds in the order of sha256(seed), the first tenth validates; episodes of one seed stay together; what is"
-    " appended changes no earlier episode's side"
+    "seeds in the order of sha256(seed), the first tenth is for validation; episodes of one seed stay together;"
+    " appended episodes do not change the split of earlier ones"
 )
 
 
 def split_by_seed(
-    seed_of: Mapping[int, Any], before: tuple[Iterable[int], Iterable[int]] = ((), ())
+    seed_of: Mapping[int, Any], previous: tuple[Iterable[int], Iterable[int]] = ((), ())
 ) -> tuple[list[int], list[int]]:
-    """Split episodes, number -> seed as files have it, 90 : 10; one without a seed has its number in its place.
+    """Split episodes by seed, 90 % training and 10 % validation; return the numbers of both.
 
-    The place of a seed depends on no order and no generator.
-
-    Training and validation episodes ``before`` and their seeds keep their side, and of the new seeds as many validate
-    as make up a tenth of all. At least one seed validates where there are two.
+    ``seed_of`` has the seed of each episode by number; an episode without a seed is split by its number. The split
+    depends on the seeds alone, not on their order. Episodes of the ``previous`` split, and their seeds, keep their
+    split; new seeds fill validation up to a tenth of all seeds. At least one of two seeds is for validation.
     """
     known = {number: one_seed(value) for number, value in seed_of.items()}
     seeds = {number: number if seed is None else seed for number, seed in known.items()}
-    old = [{seeds[number] for number in numbers if number in seeds} for numbers in before]
+    old = [{seeds[number] for number in numbers if number in seeds} for numbers in previous]
     ranked = sorted(set(seeds.values()), key=lambda seed: hashlib.sha256(str(seed).encode()).hexdigest())
     count = max(1, round(len(ranked) / 10)) if len(ranked) > 1 else 0
     new = [seed for seed in ranked if seed not in old[0] | old[1]]
     chosen = old[1] | set(new[: max(0, count - len(old[1]))])
-    kept = set(before[0])  # an episode that trains goes on to, whatever others of its seed do
+    kept = set(previous[0])  # a training episode stays, even if its seed is for validation
     val = sorted(number for number, seed in seeds.items() if seed in chosen and number not in kept)
     return sorted(set(seeds) - set(val)), val

@@ -1,4 +1,4 @@
-"""Episodes of a trajectory file of ``robocas generate``: states, which are no images until they are rendered."""
+"""Episode source for trajectory files of ``robocas generate``; it has states and no images."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from robocas_ms3.scenes.layout import PARKING_HEIGHT
 
 
 class TrajectorySource(EpisodeSource):
-    """A trajectory file: its episodes as ``robocas convert`` would number and sample them.
+    """Trajectory file with episodes numbered and sampled as by ``robocas convert``.
 
     Attributes:
-        file: the trajectory file, closed.
+        file: the closed trajectory file.
         stride: control steps per step.
         index: position of each episode in the file.
     """
@@ -52,33 +52,35 @@ class TrajectorySource(EpisodeSource):
         self.numbers, self.file = list(range(len(self.index))), file
 
     def info(self, number: int) -> EpisodeEntry:
-        """Return what the JSON says of an episode, which is checked."""
+        """Return the validated JSON entry of an episode."""
         found = self._entries[number]
         if isinstance(found, DatasetError):
             raise found
         return found
 
     def objects(self, number: int) -> list[Any]:
+        """Return the object ids of an episode, by slot."""
         return list(self.file.episodes[self.index[number]]["robocas"].get("objects") or ())
 
     def steps(self, number: int) -> int:
+        """Return the number of steps T of an episode."""
         return len(sample_states(self.info(number).control_steps, self.stride))
 
     @cached_property
     def lengths(self) -> dict[int, int]:
         return {number: self.steps(number) for number in self.numbers}
 
-    def split(self, side: Split) -> list[int]:
-        if side == "all":
+    def split(self, name: Split) -> list[int]:
+        if name == "all":
             return self.numbers
-        return split_by_seed({number: self.info(number).seed for number in self.numbers})[side == "val"]
+        return split_by_seed({number: self.info(number).seed for number in self.numbers})[name == "val"]
 
     def entry(self, number: int) -> Mapping[str, Any]:
         with self.file.reopened() as file:
             return recording_entry(file, self.index[number])
 
     def recording(self, number: int, *, bodies: bool = True) -> Recording:
-        """Return all control steps of an episode, with the states of all bodies or of the robot alone."""
+        """Return the recording of an episode, with the states of all bodies or of the robot only."""
         with self.file.reopened() as file:
             return file.recording(self.index[number], bodies=bodies)
 
@@ -89,7 +91,7 @@ class TrajectorySource(EpisodeSource):
 
 
 class RecordedEpisode(SourceEpisode):
-    """One of its episodes; arrays are computed from the states, by forward kinematics."""
+    """Episode of a `TrajectorySource`; arrays are computed from the states by forward kinematics."""
 
     cameras = ()
 
@@ -125,7 +127,7 @@ class RecordedEpisode(SourceEpisode):
 
     @property
     def scene(self) -> dict[str, Any]:
-        """What the JSON says of how it was made, and what its objects are called, if their pack is installed."""
+        """Content of ``scene.json`` from the JSON of the file; object names need the installed pack."""
         source = self._source
         scene = recorded_scene(source.file, source.index[self._number])
         kwargs = scene["env_info"]["env_kwargs"]
@@ -135,7 +137,7 @@ class RecordedEpisode(SourceEpisode):
             for slot, asset in enumerate(source.objects(self._number))
             if isinstance(asset, str) and asset in names
         ]
-        config = config if isinstance(config, Mapping) else _shipped(str(config))
+        config = config if isinstance(config, Mapping) else _bundled_config(str(config))
         return {**scene, "config": config, "objects": objects}
 
     @cached_property
@@ -152,7 +154,7 @@ class RecordedEpisode(SourceEpisode):
 
 
 def _read_entry(file: TrajectoryFile, index: int) -> EpisodeEntry | DatasetError:
-    """Return the JSON's entry, or the error, which is of that episode alone."""
+    """Return the JSON entry of an episode, or its error, which is raised when the episode is read."""
     try:
         entry = file.entry(index)
         recorded_scene(file, index)
@@ -163,7 +165,7 @@ def _read_entry(file: TrajectoryFile, index: int) -> EpisodeEntry | DatasetError
 
 @cache
 def _names(pack: str) -> dict[str, str]:
-    """Return the names of objects of an installed pack, by id; a file can't choose a folder."""
+    """Return the object names of an installed pack, by id; empty for paths and unknown packs."""
     try:
         return {asset: of.asset.name for asset, of in load_pack(pack).objects.items()} if pack in find_packs() else {}
     except AssetError:
@@ -171,8 +173,8 @@ def _names(pack: str) -> dict[str, str]:
 
 
 @cache
-def _shipped(name: str) -> Mapping[str, Any]:
-    """Return a configuration by its name; empty if it can't be found any more."""
+def _bundled_config(name: str) -> Mapping[str, Any]:
+    """Return a bundled configuration by name; empty if it does not exist."""
     try:
         return load_task_config(name).model_dump(mode="json")
     except RobocasError:

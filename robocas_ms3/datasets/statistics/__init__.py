@@ -1,1 +1,1 @@
-"""What is in a dataset, counted and drawn."""
+"""Statistics of a dataset and their plots."""

@@ -1,4 +1,4 @@
-"""What is in a dataset: lengths, objects, layouts, instructions, actions, sub-goals, sort_counts in one pass."""
+"""Statistics of a dataset: lengths, objects, layouts, instructions, actions and sub-goals."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.provenance import task_of
 from robocas_ms3.datasets.statistics.layouts import LayoutMap, Placement, layout_map, round_values, surface_of
 
-NOOP = (1e-3, np.deg2rad(0.5))  # m and rad per step below which the gripper counts as standing still
-BINS = 41  # of histograms; odd, so that standing still has a bin of its own
+NOOP = (1e-3, np.deg2rad(0.5))  # m and rad per step; smaller motion counts as no motion
+BINS = 41  # of histograms; odd, so that zero motion has a bin of its own
 UNKNOWN = "unknown"
 
 
 @dataclass
 class Stats:
-    """Counts of a dataset: episodes of each kind, T of the episodes of each task, steps of each type of sub-goal."""
+    """Statistics of a dataset: episode counts, lengths T per task, sub-goal lengths in steps per type."""
 
     path: Path
     rate_hz: float
@@ -57,14 +57,14 @@ class Stats:
         return sum(map(sum, self.lengths.values()))
 
     def add(self, episode: SourceEpisode, steps: int) -> tuple[str, Placement]:
-        """Count what ``scene.json`` has of an episode; return its configuration, and where its objects stood."""
+        """Count an episode by its ``scene.json``; return its configuration name and its object positions."""
         where = f"{episode.where}/{schema.SCENE_FILE}"
         scene = read_scene(episode.scene, where)
         recorded, target, config = scene.recorded or RecordedDetails(), scene.target, _config_name(scene)
         try:
             layout, surface = Layout.model_validate(episode.layout), surface_of(scene.config or {})
         except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
-            what, found = "this description of a scene is damaged", format_error(error, 200)
+            what, found = "invalid description of a scene", format_error(error, 200)
             raise DatasetError(what, where=where, found=found, fix=SEE_VALIDATE) from error
         slots = [n for n in range(len(layout.object_ids)) if not layout.present or layout.present[n]]
         poses = np.array(layout.poses, dtype=np.float64).reshape(-1, 7)
@@ -88,8 +88,9 @@ class Stats:
         return config, Placement(poses[slots, :2], index, surface)
 
     def summary(self) -> str:
+        """Return the statistics in one line."""
         tasks = ", ".join(f"{task} {len(lengths)}" for task, lengths in sorted(self.lengths.items()))
-        covered = [share for share in (one.coverage for one in self.layouts.values()) if share is not None]
+        covered = [layout.coverage for layout in self.layouts.values() if layout.coverage is not None]
         parts = [
             f"{format_count(self.episodes, 'episode')} ({tasks})",
             f"{format_count(self.steps, 'step')} ({self.steps / self.rate_hz / 60:.1f} min at {self.rate_hz:g} Hz)",
@@ -102,7 +103,7 @@ class Stats:
         return ", ".join(parts)
 
     def as_json(self) -> dict[str, Any]:
-        """Return ``stats.json``: counts by descending count, lengths in steps, durations in s, positions in m."""
+        """Return ``stats.json``: counts in descending order, lengths in steps, durations in s, positions in m."""
         shift, turn = np.linalg.norm(self.actions[:, :3], axis=1), np.abs(self.actions[:, 3:6]).max(1, initial=0)
         noop = (shift < NOOP[0]) & (turn < NOOP[1])
         return {
@@ -145,16 +146,18 @@ class Stats:
 def collect(
     path: Path | str, *, rate_hz: float | None = None, on_episode: Callable[[int, int], None] | None = None
 ) -> Stats:
-    """Read a dataset, or a trajectory with failed episodes, without images; ``on_episode`` is called with (done, all).
+    """Return the statistics of a dataset, or of a trajectory file including its failed episodes.
+
+    Images are not read. ``on_episode`` is called with (done, total) after each episode.
 
     Raises:
-        DatasetError: it can't be read.
+        DatasetError: the dataset is damaged or has no episodes.
     """
     source = open_source(path, rate_hz=rate_hz, include_failed=True)
     numbers = source.split("all")
     if not numbers:
-        raise DatasetError("no episodes to count", where=path)
-    stats = Stats(source.root, source.rate_hz, {side: len(source.split(side)) for side in ("train", "val")})
+        raise DatasetError("this dataset has no episodes", where=path)
+    stats = Stats(source.root, source.rate_hz, {name: len(source.split(name)) for name in ("train", "val")})
     actions: list[NDArray[np.float32]] = []
     places: dict[str, list[Placement]] = defaultdict(list)
     for done, number in enumerate(numbers, start=1):
@@ -169,7 +172,7 @@ def collect(
         if on_episode:
             on_episode(done, len(numbers))
     stats.actions = np.concatenate(actions)
-    stats.layouts = {config: layout_map(parts) for config, parts in places.items()}
+    stats.layouts = {config: layout_map(placements) for config, placements in places.items()}
     return stats
 
 
@@ -183,11 +186,12 @@ def _config_name(scene: SceneRecord) -> str:
 
 
 def sort_counts(counter: Mapping[str, int]) -> dict[str, int]:
-    """Return counts, the most frequent first, then by name."""
+    """Return counts sorted by descending count, then by name."""
     return dict(sorted(counter.items(), key=lambda item: (-item[1], item[0])))
 
 
 def summarize_values(values: Iterable[float] | NDArray) -> dict[str, Any]:
+    """Return count, mean, standard deviation and percentiles of some values."""
     array = np.asarray(list(values) if not isinstance(values, np.ndarray) else values, dtype=np.float64)
     if not len(array):
         return {"count": 0}
@@ -197,7 +201,7 @@ def summarize_values(values: Iterable[float] | NDArray) -> dict[str, Any]:
 
 
 def histogram(values: NDArray) -> dict[str, Any]:
-    """Return counts over equal bins, symmetric about 0; two bins for values that are 0 or 1."""
+    """Return a histogram with equal bins, symmetric about 0; two bins for values that are 0 or 1."""
     if not len(values):
         return {"edges": [], "counts": []}
     reach = float(np.abs(values).max()) or 1.0

@@ -1,4 +1,4 @@
-"""Heat maps of where objects stood at the beginning of the episodes of one configuration."""
+"""Heat maps of object positions at the start of the episodes of a configuration."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 CELL = 0.05  # m
-MARGIN = 0.3  # m around the region that layouts are sampled in; heaps slide out of it
+MARGIN = 0.3  # m around the region in which layouts are sampled; heaps extend beyond it
 
 
 @dataclass(frozen=True)
 class Surface:
-    """The surface that objects stand on: pose of its furniture in the world (m, rad), and region there."""
+    """Supporting surface: pose of its furniture in the world (m, rad), and region in the furniture frame."""
 
     label: str
     x: float
@@ -24,14 +24,14 @@ class Surface:
     region: list[list[float]] | None
 
     def place(self, xy: Array) -> Array:
-        """Return positions (N, 2) in the world in the frame of the furniture."""
+        """Convert positions (N, 2) from the world frame to the furniture frame, m."""
         cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
         return (xy - [self.x, self.y]) @ np.array([[cosine, -sine], [sine, cosine]])
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Positions (N, 2) of the objects in the world at the beginning of an episode, m, and the index of its target."""
+    """Positions (N, 2) of the objects at the start of an episode, world frame, m; index of the target."""
 
     positions: Array
     target: int | None = None
@@ -40,13 +40,17 @@ class Placement:
 
 @dataclass(frozen=True)
 class LayoutMap:
-    """Where objects stood at the beginning of the episodes of one configuration, m.
+    """Heat map of object positions at the start of the episodes of a configuration, m.
 
     Attributes:
-        frame: of the positions: a piece of furniture's, or the world's.
-        region: [min_xy, max_xy] that layouts are sampled in; None: not known.
-        counts: (nx, ny) objects in each cell.
-        outside: objects farther from the region than ``MARGIN``, in no cell.
+        frame: frame of the positions: a furniture surface, or the world.
+        region: [min_xy, max_xy] in which layouts are sampled; None: unknown.
+        x_edges: (nx + 1,) cell edges along x.
+        y_edges: (ny + 1,) cell edges along y.
+        counts: (nx, ny) number of objects per cell.
+        outside: number of objects farther than ``MARGIN`` from the region, in no cell.
+        targets: (K, 2) positions of the targets.
+        episodes: number of episodes.
     """
 
     frame: str
@@ -60,7 +64,7 @@ class LayoutMap:
 
     @property
     def coverage(self) -> float | None:
-        """Fraction of the region's cells that an object's centre was ever in; None without a region."""
+        """Fraction of the cells of the region with an object centre in any episode; None without a region."""
         if self.region is None:
             return None
         (x0, y0), (x1, y1) = self.region
@@ -83,14 +87,14 @@ class LayoutMap:
         }
 
 
-def layout_map(parts: list[Placement]) -> LayoutMap:
-    """Return the heat map of one configuration, in the frame of its furniture where that is known for all."""
-    surface = parts[0].surface
-    if surface is None or any(part.surface != surface for part in parts):
+def layout_map(placements: list[Placement]) -> LayoutMap:
+    """Return the heat map of a configuration, in the furniture frame if all episodes have the same one."""
+    surface = placements[0].surface
+    if surface is None or any(placement.surface != surface for placement in placements):
         surface = None
-    placed = [part.positions if surface is None else surface.place(part.positions) for part in parts]
+    placed = [p.positions if surface is None else surface.place(p.positions) for p in placements]
     points = np.concatenate(placed)
-    targets = [xy[part.target] for part, xy in zip(parts, placed, strict=True) if part.target is not None]
+    targets = [xy[p.target] for p, xy in zip(placements, placed, strict=True) if p.target is not None]
     region = surface.region if surface else None
     low, high = np.asarray(region) if region else (points.min(0), points.max(0))
     near = points[((points >= low - MARGIN) & (points <= high + MARGIN)).all(axis=1)]
@@ -98,11 +102,13 @@ def layout_map(parts: list[Placement]) -> LayoutMap:
     counts = np.histogramdd(near, bins=(x_edges, y_edges))[0].astype(np.int64)
     frame = surface.label if surface else "world"
     outside = len(points) - int(counts.sum())
-    return LayoutMap(frame, region, x_edges, y_edges, counts, outside, np.array(targets).reshape(-1, 2), len(parts))
+    return LayoutMap(
+        frame, region, x_edges, y_edges, counts, outside, np.array(targets).reshape(-1, 2), len(placements)
+    )
 
 
 def _edges(low: float, high: float, points: Array) -> Array:
-    """Return edges of equal cells of about ``CELL`` that divide [low, high], and as many more as the points need."""
+    """Return edges of equal cells of about ``CELL`` that divide [low, high] and cover all points."""
     cell = (high - low) / max(1, round((high - low) / CELL)) if high - low > CELL / 2 else CELL
     before = np.ceil((low - points.min(initial=low)) / cell - 1e-9)
     after = np.ceil((points.max(initial=high) - low) / cell - 1e-9)
@@ -110,7 +116,7 @@ def _edges(low: float, high: float, points: Array) -> Array:
 
 
 def surface_of(config: dict[str, Any]) -> Surface | None:
-    """Return the surface of a configuration that a file holds; a damaged one raises any error."""
+    """Return the surface of a configuration, None without one; an invalid configuration raises any error."""
     surface = config.get("surface")
     if not surface:
         return None

@@ -1,4 +1,4 @@
-"""Images of a dataset's statistics, with matplotlib and without a display."""
+"""Plots of the statistics of a dataset, with matplotlib and without a display."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from robocas_ms3.datasets.statistics.layouts import LayoutMap
 
 DPI = 110
 BLUE, ORANGE, GREY = "#2f6fa8", "#e08a2e", "#9aa3ab"
-MAX_ROWS = 50  # bars of one image; the rest is in stats.json
-_TEXT = 84  # letters of a label
+MAX_ROWS = 50  # bars per plot; stats.json has all
+_TEXT = 84  # characters of a label
 
 
 def write_stats(stats: Stats, out: Path) -> list[Path]:
-    """Write ``stats.json`` and a PNG of each kind into a folder; return their paths."""
+    """Write ``stats.json`` and the plots as PNG into a folder; return the paths."""
     require_extra("plots", "statistics", "matplotlib")
     make_folder(out)
     paths = [out / "stats.json"]
@@ -62,7 +62,7 @@ def _shape(count: int, columns: int) -> tuple[int, int]:
 
 
 def _label(text: str) -> str:
-    """Return a text of the dataset as a short label: on one line, no formula between dollars."""
+    """Return a text as a short label: one line, dollar signs escaped."""
     text = escape_controls(text)
     return (text if len(text) <= _TEXT else text[: _TEXT - 1].rstrip() + "…").replace("$", r"\$")
 
@@ -98,8 +98,8 @@ def draw_objects(stats: Stats) -> Any:
     axes = _axes(figure, 1, 1, 1)[0]
     rows = np.arange(len(ids))
     names = [_label(format_object_name(i, stats.names.get(i, ""))) for i in ids]
-    axes.barh(rows, [stats.objects[i] for i in ids], color=GREY, height=0.8, label="took part")
-    axes.barh(rows, [stats.targets[i] for i in ids], color=ORANGE, height=0.45, label="was the target")
+    axes.barh(rows, [stats.objects[i] for i in ids], color=GREY, height=0.8, label="in the scene")
+    axes.barh(rows, [stats.targets[i] for i in ids], color=ORANGE, height=0.45, label="target")
     axes.set_yticks(rows, names)
     axes.set_ylim(len(ids) - 0.4, -0.6)
     _whole_numbers(axes.xaxis)
@@ -112,7 +112,7 @@ def draw_objects(stats: Stats) -> Any:
 
 
 def draw_layouts(stats: Stats) -> Any:
-    """Heat maps of where objects stood, with the targets, one of each configuration; x goes up, y to the left."""
+    """Draw a heat map of object positions per configuration, with the targets; x is up, y is left."""
     if not stats.layouts:
         return None
     rows, columns = _shape(len(stats.layouts), 3)
@@ -120,7 +120,7 @@ def draw_layouts(stats: Stats) -> Any:
     panels = _axes(figure, rows, columns, len(stats.layouts))
     for axes, (name, layout) in zip(panels, sorted(stats.layouts.items()), strict=True):
         _draw_layout(figure, axes, name, layout)
-    figure.suptitle("Objects in a cell at the beginning; dots: targets", fontsize=9)
+    figure.suptitle("Objects per cell at the start; dots: targets", fontsize=9)
     return figure
 
 
@@ -132,7 +132,7 @@ def _draw_layout(figure: Any, axes: Any, name: str, layout: LayoutMap) -> None:
         shown,
         cmap="YlGnBu",
         vmin=0,
-        vmax=max(5, layout.counts.max()),  # a single object is no hot spot
+        vmax=max(5, layout.counts.max()),  # a single object should not look like a hot spot
         edgecolor="#eeeeee",
         linewidth=0.4,
     )
@@ -196,7 +196,7 @@ def draw_actions(stats: Stats) -> Any:
         for percentile in np.percentile(column, [1, 99]):
             axes.axvline(percentile, color=ORANGE, linestyle="--", linewidth=1)
         axes.set(title=f"{name} ({unit})", ylabel="steps (log)")
-    figure.suptitle(f"Actions of a step at {stats.rate_hz:g} Hz, in the EEF frame; dashed: 1st and 99th percentile")
+    figure.suptitle(f"Actions per step at {stats.rate_hz:g} Hz, in the EEF frame; dashed: 1st and 99th percentile")
     return figure
 
 
@@ -225,7 +225,7 @@ def draw_subgoals(stats: Stats) -> Any:
     axes.invert_yaxis()
     axes.set_xlim(left=0)
     axes.grid(axis="x", color="#dddddd", linewidth=0.6)
-    axes.set(xlabel="s", title="How long sub-goals take")
+    axes.set(xlabel="s", title="Duration of sub-goals")
     return figure
 
 
@@ -237,4 +237,4 @@ PLOTS: dict[str, Callable[[Stats], Any]] = {
     "actions": draw_actions,
     "subgoals": draw_subgoals,
 }
-"""Name of the PNG -> function that draws it, or returns None where there is nothing to draw."""
+"""Plot functions by file name; a function returns None if there is nothing to draw."""

@@ -1,1 +1,1 @@
-"""Training samples for torch."""
+"""Training samples for PyTorch."""

@@ -1,6 +1,6 @@
-"""Demonstrations as a torch dataset: windows of observations and actions, decoded when they are asked for.
+"""PyTorch dataset of demonstrations: windows of observations and actions, decoded on access.
 
-What upstream's training loader computes, and what it leaves open: docs/training.md.
+docs/training.md compares it with the training loader of RoboCAS-v0.
 """
 
 from __future__ import annotations
@@ -29,41 +29,41 @@ _TYPE_INDEX = {kind: index for index, kind in enumerate(GOAL_TYPES)}
 
 
 class RoboCASDataset(torch.utils.data.Dataset):
-    """Samples of a dataset, or of a trajectory file (state and action only).
+    """PyTorch dataset of the samples of a dataset, or of a trajectory file (state and action only).
 
-    Only the overview is read at the beginning; arrays and images are read sample by sample, and no file stays open,
-    so that workers may be forked or spawned. A sample is a dict; H = ``observation_horizon``, A = ``action_horizon``:
+    Arrays and images are read on access, and no file stays open, so workers may be forked or spawned. A sample is a
+    dict; H = ``observation_horizon``, A = ``action_horizon``, C = number of cameras:
 
     ======================  ==================  ==================================================================
-    ``rgb``                 (H, C, 3, h, w)     uint8, or float32 in 0..1; cameras in the order asked for
-    ``depth``               (H, C, h, w)        float32, m along the optical axis, 0 = nothing
-    ``state``               (H, D)              float32, the arrays of ``state`` side by side
+    ``rgb``                 (H, C, 3, h, w)     uint8, or float32 in 0..1; cameras in the given order
+    ``depth``               (H, C, h, w)        float32, m along the optical axis, 0 = no depth
+    ``state``               (H, D)              float32, the concatenated arrays of ``state``
     ``action``              (H + A - 1, 7)      float32; row i belongs to observation i, the last A rows are the chunk
     ``observation_mask``    (H,)                bool, False = padding
     ``action_mask``         (H + A - 1,)        bool, False = padding
     ``instruction``         str
     ``language_embedding``  (384,)              float32
-    ``subgoal``             str                 text of the present sub-goal
+    ``subgoal``             str                 text of the current sub-goal
     ``subgoal_type``        (H,)                int64, index in ``language.templates.GOAL_TYPES``; -1 = unknown
     ``subgoal_embedding``   (H, 384)            float32
-    ``episode``, ``step``   int                 whose sample this is
+    ``episode``, ``step``   int                 episode number and step of the sample
     ======================  ==================  ==================================================================
 
-    Keys that were not asked for are absent.
+    Keys that are not requested are absent.
 
     Args:
-        path: a RoboCAS folder, a LeRobot folder of ours, one of another format, or ``trajectory.h5``.
-        options: what the samples hold.
-        transform: called with each sample; has to be picklable where workers are spawned.
+        path: a RoboCAS folder, a LeRobot dataset of ``robocas convert``, another format, or a ``trajectory.h5``.
+        options: options of the samples.
+        transform: function that is called with each sample; it must be picklable for spawned workers.
 
     Attributes:
         rate_hz: steps per second.
-        episodes: numbers of the split's episodes, sorted.
+        episodes: sorted numbers of the episodes of the split.
         stages: (N,) int8 sub-goal type of each sample's step, index in ``GOAL_TYPES``; -1 = unknown.
-        scale: how actions are normalised; None: they are not.
+        scale: scale of normalized actions; None: actions are not normalized.
 
     Raises:
-        DatasetError: nothing there, an empty split, a wrong option, something asked for that the dataset does not hold.
+        DatasetError: the dataset can't be read, the split is empty, or the dataset lacks requested data.
     """
 
     def __init__(
@@ -80,16 +80,16 @@ class RoboCASDataset(torch.utils.data.Dataset):
         check_options(self.source, options)
         self.episodes: list[int] = self.source.split(options.split)
         if not self.episodes:
-            expected, found = f"some in {options.split}", f"{len(self.source.lengths)} in all"
-            what, fix = "this split holds no episodes", 'Add seeds, or pass split="all".'
+            expected, found = f"episodes in {options.split}", f"{len(self.source.lengths)} episodes in total"
+            what, fix = "this split has no episodes", 'Add seeds, or pass split="all".'
             raise EmptySplitError(what, where=path, expected=expected, found=found, fix=fix)
         self._steps = {number: options.sample_steps(self.source.lengths[number]) for number in self.episodes}
         self._offsets = np.cumsum([0, *map(len, self._steps.values())])
         if not len(self):
             longest = max(self.source.lengths[number] for number in self.episodes)
             needed = options.observation_horizon + options.action_horizon if options.padding == "drop" else 2
-            what, expected = "no episode is long enough", format_count(needed, "step")
-            raise DatasetError(what, where=path, expected=expected, found=longest, fix="Pad them.")
+            what, expected = "all episodes are too short", f"at least {format_count(needed, 'step')}"
+            raise DatasetError(what, where=path, expected=expected, found=longest, fix='Pass padding="hold".')
         self.subgoal_types = np.concatenate([self._types_of(number, within) for number, within in self._steps.items()])
         self.scale: ActionScale | None = None
         if options.normalize:
@@ -98,10 +98,10 @@ class RoboCASDataset(torch.utils.data.Dataset):
         self._cache: OrderedDict[int, dict[str, Any]] = OrderedDict()
 
     def _types_of(self, number: int, steps: range) -> NDArray[np.int8]:
-        stages = np.full(self.source.lengths[number], -1, dtype=np.int8)
+        types = np.full(self.source.lengths[number], -1, dtype=np.int8)
         for goal in self.source.episode(number).goals:
-            stages[goal.first : goal.last + 1] = _TYPE_INDEX.get(goal.goal_type, -1)
-        return stages[steps.start : steps.stop]
+            types[goal.first : goal.last + 1] = _TYPE_INDEX.get(goal.goal_type, -1)
+        return types[steps.start : steps.stop]
 
     def __len__(self) -> int:
         return int(self._offsets[-1])
@@ -109,39 +109,39 @@ class RoboCASDataset(torch.utils.data.Dataset):
     def locate(self, index: int) -> tuple[int, int]:
         """Return episode number and step of a sample."""
         if not -len(self) <= index < len(self):
-            raise IndexError(f"sample {index} of {len(self)}")
+            raise IndexError(f"sample index {index} out of range for {len(self)} samples")
         index %= len(self)
         place = int(np.searchsorted(self._offsets, index, side="right")) - 1
         number = self.episodes[place]
         return number, self._steps[number][index - int(self._offsets[place])]
 
     def indices(self, episode: int) -> range:
-        """Return the samples of an episode of this split."""
+        """Return the sample indices of an episode of the split."""
         if episode not in self._steps:
             raise DatasetError("no such episode in this split", where=f"episode {episode}")
         place = self.episodes.index(episode)
         return range(int(self._offsets[place]), int(self._offsets[place + 1]))
 
     def index(self, episode: int, step: int) -> int:
-        """Return the sample of a step of an episode."""
+        """Return the sample index of a step of an episode."""
         found, steps = self.indices(episode), self._steps[episode]
         if step not in steps:
             expected = f"{steps[0]} to {steps[-1]}" if steps else "none"
-            raise DatasetError("no sample of this step", where=f"episode {episode}", expected=expected, found=step)
+            raise DatasetError("this step has no sample", where=f"episode {episode}", expected=expected, found=step)
         return found[step - steps.start]
 
     def weights(self) -> torch.Tensor:
-        """Return weights (N,) for ``WeightedRandomSampler``, with which each sub-goal type is drawn equally often."""
+        """Return weights (N,) for ``WeightedRandomSampler`` that balance the sub-goal types."""
         if (self.subgoal_types < 0).all():
-            raise DatasetError("no sub-goals are known here", where=self.source.root, expected="step_goals")
-        _, stages, counts = np.unique(self.subgoal_types, return_inverse=True, return_counts=True)
-        return torch.from_numpy(1.0 / (len(counts) * counts[stages]))
+            raise DatasetError("this dataset has no sub-goals", where=self.source.root, expected="step_goals")
+        _, types, counts = np.unique(self.subgoal_types, return_inverse=True, return_counts=True)
+        return torch.from_numpy(1.0 / (len(counts) * counts[types]))
 
     def __getitem__(self, index: int) -> Any:
         number, step = self.locate(int(index))
         arrays, options = self._arrays(number), self.options
         observed, acted = options.observation_steps(step), options.action_steps(step)
-        last = len(arrays["action"]) - 2  # that an action leaves
+        last = len(arrays["action"]) - 2  # last step with an action
         sample: dict[str, Any] = {"episode": number, "step": step}
         sample["observation_mask"] = torch.from_numpy(observed >= 0)
         sample["action_mask"] = torch.from_numpy((acted >= 0) & (acted <= last))
@@ -167,7 +167,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
         outside = acted != rows
         if self.options.padding == "hold":
             actions[outside, :6] = 0
-            actions[acted < 0, 6] = arrays["first_command"]  # that of the last one goes on after the end
+            actions[acted < 0, 6] = arrays["first_command"]  # after the end, the last command is repeated
         if self.scale is not None:
             actions = self.scale.encode(actions)
         if self.options.padding == "zero":
@@ -187,24 +187,25 @@ class RoboCASDataset(torch.utils.data.Dataset):
 
 
 def check_options(source: EpisodeSource, options: SampleOptions) -> None:
-    there, cameras = source.cameras, tuple(options.cameras)
-    if set(cameras) - set(there) or len(set(cameras)) < len(cameras):
-        fix = "" if there else "Pass cameras=(), or make images with robocas convert."
-        expected, found = f"some of {', '.join(there) or 'none'}, each once", ", ".join(cameras)
-        raise DatasetError("no such cameras", where=source.root, expected=expected, found=found, fix=fix)
+    """Raise DatasetError if a source lacks requested cameras, depth or embeddings."""
+    available, cameras = source.cameras, tuple(options.cameras)
+    if set(cameras) - set(available) or len(set(cameras)) < len(cameras):
+        fix = "" if available else "Pass cameras=(), or render images with robocas convert."
+        expected, found = f"some of {', '.join(available) or 'none'}, each once", ", ".join(cameras)
+        raise DatasetError("unknown or repeated camera", where=source.root, expected=expected, found=found, fix=fix)
     if options.depth and not (source.has_depth and cameras):
         found = "no cameras" if source.has_depth else "no depth"
-        raise DatasetError("there is no depth here", where=source.root, found=found, fix="Pass depth=False.")
+        raise DatasetError("missing depth images", where=source.root, found=found, fix="Pass depth=False.")
     if options.embedding and not source.has_embeddings:
-        fix = "Pass embedding=False, or convert the trajectory with embeddings."
-        raise DatasetError("there are no embeddings here", where=source.root, fix=fix)
+        fix = "Pass embedding=False, or convert the trajectory file with embeddings."
+        raise DatasetError("missing embeddings", where=source.root, fix=fix)
 
 
 def read_episode(source: EpisodeSource, number: int, options: SampleOptions) -> dict[str, Any]:
-    """Read what the samples of an episode are made of, except images.
+    """Read the arrays of an episode from which its samples are computed.
 
-    Return ``action`` (T, 7), ``first_command``, ``instruction``; ``state`` (T, D), ``texts``, ``subgoal_type`` (T,) and
-    the embeddings where they are wanted.
+    Return ``action`` (T, 7), ``first_command`` and ``instruction``; if requested, ``state`` (T, D), ``texts``,
+    ``subgoal_type`` (T,) and embeddings.
     """
     state, embedding, subgoals = options.state, options.embedding, options.subgoals
     keys = (*ACTION_ARRAYS, *state, "language_goal")
@@ -214,7 +215,7 @@ def read_episode(source: EpisodeSource, number: int, options: SampleOptions) -> 
     length, where = source.lengths[number], f"{source.root}, episode {number}"
     for key, array in arrays.items():
         if key not in {"language_goal", "language_embedding"} and len(array) != length:
-            what = "another length than the overview says"
+            what = "wrong length of an array"
             raise DatasetError(what, where=f"{where}, {key}", expected=length, found=len(array))
     check_finite(arrays, where)
     made: dict[str, Any] = {
@@ -238,9 +239,12 @@ def read_episode(source: EpisodeSource, number: int, options: SampleOptions) -> 
 def read_images(
     episode: SourceEpisode, options: SampleOptions, observed: NDArray[np.int64], kind: ImageKind
 ) -> torch.Tensor:
-    """Read the images of steps (H,), below 0 before the episode: (H, C, 3, h, w), or (H, C, h, w) in m."""
+    """Read the images of steps (H,): RGB (H, C, 3, h, w) or depth (H, C, h, w) in m.
+
+    Negative steps use the first image.
+    """
     if get_worker_info() is not None and cv2.getNumThreads() > 1:
-        cv2.setNumThreads(0)  # a pool of OpenCV does not survive a fork
+        cv2.setNumThreads(0)  # the thread pool of OpenCV does not survive a fork
     steps = np.maximum(observed, 0)
     first, count = int(steps[0]), int(steps[-1] - steps[0]) + 1
     by_camera = {
@@ -248,7 +252,9 @@ def read_images(
     }
     shapes = {image.shape for images in by_camera.values() for image in images}
     if len(shapes) > 1:
-        raise DatasetError("images differ in size", where=episode.where, found=sorted(shapes), fix="Pass a size.")
+        raise DatasetError(
+            "images have different sizes", where=episode.where, found=sorted(shapes), fix="Pass size=(width, height)."
+        )
     stack = np.stack([np.stack(images) for images in by_camera.values()], axis=1)[steps - first]
     if kind == "depth":
         stack = stack.astype(np.float32) / 1000
@@ -268,7 +274,7 @@ def _read_camera(
         for step, image in enumerate(frames, start=run[0]):
             if (image.ndim, image.dtype) != ((3, np.uint8) if kind == "rgb" else (2, np.uint16)):
                 raise DatasetError(
-                    "not an image of this kind",
+                    "invalid image",
                     where=f"{episode.where}/{camera}/{kind}, step {step}",
                     expected="(H, W, 3) uint8" if kind == "rgb" else "(H, W) uint16",
                     found=f"{image.shape} {image.dtype}",
@@ -278,7 +284,7 @@ def _read_camera(
 
 
 def resize(image: NDArray, size: tuple[int, int] | None) -> NDArray:
-    """Scale to width and height: RGB by areas, depth by the nearest pixel, which mixes no distances."""
+    """Scale an image to a width and height: RGB by area, depth by nearest pixel."""
     if size is None or image.shape[1::-1] == tuple(size):
         return image
     smaller = size[0] <= image.shape[1] and size[1] <= image.shape[0]

@@ -1,11 +1,11 @@
 "use strict";
-// Data come as scripts that call robocas.put(name, content): the same from the server and from files on disk.
+// Data are scripts that call robocas.put(name, content), from the server or from disk.
 
 const robocas = (() => {
   const store = new Map();
   const waiting = new Map();
   const KEEP = 12; // episodes in memory
-  let query = ""; // of images, which a browser keeps: it must not take them for those of another server
+  let query = ""; // of image URLs: browsers cache images, and another server may use the same port
 
   function put(name, content) {
     store.set(name, content);
@@ -20,7 +20,7 @@ const robocas = (() => {
     const promise = new Promise((resolve, reject) => {
       const script = document.createElement("script");
       script.src = `data/${name}.js`;
-      script.onload = () => (store.has(name) ? resolve(store.get(name)) : reject(new Error(`${name}: nothing came`)));
+      script.onload = () => (store.has(name) ? resolve(store.get(name)) : reject(new Error(`${name}: no content`)));
       script.onerror = () => reject(new Error(`${name} can't be loaded`));
       document.head.append(script);
       script.addEventListener("load", () => script.remove());

@@ -1,5 +1,5 @@
 "use strict";
-// One episode: what is said of it, and its parts put together.
+// One episode: instruction, summary, facts and failed attempts.
 
 robocas.episode = (() => {
   const { byId, element, player, plots, space, table } = robocas;
@@ -14,11 +14,11 @@ robocas.episode = (() => {
       content = await robocas.load(`episode_${number}`);
     } catch (error) {
       const entry = table.find(number);
-      const why = entry && (entry.damage ? `: ${entry.damage}.` : ": it is damaged or gone.");
+      const why = entry && (entry.damage ? `: ${entry.damage}.` : ": it is damaged or missing.");
       if (wanted === number) fail(why ? `Episode ${number} can't be shown${why}` : `There is no episode ${number}.`);
       return undefined;
     }
-    if (wanted !== number) return undefined; // another was asked for meanwhile
+    if (wanted !== number) return undefined; // another episode was opened
     opened = number;
     byId("message").hidden = true;
     byId("episode").hidden = false;
@@ -57,7 +57,7 @@ robocas.episode = (() => {
       byId("summary").append(" \u00b7 ", element("span", { class: entry.success ? "good" : "bad", textContent: entry.success ? "success" : "failure" }));
     }
     byId("damage").hidden = !entry.damage;
-    byId("damage").textContent = entry.damage ? `Damaged and left out: ${entry.damage}` : "";
+    byId("damage").textContent = entry.damage ? `Not shown (damaged): ${entry.damage}` : "";
     byId("facts").replaceChildren(
       ...Object.entries(content.facts).flatMap(([name, value]) => [
         element("dt", { textContent: name.replaceAll("_", " ") }),

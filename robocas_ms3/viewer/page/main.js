@@ -1,5 +1,5 @@
 "use strict";
-// Puts the page together: deep links (#episode=12&step=30) and keys.
+// Starts the page: deep links (#episode=12&step=30) and keys.
 
 (async () => {
   const { byId, element, table, player, plots, space, episode } = robocas;
@@ -21,7 +21,7 @@
     episode.open(number);
   }
 
-  // Browsers refuse an address that changes with every image: it follows when things rest.
+  // Browsers limit URL changes: the URL is updated when playing stops.
   function stepped(step) {
     plots.cursor(step);
     space.cursor(step);
@@ -67,7 +67,7 @@
   try {
     index = await robocas.load("index");
   } catch (error) {
-    byId("message").textContent = "The index can't be loaded: has `robocas view` ended?";
+    byId("message").textContent = "The index can't be loaded. Is `robocas view` still running?";
     return;
   }
   byId("name").textContent = index.name;

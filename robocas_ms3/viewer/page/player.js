@@ -1,5 +1,5 @@
 "use strict";
-// The step that is looked at: images, timeline, playing.
+// The current step: images, timeline, playback.
 
 robocas.player = (() => {
   const { byId, element, imageUrl, seriesColour } = robocas;
@@ -28,7 +28,7 @@ robocas.player = (() => {
     const click = (id, action) => {
       byId(id).onclick = () => {
         action();
-        byId(id).blur(); // so that Space goes on playing
+        byId(id).blur(); // so that Space still plays
       };
     };
     click("b-first", () => go(0));
@@ -67,7 +67,7 @@ robocas.player = (() => {
   function go(to) {
     if (!episode) return;
     const last = episode.steps - 1;
-    step = Math.max(0, Math.min(last, Math.round(to) || 0)); // NaN, of an address: the first
+    step = Math.max(0, Math.min(last, Math.round(to) || 0)); // NaN in a URL: the first step
     byId("scrub").value = step;
     byId("clock").textContent = `step ${step} / ${last}   ${episode.times[step].toFixed(2)} s`;
     const now = episode.subgoals.findIndex((goal) => goal.first <= step && step <= goal.last);
@@ -79,7 +79,7 @@ robocas.player = (() => {
     onStep(step);
   }
 
-  // An image is put in once it is decoded, and only if nobody has moved on: no flicker.
+  // An image is shown once it is decoded, if the step is still current: no flicker.
   function images() {
     for (const frame of frames) {
       const url = imageUrl(episode.n, frame.camera, kind, step);
@@ -123,7 +123,7 @@ robocas.player = (() => {
     const tick = (now) => {
       if (!playing) return;
       const ready = frames.every((frame) => frame.loaded === frame.wanted);
-      if (ready) time += ((now - before) / 1000) * Number(byId("speed").value); // slow images slow the clock
+      if (ready) time += ((now - before) / 1000) * Number(byId("speed").value); // slow images pause the clock
       before = now;
       let to = step;
       while (to < episode.steps - 1 && episode.times[to + 1] <= time) to += 1;

@@ -36,8 +36,8 @@ robocas.plots = (() => {
     const plot = { content, canvas, legend, values, box, low: low - margin, high: high + margin, cache: null };
     const seek = (event) => {
       const area = canvas.getBoundingClientRect();
-      const share = (event.clientX - area.left - LEFT) / (area.width - LEFT - RIGHT);
-      onSeek(Math.round(share * (steps - 1)));
+      const fraction = (event.clientX - area.left - LEFT) / (area.width - LEFT - RIGHT);
+      onSeek(Math.round(fraction * (steps - 1)));
     };
     canvas.onpointerdown = (event) => {
       canvas.setPointerCapture(event.pointerId);
@@ -48,7 +48,7 @@ robocas.plots = (() => {
     return plot;
   }
 
-  // The lines change with size and colours only; they are kept as a bitmap under the cursor.
+  // Lines change only with size and colours; they are cached as a bitmap.
   function lines(plot, width, height) {
     const ratio = window.devicePixelRatio || 1;
     const sheet = document.createElement("canvas");
@@ -140,7 +140,7 @@ robocas.plots = (() => {
 
   const format = (value) => value.toFixed(Math.abs(value) >= 100 ? 0 : Math.abs(value) >= 10 ? 1 : 3);
 
-  // After a change of size or colours.
+  // Redraw after a change of size or colours.
   function redraw() {
     for (const plot of plots) {
       plot.cache = null;

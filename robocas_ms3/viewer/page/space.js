@@ -49,7 +49,7 @@ robocas.space = (() => {
     floor = low[2] - 0.02;
   }
 
-  // To pixels: turned about z, tilted, seen in perspective from four radii away.
+  // Project to pixels: rotation about z, tilt, perspective from four radii away.
   function project([x, y, z], width, height) {
     const [dx, dy, dz] = [x - centre[0], y - centre[1], z - centre[2]];
     const [cos, sin] = [Math.cos(view.turn), Math.sin(view.turn)];
@@ -98,7 +98,7 @@ robocas.space = (() => {
     ctx.fillText(`grid ${cell * 100} cm, at z = ${floor.toFixed(2)} m`, 8, 16);
   }
 
-  // The path in the colours of the sub-goals: what is done strong, what comes faint.
+  // The path in the colours of the sub-goals: past strong, future faint.
   function tcp(ctx, at) {
     const points = trace.tcp.map(at);
     const parts = goals.length ? goals : [{ first: 0, last: points.length - 1 }];
@@ -132,7 +132,7 @@ robocas.space = (() => {
     ctx.globalAlpha = 1;
   }
 
-  // Names, the target's and the basket's first; one that would lie on another is left out.
+  // Names, target and basket first; overlapping names are omitted.
   function label(ctx, labels, width) {
     const taken = labels.map(([, x, y]) => [x - 11, y - 7, x - 3, y + 1]); // the dots
     for (const [text, x, y, strong] of labels.sort((a, b) => b[3] - a[3] || b[4] - a[4])) {

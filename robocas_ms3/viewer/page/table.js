@@ -1,5 +1,5 @@
 "use strict";
-// The episode table: filters, sorting, and rows made only where they are seen.
+// The episode table: filters, sorting, and rows created when visible.
 
 robocas.table = (() => {
   const { byId, element, thumbnailUrl } = robocas;
@@ -30,7 +30,7 @@ robocas.table = (() => {
     apply();
   }
 
-  // A filter with nothing to choose from is left out.
+  // A filter without a choice is hidden.
   function options(id, all, values, least, prefix = "") {
     const select = byId(id);
     select.replaceChildren(element("option", { value: "", textContent: all }));
@@ -82,13 +82,13 @@ robocas.table = (() => {
     const order = (a, b) => {
       const [x, y] = [rank(a), rank(b)];
       if (x === y) return (a.n ?? Infinity) - (b.n ?? Infinity) || a.seed - b.seed;
-      if (x === Infinity || y === Infinity) return x === Infinity ? 1 : -1; // unknown ones last, either way
+      if (x === Infinity || y === Infinity) return x === Infinity ? 1 : -1; // unknown values last
       return (x < y ? -1 : 1) * (down ? -1 : 1);
     };
     shown = index.episodes.filter(passes()).sort(order);
-    const gone = (e) => e.n === null;
-    const lost = counted(gone, "seed");
-    byId("count").textContent = counted((e) => !gone(e), "episode") + (lost ? `, ${lost} given up` : "");
+    const isSkipped = (e) => e.n === null;
+    const skipped = counted(isSkipped, "seed");
+    byId("count").textContent = counted((e) => !isSkipped(e), "episode") + (skipped ? `, ${skipped} skipped` : "");
     byId("f-reset").hidden = shown.length === index.episodes.length;
     byId("spacer").style.height = `${shown.length * HEIGHT}px`;
     for (const row of made.values()) row.remove();
@@ -96,7 +96,7 @@ robocas.table = (() => {
     draw();
   }
 
-  // "3 episodes", "1 of 3 episodes"; nothing where there are no seeds that were given up.
+  // "3 episodes", "1 of 3 episodes"; empty without skipped seeds.
   function counted(which, name) {
     const [some, all] = [shown.filter(which).length, index.episodes.filter(which).length];
     if (!all && name !== "episode") return "";
@@ -123,12 +123,12 @@ robocas.table = (() => {
   }
 
   function makeRow(e) {
-    const gone = e.n === null;
-    const row = element(gone ? "div" : "a", { class: "row" });
+    const isSkipped = e.n === null;
+    const row = element(isSkipped ? "div" : "a", { class: "row" });
     row.classList.toggle("plain", !index.cameras.length);
-    row.classList.toggle("gone", gone);
-    row.classList.toggle("chosen", !gone && e.n === chosen);
-    if (!gone) {
+    row.classList.toggle("skipped", isSkipped);
+    row.classList.toggle("chosen", !isSkipped && e.n === chosen);
+    if (!isSkipped) {
       row.href = `#episode=${e.n}`;
       row.dataset.episode = e.n;
       row.onclick = (event) => {
@@ -138,19 +138,19 @@ robocas.table = (() => {
       };
     }
     if (index.cameras.length) {
-      row.append(gone ? element("span") : element("img", { src: thumbnailUrl(e.n), alt: "", loading: "lazy" }));
+      row.append(isSkipped ? element("span") : element("img", { src: thumbnailUrl(e.n), alt: "", loading: "lazy" }));
     }
-    const title = gone ? `seed ${e.seed}, given up` : e.object || e.instruction || `seed ${e.seed ?? "unknown"}`;
+    const title = isSkipped ? `seed ${e.seed}, skipped` : e.object || e.instruction || `seed ${e.seed ?? "unknown"}`;
     const attempts = e.attempts > 1 ? `${e.attempts} attempts` : "";
     const failed = e.stages.length ? `failed at ${e.stages.join(", ").replaceAll("_", " ")}` : "";
-    const second = gone ? [attempts, failed].filter(Boolean).join(", ") : e.damage || e.instruction;
+    const second = isSkipped ? [attempts, failed].filter(Boolean).join(", ") : e.damage || e.instruction;
     const what = element("div", { class: "what", title: second }, element("div", { textContent: title }), element("div", { textContent: second }));
     const outcome = element("div", { class: "outcome", title: [attempts, failed].filter(Boolean).join(", ") });
     if (e.success !== null) outcome.append(element("span", { class: e.success ? "good" : "bad", textContent: e.success ? "success" : "failure" }));
     if (e.damage) outcome.append(element("div", { class: "bad", textContent: "damaged", title: e.damage }));
-    else if (attempts && !gone) outcome.append(element("div", { class: "faint", textContent: attempts.replace("attempts", "tries") }));
+    else if (attempts && !isSkipped) outcome.append(element("div", { class: "faint", textContent: attempts }));
     row.append(
-      element("span", { class: "number", textContent: gone ? "" : e.n }), what,
+      element("span", { class: "number", textContent: isSkipped ? "" : e.n }), what,
       element("span", { class: "number", textContent: e.steps || "" }), outcome
     );
     return row;
@@ -165,12 +165,12 @@ robocas.table = (() => {
     const top = position * HEIGHT;
     const above = top - box.scrollTop;
     const below = top + HEIGHT - box.scrollTop - box.clientHeight;
-    if (above < -HEIGHT || below > HEIGHT) box.scrollTop = top - box.clientHeight / 2; // far away: to the middle
+    if (above < -HEIGHT || below > HEIGHT) box.scrollTop = top - box.clientHeight / 2; // far away: scroll to the middle
     else if (above < 0) box.scrollTop = top;
     else if (below > 0) box.scrollTop += below;
   }
 
-  // The episode some rows further on among those that pass the filters.
+  // The number of the episode some rows further, among those that pass the filters.
   function neighbour(number, by) {
     const real = shown.filter((e) => e.n !== null);
     const position = real.findIndex((e) => e.n === number);

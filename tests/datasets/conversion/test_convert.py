@@ -225,6 +225,19 @@ def test_append_keeps_numbers_and_split(trajectory, tmp_path):
     assert files_of(out) == after
 
 
+def test_append_takes_cameras_and_size_from_the_dataset(trajectory, tmp_path):
+    out, more = tmp_path / "out", write_trajectory(tmp_path / "more.h5", seeds=(10,))
+    run(trajectory, out, cameras=("static_camera", "base_camera"), size=(80, 60))
+    assert [episode.number for episode in run(more, out, append=True).episodes] == [2]
+    episode = Dataset(out).episode(2)
+    assert episode.cameras == ("base_camera", "static_camera")
+    assert episode.rgb("static_camera", 0).shape == (60, 80, 3)
+    assert validate(out).violations == []
+    for other in ({"size": (64, 48)}, {"cameras": ("static_camera",)}):
+        with pytest.raises(OutputExistsError):
+            run(more, out, append=True, **other)
+
+
 def test_with_other_versions_it_does_not_go_on(trajectory, tmp_path):
     out, more = tmp_path / "out", write_trajectory(tmp_path / "more.h5", seeds=(10,))
     run(trajectory, out)

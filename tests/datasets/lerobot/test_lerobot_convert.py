@@ -163,7 +163,7 @@ def test_an_imported_folder_can_be_resumed(dataset, tmp_path):
 def test_from_the_command_line(made, tmp_path, capsys):
     command = ["convert", str(made), "--to", "lerobot", "--out", str(tmp_path / "out")]
     assert main.run([*command, "--append"]) == 2
-    assert capsys.readouterr().err == "error: --append: not for LeRobot datasets. Leave it out.\n"
+    assert capsys.readouterr().err == "error: --append: this option does not apply to a LeRobot dataset. Omit it.\n"
     assert main.run([*command, "--codec", "av1", "--cameras", "static_camera", "--no-depth"]) == 0
     assert "2 episodes, 14 steps" in capsys.readouterr().out
     dataset = LeRobotDataset(tmp_path / "out")
@@ -172,7 +172,10 @@ def test_from_the_command_line(made, tmp_path, capsys):
     assert np.abs(dataset.episode(1).rgb("static_camera", 4) - Dataset(made).episode(1).rgb("static_camera", 4)).any()
     other = ["convert", str(made), "--out", str(tmp_path / "other"), "--lerobot-version", "2.1"]
     assert main.run(other) == 2
-    assert capsys.readouterr().err == "error: --lerobot-version: not for RoboCAS folders. Leave it out.\n"
+    assert (
+        capsys.readouterr().err
+        == "error: --lerobot-version: this option does not apply to a RoboCAS folder. Omit it.\n"
+    )
 
 
 def shrink(path, size):
@@ -200,7 +203,7 @@ def test_cameras_of_a_folder_may_differ_in_size(dataset, tmp_path):
     assert len(convert_lerobot(ConversionSettings(dataset, tmp_path / "out")).episodes) == 2
 
 
-def sides_of(root):
+def splits_of(root):
     settings = LeRobotDataset(root).settings
     return settings["train_eps"], settings["val_eps"]
 
@@ -212,21 +215,21 @@ def test_the_split_is_the_folders_own(tmp_path):
     convert_lerobot(ConversionSettings(root, tmp_path / "before", include_failed=True))
     resplit(root, SplitOptions(0.5))
     train, val = Dataset(root).splits
-    assert sides_of(tmp_path / "before") != (train, val)  # that of the rule alone
+    assert splits_of(tmp_path / "before") != (train, val)  # that of the rule alone
     convert_lerobot(ConversionSettings(root, tmp_path / "all", include_failed=True))
-    assert sides_of(tmp_path / "all") == (train, val)
+    assert splits_of(tmp_path / "all") == (train, val)
     convert_lerobot(ConversionSettings(root, tmp_path / "good"))  # without episode 2: numbers move up
     dataset = LeRobotDataset(tmp_path / "good")
     assert [entry["source"] for entry in dataset.settings["episodes"]] == [0, 1, 3, 4, 5]
     moved = [[n - (n > 2) for n in side if n != 2] for side in (train, val)]
-    assert list(sides_of(tmp_path / "good")) == moved
+    assert list(splits_of(tmp_path / "good")) == moved
     assert check_lerobot(tmp_path / "good").violations == []
     edit(root / "data_info.json", lambda c: c.update(train_eps=[0, 1], val_eps=[2, 3]))
     convert_lerobot(ConversionSettings(root, tmp_path / "some", include_failed=True))
-    assert sides_of(tmp_path / "some") == ([0, 1, 4, 5], [2, 3])  # those that no side lists train
+    assert splits_of(tmp_path / "some") == ([0, 1, 4, 5], [2, 3])  # unlisted episodes are for training
     (root / "data_info.json").unlink()
     convert_lerobot(ConversionSettings(root, tmp_path / "none", include_failed=True))
-    assert sides_of(tmp_path / "none") == split_by_seed({n: n for n in range(6)})
+    assert splits_of(tmp_path / "none") == split_by_seed({n: n for n in range(6)})
 
 
 @pytest.mark.parametrize(("array", "value"), [("ee_pos", np.nan), ("gripper_width", -np.inf)])

@@ -80,7 +80,7 @@ def test_other_types_and_axes(upstream, made, tmp_path):
     fx, fy, cx, cy = intrinsic
     np.save(episode / "base_camera" / "intrinsic.npy", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
     np.testing.assert_array_equal(Dataset(upstream).episode(0).intrinsic("base_camera"), intrinsic)
-    assert (0, f"{NPZ}, speed", "an unknown key", "not taken") in problems(upstream, "warning")
+    assert (0, f"{NPZ}, speed", "an unknown key", "not imported") in problems(upstream, "warning")
     new = imported(upstream, tmp_path / "out")
     assert validate(new.root).violations == []
     old = arrays_of(made / "episode_0000000")
@@ -97,7 +97,7 @@ def test_pickles_are_never_loaded(upstream, tmp_path):
         _ = Dataset(upstream).episode(0).arrays
     assert (0, f"{NPZ}, robot_joints", pickled, "") in problems(upstream, "skipped")
     # Texts are in data_info.json, too.
-    assert (1, f"{NPZ}, step_lang_goals", pickled, "made of data_info.json") in problems(upstream, "repaired")
+    assert (1, f"{NPZ}, step_lang_goals", pickled, "derived from data_info.json") in problems(upstream, "repaired")
     new = imported(upstream, tmp_path / "out")
     assert new.numbers == [1]
     assert validate(new.root).violations == []
@@ -111,7 +111,7 @@ def test_relative_motion_as_the_paper_writes_it(upstream, made, tmp_path):
     np.testing.assert_allclose(
         new.episode(1).arrays["rel_pos"], arrays_of(made / "episode_0000001")["rel_pos"], atol=1e-6
     )
-    assert any("one step later" in text for text in new.episode(1).scene["source"]["repaired"])
+    assert any("moved by one step" in text for text in new.episode(1).scene["source"]["repaired"])
 
 
 def test_a_last_motion_becomes_the_identity_and_missing_velocities_are_made(upstream):
@@ -179,7 +179,7 @@ def test_a_turned_eef_frame_is_turned_back(upstream, made, tmp_path):
     [
         ({"ee_pos": np.zeros((6, 3), np.float32)}, "rel_pos", "shape (7, 3)"),
         ({"arm_joint_vel": np.zeros((6, 7), np.float32)}, "arm_joint_vel", "shape (6, 7)"),
-        ({"ee_pos": np.full((7, 3), np.nan)}, "ee_pos", "21 others"),
+        ({"ee_pos": np.full((7, 3), np.nan)}, "ee_pos", "21 NaN or infinite values"),
         ({"ee_orn": np.full((7, 4), 0.6)}, "ee_orn", "off by 0.2 in row 0"),
         ({"rel_pos": np.ones((7, 3))}, "rel_pos", "7 of 7 rows off"),
         ({"gripper_status": np.full(7, 0.3)}, "gripper_status", "float64, not bool"),
@@ -207,7 +207,7 @@ def test_arrays_that_can_not_be_made_are_told(upstream, tmp_path):
     new = imported(upstream, tmp_path / "out")
     missing = ["robot_joints", "arm_joint_vel", "base_pos", "agv_pose", "rel_agv_pose"]
     assert new.episode(1).scene["source"]["missing"] == missing
-    assert (1, f"{NPZ}, base_pos", "no such key", "it can't be made") in problems(upstream, "warning")
+    assert (1, f"{NPZ}, base_pos", "no such key", "can't be derived") in problems(upstream, "warning")
     assert {violation.key for violation in validate(new.root).violations} == set(missing)
 
 
@@ -221,8 +221,8 @@ def test_embeddings_of_all_or_none_or_made(dataset, made, tmp_path):
     (dataset / "conversion.json").unlink()
     assert imported(dataset, tmp_path / "all").settings["embeddings"] is True
     change(dataset / "episode_0000000", language_embedding=np.ones(512, np.float32))
-    assert (0, f"{NPZ}, language_embedding", "shape (512,)", "not taken") in problems(dataset, "warning")
-    assert (None, f"{NPZ}, embeddings", "1 episode without", "not taken") in problems(dataset, "repaired")
+    assert (0, f"{NPZ}, language_embedding", "shape (512,)", "not imported") in problems(dataset, "warning")
+    assert (None, f"{NPZ}, embeddings", "1 episode without", "not imported") in problems(dataset, "repaired")
     assert imported(dataset, tmp_path / "none").settings["embeddings"] is False
     assert validate(tmp_path / "none").violations == []
     import_robocas(survey(dataset), tmp_path / "made", embed=embed)

@@ -79,7 +79,7 @@ def test_where_a_merged_episode_had_been_before_is_kept(parts, tmp_path):
 def test_duplicates(parts, tmp_path):
     a, b = parts
     merge([a, b], tmp_path / "ab")
-    with pytest.raises(DatasetError, match="the same recording twice .found 2: b 0 = ab 2, b 1 = ab 3.*--skip-dup"):
+    with pytest.raises(DatasetError, match="duplicate recordings .found 2: b 0 = ab 2, b 1 = ab 3.*--skip-dup"):
         merge([b, tmp_path / "ab"], tmp_path / "out")
     assert not (tmp_path / "out").exists()
     done = merge([b, tmp_path / "ab"], tmp_path / "out", skip_duplicates=True)
@@ -93,7 +93,7 @@ def test_duplicates_of_unknown_recordings_are_told_by_their_arrays(parts, tmp_pa
     first = spoiled(parts[0], tmp_path)
     edit(first / "conversion.json", lambda c: [e.update(recording=None) for e in c["episodes"].values()])
     second = shutil.copytree(first, tmp_path / "again")
-    with pytest.raises(DatasetError, match="the same recording twice .found 2"):
+    with pytest.raises(DatasetError, match="duplicate recordings .found 2"):
         merge([first, second], tmp_path / "out")
 
 
@@ -102,18 +102,30 @@ def in_conversion(change):
 
 
 UNFIT = {  # what is wrong with one of the datasets -> (how it comes about, what the message says)
-    "an older schema": (in_conversion(lambda c: c.pop("schema_version")), "again from its recording"),
+    "an older schema": (in_conversion(lambda c: c.pop("schema_version")), "Convert the recording again"),
     "RoboCAS-v0": (lambda part: (part / "conversion.json").unlink(), "import-robocas"),
-    "a newer schema": (in_conversion(lambda c: c.update(schema_version=3)), "newer robocas"),
-    "an episode of an older schema": (lambda part: (part / "episode_0000001/scene.json").unlink(), "an episode of"),
-    "other settings": (in_conversion(lambda c: c.update(rate_hz=10.0)), "other settings"),
-    "an episode is gone": (lambda part: shutil.rmtree(part / "episode_0000001"), "not the episodes on disk"),
-    "no overview": (lambda part: (part / "data_info.json").unlink(), "not finished"),
-    "an unlisted episode": (in_conversion(lambda c: c["episodes"].pop("1")), "not listed"),
+    "a newer schema": (in_conversion(lambda c: c.update(schema_version=3)), "Update robocas_ms3"),
+    "an episode of an older schema": (
+        lambda part: (part / "episode_0000001/scene.json").unlink(),
+        "an episode with another schema",
+    ),
+    "other settings": (in_conversion(lambda c: c.update(rate_hz=10.0)), "settings of the datasets differ"),
+    "an episode is gone": (
+        lambda part: shutil.rmtree(part / "episode_0000001"),
+        "listed episodes differ from those on disk",
+    ),
+    "no overview": (lambda part: (part / "data_info.json").unlink(), "this dataset is unfinished"),
+    "an unlisted episode": (in_conversion(lambda c: c["episodes"].pop("1")), "episodes without an entry"),
     "nothing": (shutil.rmtree, "no dataset here"),
-    "a split of texts": (lambda part: edit(part / "data_info.json", lambda c: c.update(val_eps=["x"])), "damaged"),
-    "a split of flags": (lambda part: edit(part / "data_info.json", lambda c: c.update(val_eps=[True])), "damaged"),
-    "no split": (lambda part: edit(part / "data_info.json", lambda c: c.update(val_eps=None)), "damaged"),
+    "a split of texts": (
+        lambda part: edit(part / "data_info.json", lambda c: c.update(val_eps=["x"])),
+        "invalid value",
+    ),
+    "a split of flags": (
+        lambda part: edit(part / "data_info.json", lambda c: c.update(val_eps=[True])),
+        "invalid value",
+    ),
+    "no split": (lambda part: edit(part / "data_info.json", lambda c: c.update(val_eps=None)), "invalid value"),
 }
 
 
@@ -186,7 +198,7 @@ def test_the_output(parts, tmp_path):
     a, b = parts
     before = files_of(a)
     for out in (a, a / "inside", a.parent):
-        with pytest.raises(DatasetError, match="the output is an input"):
+        with pytest.raises(DatasetError, match="the output folder overlaps an input"):
             merge([a, b], out, options=CopyOptions(overwrite=True))
     assert files_of(a) == before
     merge([a], tmp_path / "out")
@@ -211,12 +223,12 @@ def test_command(parts, tmp_path, capsys):
     assert run(words) == 1
     assert capsys.readouterr().err.startswith("error: ")
     assert run([*words, "--skip-duplicates", "--copy"]) == 0
-    assert "4 episodes, 0 files linked, 212 copied, 2 duplicates left out" in capsys.readouterr().out
+    assert "4 episodes, 0 files linked, 212 copied, 2 duplicates skipped" in capsys.readouterr().out
 
 
 def test_the_command_wants_datasets(tmp_path, capsys):
     assert run(["merge", "--out", str(tmp_path / "out")]) == 1
-    assert "nothing to merge" in capsys.readouterr().err
+    assert "no datasets to merge" in capsys.readouterr().err
 
 
 def test_a_merged_dataset_can_be_appended_to(parts, tmp_path):

@@ -72,9 +72,9 @@ def test_images_that_are_missing_damaged_or_of_another_kind(copy, tmp_path):
     for path in (copy / "episode_0000000").glob("*/depth/*.png"):
         cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.uint8))
     assert problems(copy, "skipped") == [
-        *((0, f"{name}_camera/depth/0000.png", "64 x 48, 1 x 8 bit", "and 6 others") for name in NAMES),
-        (1, "base_camera/rgb/0002.png", "no file", "and 1 other"),
-        (2, "static_camera/depth/0000.png", "no file", "and 6 others"),
+        *((0, f"{name}_camera/depth/0000.png", "64 x 48, 1 x 8 bit", "and 6 more") for name in NAMES),
+        (1, "base_camera/rgb/0002.png", "no file", "and 1 more"),
+        (2, "static_camera/depth/0000.png", "no file", "and 6 more"),
     ]
     assert (3, "gripper_camera/depth/0007.png", "an additional file", "") in problems(copy, "warning")
     new = imported(copy, tmp_path / "out")
@@ -103,7 +103,7 @@ def test_cameras(copy, tmp_path):
     assert [(episode, file) for episode, file, *_ in found] == [
         (0, "base_camera"), (1, "base_camera"), (2, "static_camera")
     ]  # fmt: skip
-    assert [text for *_, text, _ in found[1:]] == ["no pose of this camera", "another matrix"]
+    assert [text for *_, text, _ in found[1:]] == ["missing pose of a camera", "another matrix"]
 
 
 def test_rgb_alone_and_fewer_cameras(copy, tmp_path):
@@ -123,11 +123,11 @@ def test_the_overview(copy, tmp_path):
     edit(copy / "data_info.json", spoil)
     found = [(episode, text) for episode, _, text, _ in problems(copy, "repaired") if episode is not None]
     assert found == [
-        (0, "an episode twice"),
+        (0, "a repeated episode"),
         (0, "7"),
-        (1, "an episode that is not listed"),
+        (1, "an unlisted episode"),
         (2, "'grasp the cube 2 on the table and move it to the basket'"),
-        (3, "an episode that is not listed"),
+        (3, "an unlisted episode"),
         (7, "an episode without a folder"),
     ]
     new = imported(copy, tmp_path / "out")

@@ -144,7 +144,7 @@ def test_the_default_folder_is_next_to_a_trajectory(trajectory, tmp_path):
 
 def test_damaged_scene(told):
     (told / "episode_0000001/scene.json").write_text('{"layout": {"object_ids": 3}}')
-    with pytest.raises(DatasetError, match=r"episode_0000001/scene\.json: this description of a scene is damaged"):
+    with pytest.raises(DatasetError, match=r"episode_0000001/scene\.json: invalid description of a scene"):
         collect(told)
 
 
@@ -158,7 +158,7 @@ def test_actions_that_are_none(told, key, value):
 def test_no_episodes(told):
     info = {"train_eps": [], "val_eps": [], "ep_length": {}}
     (told / "data_info.json").write_text(json.dumps(info))
-    with pytest.raises(DatasetError, match="no episodes to count"):
+    with pytest.raises(DatasetError, match="this dataset has no episodes"):
         collect(told)
 
 
