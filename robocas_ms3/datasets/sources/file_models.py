@@ -94,7 +94,7 @@ class _Recovery(_Part):
     reason: str
 
 
-class Recorded(_Part):
+class RecordedDetails(_Part):
     """Content of ``recorded``."""
 
     instruction_template: str | None = None
@@ -189,7 +189,7 @@ class SceneRecord(_Part):
     source: _Source = Field(
         description="{trajectory, episode_id, recording: SHA-256 of seed, control mode, instruction and actions}"
     )
-    recorded: Recorded | None = Field(
+    recorded: RecordedDetails | None = Field(
         description="reported by the generator: template, relation, facts, attempts, seconds"
     )
     versions: dict[str, Any] | None = Field(description="{package: version} at the time of the recording")
