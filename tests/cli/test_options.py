@@ -1,4 +1,4 @@
-"""Code that a command calls may change the working directory: paths were made absolute when the command started."""
+"""Paths of options become absolute at the start of a command, because libraries may change the working directory."""
 
 import os
 from dataclasses import dataclass, field
@@ -33,7 +33,7 @@ def test_all_paths_of_a_command_are_absolute(tmp_path, monkeypatch):
     assert (os.environ[CACHE], DATA in os.environ) == (str(tmp_path / "cache"), False)
 
 
-def test_a_working_directory_that_was_removed(tmp_path, monkeypatch):
+def test_deleted_working_directory_is_an_error(tmp_path, monkeypatch):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     (tmp_path / "here").rmdir()

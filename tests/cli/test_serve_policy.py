@@ -27,21 +27,21 @@ class Up:
 
 @contextmanager
 def serving(policy, folder, *options):
-    """The command at work, and the address that it says."""
+    """Start the command; yield its process and the address that it prints."""
     words = [sys.executable, ROOT / "robocas_cli.py", "serve-policy", policy, "--port", "0", *options]
     where = {"PYTHONPATH": f"{folder}{os.pathsep}{os.environ.get('PYTHONPATH', ROOT)}"}
     served = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | where)
     try:
         assert served.stdout is not None
-        said = served.stdout.readline()
-        assert said.startswith(f"{policy} at ws://127.0.0.1:")
-        yield served, said.split()[-1]
+        line = served.stdout.readline()
+        assert line.startswith(f"{policy} at ws://127.0.0.1:")
+        yield served, line.split()[-1]
     finally:
         served.kill()
         served.communicate()
 
 
-def test_a_policy_of_ones_own_is_served_until_ctrl_c(tmp_path):
+def test_own_policy_is_served_until_ctrl_c(tmp_path):
     from robocas_ms3.evaluation.policy import policy_spec_values
     from robocas_ms3.evaluation.remote.client import RemotePolicy
 
@@ -69,7 +69,7 @@ class Slow:
 """
 
 
-def test_ctrl_c_ends_a_policy_that_computes(tmp_path):
+def test_ctrl_c_ends_a_busy_policy(tmp_path):
     from websockets.sync.client import connect
 
     from robocas_ms3.evaluation.remote.wire import pack
@@ -88,7 +88,7 @@ def observation():
     return {f"observation/{name}": np.zeros(size, np.float32) for name, size in sizes.items()}
 
 
-def test_the_size_of_batches_is_announced(tmp_path):
+def test_batch_size_is_sent_to_clients(tmp_path):
     from websockets.sync.client import connect
 
     from robocas_ms3.evaluation.remote.wire import unpack
@@ -98,6 +98,6 @@ def test_the_size_of_batches_is_announced(tmp_path):
 
 
 @pytest.mark.parametrize(("option", "value"), [("--port", "99999"), ("--max-batch", "0"), ("--max-batch", "257")])
-def test_an_option_out_of_range(capsys, option, value):
+def test_option_out_of_range(capsys, option, value):
     assert run(["serve-policy", "noop", option, value]) == 2
     assert capsys.readouterr().err.startswith(f"error: {option}: ")

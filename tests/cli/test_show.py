@@ -6,11 +6,11 @@ from robocas_ms3.cli.main import run
 from robocas_ms3.cli.show import Show
 
 
-def test_shaders_are_maniskills():
+def test_shaders_exist_in_maniskill():
     assert set(get_args(get_type_hints(Show)["shader"])) == PREBUILT_SHADER_CONFIGS.keys()
 
 
-def test_ray_tracing_without_a_gpu_is_refused(tmp_path, monkeypatch, capsys):
+def test_ray_tracing_without_a_gpu_is_an_error(tmp_path, monkeypatch, capsys):
     def none(name):
         raise RuntimeError(f'failed to find device "{name}"')
 

@@ -1,4 +1,4 @@
-"""What comes from data moves no cursor and changes no colours, wherever a command prints it."""
+"""Control characters in data are printed as escapes by all commands."""
 
 import io
 import subprocess
@@ -20,11 +20,11 @@ SHOWN = "a\\u001b[2J\\u009b31m\\u202eb"
 
 
 def controls(text: str) -> set[str]:
-    """Characters of a text that are not printable, but for line breaks."""
+    """Return the unprintable characters of a text, except line breaks."""
     return {character for character in text if not character.isprintable()} - {"\n"}
 
 
-def test_a_line_is_one_line(capsys):
+def test_print_line_prints_one_line(capsys):
     print_line(HOSTILE)
     print_stderr(HOSTILE)
     shown = capsys.readouterr()
@@ -33,7 +33,7 @@ def test_a_line_is_one_line(capsys):
     assert capsys.readouterr().out == f"one\n{SHOWN}\\u001b\ntwo\n"
 
 
-def test_a_pipe_that_nobody_reads():
+def test_closed_pipe():
     class Closed(io.StringIO):
         def write(self, _text):
             raise BrokenPipeError
@@ -42,7 +42,7 @@ def test_a_pipe_that_nobody_reads():
         console(file=Closed()).print("a line")
 
 
-def test_tables_titles_and_styled_texts():
+def test_tables():
     file = io.StringIO()
     table = Table(HOSTILE, title=HOSTILE)
     table.add_row(HOSTILE)
@@ -53,7 +53,7 @@ def test_tables_titles_and_styled_texts():
     assert file.getvalue().count("c[bold]d[/e] :smile:") == 6
 
 
-def test_bars_and_their_notes(monkeypatch):
+def test_progress_bars(monkeypatch):
     file = io.StringIO()
     made = console(file=file, force_terminal=True, width=200, color_system=None)
     monkeypatch.setattr(progress, "terminal_of_stderr", lambda: made)
@@ -67,7 +67,7 @@ def test_bars_and_their_notes(monkeypatch):
 
 
 @pytest.mark.parametrize("error", [RobocasError(HOSTILE, where=HOSTILE, found=HOSTILE), DocumentError(HOSTILE)])
-def test_an_error_is_one_line(monkeypatch, capsys, error):
+def test_error_is_one_line(monkeypatch, capsys, error):
     def main(cfg: List) -> int:
         raise error
 

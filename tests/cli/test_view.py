@@ -1,4 +1,4 @@
-"""`robocas view` as a program: serves until Ctrl-C, writes a folder, refuses what it did not make."""
+"""`robocas view`: serve a page until Ctrl-C, or write it to a folder."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def trajectory(tmp_path_factory):
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
-def test_it_serves_until_it_is_interrupted(trajectory, ending):
+def test_page_is_served_until_interrupted(trajectory, ending):
     words = [sys.executable, str(ROOT / "robocas_cli.py"), "view", str(trajectory), "--no-open"]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as process:
@@ -41,7 +41,7 @@ def test_it_serves_until_it_is_interrupted(trajectory, ending):
     assert (process.returncode, out, err) == (0, "stopped\n", "")
 
 
-def test_it_writes_a_folder(trajectory, tmp_path, capsys):
+def test_static_page(trajectory, tmp_path, capsys):
     out = tmp_path / "page"
     assert run(["view", str(trajectory), "--static", str(out)]) == 0
     assert capsys.readouterr().out.strip() == f"2 episodes: {out / 'index.html'}"
@@ -52,14 +52,14 @@ def test_it_writes_a_folder(trajectory, tmp_path, capsys):
     assert sorted(path.name for path in (out / "data").iterdir()) == ["episode_1.js", "index.js"]
 
 
-def test_it_replaces_only_what_it_made(trajectory, tmp_path, capsys):
+def test_overwrite_replaces_only_static_pages(trajectory, tmp_path, capsys):
     (tmp_path / "notes.txt").write_text("mine")
     assert run(["view", str(trajectory), "--static", str(tmp_path), "--overwrite"]) == 1
     assert "refusing to replace" in capsys.readouterr().err
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
-def test_an_episode_that_there_is_not_is_one_line(trajectory, tmp_path, capsys):
+def test_unknown_episode_is_one_line(trajectory, tmp_path, capsys):
     assert run(["view", str(trajectory), "--static", str(tmp_path / "x"), "--episodes", "7"]) == 1
     (error,) = capsys.readouterr().err.splitlines()
     assert "no such episode" in error

@@ -1,4 +1,4 @@
-"""Tests marked `faults` run real commands for hours: only where they are asked for, as scripts/faults.sh does."""
+"""Select tests marked `faults`, which take hours, only with `-m faults`, as scripts/faults.sh does."""
 
 
 def pytest_collection_modifyitems(config, items):

@@ -1,4 +1,4 @@
-"""Damaged files of a cache, a ledger, arrays and a training: read, made again or refused."""
+"""Damaged files of layout caches, JSON lines, arrays and training runs are repaired, skipped or an error."""
 
 import json
 import shutil
@@ -29,7 +29,7 @@ from robocas_ms3.scenes.model import SceneModel
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
-    """A cache whose layouts are drawn at no cost: all the same one."""
+    """A layout cache with a constant layout, which takes no time to sample."""
     pack = load_pack("builtin")
     cache = LayoutCache(SceneModel.load(load_task_config("pick_table_scattered"), pack, pack), tmp_path)
     poses = np.stack([from_xyz_yaw(0.1 * i, 0.2, 0.6, i) for i in range(3)])
@@ -40,7 +40,7 @@ def cache(tmp_path, monkeypatch):
     return cache
 
 
-def test_a_damaged_layout_of_a_cache_is_made_again(cache):
+def test_damaged_layout_of_a_cache_is_sampled_again(cache):
     made = cache.get(0, 0)
     path = cache.path(0, 0)
     whole = path.read_bytes()
@@ -51,7 +51,7 @@ def test_a_damaged_layout_of_a_cache_is_made_again(cache):
         assert np.array_equal(again.object_poses, made.object_poses), seed
 
 
-def test_caches_with_damaged_notes_are_listed(cache, capsys):
+def test_caches_with_damaged_description_are_listed(cache, capsys):
     cache.get(0, 0)
     path = cache.folder / ABOUT
     whole = json.loads(path.read_text())
@@ -79,7 +79,7 @@ LINE = st.fixed_dictionaries({"seed": JSON}, optional={"more": JSON, "seconds": 
 
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(lines=st.lists(st.binary(max_size=20) | JSON | LINE, max_size=5))
-def test_ledgers(tmp_path_factory, lines):
+def test_json_lines(tmp_path_factory, lines):
     ledger: JsonLinesFile[Try] = JsonLinesFile(tmp_path_factory.mktemp("ledger") / "tries.jsonl", Try)
     texts = [line if isinstance(line, bytes) else json.dumps(line).encode() for line in lines]
     ledger.path.write_bytes(b"\n".join(texts))
@@ -96,12 +96,12 @@ FAILURE = {"seed": 1, "attempt": 0, "stage": "a", "reason": "b", "seconds": 1.0}
 
 
 @pytest.mark.parametrize("changes", [{"attempt": -2}, {"seed": 2**62}, {"seconds": 1e308}, {"seconds": True}])
-def test_a_failure_out_of_range_is_no_failure(tmp_path, changes):
+def test_failed_attempt_out_of_range_is_skipped(tmp_path, changes):
     (tmp_path / "failures.jsonl").write_text(json.dumps({**FAILURE, **changes}) + "\n")
     assert JsonLinesFile(tmp_path / "failures.jsonl", FailedAttempt).read() == []
 
 
-def test_arrays_that_unpack_to_more_than_there_may_be(tmp_path, monkeypatch):
+def test_arrays_over_the_size_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(documents, "ARRAYS_LIMIT", 2**20)
     path = tmp_path / "annotations.npz"
     np.savez_compressed(path, zeros=np.zeros(2**20))
@@ -115,7 +115,7 @@ def test_arrays_that_unpack_to_more_than_there_may_be(tmp_path, monkeypatch):
         Annotations.load(path)
 
 
-def test_facts_and_checkpoints_of_a_training(tmp_path):
+def test_facts_and_checkpoints_of_a_run(tmp_path):
     torch = pytest.importorskip("torch", reason="needs torch")
     from safetensors.torch import save_file
 

@@ -1,4 +1,4 @@
-"""Whatever files of others hold, there is an answer or one of our errors, of one line."""
+"""Readers of randomly changed files return a result or raise a RobocasError of one line."""
 
 import json
 import shutil
@@ -112,7 +112,7 @@ def plan_folder(root):
 
 
 def first_seed(folder):
-    """Files of the first seed of the unit that is started."""
+    """Return the files of the first seed of the started work unit."""
     return folder.files(STARTED, STARTED.seeds(folder.plan)[0]).folder
 
 
@@ -166,7 +166,7 @@ def read_dataset(root):
 
 
 def read_recording(root):
-    """Everything that a conversion, statistics, the viewer and a replay read."""
+    """Read a recording as conversion, statistics, viewer and replay do."""
     path = root / "trajectory.h5"
     with TrajectoryFile(path) as file:
         for index in range(len(file.episodes)):
@@ -184,7 +184,7 @@ def read_recording(root):
 
 
 def show_page(root):
-    """Everything that the viewer serves but images: a damaged episode costs no other."""
+    """Request all answers of the viewer except images."""
     routes = Routes(open_page(root))
     assert routes.respond("/data/index.js").status == 200
     for number in (0, 1):
@@ -247,7 +247,7 @@ def read_frozen(root):
 
 
 ROBOCAS_FILES = ("data_info.json", "conversion.json", "episode_0000000/scene.json")
-TABLE = [  # writer, file, reader, how many kinds of damage, how many of them are refused at least
+CASES = [  # writer, file, reader, number of changed files, least number of errors
     *((write_robocas, name, read, 16, 0) for read in (validate, read_dataset) for name in ROBOCAS_FILES),
     (write_robocas, "episode_0000000/episode_info.npz", read_dataset, 16, 0),
     *((write_lerobot, f"meta/{name}.json", check_lerobot, 10, 0) for name in ("info", "stats", "robocas/conversion")),
@@ -273,7 +273,7 @@ TABLE = [  # writer, file, reader, how many kinds of damage, how many of them ar
 ]
 
 
-def is_refused(read, path, case):
+def raises_error(read, path, case):
     try:
         read(path)
     except (RobocasError, DocumentError) as error:
@@ -286,7 +286,7 @@ def is_refused(read, path, case):
 
 @pytest.fixture(scope="module")
 def folder_of(tmp_path_factory):
-    """Writer -> a folder that it wrote."""
+    """Return a function that returns the folder of a writer; each writer runs once."""
     kept = {}
 
     def of(write):
@@ -298,19 +298,19 @@ def folder_of(tmp_path_factory):
     return of
 
 
-@pytest.mark.parametrize(("write", "name", "read", "count", "least"), TABLE)
-def test_it_is_read_or_refused(folder_of, tmp_path, write, name, read, count, least):
+@pytest.mark.parametrize(("write", "name", "read", "count", "least"), CASES)
+def test_file_is_read_or_an_error(folder_of, tmp_path, write, name, read, count, least):
     root = shutil.copytree(folder_of(write), tmp_path / "copy")
     if read is not load_pack:
-        assert not is_refused(read, root, "whole")
-    whole, refused = (root / name).read_bytes(), 0
+        assert not raises_error(read, root, "whole")
+    whole, errors = (root / name).read_bytes(), 0
     for seed in range(count):
         (root / name).write_bytes(damage(name, whole, seed))
-        refused += is_refused(read, root, seed)
-    assert refused >= least
+        errors += raises_error(read, root, seed)
+    assert errors >= least
 
 
-def test_damage_of_images_and_arrays_is_found(folder_of, tmp_path):
+def test_damaged_images_and_arrays_are_violations(folder_of, tmp_path):
     root = shutil.copytree(folder_of(write_robocas), tmp_path / "copy")
     for name in ("episode_info.npz", "base_camera/intrinsic.npy", "base_camera/rgb/0001.png"):
         path = root / "episode_0000000" / name
