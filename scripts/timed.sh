@@ -1,10 +1,10 @@
-# Sourced by other scripts: `timed COMMAND VERB ...` runs that, and says how many minutes it took; or that the script can go on.
+# Sourced by other scripts: `timed COMMAND VERB ...` runs the command and prints its minutes, or its exit status.
 timed() {
-    local begun=$SECONDS status=0
+    local start=$SECONDS status=0
     "$@" || status=$?
     if ((status)); then
-        printf '%s: %s ended with %d; what is there is kept, and the same call goes on from it\n' "$(basename "$0" .sh)" "$2" "$status" >&2
+        printf '%s: error: %s exited with status %d; call the script again to continue\n' "$(basename "$0" .sh)" "$2" "$status" >&2
         exit "$status"
     fi
-    printf '%s: %s: %d min\n' "$(basename "$0" .sh)" "$2" $(((SECONDS - begun + 30) / 60))
+    printf '%s: %s: %d min\n' "$(basename "$0" .sh)" "$2" $(((SECONDS - start + 30) / 60))
 }

@@ -1,15 +1,15 @@
 #!/usr/bin/env bash
-# Trains LeRobot's own ACT or diffusion policy, by lerobot-train, on a dataset of `robocas convert --to lerobot`.
+# Trains LeRobot's ACT or diffusion policy with lerobot-train on a dataset of `robocas convert --to lerobot`.
 #
 #   bash scripts/train_lerobot.sh act|diffusion DATASET OUT [STEPS] [--OPTION=VALUE ...]
 #
-# Options are those of lerobot-train, and win over the sizes below, which suit a CPU: --policy.device=cuda,
-# --batch_size=64, --policy.dim_model=512 ... With --no-language as the first of them the policy isn't told what to do.
-# An OUT that has a checkpoint goes on from it, to STEPS, with the settings it was begun with.
+# Options are passed to lerobot-train and override the sizes below, which suit a CPU: --policy.device=cuda,
+# --batch_size=64, --policy.dim_model=512 ... With --no-language as the first option the policy gets no instruction.
+# If OUT has a checkpoint, the training continues from it to STEPS, with the settings that it was started with.
 #
-#   OUT/asked     what it was begun with: another policy or dataset is refused
-#   OUT/dataset   the dataset as the policy socket shows things (robocas_ms3.baselines.lerobot.prepare)
-#   OUT/train     of lerobot-train; scripts/serve_lerobot.sh OUT serves its last checkpoint
+#   OUT/settings.txt   policy, dataset and language of the training; others are refused
+#   OUT/dataset        dataset reduced to what the policy socket sends (robocas_ms3.baselines.lerobot.prepare)
+#   OUT/train          output of lerobot-train; scripts/serve_lerobot.sh OUT serves its last checkpoint
 #
 # Runs in LeRobot's environment, see lerobot_environment.sh.
 set -euo pipefail
@@ -26,7 +26,7 @@ language=()
 if [ "${1:-}" = --no-language ]; then language=(--no-language) && shift; fi
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
-# Chunks of 2 s at 5 Hz, half of it played. No pretrained weights: nothing is fetched from a hub.
+# Chunks of 2 s at 5 Hz, of which half is executed. No pretrained weights: nothing is downloaded from a model hub.
 act=(--policy.chunk_size=10 --policy.n_action_steps=5 --policy.dim_model=256 --policy.n_heads=4
     --policy.dim_feedforward=1024 --policy.optimizer_lr=1e-4 --policy.optimizer_lr_backbone=1e-4
     --policy.pretrained_backbone_weights=null)
@@ -39,27 +39,27 @@ diffusion) sizes=("${diffusion[@]}") ;;
 *) usage ;;
 esac
 
-asked="$kind $(sha256sum <"$dataset/meta/info.json" | cut -c 1-16) ${language[*]}"
-if [ -f "$out/asked" ] && [ "$(cat "$out/asked")" != "$asked" ]; then
-    echo "$out: begun as '$(cat "$out/asked")' (policy, dataset, language), not '$asked'. Name another OUT." >&2
+settings="$kind $(sha256sum <"$dataset/meta/info.json" | cut -c 1-16) ${language[*]}"
+if [ -f "$out/settings.txt" ] && [ "$(cat "$out/settings.txt")" != "$settings" ]; then
+    echo "$out: expected '$(cat "$out/settings.txt")' (policy, dataset, language), found '$settings'; choose another OUT" >&2
     exit 2
 fi
-if [ -d "$out/dataset" ] && [ ! -f "$out/asked" ]; then
-    echo "$out/dataset: of what, is not said. Remove it, or name another OUT." >&2
+if [ -d "$out/dataset" ] && [ ! -f "$out/settings.txt" ]; then
+    echo "$out/dataset: unknown dataset without settings.txt; remove it, or choose another OUT" >&2
     exit 2
 fi
-echo "$asked" >"$out/asked"
+echo "$settings" >"$out/settings.txt"
 
 . scripts/lerobot_environment.sh
 if [ ! -d "$out/dataset" ]; then
     "$venv/bin/python" -m robocas_ms3.baselines.lerobot.prepare "$dataset" "$out/dataset" "${language[@]}"
 fi
-begun=$out/train/checkpoints/last/pretrained_model/train_config.json
-if [ -f "$begun" ]; then
-    exec "$venv/bin/lerobot-train" "--config_path=$begun" --resume=true "--steps=$steps" "$@"
+started=$out/train/checkpoints/last/pretrained_model/train_config.json
+if [ -f "$started" ]; then
+    exec "$venv/bin/lerobot-train" "--config_path=$started" --resume=true "--steps=$steps" "$@"
 fi
-if [ -e "$out/train" ]; then # lerobot-train wants to make it
-    echo "$out/train: there already, without a checkpoint to go on from. Remove it, or name another OUT." >&2
+if [ -e "$out/train" ]; then # lerobot-train creates this folder
+    echo "$out/train: exists without a checkpoint; remove it, or choose another OUT" >&2
     exit 2
 fi
 exec "$venv/bin/lerobot-train" "--policy.type=$kind" "${sizes[@]}" --policy.device=cpu --policy.push_to_hub=false \

@@ -103,12 +103,12 @@ def test_study_trains_on_the_dataset_or_on_a_fraction(tmp_path, what):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["study_small.sh", "nowhere"], "nowhere: no data; bash scripts/reproduce_small.sh pick nowhere makes it"),
-        (["reproduce_small.sh"], "which task?"),
-        (["reproduce_small.sh", "open_pick"], "which task?"),
+        (["study_small.sh", "nowhere"], "nowhere: no dataset; make it: bash scripts/reproduce_small.sh pick nowhere"),
+        (["reproduce_small.sh"], "invalid task ''"),
+        (["reproduce_small.sh", "open_pick"], "invalid task 'open_pick'"),
         (
             ["dagger_small.sh", "pick", "nowhere"],
-            "nowhere: no run that was trained to its end; bash scripts/reproduce_small.sh pick",
+            "nowhere: no finished run; make it: bash scripts/reproduce_small.sh pick",
         ),
     ],
 )

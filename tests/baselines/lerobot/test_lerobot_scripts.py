@@ -1,4 +1,4 @@
-"""What the scripts that run LeRobot refuse before they make an environment."""
+"""Checks of the scripts that run LeRobot, before they create an environment."""
 
 import subprocess
 from pathlib import Path
@@ -15,12 +15,12 @@ def refused(folder, name, *words):
     return done.stderr
 
 
-@pytest.mark.parametrize("begun", ["diffusion 0123 ", None])
-def test_an_output_of_another_training_is_refused(tmp_path, begun):
+@pytest.mark.parametrize("settings", ["diffusion 0123 ", None])
+def test_output_folder_of_another_training_is_refused(tmp_path, settings):
     (tmp_path / "data" / "meta").mkdir(parents=True)
     (tmp_path / "data" / "meta" / "info.json").write_text("{}")
     (tmp_path / "out" / "dataset").mkdir(parents=True)
-    if begun:
-        (tmp_path / "out" / "asked").write_text(begun)
+    if settings:
+        (tmp_path / "out" / "settings.txt").write_text(settings)
     assert str(tmp_path / "out") in refused(tmp_path, "train_lerobot.sh", "act", "data", "out", "40000")
-    assert [path.name for path in (tmp_path / "out").iterdir() if path.name != "asked"] == ["dataset"]
+    assert [path.name for path in (tmp_path / "out").iterdir() if path.name != "settings.txt"] == ["dataset"]
