@@ -1,4 +1,4 @@
-"""From an asset's source to its finished files: display meshes, hulls, annotations, mass properties, quality."""
+"""Build the files of an asset from its source: visual meshes, hulls, annotations, mass properties, quality."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ from robocas_ms3.assets.physics import RigidBody
 from robocas_ms3.core.errors import AssetError
 
 SURFACE_POINTS = 1024
-GRASPS = 800  # many, since of an object on a table most are from below or blocked by neighbours
-FEW_GRASPS = 50  # with fewer, the manifest says why
-FAST, FAST_ENOUGH = 1000, 1500  # triangles: what `fast` is decimated to, and what is left as it is
+GRASPS = 800  # many, since most grasps of an object on a table are from below or blocked by neighbours
+FEW_GRASPS = 50  # with fewer grasps, the manifest has the reason
+FAST, FAST_ENOUGH = 1000, 1500  # triangles of `fast` after decimation, and the limit for no decimation
 FULL, FULL_TEXTURE = 12_000, 1024
 
 
 def build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
-    """Make an object's files in a folder and say what the manifest says of it. The same source gives the same files.
+    """Write the files of an object to a folder and return its manifest entry; deterministic.
 
-    The frame's origin becomes the centre of the mesh's bounding box.
+    The origin of the frame is moved to the centre of the mesh's bounding box.
 
     Raises:
-        AssetError: naming the object and what can't be done with it.
+        AssetError: the object cannot be built.
     """
     try:
         return _build_object(source, folder)
@@ -74,10 +74,10 @@ def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
         pieces = [piece + shift for piece in source.pieces]
         parts = Decomposition(pieces, volume_iou(closed, pieces))
     write_hulls(folder / HULLS, parts.hulls)
-    # what the simulator will load: a round thing rests differently on a facet that was rounded away
+    # hulls as the simulator loads them: rounding of the file changes the resting poses of round objects
     hulls = [hull.vertices for hull in read_hulls(folder / HULLS)]
 
-    # as the manifest has them, so that whoever measures the pack again finds the same
+    # rounded as in the manifest, so that measuring the pack again gives equal values
     center = np.array(to_tuple(closed.center_mass))
     moments, axes = principal_inertia(closed, source.mass)
     inertia = np.array(to_moments(moments))
@@ -129,7 +129,7 @@ def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
 
 
 def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
-    """Make a piece of furniture's files in a folder and say what the manifest says of it."""
+    """Write the files of furniture to a folder and return its manifest entry."""
     _write_body(source.mesh, source.pieces, folder)
     for link in source.links:
         _write_body(link.mesh, link.pieces, folder / LINKS / link.name)
@@ -160,19 +160,19 @@ def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
         origin_height=source.origin_height,
         surfaces=source.surfaces,
         inner=source.inner,
-        links=tuple(link.facts() for link in source.links),
+        links=tuple(link.to_link() for link in source.links),
         handles=source.handles,
         finishes={part: tuple(finishes) for part, finishes in source.finishes.items()},
         quality=FurnitureQuality(hull_count=1, hull_vertices=4, joints_open=None, surfaces_hold=None),
         **body,
     )
-    # of what the simulator will load, not of what it was written from
+    # measured on the files that the simulator loads
     parts = {link.name: BodyFiles(folder / LINKS / link.name) for link in asset.links}
     return asset.model_copy(update={"quality": measure_furniture(LoadedFurniture(folder, asset=asset, links=parts))})
 
 
 def write_visuals(mesh: trimesh.Trimesh, folder: Path) -> list[str]:
-    """Write a textured mesh at both levels of detail; return a line per level that kept more faces than it should."""
+    """Write a textured mesh at both levels of detail; return a note per level with more faces than the limit."""
     levels: dict[VisualLevel, tuple[int, int]] = {
         "fast": (FAST_ENOUGH if len(mesh.faces) <= FAST_ENOUGH else FAST, 512),
         "full": (FULL, FULL_TEXTURE),
@@ -188,7 +188,7 @@ def write_visuals(mesh: trimesh.Trimesh, folder: Path) -> list[str]:
 
 def _write_body(mesh: trimesh.Trimesh, pieces: list[np.ndarray], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    # One mesh serves both levels: furniture is made of loose boards and sheets, of which decimation drops some.
+    # the same mesh for both levels: decimation would drop some of the loose boards and sheets of furniture
     body = mesh if len(mesh.faces) <= FULL else to_display(mesh, triangles=FULL, texture_size=FULL_TEXTURE)
     for name in VISUALS.values():
         write_glb(body, folder / name)
@@ -196,7 +196,7 @@ def _write_body(mesh: trimesh.Trimesh, pieces: list[np.ndarray], folder: Path) -
 
 
 def _light(values: Any) -> Any:
-    """Single precision: half the size on disk, and still a thousandth of a millimetre."""
+    """Convert to single precision, which halves the file size with errors below 1e-6 m."""
     return np.asarray(values, dtype=np.float32)
 
 

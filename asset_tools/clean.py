@@ -16,23 +16,23 @@ from robocas_ms3.core.errors import AssetError
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-LOOSE = 0.02  # share of the surface below which a separate piece may be scanner dirt
-SPECK = 0.02  # of the diagonal: closed pieces of at least this size are parts, if they are near
-NEAR = 0.01  # of the diagonal: distance of a part from the bounding box of another part, at most
-STICKS_OUT = 0.05  # of the diagonal: change of the bounding box above which no piece or face is dropped
-DROPPED = 0.05  # share of the surface that dropped dirt may have, flat scraps not counted
+LOOSE = 0.02  # fraction of the surface below which a separate piece may be scanner dirt
+SPECK = 0.02  # of the diagonal: minimum size of closed pieces that are parts if they are near
+NEAR = 0.01  # of the diagonal: largest distance of a part from the bounding box of another part
+STICKS_OUT = 0.05  # of the diagonal: a piece or face that changes the bounding box by more is not dropped
+DROPPED = 0.05  # largest fraction of the surface that is dropped as dirt, not counting flat scraps
 FLAT = 0.001  # second largest over largest eigenvalue of the normals' covariance of a flat piece
-# scans are written with 5 or 6 digits, so that corners of one point may differ in the last
+# tolerance for equal vertices: files have 5 or 6 digits
 SAME = 1e-6  # of the diagonal
 
 
 @dataclass(frozen=True)
 class CleanScan:
-    """A scan without its dirt.
+    """A cleaned scan.
 
     Attributes:
-        scan: as it was, colours and all, without the faces that were dropped; all faces outwards.
-        welded: the same faces in the same order, without colours, seams closed.
+        scan: scan with its colours and outward faces, without the dropped faces.
+        welded: the same faces in the same order with merged vertices, without colours.
     """
 
     scan: trimesh.Trimesh
@@ -40,20 +40,22 @@ class CleanScan:
 
 
 def clean_scan(scan: trimesh.Trimesh, repairs: list[str]) -> CleanScan:
-    """Drop faces that are no part of the outer surface, and turn all others outwards.
+    """Drop faces that are not part of the outer surface, and orient the others outwards.
 
     Args:
-        scan: any unit; may have UV seams, which are no gaps.
-        repairs: gets a line for each thing that was mended.
+        scan: any unit; UV seams are allowed.
+        repairs: list to which a note per repair is added.
 
     Raises:
-        AssetError: no face has any size.
+        AssetError: all faces are degenerate.
     """
     welded = _welded(scan, repairs)
     a, b, c = welded.faces.T
     kept = np.flatnonzero(welded.unique_faces() & (a != b) & (b != c) & (c != a))
     if len(kept) == 0:
-        raise AssetError("the mesh has no faces of any size", expected="triangles", found=f"{len(scan.faces)} slivers")
+        raise AssetError(
+            "all faces of the mesh are degenerate", expected="triangles", found=f"{len(scan.faces)} slivers"
+        )
     if len(kept) < len(scan.faces):
         repairs.append(f"dropped {_count(len(scan.faces) - len(kept), 'double or degenerate face')}")
         welded.update_faces(kept)
@@ -67,8 +69,8 @@ def clean_scan(scan: trimesh.Trimesh, repairs: list[str]) -> CleanScan:
     welded.update_faces(outer)
     turned = _inward_faces(welded)
     if turned.any():
-        every = turned.all()
-        repairs.append("turned inside out" if every else f"turned {_count(int(turned.sum()), 'face')} outwards")
+        all_turned = turned.all()
+        repairs.append("turned inside out" if all_turned else f"turned {_count(int(turned.sum()), 'face')} outwards")
         faces = np.array(welded.faces)
         faces[turned] = faces[turned][:, ::-1]
         welded.faces = faces
@@ -77,14 +79,16 @@ def clean_scan(scan: trimesh.Trimesh, repairs: list[str]) -> CleanScan:
 
 
 def _welded(scan: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
-    """The scan's faces over vertices merged by position."""
+    """Return the scan's faces with vertices merged by position."""
     scale = 1 / (SAME * float(np.linalg.norm(np.ptp(scan.vertices[np.unique(scan.faces)], axis=0))))
     keys = np.rint(np.asarray(scan.vertices) * scale).astype(np.int64)
     _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     uv: Any = getattr(scan.visual, "uv", None)
     different = keys if uv is None else np.column_stack([keys, np.rint(np.asarray(uv) * 1e6).astype(np.int64)])
     double = len(keys) - len(np.unique(different, axis=0))
-    if double and "vertex_normals" not in scan._cache.cache:  # with normals, edges are double by right
+    if (
+        double and "vertex_normals" not in scan._cache.cache
+    ):  # with normals, duplicate vertices at sharp edges are correct
         repairs.append(f"merged {_count(double, 'duplicate vertex', 'duplicate vertices')}")
     vertices = np.asarray(scan.vertices)[first]
     return trimesh.Trimesh(vertices, inverse.reshape(-1)[scan.faces], process=False)
@@ -93,17 +97,19 @@ def _welded(scan: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
 def _outer_boundary(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, Ints]:
     """Resolve edges of more than two faces: drop inner walls and fins, and separate parts that share an edge.
 
-    The faces divide space into cells: around an edge, the sides of two neighbouring faces that look at each other
-    belong to one cell. A face of the outer surface has the unbounded cell on exactly one side.
+    The faces divide space into cells: facing sides of two neighbouring faces at an edge belong to the same cell. A face
+    of the outer surface has the unbounded cell on exactly one side.
 
     Returns:
-        Mesh of the outer faces, where no edge of a closed part has more than two faces, and their indices (K,).
+        Mesh of the outer faces, in which edges of closed parts have at most two faces, and the face indices (K,).
     """
     count = len(mesh.faces)
     edge, face = np.asarray(mesh.edges_unique_inverse), np.asarray(mesh.edges_face)
-    upwards = np.asarray(mesh.edges)[:, 0] < np.asarray(mesh.edges)[:, 1]  # whether a face runs to the higher vertex
+    upwards = (
+        np.asarray(mesh.edges)[:, 0] < np.asarray(mesh.edges)[:, 1]
+    )  # whether the face's edge runs to the vertex with the higher index
     order = _around_edges(mesh, upwards ^ _inward_faces(mesh)[face])
-    ahead, behind = 2 * face + ~upwards, 2 * face + upwards  # sides that look ahead and back; 2 f is the front of f
+    ahead, behind = 2 * face + ~upwards, 2 * face + upwards  # sides that face ahead and back; 2 f is the front of f
     one, other = _neighbours(order, edge)
     cell = _components(ahead[one], behind[other], 2 * count)
     component = _components(face[one], face[other], count)
@@ -117,7 +123,7 @@ def _outer_boundary(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, Ints]:
         if boundary.any() and _box_change(mesh, members, members[boundary]) <= STICKS_OUT:
             outside[2 * members], outside[2 * members + 1] = unbounded.T
             kept[members] = boundary
-    # corners of faces that hold the same part of the inside between them share a vertex
+    # corners of faces that enclose the same part of the inside share a vertex
     one, other = _neighbours(order[kept[face[order]]], edge)
     within = ~outside[ahead[one]]
     one, other = one[within], other[within]
@@ -131,13 +137,13 @@ def _outer_boundary(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, Ints]:
 
 
 def _around_edges(mesh: trimesh.Trimesh, outside_ahead: NDArray[np.bool_]) -> Ints:
-    """Return the order (3 F,) of half-edges by edge, and around it by the angle of their faces.
+    """Return the order (3 F,) of half-edges by edge, and around each edge by the angle of their faces.
 
-    Of two faces at one angle, one that has its outside ahead comes first: it ends a part, and the other face begins the
-    next part. Of two with one outside, the face of the larger surface is outermost.
+    If two faces have the same angle, the face with its outside ahead comes first: it ends a part, and the other face
+    starts the next part. If both have the same outside, the face of the larger surface is outermost.
 
     Args:
-        mesh: its half-edges in the order of ``mesh.edges``.
+        mesh: mesh with half-edges in the order of ``mesh.edges``.
         outside_ahead: (3 F,) whether the outside of the half-edge's face is on the side of larger angles.
     """
     vertices, edges = np.asarray(mesh.vertices), np.asarray(mesh.edges_sorted)
@@ -153,7 +159,7 @@ def _around_edges(mesh: trimesh.Trimesh, outside_ahead: NDArray[np.bool_]) -> In
 
 
 def _neighbours(order: Ints, edge: Ints) -> tuple[Ints, Ints]:
-    """Return each half-edge in an order and the next one around its edge (3 F,), without edges of one face."""
+    """Return each half-edge and the next half-edge around its edge (3 F,), without edges of a single face."""
     first = np.flatnonzero(np.diff(edge[order], prepend=-1))
     following = np.arange(1, len(order) + 1)
     following[np.append(first[1:], len(order)) - 1] = first
@@ -168,7 +174,7 @@ def _outermost_side(mesh: trimesh.Trimesh, faces: Ints) -> int:
     areas = np.linalg.norm(normals, axis=1)
     largest = int(areas.argmax())
     start = (a[largest] + b[largest] + c[largest]) / 3
-    ray = normals[largest] / areas[largest] + [0.0123, 0.0345, 0.0234]  # askew, so that it meets no edge
+    ray = normals[largest] / areas[largest] + [0.0123, 0.0345, 0.0234]  # tilted, so that it hits no edge
     slope = normals @ ray
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = ((a - start) * normals).sum(axis=1) / slope
@@ -180,27 +186,27 @@ def _outermost_side(mesh: trimesh.Trimesh, faces: Ints) -> int:
 
 
 def _box_change(mesh: trimesh.Trimesh, faces: Ints, kept: Ints) -> float:
-    """Return the change of the bounding box of faces if only some are kept, over its diagonal."""
+    """Return the relative change of the bounding box of faces if only ``kept`` faces stay."""
     corners, left = mesh.vertices[mesh.faces[faces]].reshape(-1, 3), mesh.vertices[mesh.faces[kept]].reshape(-1, 3)
     change = np.maximum(left.min(axis=0) - corners.min(axis=0), corners.max(axis=0) - left.max(axis=0))
     return float(change.max() / np.linalg.norm(np.ptp(corners, axis=0)))
 
 
 def _pieces(mesh: trimesh.Trimesh) -> Ints:
-    """Return the number of the piece (F,) of each face; edges of more than two faces connect none."""
+    """Return the piece number (F,) of each face; edges of more than two faces do not connect faces."""
     one, other = np.asarray(mesh.face_adjacency).reshape(-1, 2).T
     return _components(one, other, len(mesh.faces))
 
 
 def _components(one: Ints, other: Ints, count: int) -> Ints:
-    """Return the number of the connected component (N,) of each of N nodes, from pairs of nodes."""
+    """Return the connected component (N,) of each of N nodes from pairs of nodes."""
     graph = coo_matrix((np.ones(len(one), bool), (one, other)), shape=(count, count))
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 @dataclass(frozen=True)
 class _Pieces:
-    """The N connected pieces of a mesh: faces, bounding boxes (N, 3), shares of the surface, closed, flat."""
+    """The N connected pieces of a mesh: faces, bounding boxes (N, 3), fractions of the surface, closed, flat."""
 
     faces: list[Ints]
     low: Array
@@ -211,7 +217,7 @@ class _Pieces:
 
 
 def _object_faces(mesh: trimesh.Trimesh, repairs: list[str]) -> Ints:
-    """Return the indices of the faces that are neither dirt nor a shell inside of another piece."""
+    """Return the indices of faces that are neither dirt nor a shell inside another piece."""
     piece = _pieces(mesh)
     if piece.max() == 0:
         return np.arange(len(mesh.faces))
@@ -240,7 +246,7 @@ def _object_faces(mesh: trimesh.Trimesh, repairs: list[str]) -> Ints:
 
 
 def _measure_pieces(mesh: trimesh.Trimesh, piece: Ints) -> _Pieces:
-    """Measure the pieces of a mesh, whose numbers are given for each face (F,)."""
+    """Measure the pieces of a mesh from the piece number (F,) of each face."""
     order = np.argsort(piece, kind="stable")
     starts = np.flatnonzero(np.diff(piece[order], prepend=-1))
     triangles, normals, areas = mesh.triangles[order], np.asarray(mesh.face_normals)[order], mesh.area_faces[order]
@@ -257,10 +263,10 @@ def _measure_pieces(mesh: trimesh.Trimesh, piece: Ints) -> _Pieces:
 
 
 def _are_parts(pieces: _Pieces) -> NDArray[np.bool_]:
-    """Tell the parts of an object from scanner dirt (N,).
+    """Return which pieces are parts of the object instead of scanner dirt (N,).
 
-    Pieces of at least 2 % of the surface are parts. A smaller piece next to a part is a part as well if it is closed
-    and no speck, or sticks out. The rest is dirt. Where that is more than 5 % of the surface, its largest pieces are
+    Pieces of at least 2 % of the surface are parts. A smaller piece next to a part is also a part if it is closed and
+    not tiny, or sticks out. Other pieces are dirt. If dirt has more than 5 % of the surface, its largest pieces are
     parts. Flat scraps are always dirt.
     """
     shares = pieces.shares
@@ -283,16 +289,16 @@ def _are_parts(pieces: _Pieces) -> NDArray[np.bool_]:
     dirt = dirt[np.argsort(shares[dirt], kind="stable")]
     above = np.flatnonzero(np.cumsum(shares[dirt]) > DROPPED)
     if len(above):
-        parts[dirt[shares[dirt] > shares[dirt[above[0]]] / 2]] = True  # pieces of similar size stay together
+        parts[dirt[shares[dirt] > shares[dirt[above[0]]] / 2]] = True  # pieces of similar size are treated equally
     return parts
 
 
 def _inward_faces(mesh: trimesh.Trimesh) -> NDArray[np.bool_]:
-    """Faces to be turned so that neighbours agree and each piece has its faces outwards."""
+    """Return which faces (F,) must be flipped so that all faces are oriented outwards."""
     faces, count = np.asarray(mesh.faces), len(mesh.faces)
     links = np.asarray(mesh.face_adjacency).reshape(-1, 2)
     edges = np.asarray(mesh.face_adjacency_edges).reshape(-1, 2)
-    # two faces agree when they run along their common edge in opposite directions
+    # two faces agree if they traverse their common edge in opposite directions
     disagree = _runs_along(faces[links[:, 0]], edges) == _runs_along(faces[links[:, 1]], edges)
     turned = np.zeros(count, bool)
     graph = coo_matrix((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(count, count)).tocsr()
@@ -310,7 +316,7 @@ def _inward_faces(mesh: trimesh.Trimesh) -> NDArray[np.bool_]:
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) * np.where(turned, -1, 1)[:, None]
     middles = corners.mean(axis=1)
     sizes = np.maximum(np.bincount(piece, minlength=number), 1)
-    # about its own middle, since a piece with a hole has another volume about any other point
+    # relative to its own centre, since the volume of a piece with holes depends on the reference point
     own = np.stack([np.bincount(piece, middles[:, axis], number) / sizes for axis in range(3)], axis=1)
     volumes = np.bincount(piece, (area * (middles - own[piece])).sum(axis=1), number)
     return turned ^ (volumes < 0)[piece]
@@ -322,7 +328,7 @@ def _runs_along(faces: Ints, edges: Ints) -> NDArray[np.bool_]:
 
 
 def _shown(scan: trimesh.Trimesh, kept: Ints, turned: NDArray[np.bool_], repairs: list[str]) -> trimesh.Trimesh:
-    """The scan with some of its faces, some of them turned; its normals dropped where they don't fit the faces."""
+    """Return the scan with the kept faces, flipped where ``turned``; drop normals that do not fit the faces."""
     shown, normals = scan.copy(), scan._cache.cache.get("vertex_normals")
     shown.update_faces(kept)
     if turned.any():
@@ -339,5 +345,5 @@ def _shown(scan: trimesh.Trimesh, kept: Ints, turned: NDArray[np.bool_], repairs
     return shown
 
 
-def _count(number: int, one: str, many: str = "") -> str:
-    return f"{number} {one if number == 1 else many or one + 's'}"
+def _count(number: int, singular: str, plural: str = "") -> str:
+    return f"{number} {singular if number == 1 else plural or singular + 's'}"

@@ -1,4 +1,4 @@
-"""GLB files of meshes to look at, the same bytes every time; and what materials say."""
+"""Write GLB files of visual meshes deterministically, and read properties of materials."""
 
 from __future__ import annotations
 
@@ -22,14 +22,16 @@ JPEG_QUALITY = 88
 
 
 def write_glb(mesh: trimesh.Trimesh, path: Path | str) -> None:
-    """Write a mesh from `visual.to_display` as GLB with its texture inside as JPEG; the same mesh gives the same bytes.
+    """Write a mesh of `visual.to_display` as GLB with a JPEG texture; deterministic.
 
     Raises:
         AssetError: the mesh has no ``PBRMaterial``.
     """
     material = getattr(mesh.visual, "material", None)
     if not isinstance(material, PBRMaterial):
-        raise AssetError("can't write this mesh", where=path, expected="a PBRMaterial", fix="Use to_display first.")
+        raise AssetError(
+            "cannot write this mesh as GLB", where=path, expected="a PBRMaterial", fix="Use to_display first."
+        )
     vertices = np.asarray(mesh.vertices, dtype="<f4")
     normals = np.asarray(mesh.vertex_normals, dtype="<f4")
     indices = np.asarray(mesh.faces, dtype="<u2" if len(vertices) < 65535 else "<u4").reshape(-1)
@@ -58,7 +60,7 @@ def write_glb(mesh: trimesh.Trimesh, path: Path | str) -> None:
     tree: dict = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
     uv = getattr(mesh.visual, "uv", None)
     if material.baseColorTexture is not None and uv is not None:
-        flipped = np.column_stack([uv[:, 0], 1 - uv[:, 1]]).astype("<f4")  # glTF counts v from the top
+        flipped = np.column_stack([uv[:, 0], 1 - uv[:, 1]]).astype("<f4")  # in glTF, v = 0 is the top
         accessors.append({"bufferView": view(flipped.tobytes(), target=34962), **float_view, "type": "VEC2"})
         primitive["attributes"]["TEXCOORD_0"] = 3
         jpeg = io.BytesIO()
@@ -81,11 +83,11 @@ def write_glb(mesh: trimesh.Trimesh, path: Path | str) -> None:
 
 
 def get_roughness(material: Any) -> float:
-    """Roughness of a material, which need not say any."""
+    """Return the roughness of a material, or the default."""
     value = getattr(material, "roughnessFactor", None)
     return DEFAULT_ROUGHNESS if value is None else float(value)
 
 
 def get_rgba(color: Any) -> NDArray[np.float64]:
-    """(4,) of a colour, 0 to 255; white where there is none."""
+    """Convert a colour to RGBA (4,) in 0..255; None is white."""
     return np.asarray((255,) * 4 if color is None else to_rgba(color), dtype=float)

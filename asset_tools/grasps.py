@@ -1,4 +1,4 @@
-"""Antipodal force-closure grasps of a parallel gripper on a closed mesh, by rays and box tests; no simulator."""
+"""Sample antipodal force-closure grasps of a parallel gripper on a closed mesh, without a simulator."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 
-MAX_WIDTH = 0.074  # m between the contacts, 6 mm less than the gripper opens
+MAX_WIDTH = 0.074  # m between the contacts; the gripper opens 6 mm wider
 MIN_FRICTION, MAX_FRICTION = 0.1, 1.0
-GOOD_FRICTIONS = (0.2, 0.4)  # a grasp above either gives way to a neighbour below it
+GOOD_FRICTIONS = (0.2, 0.4)  # a grasp above a limit is dropped if a near grasp is below it
 RAYS, PAIRS, ANGLES, POINTS = 4000, 1200, 12, 3000
-JITTER = 0.4  # tangent of the cone of half of the rays; the others go straight in
-# m, the TCP beyond the contacts; the first lets thin things be taken off a table without touching it
+JITTER = 0.4  # tangent of the cone angle for half of the rays; the others follow the normal
+# m, TCP beyond the contacts; the first allows to grasp thin objects on a table without touching it
 DEPTHS = np.array([-0.004, 0.0, 0.01, 0.02])
-FINGER_HALF_WIDTH, FINGER_Z = 0.010, (-0.04, 0.0085)  # m, the fingers' flat inner faces, as in GRIPPER_BOXES
-PAD_HALF_SIZE = (0.009, 0.010)  # m, along x and z: the part of the faces that should bear on the object
-PAD_GIVE = 0.003  # m, points this close to a contact's plane count as touched
-MAX_STICKING_OUT = 0.004  # m, beyond the contacts, where a finger would touch first
+FINGER_HALF_WIDTH, FINGER_Z = 0.010, (-0.04, 0.0085)  # m, flat inner faces of the fingers, as in GRIPPER_BOXES
+PAD_HALF_SIZE = (0.009, 0.010)  # m, along x and z: contact area of the pads
+PAD_GIVE = 0.003  # m, points within this distance of a contact's plane are touched
+MAX_STICKING_OUT = 0.004  # m, largest protrusion beyond the contacts between the fingers
 MIN_PAD_SHARE = 0.15
 CHUNK = 128
 
 
 @dataclass(frozen=True)
 class Grasps:
-    """Grasps in the object's frame, each the one that adds most to those before it: good, and unlike them.
+    """Grasps in the object's frame, ordered greedily by quality and by distance from previous grasps.
 
     Attributes:
-        tcp_in_object: (G, 4, 4) TCP poses: z approach, y closing, origin midway between the finger tips; m.
-        widths: (G,) finger opening the object needs, m.
-        qualities: (G,) lowest friction coefficient that closes the grasp, at least 0.1; smaller is better.
+        tcp_in_object: (G, 4, 4) TCP poses: z approach, y closing, origin between the finger tips; m.
+        widths: (G,) required finger opening, m.
+        qualities: (G,) smallest friction coefficient for force closure, at least 0.1; smaller is better.
     """
 
     tcp_in_object: Array
@@ -47,8 +47,8 @@ class Grasps:
     def __len__(self) -> int:
         return len(self.widths)
 
-    def joined(self, more: Grasps) -> Grasps:
-        """These, then others."""
+    def concatenate(self, more: Grasps) -> Grasps:
+        """Return these grasps followed by others."""
         pairs = zip(vars(self).values(), vars(more).values(), strict=True)
         return Grasps(*(np.concatenate(pair) for pair in pairs))
 
@@ -66,26 +66,28 @@ class _Pairs:
 def sample_grasps(
     closed: trimesh.Trimesh, center_of_mass: Array, rng: np.random.Generator, *, count: int = 400
 ) -> Grasps:
-    """Find grasps that the open gripper reaches on a straight way in, spread over directions and places.
+    """Sample grasps that the open gripper reaches along a straight approach, spread over directions and positions.
 
     Args:
         closed: watertight mesh, m; may be concave.
         center_of_mass: (3,) in the mesh's frame, m.
-        rng: source of chance; the same state gives the same grasps.
-        count: how many at most.
+        rng: random generator; the same state gives the same grasps.
+        count: maximum number of grasps.
 
     Returns:
-        None to ``count`` grasps. A thing too thick everywhere has none.
+        0 to ``count`` grasps; 0 if the object is too thick everywhere.
 
     Raises:
         AssetError: the mesh is empty or not closed.
     """
     if len(closed.faces) == 0 or not closed.is_watertight:
-        raise AssetError("no closed mesh to grasp", expected="watertight", found=f"{len(closed.faces)} faces")
+        raise AssetError(
+            "cannot sample grasps on an open mesh", expected="watertight", found=f"{len(closed.faces)} faces"
+        )
     points = surface_samples(closed, POINTS, rng)[0]
     pairs = _contact_pairs(closed, rng)
     pair, rotations, depths = _reachable(pairs, points, rng)
-    limit = 30 * count  # keeps the rest quick; what is left is still dense
+    limit = 30 * count  # limits the time; the remaining candidates are still dense
     if len(pair) > limit:
         keep = np.sort(rng.choice(len(pair), limit, replace=False))
         pair, rotations, depths = pair[keep], rotations[keep], depths[keep]
@@ -95,7 +97,7 @@ def sample_grasps(
     poses[:, :3, 3] = pairs.middles[pair] + depths[:, None] * rotations[:, :, 2]
     frictions = pairs.frictions[pair]
     to_center = np.asarray(center_of_mass) - pairs.middles[pair]
-    # Weight far off the approach line twists the object in the pads; along that line it does little harm.
+    # a centre of mass far from the approach line rotates the object in the pads
     lever = np.linalg.norm(np.cross(to_center, rotations[:, :, 2]), axis=1)
     distance = np.linalg.norm(to_center, axis=1)
     scores = 0.5 * shares - 2.0 * (frictions - MIN_FRICTION) - lever / 0.15 - distance / 0.3
@@ -106,7 +108,7 @@ def sample_grasps(
 
 
 def surface_samples(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.int_]]:
-    """Points (P, 3) and their faces (P,), evenly over the area."""
+    """Sample points (P, 3) evenly over the area; return them and their faces (P,)."""
     area = np.cumsum(mesh.area_faces)
     faces = np.searchsorted(area, (np.arange(count) + rng.random(count)) / count * area[-1])
     faces = np.minimum(faces, len(area) - 1)
@@ -117,7 +119,7 @@ def surface_samples(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator)
 
 
 def _contact_pairs(mesh: trimesh.Trimesh, rng: np.random.Generator) -> _Pairs:
-    """Shoot rays into the body; where one leaves a wall, and where it leaves the object, is the other contact."""
+    """Cast rays into the body; the second contact is the exit from the first wall or from the object."""
     points, faces = surface_samples(mesh, RAYS, rng)
     normals = np.asarray(mesh.face_normals)
     u, v = _across(normals[faces])
@@ -142,7 +144,7 @@ def _contact_pairs(mesh: trimesh.Trimesh, rng: np.random.Generator) -> _Pairs:
         -np.einsum("ij,ij->i", normals[faces[ray]], axes), np.einsum("ij,ij->i", normals[hit_faces], axes)
     )
     frictions = np.maximum(np.tan(np.arccos(np.clip(cosines, 0, 1))), MIN_FRICTION)
-    # Firm pairs first, by chance within a tier, so that loose ones come in only where there is nothing else.
+    # pairs with low friction first, in random order; others are used only where no better pair exists
     order = np.lexsort((rng.random(len(keep)), frictions > GOOD_FRICTIONS[-1]))
     order = order[frictions[order] <= MAX_FRICTION][:PAIRS]
     middles = points[ray] + 0.5 * distance[:, None] * axes
@@ -150,10 +152,10 @@ def _contact_pairs(mesh: trimesh.Trimesh, rng: np.random.Generator) -> _Pairs:
 
 
 def _reachable(pairs: _Pairs, points: Array, rng: np.random.Generator) -> tuple[NDArray[np.int_], Array, Array]:
-    """Turn the gripper about each closing axis; keep poses whose open gripper, coming straight in, hits no point.
+    """Rotate the gripper about each closing axis; keep poses whose straight approach with an open gripper is free.
 
     Returns:
-        Pair of each grasp (K,), its rotation (K, 3, 3), its depth (K,).
+        Index of the pair (K,), rotation (K, 3, 3) and depth (K,) of each grasp.
     """
     count = len(pairs.widths)
     u, v = _across(pairs.axes)
@@ -169,7 +171,7 @@ def _reachable(pairs: _Pairs, points: Array, rng: np.random.Generator) -> tuple[
         x, y = np.abs(x), np.abs(y)
         free = np.ones((len(x), len(DEPTHS)), dtype=bool)
         for low, high in GRIPPER_BOXES:
-            # Whatever lies behind the front of a box is hit on the way in, so only the rearmost point counts.
+            # the box sweeps all points behind its front during the approach, so only the rearmost point matters
             inside = (x <= high[0]) & (y >= low[1]) & (y <= high[1])
             rearmost = np.where(inside, z, np.float32(np.inf)).min(axis=1)
             free &= rearmost[:, None] - DEPTHS > high[2]
@@ -181,9 +183,9 @@ def _reachable(pairs: _Pairs, points: Array, rng: np.random.Generator) -> tuple[
 def _touched(
     pairs: _Pairs, pair: NDArray[np.int_], rotations: Array, depths: Array, points: Array, area: float
 ) -> tuple[Array, Array]:
-    """Opening (K,) that each grasp needs, m, and the share (K,) of the pads that bears on the object.
+    """Return the required opening (K,) in m and the fraction (K,) of the pads in contact with the object.
 
-    The share is that of the emptier pad, and 0 where a finger would touch something else before the contacts.
+    The fraction is that of the pad with less contact, and 0 if a finger would touch another point before the contacts.
     """
     widths, shares = np.zeros(len(pair)), np.zeros(len(pair))
     expected = max(len(points) / area * 4 * PAD_HALF_SIZE[0] * PAD_HALF_SIZE[1], 2.0)
@@ -207,7 +209,7 @@ def _touched(
 
 
 def _not_dominated(poses: Array, frictions: Array) -> NDArray[np.int_]:
-    """Drop loose grasps that have a firm one nearby (some 30 deg and 2 cm)."""
+    """Return indices of grasps without a better grasp nearby (about 30 deg and 2 cm)."""
     keep = np.ones(len(poses), dtype=bool)
     places = np.concatenate([poses[:, :3, 2] / 0.5, poses[:, :3, 3] / 0.02], axis=1)
     for limit in GOOD_FRICTIONS:
@@ -218,12 +220,12 @@ def _not_dominated(poses: Array, frictions: Array) -> NDArray[np.int_]:
 
 
 def select_spread(poses: Array, scores: Array, count: int) -> NDArray[np.int_]:
-    """Pick greedily: the best score plus the distance (in approach, closing axis, place) from what was picked."""
+    """Select grasps greedily by score plus distance (approach, closing axis, position) from selected grasps."""
     closing = poses[:, :3, 1]
-    both_ways = np.einsum("ni,nj->nij", closing, closing).reshape(-1, 9)  # the same for either sign of the axis
+    both_ways = np.einsum("ni,nj->nij", closing, closing).reshape(-1, 9)  # independent of the axis' sign
     if len(poses) == 0:
         return np.zeros(0, dtype=int)
-    reach = max(0.04, float(np.ptp(poses[:, :3, 3], axis=0).max()) / 4)  # long things: directions still count
+    reach = max(0.04, float(np.ptp(poses[:, :3, 3], axis=0).max()) / 4)  # long objects: directions still matter
     places = np.concatenate([poses[:, :3, 2] / 0.4, both_ways / 0.8, poses[:, :3, 3] / reach], axis=1)
     apart, picked = np.full(len(poses), 2.0), []
     for _ in range(min(count, len(poses))):

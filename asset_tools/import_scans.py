@@ -24,24 +24,24 @@ from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset
 from robocas_ms3.core.errors import AssetError
 
-# Filled packages weigh about what water does, half-empty ones and boxes of cereal far less.
+# filled packages have about the density of water; half-empty ones and boxes of cereal far less
 DENSITY = 600.0  # kg/m3 of the whole body
 MASS_RANGE = (0.03, 0.8)  # kg
 LONGEST_ID = 50
-# mesh formats that are not read; a folder with one of them is an object, not a folder of textures
+# unsupported mesh formats; a folder with such a file is an object, not a folder of textures
 UNREAD = {".fbx", ".blend", ".usd", ".usda", ".usdc", ".usdz", ".3ds", ".max", ".ma", ".mb", ".step", ".stp", ".wrl"}
 
 
 @dataclass(frozen=True)
 class ImportSettings:
-    """How scans are read; the same for all of a folder.
+    """Settings for importing a folder of scans.
 
     Attributes:
-        units: of the files; None: guessed from all sizes together.
-        up: axis that points up in the files; None: guessed for each.
-        masses: kg by object id; others are estimated from their volume.
-        licence: of the scans.
-        attribution: whom to name.
+        units: unit of the files; None: guessed from all sizes together.
+        up: axis of the files that points up; None: guessed per scan.
+        masses: masses in kg by object id; other masses are estimated from the volume.
+        licence: licence of the scans.
+        attribution: credit for the scans.
     """
 
     units: Unit | None = None
@@ -56,9 +56,9 @@ class FoundScans:
     """The scans of a folder.
 
     Attributes:
-        models: by object id.
-        errors: why an id can't be imported.
-        skipped: what is no scan, with the reason, a line each.
+        models: models by object id.
+        errors: errors by object id.
+        skipped: entries that are not scans, with reasons, one line each.
     """
 
     models: dict[str, ModelSource] = field(default_factory=dict)
@@ -72,16 +72,16 @@ def scan_jobs(
     inspect: Inspect = inspect_models,
     on_skipped: Callable[[str], None] = lambda reason: None,
 ) -> list[AssetJob]:
-    """Return the jobs that import a folder of scans. One that can't be read is a job that fails when it is its turn.
+    """Return the jobs that import a folder of scans; an unreadable scan gives a failing job.
 
     Args:
         source: the folder.
-        settings: how scans are read.
-        inspect: looks at the models first; `inspect_models` with its options.
-        on_skipped: called with each entry of the folder that is no scan, and the reason.
+        settings: settings of the import.
+        inspect: inspects the models; `inspect_models` with its options.
+        on_skipped: called with a text for each entry that is not a scan.
 
     Raises:
-        AssetError: there are none, or masses are given for others.
+        AssetError: the folder has no scans, or masses are given for unknown scans.
     """
     scans = find_scans(source)
     for reason in scans.skipped:
@@ -90,11 +90,11 @@ def scan_jobs(
     unknown = sorted(set(settings.masses) - set(ids))
     if unknown:
         expected = f"ids among {', '.join(ids)}"
-        raise AssetError("masses are given for scans that are not there", expected=expected, found=", ".join(unknown))
+        raise AssetError("masses for unknown scans", expected=expected, found=", ".join(unknown))
     inspected = inspect(scans.models)
     errors = {**scans.errors, **{id_: found.error for id_, found in inspected.items() if found.error is not None}}
     units: dict[str, Unit] = {}
-    # a scan that fits no unit says nothing about which one is usual
+    # scans that fit no unit do not take part in the guess
     sides = {id_: found.longest for id_, found in inspected.items() if id_ not in errors}
     usual = {id_: side for id_, side in sides.items() if _in_some_unit(side)}
     for id_, side in sides.items():
@@ -114,16 +114,16 @@ def scan_jobs(
 
 
 def find_scans(source: Path) -> FoundScans:
-    """Find the scans of a folder: every subfolder with a mesh in it, and every mesh file.
+    """Find the scans of a folder: mesh files, and subfolders with meshes.
 
-    Files of one name, such as ``mug.obj`` and ``mug.stl``, are versions of one object.
+    Files with the same stem, such as ``mug.obj`` and ``mug.stl``, are versions of one object.
 
     Raises:
-        AssetError: there is no such folder, or no scan in it.
+        AssetError: the folder does not exist, or has no scans.
     """
     if source.exists() and not source.is_dir():
         raise AssetError(
-            "not a folder", where=source, expected="a folder of scans", fix="Give the folder that holds it."
+            "not a folder", where=source, expected="a folder of scans", fix="Pass the folder that contains it."
         )
     if not source.is_dir():
         raise AssetError("no such folder of scans", where=source)
@@ -146,7 +146,7 @@ def find_scans(source: Path) -> FoundScans:
         elif name in found.models or name in found.errors:
             found.models.pop(name, None)
             found.errors[name] = AssetError(
-                "two scans would get the same id", where=path, found=name, fix="Rename one."
+                "two scans have the same id", where=path, found=name, fix="Rename one of them."
             )
         else:
             found.models[name] = ModelSource((path,), source)
@@ -157,24 +157,24 @@ def find_scans(source: Path) -> FoundScans:
 
 
 def object_id(name: str) -> str:
-    """Return a name as an id: small letters, digits and underscores; one without any, or too long, gets a number."""
+    """Convert a name to an id of lower-case letters, digits and underscores; add a number to an empty or long one."""
     plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
     id_, number = re.sub(r"[^a-z0-9]+", "_", plain.lower()).strip("_"), f"{zlib.crc32(os.fsencode(name)):08x}"
     return f"{id_[:LONGEST_ID]}_{number}" if len(id_) > LONGEST_ID else id_ or f"object_{number}"
 
 
 def estimate_mass(closed: trimesh.Trimesh) -> float:
-    """Return the mass in kg of a household product of this volume (m3)."""
+    """Estimate the mass in kg of a household product from its volume."""
     return round(min(max(DENSITY * float(closed.volume), MASS_RANGE[0]), MASS_RANGE[1]), 4)
 
 
 def _no_scan(folder: Path) -> str:
-    """Return why a folder is no object; empty: it is one."""
+    """Return the reason why a folder is not an object; empty if it is one."""
     if folder.name.lower() == "__macosx":
-        return "what macOS adds to archives"
+        return "a folder that macOS adds to archives"
     if any(is_mesh(path) or path.suffix.lower() in UNREAD for path in files_below(folder)):
         return ""
-    return "no mesh is in it"
+    return "no mesh in this folder"
 
 
 def _in_some_unit(side: float) -> bool:

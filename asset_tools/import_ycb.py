@@ -1,7 +1,7 @@
-"""The YCB objects that ManiSkill downloads, as assets.
+"""Import the YCB objects that ManiSkill downloads.
 
-ManiSkill's folder holds ``info_pick_v0.json``, which maps a model's name to its scale among other things, and
-``models/<name>/textured.obj``; its ``collision.ply`` isn't used, hulls are made anew.
+ManiSkill's folder has ``info_pick_v0.json``, which maps the name of a model to its scale and more, and
+``models/<name>/textured.obj``. Its ``collision.ply`` is not used; new hulls are computed.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.strict_model import check_name
 
 INFO, MODELS = "info_pick_v0.json", "models"
-DOWNLOAD = "Run `python -m mani_skill.utils.download_asset ycb`, or give the folder that holds it."
+DOWNLOAD = "Run `python -m mani_skill.utils.download_asset ycb`, or pass the folder that contains the download."
 LICENCE = "CC BY 4.0"
 ATTRIBUTION = "YCB Object and Model Set (B. Calli et al., 2015), as prepared by ManiSkill"
 
-# kg, as the set's authors list them; of those that GraspNet-1Billion has too, its catalogue says it
+# kg, from the authors of the set; the catalogue of GraspNet-1Billion has the masses of its objects
 MASSES = {
     "master_chef_can": 0.414,
     "cracker_box": 0.411,
@@ -70,28 +70,31 @@ HOLLOW = re.compile(r"bowl|cups|pitcher|plate|skillet|fork|spoon|knife|spatula|c
 
 
 def default_root() -> Path:
-    """Where ManiSkill puts the YCB objects."""
+    """Return the folder of ManiSkill's YCB download."""
     data = Path(os.environ.get("MS_ASSET_DIR") or Path.home() / ".maniskill") / "data"
     return data / "assets" / "mani_skill2_ycb"
 
 
 def ycb_jobs(root: Path | None = None, ids: Sequence[str] = (), inspect: Inspect = inspect_models) -> list[AssetJob]:
-    """Return the jobs that import ManiSkill's YCB folder. A model that can't be read is a job that fails.
+    """Return the jobs that import ManiSkill's YCB folder; an unreadable model gives a failing job.
 
     Args:
-        root: the folder; None: where ManiSkill puts it.
+        root: the folder; None: ManiSkill's default.
         ids: names such as ``005_tomato_soup_can``; empty: all.
-        inspect: looks at the models first; `inspect_models` with its options.
+        inspect: inspects the models; `inspect_models` with its options.
 
     Raises:
-        AssetError: it isn't there, or lacks objects, naming them all.
+        AssetError: the folder or some models are missing.
     """
     root = root or default_root()
     info = _info(root)
     unknown = sorted(set(ids) - set(info))
     if unknown:
         raise AssetError(
-            "no such YCB objects", where=root / INFO, expected=f"among {len(info)}", found=_listed(unknown)
+            "no such YCB objects",
+            where=root / INFO,
+            expected=f"names of the {len(info)} objects",
+            found=_listed(unknown),
         )
     models = sorted(set(ids) or info)
     missing = [model for model in models if not _mesh(root, model).is_file()]
@@ -102,18 +105,18 @@ def ycb_jobs(root: Path | None = None, ids: Sequence[str] = (), inspect: Inspect
 
 
 def ycb_source(root: Path, model: str) -> ObjectSource:
-    """One of ManiSkill's YCB objects. Models are z up.
+    """Return the source of a YCB object; models have z up.
 
     Args:
         root: ManiSkill's YCB folder.
-        model: its name there, such as ``005_tomato_soup_can``.
+        model: name of the model, such as ``005_tomato_soup_can``.
 
     Raises:
-        AssetError: it isn't there, is damaged, or can't be closed.
+        AssetError: the model is missing or damaged, or cannot be closed.
     """
     info = _info(root)
     if model not in info:
-        raise AssetError("no such YCB object", where=root / INFO, expected=f"among {len(info)}", found=model)
+        raise AssetError("no such YCB object", where=root / INFO, expected=f"one of the {len(info)} names", found=model)
     scan = prepare_scan(_mesh(root, model), root=root, up="z", unit="m")
     scale = _scale(root, model, info[model])
     if scale != 1:
@@ -138,7 +141,7 @@ def ycb_source(root: Path, model: str) -> ObjectSource:
 
 
 def ycb_id(model: str) -> str:
-    """A model's name as an id, the same as GraspNet-1Billion's object has here: 072-a_toy_airplane: toy_airplane_a."""
+    """Convert a model's name to the id of the GraspNet-1Billion object, e.g. 072-a_toy_airplane -> toy_airplane_a."""
     found = re.fullmatch(r"\d+(?:-([a-z]))?_(\w+)", model)
     if found is None:
         return object_id(model)
@@ -168,13 +171,13 @@ def _make(root: Path, model: str, folder: Path) -> ObjectAsset:
 def _info(root: Path) -> dict[str, dict[str, Any]]:
     path = root / INFO
     if not path.is_file():
-        raise AssetError("ManiSkill's YCB objects are not there", where=root, expected=INFO, fix=DOWNLOAD)
+        raise AssetError("ManiSkill's YCB objects are missing", where=root, expected=INFO, fix=DOWNLOAD)
     try:
         info = load_json(path)
     except ValueError as error:
-        raise AssetError("can't read the list of YCB objects", where=path, found=error, fix=DOWNLOAD) from error
+        raise AssetError("cannot read the list of YCB objects", where=path, found=error, fix=DOWNLOAD) from error
     if not isinstance(info, dict) or not info or not all(isinstance(entry, dict) for entry in info.values()):
-        raise AssetError("can't read the list of YCB objects", where=path, expected="name: facts", fix=DOWNLOAD)
+        raise AssetError("cannot read the list of YCB objects", where=path, expected="a mapping of names", fix=DOWNLOAD)
     for name in info:
         check_name(name, AssetError, where=path, fix=DOWNLOAD)
     return info
@@ -185,9 +188,9 @@ def _scale(root: Path, model: str, info: dict[str, Any]) -> float:
     try:
         scale = float(scales[0])
     except (TypeError, ValueError, LookupError) as error:
-        raise AssetError("no scale of a YCB object", where=root / INFO, found=f"{model}: {scales}") from error
+        raise AssetError("invalid scale of a YCB object", where=root / INFO, found=f"{model}: {scales}") from error
     if not 0 < scale < float("inf"):
-        raise AssetError("no scale of a YCB object", where=root / INFO, found=f"{model}: {scale}")
+        raise AssetError("invalid scale of a YCB object", where=root / INFO, found=f"{model}: {scale}")
     return scale
 
 

@@ -43,12 +43,12 @@ def _principal(tensor: np.ndarray) -> tuple[np.ndarray, tuple[float, float, floa
 
 
 def to_tuple(values: np.ndarray) -> tuple[float, float, float]:
-    """To a billionth, as manifests say metres."""
+    """Round to 9 decimals, as in manifests."""
     x, y, z = (round(float(value), 9) for value in values)
     return x, y, z
 
 
 def to_moments(values: np.ndarray) -> tuple[float, float, float]:
-    """Moments of inertia to nine digits, however small: those of a dice are 4e-10 kg m2."""
+    """Round moments of inertia to 9 significant digits; they can be as small as 4e-10 kg m2."""
     x, y, z = (float(f"{value:.9g}") for value in values)
     return x, y, z

@@ -1,4 +1,4 @@
-"""A first look at models before they are imported: can they be read, how large are they, of which files are they."""
+"""Inspect models before an import: readability, size and files."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ Inspect: TypeAlias = "Callable[[Mapping[str, ModelSource]], Mapping[str, Inspect
 
 log = logging.getLogger(__name__)
 
-GRACE = 5.0  # s after the limit of time, until a process that is stuck in native code is ended
-MEMORY_GB = 4.0  # of the process, with all that is imported
+GRACE = 5.0  # s after the time limit until a process that hangs in native code is killed
+MEMORY_GB = 4.0  # of the whole process, including imported libraries
 
 
 @dataclass(frozen=True)
 class ModelSource:
-    """Where a model is.
+    """Paths of a model.
 
     Attributes:
-        paths: its folder, its file, or its files where there are several versions.
+        paths: the folder, the file, or several files that are versions of one model.
         root: the imported folder.
     """
 
@@ -37,12 +37,12 @@ class ModelSource:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What a first look found.
+    """Result of an inspection.
 
     Attributes:
-        longest: longest side, in the unit of the file; 0 where it can't be read.
-        files: that were read.
-        error: why it can't be read; None: it can.
+        longest: longest side in the unit of the file; 0 after an error.
+        files: files that were read.
+        error: error of reading the model, or None.
     """
 
     longest: float = 0.0
@@ -53,15 +53,15 @@ class Inspection:
 def inspect_models(
     models: Mapping[str, ModelSource], processes: int = 0, on_inspected: Callable[[], None] = lambda: None
 ) -> dict[str, Inspection]:
-    """Look at models, each within 30 s and 2 GB of memory.
+    """Inspect models, with limits of 30 s and 2 GB of memory per model.
 
     Args:
-        models: by id.
-        processes: how many look at a time; 0: this process does, and a crash of native code ends it.
+        models: models by id.
+        processes: number of worker processes; 0: this process, which a crash of native code would end.
         on_inspected: called after each model.
 
     Returns:
-        What was found, by id; models that can't be read have an error.
+        Inspections by id; unreadable models have an error.
     """
     limits, found = Limits(MAX_SECONDS + GRACE, MEMORY_GB), {}
     with WorkerPool(partial(FunctionWorker, _inspect), processes, limits=limits, on_crash=_crashed) as pool:
@@ -79,12 +79,14 @@ def _inspect(task: tuple[str, ModelSource]) -> tuple[str, Inspection]:
             return id_, Inspection(float(model.mesh.extents.max()), model.files)
     except RobocasError as error:
         return id_, Inspection(error=AssetError(str(error)))
-    except Exception as error:  # whatever a parser trips over: one model fails, not the import
-        log.debug("%s can't be read", source.paths[0], exc_info=True)
+    except Exception as error:  # parsers may raise any error; only this model fails
+        log.debug("cannot read %s", source.paths[0], exc_info=True)
         found = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        return id_, Inspection(error=AssetError("can't read this model", where=source.paths[0], found=found))
+        return id_, Inspection(error=AssetError("cannot read this model", where=source.paths[0], found=found))
 
 
-def _crashed(task: tuple[str, ModelSource], why: str) -> tuple[str, Inspection]:
+def _crashed(task: tuple[str, ModelSource], reason: str) -> tuple[str, Inspection]:
     id_, source = task
-    return id_, Inspection(error=AssetError("the process that read the model died", where=source.paths[0], found=why))
+    return id_, Inspection(
+        error=AssetError("the process that read the model crashed", where=source.paths[0], found=reason)
+    )

@@ -1,4 +1,4 @@
-"""Making many assets: in parallel, each kept by the content it was made from, so that what is done is never redone."""
+"""Build packs of assets in parallel, with a cache of finished assets by a hash of their inputs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache as cached
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -32,15 +33,15 @@ from robocas_ms3.core.output_folder import check_replaceable
 from robocas_ms3.core.strict_model import validate_json
 from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 
-MADE_FROM = "made_from.json"  # of a pack: asset id -> hash of what it was made from
-ENTRY = "asset.json"  # what the manifest says of a kept asset; written last
-CACHE_DAYS = 60  # an asset that wasn't asked for in this time is made again
+MADE_FROM = "made_from.json"  # file of a pack: asset id -> hash of its inputs
+ENTRY = "asset.json"  # manifest entry of a cached asset; written last
+CACHE_DAYS = 60  # a cached asset that was not used in this time is deleted
 TOOLS = ("coacd", "trimesh", "manifold3d", "numpy", "scipy", "sapien", "xatlas", "fast-simplification", "embreex") + (
     "pillow",
     "scikit-image",
     "shapely",
 )
-SKIP_FIX = "Pass --skip-errors to leave it out."
+SKIP_FIX = "Pass --skip-errors to skip it."
 PACK_NAME = r"[a-z0-9_\-]+"
 UNRELATED_FILES = (
     "inspection",
@@ -56,13 +57,13 @@ _ASSET: TypeAdapter[ObjectAsset | FurnitureAsset] = TypeAdapter(Asset)
 
 @dataclass(frozen=True)
 class AssetJob:
-    """An asset to make.
+    """An asset to build.
 
     Attributes:
-        id: of the asset.
-        make: makes its files in a folder and says what the manifest says of it; must survive pickling.
-        content: hash of everything the asset depends on besides this code, see `content_hash`.
-        error: why it can't be made, where that is known beforehand.
+        id: id of the asset.
+        make: writes the files of the asset to a folder and returns its manifest entry; must be picklable.
+        content: hash of all inputs of the asset, see `content_hash`.
+        error: error that is known before the build, or None.
     """
 
     id: str
@@ -76,14 +77,14 @@ class AssetJob:
 
 @dataclass(frozen=True)
 class AssetJobResult:
-    """What became of a job.
+    """Result of a job.
 
     Attributes:
-        id: of the asset.
-        asset: its entry in the manifest; none where it failed.
-        error: why it failed.
-        reused: it was made before, of the same content.
-        seconds: that making it took.
+        id: id of the asset.
+        asset: manifest entry; None if the job failed.
+        error: reason of the failure.
+        reused: whether the asset is from the cache.
+        seconds: duration of the build.
     """
 
     id: str
@@ -94,7 +95,7 @@ class AssetJobResult:
 
 
 def make_failing_job(id_: str, error: AssetError) -> AssetJob:
-    """Return a job that raises an error when it is its turn, so that it can be left out as any other."""
+    """Return a job that raises an error when it runs, so that it can be skipped like other failures."""
     return AssetJob(id_, partial(_fail, error), content_hash(str(error)), error)
 
 
@@ -103,51 +104,47 @@ def _fail(error: AssetError, folder: Path) -> ObjectAsset:
 
 
 def check_jobs(jobs: Iterable[AssetJob]) -> None:
-    """Raise the error of the first job that is known to fail.
-
-    Raises:
-        AssetError: it, with its id.
-    """
+    """Raise AssetError for the first job with a known error."""
     for job in jobs:
         if job.error is not None:
             raise AssetError(_failed_result(job, str(job.error)).error.rstrip("."), fix=SKIP_FIX)
 
 
-def make_assets(jobs: Sequence[AssetJob], out: Path, kept: Path, *, processes: int = 1) -> Iterator[AssetJobResult]:
-    """Make assets into ``out/<id>``, or copy them from where earlier runs kept them; yields each as it gets done.
+def make_assets(jobs: Sequence[AssetJob], out: Path, cache: Path, *, processes: int = 1) -> Iterator[AssetJobResult]:
+    """Build assets in ``out/<id>``, or copy them from the cache; yield each result when it is done.
 
-    A run that was interrupted goes on where it stopped, since every finished asset is kept.
+    An interrupted run continues where it stopped, since every finished asset is cached.
 
     Args:
-        jobs: what to make.
+        jobs: assets to build.
         out: folder of the pack.
-        kept: folder where finished assets are kept.
-        processes: how many to make at a time.
+        cache: folder of finished assets.
+        processes: number of worker processes.
     """
-    _delete_old_entries(kept)
+    _delete_old_entries(cache)
     todo = []
     for job in jobs:
-        place = kept / f"{job.id}-{job.content[:20]}"
+        place = cache / f"{job.id}-{job.content[:20]}"
         asset = _copy_from_cache(place, out / job.id)
         if asset is None:
             todo.append((job, place))
         else:
             yield AssetJobResult(job.id, asset, reused=True)
     for made, place in _run(todo, processes):
-        # another run may be replacing it by the same just now
+        # a second try: another run may replace the entry by an identical one at the same time
         if made.asset is None or _copy_from_cache(place, out / made.id) or _copy_from_cache(place, out / made.id):
             yield made
         else:
-            yield AssetJobResult(made.id, None, f"{made.id}: what was made is gone from {place.parent}")
+            yield AssetJobResult(made.id, None, f"{made.id}: the finished asset was removed from {place.parent}")
 
 
 def content_hash(*parts: object, files: Iterable[Path] = (), packages: Sequence[str] = ()) -> str:
-    """Hash of what an asset is made from: settings, source files, and the code and libraries that make it.
+    """Return a hash of the inputs of an asset: settings, source files, code and versions of libraries.
 
     Args:
-        parts: settings; must have a telling ``repr``.
-        files: source files; their names count too.
-        packages: folders of ``asset_tools`` with further code and YAML that takes part, besides what all assets share.
+        parts: settings; their ``repr`` must show all values.
+        files: source files; names are part of the hash.
+        packages: further folders of ``asset_tools`` with code and YAML, in addition to the shared code.
     """
     digest = hashlib.sha256(repr((SCHEMA_VERSION, parts)).encode())
     for path in files:
@@ -157,7 +154,7 @@ def content_hash(*parts: object, files: Iterable[Path] = (), packages: Sequence[
     return digest.hexdigest()
 
 
-@cache
+@cached
 def _code(package: str) -> str:
     here = Path(__file__).parent
     digest = hashlib.sha256()
@@ -191,7 +188,7 @@ def _make(task: tuple[AssetJob, Path]) -> tuple[AssetJobResult, Path]:
             (tmp / ENTRY).write_text(asset.model_dump_json(), encoding="utf-8")
     except RobocasError as error:
         made = _failed_result(job, str(error))
-    except Exception as error:  # whatever a mesh library trips over: one asset fails, with its name, not the run
+    except Exception as error:  # mesh libraries may raise any error; only this asset fails
         log.debug("%s failed", job.id, exc_info=True)
         made = _failed_result(job, f"{type(error).__name__}: {' '.join(str(error).split())}")
     else:
@@ -204,7 +201,7 @@ def _failed_result(job: AssetJob, message: str) -> AssetJobResult:
 
 
 def _copy_from_cache(place: Path, folder: Path) -> ObjectAsset | FurnitureAsset | None:
-    """Copy an asset that was kept; none if there is none, or it was damaged since."""
+    """Copy an asset from the cache and return its entry; None if it is missing or damaged."""
     try:
         asset = validate_json(_ASSET, (place / ENTRY).read_bytes())
         place.touch()
@@ -217,9 +214,9 @@ def _copy_from_cache(place: Path, folder: Path) -> ObjectAsset | FurnitureAsset 
     return None
 
 
-def _delete_old_entries(kept: Path) -> None:
+def _delete_old_entries(cache: Path) -> None:
     oldest = time.time() - CACHE_DAYS * 86400
-    for place in kept.glob("*-*"):
+    for place in cache.glob("*-*"):
         if place.stat().st_mtime < oldest:
             shutil.rmtree(place, ignore_errors=True)
 
@@ -227,7 +224,7 @@ def _delete_old_entries(kept: Path) -> None:
 def write_pack(
     jobs: Sequence[AssetJob],
     folder: Path,
-    kept: Path,
+    cache: Path,
     *,
     description: str = "",
     processes: int = 1,
@@ -235,25 +232,25 @@ def write_pack(
     record: bool = True,
     on_made: Callable[[AssetJobResult], None] = lambda made: None,
 ) -> list[AssetJobResult]:
-    """Make a pack of assets: it appears at ``folder`` when all are done, or not at all.
+    """Build a pack of assets; the folder appears atomically when all assets are done.
 
     Args:
-        jobs: the assets.
-        folder: of the pack; its name is the pack's.
-        kept: see `make_assets`.
-        description: for the manifest.
-        processes: how many to make at a time.
-        skip_errors: leave out assets that can't be made, instead of giving up.
-        record: write down what each asset was made from, for `up_to_date`.
+        jobs: assets to build.
+        folder: of the pack; its name is the name of the pack.
+        cache: see `make_assets`.
+        description: description in the manifest.
+        processes: number of worker processes.
+        skip_errors: whether to skip assets with errors instead of raising.
+        record: whether to store the hashes of the inputs, for `is_up_to_date`.
         on_made: called after each asset.
 
     Raises:
-        AssetError: an asset can't be made, or not be simulated as it is, naming it and why; or none can.
+        AssetError: an asset cannot be built or simulated, or all assets failed.
     """
     check_pack_folder(folder)
     results = []
     with atomic_folder(folder) as tmp:
-        for made in make_assets(jobs, tmp, kept, processes=processes):
+        for made in make_assets(jobs, tmp, cache, processes=processes):
             if made.asset is None and not skip_errors:
                 raise AssetError(made.error.rstrip("."), fix=SKIP_FIX)
             results.append(made)
@@ -261,44 +258,44 @@ def write_pack(
         results = _remove_hull_violations(results, tmp, skip_errors)
         assets = sorted((made.asset for made in results if made.asset), key=lambda asset: (asset.kind, asset.id))
         if not assets:
-            raise AssetError("none of the assets could be made", where=folder, found=results[0].error)
+            raise AssetError("all assets failed", where=folder, found=results[0].error)
         manifest = PackManifest(name=folder.name, description=description, assets=assets)
         (tmp / MANIFEST).write_text(manifest.model_dump_json(indent=1) + "\n", encoding="utf-8")
         if record:
             bad = sorted(made.id for made in results if made.asset is None)
-            write_json(tmp / MADE_FROM, {"content": {job.id: job.content for job in jobs}, "left_out": bad})
+            write_json(tmp / MADE_FROM, {"content": {job.id: job.content for job in jobs}, "skipped": bad})
     return results
 
 
 def _remove_hull_violations(results: list[AssetJobResult], folder: Path, skip_errors: bool) -> list[AssetJobResult]:
-    """Give up, or leave them out, where the physics engine makes less of hulls than their files say."""
-    faults: dict[str, str] = {}
-    for fault in find_hull_violations(folder):
-        faults.setdefault(fault.asset.partition("/")[0], str(fault))
-    if faults and not skip_errors:
-        raise AssetError("; ".join(faults.values()), fix=SKIP_FIX)
-    for name in faults:
+    """Skip assets with hulls that the physics engine shrinks or rejects, or raise AssetError."""
+    violations: dict[str, str] = {}
+    for violation in find_hull_violations(folder):
+        violations.setdefault(violation.asset.partition("/")[0], str(violation))
+    if violations and not skip_errors:
+        raise AssetError("; ".join(violations.values()), fix=SKIP_FIX)
+    for name in violations:
         shutil.rmtree(folder / name)
-    return [AssetJobResult(made.id, None, faults[made.id]) if made.id in faults else made for made in results]
+    return [AssetJobResult(made.id, None, violations[made.id]) if made.id in violations else made for made in results]
 
 
 def check_pack_folder(folder: Path) -> None:
-    """See that a pack may be written to a folder.
+    """Check that a pack may be written to a folder.
 
     Raises:
-        AssetError: its name is no name for a pack.
-        OutputExistsError: there is something there that is no pack.
+        AssetError: the folder's name is not valid for a pack.
+        OutputExistsError: the path exists and is not a pack.
     """
     if not re.fullmatch(PACK_NAME, folder.name):
-        expected = "small letters, digits, _ and -"
-        raise AssetError("this is no name for a pack", where=folder, expected=expected, found=folder.name)
+        expected = "lower-case letters, digits, _ and -"
+        raise AssetError("invalid name of a pack", where=folder, expected=expected, found=folder.name)
     check_replaceable(folder, overwrite=True, markers=(MANIFEST,))
 
 
 def is_up_to_date(jobs: Sequence[AssetJob], folder: Path, *, skip_errors: bool = False) -> bool:
-    """Whether a pack was made of just these assets, by this code; with ``skip_errors``, some may have been left out."""
+    """Return whether a pack was built from the same inputs; with ``skip_errors`` it may lack failed assets."""
     try:
         found = load_json(folder / MADE_FROM)
-        return found["content"] == {job.id: job.content for job in jobs} and (skip_errors or not found["left_out"])
+        return found["content"] == {job.id: job.content for job in jobs} and (skip_errors or not found["skipped"])
     except (OSError, ValueError, TypeError, KeyError):
         return False

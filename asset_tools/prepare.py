@@ -1,4 +1,4 @@
-"""From a raw scan to what assets are made of: a textured mesh and a solid, in metres, z up, every repair logged."""
+"""Prepare a raw scan for an asset: a textured mesh and a closed mesh in metres with z up, and a list of repairs."""
 
 from __future__ import annotations
 
@@ -21,11 +21,14 @@ from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 
-PRESS_STEP = 0.00025  # m: depths that are tried
-DEEPEST, SHARE = 0.004, 0.04  # m, and share of the height, above which nothing belongs to the base
-BROAD = 0.6  # reach of the base over that of the body's outline; a ball's reaches 0.45 there
-FEET, ROCKS = 0.0003, 0.5  # m that contacts forgive; with less of the base's reach within it, it rocks
-FLAT = 0.8  # of the base's reach that is wanted
+PRESS_STEP = 0.00025  # m, step of the tried depths
+DEEPEST, SHARE = 0.004, 0.04  # m, and fraction of the height; limits of the base
+BROAD = 0.6  # minimum ratio of the reaches of base and outline; 0.45 for a ball
+FEET, ROCKS = (
+    0.0003,
+    0.5,
+)  # m of contact tolerance; the object rocks if less than this fraction of the base's reach is within it
+FLAT = 0.8  # required fraction of the base's reach
 UNIT_NAMES = {"cm": "centimetres", "mm": "millimetres", "inch": "inches"}
 
 
@@ -34,12 +37,11 @@ class PreparedScan:
     """A scan, ready for hulls and grasps.
 
     Attributes:
-        mesh: to look at; textured, metres, z up, faces outwards.
-        closed: watertight, of the same body in the same frame.
+        mesh: visual mesh: textured, metres, z up, outward faces.
+        closed: watertight mesh of the same body in the same frame.
         up: axis of the file that points up.
-        unit: of the file.
-        repairs: what was repaired, substituted or left out, one line each; those that begin with "warning:" change how
-            the object looks.
+        unit: unit of the file.
+        repairs: repairs, substitutions and omissions, one line each; lines with "warning:" change the appearance.
     """
 
     mesh: trimesh.Trimesh
@@ -55,13 +57,13 @@ def prepare_scan(
     """Read a scan and repair it: files, faces, holes, axis, unit, base.
 
     Args:
-        path: the mesh file, a folder with its files, or several files of which some are versions of others.
-        root: the imported folder, outside of which nothing is read; None: the scan's own folder.
+        path: a mesh file, a folder with its files, or several files, which may be versions of one mesh.
+        root: the imported folder; no files outside of it are read. None: the scan's own folder.
         up: axis of the file that points up; None: guessed.
-        unit: of the file; None: guessed.
+        unit: unit of the file; None: guessed.
 
     Raises:
-        AssetError: it can't be read or closed, or is of no size that can be picked up.
+        AssetError: the scan cannot be read or closed, or its size is not plausible for picking.
     """
     model = read_model(path if isinstance(path, Path) else list(path), root)
     repairs = list(model.notes)
@@ -76,10 +78,10 @@ def prepare_scan(
     unit = unit or guess_unit([longest])
     if not PLAUSIBLE[0] <= longest * METRES_PER_UNIT[unit] <= PLAUSIBLE[1]:
         raise AssetError(
-            "the scan is of no size that can be picked up",
+            "implausible size of a scan",
             where=path if isinstance(path, Path) else path[0],
             expected=f"{PLAUSIBLE[0]} to {PLAUSIBLE[1]} m for the longest side",
-            found=f"{longest * METRES_PER_UNIT[unit]:g} m, taking its {longest:g} for {UNIT_NAMES.get(unit, 'metres')}",
+            found=f"{longest * METRES_PER_UNIT[unit]:g} m ({longest:g} taken as {UNIT_NAMES.get(unit, 'metres')})",
             fix="Pass --units with the unit of the file.",
         )
     if unit != "m":
@@ -90,7 +92,7 @@ def prepare_scan(
 
 
 def _about_colours(mesh: trimesh.Trimesh) -> list[str]:
-    """Return what becomes of colours that are no single texture."""
+    """Return notes on the conversion of colours that are not a single texture."""
     visual: Any = mesh.visual
     if visual.kind == "vertex":
         return ["baked colours into a texture"]
@@ -103,15 +105,15 @@ def _about_colours(mesh: trimesh.Trimesh) -> list[str]:
 def level_base(
     mesh: trimesh.Trimesh, closed: trimesh.Trimesh, repairs: list[str]
 ) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
-    """Press the base flat where it bulges so that the thing rocks on it, though it is broad enough to stand on.
+    """Flatten a broad base that bulges, so that the object does not rock.
 
     Args:
-        mesh: to look at; metres, z up.
-        closed: watertight, the same body in the same frame.
-        repairs: gets a line if something was done.
+        mesh: visual mesh, metres, z up.
+        closed: watertight mesh of the same body in the same frame.
+        repairs: list to which a note is added.
 
     Returns:
-        both, as they were if there was nothing to do or the base is round.
+        Both meshes; unchanged if the base is flat or round.
     """
     center = np.asarray(closed.center_mass)
     low, height = float(closed.bounds[0, 2]), float(closed.extents[2])
@@ -127,19 +129,19 @@ def level_base(
             pressed = mesh.copy()
             pressed.vertices = vertices
             repairs.append(f"pressed the base flat by {1e3 * depth:.2g} mm")
-            solid: Any = to_solid(closed)  # what is watertight is one
+            solid: Any = to_solid(closed)  # a watertight mesh is a solid
             return pressed, to_mesh(solid.trim_by_plane((0.0, 0.0, 1.0), low + depth))
     return mesh, closed
 
 
 def _reach(closed: trimesh.Trimesh, height: float, center: Array) -> float:
-    """How far a body's section at a height reaches from the centre of mass, in the worst direction."""
+    """Return the smallest distance from the centre of mass to the outline of the section at a height."""
     section = closed.section([0, 0, 1], [0, 0, height])
     return 0.0 if section is None else _edge_distance(np.asarray(section.vertices)[:, :2], center)
 
 
 def _edge_distance(flat: Array, center: Array) -> float:
-    """Distance from the centre of mass to the nearest edge of the convex outline of points (N, 2)."""
+    """Return the distance from the centre of mass to the nearest edge of the convex outline of points (N, 2)."""
     try:
         return float((-(ConvexHull(flat).equations @ [*center[:2], 1.0])).min())
     except (QhullError, ValueError):

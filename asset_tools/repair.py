@@ -1,4 +1,4 @@
-"""Closing scans: from whatever a scanner left to a solid whose volume, hulls and grasps can be trusted."""
+"""Close scans: convert the surface of a scan to a watertight solid for volume, hulls and grasps."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from robocas_ms3.core.errors import AssetError
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-FILLED = 0.35  # share of the surface that may be filled in
-HOPELESS = 0.4  # share of the edges that are open: no surface, but confetti
-LEAST_VOLUME = 0.01  # of the convex hull's: less is a sheet, not a body
-FOIL = 1e-5  # thickness over diagonal, below which a body is a sheet as well
-FACES = 5000  # of the solid at most; more only costs time
-SIMPLIFIED_VOLUME = 0.05  # share of the volume that simplifying may change: more removes thin parts
-TOLERANCES = (0.0005, 0.001, 0.0015, 0.002, 0.003)  # of the diagonal, tried in turn to get there
-LOST = 0.03  # of the diagonal: how far from the mesh's ends the solid may end
+FILLED = 0.35  # largest filled fraction of the surface
+HOPELESS = 0.4  # fraction of open edges above which a scan is not remeshed
+LEAST_VOLUME = 0.01  # of the convex hull's volume; less is a sheet, not a body
+FOIL = 1e-5  # thickness over diagonal; below, the body is a sheet
+FACES = 5000  # maximum for the solid
+SIMPLIFIED_VOLUME = 0.05  # largest relative change of the volume by simplification; more removes thin parts
+TOLERANCES = (0.0005, 0.001, 0.0015, 0.002, 0.003)  # of the diagonal, tried in this order
+LOST = 0.03  # of the diagonal: largest change of the bounding box
 MOST_PIECES = 1000
-CRUMB = 0.001  # of the largest body's volume: smaller ones of a new mesh are noise
-CELLS = 64  # of the grid that a mesh is re-meshed on, along its longest side
+CRUMB = 0.001  # of the largest body's volume; smaller bodies after remeshing are noise
+CELLS = 64  # of the remeshing grid along the longest side
 WINDING_SAMPLES, WINDING_CHUNK = 4000, 2048
-NEIGHBOURS = 6  # samples that tell on which side of the surface a point near it lies
+NEIGHBOURS = 6  # samples that determine the side of the surface for a close point
 
 
 @dataclass(frozen=True)
 class ClosedScan:
-    """A solid made of a scan.
+    """A closed scan.
 
     Attributes:
-        mesh: watertight, faces outwards, in the scan's frame and unit.
-        scan: to look at: without dirt and inner shells, faces outwards.
-        repairs: what had to be mended, in words.
+        mesh: watertight mesh with outward faces, in the scan's frame and unit.
+        scan: visual mesh without dirt and inner shells, with outward faces.
+        repairs: notes on repairs.
     """
 
     mesh: trimesh.Trimesh
@@ -51,15 +51,15 @@ class ClosedScan:
 
 
 def close_scan(scan: trimesh.Trimesh) -> ClosedScan:
-    """Make a watertight solid of a scan: weld, drop dirt, turn faces outwards, fill holes; else mesh it anew.
+    """Convert a scan to a watertight solid: merge vertices, drop dirt, orient faces, fill holes, or else remesh.
 
-    A shell inside of the outer surface (an empty can scanned through) is dropped: things are solid.
+    Shells inside the outer surface (a transparent can) are dropped.
 
     Args:
         scan: any unit; may have UV seams.
 
     Raises:
-        AssetError: it encloses nothing (a sheet), or can't be closed.
+        AssetError: the scan is a sheet without volume, or cannot be closed.
     """
     repairs: list[str] = []
     cleaned = clean_scan(scan, repairs)
@@ -75,18 +75,18 @@ def close_scan(scan: trimesh.Trimesh) -> ClosedScan:
     diagonal = float(np.linalg.norm(shown.extents))
     if solid is None or solid.volume() < max(LEAST_VOLUME * _hull_volume(mesh), FOIL * shown.area * diagonal):
         raise AssetError(
-            "the mesh can't be closed to a solid",
+            "cannot close the mesh to a solid",
             expected=f"at most small holes, and at least {LEAST_VOLUME:.0%} of the convex hull's volume",
             found=f"{_open_edges(mesh)} open edges of {len(mesh.edges_unique)}, in {mesh.body_count} pieces",
-            fix="Repair the scan, or leave it out.",
+            fix="Repair the scan, or skip it.",
         )
     closed = _light(solid, diagonal)
     lost = float(np.abs(closed.bounds - shown.bounds).max())
     if lost > LOST * diagonal:
         raise AssetError(
             "closing the mesh would lose a part of it",
-            expected=f"a solid that ends within {LOST:.0%} of where the mesh does",
-            found=f"{lost / diagonal:.0%} of its diagonal missing",
+            expected=f"a change of the bounding box of at most {LOST:.0%}",
+            found=f"{lost / diagonal:.0%} of its diagonal",
             fix="Repair the mesh: join its parts to one closed surface.",
         )
     return ClosedScan(closed, shown, tuple(repairs))
@@ -103,12 +103,12 @@ def _hull_volume(mesh: trimesh.Trimesh) -> float:
 def _filled(
     mesh: trimesh.Trimesh, shown: trimesh.Trimesh, repairs: list[str]
 ) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
-    """Close each hole by a fan around its middle, if its rim is a simple loop; the same in the mesh to look at."""
+    """Fill each hole with a simple loop as rim by a fan around its centre, in both meshes."""
     rim_edges = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
     edges = mesh.edges[rim_edges]
-    following = {int(a): int(b) for b, a in edges}  # the fill runs along the rim the other way
+    following = {int(a): int(b) for b, a in edges}  # the fill traverses the rim in the opposite direction
     if len(following) < len(edges) or not following:
-        return mesh, shown  # holes meet in a vertex, or more than two faces in an edge: left to re-meshing
+        return mesh, shown  # holes that share a vertex, or edges of more than two faces: remeshed instead
     middles: dict[int, Any] = {}
     vertices, faces = [np.asarray(mesh.vertices)], [np.asarray(mesh.faces)]
     count, holes, area = len(mesh.vertices), 0, 0.0
@@ -129,10 +129,10 @@ def _filled(
         holes += 1
     if area > FILLED * mesh.area:
         raise AssetError(
-            "the mesh can't be closed to a solid",
+            "cannot close the mesh to a solid",
             expected=f"holes of at most {FILLED:.0%} of its surface",
             found=f"{area / mesh.area:.0%}",
-            fix="Scan it from all sides, or leave it out.",
+            fix="Scan it from all sides, or skip it.",
         )
     repairs.append(f"filled {holes} hole{'s' if holes > 1 else ''}")
     filled = trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
@@ -141,13 +141,13 @@ def _filled(
 
 
 def _patched(shown: trimesh.Trimesh, face: Ints, corner: Ints, middles: Array) -> trimesh.Trimesh:
-    """A mesh with a triangle from each edge at a hole's rim to the hole's middle, in the colours of the edge.
+    """Add a triangle from each edge of a hole's rim to the hole's centre, in the colours of the edge.
 
     Args:
-        shown: textured or coloured.
-        face: (E,) that each edge belongs to.
-        corner: (E,) of the face, at which the edge begins.
-        middles: (E, 3) of the hole that each is at.
+        shown: textured or coloured mesh.
+        face: (E,) face of each edge.
+        corner: (E,) first corner of the edge in its face.
+        middles: (E, 3) centre of the hole of each edge.
     """
     old = np.asarray(shown.faces)
     first, second = old[face, corner], old[face, (corner + 1) % 3]
@@ -172,7 +172,7 @@ def _patched(shown: trimesh.Trimesh, face: Ints, corner: Ints, middles: Array) -
 
 
 def _as_solid(mesh: trimesh.Trimesh) -> Manifold | None:
-    """The mesh as a solid with outward faces; none if it isn't closed or encloses nothing."""
+    """Convert a mesh to a solid with outward faces; None if it is not closed or has no volume."""
     if not mesh.is_watertight:
         return None
     if mesh.volume < 0:
@@ -181,13 +181,13 @@ def _as_solid(mesh: trimesh.Trimesh) -> Manifold | None:
     if solid is None or solid.volume() <= 0:
         return None
     bodies = [body for body in solid.decompose() if body.volume() > 0]
-    return Manifold.batch_boolean(bodies, OpType.Add)  # where they overlap would count twice
+    return Manifold.batch_boolean(bodies, OpType.Add)  # otherwise overlaps would count twice
 
 
 def _union_of_pieces(mesh: trimesh.Trimesh, repairs: list[str]) -> Manifold | None:
-    """Return the union of closed pieces that share edges and parts of faces; None where a piece is not closed.
+    """Return the union of closed pieces that share edges and parts of faces; None if a piece is not closed.
 
-    Pieces are joined by edges of exactly two faces: at an edge that two boxes share there are four.
+    Only edges of exactly two faces connect faces to a piece; an edge shared by two boxes has four faces.
     """
     count = len(mesh.faces)
     pieces = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(count), min_len=1)
@@ -204,14 +204,14 @@ def _union_of_pieces(mesh: trimesh.Trimesh, repairs: list[str]) -> Manifold | No
 
 
 def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Zero level of the distance to the surface, signed by the winding number, on a grid."""
+    """Remesh the zero level of the distance to the surface on a grid, signed by the winding number."""
     from skimage.measure import marching_cubes
 
     pitch = float(mesh.extents.max()) / CELLS
     low = mesh.bounds[0] - 2 * pitch
     shape = np.ceil(mesh.extents / pitch).astype(int) + 5
     grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3) * pitch + low
-    # dense samples: the distance to them is that to the surface within a small part of a cell
+    # dense samples approximate the distance to the surface to a small part of a cell
     count = int(min(4e5, 50 * mesh.area / pitch**2))
     samples, faces = trimesh.sample.sample_surface(mesh, count, seed=0)[:2]
     normals = mesh.face_normals[faces]
@@ -219,14 +219,14 @@ def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     found: Any = KDTree(samples).query(grid, k=NEIGHBOURS, distance_upper_bound=4 * pitch)
     distance, nearest = np.minimum(found[0], 4 * pitch), np.minimum(found[1], count - 1)
     few = slice(None, None, max(1, count // WINDING_SAMPLES))
-    scale = 1 / pitch  # single precision likes numbers near 1
+    scale = 1 / pitch  # numbers near 1 keep single precision accurate
     middle = grid.mean(axis=0)
     inside = winding_number(
         (grid - middle) * scale, (samples[few] - middle) * scale, normals[few], mesh.area * scale**2
     )
     outwards = 1.0 if np.abs(inside.max()) >= np.abs(inside.min()) else -1.0
     inside *= outwards
-    # nearer than the samples' spacing the surface itself tells
+    # closer than the samples' spacing, the normals of near samples determine the side
     near = distance[:, 0] < min(2 * np.sqrt(mesh.area / len(samples[few])), 3 * pitch)
     height = np.einsum("nki,nki->nk", grid[near, None] - samples[nearest[near]], normals[nearest[near]]).mean(axis=1)
     inside[near] = height * outwards < 0
@@ -244,18 +244,15 @@ def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def winding_number(points: Array, samples: Array, normals: Array, area: float) -> Array:
-    """How often a surface, closed or not, runs around points: 1 inside, 0 outside, between them near a hole.
+    """Return the winding number (N,) of an open or closed surface: 1 inside, 0 outside, in between near a hole.
 
-    Each sample stands for its share of the surface, which holds from about two samples' spacing on.
+    Samples approximate the surface; the result is accurate at distances above two samples' spacing.
 
     Args:
-        points: (N, 3).
-        samples: (S, 3) spread evenly over the surface.
-        normals: (S, 3) outward unit normals there.
-        area: of the surface.
-
-    Returns:
-        (N,)
+        points: (N, 3) query points.
+        samples: (S, 3) points spread evenly over the surface.
+        normals: (S, 3) outward unit normals of the samples.
+        area: area of the surface.
     """
     at, out = samples.astype(np.float32), normals.astype(np.float32)
     reach = np.einsum("si,si->s", at, out)
@@ -268,7 +265,7 @@ def winding_number(points: Array, samples: Array, normals: Array, area: float) -
 
 
 def _light(solid: Manifold, diagonal: float) -> trimesh.Trimesh:
-    """Return the surface of the solid with few faces, closed, within a thousandth or so of its size."""
+    """Return the simplified, closed surface of a solid, within about 0.1 % of its size."""
     for tolerance in TOLERANCES:
         if solid.num_tri() <= FACES:
             break

@@ -1,4 +1,4 @@
-"""Units and axes of raw scans, guessed from their sizes and shapes."""
+"""Guess units and up axes of raw scans from their sizes and shapes."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 METRES_PER_UNIT: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 UP_AXES: tuple[str, ...] = get_args(Up)
-PLAUSIBLE = (0.005, 1.5)  # m, longest side of a thing that a hand can pick up, generously
+PLAUSIBLE = (0.005, 1.5)  # m, longest side of an object that a gripper may pick
 TYPICAL = 0.15  # m, longest side of a household object
-GIANT = 5.0  # times the typical size: next to scans in another unit, more likely one of ten times smaller things
-FAR = np.log(20)  # from the typical size, where a scan no longer tells what unit the others have
-STANDS = 0.27  # thickness over height down to which people put a box on its end
-BOX_FILL = 0.93  # share of its rectangle that a box's outline fills; an ellipse fills 0.785
+GIANT = 5.0  # times the typical size; a larger scan is more likely in a unit ten times smaller
+FAR = np.log(20)  # log ratio to the typical size; limits the weight of a scan in the guess for a folder
+STANDS = 0.27  # thickness over height; thinner boxes are not placed upright
+BOX_FILL = 0.93  # outline over bounding rectangle of a box; 0.785 for an ellipse
 
 
 def guess_unit(longest: Sequence[float]) -> Unit:
-    """The unit in which a set of scans was made: metres, centimetres or millimetres.
+    """Guess the common unit of scans: metres, centimetres or millimetres.
 
-    Inches are too near to centimetres to be told from sizes.
+    Inches cannot be distinguished from centimetres by size.
 
     Args:
         longest: longest side of each scan, in its unit.
 
     Raises:
-        AssetError: in none of them are the things of a size that can be picked up.
+        AssetError: the size is implausible for picking in every unit.
     """
     middle = float(np.median(longest))
     best = min(("m", "cm", "mm"), key=lambda unit: abs(np.log(middle * METRES_PER_UNIT[unit] / TYPICAL)))
     if not PLAUSIBLE[0] <= middle * METRES_PER_UNIT[best] <= PLAUSIBLE[1]:
         raise AssetError(
-            "can't guess the unit of the scans",
+            "cannot guess the unit of the scans",
             expected=f"{PLAUSIBLE[0]} to {PLAUSIBLE[1]} m for the longest side",
             found=f"{middle:g} units",
             fix="Pass --units.",
@@ -50,13 +50,13 @@ def guess_unit(longest: Sequence[float]) -> Unit:
 
 
 def guess_units(longest: Mapping[str, float]) -> dict[str, Unit]:
-    """The unit of each scan of a folder: that of most of them, save for those that it makes giants or crumbs.
+    """Guess the unit of each scan of a folder: the common unit, except for scans that it makes too large or too small.
 
     Args:
-        longest: longest side of each scan, in its unit, by its name.
+        longest: name -> longest side in the unit of the scan.
 
     Raises:
-        AssetError: a scan is in no unit of a size that can be picked up.
+        AssetError: the size of a scan is implausible for picking in every unit.
     """
     cost = {
         unit: sum(min(abs(np.log(side * METRES_PER_UNIT[unit] / TYPICAL)), FAR) for side in longest.values())
@@ -76,9 +76,9 @@ def guess_units(longest: Mapping[str, float]) -> dict[str, Unit]:
 
 
 def guess_up(mesh: trimesh.Trimesh) -> Up:
-    """The axis that points up: y or z, the two that software uses.
+    """Guess the axis that points up: y or z, the two conventions of software.
 
-    A thing with a long axis stands on it, unless it is a flat box; a flat thing lies on its broad side.
+    The long axis is assumed to be vertical, except for flat boxes. Flat objects are assumed to lie on their broad side.
 
     Args:
         mesh: any unit.
@@ -96,8 +96,8 @@ def guess_up(mesh: trimesh.Trimesh) -> Up:
 
 
 def rotate_upright(mesh: trimesh.Trimesh, up: Up) -> trimesh.Trimesh:
-    """A copy with an axis of the file turned to +z."""
-    turned = mesh.copy(include_cache=True)  # with its normals
+    """Return a copy with an axis of the file rotated to +z."""
+    turned = mesh.copy(include_cache=True)  # keeps its normals
     axis = np.zeros(3)
     axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
     transform = np.diag([1.0, -1.0, -1.0, 1.0]) if up == "-z" else np.eye(4)
@@ -109,7 +109,7 @@ def rotate_upright(mesh: trimesh.Trimesh, up: Up) -> trimesh.Trimesh:
 
 
 def _fill(hull: trimesh.Trimesh, axis: int) -> float:
-    """Share of its smallest rectangle that a convex body's outline along an axis fills."""
+    """Return the area of a convex body's outline along an axis over that of its smallest rectangle."""
     flat = np.delete(hull.vertices, axis, axis=1)
     outline = MultiPoint(flat).convex_hull
     return float(outline.area / outline.minimum_rotated_rectangle.area)

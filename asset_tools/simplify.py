@@ -1,4 +1,4 @@
-"""Fewer faces for rendering: edges are collapsed as far as no part is lost."""
+"""Reduce the number of faces for rendering without losing parts."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 
-DENSE = 3  # times as many faces as are wanted
-STUCK = 0.9  # of the faces left by a step of simplifying: a rougher one is needed
-ENOUGH = 6  # times as many faces as are wanted are accepted of a mesh with many holes or pieces
-GRIDS = (512, 362, 256, 181, 128, 91, 64, 45, 32, 16, 8)  # cells along the diagonal, to merge vertices in, fine first
-LEFT = 0.8  # share of area and volume that simplifying has to leave: with less, parts are lost or holes torn
+DENSE = 3  # times the limit
+STUCK = 0.9  # fraction of faces left by a step; above, a more aggressive step follows
+ENOUGH = 6  # times the limit is accepted for a mesh with many holes or pieces
+GRIDS = (512, 362, 256, 181, 128, 91, 64, 45, 32, 16, 8)  # cells along the diagonal for merging vertices, fine first
+LEFT = 0.8  # minimum fraction of area and volume after simplification; less means lost parts or holes
 
 
 def simplify_mesh(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
-    """Merge vertices by position, collapse faces to the limit, and wind them outward.
+    """Merge vertices by position, reduce the faces to the limit, and orient them outwards.
 
-    A mesh with many holes or pieces can't be collapsed to the limit, or loses parts on the way. Up to six times as many
-    faces are accepted then; where that is not enough, vertices are merged on a grid.
+    Meshes with many holes or pieces cannot be reduced to the limit without losing parts. For them, up to six times the
+    limit is accepted; if that is not enough, vertices are merged on a grid.
 
     Raises:
         AssetError: no face is left.
@@ -47,7 +47,7 @@ def simplify_mesh(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
     found = [part for part in found if len(part[1]) <= most]
     vertices, faces = next((part for part in found if keeps_parts(*part)), found[-1])
     if len(faces) == 0:
-        raise AssetError("the mesh has no faces of any size", expected=f"1 to {triangles} faces", found=0)
+        raise AssetError("all faces of the mesh are degenerate", expected=f"1 to {triangles} faces", found=0)
     body = trimesh.Trimesh(vertices * size + center, faces, process=False)
     body.update_faces(body.nondegenerate_faces())
     body.remove_unreferenced_vertices()
@@ -59,14 +59,14 @@ def simplify_mesh(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
 
 
 def merge_vertices(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return the faces of a mesh, in the same order, over vertices merged by position."""
+    """Return the faces of a mesh in the same order, with vertices merged by position."""
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     body.merge_vertices(digits_vertex=None)
     return body
 
 
 def orient_outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return a welded mesh with its faces outwards, in the same order."""
+    """Return a mesh with merged vertices and outward faces in the same order."""
     body = merge_vertices(mesh)
     if body.volume < 0:
         body.faces = np.array(body.faces)[:, ::-1]
@@ -74,12 +74,12 @@ def orient_outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _collapsed(vertices: Array, faces: NDArray, triangles: int) -> tuple[Array, NDArray]:
-    """Return vertices and faces after edges were collapsed to the limit, or as near to it as it goes."""
+    """Collapse edges until the limit, or as close to it as possible; return vertices and faces."""
     gentle = (2, 3) if len(faces) > DENSE * triangles else ()
-    for aggression in (*gentle, 5, 7, 9, 12, 16, 20):  # it may stop above the limit
+    for aggression in (*gentle, 5, 7, 9, 12, 16, 20):  # the library may stop above the limit
         before = np.inf
         while triangles < len(faces) < STUCK * before:
-            before = len(faces)  # by halves: a dense mesh that loses most of its faces at once folds over
+            before = len(faces)  # in halves: a dense mesh folds over if it loses most of its faces at once
             target = max(triangles, before // 2) if gentle else triangles
             vertices, faces = fast_simplification.simplify(
                 np.ascontiguousarray(vertices), faces.astype(np.int32), target_count=target, agg=aggression
@@ -88,7 +88,7 @@ def _collapsed(vertices: Array, faces: NDArray, triangles: int) -> tuple[Array, 
 
 
 def _merged(vertices: Array, faces: NDArray, cells: int) -> tuple[Array, NDArray]:
-    """Return vertices and faces with one vertex, the mean, per cell of a grid with so many cells per unit."""
+    """Merge the vertices in each cell of a grid with ``cells`` cells per unit; return vertices and faces."""
     _, cell, counts = np.unique(np.floor(vertices * cells), axis=0, return_inverse=True, return_counts=True)
     cell = cell.reshape(-1)
     means = np.stack([np.bincount(cell, column) / counts for column in vertices.T], axis=1)

@@ -1,4 +1,4 @@
-"""What assets are made from: the hand-over between those who read or invent meshes and those who build assets."""
+"""Sources of assets: the interface between importers, which create meshes, and the build of assets."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from robocas_ms3.assets.manifest import Handle, InnerBox, Joint, Link, Surface, 
 
 @dataclass(frozen=True)
 class ObjectSource:
-    """What an object is made from.
+    """Source of an object.
 
     Attributes:
-        id: folder name.
-        name: for language.
-        category: what kind of thing it is.
-        mesh: to look at; textured, metres, z up, any origin.
+        id: id and folder name.
+        name: name in instructions.
+        category: category of the object.
+        mesh: visual mesh: textured, metres, z up, any origin.
         closed: watertight mesh of the same body in the same frame, for volume, hulls and grasps.
         mass: kg.
-        friction: of its surface.
-        source: where the geometry comes from.
-        licence: of the mesh.
-        attribution: whom to name.
-        repairs: what had to be mended.
-        graspnet_id: of the object of GraspNet-1Billion that it is or stands in for.
-        pieces: (V, 3) corners of convex pieces, in the mesh's frame, where they are known; none: by decomposition.
-        grasps: in the mesh's frame, where they are known; none: sampled.
-        hollow: a container or a thin thing, whose hulls are judged by distance.
+        friction: friction coefficient of the surface.
+        source: source of the geometry.
+        licence: licence of the mesh.
+        attribution: credit for the mesh.
+        repairs: repairs of the source mesh.
+        graspnet_id: id of the same object, or of the replaced object, in GraspNet-1Billion.
+        pieces: (V, 3) corners of convex pieces in the mesh's frame; None: computed by decomposition.
+        grasps: known grasps in the mesh's frame; None: sampled.
+        hollow: whether the object is a container or thin; its hulls are then checked by surface distance.
     """
 
     id: str
@@ -51,7 +51,7 @@ class ObjectSource:
     hollow: bool = False
 
     def __post_init__(self) -> None:
-        """Check the name before a folder gets it."""
+        """Check the name, which becomes a folder."""
         check_asset_name(self.id, "id of an object")
 
 
@@ -60,11 +60,11 @@ class LinkSource:
     """A moving part of a piece of furniture, in the furniture's frame with all joints at 0; metres.
 
     Attributes:
-        name: of the link.
-        joint: how it hangs on its parent.
-        mesh: to look at.
+        name: name of the link.
+        joint: joint between the link and its parent.
+        mesh: visual mesh.
         pieces: (V, 3) corners of each convex collision piece.
-        mass: kg; its centre and inertia are those of the pieces, solid.
+        mass: kg; centre of mass and inertia are those of the solid pieces.
         parent: name of another link; empty: the fixed body.
     """
 
@@ -76,11 +76,11 @@ class LinkSource:
     parent: str = ""
 
     def __post_init__(self) -> None:
-        """Check the name before a folder gets it."""
+        """Check the name, which becomes a folder."""
         check_asset_name(self.name, "name of a link")
 
-    def facts(self) -> Link:
-        """What a pack says of it."""
+    def to_link(self) -> Link:
+        """Return the manifest entry of the link."""
         center, inertia, axes = piece_inertia(self.pieces, self.mass)
         return Link(
             name=self.name,
@@ -95,21 +95,21 @@ class LinkSource:
 
 @dataclass(frozen=True)
 class FurnitureSource:
-    """What a piece of furniture is made from; everything in its own frame, metres.
+    """Source of a piece of furniture, in its own frame; metres.
 
     Attributes:
-        id: folder name.
-        name: for language.
-        category: what kind of thing it is.
-        mesh: to look at, of the fixed body.
+        id: id and folder name.
+        name: name in instructions.
+        category: category of the furniture.
+        mesh: visual mesh of the fixed body.
         pieces: (V, 3) corners of each convex collision piece of the fixed body.
-        mass: kg; none: it can't move. Its centre and inertia are those of the pieces, solid.
-        origin_height: of the frame above the lowest point.
-        surfaces: where objects may stand.
+        mass: kg; None: the body is fixed. Centre of mass and inertia are those of the solid pieces.
+        origin_height: height of the frame's origin above the lowest point, m.
+        surfaces: surfaces for objects.
         inner: inside of a container.
         links: moving parts, parents first.
-        handles: where to take hold of them.
-        finishes: part -> finish -> mesh of that part; the first is the default. Not in ``mesh``.
+        handles: grasps of the moving parts.
+        finishes: part -> finish -> mesh of the part, not included in ``mesh``; the first finish is the default.
     """
 
     id: str
@@ -131,7 +131,7 @@ class FurnitureSource:
     repairs: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check the names before folders and files get them."""
+        """Check the names, which become folders and files."""
         check_asset_name(self.id, "id of a piece of furniture")
         for part, finishes in self.finishes.items():
             for name in (part, *finishes):

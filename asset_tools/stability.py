@@ -1,4 +1,4 @@
-"""On which sides a body can rest, by the geometry of its convex hull: how probably, how firmly."""
+"""Find stable poses of a body from its convex hull, with probabilities and toppling angles."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray
 
-LIMIT = 12  # poses of an object at most
-FALLBACK = 3  # poses tried where each is improbable
-SAME_DEG = 5.0  # poses whose up directions are nearer than this count as one
-SAME_HEIGHT = 0.0005  # m: poses with their centre of mass this level are of one family (a cylinder on its side)
+LIMIT = 12  # maximum number of poses of an object
+FALLBACK = 3  # number of tried poses if all are improbable
+SAME_DEG = 5.0  # poses with a smaller angle between their up directions are equal
+SAME_HEIGHT = 0.0005  # m: poses with equal height of the centre of mass form a family (a cylinder on its side)
 UPRIGHT_DEG = 10.0
-BELOW = 0.0004  # m: how far corners of the object may reach below the plane
-ROCKING_DEG = tuple(range(1, 11))  # a body rocks if, tilted by any of these, it is no lower than before
+BELOW = 0.0004  # m: tolerated depth of corners below the plane
+ROCKING_DEG = tuple(range(1, 11))  # tilts of the check for rocking
 
 
 def stable_directions(hull: ConvexHull, center: Array) -> tuple[Array, Array, Array]:
-    """Up directions (N, 3) of the facets the object can rest on, their probabilities and centre of mass heights.
+    """Return up directions (N, 3) of stable facets, their probabilities and the heights of the centre of mass.
 
-    Each facet gets the solid angle under which it is seen from the centre of mass; where the foot of the
-    perpendicular is outside of a facet, the object topples over that edge (Goldberg et al. 1999).
+    The probability of a facet is its solid angle seen from the centre of mass. If the foot of the perpendicular is
+    outside of a facet, the object topples over that edge to another facet (Goldberg et al. 1999).
     """
     normals, heights = hull.equations[:, :3], -(hull.equations[:, :3] @ center + hull.equations[:, 3])
     if heights.min() <= 0:
@@ -42,7 +42,7 @@ def stable_directions(hull: ConvexHull, center: Array) -> tuple[Array, Array, Ar
         overhang[:, k] = np.einsum("ij,ij->i", out, feet - p) / length
     here = np.arange(len(feet))
     beyond = hull.neighbors[here, overhang.argmax(1)]
-    # never uphill, so that rounding can't send it round in circles
+    # never uphill, so that rounding cannot cause cycles
     topples = (overhang.max(1) > 1e-7) & (heights[beyond] <= heights + 1e-9)
     follow = np.where(topples, beyond, here)
     for _ in range(int(np.log2(len(feet))) + 1):
@@ -53,10 +53,10 @@ def stable_directions(hull: ConvexHull, center: Array) -> tuple[Array, Array, Ar
 
 
 def merge_poses(directions: Array, probabilities: Array, heights: Array) -> tuple[Array, Array, Array]:
-    """Unite poses of nearly the same up direction under their most probable one; the most probable first."""
+    """Merge poses with similar up directions into the most probable one; return them by descending probability."""
     kept: list[int] = []
     sums: list[float] = []
-    # rounded, so that noise does not decide between equals
+    # rounded, so that noise does not change the order of equal values
     ranking: list[int] = np.argsort(-np.round(probabilities, 9), kind="stable").tolist()
     for i in ranking:
         if kept:
@@ -71,9 +71,9 @@ def merge_poses(directions: Array, probabilities: Array, heights: Array) -> tupl
 
 
 def select_poses(directions: Array, probabilities: Array, heights: Array, minimum: float) -> list[int]:
-    """Indices of the poses to try: those of probable families, the families' heads first, then well spread.
+    """Return indices of the poses to try: one of each probable family first, then spread over directions.
 
-    The upright pose is among them however improbable it is: that is how people put things down.
+    The upright pose is always included, since people place objects upright.
     """
     family = np.full(len(heights), -1)
     for i in range(len(heights)):
@@ -97,15 +97,15 @@ def select_poses(directions: Array, probabilities: Array, heights: Array, minimu
 
 
 def pool_probabilities(directions: Array, probabilities: Array, kept: list[int]) -> Array:
-    """Probabilities of the kept poses with those of all others added to the nearest."""
+    """Return the probabilities of the kept poses; add those of other poses to the nearest kept pose."""
     nearest = (directions @ directions[kept].T).argmax(1)
     return np.bincount(nearest, probabilities, len(kept))
 
 
 def rocks_in_place(points: Array, up: Array) -> bool:
-    """Whether a body of corners (V, 3) about its centre of mass stays near a pose even if it leaves it.
+    """Return whether a body with corners (V, 3), relative to its centre of mass, rocks around a pose without toppling.
 
-    The sides of an oval bottle are a few facets, and on each of them it stands by a hair.
+    Example: an oval bottle on its side, which has several facets with tiny toppling angles.
     """
     across = np.linalg.svd(up[None])[2][1:]
     turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
@@ -116,12 +116,12 @@ def rocks_in_place(points: Array, up: Array) -> bool:
 
 
 def toppling_angle(points: Array, center_of_mass: Array, up: Array) -> float:
-    """Angle in degrees by which a body can be tilted, in the worst direction, before it topples.
+    """Return the smallest angle in degrees at which a tilted body topples.
 
     Args:
-        points: (V, 3) its corners, m.
-        center_of_mass: (3,).
-        up: (3,) unit, the direction of its frame that points up.
+        points: (V, 3) corners, m.
+        center_of_mass: (3,) m.
+        up: (3,) unit vector in the body's frame that points up.
     """
     heights = points @ up
     feet = points[heights - heights.min() < BELOW]
@@ -130,6 +130,6 @@ def toppling_angle(points: Array, center_of_mass: Array, up: Array) -> float:
     try:
         edges = ConvexHull(outline).equations
     except (QhullError, ValueError):
-        return 0.0  # it stands on an edge or a corner
+        return 0.0  # supported by an edge or a corner only
     reach = float((-edges[:, 2]).min())
     return float(np.degrees(np.arctan2(reach, center_of_mass @ up - heights.min())))

@@ -99,7 +99,7 @@ def _grasps(labels: Path, closed: trimesh.Trimesh, id_: str) -> tuple[Grasps | N
     rng = np.random.default_rng(zlib.crc32(id_.encode()))
     sampled = sample_grasps(closed, np.asarray(closed.center_mass), rng, count=GRASPS - len(found))
     note = f"of {labelled} good grasp labels {len(found)} fit the gripper; sampled {len(sampled)} more"
-    return found.joined(sampled), (note,)
+    return found.concatenate(sampled), (note,)
 
 
 def _job(root: Path, number: int, inspected: Inspection) -> AssetJob:

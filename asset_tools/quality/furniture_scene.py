@@ -47,7 +47,7 @@ def model_of(furniture: FurnitureSource | LoadedFurniture) -> Model:
     pieces = {"": furniture.pieces} | {link.name: link.pieces for link in furniture.links}
     return Model(
         pieces,
-        tuple(link.facts() for link in furniture.links),
+        tuple(link.to_link() for link in furniture.links),
         furniture.surfaces,
         furniture.handles,
         furniture.friction,

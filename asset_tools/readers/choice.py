@@ -1,4 +1,4 @@
-"""Which files of a folder are the object: of several versions the best one, of several parts all of them."""
+"""Choose the files of a folder that form an object: the best of several versions, or all of several parts."""
 
 from __future__ import annotations
 
@@ -19,35 +19,35 @@ from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 
-FORMATS = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off", ".dae", ".3mf")  # the better first
+FORMATS = (".obj", ".glb", ".gltf", ".ply", ".stl", ".off", ".dae", ".3mf")  # in order of preference
 _WORD = r"(^|[^a-z])({})([^a-z]|$)"
 COLLISION = re.compile(_WORD.format("collisions?|collider|coll?|vhacd|coacd|ucx|ubx|usp|cvx|decomp|decomposed"))
-HULL = re.compile(_WORD.format("convex|hulls?|physics|phys"))  # or a part of a boat
-# what tells versions of one mesh apart
+HULL = re.compile(_WORD.format("convex|hulls?|physics|phys"))  # may also be a part of a boat
+# suffixes of versions of one mesh
 QUALIFIERS = re.compile(
     r"[^a-z0-9]*(non[^a-z0-9]*textured|untextured|textured?|tex|visual|lod[^a-z]*\d*|low|high|simplified)$"
 )
-PREFERRED_FOLDER = "google_16k"  # of the YCB set; its other folders hold the same mesh, larger or from other methods
+PREFERRED_FOLDER = "google_16k"  # in the YCB set; its other folders have the same mesh, larger or from other methods
 COLLISION_FOLDERS = {"collision", "collisions", "coacd", "vhacd"}
-DEPTH = 3  # folders below the object's in which meshes are looked for
+DEPTH = 3  # levels of subfolders that are searched for meshes
 MOST_FILES = 64
-ENOUGH_FACES = 20_000  # more detail is no reason to prefer a mesh
-SAME = 0.02  # of the diagonal: distance of surfaces, and difference of boxes, that show the same
-COVERED = 0.9  # share of a surface that has to be on another one for that to show it
-APART = 0.05  # of the diagonal: gap between parts of one object at most
-INSIDE = 0.05  # share of a part inside of another's hull, above which they are two objects around one axis
-MOST_OF = 0.6  # of a hull's diagonal that other meshes have to reach
+ENOUGH_FACES = 20_000  # above this number, more faces are not preferred
+SAME = 0.02  # of the diagonal: tolerance for equal surfaces and bounding boxes
+COVERED = 0.9  # fraction of a surface that must be on another one to be contained in it
+APART = 0.05  # of the diagonal: largest gap between parts of one object
+INSIDE = 0.05  # fraction of a part in the hull of another; above, they are two objects around one axis
+MOST_OF = 0.6  # of a hull's diagonal: minimum size of the other meshes
 SCALES = (1.0, 10.0, 100.0, 1000.0, 25.4, 2.54, 39.37, 0.3937)  # between units
-SAMPLES, TRIED = 20_000, 500  # points on a surface, and how many of them are compared with another surface
+SAMPLES, TRIED = 20_000, 500  # points on a surface, and number of points compared with another surface
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A mesh file that may be the object, or a part of it.
+    """A mesh file that may be the object or a part of it.
 
     Attributes:
         path: of the file.
-        parts: what it holds.
+        parts: content of the file.
     """
 
     path: Path
@@ -55,7 +55,7 @@ class Candidate:
 
     @cached_property
     def bounds(self) -> Array:
-        """(2, 3) of all faces."""
+        """Bounding box (2, 3) of all faces."""
         return np.array([self.samples.min(axis=0), self.samples.max(axis=0)])
 
     @cached_property
@@ -65,19 +65,19 @@ class Candidate:
 
     @cached_property
     def textured(self) -> bool:
-        """Whether an image is shown."""
+        """Whether the mesh has a texture image."""
         return any(part.uvs is not None and part.material.image is not None for part in self.parts)
 
     @property
     def rank(self) -> tuple[bool, bool, int, int, str]:
-        """Sort key, the best first: textured, coloured, detailed, of a better format, by name."""
+        """Sort key, best first: textured, coloured, detailed, preferred format, name."""
         coloured = any(part.colors is not None or part.material.color != (1.0, 1.0, 1.0) for part in self.parts)
         faces, suffix = sum(len(part.faces) for part in self.parts), self.path.suffix.lower()
         return not self.textured, not coloured, -min(faces, ENOUGH_FACES), FORMATS.index(suffix), self.path.name
 
     @cached_property
     def samples(self) -> Array:
-        """(N, 3) corners and points spread over the surface."""
+        """Points (N, 3) on the surface, including extreme vertices."""
         offsets = np.cumsum([0] + [len(part.vertices) for part in self.parts[:-1]])
         vertices = np.concatenate([part.vertices for part in self.parts])
         faces = np.concatenate([part.faces + offset for part, offset in zip(self.parts, offsets, strict=True)])
@@ -89,11 +89,11 @@ class Candidate:
 
     @cached_property
     def tree(self) -> KDTree:
-        """Of the samples."""
+        """KD tree of the samples."""
         return KDTree(self.samples)
 
-    def shows(self, points: Array) -> bool:
-        """Return whether points (N, 3) are on the surface, nearly all of them."""
+    def contains(self, points: Array) -> bool:
+        """Return whether nearly all points (N, 3) are on the surface."""
         reach = SAME * self.diagonal
         near = ((points >= self.bounds[0] - reach) & (points <= self.bounds[1] + reach)).all(axis=1)
         if near.mean() < COVERED:
@@ -102,10 +102,10 @@ class Candidate:
 
 
 def mesh_files(folder: Path) -> list[Path]:
-    """Return the mesh files of an object's folder and of the folders in it, by name.
+    """Return the mesh files of an object's folder and its subfolders, sorted by name.
 
     Raises:
-        AssetError: there are none, or more than 64 apart from collision meshes.
+        AssetError: the folder has no mesh files, or more than 64 without collision meshes.
     """
     found = _meshes_below(folder, DEPTH)
     if not found:
@@ -114,35 +114,35 @@ def mesh_files(folder: Path) -> list[Path]:
         raise AssetError("no mesh in this folder", where=folder, found=", ".join(others), fix=fix)
     shown = [path for path in found if not is_collision(path, folder)]
     if len(shown) > MOST_FILES:
-        fix, expected = "Give each object a folder of its own, or its parts in one file.", f"at most {MOST_FILES}"
+        fix, expected = "Use one folder per object, or join the parts into one file.", f"at most {MOST_FILES}"
         raise AssetError("too many mesh files", where=folder, expected=expected, found=len(shown), fix=fix)
     return found if shown else found[:MOST_FILES]
 
 
 def is_mesh(path: Path) -> bool:
-    """Return whether a file has the suffix of a mesh format; hidden files have not."""
+    """Return whether a path is a file with the suffix of a mesh format, and not hidden."""
     return path.suffix.lower() in FORMATS and not path.name.startswith(".") and not path.is_dir()
 
 
 def is_collision(path: Path, folder: Path) -> bool:
-    """Return whether the name of a file, or of its folder below ``folder``, says that it is for collision checking."""
+    """Return whether the name of a file, or of its folders below ``folder``, indicates a collision mesh."""
     folders = {part.lower() for part in path.relative_to(folder).parts[:-1]}
     return COLLISION.search(path.stem.lower()) is not None or bool(folders & COLLISION_FOLDERS)
 
 
 def choose_candidates(candidates: Sequence[Candidate], folder: Path, notes: list[str]) -> list[Candidate]:
-    """Return the candidates that together are the object.
+    """Return the candidates that together form the object.
 
-    What another mesh shows is left out: another version of it, or a part of it. Of versions the textured and most
-    detailed one stays. What remains has to look like parts of one object, which touch each other.
+    Other versions and parts of a mesh are ignored; the textured and most detailed version stays. The remaining meshes
+    must look like parts of one object, which touch each other.
 
     Args:
-        candidates: all with faces; no collision meshes, unless there are no others.
-        folder: that holds them.
-        notes: gets a line that says which files were used, and one per file that was ignored.
+        candidates: meshes with faces; no collision meshes, unless there are no others.
+        folder: folder of the object.
+        notes: list to which notes on used and ignored files are added.
 
     Raises:
-        AssetError: several files that do not look like parts of one object, all named.
+        AssetError: several files do not look like parts of one object.
     """
     ignored: dict[Path, str] = {}
     left = _without_hulls(sorted(candidates, key=lambda one: one.rank), ignored)
@@ -156,8 +156,8 @@ def choose_candidates(candidates: Sequence[Candidate], folder: Path, notes: list
     for candidate in list(best):
         points = candidate.samples[:TRIED]
         for other in best:
-            if other is not candidate and (other.textured or not candidate.textured) and other.shows(points):
-                ignored[candidate.path] = f"{_name(other, folder)} shows it"
+            if other is not candidate and (other.textured or not candidate.textured) and other.contains(points):
+                ignored[candidate.path] = f"{_name(other, folder)} contains it"
                 best.remove(candidate)
                 break
     if len(best) > 1:
@@ -180,7 +180,7 @@ def _meshes_below(folder: Path, depth: int) -> list[Path]:
 
 
 def _without_hulls(candidates: list[Candidate], ignored: dict[Path, str]) -> list[Candidate]:
-    """Return candidates without those called hulls, if the others are about as large."""
+    """Remove candidates with names of hulls, if the others are about as large."""
     hulls = [one for one in candidates if HULL.search(one.path.stem.lower())]
     others = [one for one in candidates if one not in hulls]
     if not hulls or not others:
@@ -193,7 +193,7 @@ def _without_hulls(candidates: list[Candidate], ignored: dict[Path, str]) -> lis
 
 
 def _are_versions(first: Candidate, second: Candidate) -> bool:
-    """Return whether two files hold one mesh, which may be in another unit, or have another axis up."""
+    """Return whether two files have the same mesh, possibly in another unit or with another up axis."""
     one, other = (_version_name(candidate.path) for candidate in (first, second))
     alike = one == other and first.path.parent == second.path.parent
     if alike and np.abs(first.bounds - second.bounds).max() <= SAME * first.diagonal:
@@ -209,10 +209,10 @@ def _are_versions(first: Candidate, second: Candidate) -> bool:
 
 
 def _same_surface(first: Candidate, second: Candidate, transform: Array) -> bool:
-    """Return whether a surface, transformed (3x3), is another one."""
-    if not first.shows(second.samples[:TRIED] @ transform.T):
+    """Return whether a surface, transformed by a matrix (3, 3), equals another one."""
+    if not first.contains(second.samples[:TRIED] @ transform.T):
         return False
-    return second.shows(first.samples[:TRIED] @ np.linalg.inv(transform).T)
+    return second.contains(first.samples[:TRIED] @ np.linalg.inv(transform).T)
 
 
 def _version_name(path: Path) -> str:
@@ -224,7 +224,7 @@ def _check_parts(parts: Sequence[Candidate], folder: Path) -> None:
     """Check that files look like parts of one object.
 
     Raises:
-        AssetError: they do not touch, or are around one axis and inside of each other, as separate objects are.
+        AssetError: the parts do not touch, or enclose each other around one axis like separate objects.
     """
     bounds = np.array([part.bounds for part in parts])
     diagonal = float(np.linalg.norm(bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)))
@@ -240,14 +240,14 @@ def _check_parts(parts: Sequence[Candidate], folder: Path) -> None:
         raise AssetError(
             "several mesh files that do not look like parts of one object",
             where=folder,
-            expected="parts that touch each other, each in its place",
+            expected="parts that touch each other",
             found=", ".join(_name(part, folder) for part in parts),
-            fix="Give each object a folder of its own, or join the parts into one file.",
+            fix="Use one folder per object, or join the parts into one file.",
         )
 
 
 def _around_one_axis(bounds: Array, tolerance: float) -> bool:
-    """Return whether boxes (N, 2, 3) have one middle, or stand on one plane around one axis."""
+    """Return whether boxes (N, 2, 3) have the same centre, or the same base plane and axis."""
     middles = bounds.mean(axis=1)
     apart = np.ptp(middles, axis=0) > tolerance
     bases_apart = np.ptp(bounds[:, 0], axis=0) > tolerance
@@ -255,7 +255,7 @@ def _around_one_axis(bounds: Array, tolerance: float) -> bool:
 
 
 def _inside(parts: Sequence[Candidate]) -> bool:
-    """Return whether much of a part is inside of the convex hull of another one."""
+    """Return whether a large fraction of a part is inside the convex hull of another part."""
     for one in parts:
         try:
             planes = ConvexHull(one.samples).equations

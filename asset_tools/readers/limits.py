@@ -1,4 +1,4 @@
-"""Time and memory that reading a file of others may take."""
+"""Limit time and memory for reading untrusted files."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ MAX_MEMORY = 2 * 2**30  # bytes
 
 @contextmanager
 def reading_limits(where: object) -> Iterator[None]:
-    """End what is inside after 25 s, or when it needs 2 GB of memory more than the process has.
+    """Abort the block after 25 s, or if it needs more than 2 GB of additional memory.
 
-    Outside of the main thread, where no alarm can be set, there is no limit of time.
+    The time limit applies only in the main thread, since other threads cannot set an alarm.
 
     Args:
-        where: the model, for errors.
+        where: the model, for messages.
 
     Raises:
-        AssetError: a limit was reached.
+        AssetError: a limit was exceeded.
     """
-    fix = "Reduce the mesh, or leave the model out."
+    fix = "Reduce the mesh, or skip the model."
     too_slow = AssetError(
-        "reading the model takes too long", where=where, expected=f"at most {MAX_SECONDS:.0f} s", fix=fix
+        "reading the model exceeded the time limit", where=where, expected=f"at most {MAX_SECONDS:.0f} s", fix=fix
     )
     limit = resource.getrlimit(resource.RLIMIT_DATA)
     wanted = _data_size() + MAX_MEMORY
@@ -46,12 +46,12 @@ def reading_limits(where: object) -> Iterator[None]:
             signal.setitimer(signal.ITIMER_REAL, MAX_SECONDS)
         yield
     except MemoryError as error:
-        what = "reading the model needs too much memory"
+        what = "reading the model exceeded the memory limit"
         raise AssetError(what, where=where, expected=f"at most {MAX_MEMORY >> 30} GB", fix=fix) from error
     except _Timeout as error:
         raise too_slow from error
     except Exception as error:
-        if alarm.rung:  # native code has made another error of it
+        if alarm.rung:  # native code has converted the alarm to another error
             raise too_slow from error
         raise
     finally:
@@ -62,7 +62,7 @@ def reading_limits(where: object) -> Iterator[None]:
 
 
 class _Timeout(BaseException):
-    """No parser takes it for an error of the file."""
+    """Timeout; not an Exception, so that parsers do not catch it."""
 
 
 class _Alarm:
@@ -75,6 +75,6 @@ class _Alarm:
 
 
 def _data_size() -> int:
-    """Return the bytes that count against RLIMIT_DATA."""
+    """Return the number of bytes that count towards RLIMIT_DATA."""
     found = re.search(r"^VmData:\s*(\d+) kB", Path("/proc/self/status").read_text(), flags=re.MULTILINE)
     return int(found[1]) * 1024 if found else 0

@@ -1,4 +1,4 @@
-"""A model's files as one mesh."""
+"""Read the files of a model as one mesh."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ READERS: dict[str, Callable[[Path, ModelFiles], list[MeshPart]]] = {
     ".obj": read_obj,
     ".glb": read_gltf,
     ".gltf": read_gltf,
-}  # the others are trimesh's
+}  # trimesh reads other formats
 
 
-LARGEST_UV = 1e4  # an image that repeats more often is an error of the file
+LARGEST_UV = 1e4  # more repetitions of an image are an error of the file
 UPS: dict[bytes, Literal["x", "y", "z"]] = {b"X": "x", b"Y": "y", b"Z": "z"}
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What was read of a model.
+    """A model that was read from files.
 
     Attributes:
-        mesh: of all its triangles, in the unit and frame of the file.
-        up: axis that points up by the format's rules; None: the format has none.
-        files: all that were read, for a content hash.
-        notes: files used and ignored, substitutions, and warnings; a line each.
+        mesh: all triangles, in the unit and frame of the file.
+        up: axis that points up by the rules of the format; None: the format has no rule.
+        files: all files that were read, for a content hash.
+        notes: used and ignored files, substitutions and warnings, one line each.
     """
 
     mesh: trimesh.Trimesh
@@ -50,17 +50,17 @@ class Model:
 
 
 def read_model(path: Path | list[Path], root: Path | None = None) -> Model:
-    """Read a model: a mesh file, a folder with its files, or several files of which some may be versions.
+    """Read a model: a mesh file, a folder with its files, or several files, which may be versions of one mesh.
 
     Args:
         path: of the model.
-        root: the imported folder, outside of which nothing is read; None: the model's own folder.
+        root: the imported folder; no files outside of it are read. None: the model's own folder.
 
     Raises:
-        AssetError: a file is missing, damaged, too large or outside of ``root``; the mesh is empty, of no size or not
-            finite; or a folder holds several objects.
+        AssetError: a file is missing, damaged, too large or outside of ``root``; the mesh is empty or has an invalid
+            size; or a folder contains several objects.
     """
-    paths = [Path(os.path.abspath(one)) for one in (path if isinstance(path, list) else [path])]
+    paths = [Path(os.path.abspath(item)) for item in (path if isinstance(path, list) else [path])]
     is_folder = paths[0].is_dir()
     home = paths[0] if is_folder else paths[0].parent
     files = ModelFiles(Path(os.path.abspath(root or home)), home, None if is_folder else paths[0].stem)
@@ -74,7 +74,7 @@ def read_model(path: Path | list[Path], root: Path | None = None) -> Model:
 
 
 def _chosen(paths: list[Path], files: ModelFiles) -> list[Candidate]:
-    """Return the candidates that are the object; notes are those of the files that are used."""
+    """Return the candidates that form the object; keep the notes of the used files only."""
     collision = [path for path in paths if is_collision(path, files.home)]
     if len(collision) == len(paths):
         collision = []
@@ -96,7 +96,7 @@ def _chosen(paths: list[Path], files: ModelFiles) -> list[Candidate]:
     files.notes.extend(f"ignored {names[path]}: a collision mesh" for path in collision)
     files.notes.extend(f"warning: ignored {names[path]}: {error}" for path, error in errors.items())
     for candidate, own in candidates:
-        # those that were not chosen count too: without them the notes would be others
+        # files that were not chosen also count, since they affect the notes
         files.used.extend(path for path in own.used if path not in files.used)
         if candidate in chosen:
             files.notes.extend(own.notes)
@@ -105,7 +105,7 @@ def _chosen(paths: list[Path], files: ModelFiles) -> list[Candidate]:
 
 def _candidate(path: Path, files: ModelFiles) -> Candidate:
     if not os.path.lexists(path):
-        raise AssetError("there is no such mesh", where=path)
+        raise AssetError("no such mesh file", where=path)
     if not is_mesh(path):
         raise AssetError("not a mesh file", where=path, expected=f"one of {', '.join(FORMATS)}", found=path.suffix)
     parts = READERS.get(path.suffix.lower(), read_exchange)(path, files)
@@ -117,10 +117,10 @@ def _candidate(path: Path, files: ModelFiles) -> Candidate:
 
 
 def _clean(part: MeshPart, path: Path, files: ModelFiles) -> MeshPart:
-    """Return a part without unused vertices, and without coordinates and colours that are not finite.
+    """Return a part without unused vertices and without non-finite UVs and colours.
 
     Raises:
-        AssetError: the faces have vertices that are not finite.
+        AssetError: faces have non-finite vertices.
     """
     used, faces = np.unique(part.faces, return_inverse=True)
     vertices, uvs, colors, normals = (
@@ -130,12 +130,12 @@ def _clean(part: MeshPart, path: Path, files: ModelFiles) -> MeshPart:
     if not np.isfinite(vertices).all():
         found = f"{int((~np.isfinite(vertices).all(axis=1)).sum())} of {len(vertices)}"
         fix = "Export it again."
-        raise AssetError("the mesh has vertices that are not finite", where=path, found=found, fix=fix)
+        raise AssetError("the mesh has NaN or infinite vertices", where=path, found=found, fix=fix)
     if uvs is not None and not (np.abs(uvs) < LARGEST_UV).all():
-        files.notes.append(f"warning: {path.name}: left out a texture, whose coordinates are not finite")
+        files.notes.append(f"warning: {path.name}: ignored a texture with NaN or infinite coordinates")
         uvs = None
     if colors is not None and not np.isfinite(colors).all():
-        files.notes.append(f"warning: {path.name}: left out vertex colours that are not finite")
+        files.notes.append(f"warning: {path.name}: ignored NaN or infinite vertex colours")
         colors = None
     if normals is not None and not (np.isfinite(normals).all() and (np.abs(normals) <= 1.01).all()):
         normals = None
@@ -149,7 +149,7 @@ def _check(mesh: trimesh.Trimesh, path: Path) -> None:
     size, fix = float(mesh.extents.max()), "Export it again, in metres."
     if not 1e-9 < size < 1e9:
         expected, found = "1e-9 to 1e9 units", f"{size:g}"
-        raise AssetError("the mesh has no usable size", where=path, expected=expected, found=found, fix=fix)
+        raise AssetError("invalid size of the mesh", where=path, expected=expected, found=found, fix=fix)
 
 
 def _up(path: Path, files: ModelFiles) -> Literal["x", "y", "z"] | None:
@@ -158,5 +158,5 @@ def _up(path: Path, files: ModelFiles) -> Literal["x", "y", "z"] | None:
         return "y"
     if suffix == ".dae":
         found = re.search(rb"<up_axis>\s*([XYZ])_UP", files.read(path))
-        return UPS[found[1]] if found else "y"  # which is the format's default
+        return UPS[found[1]] if found else "y"  # default of the format
     return None

@@ -71,7 +71,7 @@ def test_skip_errors_imports_the_other_scans(scans, capsys):
     [
         (("--pack", "builtin"), "invalid name for an imported pack"),
         (("--pack", "../escaped"), "invalid name for an imported pack"),
-        (("--pack", "My.Pack"), "no name for a pack"),
+        (("--pack", "My.Pack"), "invalid name of a pack"),
         (("--pack", "mine", "--masses", "lost.yaml"), "lost.yaml"),
         (("--pack", "mine", "--jobs", "0"), "--jobs"),
     ],
