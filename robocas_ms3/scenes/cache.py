@@ -168,20 +168,20 @@ class LayoutCache:
         """
         with self._locked():
             before = self.table(engine)
-            states = {pair: before.state(pair) for pair in before.pairs()} if before else {}
+            statuses = {pair: before.status(pair) for pair in before.pairs()} if before else {}
             layouts: dict[SeedPair, Layout] = {}
-            for pair in dict.fromkeys([*states, *pairs]):
+            for pair in dict.fromkeys([*statuses, *pairs]):
                 if self.path(*pair).is_file():
                     layouts[pair] = self.get(*pair)
                 elif before is not None and (tabled := before.layout(pair)) is not None:
                     layouts[pair] = tabled
             if layouts:
-                write_table(self.table_path(engine), self._names, layouts, states)
+                write_table(self.table_path(engine), self._names, layouts, statuses)
             return self.table(engine)
 
-    def write_statuses(self, engine: Engine, states: Mapping[SeedPair, LayoutStatus]) -> None:
+    def write_statuses(self, engine: Engine, statuses: Mapping[SeedPair, LayoutStatus]) -> None:
         with self._locked():
-            write_statuses(self.table_path(engine), self._names, states)
+            write_statuses(self.table_path(engine), self._names, statuses)
 
     @contextmanager
     def _locked(self) -> Iterator[None]:

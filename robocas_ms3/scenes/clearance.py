@@ -77,7 +77,7 @@ def check_clearance(
     if envelope is not None:
         if config.randomisation.robot is None:
             arm = np.array(envelope.arm_at_start[config.robot_start])
-            _check_arm(transform_points(robot_pose, _densely(arm)), fixed)
+            _check_arm(transform_points(robot_pose, _interpolate(arm)), fixed)
         _check_reach(config, placed.get("basket"), region, _shoulders(config, robot_pose, robot, envelope), envelope)
 
 
@@ -139,7 +139,7 @@ def _body(envelope: Envelope, robot_pose: Array) -> CollisionBody:
     return CollisionBody("robot", hulls)
 
 
-def _densely(corners: Array) -> Array:
+def _interpolate(corners: Array) -> Array:
     pieces = zip(corners[:-1], corners[1:], strict=True)
     return np.concatenate([np.linspace(a, b, int(np.ceil(np.linalg.norm(b - a) / _ALONG)) + 1) for a, b in pieces])
 

@@ -40,9 +40,9 @@ class LayoutStatus(IntEnum):
     UNSTABLE = 3  # objects move in the engine of the table
 
 
-def is_usable(states: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def is_usable(statuses: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Return whether layouts with these statuses may start an episode."""
-    return (states == LayoutStatus.UNCHECKED) | (states == LayoutStatus.STABLE)
+    return (statuses == LayoutStatus.UNCHECKED) | (statuses == LayoutStatus.STABLE)
 
 
 class LayoutTable:
@@ -63,7 +63,7 @@ class LayoutTable:
         self._names = list(names)
         self.rows = _open(path, partial(np.lib.format.open_memmap, mode="r"), "not a layout table", dimensions=2)
         self._sets, self._seeds = self.rows["objects_seed"][:, 0].copy(), self.rows["seed"][0].copy()  # rising
-        self._states = self.rows["state"].copy()
+        self._statuses = self.rows["state"].copy()
 
     def find_records(
         self, objects_seeds: NDArray[np.int64], seeds: NDArray[np.int64]
@@ -72,25 +72,25 @@ class LayoutTable:
         rows = np.minimum(np.searchsorted(self._sets, objects_seeds), len(self._sets) - 1)
         columns = np.minimum(np.searchsorted(self._seeds, seeds), len(self._seeds) - 1)
         there = (self._sets[rows] == objects_seeds) & (self._seeds[columns] == seeds)
-        return np.where(there, self._states[rows, columns], LayoutStatus.MISSING), rows, columns
+        return np.where(there, self._statuses[rows, columns], LayoutStatus.MISSING), rows, columns
 
-    def state(self, pair: SeedPair) -> LayoutStatus:
+    def status(self, pair: SeedPair) -> LayoutStatus:
         return LayoutStatus(int(self.find_records(np.array([pair[0]]), np.array([pair[1]]))[0][0]))
 
-    def pairs(self, *states: LayoutStatus) -> list[SeedPair]:
+    def pairs(self, *statuses: LayoutStatus) -> list[SeedPair]:
         """Return the seed pairs of the layouts with these statuses; default: of all layouts in the table."""
-        rows, columns = np.nonzero(np.isin(self._states, states) if states else self._states)
+        rows, columns = np.nonzero(np.isin(self._statuses, statuses) if statuses else self._statuses)
         return [*zip(self._sets[rows].tolist(), self._seeds[columns].tolist(), strict=True)]
 
     def has_usable_layout(self, objects_seed: int) -> bool:
-        return bool(is_usable(self._states[self._sets == objects_seed]).any())
+        return bool(is_usable(self._statuses[self._sets == objects_seed]).any())
 
     def object_ids(self, objects_seed: int) -> ObjectIds | None:
         """Return the objects of an objects seed; None if the table has no layout of them."""
         row = int(np.searchsorted(self._sets, objects_seed))
         if row == len(self._sets) or self._sets[row] != objects_seed:
             return None
-        column = int(np.argmax(self._states[row] != LayoutStatus.MISSING))
+        column = int(np.argmax(self._statuses[row] != LayoutStatus.MISSING))
         return tuple(str(self._names[i]) for i in self.rows["objects"][row, column].tolist())
 
     def layout(self, pair: SeedPair) -> Layout | None:
@@ -103,7 +103,7 @@ def write_table(
     path: Path,
     names: Sequence[str],
     layouts: Mapping[SeedPair, Layout],
-    states: Mapping[SeedPair, LayoutStatus] = MappingProxyType({}),
+    statuses: Mapping[SeedPair, LayoutStatus] = MappingProxyType({}),
 ) -> None:
     """Write layouts as a table.
 
@@ -111,9 +111,9 @@ def write_table(
         path: the file.
         names: sorted ids of the object pack's objects.
         layouts: layouts by seed pair; other pairs of the same seeds become `LayoutStatus.MISSING`.
-        states: statuses by seed pair; default: `LayoutStatus.UNCHECKED`.
+        statuses: statuses by seed pair; default: `LayoutStatus.UNCHECKED`.
     """
-    records = _records(names, layouts, states)
+    records = _records(names, layouts, statuses)
     sets, row = np.unique(records["objects_seed"], return_inverse=True)
     seeds, column = np.unique(records["seed"], return_inverse=True)
     rows = np.zeros((len(sets), len(seeds)), records.dtype)
@@ -122,11 +122,11 @@ def write_table(
     _save(path, rows)
 
 
-def write_statuses(path: Path, names: Sequence[str], states: Mapping[SeedPair, LayoutStatus]) -> None:
+def write_statuses(path: Path, names: Sequence[str], statuses: Mapping[SeedPair, LayoutStatus]) -> None:
     """Write the statuses of some layouts into a table; pairs without a layout stay `LayoutStatus.MISSING`."""
     table = LayoutTable(path, names)
     rows = np.array(table.rows)
-    for pair, state in states.items():
+    for pair, state in statuses.items():
         before, row, column = table.find_records(np.array([pair[0]]), np.array([pair[1]]))
         if before[0] != LayoutStatus.MISSING:
             rows["state"][row[0], column[0]] = state
@@ -191,7 +191,7 @@ def join_frozen_layouts(path: Path, parts: Sequence[Path]) -> None:
 def _records(
     names: Sequence[str],
     layouts: Mapping[SeedPair, Layout],
-    states: Mapping[SeedPair, LayoutStatus] = MappingProxyType({}),
+    statuses: Mapping[SeedPair, LayoutStatus] = MappingProxyType({}),
 ) -> NDArray[np.void]:
     slots = len(next(iter(layouts.values())).object_ids)
     words = max(1, *(len(layout.relation) for layout in layouts.values()))
@@ -200,7 +200,7 @@ def _records(
     for i, (pair, layout) in enumerate(layouts.items()):
         records[i] = (
             *pair,
-            states.get(pair, LayoutStatus.UNCHECKED),
+            statuses.get(pair, LayoutStatus.UNCHECKED),
             [number[name] for name in layout.object_ids],
             to_wxyz(layout.object_poses),
             to_wxyz(layout.robot_pose),

@@ -103,12 +103,12 @@ def _snuggest(outlines: NDArray, placed: list[shapely.Polygon], region: Region) 
 def _candidates(rng: np.random.Generator, footprint: Array, region: Region) -> tuple[Array, Array, NDArray]:
     """Draw yaws (n,), positions (n, 2) and outlines (n,) of a footprint inside a region; n depends on its size."""
     yaws = rng.uniform(-np.pi, np.pi, _TRIES_AT_ONCE)
-    shares = rng.uniform(0, 1, (_TRIES_AT_ONCE, 2))
+    fractions = rng.uniform(0, 1, (_TRIES_AT_ONCE, 2))
     cos, sin = np.cos(yaws), np.sin(yaws)
     turned = np.einsum("nij,kj->nki", np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], 1), footprint)
     low, high = turned.min(axis=1), turned.max(axis=1)
     free = np.subtract(region.max_xy, region.min_xy) - (high - low)
-    positions = np.add(region.min_xy, shares * free) - low
+    positions = np.add(region.min_xy, fractions * free) - low
     fits = (free >= 0).all(axis=1)
     return yaws[fits], positions[fits], shapely.polygons((turned + positions[:, None])[fits])
 

@@ -185,12 +185,12 @@ def _usable(model: SceneModel, ids: list[str], *, columns: bool = False) -> list
     if columns:
         usable = [i for i in usable if things[i].display_pose >= 0] or usable
     if model.config.objects.ids != "all" and len(usable) < len(ids):
-        _warn_left_out(tuple(i for i in ids if i not in usable))
+        _warn_excluded(tuple(i for i in ids if i not in usable))
     return usable
 
 
 @lru_cache  # once each
-def _warn_left_out(ids: tuple[str, ...]) -> None:
+def _warn_excluded(ids: tuple[str, ...]) -> None:
     _log.warning(
         "objects excluded: %s. None of their resting poses (in an orderly layout: their display pose) fits below the "
         "surface's headroom.",

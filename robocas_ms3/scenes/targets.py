@@ -181,19 +181,19 @@ def _by_visibility(rng: np.random.Generator, scene: SettledScene) -> TargetChoic
     """
     rules = scene.model.config.target
     slots = np.flatnonzero(scene.present)
-    shares = np.full(len(scene.assets), np.nan)
+    fractions = np.full(len(scene.assets), np.nan)
     scenery = MeshScene([object_mesh(scene.assets[s]) for s in slots], scene.poses[slots])
-    shares[slots] = scenery.visible_fractions(selection_camera(scene.model))
+    fractions[slots] = scenery.visible_fractions(selection_camera(scene.model))
     unique = np.array([scene.names.count(name) == 1 for name in scene.names])
     fits = scene.eligible & unique
     if rules.max_visible_share is not None:
-        fits &= shares < rules.max_visible_share
+        fits &= fractions < rules.max_visible_share
     likely = 1 / np.linalg.norm(scene.xy_in_robot, axis=1) if rules.weight == "nearness" else np.ones(len(fits))
     weight = np.where(fits, likely, 0)
     while weight.any():
         slot = int(rng.choice(len(weight), p=weight / weight.sum()))
         if scene.has_uncovered_grasps(slot) and (rules.min_free_grasps == 0 or scene.has_free_grasps(slot)):
-            return TargetChoice(slot, visible_fractions=shares)
+            return TargetChoice(slot, visible_fractions=fractions)
         weight[slot] = 0
     return None
 

@@ -31,7 +31,7 @@ from robocas_ms3.scenes.task_specs import TaskSpec
 from robocas_ms3.tasks import engine
 from robocas_ms3.tasks.bodies import Bodies, Contacts, link_poses
 from robocas_ms3.tasks.goals import Goal, InBasket
-from robocas_ms3.tasks.initial_states import place
+from robocas_ms3.tasks.initial_states import set_initial_states
 from robocas_ms3.tasks.observations import over_the_shoulder, place_camera, privileged_observations
 from robocas_ms3.tasks.rewards import DENSE, TRANSFER, DenseReward, RewardTable, count_fraction
 from robocas_ms3.tasks.seeds import EpisodeSeeds, check_reset_options
@@ -228,7 +228,7 @@ class RoboCASEnv(BaseEnv):
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self._engine_errors.check()
-        place(self, self.seeds.find_initial_states(env_idx.cpu().numpy(), self.device), env_idx)
+        set_initial_states(self, self.seeds.find_initial_states(env_idx.cpu().numpy(), self.device), env_idx)
         self.success_check.reset(env_idx)
         self.dense_reward.reset(env_idx)
 
@@ -361,8 +361,8 @@ class RoboCASEnv(BaseEnv):
 
     def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
         """Return the reward (N,) float32 in [0, ``REWARDS.total``]; add ``reward_terms`` to the last step's info."""
-        moment = self.success_check.state
-        penalties = {"disturbed": count_fraction(moment.disturbed.sum(1)), **self.goal.penalties(moment)}
+        state = self.success_check.state
+        penalties = {"disturbed": count_fraction(state.disturbed.sum(1)), **self.goal.penalties(state)}
         return self.dense_reward.compute(self.reward_progress(), penalties, action, info)
 
     def reward_progress(self) -> tuple[Array, dict[str, Array]]:

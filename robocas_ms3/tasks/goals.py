@@ -66,7 +66,7 @@ class Goal(ABC):
         """Return additional conditions of success by name, (N,) bool each."""
         return {}
 
-    def is_lost(self, basket: Array | None, measures: dict[str, Array]) -> Array | None:
+    def is_lost(self, basket: Array | None, conditions: dict[str, Array]) -> Array | None:
         """Return (N,) in which envs the goal can't be reached any more; None: in no env."""
         return None
 
@@ -78,12 +78,14 @@ class Goal(ABC):
         """Return the position (N, 3) m, world, to which the target's centre of mass is carried; None: no fixed one."""
         return None
 
-    def progress(self, now: TaskState, brought: Array, table: rewards.RewardTable) -> tuple[Array, dict[str, Array]]:
+    def progress(
+        self, state: TaskState, was_lifted: Array, table: rewards.RewardTable
+    ) -> tuple[Array, dict[str, Array]]:
         """Return the current stage and reward terms, for dense rewards.
 
         Args:
-            now: state of the task.
-            brought: (N,) bool, whether the target has been lifted.
+            state: state of the task.
+            was_lifted: (N,) bool, whether the target has been lifted.
             table: reward table of the task.
 
         Returns:
@@ -94,7 +96,7 @@ class Goal(ABC):
         """
         raise NotImplementedError(f"{type(self).__name__} has no dense rewards")
 
-    def penalties(self, now: TaskState) -> dict[str, Array]:
+    def penalties(self, state: TaskState) -> dict[str, Array]:
         """Return penalties of dense rewards by name, (N,) in [0, 1] each."""
         return {}
 
@@ -131,51 +133,55 @@ class InBasket(Goal):
         start = to_native(self.env.basket_start_poses)
         return {"basket_stands": terms.is_basket_standing(*_split(basket), *_split(start))}
 
-    def is_lost(self, basket: Array | None, measures: dict[str, Array]) -> Array | None:
-        if known_all_true(measures["basket_stands"]):  # as nearly always
+    def is_lost(self, basket: Array | None, conditions: dict[str, Array]) -> Array | None:
+        if known_all_true(conditions["basket_stands"]):  # as nearly always
             return None
         start = to_native(self.env.basket_start_poses)
         over = terms.has_basket_fallen(*_split(basket), *_split(start))
-        return over & ~measures["basket_stands"]
+        return over & ~conditions["basket_stands"]
 
     def is_over_goal(self, positions: Array, basket: Array | None) -> Array | None:
         """Return which targets are above the basket; see `Goal`."""
         return terms.is_inside_box(positions, *_split(basket), *self._above)
 
-    def progress(self, now: TaskState, brought: Array, table: rewards.RewardTable) -> tuple[Array, dict[str, Array]]:
+    def progress(
+        self, state: TaskState, was_lifted: Array, table: rewards.RewardTable
+    ) -> tuple[Array, dict[str, Array]]:
         """Return the stage (grasp, lift, carry, place, release, rest) and the terms; see `Goal`."""
         env = self.env
         slot = to_native(env.target_slot)
-        target, center = terms.select_target(now.objects, slot), env.target_center(now.objects)
-        basket, turned = _split(now.basket)
+        target, center = terms.select_target(state.objects, slot), env.target_center(state.objects)
+        basket, turned = _split(state.basket)
         inside = rotations.rotate_inverse(turned, center - basket)  # the target in the basket's frame
         low, high = self._inside
         over = ((inside[:, :2] >= low[:2]) & (inside[:, :2] <= high[:2])).all(-1) & (inside[:, 2] >= low[2])  # pyright: ignore[reportOperatorIssue]
-        delivered = brought & now.at_goal
+        delivered = was_lifted & state.at_goal
         stage = rewards.furthest_stage(
             0 * slot + table.index("grasp"),
             [
-                (now.held, table.index("lift")),
+                (state.held, table.index("lift")),
                 # the basket may be lower than the target's start
-                (now.held & brought, table.index("carry")),
-                (brought & over, table.index("place")),
+                (state.held & was_lifted, table.index("carry")),
+                (was_lifted & over, table.index("place")),
                 (delivered, table.index("release")),
-                (delivered & ~now.touched, table.index("rest")),
+                (delivered & ~state.touched, table.index("rest")),
             ],
         )
         start = terms.select_target(to_native(env.start_poses)[..., 2], slot)
         return stage, {
             "reach": rewards.closeness(env.tcp_in_world()[:, :3], center),
             "lift": rewards.progress_fraction(target[:, 2], start, terms.LIFT),
-            "carry": rewards.closeness(center, self.position(now.basket), half=_FAR),
+            "carry": rewards.closeness(center, self.position(state.basket), half=_FAR),
             "place": 1 - rewards.progress_fraction(inside[:, 2], high[2], _LOWERING),
-            "released": rewards.release_fraction(now.held, now.touched),
+            "released": rewards.release_fraction(state.held, state.touched),
             "at_rest": rewards.stillness(target[:, 7:10], target[:, 10:]),
         }
 
-    def penalties(self, now: TaskState) -> dict[str, Array]:
+    def penalties(self, state: TaskState) -> dict[str, Array]:
         return {
-            "basket_shift": rewards.shift_fraction(_split(now.basket)[0], to_native(self.env.basket_start_poses)[:, :3])
+            "basket_shift": rewards.shift_fraction(
+                _split(state.basket)[0], to_native(self.env.basket_start_poses)[:, :3]
+            )
         }
 
 

@@ -78,7 +78,7 @@ class InitialStateTable:
         rows, self._row_of_env = np.unique(there, return_inverse=True)
         taken = table.rows[rows]  # a copy: torch can't convert the mapped records
         names = ("object_poses", "robot_pose", "basket_pose", "target", "present")
-        self._kept = [torch.from_numpy(np.ascontiguousarray(taken[name])).to(device) for name in names]
+        self._columns = [torch.from_numpy(np.ascontiguousarray(taken[name])).to(device) for name in names]
 
     def is_usable(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return (E,) whether layouts exist and are not known to be unstable, by env (E,) and layout seed (E,)."""
@@ -88,17 +88,17 @@ class InitialStateTable:
         """Return the initial states of some envs (E,) by their layout seeds (E,), which must be usable."""
         columns = self._table.find_records(self._objects_seeds[envs], seeds)[2]
         row, column = (torch.from_numpy(index).to(self._device) for index in (self._row_of_env[envs], columns))
-        objects, robots, baskets, targets, present = (kept[row, column] for kept in self._kept)
+        objects, robots, baskets, targets, present = (columns[row, column] for columns in self._columns)
         return InitialStates(objects, robots, baskets, targets.long(), present)
 
 
-def place(env: Any, starts: InitialStates, envs: torch.Tensor) -> None:
+def set_initial_states(env: Any, states: InitialStates, envs: torch.Tensor) -> None:
     """Set robot, furniture, basket and objects of some envs (E,) to their initial states."""
     with torch.device(env.device):
         qpos: Any = torch.as_tensor(env.agent.keyframes[env.task_config.robot_start].qpos, dtype=torch.float32)
         env.agent.reset(qpos.repeat(len(envs), 1))
         env.agent.controller.reset_only = envs
-        env.agent.robot.set_pose(cast("Any", Pose.create(starts.robot_poses)))
+        env.agent.robot.set_pose(cast("Any", Pose.create(states.robot_poses)))
         for name, furniture in env.fixtures.furniture.items():
             if isinstance(furniture, Articulation):
                 positions = env.model.joint_positions(name, opened=False)
@@ -106,15 +106,15 @@ def place(env: Any, starts: InitialStates, envs: torch.Tensor) -> None:
                 furniture.set_qpos(qpos.repeat(len(envs), 1))
                 furniture.set_qvel(torch.zeros(len(envs), furniture.max_dof))
         if env.fixtures.basket is not None:
-            basket = Pose.create(starts.basket_poses)
+            basket = Pose.create(states.basket_poses)
             env.fixtures.basket.set_pose(basket)
             env.basket_start_poses[envs] = basket.raw_pose
         if env.gpu_sim_enabled:
-            env.bodies.set_object_poses(envs, starts.object_poses)
+            env.bodies.set_object_poses(envs, states.object_poses)
         else:
             for slot, actor in enumerate(env.objects):
-                actor.set_pose(Pose.create(starts.object_poses[:, slot]))
-        env.start_poses[envs] = starts.object_poses
-        env.target_slot[envs] = starts.targets
-        env.present[envs] = starts.present
+                actor.set_pose(Pose.create(states.object_poses[:, slot]))
+        env.start_poses[envs] = states.object_poses
+        env.target_slot[envs] = states.targets
+        env.present[envs] = states.present
         env.is_target = torch.nn.functional.one_hot(env.target_slot, len(env.objects)).bool()

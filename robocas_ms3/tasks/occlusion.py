@@ -155,7 +155,7 @@ def pairwise_occlusion(points: Tensor, present: Tensor, eye: Tensor) -> Tensor:
         (N, K, K) hidden fractions; rows: the object that hides, columns: the object that is hidden.
     """
     count, slots = present.shape
-    heights, shares = points[:, :, 2], []
+    heights, fractions = points[:, :, 2], []
     for slot in range(slots):
         own = points[:, slot]
         seen = project_down(points, eye, (eye[2] - own[:, 2].mean(dim=-1)).clamp(min=NEAREST))
@@ -164,9 +164,9 @@ def pairwise_occlusion(points: Tensor, present: Tensor, eye: Tensor) -> Tensor:
         maps = _closed(_height_map(cells.flatten(0, 1), heights.flatten(0, 1)).unflatten(0, (count, slots)))
         at_it = maps[:, slot : slot + 1]
         filled = at_it > _NOTHING
-        shares.append((filled & (maps > at_it)).sum(dim=(2, 3)) / filled.sum(dim=(2, 3)).clamp(min=1))
+        fractions.append((filled & (maps > at_it)).sum(dim=(2, 3)) / filled.sum(dim=(2, 3)).clamp(min=1))
     both = present[:, :, None] & present[:, None]
-    return torch.stack(shares, dim=2) * both
+    return torch.stack(fractions, dim=2) * both
 
 
 def push_point(points: Tensor, obstacles: Tensor, target: Tensor) -> Tensor:

@@ -61,7 +61,7 @@ SEARCH = RewardTable(
 OPEN_PICK = RewardTable({"open": {"handle": 1.0, "open": 3.0}, **_TRANSFER}, TRANSFER.penalties)
 
 
-def weigh(
+def weighted_reward(
     table: RewardTable, stage: Array, terms: dict[str, Array], penalties: dict[str, Array]
 ) -> tuple[Array, dict[str, Array]]:
     """Return the weighted reward of envs from their stages and terms.
@@ -164,7 +164,7 @@ class DenseReward:
         self.last_level = level.clone()
         return (level - before).nan_to_num()
 
-    def weigh(
+    def compute(
         self, progress: tuple[Array, dict[str, Array]], penalties: dict[str, Array], action: Any, info: dict[str, Any]
     ) -> torch.Tensor:
         """Return the reward (N,) in [0, ``table.total``], and add ``reward_terms`` to the info.
@@ -179,7 +179,7 @@ class DenseReward:
         penalties = {**penalties, "action_rate": self._action_rate(action)}
         penalties = {name: penalties[name] for name in self._table.penalties}
         stage = where(to_native(info["success"]), 0 * stage + len(self._table.stages), stage)
-        reward, counted = weigh(self._table, stage, found, penalties)
+        reward, counted = weighted_reward(self._table, stage, found, penalties)
         counted.update(penalties)
         info["reward_terms"] = {name: as_tensor(term) for name, term in counted.items()}
         return as_tensor(reward * ~to_native(info["fail"]))

@@ -97,12 +97,12 @@ class RoboCASSearchEnv(RoboCASEnv):
             measured is not None and measured.others is not None and measured.others == self.bodies.state_except_robot
         )
         if not unchanged and not known_all_false(due := self._due()):
-            moment = self.success_check.state
+            state = self.success_check.state
             in_heap = (
-                terms.select_target(moment.objects[..., 2], to_native(self.target_slot))
+                terms.select_target(state.objects[..., 2], to_native(self.target_slot))
                 > self.success_check.fallen_below
             )
-            cleared = to_native(self._measure(as_tensor(due), as_tensor(moment.objects[..., :7])))
+            cleared = to_native(self._measure(as_tensor(due), as_tensor(state.objects[..., :7])))
             found["obstacles_cleared"] = self.success_check.reach("obstacles_cleared", cleared & in_heap & due)
         cleared_at_reset = torch.where(self._just_reset, found["obstacles_cleared"], self._cleared_at_reset)
         self._cleared_at_reset, self._just_reset = cleared_at_reset, torch.zeros_like(self._just_reset)

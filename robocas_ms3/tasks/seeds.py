@@ -211,7 +211,7 @@ class EpisodeSeeds:
         if pair[0] == pair[1] and pair[0] in self._built_with:
             return self._built_with[pair[0]]
         if self.table is not None:
-            if self.table.state(pair) == LayoutStatus.UNSTABLE:
+            if self.table.status(pair) == LayoutStatus.UNSTABLE:
                 where = f"objects seed {pair[0]}, seed {pair[1]}"
                 what, fix = "the objects of this layout are not stable in this physics engine", "Use another seed."
                 raise _UnstableLayout(what, where=where, fix=fix)

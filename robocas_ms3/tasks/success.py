@@ -99,7 +99,7 @@ class SuccessCheck:
         slot, goal = to_native(env.target_slot), env.goal
         grasped, touched = self.grasped(forces), terms.is_touched(forces)
         lifted = terms.is_lifted(objects[..., 2], to_native(env.start_poses)[..., 2], grasped)
-        measures = self._measures(touched, objects, basket)
+        conditions = self._conditions(touched, objects, basket)
         held = terms.select_target(grasped, slot)
         now = {
             "reached_any": touched.any(1),
@@ -107,18 +107,18 @@ class SuccessCheck:
             "reached_target": terms.select_target(touched, slot),
             "target_grasped": held,
             "target_lifted": terms.select_target(lifted, slot),
-            f"target_{goal.NAME}": measures[goal.NAME],
+            f"target_{goal.NAME}": conditions[goal.NAME],
         }
         for stage, flags in now.items():
             if stage in self.stages:
                 self.reach(stage, flags)
-        success = reduce(and_, measures.values())
+        success = reduce(and_, conditions.values())
         if goal.REQUIRES_LIFT:
             success = self.stages["target_lifted"] & success
-        fail = self._has_failed(measures, objects, basket)
+        fail = self._has_failed(conditions, objects, basket)
         stages = dict(zip(self.stages, self.reached.clone(), strict=True))
         disturbed = self._disturbed(objects[..., :7])
-        self.state = TaskState(objects, basket, held, now["reached_target"], measures[goal.NAME], disturbed, forces)
+        self.state = TaskState(objects, basket, held, now["reached_target"], conditions[goal.NAME], disturbed, forces)
         flags = {"success": as_tensor(success), "fail": as_tensor(fail)}
         return {**stages, **flags, "disturbed": as_tensor(disturbed.sum(1))}
 
@@ -145,7 +145,7 @@ class SuccessCheck:
     def success_conditions(self) -> dict[str, torch.Tensor]:
         """Return the conditions that success requires at the same time, in addition to the lift, (N,) bool each."""
         touched = terms.is_touched(self._env.gripper_contacts.forces())
-        found = self._measures(touched, *self._objects_and_basket(self._env.bodies.read()))
+        found = self._conditions(touched, *self._objects_and_basket(self._env.bodies.read()))
         return {name: as_tensor(measure) for name, measure in found.items()}
 
     def _objects_and_basket(self, state: torch.Tensor) -> tuple[Array, Array | None]:
@@ -153,7 +153,7 @@ class SuccessCheck:
         basket = self._env.bodies.basket(state)
         return to_native(self._env.bodies.objects(state)), None if basket is None else to_native(basket)
 
-    def _measures(self, touched: Array, objects: Array, basket: Array | None) -> dict[str, Array]:
+    def _conditions(self, touched: Array, objects: Array, basket: Array | None) -> dict[str, Array]:
         """Return the native `success_conditions` from touched objects (N, K), object states and the basket's pose."""
         goal, slot = self._env.goal, to_native(self._env.target_slot)
         target = terms.select_target(objects, slot)
@@ -175,16 +175,16 @@ class SuccessCheck:
             return low
         return low & ~env.goal.is_at_goal(self.centers(objects), self.state.basket)
 
-    def _has_failed(self, measures: dict[str, Array], objects: Array, basket: Array | None) -> Array:
+    def _has_failed(self, conditions: dict[str, Array], objects: Array, basket: Array | None) -> Array:
         """Return ``fail`` (N,) bool from success conditions, object states (N, K, 13) and the basket's pose; native."""
         goal, slot = self._env.goal, to_native(self._env.target_slot)
         height = terms.select_target(objects[..., 2], slot)
-        low, lost = height < self.fallen_below, goal.is_lost(basket, measures)
+        low, lost = height < self.fallen_below, goal.is_lost(basket, conditions)
         if lost is None and known_all_false(low):  # as nearly always
             return low
         caught = goal.is_over_goal(terms.select_target(objects[..., :3], slot), basket)
         fell = terms.has_target_fallen(
-            height, self.surface, low & False if caught is None else caught, ~measures["untouched"]
+            height, self.surface, low & False if caught is None else caught, ~conditions["untouched"]
         )
         return fell if lost is None else fell | lost
 

@@ -76,7 +76,7 @@ def test_what_it_lacks_it_does_not_make_up(layouts, tmp_path):
     table = LayoutTable(path, NAMES)
     for pair in ((5, 20), (5, 50), (5, 15), (8, 10), (3, 10), (0, 0)):
         assert table.layout(pair) is None
-        assert table.state(pair) == LayoutStatus.MISSING
+        assert table.status(pair) == LayoutStatus.MISSING
     assert [table.object_ids(seed) is None for seed in (1, 2, 3, 5, 9)] == [True, False, True, False, True]
     states = table.find_records(np.array([5, 5, 9]), np.array([10, 20, 10]))[0]
     assert states.tolist() == [LayoutStatus.UNCHECKED, LayoutStatus.MISSING, LayoutStatus.MISSING]

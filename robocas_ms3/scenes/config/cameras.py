@@ -47,7 +47,7 @@ class CameraConfig(StrictModel):
             raise ValueError("expected rotation_deg or look_at, found both")
         return self
 
-    def change(self, camera: CameraSpec) -> CameraSpec:
+    def apply_to(self, camera: CameraSpec) -> CameraSpec:
         given: dict[str, Any] = self.model_dump(exclude_none=True)
         angles, fov = given.pop("rotation_deg", None), given.pop("fov_deg", None)
         if angles is not None:
@@ -86,5 +86,5 @@ def apply_camera_changes(
                 expected=f"one of {list(specs)}, or `position` or `overview`",
                 fix=did_you_mean(name, specs),
             )
-        specs[name] = change.change(specs.get(name, CameraSpec(name)))
+        specs[name] = change.apply_to(specs.get(name, CameraSpec(name)))
     return tuple(specs.values())

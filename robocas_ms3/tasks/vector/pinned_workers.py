@@ -56,7 +56,7 @@ class PinnedWorkers(Generic[Task, Result]):
         """Whether a task is running, after a call was interrupted."""
         return bool(self._unread)
 
-    def ask(self, tasks: Sequence[Task]) -> list[Result]:
+    def run(self, tasks: Sequence[Task]) -> list[Result]:
         """Send each worker its task, and return all results; results of an interrupted call are read first.
 
         Raises:

@@ -77,15 +77,17 @@ class ProcessEnv(gym.Env):
             what = "worker processes can't import an environment that is registered in the main program"
             raise VectorEnvError(what, where=env_id, fix=fix)
         cuts = [num_envs * worker // workers for worker in range(workers + 1)]
-        self._shares = [range(*cut) for cut in zip(cuts, cuts[1:], strict=False)]
-        with tempfile.NamedTemporaryFile(prefix="robocas-envs-") as at_work:
-            self._at_work = np.memmap(at_work, mode="w+", shape=num_envs)
-            settings = EnvSettings(env_id, module, kwargs, tuple(wrappers), at_work.name)
+        self._env_ranges = [range(*cut) for cut in zip(cuts, cuts[1:], strict=False)]
+        with tempfile.NamedTemporaryFile(prefix="robocas-envs-") as busy_file:
+            self._busy = np.memmap(busy_file, mode="w+", shape=num_envs)
+            settings = EnvSettings(env_id, module, kwargs, tuple(wrappers), busy_file.name)
             try:
                 pickled = cloudpickle.dumps(settings)
             except Exception as error:
                 raise VectorEnvError("arguments can't be sent to processes", where=env_id, found=error) from error
-            self._workers = PinnedWorkers([partial(EnvWorker, pickled, share) for share in self._shares], limits)
+            self._workers = PinnedWorkers(
+                [partial(EnvWorker, pickled, env_range) for env_range in self._env_ranges], limits
+            )
             for name in ("render_mode", "metadata", "single_observation_space", "single_action_space"):
                 setattr(self, name, self.call(name)[0])
         self.pids = self._workers.pids
@@ -111,8 +113,12 @@ class ProcessEnv(gym.Env):
             what = "the other environments have not been reset yet"
             raise VectorEnvError(what, found=f"a reset of {name_envs(envs)}", fix="Reset all environments first.")
         self._must_reset |= set(envs)
-        shares = [{env: seeds[env] for env in share if env in seeds} for share in self._shares]
-        new = [row for rows in self._ask([("reset", share, options) for share in shares]) for row in rows]
+        seeds_of_workers = [{env: seeds[env] for env in env_range if env in seeds} for env_range in self._env_ranges]
+        new = [
+            row
+            for rows in self._ask([("reset", seeds_of_worker, options) for seeds_of_worker in seeds_of_workers])
+            for row in rows
+        ]
         self._must_reset -= set(envs)
         if new:
             paths = dict.fromkeys(
@@ -143,15 +149,15 @@ class ProcessEnv(gym.Env):
             raise VectorEnvError("invalid shape of actions", expected=expected, found=action.shape)
         action = action.astype(self.action_space.dtype).reshape(expected)
         self._must_reset = set(range(self.num_envs))
-        answers = self._ask([("step", action[share.start : share.stop]) for share in self._shares])
+        answers = self._ask([("step", action[env_range.start : env_range.stop]) for env_range in self._env_ranges])
         self._must_reset = set()
-        self._parts = [*zip(map(len, self._shares), answers, strict=True)]
+        self._parts = [*zip(map(len, self._env_ranges), answers, strict=True)]
         found = self._batch()
         return found.get("obs", {}), found["reward"], found["terminated"], found["truncated"], found["info"]
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of each env, or read an attribute; return the results, which are pickled."""
-        answers = self._ask([("call", name, args, kwargs)] * len(self._shares))
+        answers = self._ask([("call", name, args, kwargs)] * len(self._env_ranges))
         return tuple(pickle.loads(result) for results in answers for result in results)
 
     def get_language_instruction(self) -> list[str]:
@@ -185,10 +191,10 @@ class ProcessEnv(gym.Env):
         if self._workers.closed:
             raise VectorEnvError("the environments are closed", fix="Make a new vector environment.")
         try:
-            answers = self._workers.ask(commands)
+            answers = self._workers.run(commands)
         except ProcessCrashError as crash:
-            share = self._shares[self._workers.pids.index(crash.pid)]
-            envs = [env for env in share if self._at_work[env]] or list(share)
+            env_range = self._env_ranges[self._workers.pids.index(crash.pid)]
+            envs = [env for env in env_range if self._busy[env]] or list(env_range)
             fix = "Read the output above, run robocas doctor, and make a new vector environment."
             died = VectorEnvCrashError("its worker process crashed", where=name_envs(envs), found=crash.found, fix=fix)
             died.envs = tuple(envs)

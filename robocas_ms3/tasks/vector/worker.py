@@ -36,7 +36,7 @@ class EnvSettings:
     module: str  # module that registers the environment
     kwargs: dict[str, Any]  # arguments of `gym.make`
     wrappers: tuple[Callable[[gym.Env], gym.Env], ...]  # the first one is the innermost
-    at_work: str  # file of (num_envs,) bytes: 1 while an env is busy; read after a crash
+    busy_file: str  # file of (num_envs,) bytes: 1 while an env is busy; read after a crash
 
 
 class EnvWorker:
@@ -54,7 +54,7 @@ class EnvWorker:
         os.environ.setdefault("LP_NUM_THREADS", "1")  # several processes render in software
         use_one_torch_thread()
         self._settings: EnvSettings = pickle.loads(settings)
-        self._at_work = np.memmap(self._settings.at_work, mode="r+")
+        self._busy = np.memmap(self._settings.busy_file, mode="r+")
         self._first, self._envs = envs.start, dict[int, gym.Env]()
         _, failed = self._each(envs, self._make)
         if failed:
@@ -92,12 +92,12 @@ class EnvWorker:
     def _each(self, envs: Iterable[int], act: Callable[[int], Any]) -> tuple[list[Any], RemoteError | None]:
         results, failed = [], None
         for env in list(envs):
-            self._at_work[env] = 1
+            self._busy[env] = 1
             try:
                 results.append(act(env))
             except BaseException as error:  # noqa: BLE001  (raised again in the main process)
                 failed = failed or worker_error(error, f"env {env}")
-            self._at_work[env] = 0
+            self._busy[env] = 0
         return results, failed
 
     def _make(self, env: int) -> None:
