@@ -88,7 +88,7 @@ MISTAKES = {  # arguments -> text of the error, printed before anything heavy is
     "layouts build pick_tabel_scattered": "Did you mean pick_table_scattered",
     "layouts build pick_table_scattered --seeds 3": "--seeds: invalid range of seeds",
     "layouts build pick_table_scattered --jobs 0": "--jobs: number out of range",
-    "replay missing.h5": "missing.json: the JSON that belongs to this trajectory is missing",
+    "replay missing.h5": "missing.json: missing JSON file of the trajectory",
     "convert missing.h5 --out o --to lerobt": "Did you mean lerobot?",
     "convert missing.h5 --out o": "missing.h5: no such trajectory file",
     "validate missing": "missing: no such dataset folder",

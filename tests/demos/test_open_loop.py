@@ -99,5 +99,5 @@ def test_motion_beyond_a_step_is_counted(recorded):
 
 @pytest.mark.parametrize("rate", [0, 2.5, 7])
 def test_rates_that_physics_does_not_know(rate):
-    with pytest.raises(DatasetError, match="can't be played at this rate"):
+    with pytest.raises(DatasetError, match="cannot be replayed at this rate"):
         OpenLoopEnv({"env_id": "robocas_ms3:RoboCASPick-v1", "env_kwargs": {}}, rate)

@@ -37,16 +37,16 @@ def test_only_a_scene_like_the_recorded_one_fits(trajectory):
     recorded = RecordedEpisode.read(trajectory, entry(trajectory))
     recorded.check_compatible(env_like(recorded))
     recorded.check_compatible(env_like(recorded, control_mode="pd_ee_pose", actions=7))
-    with pytest.raises(DatasetError, match="actions of another robot .expected 7 numbers, found 8"):
+    with pytest.raises(DatasetError, match="actions do not fit the robot .expected 7 numbers per action, found 8"):
         recorded.check_compatible(env_like(recorded, actions=7))
     with h5py.File(trajectory, "r+") as file:
         bodies = file["traj_0/env_states/actors"]
         bodies["guest"] = bodies["object_0"][:]
         file["traj_0/env_states/controller/arm"] = np.zeros((STEPS + 1, 7), np.float32)
     other = RecordedEpisode.read(trajectory, entry(trajectory))
-    with pytest.raises(DatasetError, match="actors/guest: states of another scene .expected nothing of this name"):
+    with pytest.raises(DatasetError, match="actors/guest: states do not fit the scene .expected no such entry"):
         other.check_compatible(env_like(recorded))
-    with pytest.raises(DatasetError, match="actors/guest: .*expected 13 numbers, found nothing"):
+    with pytest.raises(DatasetError, match="actors/guest: .*expected 13 numbers, found no such entry"):
         recorded.check_compatible(env_like(other))
 
 

@@ -111,6 +111,6 @@ def test_closed_form_of_another_arm_is_an_error(panda_files):
     chain.links[2] = chain.links[2].copy()
     chain.links[2][0, 3] += 0.1
     with pytest.raises(
-        RobocasError, match="robocas_mobile_panda: this closed form is not for this arm .*inverse_kinem"
+        RobocasError, match="robocas_mobile_panda: closed-form inverse kinematics do not fit the arm .*inverse_kinem"
     ):
         Reachability(chain)

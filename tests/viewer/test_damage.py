@@ -108,7 +108,7 @@ def test_a_damaged_trajectory(run_folder, tmp_path):
     assert row["instruction"].startswith("grasp the cube 4")
     write({"instruction": 3, "target": said["target"]})
     (_, row, *_) = shown(open_content(folder), [0, 1])[0]["episodes"]
-    assert row["damage"].startswith("JSON entry: the JSON's entry: ")
+    assert row["damage"].startswith("JSON entry: invalid episode entry: ")
     assert (row["object"], row["seed"], row["success"], row["stages"]) == ("cube 4 (cube)", 4, False, ["grasp"])
     for spoilt in ({"episodes": 3}, {"episodes": ["x"]}, {"env_info": {"env_id": 3, "env_kwargs": 4}}, {"robocas": []}):
         path.write_text(json.dumps({**whole, **spoilt}))

@@ -1,4 +1,4 @@
-"""ManiSkill's trajectory files, written and strictly read, and their motion at a dataset's rate.
+"""Write and strictly read ManiSkill trajectory files, and compute their motion at the rate of a dataset.
 
-Whatever reads a file raises ``DatasetError`` if it is missing or damaged, or chooses what a file may not choose.
+Readers raise ``DatasetError`` if a file is missing, damaged, or sets values that a file must not set.
 """

@@ -1,7 +1,7 @@
-"""The environment that a file says an episode was recorded in: read strictly, and made.
+"""Read the environment of a recording strictly from its file, and create it.
 
-A file is somebody's data. It names a registered task, a shipped configuration or the whole of one, and installed packs;
-never a module, a file or a folder.
+Files are untrusted data. A file may name a registered task, a bundled configuration or a complete one, and installed
+packs, but no module, file or folder.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from robocas_ms3.robots.registry import RobotSpec, find_robot
 from robocas_ms3.scenes.config.load import bundled_configs, load_config_for
 from robocas_ms3.scenes.task_specs import TASKS, TaskSpec
 
-_PREFIX = "robocas_ms3:"  # lets gymnasium import this package by itself: ManiSkill's own tools then work
-_DEEP = 3  # dicts in dicts that settings of simulation and cameras may have
+_PREFIX = "robocas_ms3:"  # makes gymnasium import this package, which ManiSkill's tools need
+_DEEP = 3  # maximum nesting of settings of simulation and cameras
 
 _NAME = re.compile(r"\w[\w.+-]*")
 _Name = Annotated[str, Field(pattern=f"^{_NAME.pattern}$")]
@@ -32,7 +32,7 @@ _Settings = dict[str, Any]
 
 
 class _Kwargs(StrictModel):
-    """Arguments of ``gym.make`` that are read of a file: those of the scene, and its actions' control mode."""
+    """Arguments of ``gym.make`` that a file may set: those of the scene and the control mode."""
 
     model_config = ConfigDict(strict=True)
 
@@ -46,7 +46,7 @@ class _Kwargs(StrictModel):
     control_mode: _Name | None = None
 
 
-# Arguments that a recording may hold, and that its reader chooses
+# arguments in a recording that are ignored, since the reader chooses them
 _READERS = {
     *("obs_mode", "reward_mode", "render_mode", "num_envs", "seeds", "reconfiguration_freq", "max_episode_steps"),
     *("enable_shadow", "enhanced_determinism", "parallel_in_single_scene", "sim_backend", "render_backend"),
@@ -63,12 +63,12 @@ class _Info(BaseModel):
 
 @dataclass(frozen=True)
 class RecordedEnv:
-    """The environment that a file names.
+    """Specification of the environment of a recording.
 
     Attributes:
-        env_id: gymnasium's, of a registered task.
-        control_mode: of the actions, if the file names it.
-        kwargs: for ``gym.make``, those of the scene; layouts follow from the seed.
+        env_id: gymnasium id of a registered task.
+        control_mode: control mode of the actions, if the file has it.
+        kwargs: arguments of ``gym.make`` for the scene; layouts follow from the seed.
     """
 
     env_id: str
@@ -76,7 +76,7 @@ class RecordedEnv:
     kwargs: dict[str, Any]
 
     def with_pack(self, pack: str | Path | None) -> RecordedEnv:
-        """Return the same with the objects of another pack, by name or folder, where one is given."""
+        """Return a copy with another object pack, by name or folder; None keeps the pack."""
         if pack is None:
             return self
         named = str(pack) if str(pack) in find_packs() else str(Path(pack).absolute())
@@ -86,23 +86,27 @@ class RecordedEnv:
         try:
             return find_robot(self.kwargs.get("robot_uids"), where=where)
         except ExtensionError as error:
-            fix = error.fix or "Install the package that has it."
+            fix = error.fix or "Install the package that provides it."
             raise DatasetError(error.what, where=where, expected=error.expected, found=error.found, fix=fix) from error
 
     def cameras(self) -> tuple[CameraSpec, ...]:
-        """Return the cameras of its task and robot; raises ``DatasetError`` if what it names is not installed."""
+        """Return the cameras of task and robot; raise ``DatasetError`` if the task or robot is not installed."""
         return load_config_for(self._task(), self.kwargs.get("config")).cameras_of(self.robot().description)
 
     def _task(self) -> TaskSpec:
         known, config = {spec.env_id: spec for spec in TASKS.values()}, self.kwargs.get("config")
         if self.env_id not in known:
-            raise DatasetError("no such task", where="env_id", expected=f"one of {sorted(known)}", found=self.env_id)
+            raise DatasetError("unknown task", where="env_id", expected=f"one of {sorted(known)}", found=self.env_id)
         if isinstance(config, str) and config not in bundled_configs():
-            raise DatasetError("no such configuration", where="config", expected="a shipped one", found=config)
+            raise DatasetError("unknown configuration", where="config", expected="a bundled one", found=config)
         return known[self.env_id]
 
     def make(self, **kwargs: Any) -> Any:
-        """Make it with further arguments of ``gym.make``; raises ``DatasetError`` if what it names is not installed."""
+        """Create the environment with further arguments of ``gym.make``.
+
+        Raises:
+            DatasetError: task, configuration, robot or pack is not installed.
+        """
         import gymnasium as gym
 
         self._task()
@@ -111,13 +115,16 @@ class RecordedEnv:
             name = self.kwargs.get(key, "builtin")
             if not Path(name).is_absolute() and name not in find_packs():
                 expected = f"one of {', '.join(find_packs())}"
-                fix = "Install it, or pass its folder with --pack." if key == "pack" else "Install it."
-                raise DatasetError("no such pack is installed", where=key, expected=expected, found=name, fix=fix)
+                fix = "Install the pack, or pass its folder with --pack." if key == "pack" else "Install the pack."
+                raise DatasetError("pack is not installed", where=key, expected=expected, found=name, fix=fix)
         return gym.make(self.env_id, **{**self.kwargs, **kwargs})
 
 
 def read_env(info: Any, where: object, *, pack: str | Path | None = None) -> RecordedEnv:
-    """Read ``env_info`` of a file, ``{"env_id": ..., "env_kwargs": {...}}``; ``pack`` replaces the named one."""
+    """Read ``env_info`` of a file; ``pack`` replaces the recorded pack.
+
+    ``env_info`` is ``{"env_id": ..., "env_kwargs": {...}}``.
+    """
     if isinstance(info, Mapping) and isinstance(info.get("env_kwargs"), Mapping):
         kwargs = {name: value for name, value in info["env_kwargs"].items() if name not in _READERS}
         info = {**info, "env_kwargs": kwargs if pack is None else {**kwargs, "pack": "builtin"}}
@@ -128,7 +135,7 @@ def read_env(info: Any, where: object, *, pack: str | Path | None = None) -> Rec
     env_id = found.env_id.removeprefix(_PREFIX)
     if not re.fullmatch(r"\w+-v\d+", env_id):
         raise DatasetError(
-            "a file can't choose this", where=f"{where}, env_id", expected="id of a task", found=found.env_id
+            "invalid environment id", where=f"{where}, env_id", expected="id of a task", found=found.env_id
         )
     kwargs = found.env_kwargs.model_dump(exclude_unset=True, exclude={"control_mode"})
     for name in ("sim_config", "sensor_configs"):
@@ -144,10 +151,10 @@ def _refusal(error: ValidationError, where: object) -> DatasetError:
     first = list_invalid_values(error, _Info)[0]
     name, fix, expected = first.key.rpartition(".")[2], first.fix, first.expected
     if first.kind == "string_pattern_mismatch":
-        expected = "a name, no path"
+        expected = "a name without a path"
         if name in ("pack", "furniture_pack"):
-            fix = "Pass the pack with --pack, if you trust it." if name == "pack" else "Install that pack by name."
-    what = first.what if first.kind == "value_error" else "the recorded environment can't be read"
+            fix = "Pass the pack with --pack if you trust it." if name == "pack" else "Install the pack."
+    what = first.what if first.kind == "value_error" else "invalid recorded environment"
     where = f"{where}, {first.key}" if first.key else where
     return DatasetError(what, where=where, expected=expected, found=first.found, fix=fix)
 
@@ -160,7 +167,7 @@ def _check_settings(settings: Any, where: str, deep: int) -> None:
         for value in settings:
             _check_settings(value, where, 0)
     elif not _is_setting(settings):
-        raise DatasetError("no such setting", where=where, expected="a number or a name", found=str(settings)[:80])
+        raise DatasetError("invalid setting", where=where, expected="a number or a name", found=str(settings)[:80])
 
 
 def _is_setting(value: Any) -> bool:

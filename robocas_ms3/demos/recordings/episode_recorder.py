@@ -1,4 +1,7 @@
-"""Record episodes in ManiSkill's trajectory format, one file per episode; `trajectory_hdf5.merge` makes one of them."""
+"""Record episodes in ManiSkill's trajectory format, one file per episode.
+
+`trajectory_hdf5.merge` merges the files.
+"""
 
 from __future__ import annotations
 
@@ -21,16 +24,16 @@ from robocas_ms3.demos.recordings.trajectory_hdf5 import write_whole
 from robocas_ms3.demos.recordings.trajectory_json import versions
 from robocas_ms3.tasks.base import RoboCASEnv
 
-# Settings of one machine or one run; a trajectory has to replay without them.
+# settings of a machine or a run; they are not recorded, since trajectories replay without them
 _LOCAL_KWARGS = ("layouts", "render_backend", "render_mode", "sim_backend", "reward_mode")
 _IMAGES = ("rgb", "depth", "seg")
 
 
 class EpisodeRecorder(gym.Wrapper):
-    """Keeps a single episode of one env, and writes it in ManiSkill's format when it is finished.
+    """Recorder of a single episode of one env; writes it in ManiSkill's format when it is finished.
 
-    Until then there is no file: a step costs little, and the recorder survives a fork of the process. The files are
-    ``<name>.h5`` and ``<name>.json`` in ``folder``.
+    The episode is in memory until then: steps are fast, and the recorder works after a fork of the process. The files
+    are ``NAME.h5`` and ``NAME.json`` in ``folder``.
     """
 
     def __init__(self, env: gym.Env, folder: Path, name: str) -> None:
@@ -40,29 +43,29 @@ class EpisodeRecorder(gym.Wrapper):
         self._base_env, self._trajectory = base_env, folder / f"{name}.h5"
         self._steps = _Steps()
         self._reset_kwargs: dict[str, Any] = {}
-        versions()  # here, where it is kept, and not in each branch
+        versions()  # cached before the process forks
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
         self._reset_kwargs = copy.deepcopy({"options": options} if seed is None else {"options": options, "seed": seed})
         self._steps = _Steps()
-        self._keep(observation)
+        self._store(observation)
         return observation, info
 
     def start_at(self, state: dict[str, Any]) -> None:
-        """Begin anew from a state of the scene that was reset, as ``set_state_dict`` takes it."""
+        """Start the recording again from a state (argument of ``set_state_dict``) of the current scene."""
         self._base_env.set_state_dict(state)
         self._steps = _Steps()
-        self._keep(self._base_env.get_obs())
+        self._store(self._base_env.get_obs())
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._steps.actions.append(np.array(action, np.float32).reshape(-1))
         self._steps.flags.append((bool(terminated), bool(truncated), bool(info["success"]), bool(info["fail"])))
-        self._keep(observation)
+        self._store(observation)
         return observation, reward, terminated, truncated, info
 
-    def _keep(self, observation: Any) -> None:
+    def _store(self, observation: Any) -> None:
         steps = self._steps
         steps.states.append(self._base_env.bodies.read()[0].cpu().numpy())
         steps.beside_bodies.append(_of_one_env(self._base_env.extra_state()))
@@ -70,7 +73,7 @@ class EpisodeRecorder(gym.Wrapper):
 
     @property
     def states(self) -> dict[str, dict[str, NDArray[np.float32]]]:
-        """ManiSkill's states since the reset: ``{"actors": {name: (S + 1, 13)}, "articulations": {...}}``."""
+        """States since the reset: ``{"actors": {name: (S + 1, 13)}, "articulations": {name: (S + 1, D)}}``."""
         return self._base_env.bodies.split(np.stack(self._steps.states))
 
     def finish(self, episode: dict[str, Any]) -> None:
@@ -89,7 +92,7 @@ class EpisodeRecorder(gym.Wrapper):
 
         with atomic_file(self._trajectory, sync=True) as tmp:
             write_whole(tmp, fill)
-            # the JSON first: an HDF5 file that is there always has its JSON
+            # the JSON first, so that an HDF5 file never lacks its JSON
             write_json(
                 self._trajectory.with_suffix(".json"),
                 {
@@ -115,7 +118,7 @@ class EpisodeRecorder(gym.Wrapper):
 
     def _env_info(self) -> dict[str, Any]:
         info = parse_env_info(self.env)
-        assert info is not None, "the environment was made by gym.make"
+        assert info is not None, "the environment was not created by gym.make"
         kwargs = {key: value for key, value in info["env_kwargs"].items() if key not in _LOCAL_KWARGS}
         return {
             "env_id": recorded_id(str(info["env_id"])),
@@ -126,7 +129,7 @@ class EpisodeRecorder(gym.Wrapper):
 
 @dataclass
 class _Steps:
-    """What was recorded since the reset: S actions and what came of them; of the rest S + 1."""
+    """Data since the reset: S actions and flags, S + 1 states and observations."""
 
     actions: list[NDArray[np.float32]] = field(default_factory=list)
     flags: list[tuple[bool, bool, bool, bool]] = field(default_factory=list)

@@ -1,8 +1,8 @@
-"""From control steps to the steps of a dataset: which states are kept, and the motion and commands between them.
+"""Sample the control steps of an episode at the rate of a dataset, and compute motion and commands in between.
 
-An episode of S control steps has states 0..S. With a stride of k control steps a dataset step, the states 0, k, 2k, ...
-are kept, and the last state S too, so that the goal is always in the data; where k does not divide S the last dataset
-step alone is shorter.
+An episode of S control steps has states 0..S. With a stride of k control steps per dataset step, the dataset contains
+the states 0, k, 2k, ... and the last state S, so that the goal is always included. If k is not a divisor of S, the last
+dataset step is shorter.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from robocas_ms3.robots.registry import RobotSpec
 
 Array = NDArray[np.float64]
 
-_POSE = 13  # of a state: position 3, quaternion wxyz 4, linear and angular velocity 6
+_POSE = 13  # length of a body state: position 3, quaternion wxyz 4, linear and angular velocity 6
 _JOINTS = RobotDescription.finger_slice.stop
 
 
 def sample_stride(control_freq: float, rate_hz: float) -> int:
-    """Return the control steps between two dataset steps."""
+    """Return the number of control steps per dataset step; raise DatasetError if it is not a whole number."""
     stride = round(control_freq / rate_hz) if rate_hz > 0 else 0
     if stride < 1 or abs(stride * rate_hz - control_freq) > 1e-6 * control_freq:
         rates = [f"{control_freq / k:g}" for k in range(1, 21) if (control_freq / k).is_integer()]
         raise DatasetError(
-            "the rate must divide the control frequency",
+            "the rate is not a divisor of the control frequency",
             where="rate",
             expected=f"one of {', '.join(rates)} Hz at {control_freq:g} Hz",
             found=f"{rate_hz:g}",
@@ -41,7 +41,7 @@ def sample_stride(control_freq: float, rate_hz: float) -> int:
 
 
 def sample_states(control_steps: int, stride: int) -> NDArray[np.int64]:
-    """Return the indices of ``control_steps + 1`` states to keep: every ``stride``-th and the last."""
+    """Return the indices of sampled states of ``control_steps + 1``: every ``stride``-th and the last."""
     indices = np.arange(0, control_steps + 1, stride)
     return indices if indices[-1] == control_steps else np.append(indices, control_steps)
 
@@ -53,15 +53,15 @@ def gripper_open(
     *,
     initial_width: float,
 ) -> NDArray[np.bool_]:
-    """Return the gripper command (T,) bool in force at each sampled state: that of the action which led there.
+    """Return the gripper command (T,), bool, of the action before each sampled state.
 
-    So ``gripper_status[t + 1]`` is what was commanded between t and t + 1, as the released loader reads it. More than
-    half open counts as open.
+    ``gripper_status[t + 1]`` is the command between t and t + 1, as in the loader of RoboCAS-v0. A gripper that is more
+    than half open counts as open.
 
     Args:
         commands: (S,) gripper actions in [-1, 1].
         samples: (T,) from ``sample_states``.
-        initial_width: of the gripper at reset, m, which is its target until the first action.
+        initial_width: width of the gripper at the reset, m; it is the target before the first action.
     """
     low, high = robot.finger_targets
     finger_targets = low + (np.clip(commands, -1, 1) + 1) / 2 * (high - low)
@@ -70,22 +70,26 @@ def gripper_open(
 
 
 def relative_motion(poses: Array) -> Array:
-    """Return ``inv(pose[t]) pose[t + 1]`` (T, 4, 4); the last one is the identity."""
+    """Return the relative motion ``inv(pose[t]) pose[t + 1]`` (T, 4, 4); the last one is the identity."""
     return np.concatenate([inverse(poses[:-1]) @ poses[1:], np.eye(4)[None]])
 
 
 def stored_motion(poses: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return ``relative_motion`` as datasets store it: positions (T, 3) m and quaternions (T, 4) xyzw, w >= 0."""
+    """Return the relative motion in the format of datasets.
+
+    Returns:
+        Positions (T, 3), m, and quaternions (T, 4), xyzw with w >= 0.
+    """
     motion = relative_motion(poses)
     turns = Rotation.from_matrix(motion[:, :3, :3]).as_quat(canonical=True)
     return motion[:, :3, 3].astype(np.float32), turns.astype(np.float32)
 
 
 def stored_actions(positions: NDArray, turns: NDArray, gripper_status: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return RoboCAS' actions (T, 7) of `stored_motion`; row t leads from step t to t + 1, so the last one holds.
+    """Return RoboCAS actions (T, 7) for `stored_motion`; row t is the motion from step t to t + 1.
 
-    Motion in m and, about the fixed axes x, y, z (scipy's "xyz"), Euler angles in rad; the gripper's command is
-    ``gripper_status[t + 1]`` of `gripper_open`, 1 = open.
+    An action has a translation in m, Euler angles about the fixed axes x, y, z in rad ("xyz" in scipy), and the gripper
+    command ``gripper_status[t + 1]`` of `gripper_open`, 1 = open. The last row holds the pose.
     """
     status = np.asarray(gripper_status, dtype=np.float64)
     actions = np.zeros((len(status), 7))
@@ -98,11 +102,13 @@ def stored_actions(positions: NDArray, turns: NDArray, gripper_status: NDArray[n
 
 
 def planar_base(root: Array, qpos: Array) -> Array:
-    """Return the mobile base in the world, (T, 3) x, y in m, yaw in rad: first in [-pi, pi), then without jumps.
+    """Return the pose (T, 3) of the mobile base in the world: x, y in m, yaw in rad.
+
+    The first yaw is in [-pi, pi); the others are unwrapped.
 
     Args:
-        root: (T, 4, 4) of the robot in the world.
-        qpos: (T, 12).
+        root: (T, 4, 4) pose of the robot's root in the world.
+        qpos: (T, 12) joint positions.
     """
     x, y, yaw = qpos[:, RobotDescription.base_slice].T
     position = root[:, :3, 3] + np.einsum("tij,tj->ti", root[:, :3, :3], np.stack([x, y, 0 * x], axis=1))
@@ -111,7 +117,7 @@ def planar_base(root: Array, qpos: Array) -> Array:
 
 
 def planar_motion(agv_pose: NDArray) -> Array:
-    """Return the differences (T, 3) of x, y, yaw; the last row is 0."""
+    """Return differences (T, 3) of consecutive x, y, yaw; the last row is 0."""
     pose = agv_pose.astype(np.float64)
     motion = np.diff(pose, axis=0, append=pose[-1:])
     motion[:, 2] = _wrap(motion[:, 2])
@@ -124,12 +130,12 @@ def _wrap(angle: Array) -> Array:
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of the robot at the T states of an episode that a dataset keeps.
+    """Motion of the robot at the T states of an episode in a dataset.
 
     Attributes:
         qpos: (T, 12) base x, y, yaw, 7 arm joints, 2 fingers, m and rad; ``qvel`` likewise.
-        root_in_world: (T, 4, 4); ``tcp_in_world`` and ``arm_base_in_world`` follow by forward kinematics.
-        gripper_open: (T,) bool, commands, see `gripper_open`.
+        root_in_world: (T, 4, 4) poses; ``tcp_in_world`` and ``arm_base_in_world`` are computed from them and ``qpos``.
+        gripper_open: (T,) bool commands, see `gripper_open`.
     """
 
     qpos: Array
@@ -147,12 +153,12 @@ class Motion:
         gripper: NDArray[np.floating],
         samples: NDArray[np.int64],
     ) -> Motion:
-        """Compute the motion in datasets from recorded states, for all of them to the same bit.
+        """Compute the motion from recorded states; the same code for all dataset formats gives identical bits.
 
         Args:
             robot_states: (S + 1, 37) after the reset and after each control step.
             gripper: (S,) commands in [-1, 1].
-            samples: (T,) indices of states, from `sample_states`, or some of them in a row.
+            samples: (T,) indices of states from `sample_states`, or a contiguous part of them.
         """
         root_in_world, qpos, qvel = split_states(robot_states[samples])
         width = float(split_states(robot_states[:1])[1][0, robot.description.finger_slice].sum())
@@ -195,12 +201,12 @@ class Motion:
 
 
 def gripper_commands(actions: NDArray[np.floating], control_mode: str) -> NDArray[np.floating]:
-    """Return the gripper's commands (S,) of actions (S, A): after 6 numbers of the end effector, or 7 joints."""
+    """Return the gripper commands (S,) of actions (S, A): column 6 in ``_ee_`` control modes, else column 7."""
     return actions[:, 6 if "_ee_" in control_mode else 7]
 
 
 def split_states(states: NDArray[np.floating]) -> tuple[Array, Array, Array]:
-    """Return root in the world (T, 4, 4), qpos (T, 12) and qvel (T, 12) of ManiSkill's robot states (T, 37)."""
+    """Split ManiSkill robot states (T, 37) into root pose (T, 4, 4), qpos (T, 12) and qvel (T, 12)."""
     states = np.asarray(states, dtype=np.float64)
     return (
         from_wxyz(states[:, :7]),

@@ -1,4 +1,4 @@
-"""Sub-goals: the parts of an episode, in words."""
+"""Sub-goals of an episode, with a text for each."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from robocas_ms3.core.strict_model import parse
 
 
 class SubGoal(BaseModel):
-    """A part of an episode, as trajectory files and ``data_info.json`` have it: ``goal_range`` includes both ends."""
+    """Sub-goal in trajectory files and ``data_info.json``; ``goal_range`` includes both ends."""
 
     model_config = ConfigDict(strict=True, extra="allow", frozen=True)
 
@@ -43,7 +43,7 @@ class SubGoal(BaseModel):
 
 
 class SubGoals(BaseModel):
-    """What has sub-goals in JSON."""
+    """JSON object with sub-goals."""
 
     model_config = ConfigDict(strict=True, extra="allow", frozen=True)
 
@@ -51,14 +51,14 @@ class SubGoals(BaseModel):
 
 
 def read_subgoals(entries: Any, where: object) -> list[SubGoal]:
-    return parse(SubGoals, {"subgoals": entries}, DatasetError, where=where, about="damaged sub-goals").subgoals
+    return parse(SubGoals, {"subgoals": entries}, DatasetError, where=where, about="invalid sub-goals").subgoals
 
 
 def sample_subgoals(subgoals: Sequence[SubGoal], samples: NDArray[np.int64]) -> list[SubGoal]:
-    """Return the sub-goals of sampled steps (`motion.sample_states`), in order, without gaps.
+    """Return the sub-goals of sampled steps (`motion.sample_states`), in order and without gaps.
 
-    A step belongs to the sub-goal of the action that leaves its state, the last step to that of the last action. A sub-
-    goal shorter than a stride may hold no step, and is left out.
+    A step has the sub-goal of the action after its state; the last step has that of the last action. A sub-goal shorter
+    than a stride may contain no step and is omitted.
     """
     actions = int(samples[-1])
     expected_first = 0
@@ -68,9 +68,9 @@ def sample_subgoals(subgoals: Sequence[SubGoal], samples: NDArray[np.int64]) -> 
         expected_first = goal.last + 1
     if expected_first != actions:
         raise DatasetError(
-            "sub-goals do not cover the actions one after the other",
+            "sub-goals do not cover the actions",
             where="subgoals",
-            expected=f"ranges from 0 to {actions - 1}",
+            expected=f"contiguous ranges from 0 to {actions - 1}",
             found=[goal.goal_range for goal in subgoals],
         )
     owner = np.searchsorted([goal.first for goal in subgoals], np.minimum(samples, actions - 1), side="right") - 1
@@ -83,6 +83,7 @@ def sample_subgoals(subgoals: Sequence[SubGoal], samples: NDArray[np.int64]) -> 
 
 
 def subgoal_runs(types: Sequence[str], texts: Sequence[str]) -> list[SubGoal]:
+    """Return one sub-goal per run of equal types and texts."""
     goals: list[SubGoal] = []
     for (kind, text), steps in groupby(range(len(types)), key=lambda step: (types[step], texts[step])):
         inside = list(steps)

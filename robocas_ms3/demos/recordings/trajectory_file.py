@@ -1,4 +1,4 @@
-"""Reads a ManiSkill trajectory, ``F.h5`` with ``F.json`` beside it, as the generator writes it."""
+"""Read a ManiSkill trajectory written by `robocas generate`: ``F.h5`` with ``F.json`` next to it."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _STATE_DIM = 13 + 2 * RobotDescription.finger_slice.stop
 
 @dataclass(frozen=True)
 class Recording(EpisodeEntry):
-    """One recorded episode.
+    """Recorded episode with its data.
 
     Attributes:
-        actions: (S, A).
+        actions: (S, A) actions.
         states: ``{"actors": {name: (S+1, 13)}, "articulations": {name: (S+1, 13 + 2 joints)}}``.
     """
 
@@ -44,18 +44,22 @@ class Recording(EpisodeEntry):
         return Motion.of(self.robot, self.states["articulations"][self.robot.description.uid], commands, samples)
 
     def state(self, index: int) -> dict[str, dict[str, NDArray[np.float32]]]:
-        """Return a state as ``set_state_dict`` takes it, each array (1, D)."""
+        """Return a state as an argument of ``set_state_dict``, each array (1, D)."""
         return {kind: {n: a[index : index + 1] for n, a in arrays.items()} for kind, arrays in self.states.items()}
 
 
 class TrajectoryFile:
-    """An open trajectory file; use it in a ``with`` statement. ``pack`` (name or folder) replaces the named one.
+    """Open trajectory file, a context manager.
+
+    Args:
+        path: the .h5 file.
+        pack: object pack to use instead of the recorded one, by name or folder.
 
     Attributes:
-        env_info: ``env_id``, ``env_kwargs``, ... of the JSON.
-        env: the environment it was recorded in.
-        versions: of the packages that it was made with.
-        episodes: the JSON's entries.
+        env_info: ``env_info`` of the JSON: ``env_id``, ``env_kwargs``, ...
+        env: specification of the recorded environment.
+        versions: package versions at recording.
+        episodes: episode entries of the JSON.
     """
 
     def __init__(self, path: str | Path, *, pack: str | Path | None = None) -> None:
@@ -63,10 +67,10 @@ class TrajectoryFile:
         metadata_path = self.path.with_suffix(".json")
         if self.path.is_dir():
             inside = self.path / "trajectory.h5"
-            fix = f"Did you mean {inside}?" if inside.is_file() else "Give the .h5 file that robocas generate made."
-            raise DatasetError("this is a folder, not a trajectory file", where=self.path, fix=fix)
+            fix = f"Did you mean {inside}?" if inside.is_file() else "Pass the .h5 file of robocas generate."
+            raise DatasetError("a folder, not a trajectory file", where=self.path, fix=fix)
         if not self.path.is_file():
-            raise DatasetError("no such trajectory file", where=self.path, fix="Make one with robocas generate.")
+            raise DatasetError("no such trajectory file", where=self.path, fix="Record one with robocas generate.")
         metadata = read_json(self.path)
         self.env_info: dict[str, Any] = metadata["env_info"]
         self.episodes: list[dict[str, Any]] = metadata["episodes"]
@@ -75,24 +79,24 @@ class TrajectoryFile:
         run = metadata.get("robocas")
         if run is None:
             raise DatasetError(
-                "the JSON lacks the instructions and sub-goals",
+                "missing instructions and sub-goals",
                 where=metadata_path,
                 expected="key 'robocas'",
-                fix="Convert the file written by robocas generate; replays of it drop them.",
+                fix="Use the file of robocas generate; replayed files do not have them.",
             )
         self.control_freq = float(run.get("control_freq", RunRecord().control_freq))
         self.versions: dict[str, Any] = run.get("versions", {})
         self._file = open_trajectory(self.path)
         listed = {f"traj_{episode['episode_id']}" for episode in self.episodes}
-        with readable(self.path, "this file is damaged"):
+        with readable(self.path, "damaged file"):
             stored = set(self._file)
         if listed != stored:
             self.close()
             raise DatasetError(
-                "HDF5 and JSON do not list the same episodes",
+                "HDF5 and JSON contain different episodes",
                 where=self.path,
-                expected=f"{len(listed)} of the JSON",
-                found=f"{len(stored)}, {len(listed ^ stored)} of them differ",
+                expected=f"the {len(listed)} episodes of the JSON",
+                found=f"{len(stored)} episodes, {len(listed ^ stored)} differ",
             )
 
     def __enter__(self) -> TrajectoryFile:
@@ -105,20 +109,21 @@ class TrajectoryFile:
         self._file.close()
 
     def reopened(self) -> TrajectoryFile:
-        """Return the same file, opened again, with its JSON as it was read."""
+        """Open the file again without reading its JSON again."""
         file = copy(self)
         file._file = open_trajectory(self.path)
         return file
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave the open file behind, which no other process and no copy can have."""
+        """Drop the open file, which cannot be pickled or copied."""
         return {**self.__dict__, "_file": None}
 
     def entry(self, index: int) -> EpisodeEntry:
+        """Read the JSON entry of an episode by its position in ``episodes``."""
         return read_entry(self.episodes[index], self._where(index))
 
     def recording(self, index: int, *, bodies: bool = True) -> Recording:
-        """Read an episode by its position in ``episodes``, with the states of all bodies or of the robot only."""
+        """Read an episode by its position in ``episodes``; without ``bodies`` only the robot's states."""
         where, uid = self._where(index), self.robot.description.uid
         group = open_episode(self._file, self.episodes[index]["episode_id"])
         actions, found = read_steps(group, body=None if bodies else uid)
@@ -127,15 +132,15 @@ class TrajectoryFile:
         }
         entry = self.entry(index)
         if entry.control_steps != len(actions):
-            expected = f"{entry.control_steps} actions, as the JSON says"
-            raise DatasetError("this episode is damaged", where=where, expected=expected, found=len(actions))
+            expected = f"{entry.control_steps} actions as in the JSON"
+            raise DatasetError("damaged episode", where=where, expected=expected, found=len(actions))
         robot = states.get("articulations", {}).get(uid)
         width = _STATE_DIM
         if robot is None or robot.shape[1] != width:
             raise DatasetError(
-                "states of another robot",
+                "states do not fit the robot",
                 where=where,
-                expected=f"{uid} of {width} numbers",
+                expected=f"{uid} with {width} numbers per state",
                 found=sorted(states.get("articulations", {})) if robot is None else robot.shape[1],
             )
         return Recording(**vars(entry), actions=actions, states=states, robot=self.robot)

@@ -1,6 +1,6 @@
-"""The JSON file of a ManiSkill trajectory: its declared form, and what it says of each episode.
+"""Models and readers of the JSON file of a ManiSkill trajectory.
 
-A file is somebody's data: it may choose a seed and ``reconfigure``, and nothing else of ``env.reset``.
+Files are untrusted data: a file may set the seed and ``reconfigure`` of ``env.reset``, and no other option.
 """
 
 from __future__ import annotations
@@ -21,23 +21,24 @@ from robocas_ms3.core.strict_model import parse
 from robocas_ms3.core.text import one_line
 from robocas_ms3.demos.recordings.subgoals import SubGoal, SubGoals
 
-_ENTRY = "the JSON's entry"
+_ENTRY = "invalid episode entry"
 
 
-@cache  # it reads the packages' descriptions
+@cache  # reads package metadata from disk
 def versions() -> dict[str, str]:
+    """Return the versions of this package and of its main dependencies."""
     return {name: version(name) for name in ("robocas-ms3", "mani_skill", "sapien", "python-fcl", "torch", "numpy")}
 
 
 def one_seed(value: Any) -> int | None:
-    """Return a seed as an integer, also from a list of one as ManiSkill writes it; None where it is neither."""
+    """Return a seed as an integer, also from a list of one seed as ManiSkill writes it; None if invalid."""
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
     return value if type(value) is int else None
 
 
 class _Record(BaseModel):
-    model_config = ConfigDict(strict=True, extra="allow", frozen=True)  # further keys are their writer's
+    model_config = ConfigDict(strict=True, extra="allow", frozen=True)  # other tools may add keys
 
 
 def _single_seed(value: Any) -> Any:
@@ -45,7 +46,7 @@ def _single_seed(value: Any) -> Any:
 
 
 Seed = Annotated[int, BeforeValidator(_single_seed), Field(ge=0, le=MAX_SEED)]
-"""A seed of ``env.reset``; ManiSkill writes a list of one."""
+"""A seed of ``env.reset``; ManiSkill writes a list with one seed."""
 
 
 class ResetRecord(_Record):
@@ -55,7 +56,7 @@ class ResetRecord(_Record):
 
 
 class EpisodeHeader(_Record):
-    """How an episode begins, in every ManiSkill trajectory."""
+    """Keys of an episode entry in any ManiSkill trajectory that define its reset."""
 
     episode_id: int
     episode_seed: Seed
@@ -64,13 +65,13 @@ class EpisodeHeader(_Record):
 
 
 class TaskRecord(SubGoals):
-    """``robocas`` of an episode: what ManiSkill's format has no place for."""
+    """Key ``robocas`` of an episode entry: data beyond ManiSkill's format."""
 
     instruction: str
 
 
 class EpisodeRecord(EpisodeHeader):
-    """An episode that ``robocas generate`` recorded."""
+    """Episode entry written by ``robocas generate``."""
 
     elapsed_steps: NonNegativeInt | None = None
     robocas: TaskRecord
@@ -86,14 +87,14 @@ class _EnvRecord(_Record):
 
 
 class RunRecord(_Record):
-    """``robocas`` of the file."""
+    """Key ``robocas`` of the file."""
 
     control_freq: Annotated[FiniteFloat, Field(gt=0)] = 20.0
     versions: dict[str, Any] = {}
 
 
 class TrajectoryRecord(_Record):
-    """The file. Its episodes are read one by one, as one that is damaged does not spoil the others."""
+    """The file. Episode entries are validated one by one, so that one damaged entry does not affect the others."""
 
     env_info: _EnvRecord
     episodes: list[_ListedRecord]
@@ -102,14 +103,14 @@ class TrajectoryRecord(_Record):
 
 @dataclass(frozen=True)
 class EpisodeEntry:
-    """A recorded episode of S control steps in the JSON.
+    """JSON entry of a recorded episode of S control steps.
 
     Attributes:
         episode_id: number in the trajectory file.
-        reset_options: further options of ``env.reset``.
+        reset_options: options of ``env.reset``.
         control_steps: S.
-        subgoals: ranges over the actions 0..S-1.
-        is_intervention: whether it begins where another policy was, instead of at the reset.
+        subgoals: sub-goals with ranges over the actions 0..S-1.
+        is_intervention: whether the episode starts in a state that another policy reached, not at the reset.
     """
 
     episode_id: int
@@ -123,11 +124,12 @@ class EpisodeEntry:
 
 
 def read_entry(episode: Mapping[str, Any], where: object) -> EpisodeEntry:
+    """Read the entry of an episode in the JSON; raise DatasetError if it is invalid."""
     found = parse(EpisodeRecord, episode, DatasetError, where=where, about=_ENTRY)
     goals = found.robocas.subgoals
     steps = found.elapsed_steps
     if steps is None and not goals:
-        raise DatasetError("the JSON's entry does not say how long the episode is", where=where)
+        raise DatasetError("unknown length of the episode", where=where, expected="elapsed_steps or subgoals")
     return EpisodeEntry(
         episode_id=found.episode_id,
         seed=found.episode_seed,
@@ -141,13 +143,13 @@ def read_entry(episode: Mapping[str, Any], where: object) -> EpisodeEntry:
 
 
 def is_intervention(episode: Mapping[str, Any]) -> bool:
-    """Whether an episode begins where another policy was."""
+    """Return whether an episode starts in a state that another policy reached."""
     recorded = episode.get("robocas")
     return isinstance(recorded, Mapping) and recorded.get("intervention") is not None
 
 
 def read_reset(episode: Mapping[str, Any], where: object) -> tuple[int, dict[str, Any], str]:
-    """Return seed and options of ``env.reset`` that an episode begins with, and the control mode of its actions."""
+    """Read seed and options of ``env.reset`` and the control mode of an episode entry."""
     found = parse(EpisodeHeader, episode, DatasetError, where=where, about=_ENTRY)
     return found.episode_seed, _options(found.reset_kwargs), found.control_mode
 
@@ -161,10 +163,10 @@ def _options(reset: ResetRecord | None) -> dict[str, Any]:
 
 
 def read_json(trajectory: Path) -> dict[str, Any]:
-    """Read the JSON of a trajectory in the form of `TrajectoryRecord`."""
-    path, about = trajectory.with_suffix(".json"), "not a trajectory's JSON"
+    """Read the JSON file of a trajectory, validated as `TrajectoryRecord`."""
+    path, about = trajectory.with_suffix(".json"), "not the JSON file of a trajectory"
     if not path.is_file():
-        raise DatasetError("the JSON that belongs to this trajectory is missing", where=path)
+        raise DatasetError("missing JSON file of the trajectory", where=path)
     try:
         metadata = load_json(path)
     except (ValueError, RecursionError) as error:

@@ -111,9 +111,9 @@ def test_tracking_error_by_hand(dataset):
         ({"env_info": {"env_id": "X-v1", "env_kwargs": {"pack": "gone"}}}, "no such pack"),
         (
             {"env_info": {"env_id": "X-v1", "env_kwargs": {"pack": "/there"}}},
-            "expected a name, no path, found '/there'",
+            "expected a name without a path, found '/there'",
         ),
-        ({"env_info": {"env_id": "evil:X-v1", "env_kwargs": {}}}, "a file can't choose this"),
+        ({"env_info": {"env_id": "evil:X-v1", "env_kwargs": {}}}, "invalid environment id"),
         ({"reset_options": {"reset_to_env_states": {}}}, "reset_options: "),
     ],
 )

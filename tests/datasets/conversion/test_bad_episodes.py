@@ -118,7 +118,7 @@ def test_texts_that_cannot_be_read(many, tmp_path, monkeypatch):
     trajectory.with_suffix(".json").write_text(json.dumps(content))
     embedder = type("Embedder", (), {"__call__": lambda self, texts: np.eye(384, dtype=np.float32)[: len(texts)]})
     monkeypatch.setattr("robocas_ms3.scenes.language.embed.TextEmbedder", embedder)
-    with pytest.raises(IncompleteDatasetError, match="episode_0000003: .*traj_3: the JSON's entry: "):
+    with pytest.raises(IncompleteDatasetError, match="episode_0000003: .*traj_3: invalid episode entry: "):
         run(trajectory, tmp_path / "out", embeddings=True)
     assert validate(tmp_path / "out").violations == []
 

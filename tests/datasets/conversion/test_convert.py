@@ -137,7 +137,7 @@ def fails(match, trajectory, out, **kwargs):
 def test_errors_leave_nothing_behind(trajectory, tmp_path):
     out = tmp_path / "out"
     fails("no such trajectory file", tmp_path / "missing.h5", out)
-    fails("the rate must divide the control frequency", trajectory, out, rate_hz=3)
+    fails("the rate is not a divisor of the control frequency", trajectory, out, rate_hz=3)
     fails("no dataset to append to.*without --append first", trajectory, out, append=True)
     failed = write_trajectory(tmp_path / "failed.h5", seeds=(1, 2), failed=(0, 1))
     fails("no successful episodes to convert .found 2 episodes.*--include-failed", failed, out)
@@ -148,7 +148,7 @@ def test_errors_leave_nothing_behind(trajectory, tmp_path):
     broken = write_trajectory(tmp_path / "broken.h5", seeds=(1,))
     with h5py.File(broken, "a") as file:
         del file["traj_0/env_states"]
-    fails("this episode is damaged", broken, out)
+    fails("damaged episode", broken, out)
 
 
 def test_a_folder_that_vanishes(trajectory, tmp_path):

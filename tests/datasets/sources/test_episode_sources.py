@@ -61,7 +61,7 @@ def test_a_damaged_entry_of_a_trajectory_is_an_error_of_that_episode(paths, tmp_
     assert source.numbers == [0, 1, 2]
     assert source.episode(2).steps == 7
     for read in (lambda: source.episode(1).scene, lambda: source.lengths, lambda: source.split("train")):
-        with pytest.raises(DatasetError, match=r"traj_1: the JSON's entry: "):
+        with pytest.raises(DatasetError, match=r"traj_1: invalid episode entry: "):
             read()
 
 

@@ -66,16 +66,16 @@ def test_files_that_are_missing_or_cut_off(tmp_path, own):
         json_file.write_text(text)
         fails(own, "F.json")
     json_file.unlink()
-    fails(own, "F.json: the JSON that belongs to this trajectory is missing")
+    fails(own, "F.json: missing JSON file of the trajectory")
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda data: data.pop("robocas"), "replays of it drop them"),
+        (lambda data: data.pop("robocas"), "replayed files do not have them"),
         (lambda data: data["robocas"].update(control_freq=0), "control_freq"),
-        (lambda data: data["episodes"].append({**data["episodes"][0], "episode_id": 1}), "same episodes"),
-        (lambda data: data["episodes"][0].update(elapsed_steps=21), "expected 21 actions, as the JSON says, found 22"),
+        (lambda data: data["episodes"].append({**data["episodes"][0], "episode_id": 1}), "different episodes"),
+        (lambda data: data["episodes"][0].update(elapsed_steps=21), "expected 21 actions as in the JSON, found 22"),
         (lambda data: data["episodes"][0]["robocas"].pop("subgoals"), "robocas.subgoals"),
     ],
 )
@@ -98,7 +98,7 @@ def test_a_json_that_does_not_fit(own, change, words):
 )
 def test_entries_choose_a_seed_and_reconfigure_alone(own, change, key):
     edit_json(own, lambda data: data["episodes"][0].update(change))
-    fails(own, "traj_0: the JSON's entry: ", key)
+    fails(own, "traj_0: invalid episode entry: ", key)
 
 
 @pytest.mark.parametrize("values", [np.zeros(23, np.float32), np.array([b"x"] * 23), np.float32(1)])
@@ -107,13 +107,13 @@ def test_states_that_are_no_rows_of_numbers(own, name, values):
     with h5py.File(own, "a") as file:
         del file[f"traj_0/env_states/{name}"]
         file[f"traj_0/env_states/{name}"] = values
-    fails(own, "this episode is damaged")
+    fails(own, "damaged episode")
 
 
 def test_states_of_another_robot_or_none(own):
     with h5py.File(own, "a") as file:
         file.move(f"traj_0/env_states/articulations/{UID}", "traj_0/env_states/articulations/panda_wristcam")
-    fails(own, f"expected {UID} of 37 numbers, found ['panda_wristcam']")
+    fails(own, f"expected {UID} with 37 numbers per state, found ['panda_wristcam']")
     with h5py.File(own, "a") as file:
         del file["traj_0/env_states"]
-    fails(own, "this episode is damaged")
+    fails(own, "damaged episode")

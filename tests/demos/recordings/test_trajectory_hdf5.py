@@ -169,7 +169,7 @@ def test_states_of_other_files(whole, fill, read):
         with h5py.File(whole, "r+") as file:
             del file["elsewhere"]
             file[CUBE.rpartition("/")[0]].create_dataset("more", data=SECRET)
-    check_refused(read, whole, "can't choose files", "object_1", "arrays of its own")
+    check_refused(read, whole, "reference to other data", "object_1", "arrays stored in this file")
     assert not whole.with_name("merged.h5").exists()
 
 
@@ -177,7 +177,7 @@ def test_states_of_other_files(whole, fill, read):
 @pytest.mark.parametrize("name", ["traj_0/actions", "traj_0"])
 def test_a_link_in_place_of_actions_or_of_the_episode(whole, read, name):
     replaced(whole, name, external_link)
-    check_refused(read, whole, "can't choose files", name.rpartition("/")[2])
+    check_refused(read, whole, "reference to other data", name.rpartition("/")[2])
 
 
 @pytest.mark.parametrize("read", [by_file, by_replay])
@@ -185,7 +185,7 @@ def test_states_said_to_be_huge(whole, read):
     """A kilobyte of a file can stand for terabytes: they are not asked for."""
     huge = {"shape": (2**33, 2**33), "dtype": np.float32, "chunks": (1024, 1024), "compression": "gzip"}
     replaced(whole, CUBE, lambda file, name: file.create_dataset(name, **huge))
-    check_refused(read, whole, "MB of numbers")
+    check_refused(read, whole, "MB of arrays")
 
 
 def test_a_ring_of_groups_ends(whole):
@@ -212,4 +212,4 @@ def test_nan_is_not_replayed(whole, name):
     with h5py.File(whole, "r+") as file:
         file[f"traj_0/{name}"][4, 2] = np.nan
     for read in (by_file, by_replay, *([by_policy] if name == "actions" else [])):
-        check_refused(read, whole, "NaN or infinity", name.rpartition("/")[2], "row 4")
+        check_refused(read, whole, "NaN or infinite value", name.rpartition("/")[2], "row 4")
