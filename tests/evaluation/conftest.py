@@ -11,7 +11,7 @@ from robocas_ms3.evaluation import session
 
 @pytest.fixture
 def made(monkeypatch) -> list[CountingEnv]:
-    """Environments without physics; those that were made, in order."""
+    """Replace environments by environments without physics; return the created environments in order."""
     envs: list[CountingEnv] = []
 
     def make_vec(env_id, num_envs, *, config, **others):

@@ -16,11 +16,11 @@ _POSE = [1, 2, 3, 0.4, 0.1, 0.2, 0.3]  # m; quaternion wxyz
 
 
 class CountingEnv:
-    """N envs; each succeeds once the first numbers of its actions, or its steps, have added up to its goal.
+    """N envs without physics; an env succeeds when the sum of its first action values, or of its steps, reaches a goal.
 
     Args:
         num_envs: N.
-        goal: of all envs or of each; None: the seed of its episode.
+        goal: goal of all envs, or one per env; None: the seed of the episode.
         steps: whether steps are counted.
         config: name of the configuration, for tests.
     """
@@ -64,14 +64,14 @@ class CountingEnv:
 
     def _info(self) -> dict[str, Any]:
         no, sums = np.zeros(self.num_envs, bool), np.zeros((self.num_envs, len(SUMS)), np.float32)
-        sums[:, 0] = self.sums  # the first is the path's length
+        sums[:, 0] = self.sums  # path_length
         done = self.sums >= (self.seed_of if self._goal is None else self._goal)
         flags = {"reached_any": self.sums > 1, "success": done, "fail": no, "success_v0": no}
         return {"sums": sums, **flags, "elapsed_steps": self.elapsed.copy()}
 
 
-class Dying(CountingEnv):
-    """Envs in a process that dies in the second step of a seed, as often as ``deaths`` counts down."""
+class CrashingEnv(CountingEnv):
+    """Envs whose worker crashes in the second step of a seed; ``deaths`` counts the remaining crashes."""
 
     def __init__(self, num_envs: int, seed: int, deaths: list[int]) -> None:
         super().__init__(num_envs, None)

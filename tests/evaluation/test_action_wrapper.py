@@ -1,4 +1,4 @@
-"""What an action does in the environment that policies act in."""
+"""Actions, images and metrics of the environment wrapper of policies."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def along(z: float, gripper: float = 1.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("reference", ["tcp", "target"])
-def test_a_slow_motion_ends_where_it_was_told_to(reference):
+def test_slow_motion_reaches_its_goal(reference):
     env = made(reference=reference)
     before = tcp(env)
     for _ in range(5):
@@ -61,7 +61,7 @@ def test_a_slow_motion_ends_where_it_was_told_to(reference):
     assert read_sum(info, "path_length") == pytest.approx(0.1, abs=0.004)
 
 
-def test_from_where_it_is_or_from_where_it_was_sent():
+def test_motions_start_from_the_tcp_or_from_the_last_target():
     gone = {}
     for reference in ("tcp", "target"):
         env = made(reference=reference)
@@ -69,16 +69,16 @@ def test_from_where_it_is_or_from_where_it_was_sent():
         env.step(along(0.02))
         sent = tcp(env)
         qpos = base.agent.robot.get_qpos().clone()
-        qpos[0, 4] += 0.03  # something has pushed the arm
+        qpos[0, 4] += 0.03  # the arm was displaced
         base.agent.robot.set_qpos(qpos)
         pushed = np.linalg.norm(tcp(env) - sent)
         env.step(along(0.0))
         gone[reference] = np.linalg.norm(tcp(env) - sent) / pushed
-    assert gone["tcp"] > 0.8  # stays where it came to
-    assert gone["target"] < 0.2  # goes back
+    assert gone["tcp"] > 0.8  # stays at the displaced pose
+    assert gone["target"] < 0.2  # returns
 
 
-def test_joint_targets_are_taken_as_they_are():
+def test_joint_targets_are_executed_unchanged():
     env = made("joint_positions", rate=20)
     base: Any = env.unwrapped
     wanted = base.agent.robot.get_qpos()[0, 3:10].numpy() + 0.05
@@ -87,7 +87,7 @@ def test_joint_targets_are_taken_as_they_are():
     np.testing.assert_allclose(base.agent.robot.get_qpos()[0, 3:10].numpy(), wanted, atol=0.01)
 
 
-def test_upstreams_step_waits_for_the_gripper_and_for_the_motion():
+def test_upstream_step_waits_for_gripper_and_motion():
     env = made(stepping="upstream")
     base: Any = env.unwrapped
 
@@ -98,17 +98,17 @@ def test_upstreams_step_waits_for_the_gripper_and_for_the_motion():
 
     with pytest.raises(EvaluationError, match="NaN or infinite action"):
         env.step(np.full(7, np.nan))
-    assert steps(along(0.01)) == 1  # there within the first fifth of a second
+    assert steps(along(0.01)) == 1  # arrives within 0.2 s
     before = tcp(env)
-    assert steps(along(0.15)) == 2  # no control step goes farther than 10 cm
+    assert steps(along(0.15)) == 2  # at most 10 cm per control step
     assert np.linalg.norm(tcp(env) - before) == pytest.approx(0.15, abs=0.02)
     shutting = steps(along(0.0, gripper=0.0))
     assert 2 < shutting <= 7
     assert float(base.agent.gripper_width) < 0.01
-    assert steps(along(0.0, gripper=0.0)) <= 2  # it stands, though its drives press
+    assert steps(along(0.0, gripper=0.0)) <= 2  # the gripper has stopped, although its drives press
 
 
-def test_what_happened_is_counted_from_the_reset_on():
+def test_metrics_count_from_the_reset():
     env = made()
     base: Any = env.unwrapped
     slot = int(base.target_slot)
@@ -118,7 +118,7 @@ def test_what_happened_is_counted_from_the_reset_on():
     above = torch.cat([base.basket_pose[:, :2], pose[:, 2:3]], dim=1)
     base.objects[slot].set_pose(Pose.create_from_pq(above, pose[:, 3:]))
     *_, info = env.step(along(0.0))
-    assert bool(info["success_v0"])  # near the basket in xy, gripper open: upstream's rule asks for no more
+    assert bool(info["success_v0"])  # near the basket in xy, gripper open: RoboCAS-v0's rule has no other condition
     assert read_sum(info, "v0_steps") == 1
     assert not bool(info["success"])
     other = next(i for i in range(len(base.objects)) if i != slot)
@@ -131,7 +131,7 @@ def test_what_happened_is_counted_from_the_reset_on():
     base.objects[slot].set_pose(Pose.create_from_pq(torch.tensor([[3.0, 2.0, 0.05]]), pose[:, 3:]))
     *_, info = env.step(along(0.0))
     assert bool(info["fail"])
-    assert read_sum(info, "fallen") == 1  # others only
+    assert read_sum(info, "fallen") == 1  # the target does not count
     env.reset(seed=3)
     *_, info = env.step(along(0.0))
     assert [read_sum(info, name) for name in ("fallen", "disturbed_most", "v0_steps")] == [0, 0, 0]
@@ -146,7 +146,7 @@ def test_images_are_rendered_only_when_the_policy_observes_them(monkeypatch):
     monkeypatch.setattr(base, "capture_sensor_data", lambda: (rendered.append(1), capture()))
     for every, looks in ((1, [1, 1, 1]), (2, [0, 1, 0])):
         stepped = PolicyActionWrapper(env, PolicySpec("robocas", "tcp", observe_every=every), "upstream")
-        for _ in range(2):  # a reset begins to count anew
+        for _ in range(2):  # a reset restarts the count
             obs, _ = stepped.reset(seed=3)
             assert obs["sensor_data"]["base_camera"]["rgb"].any()
             for expected in looks:

@@ -1,4 +1,4 @@
-"""A protocol is made from a plan."""
+"""Protocols are frozen from plans."""
 
 import pytest
 import yaml
@@ -22,7 +22,7 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("frozen") / "tiny"
     steps = freeze(ProtocolPlan.model_validate(PLAN), folder)
     assert next(steps) == (1, 1)
-    assert not folder.exists()  # it appears whole
+    assert not folder.exists()  # the folder is written atomically
     assert list(steps) == []
     return folder
 
@@ -93,10 +93,10 @@ FIRST = PLAN["parts"][0]
 @pytest.mark.parametrize(
     "changed",
     [
-        {"parts": [FIRST, {**FIRST, "change": {"objects": {"count": 3}}}]},  # two configurations of one name
+        {"parts": [FIRST, {**FIRST, "change": {"objects": {"count": 3}}}]},  # two configurations with the same name
         {"parts": [{**FIRST, "change": {"objects": {"number": 3}}}]},
         {"parts": [{**FIRST, "config": "nothing"}]},
-        {"parts": [{**FIRST, "instruction": "wrong", "change": {"objects": {"count": 1}}}]},  # no other object to name
+        {"parts": [{**FIRST, "instruction": "wrong", "change": {"objects": {"count": 1}}}]},  # no second object
         *({"parts": [{**FIRST, "split": split}]} for split in ("../../evil", "x" * 300)),
         {"parts": [FIRST], "rules": PLAN["rules"] | {"name": "../../evil"}},
         {"train": [{"config": FIRST["config"], "change": {"objects": {"count": n}}} for n in (3, 4)]},

@@ -1,4 +1,4 @@
-"""Policies by name, the user's own among them: found where the command runs, and refused in one line."""
+"""Policies by name, policies of the user, and errors of invalid policies."""
 
 import sys
 
@@ -19,11 +19,11 @@ class Mine:
     spec = PolicySpec()
     def reset(self, episodes): ...
     def act(self, observations): return np.ones((len(observations.envs), 7))
-class Picky(Mine):
+class NeedsArgument(Mine):
     def __init__(self, folder): ...
-class Wishless(Mine):
+class WithoutSpec(Mine):
     spec = {"convention": "robocas"}
-class Idle:
+class WithoutAct:
     spec = PolicySpec()
     def reset(self, episodes): ...
 class Broken(Mine):
@@ -46,7 +46,7 @@ class LeavesLookedUp(Mine):
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """The folder that a command runs in."""
+    """A working directory with modules of the user."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     for name in ("own_policy", "own_spoilt", "own_importing", "own_leaving"):
@@ -58,7 +58,7 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_specifications():
+def test_invalid_specifications_name_the_field():
     assert "observe_every" not in policy_spec_values(PolicySpec())  # the default is left out
     assert policy_spec_values(PolicySpec(observe_every=7))["observe_every"] == 7
     for wrong in ({"convention": "words"}, {"language": "loud"}, {"reference": "me"}, {"observe_every": 0}):
@@ -85,9 +85,9 @@ def test_policy_modules_in_the_working_directory_are_found(here):
         ("own_policy:Yours", "unknown policy .*Yours"),
         ("own_spoilt:Mine", "own_spoilt: cannot import the module of the policy .*SyntaxError"),
         ("own_importing:Mine", "own_importing: cannot import the module of the policy .*not_there_at_all"),
-        ("own_policy:Picky", "cannot make the policy .*without required arguments"),
-        ("own_policy:Wishless", "the policy has no valid spec"),
-        ("own_policy:Idle", "the policy has no valid act"),
+        ("own_policy:NeedsArgument", "cannot make the policy .*without required arguments"),
+        ("own_policy:WithoutSpec", "the policy has no valid spec"),
+        ("own_policy:WithoutAct", "the policy has no valid act"),
     ],
 )
 def test_invalid_policy_names_are_errors_of_one_line(here, name, message):
@@ -116,7 +116,7 @@ def test_a_policy_cannot_end_the_process(here, name):
     assert str(here) in str(caught.value.found)
 
 
-def test_offsets_follow_from_the_seed():
+def test_offsets_depend_only_on_the_seed():
     drawn = np.array([offset(seed) for seed in range(200)])
     lengths = np.linalg.norm(drawn, axis=1)
     assert lengths.min() >= OFFSETS[0] and lengths.max() <= OFFSETS[1]
@@ -130,12 +130,12 @@ SAID = {  # 1, 2, 3 cm, then a quarter turn about z; gripper open, then shut
     "robocas": ([0.01, 0.02, 0.03, 0, 0, QUARTER], 1.0, 0.5),
     "delta_euler": ([0.01, 0.02, 0.03, 0, 0, QUARTER], 0.1, -0.1),
     "delta_axis_angle": ([0.01, 0.02, 0.03, 0, 0, QUARTER], 1.0, 0.0),
-    "delta_quaternion": ([0.01, 0.02, 0.03, 2.0, 0, 0, 2.0], 0.2, -1.0),  # of any length
+    "delta_quaternion": ([0.01, 0.02, 0.03, 2.0, 0, 0, 2.0], 0.2, -1.0),  # not normalised
 }
 
 
 @pytest.mark.parametrize("name", SAID)
-def test_a_motion_is_read(name):
+def test_conventions_decode_the_same_motion(name):
     numbers, opened, shut = SAID[name]
     convention = CONVENTIONS[name]
     assert len(numbers) + 1 == convention.size
@@ -150,5 +150,7 @@ def test_euler_angles_are_about_fixed_axes_x_first_and_a_quaternion_of_zeros_is_
     euler, quaternion = (CONVENTIONS[name].decode for name in ("robocas", "delta_quaternion"))
     assert euler is not None and quaternion is not None
     turn = euler(np.array([[0, 0, 0, QUARTER, 0, QUARTER, 1.0]])).rotation
-    np.testing.assert_allclose(turn.apply([[0, 1.0, 0]]), [[0, 0, 1.0]], atol=1e-12)  # up by x, then z leaves it
+    np.testing.assert_allclose(
+        turn.apply([[0, 1.0, 0]]), [[0, 0, 1.0]], atol=1e-12
+    )  # x turns it up; z has no effect then
     assert quaternion(np.zeros((1, 8))).rotation.magnitude() == pytest.approx(0)

@@ -1,4 +1,4 @@
-"""Protocols that are shipped, and damaged ones."""
+"""Bundled and damaged protocols."""
 
 import hashlib
 import json
@@ -14,7 +14,7 @@ from robocas_ms3.evaluation.protocol import EPISODES, RULES, load_protocol, prot
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 
-HASHES = {  # a change of a frozen protocol makes its scores incomparable
+HASHES = {  # results are comparable only with unchanged hashes
     "arrangement-v1": "114ef004cb17a386",
     "cameras-v1": "9c75e0ee5d860218",
     "clutter-v1": "4a7e1604b5fdaace",
@@ -31,7 +31,7 @@ HASHES = {  # a change of a frozen protocol makes its scores incomparable
 
 @pytest.fixture
 def folder(tmp_path):
-    """A copy that may be damaged."""
+    """A copy of a protocol, to be damaged."""
     return shutil.copytree(shipped_protocols()["smoke"], tmp_path / "mine")
 
 
@@ -70,7 +70,7 @@ SUITES = ("objects", "arrangement", "clutter", "instructions", "cameras", "looks
 
 
 @pytest.mark.parametrize("name", SUITES)
-def test_suites_train_on_what_is_seen_and_hold_something_out_of_each_task(name):
+def test_training_configurations_equal_seen_and_each_task_has_a_held_out_split(name):
     protocol, configs = load_protocol(f"{name}-v1"), {}
     for episode in protocol.episodes:
         configs.setdefault(episode.split == "seen", set()).add(protocol.config_file(episode.config))
@@ -81,7 +81,7 @@ def test_suites_train_on_what_is_seen_and_hold_something_out_of_each_task(name):
     assert {config.task for config in held_out} == set(train)
 
 
-def test_a_copy_has_the_same_hash_and_a_change_another(folder):
+def test_hash_depends_only_on_the_files(folder):
     mine = load_protocol(folder)
     before = load_protocol("smoke").hash
     assert mine.hash == before
@@ -128,14 +128,14 @@ def test_a_configuration_that_extends_another_file_is_refused(folder, inside, ke
         (lambda f: (f / RULES).unlink(), "unknown protocol"),
     ],
 )
-def test_damage_is_said_in_one_line(folder, damage, said):
+def test_damaged_protocols_are_errors_of_one_line(folder, damage, said):
     damage(folder)
     with pytest.raises(EvaluationError, match=said) as caught:
         load_protocol(folder)
     assert "\n" not in str(caught.value)
 
 
-def test_an_episode_ends_by_actions_or_by_seconds_at_rates_at_which_physics_can_be_stopped():
+def test_step_limits_and_valid_action_rates():
     rules = load_protocol("smoke").rules
     assert rules.step_limit("pick", 20) == 800
     assert rules.model_copy(update={"max_steps": 30}).steps("pick", 5) == 30

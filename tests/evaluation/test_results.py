@@ -1,4 +1,4 @@
-"""A result is appended to, gone on with, read in parts and merged."""
+"""Results are appended, continued, read as partial results, and merged."""
 
 import json
 
@@ -22,7 +22,7 @@ SEARCH = dict.fromkeys(("obstacles_cleared", "reached_any", "target_grasped", "t
 
 
 def start(folder, run=RUN_OF, new=(), **options):
-    """Start or continue a result, add outcomes, and return the numbers of those that were there."""
+    """Start or continue a result, add outcomes, and return the numbers of the existing outcomes."""
     with open_result(folder, RunRecord.from_values(run, folder / RUN), **options) as done:
         for one in new:
             append_outcome(folder, one)
@@ -40,7 +40,7 @@ def test_what_is_appended_is_read_and_a_line_that_was_cut_is_written_over(tmp_pa
     assert list(read_result(tmp_path / "a").outcomes) == [2, 3]
 
 
-def test_a_damaged_line_is_an_error_with_its_number(tmp_path):
+def test_damaged_line_is_an_error_with_its_number(tmp_path):
     write(tmp_path / "a", [outcome(0)])
     with (tmp_path / "a" / OUTCOMES).open("a") as file:
         file.write('{"episode": 1}\n')
@@ -49,7 +49,7 @@ def test_a_damaged_line_is_an_error_with_its_number(tmp_path):
 
 
 @pytest.mark.parametrize("record", [None, {}, *({**RUN_OF, key: ["other"]} for key in ("protocol", "policy", "weld"))])
-def test_a_folder_without_a_valid_record_is_no_result(tmp_path, record):
+def test_folder_without_a_valid_record_is_refused(tmp_path, record):
     if record is not None:
         (tmp_path / RUN).write_text(json.dumps(record))
     with pytest.raises(EvaluationError, match="invalid evaluation result"):
@@ -59,7 +59,7 @@ def test_a_folder_without_a_valid_record_is_no_result(tmp_path, record):
 @pytest.mark.parametrize(
     "said", [{"server": 5}, {"server": ["x"]}, {"name": 3}, {"notes": float("nan")}, {"notes": "\ud800"}]
 )
-def test_a_run_that_could_not_be_read_does_not_begin(tmp_path, said):
+def test_run_with_an_invalid_record_does_not_start(tmp_path, said):
     run = {**RUN_OF, "policy": {**RUN_OF["policy"], **said}}
     with pytest.raises(EvaluationError) as error:
         start(tmp_path / "a", run)
@@ -67,7 +67,7 @@ def test_a_run_that_could_not_be_read_does_not_begin(tmp_path, said):
     assert not (tmp_path / "a").exists()
 
 
-def test_a_result_from_before_there_was_a_weld_is_one_without_it(tmp_path):
+def test_result_without_the_key_weld_has_no_weld(tmp_path):
     run = {name: value for name, value in RUN_OF.items() if name != "weld"}
     start(tmp_path / "a", run, [outcome(0)])
     write(tmp_path / "b", [outcome(1)])
@@ -78,8 +78,8 @@ def test_a_result_from_before_there_was_a_weld_is_one_without_it(tmp_path):
         start(tmp_path / "a", {**RUN_OF, "weld": True})
 
 
-def test_parts_are_merged_whatever_the_clock_and_the_machine(tmp_path):
-    """A whole number stays one."""
+def test_partial_results_with_other_clock_times_and_machines_are_merged(tmp_path):
+    """Integers stay integers."""
     counts = {"path_length": 1.0, "fallen": 3, "disturbed_most": 0}
     write(tmp_path / "a", [outcome(0, measures=counts, seconds=40, p_vis=1, inference_ms=2, flag_seconds={"fail": 5})])
     write(
@@ -119,7 +119,7 @@ OTHERS = {
 
 
 @pytest.mark.parametrize("key", OTHERS)
-def test_results_of_different_runs_are_neither_continued_nor_joined(tmp_path, key):
+def test_results_with_other_settings_are_neither_continued_nor_merged(tmp_path, key):
     write(tmp_path / "a", [outcome(0)])
     with pytest.raises(OutputExistsError, match=key):
         start(tmp_path / "a", {**RUN_OF, key: OTHERS[key]})
@@ -130,8 +130,8 @@ def test_results_of_different_runs_are_neither_continued_nor_joined(tmp_path, ke
     assert start(tmp_path / "a", {**RUN_OF, key: OTHERS[key]}, overwrite=True) == []
 
 
-def test_what_was_played_twice_is_two_results(tmp_path):
-    """As of two checkpoints that are called the same."""
+def test_folders_with_common_episodes_are_separate_results(tmp_path):
+    """For example two checkpoints with the same name."""
     for name, numbers in (("a", (0, 1)), ("b", (2,)), ("c", (1, 2))):
         write(tmp_path / name, [outcome(number) for number in numbers])
     folders = [tmp_path / name for name in "abc"]
@@ -160,8 +160,8 @@ def test_failure_stage(reached, stage):
 SERVED = {"server": {"name": "mine", "class": "m:Mine"}, "n_action_steps": None, "spec": {}}
 
 
-def test_where_a_server_was_is_not_who_it_served(tmp_path):
-    """As where each of two GPUs serves a shard."""
+def test_address_of_a_server_is_not_part_of_the_settings(tmp_path):
+    """For example two servers that serve one shard each."""
     write(tmp_path / "a", [outcome(0)], policy={"name": "ws://a:8001?connect_s=3", **SERVED})
     write(tmp_path / "b", [outcome(1)], policy={"name": "ws://b:8002", **SERVED})
     assert list(read_result(tmp_path / "a", tmp_path / "b").outcomes) == [0, 1]
@@ -171,7 +171,7 @@ def test_where_a_server_was_is_not_who_it_served(tmp_path):
     other = {**SERVED, "server": {"name": "other"}}
     with pytest.raises(OutputExistsError, match='policy.server.name: "mine" -> "other"'):
         start(tmp_path / "a", {**RUN_OF, "policy": {"name": "ws://c:1", **other}})
-    silent = {**SERVED, "server": None}  # a plain openpi server: nobody knows what it serves
+    silent = {**SERVED, "server": None}  # a plain openpi server: its policy is unknown
     write(tmp_path / "c", [outcome(0)], policy={"name": "ws://a:1", **silent})
     write(tmp_path / "d", [outcome(1)], policy={"name": "ws://a:2", **silent})
     with pytest.raises(EvaluationError, match="different policy"):
@@ -190,7 +190,7 @@ def test_what_an_error_broke_off_is_played_again_if_that_is_asked_for(tmp_path):
 @pytest.mark.parametrize("overwrite", [False, True])
 @pytest.mark.parametrize("notes", ['{"settings": {"task": "pick"}, "first_seed": 0}', "[]", "{"])
 def test_the_folder_of_another_command_stays_as_it_is(tmp_path, notes, overwrite):
-    """Demonstrations have a run.json too."""
+    """Folders of demonstrations also have a run.json."""
     (tmp_path / RUN).write_text(notes)
     with pytest.raises(OutputExistsError):
         start(tmp_path, overwrite=overwrite)

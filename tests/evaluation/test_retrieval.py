@@ -1,4 +1,4 @@
-"""What was moved before the target of a heap: a target, a lid on it, a cup on the lid, a pear aside."""
+"""Retrieval order in a heap: a target, a lid on the target, a cup on the lid, and a pear next to them."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +17,7 @@ OVER[0, LID, TARGET], OVER[0, CUP, LID], OVER[0, PEAR, CUP] = 0.5, 0.3, 0.05
 
 
 class Heaps:
-    """What `RetrievalOrder` asks of search's environment, for equal heaps at 20 Hz."""
+    """Fake search environment for `RetrievalOrder`: equal heaps at 20 Hz."""
 
     device, control_timestep = torch.device("cpu"), 0.05
 
@@ -36,8 +36,8 @@ class Heaps:
         return SimpleNamespace(obstacles=torch.zeros(len(envs), 4, dtype=torch.bool))
 
 
-def kept_of(moves: dict[int, int], held_at: int = 1000, steps: int = 200) -> np.ndarray:
-    """What is kept when objects move at these control steps, two of them a policy step."""
+def record_of(moves: dict[int, int], held_at: int = 1000, steps: int = 200) -> np.ndarray:
+    """Return the record if objects move at these control steps; two control steps per policy step."""
     heap: Any = Heaps()
     retrieval = RetrievalOrder(heap)
     retrieval.reset(torch.tensor([0]))
@@ -51,14 +51,14 @@ def kept_of(moves: dict[int, int], held_at: int = 1000, steps: int = 200) -> np.
     return retrieval.read()[0].numpy()
 
 
-def test_what_lies_on_what_lies_on_the_target_is_needed():
+def test_objects_on_top_of_needed_objects_are_needed():
     assert objects_to_move(OVER[:, :, TARGET] >= 0.1, OVER >= 0.1).tolist() == [[False, True, True, False]]
     hemmed_in = torch.tensor([[False, False, False, True]])
     assert objects_to_move(hemmed_in, OVER >= 0.1).tolist() == [[False, False, False, True]]
 
 
-def test_from_the_top_down():
-    kept = kept_of({CUP: 10, LID: 60, PEAR: 81})
+def test_order_from_the_top_down_has_full_score():
+    kept = record_of({CUP: 10, LID: 60, PEAR: 81})
     assert kept.tolist() == [[0, 0, 0], [30, 1, 1], [5, 1, 1], [41, 0, 0]]
     found = Retrieval.from_record(kept, NAMES, held_at=90, cleared=True)
     assert [move.object for move in found.moved] == ["cup", "lid", "pear"]
@@ -67,31 +67,31 @@ def test_from_the_top_down():
 
 
 @pytest.mark.parametrize("start", (20, 69, 132))
-def test_what_is_pushed_as_one_moves_within_a_second_wherever_that_begins(start):
-    assert kept_of({LID: start, CUP: start + 20})[LID].tolist() == [(start + 1) // 2, 1, 1]
-    assert kept_of({LID: start, CUP: start + 21})[LID][2] == 0
+def test_objects_pushed_together_within_a_second_are_in_order(start):
+    assert record_of({LID: start, CUP: start + 20})[LID].tolist() == [(start + 1) // 2, 1, 1]
+    assert record_of({LID: start, CUP: start + 21})[LID][2] == 0
 
 
-def test_from_below_or_not_at_all():
-    assert kept_of({LID: 20}).tolist()[LID] == [10, 1, 0]
-    found = Retrieval.from_record(kept_of({LID: 20}), NAMES, held_at=50, cleared=False)
+def test_order_from_below_or_without_moves_loses_score():
+    assert record_of({LID: 20}).tolist()[LID] == [10, 1, 0]
+    found = Retrieval.from_record(record_of({LID: 20}), NAMES, held_at=50, cleared=False)
     assert (found.left, found.score) == (1, 0.0)
-    assert Retrieval.from_record(kept_of({LID: 20}), NAMES, held_at=50, cleared=True).left == 0
+    assert Retrieval.from_record(record_of({LID: 20}), NAMES, held_at=50, cleared=True).left == 0
 
 
-def test_what_moves_once_the_target_is_held_does_not_count():
-    found = Retrieval.from_record(kept_of({CUP: 10, LID: 60}, held_at=60), NAMES, held_at=30, cleared=True)
+def test_moves_after_the_target_was_held_do_not_count():
+    found = Retrieval.from_record(record_of({CUP: 10, LID: 60}, held_at=60), NAMES, held_at=30, cleared=True)
     assert [move.object for move in found.moved] == ["cup"]
 
 
-def test_a_target_that_was_never_held_has_no_order():
-    found = Retrieval.from_record(kept_of({CUP: 10}), NAMES, held_at=None, cleared=False)
+def test_no_score_if_the_target_was_never_held():
+    found = Retrieval.from_record(record_of({CUP: 10}), NAMES, held_at=None, cleared=False)
     assert (found.score, found.left, len(found.moved)) == (None, 0, 1)
     nothing = np.zeros((4, 3), np.int16)
     assert Retrieval.from_record(nothing, NAMES, held_at=5, cleared=True).score == 1.0
 
 
-def test_envs_begin_anew_on_their_own():
+def test_envs_are_reset_independently():
     heap: Any = Heaps(2)
     retrieval = RetrievalOrder(heap)
     retrieval.reset(torch.tensor([0, 1]))

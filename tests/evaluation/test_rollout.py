@@ -12,7 +12,7 @@ from robocas_ms3.evaluation.protocol import load_protocol
 
 
 class Obedient:
-    """Does as many as its instruction says, in chunks; keeps what it was told."""
+    """Policy that acts for the number of steps in its instruction, in chunks, and records its inputs."""
 
     spec = PolicySpec(state=True)
 
@@ -25,7 +25,7 @@ class Obedient:
     def act(self, observations: Observations) -> np.ndarray:
         assert observations.state is not None
         for env, said, seed in zip(observations.envs, observations.instructions, observations.state[:, 0], strict=True):
-            assert said == f"count to {seed:.0f}", env  # the instruction of its own episode
+            assert said == f"count to {seed:.0f}", env  # instruction of the episode of this env
         self.asked.append(observations.envs.tolist())
         actions = np.zeros((len(observations.envs), self.chunk, 7))
         actions[..., 0] = 1
@@ -50,8 +50,8 @@ def test_every_episode_is_played_once_with_its_own_instruction(count, refill):
         assert one.at_end["success"] == (seed <= 7)
         assert one.flags["fail"] is None
     if not refill and count == 4:
-        assert [len(envs) for envs in env.resets] == [4, 4]  # four, then two, in one reset each
-        assert policy.asked[3] == [1, 3]  # those that are done are masked
+        assert [len(envs) for envs in env.resets] == [4, 4]  # four, then two episodes
+        assert policy.asked[3] == [1, 3]  # ended envs are not observed
 
 
 def test_chunks_are_played_to_their_end_before_the_policy_is_asked_again():
@@ -63,7 +63,7 @@ def test_chunks_are_played_to_their_end_before_the_policy_is_asked_again():
 
 @pytest.mark.parametrize(("chunk", "looks", "fits"), [(6, 3, True), (1, 3, True), (3, 6, False), (6, 4, False)])
 def test_chunks_begin_with_images(chunk, looks, fits):
-    """A policy without chunks takes care of that itself."""
+    """A policy without chunks may have any length."""
     policy = Obedient(chunk)
     policy.spec = PolicySpec(state=True, observe_every=looks)
     if fits:

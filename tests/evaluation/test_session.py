@@ -1,4 +1,4 @@
-"""Episodes of a protocol: run with a policy and continued, or in an external loop."""
+"""Evaluation sessions: runs with a policy, continued runs, and external loops."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from counting_env import BREAKS, CountingEnv, Dying
+from counting_env import BREAKS, CountingEnv, CrashingEnv
 
 from robocas_ms3.cli.main import run as cli
 from robocas_ms3.core.errors import DatasetError, EvaluationError, OutputExistsError, RobocasError, VectorEnvCrashError
@@ -32,7 +32,7 @@ def open_session(spec: PolicySpec = AT_5_HZ, **settings) -> EvaluationSession:
     return EvaluationSession(ExternalPolicy(spec), EvaluationSettings(**settings))
 
 
-def test_in_an_external_loop_an_episode_ends_by_the_protocols_rules_and_a_reset_drops_it(made):
+def test_external_loop_ends_episodes_by_the_rules_and_reset_drops_running_episodes(made):
     external = open_session()
     external.reset([0])
     external.step(ones())
@@ -50,7 +50,7 @@ def test_in_an_external_loop_an_episode_ends_by_the_protocols_rules_and_a_reset_
     external.close()
 
 
-def test_an_env_stays_open_as_long_as_its_configuration(made):
+def test_env_stays_open_while_the_configuration_is_the_same(made):
     external = open_session()
     for number in (0, 1, 2, 0):
         external.reset([number])
@@ -61,10 +61,10 @@ def test_an_env_stays_open_as_long_as_its_configuration(made):
     assert made[-1].closed
 
 
-def test_after_an_error_of_the_env_the_next_reset_opens_another(made):
+def test_reset_after_an_env_error_makes_a_new_env(made):
     external = open_session()
     external.reset([0])
-    with pytest.raises(EvaluationError, match=r"invalid shape or type of actions"):  # which is no error of the env
+    with pytest.raises(EvaluationError, match=r"invalid shape or type of actions"):  # the env stays open
         external.step(np.zeros((1, 6)))
     with pytest.raises(RuntimeError, match="the env broke"):
         external.step(ones(1, BREAKS))
@@ -76,7 +76,7 @@ def test_after_an_error_of_the_env_the_next_reset_opens_another(made):
     external.close()
 
 
-def test_each_env_of_a_batch_ends_by_itself(made):
+def test_envs_of_a_batch_end_independently(made):
     batch = open_session(envs=3)
     seen = batch.reset([4, 5, 4])
     assert seen.envs.tolist() == [0, 1, 2] and seen.instructions[0] == seen.instructions[2] != seen.instructions[1]
@@ -92,7 +92,7 @@ def test_each_env_of_a_batch_ends_by_itself(made):
     }
     assert batch.step(np.tile(ones(3), (3, 1, 1))) is None
     assert batch.outcomes[0].steps == 5
-    assert not np.stack(made[0].actions)[2:, 1:].any()  # ended envs are sent zeros
+    assert not np.stack(made[0].actions)[2:, 1:].any()  # ended envs get zeros
     for numbers, message in (
         ([0, 4, 5], "one configuration"),
         ([0, 1], "wrong number"),
@@ -132,7 +132,7 @@ def no_renderer() -> None:
         ),
     ],
 )
-def test_settings_that_do_not_fit_are_refused_before_anything_is_written(monkeypatch, settings, spec, message):
+def test_invalid_settings_are_refused_before_writing(monkeypatch, settings, spec, message):
     monkeypatch.setattr(session, "require_renderer", no_renderer)
     choose = session.choose_backend
     monkeypatch.setattr(session, "choose_backend", lambda name: name if name == "gpu" else choose(name))
@@ -140,7 +140,7 @@ def test_settings_that_do_not_fit_are_refused_before_anything_is_written(monkeyp
         open_session(spec, **settings)
 
 
-def test_episodes_are_chosen_by_task_count_and_shard():
+def test_episodes_are_selected_by_task_count_shard_and_split():
     def chosen(protocol=SMOKE, **settings):
         return [one.episode for one in protocol.select_episodes(EvaluationSettings(**settings))]
 
@@ -162,7 +162,7 @@ def test_select_runs_in_the_episodes_of_pick_in_paper_v1_and_the_result_records_
     assert result.run.played_as == {"select": "pick"}
     assert find_violations(result, evaluation.protocol) == ["398 of 400 episodes missing"]
     with pytest.raises(OutputExistsError, match="played_as"):
-        list(opened(evaluation.folder, "noop", protocol="paper-v1", tasks=("pick",), episodes=2).run())
+        list(make_session(evaluation.folder, "noop", protocol="paper-v1", tasks=("pick",), episodes=2).run())
 
 
 def test_other_protocols_have_no_alias_of_select_and_pick_cannot_run_twice():
@@ -182,24 +182,22 @@ def test_warnings_of_a_policy_about_the_configurations_are_logged(caplog):
     assert record.levelname == "WARNING" and record.getMessage().startswith("pick_table_scattered has ")
 
 
-def opened(folder, policy="random", **settings) -> EvaluationSession:
+def make_session(folder, policy="random", **settings) -> EvaluationSession:
     settings = {"backend": "processes", **settings}
     return EvaluationSession(make_policy(policy), EvaluationSettings(policy=policy, out=folder, **settings))
 
 
 def evaluate(folder, policy="random", **settings) -> dict[int, dict]:
-    list(opened(folder, policy, **settings).run())
+    list(make_session(folder, policy, **settings).run())
     return {number: one.reproducible_values() for number, one in results.read_result(folder).outcomes.items()}
 
 
 @pytest.mark.parametrize("times", [1, 2])
-def test_an_episode_whose_process_dies_runs_again_once_and_then_counts_as_failed(
-    short, tmp_path, monkeypatch, caplog, times
-):
+def test_episode_is_retried_once_after_a_crash_and_then_counts_as_failed(short, tmp_path, monkeypatch, caplog, times):
     protocol, made, deaths, out = load_protocol(short), [], [times], tmp_path / "out"
 
     def make_vec(env_id, count, **_):
-        made.append(Dying(count, protocol.episodes[1].seed, deaths))
+        made.append(CrashingEnv(count, protocol.episodes[1].seed, deaths))
         return made[-1]
 
     monkeypatch.setattr(session, "make_vec", make_vec)
@@ -208,7 +206,7 @@ def test_an_episode_whose_process_dies_runs_again_once_and_then_counts_as_failed
     assert [number for number, one in found.items() if one["error"]] == ([1] if times == 2 else [])
     assert found[1]["error"] == ("the worker process of the env crashed: SIGSEGV" if times == 2 else "")
     assert (found[1]["failure_stage"] == "error") == (times == 2)
-    assert found[0]["steps"] == 20  # from its beginning, whatever happened to the other
+    assert found[0]["steps"] == 20  # not affected by the other env
     assert [record.getMessage() for record in caplog.records] == [
         "episode 1: the worker process of the env crashed: SIGSEGV; the episode is retried once"
     ]
@@ -216,12 +214,12 @@ def test_an_episode_whose_process_dies_runs_again_once_and_then_counts_as_failed
     violations = find_violations(results.read_result(out), protocol)
     assert not [one for one in violations if one.startswith("episode 1:") and times == 2]
     command = ["eval", "--policy", "noop", "--protocol", short, "--backend", "processes", "--out", out]
-    assert cli([str(word) for word in command]) == times - 1  # continues, and does not run the failed episode again
+    assert cli([str(word) for word in command]) == times - 1  # the failed episode is not repeated
     assert results.read_result(out).error_count() == times - 1
 
 
 @pytest.mark.parametrize("times", [1, 2])
-def test_envs_whose_process_dies_while_they_are_made_are_made_again_once(short, tmp_path, monkeypatch, caplog, times):
+def test_envs_that_crash_at_start_are_restarted_once(short, tmp_path, monkeypatch, caplog, times):
     left = [times]
 
     def make_vec(env_id, count, **_):
@@ -239,7 +237,7 @@ def test_envs_whose_process_dies_while_they_are_made_are_made_again_once(short, 
         evaluate(tmp_path / "out", "noop", protocol=str(short))
 
 
-def test_an_interrupted_command_tells_how_to_continue_and_it_takes_one_thread(tmp_path, monkeypatch, capsys):
+def test_interrupted_command_prints_how_to_continue_and_uses_one_thread(tmp_path, monkeypatch, capsys):
     threads = []
 
     def interrupted(*args):
@@ -250,7 +248,7 @@ def test_an_interrupted_command_tells_how_to_continue_and_it_takes_one_thread(tm
     monkeypatch.setattr(EvaluationSession, "run_episodes", interrupted)
     torch.set_num_threads(2)
     try:
-        open_session()  # whoever makes a session keeps its threads
+        open_session()  # sessions of the API do not change the threads
         assert torch.get_num_threads() == 2
         assert cli(["eval", "--protocol", "smoke", "--policy", "noop", "--out", str(tmp_path / "out")]) == 130
     finally:
@@ -263,34 +261,34 @@ PICK = {"tasks": ("pick",)}
 
 
 @pytest.fixture(scope="module")
-def alone(short, tmp_path_factory):
+def sequential(short, tmp_path_factory):
     """Outcomes of a random policy, one env at a time."""
-    return evaluate(tmp_path_factory.mktemp("alone"), protocol=str(short), envs=1, **PICK)
+    return evaluate(tmp_path_factory.mktemp("sequential"), protocol=str(short), envs=1, **PICK)
 
 
 @pytest.mark.slow
-def test_outcomes_do_not_depend_on_shards(alone, short, tmp_path):
-    assert not any(one["success"] for one in alone.values())
-    assert len({one["measures"]["path_length"] for one in alone.values()}) == 2
-    assert evaluate(tmp_path, protocol=str(short), shard="1/2", **PICK) == {1: alone[1]}
+def test_outcomes_do_not_depend_on_shards(sequential, short, tmp_path):
+    assert not any(one["success"] for one in sequential.values())
+    assert len({one["measures"]["path_length"] for one in sequential.values()}) == 2
+    assert evaluate(tmp_path, protocol=str(short), shard="1/2", **PICK) == {1: sequential[1]}
 
 
 @pytest.mark.slow
-def test_a_run_that_was_cut_off_continues_with_other_envs_and_ends_the_same(alone, short, tmp_path):
-    begun: list[int] = []
-    playing = opened(tmp_path, protocol=str(short), envs=1, **PICK).run(begun.append)
+def test_interrupted_run_continues_with_more_envs_and_equal_outcomes(sequential, short, tmp_path):
+    counts: list[int] = []
+    playing = make_session(tmp_path, protocol=str(short), envs=1, **PICK).run(counts.append)
     next(playing)
-    assert begun == [2]
+    assert counts == [2]
     playing.close()
     path = tmp_path / "episodes.jsonl"
-    path.write_text(path.read_text() + path.read_text()[:100])  # and killed while it wrote
+    path.write_text(path.read_text() + path.read_text()[:100])  # an incomplete line
     with pytest.raises(OutputExistsError, match="policy.name"):
         evaluate(tmp_path, "noop", protocol=str(short))
-    assert evaluate(tmp_path, protocol=str(short), **PICK) == alone
+    assert evaluate(tmp_path, protocol=str(short), **PICK) == sequential
 
 
 @pytest.mark.slow
-def test_the_scripted_policy_succeeds(tmp_path):
+def test_scripted_policy_succeeds(tmp_path):
     outcome = evaluate(tmp_path, "scripted", protocol="smoke", tasks=("pick",), episodes=1)[0]
     assert outcome["success"] and outcome["success_at_end"] and outcome["success_v0"]
     flags = outcome["flags"]
@@ -299,7 +297,7 @@ def test_the_scripted_policy_succeeds(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_policy_of_the_docs_sees_what_it_declares(short, tmp_path, monkeypatch, needs_renderer):
+def test_policy_of_the_docs_gets_the_declared_observations(short, tmp_path, monkeypatch, needs_renderer):
     page = (Path(__file__).resolve().parents[2] / "docs" / "evaluation.md").read_text(encoding="utf-8")
     program = page.split("```python\n")[1].split("```")[0]
     program = program.replace("rate_hz=5,", "rate_hz=5, depth=True, state=True, language='text',")

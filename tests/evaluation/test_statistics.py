@@ -22,7 +22,7 @@ from robocas_ms3.evaluation.statistics import (
 )
 
 Z2 = norm.isf(0.025) ** 2
-SHARES = st.just(0.0) | st.floats(1e-9, 1)  # SciPy's binomial overflows at probabilities of 1e-308
+FRACTIONS = st.just(0.0) | st.floats(1e-9, 1)  # SciPy's binomial overflows at probabilities of 1e-308
 COUNTS = st.tuples(*[st.integers(0, 30)] * 4).filter(any)  # both, only A, only B, neither
 
 
@@ -42,14 +42,14 @@ def k_of_n(draw) -> tuple[int, int]:
         (0, 10, 0, 0.3085),
     ],
 )
-def test_exact_interval_is_the_published_one(k, n, low, high):
+def test_exact_interval_equals_published_values(k, n, low, high):
     found = success_rate(k, n)
     assert (found.k, found.n, found.rate) == (k, n, k / n)
     assert (found.low, found.high) == pytest.approx((low, high), abs=5e-5)
 
 
 @given(k_of_n())
-def test_exact_interval_ends_where_half_the_error_is_left(counts):
+def test_exact_interval_leaves_half_the_error_at_each_end(counts):
     k, n = counts
     found = success_rate(k, n)
     assert 0 <= found.low <= k / n <= found.high <= 1
@@ -71,25 +71,25 @@ def test_exact_interval_ends_where_half_the_error_is_left(counts):
         (6, 16, 0.052479),  # complete responses before and after therapy, Fagerland et al. (2017), ch. 8
     ],
 )
-def test_exact_mcnemar(only_a, only_b, p_value):
+def test_mcnemar_equals_published_values(only_a, only_b, p_value):
     assert mcnemar(only_a, only_b) == pytest.approx(p_value, abs=5e-7)
     assert mcnemar(only_b, only_a) == mcnemar(only_a, only_b)
 
 
-def test_paired_interval_is_the_published_one():
+def test_paired_interval_equals_published_values():
     # Fagerland et al. (2017), ch. 8: its limits by Tango's method
     assert paired_interval(6, 16, 161) == pytest.approx((-0.1240, -0.0054), abs=5e-5)
 
 
 @pytest.mark.parametrize("n", [1, 7, 40])
-def test_paired_interval_of_runs_that_agree_or_never_do_has_a_formula(n):
+def test_paired_interval_of_runs_that_always_or_never_agree_has_a_closed_form(n):
     assert paired_interval(0, 0, n) == pytest.approx((-Z2 / (n + Z2), Z2 / (n + Z2)), abs=1e-9)
     assert paired_interval(n, 0, n) == pytest.approx(((n - Z2) / (n + Z2), 1), abs=1e-9)
     assert paired_interval(0, n, n) == pytest.approx((-1, -(n - Z2) / (n + Z2)), abs=1e-9)
 
 
 @pytest.mark.parametrize(("n", "worst"), [(7, 0.835), (22, 0.89)])
-def test_paired_interval_covers_about_as_often_as_it_says(n, worst):
+def test_coverage_of_the_paired_interval(n, worst):
     tables = np.array([(a, b, n - a - b) for a in range(n + 1) for b in range(n + 1 - a)])
     low, high = np.array([paired_interval(a, b, n) for a, b, _ in tables.tolist()]).T
     coverage = []
@@ -104,7 +104,7 @@ def test_paired_interval_covers_about_as_often_as_it_says(n, worst):
 
 
 @given(COUNTS)
-def test_swapping_the_runs_swaps_signs(counts):
+def test_swapping_the_runs_swaps_the_signs(counts):
     both, only_a, only_b, neither = counts
     ours, swapped = (
         Comparison.from_counts(both, only_a, only_b, neither),
@@ -117,7 +117,7 @@ def test_swapping_the_runs_swaps_signs(counts):
     assert ours.low < ours.high
 
 
-def test_runs_are_compared_scene_by_scene():
+def test_runs_are_compared_per_scene():
     a = np.array([1, 1, 1, 1, 1, 0, 0, 0], dtype=bool)
     b = np.array([1, 1, 0, 0, 0, 1, 0, 0], dtype=bool)
     found = compare(a, b)
@@ -128,14 +128,14 @@ def test_runs_are_compared_scene_by_scene():
     assert compare(a.tolist(), a.tolist()).p_value == 1
 
 
-def test_holm_by_hand():
+def test_holm_equals_values_computed_by_hand():
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm([0.7, 0.6]) == [1, 1]
     assert holm([0.2]) == [0.2]
     assert holm([]) == []
 
 
-def test_bins_hold_their_lower_edge_and_the_last_one_both():
+def test_bins_contain_their_lower_edge_and_the_last_bin_both_edges():
     values = [0.0, 0.2, 0.5, 0.5, 0.9, 1.0]
     successes = [False, True, True, False, True, True]
     found = success_rates_by_bin(values, successes, [0, 0.5, 0.75, 0.8, 1])
@@ -143,30 +143,30 @@ def test_bins_hold_their_lower_edge_and_the_last_one_both():
 
 
 @pytest.mark.parametrize(("difference", "discordant"), [(0, 0.4), (0.3, 0.4), (0.4, 0.4), (0.6, 1)])
-def test_power_is_the_sum_over_all_outcomes(difference, discordant):
+def test_power_equals_the_sum_over_all_outcomes(difference, discordant):
     n, p, q = 14, (discordant + difference) / 2, (discordant - difference) / 2
-    told = 0.0
+    power = 0.0
     for a in range(n + 1):
         for b in range(n + 1 - a):
             ways = factorial(n) // (factorial(a) * factorial(b) * factorial(n - a - b))
             if mcnemar(a, b) <= 0.05:
-                told += ways * p**a * q**b * (1 - p - q) ** (n - a - b)
-    assert mcnemar_power(n, difference, discordant) == pytest.approx(told, abs=1e-12)
+                power += ways * p**a * q**b * (1 - p - q) ** (n - a - b)
+    assert mcnemar_power(n, difference, discordant) == pytest.approx(power, abs=1e-12)
 
 
-def test_six_scenes_are_the_fewest():
+def test_fewer_than_six_scenes_show_no_difference():
     assert smallest_paired_difference(5, 0) is None
-    assert smallest_paired_difference(6, 0) == pytest.approx(0.8 ** (1 / 6))  # all six are A's
+    assert smallest_paired_difference(6, 0) == pytest.approx(0.8 ** (1 / 6))  # A solves all six
 
 
-@given(st.integers(6, 120), SHARES)
-def test_the_smallest_difference_has_the_power_asked_for(n, discordant):
+@given(st.integers(6, 120), FRACTIONS)
+def test_smallest_difference_has_80_percent_power(n, discordant):
     found = smallest_paired_difference(n, discordant)
     assert found is not None
     assert mcnemar_power(n, found, max(found, discordant)) == pytest.approx(0.8, abs=1e-6)
 
 
-def test_a_warning_says_what_would_show():
+def test_warning_names_the_detectable_difference():
     assert power_warning(Comparison.from_counts(20, 8, 5, 7)) == (
         "no significant difference: 40 episodes show differences of 26 points or more (80 % power)"
     )
@@ -175,8 +175,8 @@ def test_a_warning_says_what_would_show():
     assert power_warning(Comparison.from_counts(0, 6, 0, 0), alpha=0.05 / 2) is not None  # one of two comparisons
 
 
-def test_another_package_says_the_same():
-    """Run by scripts/check_others.sh, whose environment has it."""
+def test_statistics_equal_those_of_robostats():
+    """Runs in scripts/check_others.sh, which installs robostats."""
     robostats = pytest.importorskip("robostats")
     for n in (1, 2, 10, 39, 200):
         for k in {0, 1, n // 3, n - 1, n}:

@@ -1,4 +1,4 @@
-"""A policy's description is checked at the start, and its texts do nothing but appear in reports."""
+"""Descriptions of policies are checked at the start, and their texts are escaped in reports."""
 
 import re
 from dataclasses import asdict
@@ -22,7 +22,7 @@ HOSTILE = "\x1b]0;t\x07\x9b\u202e<script>alert(1)</script>|`a`\n[b](http://c)"
 
 
 class Policy:
-    """Its description is what it was made with."""
+    """Policy with a given description."""
 
     spec = PolicySpec(rate_hz=5.0)
 
@@ -42,7 +42,7 @@ class Policy:
         (None, ""),
     ],
 )
-def test_a_description_that_no_result_can_hold_is_refused(description, key):
+def test_descriptions_that_cannot_be_recorded_are_refused(description, key):
     for use in (describe, PolicyServer):
         with pytest.raises(EvaluationError) as error:
             use(Policy(description))
@@ -53,17 +53,17 @@ def test_a_description_that_no_result_can_hold_is_refused(description, key):
         describe(policy)
 
 
-def test_what_a_description_says_is_read_back_and_does_not_rename_the_policy(tmp_path):
+def test_description_round_trips_and_does_not_rename_the_policy(tmp_path):
     policy = Policy({"name": 5, "sizes": (1, 2), "note": HOSTILE})
     run = EvaluationSession(policy, EvaluationSettings(policy="mine", protocol="smoke", backend="processes")).record
     with results.open_result(tmp_path / "out", run):
         results.append_outcome(tmp_path / "out", outcome(0))
     assert results.read_result(tmp_path / "out").run.policy.name == "mine"
-    with results.open_result(tmp_path / "out", run) as done:  # what was written is what is asked for again
+    with results.open_result(tmp_path / "out", run) as done:  # the record equals the written record
         assert list(done) == [0]
 
 
-def test_an_error_text_of_a_policy_is_read_back(tmp_path):
+def test_error_text_of_a_policy_round_trips(tmp_path):
     start = EpisodeSpec(0, 0, "pick", "table", "", "builtin", 0, "")
     episode = SimpleNamespace(episode=0, task="pick", config="table", seed=0, split="test", p_vis=None)
     made = Rollout(start, error=f"{HOSTILE}\udcff").outcome(episode, [])
@@ -73,7 +73,7 @@ def test_an_error_text_of_a_policy_is_read_back(tmp_path):
     assert asdict(results.read_result(tmp_path / "out").outcomes[0]) == asdict(made)
 
 
-def test_reports_show_texts_as_they_are(tmp_path):
+def test_reports_escape_texts(tmp_path):
     texts = {"config": HOSTILE, "split": HOSTILE, "failure_stage": HOSTILE, "error": HOSTILE}
     outcomes = [outcome(0), outcome(1, came_to=2, **texts), outcome(2, split=HOSTILE)]
     run = {"protocol": HOSTILE, "policy": {"name": HOSTILE, "note": HOSTILE}, "versions": {HOSTILE: HOSTILE}}
@@ -85,5 +85,7 @@ def test_reports_show_texts_as_they_are(tmp_path):
         assert all(character.isprintable() or character in "\n\t" for character in text), name
         assert "<script>alert" not in text.replace("\\<", "")
     for name in ("report.md", "comparison"):
-        for rows in re.findall(r"(?:^\|.*\n)+", reports[name], re.MULTILINE):  # of a table: as many cells as its head
+        for rows in re.findall(
+            r"(?:^\|.*\n)+", reports[name], re.MULTILINE
+        ):  # rows of a table have equal numbers of cells
             assert len({row.replace("\\|", "").count("|") for row in rows.splitlines()}) == 1

@@ -1,4 +1,4 @@
-"""What was done to a result afterwards is found, as far as its files can tell."""
+"""`robocas eval verify` finds changes of a result."""
 
 import json
 import math
@@ -64,7 +64,7 @@ def tamper_run(folder, **values):
         ({"episode": 99}, "episode 99: not in the protocol"),
     ],
 )
-def test_a_changed_episode_is_found(folder, protocol, values, said):
+def test_changed_outcomes_are_found(folder, protocol, values, said):
     assert find_violations(read_result(folder), protocol) == []
     tamper(folder, 0, **values)
     found = find_violations(read_result(folder), protocol)
@@ -83,13 +83,13 @@ def test_a_changed_episode_is_found(folder, protocol, values, said):
     ],
     ids=str,
 )
-def test_a_value_out_of_range_makes_no_result(folder, values):
+def test_values_out_of_range_are_refused(folder, values):
     tamper(folder, 0, **values)
     with pytest.raises(EvaluationError, match=f"{OUTCOMES}:1: "):
         read_result(folder)
 
 
-def test_another_protocol_or_pack_or_a_weld_where_none_can_be_is_found(folder, protocol):
+def test_another_protocol_or_pack_or_an_impossible_weld_is_found(folder, protocol):
     tamper(folder, 0, measures=read_result(folder).outcomes[0].measures | {"welds": 1.0})
     assert find_violations(read_result(folder), protocol) == [
         "episode 0: a number of welds, but the run has weld: False"
@@ -124,8 +124,8 @@ def test_an_outcome_of_select_is_valid_only_if_the_run_has_played_as(tmp_path):
 @pytest.mark.parametrize(
     ("changed", "well"), [({}, True), ({"score": None}, False), ({"moved": [{**MOVE, "step": 10**6}]}, False)]
 )
-def test_an_order_of_retrieval_agrees_with_itself(folder, protocol, changed, well):
-    """Whatever the task is called, there were obstacles to clear."""
+def test_inconsistent_retrieval_orders_are_found(folder, protocol, changed, well):
+    """The order is checked for every task with the stage obstacles_cleared."""
     before = read_result(folder).outcomes[0]
     flags, seconds = before.flags | {"obstacles_cleared": 20}, before.flag_seconds | {"obstacles_cleared": 1.0}
     tamper(folder, 0, flags=flags, flag_seconds=seconds, retrieval={**ORDER, **changed})
@@ -136,7 +136,7 @@ def test_an_order_of_retrieval_agrees_with_itself(folder, protocol, changed, wel
     )
 
 
-def test_the_stages_of_an_episode_are_those_of_its_task(folder, protocol, monkeypatch):
+def test_failure_stage_is_checked_with_the_stages_of_the_task(folder, protocol, monkeypatch):
     row = replace(TASKS["pick"], stages=("reached_target", "aligned"))
     monkeypatch.setitem(TASKS.builtin, "pick", row)
     flags = {"reached_any": 1, "reached_target": 2, "aligned": None, "success": None}
@@ -151,11 +151,11 @@ def test_the_stages_of_an_episode_are_those_of_its_task(folder, protocol, monkey
     ]
 
 
-def test_the_command_fails_where_something_is_wrong_and_a_result_chooses_no_folder(
+def test_verify_command_fails_on_violations_and_ignores_folders_named_in_a_result(
     folder, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "ms3-v1").mkdir()  # the default's name is none that was given
+    (tmp_path / "ms3-v1").mkdir()  # a folder with the name of a bundled protocol is not used
     assert verify(Verify((folder,))) == 0
     assert "8 episodes of smoke, no violations" in capsys.readouterr().out
     shutil.copytree(load_protocol("smoke").folder, tmp_path / "easy")

@@ -1,4 +1,4 @@
-"""Upstream's weld: what is lifted hangs on the hand, until the gripper is told to open, and no longer."""
+"""RoboCAS-v0's weld: lifted objects are fixed to the hand until the gripper is commanded to open."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ OPEN, CLOSE = 1.0, 0.0
 
 
 class ClaimsSuccess(gym.Wrapper):
-    """An environment whose task has succeeded at every step."""
+    """Environment whose task succeeds at each step."""
 
     def step(self, action: Any) -> Any:
         *others, info = self.env.step(action)
@@ -42,7 +42,7 @@ def pick():
     return make()
 
 
-def welding(env: gym.Env, weld: bool = True) -> PolicyActionWrapper:
+def wrap(env: gym.Env, weld: bool = True) -> PolicyActionWrapper:
     stepped = PolicyActionWrapper(env, PolicySpec("robocas", "tcp"), "upstream", weld=weld)
     stepped.reset(seed=3)
     return stepped
@@ -58,7 +58,7 @@ def target(env: PolicyActionWrapper) -> Any:
 
 
 def grasp(env: PolicyActionWrapper, above: float | None = None) -> dict[str, Any]:
-    """Close the fingers on the target, which waits at the TCP, up in the air; ``above``: m that it has been raised."""
+    """Close the fingers on the target, placed at the TCP in the air; ``above``: raised height, m."""
     base: Any = env.unwrapped
     body = target(env)
     pose = sapien.Pose(base.agent.tcp.pose.sp.p, [1, 0, 0, 0])
@@ -74,38 +74,38 @@ def grasp(env: PolicyActionWrapper, above: float | None = None) -> dict[str, Any
 
 
 def open_fingers(env: PolicyActionWrapper) -> None:
-    """Open them without telling whoever welds."""
+    """Open the fingers without a gripper command."""
     for _ in range(3):
         env.env.step(torch.tensor([[0, 0, 0, 0, 0, 0, OPEN]]))
 
 
-def in_hand(env: PolicyActionWrapper) -> sapien.Pose:
+def pose_in_hand(env: PolicyActionWrapper) -> sapien.Pose:
     base: Any = env.unwrapped
     return base.agent.robot.links_map[MOBILE_PANDA.hand_link]._bodies[0].entity_pose.inv() * target(env).entity_pose
 
 
-def test_what_is_welded_keeps_its_pose_in_the_hand_whatever_arm_and_fingers_do(pick):
-    env, rng = welding(pick), np.random.default_rng(0)
+def test_welded_object_keeps_its_pose_in_the_hand_while_arm_and_fingers_move(pick):
+    env, rng = wrap(pick), np.random.default_rng(0)
     assert float(grasp(env)["welds"]) == 1
-    before = in_hand(env)
+    before = pose_in_hand(env)
     shifts, turns = [], []
     for number in range(40):
         if number % 10 == 0:
             open_fingers(env)
         *_, info = env.step(np.concatenate([rng.uniform(-0.1, 0.1, 3), rng.uniform(-0.4, 0.4, 3), [CLOSE]]))
-        gone = before.inv() * in_hand(env)
+        gone = before.inv() * pose_in_hand(env)
         shifts.append(np.linalg.norm(gone.p))
         turns.append(2 * np.arcsin(min(1.0, np.linalg.norm(gone.q[1:]))))
     assert np.isfinite(target(env).linear_velocity).all()
     assert max(shifts) < 0.001  # m
     assert max(turns) < np.deg2rad(0.5)
-    assert read_sum(info, "path_length") > 1  # the arm did move
+    assert read_sum(info, "path_length") > 1  # the arm moved
     assert float(info["welds"]) == 1
 
 
 @pytest.mark.parametrize("weld", [True, False])
-def test_it_hangs_until_the_gripper_is_told_to_open_and_then_falls(pick, weld):
-    env = welding(pick, weld)
+def test_welded_object_falls_when_the_gripper_is_commanded_to_open(pick, weld):
+    env = wrap(pick, weld)
     grasp(env)
     height = target(env).entity_pose.p[2]
     open_fingers(env)
@@ -116,38 +116,38 @@ def test_it_hangs_until_the_gripper_is_told_to_open_and_then_falls(pick, weld):
     assert height - target(env).entity_pose.p[2] > 0.3
 
 
-def test_it_is_welded_once_a_grasp(pick):
-    env = welding(pick)
+def test_object_is_welded_once_per_grasp(pick):
+    env = wrap(pick)
     counts = [grasp(env)["welds"], env.step(stay(CLOSE))[-1]["welds"], env.step(stay(OPEN))[-1]["welds"]]
     counts += [grasp(env)["welds"]]
     assert [float(count) for count in counts] == [1, 1, 1, 2]
 
 
-def test_what_was_hardly_raised_or_one_finger_touches_is_not_welded(pick, monkeypatch):
-    env = welding(pick)
+def test_object_near_the_table_or_touched_by_one_finger_is_not_welded(pick, monkeypatch):
+    env = wrap(pick)
     info = grasp(env, above=0.025)
     assert bool(info["target_grasped"])
     assert float(info["welds"]) == 0
     assert float(grasp(env, above=0.035)["welds"]) == 1
-    env = welding(pick)
+    env = wrap(pick)
     base: Any = env.unwrapped
     forces = torch.zeros(1, 3, len(base.objects), 3)
-    forces[0, 0] = forces[0, 2] = 5.0  # N, on the left finger and the hand
+    forces[0, 0] = forces[0, 2] = 5.0  # N on the left finger and the hand
     monkeypatch.setattr(base, "gripper_forces", lambda: forces)
     assert float(grasp(env)["welds"]) == 0
 
 
-def test_there_is_no_success_while_anything_is_welded(pick):
-    env = welding(ClaimsSuccess(pick))
+def test_no_success_while_an_object_is_welded(pick):
+    env = wrap(ClaimsSuccess(pick))
     assert not bool(grasp(env)["success"])
-    open_fingers(env)  # in the basket, at rest and touched by nothing it would still hang
+    open_fingers(env)  # in the basket and at rest, but still welded
     assert not bool(env.step(stay(CLOSE))[-1]["success"])
     assert bool(env.step(stay(OPEN))[-1]["success"])
 
 
 @pytest.mark.parametrize("reconfiguration_freq", [0, 1])
-def test_no_weld_outlives_a_reset(reconfiguration_freq):
-    env = welding(make(reconfiguration_freq=reconfiguration_freq))
+def test_reset_removes_the_weld(reconfiguration_freq):
+    env = wrap(make(reconfiguration_freq=reconfiguration_freq))
     base: Any = env.unwrapped
     grasp(env)
     _, info = env.reset(seed=4)
@@ -159,14 +159,14 @@ def test_no_weld_outlives_a_reset(reconfiguration_freq):
     shift = (base.object_poses - base.start_poses)[0, :, :3].norm(dim=-1)
     assert float(shift[base.present[0]].max()) < 0.005
     env.step(stay(OPEN))
-    assert float(grasp(env)["welds"]) == 1  # as ever
+    assert float(grasp(env)["welds"]) == 1  # the count starts at 0
     env.close()
 
 
-def test_where_nothing_is_lifted_it_changes_nothing(pick):
+def test_weld_option_has_no_effect_without_a_lifted_object(pick):
     poses = []
     for weld in (False, True):
-        env, rng = welding(pick, weld), np.random.default_rng(1)
+        env, rng = wrap(pick, weld), np.random.default_rng(1)
         base: Any = env.unwrapped
         for _ in range(10):
             *_, info = env.step(np.concatenate([rng.uniform(-0.05, 0.05, 6), [rng.integers(2)]]))
@@ -176,7 +176,7 @@ def test_where_nothing_is_lifted_it_changes_nothing(pick):
 
 
 @pytest.mark.slow
-def test_an_evaluation_with_it_counts_it_and_says_so(tmp_path):
+def test_evaluation_with_the_weld_counts_and_records_welds(tmp_path):
     protocol, folder = load_protocol("paper-v1"), tmp_path / "out"
     name, settings = "scripted-ee-delta", {"episodes": 1, "envs": 1, "backend": "processes", "weld": True}
     settings = EvaluationSettings(("pick",), name, str(protocol.folder), folder, **settings)

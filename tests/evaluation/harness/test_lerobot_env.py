@@ -1,4 +1,4 @@
-"""RoboCAS as LeRobot sees it: settings, names, its evaluation loop and its EnvHub."""
+"""RoboCAS in LeRobot: settings, names, evaluation loop and EnvHub."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SMALL = {
 
 @pytest.fixture
 def hub(tmp_path, monkeypatch) -> Path:
-    """A cache of the Hub that holds our env.py, and no network."""
+    """An offline Hub cache with env.py."""
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     repository = tmp_path / "hub" / "models--someone--robocas"
     (repository / "snapshots" / COMMIT).mkdir(parents=True)
@@ -48,7 +48,7 @@ def hub(tmp_path, monkeypatch) -> Path:
 
 
 class Adder(torch.nn.Module):
-    """Adds 2.5 in the first env and 1 in the others; keeps the observations."""
+    """Policy that adds 2.5 in the first env and 1 in the others, and records its observations."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -16,7 +16,7 @@ COMMANDS = np.where(np.arange(STEPS) // 7 % 2, -1.0, 1.0)
 
 
 def moving(seed: int) -> Motion:
-    """A robot that turns on the spot, more than once, and swings its arm through where the quaternion's sign jumps."""
+    """A robot whose base turns more than once and whose arm passes a sign flip of the quaternion."""
     rng = np.random.default_rng(seed)
     root = np.array([[0.4, -1.2, 0.0, np.cos(1.1), 0, 0, np.sin(1.1)]])
     qpos = np.cumsum(rng.normal(scale=0.2, size=(STEPS, 12)), axis=0)
@@ -47,7 +47,7 @@ def observed(robots: list[Motion], step: int) -> dict:
     }
 
 
-def test_every_step_of_two_envs_is_what_a_dataset_holds():
+def test_proprioception_equals_dataset_columns_at_each_step():
     robots, state = [moving(1), moving(2)], Proprioception(DEFAULT_ROBOT)
     state.reset(observed(robots, 0))
     read: list[list[dict]] = [[], []]
@@ -62,7 +62,7 @@ def test_every_step_of_two_envs_is_what_a_dataset_holds():
             assert found.dtype == np.float32
             np.testing.assert_allclose(found, columns[column], atol=3e-6, err_msg=name)
     turns = np.stack([one["agent_pos"] for one in read[0]])
-    assert np.ptp(turns[:, 17]) > 2 * np.pi  # it went round
+    assert np.ptp(turns[:, 17]) > 2 * np.pi  # more than one turn
     assert (np.sum(turns[1:, 3:7] * turns[:-1, 3:7], axis=1) >= 0).all()
     widths = {one.key: one.width for one in FEATURES if one.key.startswith("observation.")}
     assert {KEYS[name]: width for name, width in WIDTHS.items()} == widths  # all state columns of a dataset

@@ -23,17 +23,17 @@ SPEC = PolicySpec(reference="tcp", rate_hz=5, cameras={"base_camera": (6, 4)}, d
 
 @pytest.fixture
 def make(made):
-    """Makes environments without physics, and closes them."""
-    opened = []
+    """Factory of environments without physics; closes them at the end."""
+    envs = []
 
     def make(num_envs=2, task="pick", spec=SPEC, protocol="smoke", **settings):
         settings = {"backend": "processes", **settings}
         settings = EvaluationSettings((task,), "mine", protocol, envs=num_envs, **settings)
-        opened.append(ProtocolVectorEnv(spec, settings))
-        return opened[-1]
+        envs.append(ProtocolVectorEnv(spec, settings))
+        return envs[-1]
 
     yield make
-    for env in opened:
+    for env in envs:
         env.close()
     assert all(env.closed for env in made)
 

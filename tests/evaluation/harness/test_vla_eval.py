@@ -1,4 +1,4 @@
-"""The benchmark as vla-eval's runners ask it; scripts/check_others.sh lets vla-eval itself do it."""
+"""The benchmark, called like vla-eval's runners call it; scripts/check_others.sh runs vla-eval itself."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ACT = {"actions": np.array([1, 0, 0, 0, 0, 0, 1], np.float32)}
 
 
 class Recorder:
-    """Keeps images."""
+    """Recorder that keeps images."""
 
     def __init__(self) -> None:
         self.frames: list[Any] = []
@@ -37,7 +37,7 @@ def benchmark(made):
 
 
 async def play(benchmark, task, *, max_steps=None, recorder=None) -> dict[str, Any]:
-    """As the runner of vla-eval's mode: sync goes."""
+    """Run an episode like vla-eval's runner of mode sync."""
     await benchmark.start_episode(task, recorder=recorder)
     seen = [await benchmark.get_observation()]
     for _ in range(max_steps or benchmark.get_metadata()["max_steps"]):

@@ -1,4 +1,4 @@
-"""A fake observation, and servers in threads that end with their test."""
+"""Fake observations, and servers in threads that end with the test."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from robocas_ms3.core.paths import protocols_dir
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 CAMERA = (6, 4)  # width, height
-IN_A_HURRY = "timeout_s=0.5&connect_s=0.5"  # options of an address: as long as a test can wait
+SHORT_TIMEOUTS = "timeout_s=0.5&connect_s=0.5"  # options of an address
 
 
-def a_start(env: int = 0, episode: int = 3, seed: int = 7) -> EpisodeSpec:
+def make_episode(env: int = 0, episode: int = 3, seed: int = 7) -> EpisodeSpec:
     smoke, name = protocols_dir() / "smoke", "pick_table_scattered"
     files = (str(smoke / f"configs/{name}.yaml"), str(smoke / f"layouts/{name}.npy"))
     return EpisodeSpec(env, episode, "pick", *files, "builtin", seed, "take the apple")
 
 
-def some_observations(*envs: int, cameras: bool = False) -> Observations:
+def make_observations(*envs: int, cameras: bool = False) -> Observations:
     rng, count = np.random.default_rng(0), len(envs)
     width, height = CAMERA
     shape = (count, height, width)
@@ -41,8 +41,8 @@ def some_observations(*envs: int, cameras: bool = False) -> Observations:
     )
 
 
-class Told:
-    """A policy that keeps what it is told, and acts by what it sees."""
+class RecordingPolicy:
+    """Policy that records its inputs and computes actions from its observations."""
 
     def __init__(self, spec: PolicySpec | None = None) -> None:
         self.spec = spec or PolicySpec()
@@ -59,7 +59,7 @@ class Told:
 
 @contextmanager
 def serving(policy: Any, port: int = 0, **options: Any) -> Iterator[str]:
-    """Serve a policy of ours; gives the address."""
+    """Serve a policy; yield the address."""
     from robocas_ms3.evaluation.remote.server import PolicyServer
 
     server, addresses, ready = PolicyServer(policy, port=port, **options), [], threading.Event()
@@ -79,8 +79,8 @@ def serving(policy: Any, port: int = 0, **options: Any) -> Iterator[str]:
 
 
 @contextmanager
-def talking(talk: Callable[[Any], None]) -> Iterator[str]:
-    """A server that does anything; gives the address."""
+def serve_connections(talk: Callable[[Any], None]) -> Iterator[str]:
+    """Run a server with a function for each connection; yield the address."""
     from websockets.sync.server import serve
 
     with serve(talk, "127.0.0.1", 0, compression=None, max_size=None, close_timeout=0.1) as server:
@@ -92,8 +92,8 @@ def talking(talk: Callable[[Any], None]) -> Iterator[str]:
             server.shutdown()
 
 
-def answering(answer: Any, metadata: dict[str, Any] | None = None) -> Any:
-    """A server with this answer, bytes or a text; or what a function makes of the connection and a message."""
+def serve_answer(answer: Any, metadata: dict[str, Any] | None = None) -> Any:
+    """Run a server with a fixed answer, or with a function of the connection and the message."""
     from robocas_ms3.evaluation.remote.wire import pack
 
     def talk(socket: Any) -> None:
@@ -103,4 +103,4 @@ def answering(answer: Any, metadata: dict[str, Any] | None = None) -> Any:
             if reply is not None:
                 socket.send(reply)
 
-    return talking(talk)
+    return serve_connections(talk)

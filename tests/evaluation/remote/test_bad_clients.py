@@ -1,4 +1,4 @@
-"""Clients of a policy server choose no path of its machine, and learn no more than one line of what went wrong."""
+"""Invalid requests to a policy server: clients select no paths, and get errors of one line."""
 
 import logging
 from dataclasses import replace
@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
-from remote_ends import Told, a_start, serving, some_observations
+from remote_ends import RecordingPolicy, make_episode, make_observations, serving
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -24,8 +24,8 @@ from robocas_ms3.evaluation.remote.wire import pack
 GARBAGE, TOO_LARGE = 1008, 1009
 
 
-class Failing(Told):
-    """A policy that raises something with several lines and a control character."""
+class Failing(RecordingPolicy):
+    """Policy that raises an error with several lines and a control character."""
 
     def __init__(self, error: BaseException) -> None:
         super().__init__()
@@ -35,8 +35,8 @@ class Failing(Told):
         raise self.error
 
 
-class Reading(Told):
-    """A policy that reads the episode's configuration, as the scripted ones do."""
+class Reading(RecordingPolicy):
+    """Policy that reads the task configuration, like the scripted policies."""
 
     def reset(self, episodes):
         super().reset(episodes)
@@ -44,12 +44,12 @@ class Reading(Told):
 
 
 def message(env=0, start=None, **more):
-    made = observation_message(some_observations(env), 0, a_start(env), reset=True)
+    made = observation_message(make_observations(env), 0, make_episode(env), reset=True)
     return made | {"start": made["start"] | (start or {})} | more
 
 
 def ask(url, request):
-    """The answer to a first message, and the close code; None where the server hangs up without an answer."""
+    """Return the answer to a first message and the close code; None: closed without an answer."""
     with connect(url, proxy=None, compression=None) as client:
         client.recv()
         try:
@@ -65,10 +65,10 @@ def ask(url, request):
 
 
 @pytest.mark.parametrize("name", ["config_file", "layouts_file", "pack"])
-def test_no_text_of_a_client_becomes_a_path(tmp_path, monkeypatch, name):
+def test_texts_of_clients_are_not_used_as_paths(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "secret.yaml").write_text("hunter2: [")
-    (tmp_path / "new").mkdir()  # a folder where the server runs is not installed as a pack
+    (tmp_path / "new").mkdir()  # a folder in the working directory is no installed pack
     policy = Reading()
     with serving(policy) as url:
         for path in (f"{tmp_path}/secret.yaml", f"smoke/configs/../../{tmp_path}/secret.yaml", "new", "a\0b"):
@@ -79,8 +79,10 @@ def test_no_text_of_a_client_becomes_a_path(tmp_path, monkeypatch, name):
     assert {entry.name for entry in tmp_path.iterdir()} == {"secret.yaml", "new"}
 
 
-def test_shipped_files_and_those_of_the_servers_own_protocols_are_served(tmp_path):
-    theirs = replace(a_start(), config_file="mine/configs/a.yaml", layouts_file="mine/layouts/a.npy", pack="packs/own")
+def test_files_of_bundled_and_passed_protocols_are_served(tmp_path):
+    theirs = replace(
+        make_episode(), config_file="mine/configs/a.yaml", layouts_file="mine/layouts/a.npy", pack="packs/own"
+    )
     for name in (theirs.config_file, theirs.layouts_file):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).touch()
@@ -89,7 +91,7 @@ def test_shipped_files_and_those_of_the_servers_own_protocols_are_served(tmp_pat
     assert Path(ours.layouts_file) == tmp_path / theirs.layouts_file
     assert ours.pack == "packs/own"
     assert ServedFiles.collect().resolve(theirs) == replace(theirs, config_file="", layouts_file="", pack="")
-    assert file_name(a_start().config_file) == "smoke/configs/pick_table_scattered.yaml"
+    assert file_name(make_episode().config_file) == "smoke/configs/pick_table_scattered.yaml"
     (tmp_path / "smoke").mkdir()
     with pytest.raises(EvaluationError):
         ServedFiles.collect([tmp_path / "smoke"])
@@ -98,7 +100,7 @@ def test_shipped_files_and_those_of_the_servers_own_protocols_are_served(tmp_pat
 
 
 @pytest.mark.parametrize("name", ["task", "robot"])
-def test_a_task_or_robot_that_the_server_lacks_is_one_line_of_its_log(caplog, name):
+def test_unknown_task_or_robot_is_one_line_in_the_log(caplog, name):
     with serving(Reading()) as url, caplog.at_level(logging.WARNING):
         answer, code = ask(url, message(start={name: "nothing"}))
     assert isinstance(answer, str) and answer.startswith(f"start.{name}:") and code
@@ -106,7 +108,7 @@ def test_a_task_or_robot_that_the_server_lacks_is_one_line_of_its_log(caplog, na
 
 
 @pytest.mark.parametrize("error", [ValueError("a\nb\x1b[31m" + "c" * 9999), SystemExit(0), RecursionError()])
-def test_a_failing_policy_is_one_line_to_its_client_and_others_are_served(error):
+def test_policy_error_is_one_line_for_the_client_and_other_clients_are_served(error):
     with serving(Failing(error)) as url:
         answer, code = ask(url, message())
         assert isinstance(answer, str) and len(answer) < 1000
@@ -114,8 +116,8 @@ def test_a_failing_policy_is_one_line_to_its_client_and_others_are_served(error)
         assert isinstance(ask(url, message())[0], str)
 
 
-def test_messages_are_no_larger_than_a_policys_images_need():
-    with serving(Told()) as url:
+def test_message_limit_depends_on_the_images_of_the_policy():
+    with serving(RecordingPolicy()) as url:
         assert ask(url, message(**{"observation/more": np.zeros(16 * 2**20, np.uint8)})) == (None, TOO_LARGE)
 
 
@@ -137,16 +139,16 @@ def test_messages_are_no_larger_than_a_policys_images_need():
     ],
     ids=range(20),
 )
-def test_an_invalid_request_is_one_line_to_its_client(request_):
-    policy = Told()
+def test_invalid_request_is_one_line_for_the_client(request_):
+    policy = RecordingPolicy()
     with serving(policy, max_batch=4) as url:
         answer, code = ask(url, request_)
     assert isinstance(answer, str) and answer.isprintable()
     assert (code, policy.seen, policy.starts) == (GARBAGE, [], [])
 
 
-def test_embeddings_of_a_batch_have_one_length():
-    policy = Told(PolicySpec(language="embedding"))
+def test_embeddings_of_a_batch_must_have_equal_length():
+    policy = RecordingPolicy(PolicySpec(language="embedding"))
     batch = [message(env, **{"observation/embedding": np.zeros(384 - env, np.float32)}) for env in range(2)]
     with serving(policy) as url:
         assert ask(url, {"batch": batch})[1] == GARBAGE

@@ -1,4 +1,4 @@
-"""Servers that are not what they should be: an episode fails, with a reason, and the run goes on."""
+"""Invalid answers of policy servers end the episode with a reason; the run continues."""
 
 import socket as sockets
 import threading
@@ -11,7 +11,15 @@ pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
 from counting_env import CountingEnv, play
-from remote_ends import IN_A_HURRY, Told, a_start, answering, serving, some_observations, talking
+from remote_ends import (
+    SHORT_TIMEOUTS,
+    RecordingPolicy,
+    make_episode,
+    make_observations,
+    serve_answer,
+    serve_connections,
+    serving,
+)
 
 from robocas_ms3.core.errors import EvaluationError, PolicyError
 from robocas_ms3.evaluation.remote.client import RemotePolicy
@@ -40,15 +48,15 @@ from robocas_ms3.evaluation.remote.wire import pack
     ],
     ids=range(15),
 )
-def test_a_bad_answer_fails_the_episode(reply, reason):
-    with answering(reply) as url:
-        remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
-        remote.reset([a_start(0)])
+def test_invalid_answer_ends_the_episode(reply, reason):
+    with serve_answer(reply) as url:
+        remote = RemotePolicy(f"{url}?{SHORT_TIMEOUTS}")
+        remote.reset([make_episode(0)])
         with pytest.raises(PolicyError, match=reason):
-            remote.act(some_observations(0))
+            remote.act(make_observations(0))
 
 
-GOOD = {"actions": [[0.0] * 7]}  # lists are actions too
+GOOD = {"actions": [[0.0] * 7]}  # actions may be lists
 
 
 @pytest.mark.parametrize(
@@ -65,12 +73,12 @@ GOOD = {"actions": [[0.0] * 7]}  # lists are actions too
     ],
     ids=range(14),
 )
-def test_a_bad_answer_to_a_batch_fails_its_episodes(answer, failed):
-    with answering(pack(answer), {"robocas_max_batch": 8}) as url:
-        remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
-        remote.reset([a_start(0), a_start(1)])
+def test_invalid_batch_answer_ends_its_episodes(answer, failed):
+    with serve_answer(pack(answer), {"robocas_max_batch": 8}) as url:
+        remote = RemotePolicy(f"{url}?{SHORT_TIMEOUTS}")
+        remote.reset([make_episode(0), make_episode(1)])
         with pytest.raises(PolicyError) as raised:
-            remote.act(some_observations(0, 1))
+            remote.act(make_observations(0, 1))
         remote.close()
     assert raised.value.reasons.keys() == failed
     assert all(reason.isprintable() for reason in raised.value.reasons.values())
@@ -95,16 +103,16 @@ SPECS = (
     ],
     ids=range(18),
 )
-def test_bad_metadata_are_an_error_before_anything_is_played(first):
+def test_invalid_metadata_is_an_error_before_the_first_episode(first):
     def talk(socket):
         time.sleep(1) if first is None else socket.send(first)
 
-    with talking(talk) as url, pytest.raises(EvaluationError):
-        RemotePolicy(f"{url}?{IN_A_HURRY}")
+    with serve_connections(talk) as url, pytest.raises(EvaluationError):
+        RemotePolicy(f"{url}?{SHORT_TIMEOUTS}")
 
 
 @pytest.mark.parametrize("said", [b"SSH-2.0-OpenSSH_9.6\r\n", b"HTTP/1.1 200 OK\r\n\r\nhello", b"\x00" * 99999, b""])
-def test_something_else_listens(said):
+def test_other_programs_on_the_port_are_an_error(said):
     with sockets.create_server(("127.0.0.1", 0)) as server:
 
         def talk():
@@ -118,26 +126,26 @@ def test_something_else_listens(said):
 
         threading.Thread(target=talk, daemon=True).start()
         with pytest.raises(EvaluationError, match="no connection to the policy server within"):
-            RemotePolicy(f"ws://127.0.0.1:{server.getsockname()[1]}?{IN_A_HURRY}")
+            RemotePolicy(f"ws://127.0.0.1:{server.getsockname()[1]}?{SHORT_TIMEOUTS}")
         server.shutdown(sockets.SHUT_RDWR)
 
 
-def test_a_server_that_does_not_read_is_not_waited_for():
+def test_timeout_if_the_server_does_not_read():
     def talk(socket):
         socket.send(pack({}))
         time.sleep(2)
 
-    with talking(talk) as url:
+    with serve_connections(talk) as url:
         remote = RemotePolicy(f"{url}?timeout_s=0.5&cameras=base_camera:6x4")
-        remote.reset([a_start(0)])
-        seen = some_observations(0)
-        seen.images["base_camera"] = np.zeros((1, 4096, 4096, 3), np.uint8)  # more than a socket holds
+        remote.reset([make_episode(0)])
+        seen = make_observations(0)
+        seen.images["base_camera"] = np.zeros((1, 4096, 4096, 3), np.uint8)  # more than the socket buffer
         with pytest.raises(PolicyError, match="no answer from the policy server within"):
             remote.act(seen)
 
 
-class Stumbling(Told):
-    """Raises in every third episode."""
+class FailingEveryThird(RecordingPolicy):
+    """Policy that raises in every third episode."""
 
     def act(self, observations):
         if self.starts[-1].episode % 3 == 2:
@@ -145,10 +153,10 @@ class Stumbling(Told):
         return super().act(observations)
 
 
-def test_a_run_continues_after_episodes_in_which_the_policy_fails_and_ends_without_a_server():
-    env, starts = CountingEnv(1, 4, steps=True), [a_start(-1, episode=number) for number in range(7)]
-    with serving(Stumbling()) as url:
-        remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
+def test_run_continues_after_policy_errors_and_ends_without_a_server():
+    env, starts = CountingEnv(1, 4, steps=True), [make_episode(-1, episode=number) for number in range(7)]
+    with serving(FailingEveryThird()) as url:
+        remote = RemotePolicy(f"{url}?{SHORT_TIMEOUTS}")
         played = {one.spec.episode: one for one in play(env, remote, starts, 10)}
     assert {number: one.steps for number, one in played.items()} == {0: 4, 1: 4, 2: 0, 3: 4, 4: 4, 5: 0, 6: 4}
     assert {number for number, one in played.items() if one.error} == {2, 5}

@@ -1,4 +1,4 @@
-"""Our client and our server, and openpi's client and a server as openpi writes one."""
+"""Client and server of this package, with each other and with openpi's client and server."""
 
 import multiprocessing
 import re
@@ -15,7 +15,7 @@ pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
 from counting_env import CountingEnv, play
-from remote_ends import CAMERA, IN_A_HURRY, Told, a_start, answering, serving, some_observations
+from remote_ends import CAMERA, SHORT_TIMEOUTS, RecordingPolicy, make_episode, make_observations, serve_answer, serving
 
 from robocas_ms3.core.errors import EvaluationError, PolicyError
 from robocas_ms3.evaluation.policies import make_policy
@@ -30,17 +30,17 @@ ALL = PolicySpec(cameras={"base_camera": CAMERA}, depth=True, state=True, rate_h
 PAGE = Path(__file__).resolve().parents[3] / "docs/remote_policies.md"
 
 
-def test_a_served_policy_observes_and_answers_the_same():
-    policy = Told(ALL)
+def test_served_policy_gets_the_same_observations_and_returns_the_same_actions():
+    policy = RecordingPolicy(ALL)
     with serving(policy) as url:
         remote = make_policy(url)
         assert remote.spec == ALL
-        assert remote.describe()["server"]["class"].endswith(":Told")
-        remote.reset([a_start()])
-        seen = some_observations(0, cameras=True)
-        np.testing.assert_array_equal(remote.act(seen), Told().act(seen))
+        assert remote.describe()["server"]["class"].endswith(":RecordingPolicy")
+        remote.reset([make_episode()])
+        seen = make_observations(0, cameras=True)
+        np.testing.assert_array_equal(remote.act(seen), RecordingPolicy().act(seen))
         remote.close()
-    assert policy.starts == [a_start()]
+    assert policy.starts == [make_episode()]
     for field in fields(seen):
         sent, got = getattr(seen, field.name), getattr(policy.seen[0], field.name)
         for one, other in zip(*(x.values() if isinstance(x, dict) else [x] for x in (sent, got)), strict=True):
@@ -48,8 +48,8 @@ def test_a_served_policy_observes_and_answers_the_same():
             assert getattr(one, "dtype", None) == getattr(other, "dtype", None)
 
 
-class SharedNoise(Told):
-    """Draw the noise of all envs of a call from one generator, so that an outcome follows from the calls."""
+class SharedNoise(RecordingPolicy):
+    """Policy that draws the noise of all envs from one generator, so that outcomes depend on the calls."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -69,19 +69,19 @@ class SharedNoise(Told):
         return noise * observations.tcp_in_base[:, None] + noise.mean()
 
 
-def play_eight(policy):
-    """Play eight episodes in three envs that end after different numbers of steps."""
+def run_eight_episodes(policy):
+    """Run eight episodes of different lengths in three envs."""
     env = CountingEnv(3, np.array([3, 4, 7]), steps=True)
-    starts = [a_start(-1, episode=number, seed=number) for number in range(8)]
+    starts = [make_episode(-1, episode=number, seed=number) for number in range(8)]
     return [replace(one, inference_seconds=0.0) for one in play(env, policy, starts, 9)], env.actions
 
 
 def test_a_remote_run_is_equal_to_a_local_run_bit_for_bit():
     local, served = SharedNoise(), SharedNoise()
-    expected, expected_actions = play_eight(local)
+    expected, expected_actions = run_eight_episodes(local)
     with serving(served) as url:
         remote = RemotePolicy(url)
-        played, actions = play_eight(remote)
+        played, actions = run_eight_episodes(remote)
         remote.close()
     assert served.calls == local.calls
     assert any(envs != sorted(envs) for _, envs in local.calls), "the order of rows would not be tested"
@@ -90,7 +90,7 @@ def test_a_remote_run_is_equal_to_a_local_run_bit_for_bit():
     assert [step.tobytes() for step in actions] == [step.tobytes() for step in expected_actions]
 
 
-def test_a_batch_of_the_announced_size_fits_in_a_message():
+def test_batch_of_the_announced_size_fits_in_a_message():
     for camera in ((8, 8), (224, 224), (640, 480), (4096, 4096)):
         spec = PolicySpec(cameras=dict.fromkeys(("base_camera", "gripper_camera", "static_camera"), camera), depth=True)
         envs = batch_limit(spec, 256)
@@ -99,8 +99,8 @@ def test_a_batch_of_the_announced_size_fits_in_a_message():
         assert batch_limit(spec, 1) == 1
 
 
-class FailingIn(Told):
-    """Fail in one env by `PolicyError`, and in another one by an exception."""
+class FailingInEnvs(RecordingPolicy):
+    """Policy that fails in one env with `PolicyError` and in another env with another exception."""
 
     failing, raising = 1, 4
 
@@ -113,47 +113,47 @@ class FailingIn(Told):
         return actions
 
 
-def test_batches_are_split_and_failures_end_their_episodes_alone():
-    policy, seen = FailingIn(), some_observations(*range(6))
+def test_batches_are_split_and_failures_end_only_their_episodes():
+    policy, seen = FailingInEnvs(), make_observations(*range(6))
     with serving(policy, max_batch=2) as url:
         remote = RemotePolicy(url)
-        remote.reset([a_start(env) for env in range(6)])
+        remote.reset([make_episode(env) for env in range(6)])
         with pytest.raises(PolicyError) as failed:
             remote.act(seen)
         assert [one.envs.tolist() for one in policy.seen] == [[0, 1], [2, 3], [4, 5]]
         exception = "the server failed: RuntimeError: out of memory"
         assert failed.value.reasons == {1: "the server failed: no plan", 4: exception, 5: exception}
-        np.testing.assert_array_equal(failed.value.actions[[0, 2, 3]], Told().act(seen)[[0, 2, 3]])
-        assert remote.act(some_observations(0, 2)).shape == (2, 3, 7)
+        np.testing.assert_array_equal(failed.value.actions[[0, 2, 3]], RecordingPolicy().act(seen)[[0, 2, 3]])
+        assert remote.act(make_observations(0, 2)).shape == (2, 3, 7)
         with pytest.raises(PolicyError, match="lost connection"):
-            remote.act(some_observations(1))
+            remote.act(make_observations(1))
         policy.failing = -1
-        remote.reset([a_start(1, episode=9)])
-        assert remote.act(some_observations(0, 1)).shape == (2, 3, 7)
+        remote.reset([make_episode(1, episode=9)])
+        assert remote.act(make_observations(0, 1)).shape == (2, 3, 7)
         remote.close()
-    assert policy.starts[6:] == [a_start(1, episode=9)]
+    assert policy.starts[6:] == [make_episode(1, episode=9)]
 
 
-def test_with_play_each_observation_has_images():
-    with serving(Told(PolicySpec(observe_every=3))) as url:
-        for address, looks in ((url, 3), (f"{url}?n_action_steps=2", 1)):
+def test_with_n_action_steps_each_observation_has_images():
+    with serving(RecordingPolicy(PolicySpec(observe_every=3))) as url:
+        for address, period in ((url, 3), (f"{url}?n_action_steps=2", 1)):
             remote = RemotePolicy(address)
-            assert remote.spec.observe_every == looks
+            assert remote.spec.observe_every == period
             remote.close()
 
 
-def test_two_clients_have_envs_of_their_own():
-    policy = Told()
+def test_two_clients_have_separate_envs():
+    policy = RecordingPolicy()
     with serving(policy) as url:
         for _ in range(2):
             remote = RemotePolicy(url)
-            remote.reset([a_start(0)])
-            remote.act(some_observations(0))
+            remote.reset([make_episode(0)])
+            remote.act(make_observations(0))
     assert [start.env for start in policy.starts] == [0, 1]
 
 
-def test_a_forked_process_asks_over_a_connection_of_its_own():
-    with serving(Told()) as url:
+def test_forked_process_opens_its_own_connection():
+    with serving(RecordingPolicy()) as url:
         remote = RemotePolicy(url)  # starts the event loop of this process
         child = multiprocessing.get_context("fork").Process(target=ask_once, args=(url,))
         child.start()
@@ -167,72 +167,72 @@ def test_a_forked_process_asks_over_a_connection_of_its_own():
 
 def ask_once(url):
     remote = RemotePolicy(url)
-    remote.reset([a_start(0)])
-    assert remote.act(some_observations(0)).shape == (1, 3, 7)
+    remote.reset([make_episode(0)])
+    assert remote.act(make_observations(0)).shape == (1, 3, 7)
     remote.close()
 
 
-def test_a_web_page_may_not_ask():
+def test_requests_of_web_pages_are_refused():
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
 
-    with serving(Told()) as url, pytest.raises(InvalidStatus):
+    with serving(RecordingPolicy()) as url, pytest.raises(InvalidStatus):
         connect(url, origin="http://example.org", proxy=None).recv()
 
 
 @pytest.mark.parametrize("host", ["::1", "[::1]"])
-def test_an_ipv6_address_is_in_brackets(host):
+def test_ipv6_addresses_are_printed_in_brackets(host):
     try:
         with socket.create_server(("::1", 0), family=socket.AF_INET6):
             pass
     except OSError:
         pytest.skip("no IPv6 here")
-    with serving(Told(), host=host) as url:
+    with serving(RecordingPolicy(), host=host) as url:
         assert url.startswith("ws://[::1]:")
         ask_once(url)
 
 
-def test_a_port_that_is_taken():
-    with serving(Told()) as url, pytest.raises(EvaluationError, match="cannot listen"):
-        PolicyServer(Told(), port=int(url.rpartition(":")[2])).run()
+def test_port_in_use_is_an_error():
+    with serving(RecordingPolicy()) as url, pytest.raises(EvaluationError, match="cannot listen"):
+        PolicyServer(RecordingPolicy(), port=int(url.rpartition(":")[2])).run()
 
 
-def test_the_next_episode_finds_a_server_that_came_back_with_the_same_policy():
-    with serving(Told()) as url:
-        remote = RemotePolicy(f"{url}?{IN_A_HURRY}")
-        remote.reset([a_start(0), a_start(1)])
-        remote.act(some_observations(0, 1))
+def test_next_episode_reconnects_to_a_restarted_server_with_the_same_policy():
+    with serving(RecordingPolicy()) as url:
+        remote = RemotePolicy(f"{url}?{SHORT_TIMEOUTS}")
+        remote.reset([make_episode(0), make_episode(1)])
+        remote.act(make_observations(0, 1))
     port = int(url.rpartition(":")[2])
-    policy = Told()
+    policy = RecordingPolicy()
     with serving(policy, port):
-        remote.reset([a_start(1, episode=9)])
+        remote.reset([make_episode(1, episode=9)])
         with pytest.raises(PolicyError, match="lost connection") as failed:
-            remote.act(some_observations(0, 1))
+            remote.act(make_observations(0, 1))
         assert failed.value.reasons.keys() == {0}
-        assert policy.starts == [a_start(1, episode=9)]
-    with serving(Told(PolicySpec(convention="delta_euler")), port):
-        remote.reset([a_start(0)])
+        assert policy.starts == [make_episode(1, episode=9)]
+    with serving(RecordingPolicy(PolicySpec(convention="delta_euler")), port):
+        remote.reset([make_episode(0)])
         with pytest.raises(EvaluationError, match="now serves another policy"):
-            remote.act(some_observations(0))
+            remote.act(make_observations(0))
     remote.close()
 
 
-def test_a_start_names_the_robot_where_it_is_another():
-    """A server may be older than robots are several."""
+def test_message_names_the_robot_only_if_it_is_not_the_default():
+    """Older servers do not know the key."""
     for robot, keys in (("robocas_mobile_panda", set()), ("twin", {"robot"})):
-        start = replace(a_start(), robot=robot)
-        message = observation_message(some_observations(0), 0, start, reset=True)
+        start = replace(make_episode(), robot=robot)
+        message = observation_message(make_observations(0), 0, start, reset=True)
         assert message["start"].keys() & {"robot"} == keys
         assert ServedFiles.collect().resolve(read_request(message).episode_spec(0)) == start
 
 
-def test_openpis_client_asks_our_server():
+def test_openpi_client_with_our_server():
     openpi = pytest.importorskip("openpi_client.websocket_client_policy")
-    policy = Told()
+    policy = RecordingPolicy()
     with serving(policy) as url:
         client = openpi.WebsocketClientPolicy(host=url)
         assert client.get_server_metadata()["robocas_spec"]["convention"] == "robocas"
-        message = observation_message(some_observations(0), 0, None, reset=False)
+        message = observation_message(make_observations(0), 0, None, reset=False)
         for key in ("env_id", "reset"):
             del message[key]
         for _ in range(2):
@@ -242,7 +242,7 @@ def test_openpis_client_asks_our_server():
             client.infer({"prompt": "take the apple"})
 
 
-def test_our_client_asks_a_plain_openpi_server():
+def test_our_client_with_a_plain_openpi_server():
     openpi, seen = pytest.importorskip("openpi_client.msgpack_numpy"), []
 
     def answer(socket, data):
@@ -250,20 +250,20 @@ def test_our_client_asks_a_plain_openpi_server():
         timing = {"infer_ms": np.float64(1)}
         return openpi.packb({"actions": np.ones((10, 8), np.float32) / 10, "server_timing": timing})
 
-    with answering(answer, {"reset_pose": np.zeros(3)}) as url:
+    with serve_answer(answer, {"reset_pose": np.zeros(3)}) as url:
         options = "convention=joint_positions&cameras=base_camera:6x4&n_action_steps=4&language=text"
         remote = RemotePolicy(f"{url}?{options}&rename=base_camera:observation/image,prompt:text")
         assert remote.spec == PolicySpec(convention="joint_positions", cameras={"base_camera": (6, 4)})
-        remote.reset([a_start(1)])
-        assert remote.act(some_observations(1, cameras=True)).shape == (1, 4, 8)
-        remote.act(some_observations(1, cameras=True))
+        remote.reset([make_episode(1)])
+        assert remote.act(make_observations(1, cameras=True)).shape == (1, 4, 8)
+        remote.act(make_observations(1, cameras=True))
     assert [(one["env_id"], one["reset"]) for one in seen] == [(1, True), (1, False)]
     assert seen[0]["observation/image"].shape == (4, 6, 3)
     assert seen[0]["text"] == "take the apple"
     assert "start" not in seen[0]
 
 
-def test_the_server_of_the_documentation():
+def test_server_of_the_docs():
     pytest.importorskip("openpi_client")
     (program,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
     last = "    server.serve_forever()"
@@ -276,8 +276,8 @@ def test_the_server_of_the_documentation():
         assert served.stdout is not None
         remote = RemotePolicy(f"ws://127.0.0.1:{int(served.stdout.readline())}")
         assert dict(remote.spec.cameras) == {"base_camera": (224, 224)}
-        remote.reset([a_start(env) for env in range(5)])
-        seen = some_observations(*range(5))
+        remote.reset([make_episode(env) for env in range(5)])
+        seen = make_observations(*range(5))
         seen.images["base_camera"] = np.zeros((5, 224, 224, 3), np.uint8)
         assert remote.act(seen).shape == (5, 5, 7)
         remote.close()
@@ -286,7 +286,7 @@ def test_the_server_of_the_documentation():
         served.communicate()
 
 
-def test_addresses_have_options():
+def test_options_of_an_address():
     assert read_address("ws://127.0.0.1:8000") == Address("ws://127.0.0.1:8000")
     assert read_address("wss://[::1]/policy").url == "wss://[::1]/policy"
     text = "ws://host:1?cameras=base_camera:320x240,gripper_camera:64x64&depth=1&rate_hz=5&rename=qpos:state&n_action_steps=5"
@@ -298,7 +298,7 @@ def test_addresses_have_options():
         max_in_flight=2,
         timeout_s=9.0,
     )
-    with serving(Told()) as url, pytest.raises(EvaluationError, match="announces its policy specification"):
+    with serving(RecordingPolicy()) as url, pytest.raises(EvaluationError, match="announces its policy specification"):
         RemotePolicy(f"{url}?convention=delta_euler")
 
 
@@ -322,6 +322,6 @@ def test_addresses_have_options():
         ),
     ],
 )
-def test_errors_of_an_address_come_before_any_connection(text):
+def test_invalid_addresses_are_refused_before_connecting(text):
     with pytest.raises(EvaluationError):
         make_policy(text)

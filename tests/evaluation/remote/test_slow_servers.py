@@ -1,4 +1,4 @@
-"""Slow servers are waited for, all of them at the same time, and a dead network is noticed."""
+"""Slow servers, parallel requests, and lost networks."""
 
 import asyncio
 import multiprocessing
@@ -18,7 +18,7 @@ import pytest
 pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
-from remote_ends import Told, a_start, answering, serving, some_observations
+from remote_ends import RecordingPolicy, make_episode, make_observations, serve_answer, serving
 from websockets.asyncio.server import serve
 from websockets.sync.client import connect
 
@@ -31,8 +31,8 @@ from robocas_ms3.evaluation.remote.wire import pack, unpack
 ENVS = 5
 
 
-class Slow(Told):
-    """Take a while per call."""
+class Slow(RecordingPolicy):
+    """Policy with a delay per call."""
 
     def __init__(self, seconds: float) -> None:
         super().__init__()
@@ -46,29 +46,29 @@ class Slow(Told):
 
 @pytest.fixture
 def fast_pings(monkeypatch):
-    """Shorten the times of pings."""
+    """Shorten ping intervals and timeouts."""
     monkeypatch.setattr(connection, "PING_INTERVAL", 0.2)
     monkeypatch.setattr(connection, "PING_TIMEOUT", 1.0)
 
 
 def with_numbers(answer):
-    """Serve what a function of the env's number returns, a thread per connection."""
-    return answering(lambda _, data: pack({"actions": np.full((1, 7), answer(unpack(data)["env_id"]))}))
+    """Run a server that answers with a function of the env, with one thread per connection."""
+    return serve_answer(lambda _, data: pack({"actions": np.full((1, 7), answer(unpack(data)["env_id"]))}))
 
 
 def started(url):
     remote = RemotePolicy(url)
-    remote.reset([a_start(env) for env in range(ENVS)])
+    remote.reset([make_episode(env) for env in range(ENVS)])
     return remote
 
 
 @pytest.mark.parametrize("in_turn", [True, False])
-def test_requests_of_all_envs_are_in_flight_together_or_in_their_order(in_turn):
-    """Each answer has the time limit for itself where a server computes one after another."""
+def test_requests_of_all_envs_are_sent_together_or_in_order(in_turn):
+    """The time limit restarts with each answer of a server that computes one answer after another."""
     asked, turn, arrived = [], threading.Lock(), threading.Barrier(1 if in_turn else ENVS)
 
     def answer(env):
-        arrived.wait(20)  # nobody is answered before all have asked
+        arrived.wait(20)  # no answer before all requests have arrived
         assert turn.acquire(blocking=not in_turn)
         asked.append(env)
         time.sleep(0.1 if in_turn else 0.3)
@@ -77,14 +77,14 @@ def test_requests_of_all_envs_are_in_flight_together_or_in_their_order(in_turn):
 
     with with_numbers(answer) as url:
         remote = started(f"{url}?{'max_in_flight=1' if in_turn else 'timeout_s=1.2'}")
-        for order in ([0, 1, 2, 3, 4], [3, 0, 4, 2, 1]):  # answers in any order belong to their envs
-            assert remote.act(some_observations(*order))[:, 0, 0].tolist() == order
+        for order in ([0, 1, 2, 3, 4], [3, 0, 4, 2, 1]):  # the order of answers has no effect
+            assert remote.act(make_observations(*order))[:, 0, 0].tolist() == order
         remote.close()
     assert asked == [0, 1, 2, 3, 4, 3, 0, 4, 2, 1] or not in_turn
 
 
 def blocking_server(pipe):
-    """Serve as openpi does: nothing else happens during inference, neither pings nor new connections."""
+    """Run a server like openpi's: no pings and no new connections during inference."""
 
     async def talk(client):
         await client.send(pack({}))
@@ -100,21 +100,21 @@ def blocking_server(pipe):
     asyncio.run(run())
 
 
-def test_connections_are_opened_before_the_server_computes():
+def test_connections_are_opened_before_the_first_request():
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     server = context.Process(target=blocking_server, args=(theirs,), daemon=True)
     server.start()
     try:
         remote = started(f"ws://127.0.0.1:{ours.recv()}?connect_s=0.6")
-        assert remote.act(some_observations(0, 1, 2))[:, 0, 0].tolist() == [0, 1, 2]
+        assert remote.act(make_observations(0, 1, 2))[:, 0, 0].tolist() == [0, 1, 2]
         remote.close()
     finally:
         server.terminate()
         server.join()
 
 
-def test_an_env_without_an_answer_fails_alone():
+def test_timeout_ends_only_the_episode_of_its_env():
     ended = threading.Event()
 
     def answer(env):
@@ -125,21 +125,21 @@ def test_an_env_without_an_answer_fails_alone():
     with with_numbers(answer) as url:
         remote = started(f"{url}?timeout_s=1")
         with pytest.raises(PolicyError) as failed:
-            remote.act(some_observations(*range(ENVS)))
+            remote.act(make_observations(*range(ENVS)))
         ended.set()
         assert failed.value.reasons == {2: "no answer from the policy server within 1 s"}
         assert failed.value.actions[[0, 1, 3, 4], 0, 0].tolist() == [0, 1, 3, 4]
-        remote.reset([a_start(2)])
-        assert remote.act(some_observations(2, 3))[:, 0, 0].tolist() == [2, 3]
+        remote.reset([make_episode(2)])
+        assert remote.act(make_observations(2, 3))[:, 0, 0].tolist() == [2, 3]
         remote.close()
 
 
-def test_a_slow_server_is_not_dropped_and_answers_health_checks(fast_pings):
-    policy = Slow(2.5)  # twice what an answer to a ping may take
+def test_slow_server_stays_connected_and_answers_health_checks(fast_pings):
+    policy = Slow(2.5)  # twice the ping timeout
     with serving(policy) as url:
         remote = started(url)
         answers = []
-        asking = threading.Thread(target=lambda: answers.append(remote.act(some_observations(0))))
+        asking = threading.Thread(target=lambda: answers.append(remote.act(make_observations(0))))
         asking.start()
         assert policy.entered.wait(20)
         with urllib.request.urlopen(url.replace("ws", "http", 1) + "/healthz", timeout=3) as health:
@@ -152,7 +152,7 @@ def test_a_slow_server_is_not_dropped_and_answers_health_checks(fast_pings):
 
 @contextmanager
 def tunnel(port, cut):
-    """Forward connections to a port, until the event is set: then nothing passes, and nothing is closed."""
+    """Forward connections to a port; after the event no data pass and no connection is closed."""
 
     def forward(source, sink):
         while data := source.recv(2**16):
@@ -176,19 +176,19 @@ def tunnel(port, cut):
         server.shutdown(sockets.SHUT_RDWR)
 
 
-def test_a_dead_network_is_noticed_by_both_ends(fast_pings):
-    policy, cut = Told(), threading.Event()
+def test_both_ends_detect_a_lost_network(fast_pings):
+    policy, cut = RecordingPolicy(), threading.Event()
     with serving(policy) as url, tunnel(int(url.rpartition(":")[2]), cut) as address:
         remote = RemotePolicy(f"{address}?timeout_s=60&connect_s=1")
-        remote.reset([a_start(0)])
-        remote.act(some_observations(0))
+        remote.reset([make_episode(0)])
+        remote.act(make_observations(0))
         cut.set()
         with pytest.raises(PolicyError, match="keepalive ping timeout"):
-            remote.act(some_observations(0))
+            remote.act(make_observations(0))
         for _ in range(100):  # until the server has released the env
             other = RemotePolicy(url)
-            other.reset([a_start(0)])
-            other.act(some_observations(0))
+            other.reset([make_episode(0)])
+            other.act(make_observations(0))
             other.close()
             if policy.starts[-1].env == 0:
                 return
@@ -196,13 +196,13 @@ def test_a_dead_network_is_noticed_by_both_ends(fast_pings):
         pytest.fail("the server keeps the env of a client that is gone")
 
 
-def test_a_request_whose_client_is_gone_is_skipped():
+def test_requests_of_disconnected_clients_are_skipped():
     policy = Slow(1.0)
 
     def ask(url):
         client = connect(url, proxy=None, compression=None)
         client.recv()
-        client.send(pack(observation_message(some_observations(0), 0, a_start(), reset=True)))
+        client.send(pack(observation_message(make_observations(0), 0, make_episode(), reset=True)))
         return client
 
     with serving(policy) as url:
@@ -219,27 +219,27 @@ def test_a_request_whose_client_is_gone_is_skipped():
 CUT = """
 import os, subprocess, sys, threading, time
 subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
-from remote_ends import a_start, answering, some_observations
+from remote_ends import make_episode, serve_answer, make_observations
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.remote import connection
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 
 connection.TCP_OPTIONS = {"TCP_KEEPIDLE": 1, "TCP_KEEPINTVL": 1, "TCP_KEEPCNT": 2}
 
-with answering(lambda *_: time.sleep(1000)) as url:  # a plain openpi server, which answers no pings
+with serve_answer(lambda *_: time.sleep(1000)) as url:  # like openpi's server, without answers to pings
     policy = RemotePolicy(url + "?timeout_s=300&connect_s=0.5")
-    policy.reset([a_start(0)])
+    policy.reset([make_episode(0)])
     threading.Timer(1, lambda: subprocess.run(["ip", "link", "set", "lo", "down"], check=True)).start()
     try:
-        policy.act(some_observations(0))
+        policy.act(make_observations(0))
     except EvaluationError as failed:
         print("no connection to the policy server within" in str(failed), flush=True)
     os._exit(0)
 """
 
 
-def test_tcp_keepalive_notices_a_dead_network_without_pings():
-    """In a network namespace of its own, whose only interface goes down."""
+def test_tcp_keepalive_detects_a_lost_network_without_pings():
+    """In a separate network namespace whose only interface goes down."""
     words = ["unshare", "--map-root-user", "--user", "--net"]
     try:
         subprocess.run([*words, "ip", "link"], check=True, capture_output=True)

@@ -28,12 +28,12 @@ VALUES = st.recursive(
 
 
 @given(VALUES)
-def test_values_come_back(value):
+def test_values_round_trip(value):
     assert unpack(pack(value)) == value
 
 
 @given(ARRAYS)
-def test_arrays_come_back(array):
+def test_arrays_round_trip(array):
     back = unpack(pack({"a": [array]}))["a"][0]
     assert back.dtype == array.dtype.newbyteorder("=")
     assert back.flags.writeable
@@ -41,7 +41,7 @@ def test_arrays_come_back(array):
 
 
 @given(ARRAYS)
-def test_openpi_reads_what_we_write_and_we_what_it_writes(array):
+def test_messages_are_compatible_with_openpi(array):
     openpi = pytest.importorskip("openpi_client.msgpack_numpy")
     np.testing.assert_array_equal(openpi.unpackb(pack(array)), array)
     assert pack(array) == openpi.packb(array)
@@ -65,7 +65,7 @@ def test_openpi_reads_what_we_write_and_we_what_it_writes(array):
     ],
     ids=lambda value: type(value).__name__,
 )
-def test_what_can_not_be_sent(value):
+def test_values_that_cannot_be_encoded(value):
     with pytest.raises(WireError, match="cannot encode"):
         pack(value)
 
@@ -113,7 +113,7 @@ def array(data=bytes(8), dtype="<f4", shape=(2,), **more):
         b"\xdd\xff\xff\xff\xff",
     ],
 )
-def test_garbage_is_refused(data):
+def test_invalid_messages_are_refused(data):
     with pytest.raises(WireError):
         unpack(data)
 
@@ -129,14 +129,14 @@ def test_depth_and_size_are_bounded():
         unpack(bytes(11), max_bytes=10)
 
 
-def test_a_bool_is_zero_or_one():
+def test_decoded_bools_are_zero_or_one():
     back = unpack(array(data=b"\x02\x00", dtype="|b1"))
     assert back.tolist() == [True, False]
     assert back.view(np.uint8).tolist() == [1, 0]
 
 
 @given(VALUES | ARRAYS, st.data())
-def test_a_damaged_message_is_a_value_or_an_error(value, draw):
+def test_damaged_message_gives_a_value_or_an_error(value, draw):
     data = bytearray(pack({"a": value, "b": np.zeros((2, 2), np.float32)}))
     for place in draw.draw(st.lists(st.integers(0, len(data) - 1), min_size=1, max_size=4)):
         data[place] = draw.draw(st.integers(0, 255))

@@ -1,4 +1,4 @@
-"""Results over the same scenes, compared pair by pair."""
+"""Paired comparisons of results."""
 
 import shutil
 

@@ -1,4 +1,4 @@
-"""Failed episodes are played again and filmed."""
+"""Videos of failed episodes."""
 
 import imageio.v2 as imageio
 import numpy as np

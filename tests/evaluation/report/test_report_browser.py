@@ -1,4 +1,4 @@
-"""The page of a result in a real browser: nothing overflows, nothing fails, and the list can be narrowed."""
+"""The page of a result in a browser: no overflow, no errors, and filters of the list."""
 
 import pytest
 from browser import open_page
@@ -32,7 +32,7 @@ def url(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("width", "dark"), [(420, True), (1440, False)])
-def test_nothing_fails_or_overflows(page, url, width, dark):
+def test_page_has_no_errors_and_no_overflow(page, url, width, dark):
     page.set_viewport_size({"width": width, "height": 900})
     page.emulate_media(color_scheme="dark" if dark else "light")
     page.goto(url)
@@ -43,11 +43,11 @@ def test_nothing_fails_or_overflows(page, url, width, dark):
     assert paper != ink
 
 
-def test_failed_episodes_are_narrowed_down(page, url):
+def test_filters_of_failed_episodes(page, url):
     page.goto(url)
     assert len(page.evaluate(SHOWN).split(",")) == 35
     page.select_option("select[data-column='1']", "table")
-    page.select_option("select[data-column='4']", "target grasped")  # came to three stages
+    page.select_option("select[data-column='4']", "target grasped")  # reached three stages
     assert page.evaluate(SHOWN) == ""
     page.select_option("select[data-column='4']", "target touched")
     assert page.evaluate(SHOWN) == "2,10,18,26,34"

@@ -1,4 +1,4 @@
-"""Tables of results, with numbers worked out by hand."""
+"""Tables of results with numbers computed by hand."""
 
 from dataclasses import replace
 
