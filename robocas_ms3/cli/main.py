@@ -53,7 +53,7 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
         "show": "Render the scene of a task configuration",
     },
     "system": {
-        "list": "List tasks, configurations, robots, policies, baselines and packs",
+        "list": "List tasks, configurations, robots, policies and packs",
         "doctor": "Check the installation",
     },
 }
@@ -122,9 +122,7 @@ def run(argv: Sequence[str]) -> int:
         of_option = str(error.where).startswith("--")
         return _write_line(f"error: {' '.join(str(error).split())}", sys.stderr, 2 if of_option else 1)
     except ValueError as error:
-        from robocas_ms3.core.documents import (
-            DocumentError,  # with YAML, which no command waits for that fails otherwise
-        )
+        from robocas_ms3.core.documents import DocumentError  # imports yaml, which other errors do not need
 
         if debug or not isinstance(error, DocumentError):
             raise

@@ -28,8 +28,6 @@ Jobs = Annotated[int, _NO_DEFAULT]
 """Number of processes; default: `CORES`."""
 Several = Annotated[tuple[_T, ...], _NO_DEFAULT]
 """Several values; default: none."""
-Repeated = Annotated[tuple[_T, ...], _NO_DEFAULT, tyro.conf.UseAppendAction]
-"""Values of an option that may be given several times; default: none."""
 Folders = Annotated[
     tuple[Path, ...],
     tyro.conf.Positional,
@@ -37,8 +35,6 @@ Folders = Annotated[
     tyro.conf.arg(metavar="DIR [DIR ...]", help_behavior_hint="(required)"),
 ]
 """Positional folders, at least one."""
-ConfigName = Annotated[str, tyro.conf.arg(metavar="CONFIG")]
-"""Name of a bundled task configuration, or a YAML file."""
 PackName = Annotated[str, tyro.conf.arg(metavar="PACK")]
 """Name of an asset pack, or its folder."""
 Overrides = Annotated[tuple[str, ...], _NO_DEFAULT, tyro.conf.UseAppendAction, tyro.conf.arg(metavar="KEY=VALUE")]

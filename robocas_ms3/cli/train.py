@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from robocas_ms3.baselines.registry import BASELINES
-from robocas_ms3.cli.options import Maybe, Repeated, resumable
+from robocas_ms3.cli.options import Maybe, Overrides, resumable
 
 DESCRIPTION = """Train a baseline policy. The folder of the run is a policy: `robocas eval TASK --policy RUN`.
 
@@ -25,7 +25,7 @@ class Training:
     """Output folder of the run. Default: runs/BASELINE-DATA, or runs/BASELINE without data."""
     config: Maybe[Path] = None
     """YAML file with configuration values that differ from the defaults."""
-    set: Repeated[str] = ()
+    set: Overrides = ()
     """Set a configuration value, such as `--set chunk=4` or `--set train.learning_rate=3e-4`; repeatable."""
     steps: Maybe[int] = None
     """Number of optimiser steps; short for --set train.steps=N."""

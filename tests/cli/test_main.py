@@ -45,6 +45,7 @@ def test_help_lists_every_command_and_imports_nothing_heavy():
         capture_output=True,
         text=True,
         check=True,
+        env=os.environ | {"COLUMNS": "80"},
     )
     lines = done.stdout.splitlines()
     assert all(sum(line.startswith(f"  {name} ") for line in lines) == 1 for name in cli.COMMANDS)

@@ -21,18 +21,18 @@ def site(tmp_path, monkeypatch):
     """A folder of packages in which that of the page is."""
     folder = install("A policy", tmp_path / "site")
     monkeypatch.syspath_prepend(folder)
-    for name in ("my_policies", "spoilt_policies"):
+    for name in ("my_policies", "invalid_policies"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     builtin = policies.POLICIES
-    table = Registry(builtin.kind, builtin.group, builtin.type, builtin.builtin)
-    monkeypatch.setattr(policies, "POLICIES", table)  # as if the process had begun now
+    registry = Registry(builtin.kind, builtin.group, builtin.type, builtin.builtin)
+    monkeypatch.setattr(policies, "POLICIES", registry)  # entry points are read again
     return folder
 
 
 def test_policy_is_found_and_listed_by_name(site):
     assert type(make_policy("descend")).__module__ == "my_policies"
     listed = {row["name"]: row for row in list_all()["policies"]}
-    assert listed["descend"] == {"name": "descend", "package": "my-policies", "of": "my_policies:Descend"}
+    assert listed["descend"] == {"name": "descend", "package": "my-policies", "entry_point": "my_policies:Descend"}
     assert {"scripted", "scripted-ee-delta", "random", "noop"} <= listed.keys()
     with pytest.raises(EvaluationError, match="unknown policy .*Did you mean descend"):
         make_policy("decend")
@@ -44,11 +44,11 @@ def test_policy_is_found_and_listed_by_name(site):
     + [("def It(size): ...", EvaluationError), ("It = object", EvaluationError)],
 )
 def test_policy_with_an_import_error_fails_only_when_it_is_used(site, module, error):
-    about = site / "spoilt_policies-1.0.dist-info"
+    about = site / "invalid_policies-1.0.dist-info"
     about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: spoilt-policies\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text(f"[{POLICY_GROUP}]\nit = spoilt_policies:It\n")
-    (site / "spoilt_policies.py").write_text(module)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: invalid-policies\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(f"[{POLICY_GROUP}]\nit = invalid_policies:It\n")
+    (site / "invalid_policies.py").write_text(module)
     assert "it" in {row["name"] for row in list_all()["policies"]}
     assert type(make_policy("descend")).__name__ == "Descend"
     with pytest.raises(error):
