@@ -31,7 +31,7 @@ class Info:
     Example: robocas assets info builtin
     """
 
-    pack: Annotated[str, tyro.conf.Positional]
+    pack: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PACK")]
     """Name or folder of the pack."""
 
 
@@ -44,7 +44,7 @@ class Verify:
     Example: robocas assets verify builtin
     """
 
-    pack: Annotated[str, tyro.conf.Positional]
+    pack: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PACK")]
     """Name or folder of the pack."""
     physics: bool = False
     """Drop, grasp and shake each object, move each joint, and print the measurements."""
@@ -61,7 +61,7 @@ class Sheet:
     Example: robocas assets sheet builtin --ids plate mug
     """
 
-    pack: Annotated[str, tyro.conf.Positional]
+    pack: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PACK")]
     """Name or folder of the pack."""
     out: Maybe[Path] = None
     """PNG or JPEG file. Default: PACK.png in the working directory."""

@@ -22,7 +22,7 @@ class Results:
 
     folders: Folders
     """Folder of a result, or folders of partial results, such as shards."""
-    protocol: Maybe[str] = None
+    protocol: Annotated[Maybe[str], tyro.conf.arg(metavar="PROTOCOL")] = None
     """Folder of the protocol, if the protocol is not bundled."""
 
 
@@ -75,9 +75,9 @@ class Videos:
 
     folder: Annotated[Path, tyro.conf.Positional]
     """Folder of the result."""
-    protocol: Maybe[str] = None
+    protocol: Annotated[Maybe[str], tyro.conf.arg(metavar="PROTOCOL")] = None
     """Folder of the protocol, if the protocol is not bundled."""
-    policy: Maybe[str] = None
+    policy: Annotated[Maybe[str], tyro.conf.arg(metavar="POLICY")] = None
     """Name of the policy, required for policies that are not installed: confirms that its code may run."""
     count: int = 8
     """Number of videos, alternating between configurations and kinds of failures."""

@@ -31,7 +31,7 @@ class Build:
     Example: robocas layouts build pick_table_scattered --seeds 0:100 --set objects.count=12
     """
 
-    config: Annotated[str, tyro.conf.Positional]
+    config: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG")]
     """Name of a bundled task configuration, or a YAML file."""
     set: Overrides = ()
     """Set a key of the configuration, such as `--set objects.count=12`; repeatable (docs/configuration.md)."""

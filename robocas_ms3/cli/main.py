@@ -71,10 +71,7 @@ OPTIONS = {
     "--debug": "Show the traceback of an error",
 }
 EXAMPLE = "robocas generate pick -n 10"
-CLI_STYLE = (
-    *(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.DisallowNone),
-    tyro.conf.PositionalMetavarFromFieldName,
-)
+CLI_STYLE = (tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.DisallowNone)
 # Errors of disks, file servers, names and limits: a traceback would not explain them
 _ENVIRONMENT = {
     *DISK_FULL_ERRNOS,

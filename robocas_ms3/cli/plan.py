@@ -23,7 +23,7 @@ class Run:
     Example: robocas plan run tiny --out runs/tiny --jobs 2
     """
 
-    plan: Annotated[str, tyro.conf.Positional]
+    plan: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PLAN")]
     """Name of a bundled plan (`robocas plan list`), or a YAML file."""
     out: Path
     """Output folder of the plan."""

@@ -21,7 +21,7 @@ class ServePolicy:
     Example: robocas serve-policy runs/pick --port 8000
     """
 
-    policy: Annotated[str, tyro.conf.Positional]
+    policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
     """Policy to serve, as in robocas eval: a name from robocas list, a run folder of robocas train,
     replay:TRAJECTORY.h5, or module:Class of your own code."""
     host: str = "127.0.0.1"

@@ -21,7 +21,7 @@ class Show:
     Example: robocas show pick_table_scattered --set objects.count=12 --set target.approach=front
     """
 
-    config: Annotated[str, tyro.conf.Positional] = "pick_table_scattered"
+    config: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[CONFIG]")] = "pick_table_scattered"
     """Name of a bundled task configuration, or a YAML file."""
     set: Overrides = ()
     """Set a key of the configuration, such as `--set objects.count=12`; repeatable (docs/configuration.md)."""

@@ -37,7 +37,7 @@ class Validate:
     min_success: Maybe[float] = None
     """With --replay: lowest accepted success rate per task, 0 to 1. Exit code 1 if a task is below it or if none of
     its episodes could be replayed."""
-    pack: Maybe[str] = None
+    pack: Annotated[Maybe[str], tyro.conf.arg(metavar="PACK")] = None
     """With --replay: name or folder of the object pack to use instead of the recorded one."""
     json: bool = False
     """Print the report as JSON."""

@@ -27,9 +27,11 @@ class EpisodeSettings:
 
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(constructor_factory=_task_names)]
     """Task to record."""
-    config: Annotated[str | dict[str, Any], tyro.conf.arg(constructor=str, help_behavior_hint="")] = ""
+    config: Annotated[str | dict[str, Any], tyro.conf.arg(metavar="CONFIG", constructor=str, help_behavior_hint="")] = (
+        ""
+    )
     """Bundled task configuration by name, or a YAML file. Default: the default of the task (see `robocas list`)."""
-    pack: str = "builtin"
+    pack: Annotated[str, tyro.conf.arg(metavar="PACK")] = "builtin"
     """Object pack: name or folder."""
     control_freq: int = STANDARD_FREQ
     """Control rate in Hz, a divisor of 100, the rate of physics. The RoboCAS paper uses 5 Hz."""
@@ -49,11 +51,11 @@ class EpisodeSettings:
     check_noise_deg: Annotated[float, tyro.conf.Suppress] = 0.2
     layouts: Annotated[str, tyro.conf.Suppress] = "auto"
     """Source of the layouts, see `RoboCASEnv`."""
-    planner: str = "rrt_connect"
+    planner: Annotated[str, tyro.conf.arg(metavar="PLANNER")] = "rrt_connect"
     """Motion planner: rrt_connect, or a planner of another package (see docs/extending.md)."""
-    robot: str = DEFAULT_ROBOT
+    robot: Annotated[str, tyro.conf.arg(metavar="ROBOT")] = DEFAULT_ROBOT
     """Robot: a robot of this package or of another one (see docs/extending.md)."""
-    after_policy: Annotated[str, _NO_HINT] = ""
+    after_policy: Annotated[str, tyro.conf.arg(metavar="POLICY"), _NO_HINT] = ""
     """Policy that acts first, as --policy of `robocas eval` (DAgger). The scripted policy then completes the task, and
     only its part is recorded. Seeds in which the policy has succeeded or failed already are skipped."""
     after_steps: tuple[int, int] = (5, 60)
@@ -120,7 +122,7 @@ class GenerateSettings:
     """Output folder. Default: demos/CONFIG-PACK."""
     episodes: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 10
     """Number of successful episodes to record, at least 1."""
-    set: Annotated[tuple[str, ...], _NO_HINT, tyro.conf.UseAppendAction] = ()
+    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE"), _NO_HINT, tyro.conf.UseAppendAction] = ()
     """Set a key of the configuration, such as `--set objects.count=12`; repeatable (docs/configuration.md)."""
     seed: int = 0
     """Seed of the first episode, 0 or more; the next episodes use the following seeds."""
@@ -191,7 +193,7 @@ class ReplaySettings:
     """HDF5 file to write the replayed episodes to."""
     allow_failure: bool = False
     """With --save: also write failed episodes."""
-    pack: Annotated[str | None, _NO_HINT] = None
+    pack: Annotated[str | None, tyro.conf.arg(metavar="PACK"), _NO_HINT] = None
     """Object pack to use instead of the recorded pack: name or folder."""
     overwrite: bool = False
     """Replace the file given by --save if it exists."""

@@ -23,15 +23,15 @@ class EvaluationSettings:
     Example: robocas eval pick --policy runs/pick --protocol paper-v1 --out eval/pick
     """
 
-    tasks: Annotated[tuple[str, ...], tyro.conf.Positional, _NO_HINT] = ()
+    tasks: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[TASK ...]"), _NO_HINT] = ()
     """Tasks to evaluate, such as pick. Default: all tasks of the protocol. In paper-v1, select runs in the episodes of
     pick, as in RoboCAS-v0."""
-    policy: str = "scripted"
+    policy: Annotated[str, tyro.conf.arg(metavar="POLICY")] = "scripted"
     """Policy to evaluate. One of: scripted (joint targets), scripted-ee-delta (RoboCAS' 7-D actions),
     scripted-perturbed (7-D actions with an offset of 1 to 5 cm), random, noop, another name from `robocas list`,
     replay:TRAJECTORY.h5, a run folder of `robocas train`, module:Class of your own code, or ws://HOST:PORT of a policy
     server (`robocas serve-policy`)."""
-    protocol: str = "ms3-v1"
+    protocol: Annotated[str, tyro.conf.arg(metavar="PROTOCOL")] = "ms3-v1"
     """Name of a bundled protocol (`robocas eval protocols`), or a protocol folder."""
     out: Annotated[Path | None, _NO_HINT] = None
     """Output folder. Default: eval/PROTOCOL/POLICY; with the weld, eval/PROTOCOL/POLICY_weld."""
@@ -51,7 +51,7 @@ class EvaluationSettings:
     """Memory limit per worker process in GB."""
     backend: Literal["auto", "processes", "gpu"] = "auto"
     """Where the simulation runs. auto: on a GPU if there is one, else in worker processes."""
-    shard: str = "0/1"
+    shard: Annotated[str, tyro.conf.arg(metavar="K/N")] = "0/1"
     """K/N: run only every N-th episode, from episode K on (0 <= K < N). `robocas eval merge` joins the results."""
     split: Annotated[str, _NO_HINT] = ""
     """Run only the episodes of this split, such as `seen`. Default: all splits."""

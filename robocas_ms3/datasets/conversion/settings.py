@@ -33,7 +33,7 @@ class ConversionSettings:
     """Trajectory file F.h5 (with F.json next to it). With --to lerobot also the folder of a dataset with images."""
     out: Path
     """Output folder of the dataset."""
-    to: str = "robocas"
+    to: Annotated[str, tyro.conf.arg(metavar="FORMAT")] = "robocas"
     """Output format: robocas, lerobot (needs the extra 'lerobot'), or a format of another package."""
     lerobot_version: Version = NEWEST
     """LeRobot version that reads the dataset. 0.6: LeRobot 0.6 and later (v3.0, language columns, depth as video);
@@ -49,7 +49,7 @@ class ConversionSettings:
     lerobot)."""
     all_videos: bool = False
     """Write videos and a contact sheet for more than 20 episodes too."""
-    cameras: Annotated[tuple[str, ...], _NO_HINT] = ()
+    cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]"), _NO_HINT] = ()
     """Names of the cameras. Default: all cameras of the input; with --append those of the output dataset."""
     size: Annotated[tuple[int, int] | None, _NO_HINT] = None
     """Image width and height in pixels. Default: that of the cameras, 640 480; with --append that of the dataset."""
@@ -72,7 +72,7 @@ class ConversionSettings:
     retried once, then treated as an episode that can't be written."""
     memory_gb: float = 8.0
     """Memory limit per process in GB."""
-    pack: Annotated[str | None, _NO_HINT] = None
+    pack: Annotated[str | None, tyro.conf.arg(metavar="PACK"), _NO_HINT] = None
     """Name or folder of the object pack to use instead of the recorded one."""
     boxes: Annotated[bool, tyro.conf.Suppress] = False
     """Compute the bounding box of the target in each image."""
