@@ -116,8 +116,8 @@ def run(argv: Sequence[str]) -> int:
     except RobocasError as error:
         if debug:
             raise
-        of_option = str(error.where).startswith("--")
-        return _write_line(f"error: {' '.join(str(error).split())}", sys.stderr, 2 if of_option else 1)
+        is_usage = str(error.where).startswith("--") or error.where == "DIR"  # an option, or the positional folders
+        return _write_line(f"error: {' '.join(str(error).split())}", sys.stderr, 2 if is_usage else 1)
     except ValueError as error:
         from robocas_ms3.core.documents import DocumentError  # imports yaml, which other errors do not need
 

@@ -31,7 +31,8 @@ def merge(
         OutputExistsError: ``out`` is another dataset, or not a dataset.
     """
     if not roots:
-        raise DatasetError("no datasets to merge", expected="folders of datasets", fix="Run robocas merge A B --out C.")
+        what, fix = "missing dataset folders", "Run robocas merge A B --out C."
+        raise DatasetError(what, where="DIR", expected="folders of datasets", fix=fix)
     sources = [open_finished_dataset(root, name) for root, name in zip(roots, _distinct_names(roots), strict=True)]
     _check_settings(sources)
     members: dict[str, CopiedEpisode] = {}
