@@ -1,4 +1,4 @@
-"""Demonstrations: generation with the scripted policy over seeds and workers, recording, failures, replay.
+"""Demonstrations: generation with scripted policies, recordings, failed attempts and replay.
 
 Public names are imported from this package at first use.
 """

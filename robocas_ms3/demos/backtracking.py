@@ -27,7 +27,7 @@ class CandidatesExhaustedError(Exception):
 def order_candidates(
     candidates: Iterable[T], limits: SearchLimits, result: EpisodeResult
 ) -> Generator[tuple[T, bool], float | PlanningError | None, None]:
-    """Yield candidates in the order of the search, each with a flag: continue the episode from it, or only score it.
+    """Yield candidates in search order, each with a flag: continue the episode from it, or score it.
 
     A few candidates are scored, and the episode continues from the best of them first. Then the next few follow. After
     a candidate to score, the caller sends its score, or the error if its motions failed. After a candidate to continue
@@ -93,7 +93,10 @@ class _Decision:
 
 
 class ResimulatedDecisions:
-    """Decisions that undo failures by running the attempt again from its reset; same methods as `ForkedDecisions`."""
+    """Decisions that undo failures by simulating the attempt again from its reset.
+
+    The class has the same methods as `ForkedDecisions`.
+    """
 
     def __init__(self, result: EpisodeResult) -> None:
         self._result = result

@@ -61,7 +61,7 @@ class ForkedProcess:
             raise ForkedProcessCrashError("crashed") from error
 
     def receive(self, limit: float) -> Any:
-        """Return the next message of the process; raise ForkedProcessError if none arrives within ``limit`` seconds."""
+        """Return the next message of the process; raise ForkedProcessError after ``limit`` seconds."""
         try:
             if not self.pipe.poll(limit):
                 raise ForkedProcessError("timed_out")
@@ -94,7 +94,7 @@ def fork() -> ForkedProcess | Connection:
 
 
 def set_up_forked_process(parent: int) -> None:
-    """Prepare a forked process before it does anything else; the system kills it when the process ``parent`` ends."""
+    """Prepare a forked process, right after the fork; it is killed when the process ``parent`` ends."""
     die_with_parent(parent)
     gc.freeze()  # a garbage collection of all objects would copy the parent's memory
     torch.set_num_threads(1)  # fork keeps one thread only; a parallel loop would wait for the others forever
@@ -132,7 +132,7 @@ class _Success(Exception):  # noqa: N818
 
 
 class ForkedDecisions:
-    """Decisions that undo failures by forking; child processes send back the result of the episode (``result``)."""
+    """Decisions that undo failures by forking; child processes send back the episode's result."""
 
     def __init__(self, result: EpisodeResult) -> None:
         self._result = result
@@ -185,7 +185,7 @@ class ForkedDecisions:
     def _play_in_child(
         self, play: Callable[[T], float], candidate: T
     ) -> tuple[ForkedProcess | None, float | PlanningError]:
-        """Play a candidate in a child process; return the child and its score or error, and None in the child itself.
+        """Play a candidate in a child process; return the child and its score or error.
 
         The child returns once it has to continue the episode.
         """
@@ -226,7 +226,7 @@ class ForkedDecisions:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def _continue_as(self, child: ForkedProcess) -> bool:
-        """Let a child continue the episode; return True if the episode failed there, False if the child crashed."""
+        """Let a child continue the episode; return True if the episode failed, False after a crash."""
         try:
             child.send(self._result)
             succeeded = self._receive(child, EPISODE_TIMEOUT)

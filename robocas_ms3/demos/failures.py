@@ -1,4 +1,4 @@
-"""Results of seeds, lines of ``failures.jsonl``, and initial states of expert interventions. Loads no simulator.
+"""Results of seeds, lines of ``failures.jsonl``, and initial states of expert interventions.
 
 ``failures.jsonl`` has one line per failed attempt and one line per skipped seed.
 """

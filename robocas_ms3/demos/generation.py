@@ -154,7 +154,7 @@ def generate_seeds(
     folder: Path,
     make_roll_in: Callable[[], Worker[int, Intervention]] | None = None,
 ) -> Generator[EpisodeResult, None, None]:
-    """Yield the results of an endless iterator of seeds, in order; write each episode to a file in ``folder``."""
+    """Yield the results of endless seeds in order; write each episode to a file in ``folder``."""
     limits = Limits(settings.episode_seconds, settings.memory_gb)
     with ExitStack() as stack:
         tasks: Iterator[int | Intervention] = seeds

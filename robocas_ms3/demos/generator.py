@@ -134,7 +134,7 @@ class _Attempts:
                 return
 
     def run_in_one_motion(self) -> None:
-        """Run attempts one after the other as one motion; start from the reset again if recovery is impossible."""
+        """Run attempts as one motion; start from the reset again if recovery is impossible."""
         executor, result = self.executor, self.result
         decisions = IrreversibleDecisions(lambda: len(executor.actions))
         recoveries: list[dict[str, Any]] = []

@@ -50,7 +50,7 @@ def _carry_held_target(arm: Arm, slot: int) -> None:
 
 
 def _retreat(arm: Arm) -> None:
-    """Open the gripper and move away from everything that the arm touches: up, or back in a front approach."""
+    """Open the gripper and move away from all contacts: up, or back after a front approach."""
     if arm.executor.gripper != OPEN:
         arm.open_gripper()
     if arm.approach == "top":

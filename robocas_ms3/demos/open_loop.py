@@ -1,4 +1,4 @@
-"""Replay 7-D dataset actions open loop at the rate of a dataset, and check demonstrations while they are recorded.
+"""Replay 7-D dataset actions open loop, and check demonstrations while they are recorded.
 
 `OpenLoopChecks` replays the actions recorded so far in environments of their own: without noise in the first one, with
 noise in the others. The check runs after each part of the episode, so only a part that fails is done again.
@@ -133,14 +133,14 @@ class OpenLoopEnv:
 
 
 def draw_noise(rng: np.random.Generator, count: int, std_mm: float, std_deg: float) -> Array:
-    """Draw actuation noise (count, 7) for dataset actions: independent normal components, m and rad, gripper 0."""
+    """Draw normal actuation noise (count, 7) for dataset actions, m and rad; gripper 0."""
     drawn = np.zeros((count, 7))
     drawn[:, :6] = rng.normal(size=(count, 6)) * np.repeat([std_mm / 1000, np.deg2rad(std_deg)], 3)
     return drawn
 
 
 class OpenLoopChecks:
-    """Environments that replay a recording in parts: the first one without noise, the others with actuation noise."""
+    """Environments that replay a recording in parts, the first without noise, the others with noise."""
 
     def __init__(self, envs: Sequence[OpenLoopEnv], settings: EpisodeSettings) -> None:
         self._envs, self._settings = envs, settings

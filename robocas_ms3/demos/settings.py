@@ -1,4 +1,4 @@
-"""Settings of `robocas generate` and `robocas replay`: the options of the commands. Loads no simulator."""
+"""Settings (options) of `robocas generate` and `robocas replay`. Loads no simulator."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text describes the d
 
 
 def _task_names() -> type:
-    """Return a Literal type of all task names; called while parsing, since it loads tasks of other packages."""
+    """Return a Literal type of all task names, including tasks of other packages."""
     return tyro.extras.literal_type_from_choices(TASKS)
 
 
@@ -143,7 +143,7 @@ class GenerateSettings:
     run."""
 
     def resolve(self) -> GenerateSettings:
-        """Return settings with the defaults of folder and noise filled in, and YAML files and ``set`` resolved.
+        """Return settings with output folder and noise filled in, and YAML files and ``set`` resolved.
 
         Raises:
             ConfigError: the configuration is invalid.

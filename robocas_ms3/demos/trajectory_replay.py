@@ -1,4 +1,4 @@
-"""Replay recorded trajectories by their actions, by actions in another control mode, or by their states."""
+"""Replay recorded trajectories: actions, actions in another control mode, or states."""
 
 from __future__ import annotations
 
@@ -205,7 +205,7 @@ def _replay_one(env: gym.Env, settings: ReplaySettings, episode: dict[str, Any])
 
 
 def _convert_action(action: np.ndarray, env: RoboCASEnv) -> np.ndarray:
-    """Convert ``pd_joint_pos`` targets (8,) to an action in the control mode of the environment at its current state.
+    """Convert ``pd_joint_pos`` targets (8,) to an action in the control mode of the environment.
 
     The action is clipped to its bounds. ManiSkill's converter is not used: it expects end-effector deltas in the root
     frame and measures them in the world frame.
@@ -229,7 +229,7 @@ def _convert_action(action: np.ndarray, env: RoboCASEnv) -> np.ndarray:
 
 
 def state_distance(state: dict[str, Any], recorded: dict[str, Any]) -> float:
-    """Return the greatest absolute difference between two states over all numbers (m, rad, ...); NaN if one has NaN."""
+    """Return the greatest absolute difference of two states (m, rad, ...); NaN if one has NaN."""
     largest = np.float64(0.0)
     for kind in ("actors", "articulations"):
         for name, value in recorded[kind].items():

@@ -1,4 +1,4 @@
-"""Roll in a learned policy before the scripted policy continues: the first part of DAgger demonstrations.
+"""Roll in a learned policy before the scripted policy continues (DAgger demonstrations).
 
 The policy acts as in the protocol `PROTOCOL` (stepping of RoboCAS-v0 at 5 Hz), in scenes of any configuration.
 """
@@ -35,12 +35,12 @@ _log = logging.getLogger(__name__)
 
 
 def roll_in_steps(seed: int, after_steps: tuple[int, int]) -> int:
-    """Draw the number of policy steps in the scene of a seed: uniform, both ends of ``after_steps`` included."""
+    """Draw the number of policy steps for a seed, uniform in ``after_steps`` (both ends included)."""
     return int(np.random.default_rng([seed, _STEPS]).integers(after_steps[0], after_steps[1] + 1))
 
 
 def check_roll_in(settings: EpisodeSettings) -> str:
-    """Check the policy of ``after_policy``; return the hash of its weights, or an empty string without weights."""
+    """Check the policy of ``after_policy``; return the hash of its weights (empty without weights)."""
     with open_policy(settings.after_policy) as policy:
         load_protocol(PROTOCOL).rules.check_policy(policy.spec)
         if policy.spec.cameras:

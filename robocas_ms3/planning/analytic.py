@@ -19,7 +19,7 @@ UPRIGHT = 1 - 1e-9  # cosine between upper arm and vertical; above it joints 1 a
 
 
 class PandaGeometry:
-    """Link lengths of the Panda, read from its chain; raises RobocasError if the chain has another structure."""
+    """Link lengths of the Panda from its chain; RobocasError if the chain has another structure."""
 
     def __init__(self, chain: ArmChain) -> None:
         one, two, three, four, five, six, seven, tcp = chain.links

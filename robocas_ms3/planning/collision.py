@@ -1,4 +1,4 @@
-"""Check an arm for collisions with itself, with obstacles and with a held object, in the arm's base frame.
+"""Check an arm for self-collisions and collisions with obstacles and a held object.
 
 A broad phase in NumPy compares axis-aligned boxes of parts and obstacles for whole batches of configurations. FCL
 (python-fcl) checks only the pairs whose boxes overlap.
@@ -104,7 +104,7 @@ class CollisionChecker:
         self._low, self._high = np.concatenate(low), np.concatenate(high)
 
     def is_obstacle_point(self, points: Array) -> NDArray[np.bool_]:
-        """Return a mask (P,) of the points (P, 3) that count as obstacles: within reach and outside the robot base."""
+        """Return a mask (P,) of points (P, 3) that are obstacles: in reach and outside the robot base."""
         keep = np.einsum("ij,ij->i", points, points) <= REACH**2
         for low, high in self._closed_bounds[self._frames == BASE]:
             keep &= ~np.all((points >= low - BASE_MARGIN) & (points <= high + BASE_MARGIN), axis=1)
@@ -137,7 +137,7 @@ class CollisionChecker:
         return len(qpos)
 
     def all_free(self, qpos: Array, *, obstacles: bool = True) -> bool:
-        """Return whether all configurations of a path (M, 7) are collision-free; every SPARSE-th is checked first."""
+        """Return whether a path (M, 7) is collision-free; every SPARSE-th configuration is checked first."""
         if len(qpos) > 2 * SPARSE:
             qpos = np.concatenate([qpos[i::SPARSE] for i in (SPARSE - 1, *range(SPARSE - 1))])
             first = len(qpos) // SPARSE
@@ -204,7 +204,7 @@ class CollisionChecker:
         return self._obstacles[index]
 
     def _part_poses(self, rotations: Array, positions: Array, width: float) -> tuple[Array, Array]:
-        """Return rotations (P, M, 3, 3) and positions (P, M, 3) of the parts, given those of the frames (8, M, ...)."""
+        """Return rotations (P, M, 3, 3) and positions (P, M, 3) of parts from those of frames (8, M, ...)."""
         turned = rotations[self._frames]  # BASE indexes the last frame; its values are not used
         offsets = self._poses[:, :3, 3] + self._slides * (width / 2)
         placed = np.einsum("pmij,pj->pmi", turned, offsets) + positions[self._frames]

@@ -49,7 +49,7 @@ class CollisionPart:
 
 
 def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPart]:
-    """Read the collision parts of all links below the arm's base link; raise `RobotDescriptionError` on bad files.
+    """Read the collision parts of all links below the arm's base link; raise RobotDescriptionError.
 
     Joints other than arm and finger joints are at their zero position.
     """
@@ -83,7 +83,7 @@ def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPar
 
 
 def read_link_pairs(urdf: Path | str, srdf: Path | str, parts: list[CollisionPart]) -> list[tuple[int, int]]:
-    """Return pairs of part indices (i < j) to check: links that are neither adjacent nor disabled in the SRDF."""
+    """Return pairs of part indices (i < j) to check: not adjacent and not disabled in the SRDF."""
     ignored = {frozenset((joint.parent, joint.child)) for joint in RobotXml(urdf).joints()}
     file = RobotXml(srdf)
     for pair in file.root.iterfind("disable_collisions"):

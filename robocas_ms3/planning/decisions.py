@@ -89,7 +89,7 @@ class IrreversibleDecisions:
 
 @dataclass
 class Seconds:
-    """CPU seconds of an episode by part, in this process and in the child processes of all feasible candidates."""
+    """CPU seconds of an episode by part, including child processes of feasible candidates."""
 
     reset: float = 0.0
     planning: float = 0.0

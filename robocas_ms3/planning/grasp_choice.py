@@ -116,6 +116,9 @@ def score_grasps(
 
 
 def sample_order(rng: np.random.Generator, scores: Array) -> NDArray[np.int_]:
-    """Order grasps randomly by scores (N,): a grasp precedes one with a score 0.15 greater with probability 0.27."""
+    """Order grasps randomly by scores (N,).
+
+    A grasp precedes another one with a score 0.15 greater with probability 0.27.
+    """
     # Gumbel noise gives draws without replacement, weighted by exp(score / TEMPERATURE)
     return np.argsort(-(scores + TEMPERATURE * rng.gumbel(size=len(scores))), kind="stable")

@@ -36,7 +36,7 @@ DAMPING = 1e-8  # added to the diagonal of J J^T, so that it is invertible at si
 
 
 class ArmChain:
-    """Kinematic chain of seven revolute joints about z of their links, with the TCP fixed to the last link.
+    """Chain of seven revolute joints about z of their links, with the TCP fixed to the last link.
 
     The class computes the frames of all links in NumPy without BLAS, so that plans are reproducible to the bit.
     Controllers on a GPU use `robots.kinematics.SerialChain` instead.
@@ -177,7 +177,7 @@ class Reachability:
         return kept[:MAX_SOLUTIONS]
 
     def _solve(self, poses: Array, near: Array, step: float) -> Array:
-        """Solve poses (N, 4, 4) for sampled positions of joint 7, including that of ``near``; return (N, K, 7)."""
+        """Solve poses (N, 4, 4) for sampled positions of joint 7, including ``near``; return (N, K, 7)."""
         first, last = np.ceil((self.lower[6] - near[6]) / step), np.floor((self.upper[6] - near[6]) / step)
         turns = np.clip(near[6] + step * np.arange(first, last + 1), self.lower[6], self.upper[6])
         solved = self._geometry.solve(np.repeat(poses, len(turns), axis=0), np.tile(turns, len(poses)))
@@ -255,7 +255,7 @@ def follow_line(chain: ArmChain, start: Array, tcp_in_base: Array, *, stage: str
 
 
 def _solve_simultaneously(chain: ArmChain, start: Array, goals: Array) -> Array | None:
-    """Solve all poses (n, 4, 4) of a line at once; return the path (n + 1, 7), or None without convergence.
+    """Solve all poses (n, 4, 4) of a line at once; return a path (n + 1, 7), or None.
 
     Initial estimates come from one Newton step to every ``ESTIMATE_STRIDE``-th pose.
     """

@@ -165,7 +165,7 @@ class PandaArmMotionPlanningSolver:
             self.add_obstacles([Obstacle("points", Shape(points=points), np.eye(4))])
 
     def add_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
-        """Add bodies with world poses in ``pose_in_base``, as returned by ``PlanningScene.obstacles_in_world``."""
+        """Add obstacles with world poses, as returned by ``PlanningScene.obstacles_in_world``."""
         self._obstacles += obstacles
 
     def clear_collisions(self) -> None:

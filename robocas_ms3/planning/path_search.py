@@ -66,7 +66,7 @@ class PathSearch:
         self._remaining_checks = 0
 
     def _edge_points(self, a: Array, b: Array) -> Array:
-        """Return configurations (M, n) on the edge from ``a`` (assumed free) to ``b``; charge them to the budget."""
+        """Return configurations (M, n) on the edge from ``a`` (free) to ``b``; charge the budget."""
         count = max(1, int(np.ceil(np.linalg.norm(b - a) / self.spacing)))
         if self._remaining_checks < count:
             raise BudgetExceededError

@@ -139,7 +139,7 @@ class Planner(Protocol):
         ...
 
     def join(self, start: Array, first: Trajectory, second: Trajectory) -> Trajectory:
-        """Join two motions, the first from ``start`` (7,), without a stop in between if that is collision-free.
+        """Join two motions, the first from ``start`` (7,), without a stop if that is collision-free.
 
         The blend starts in the last second of the first motion and ends in the first second of the second one.
         """

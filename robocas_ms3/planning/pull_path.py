@@ -1,4 +1,4 @@
-"""Compute arm configurations that move a grasped handle along the motion of its joint. Geometry only, no simulator.
+"""Compute arm configurations that move a grasped handle along the motion of its joint.
 
 The handle is a bar along the TCP's x axis. The fingers may rotate about the bar, since a hinged door rotates more than
 the wrist can follow and friction on a bar of 1 cm is small.

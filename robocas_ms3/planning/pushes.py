@@ -51,7 +51,7 @@ def push_candidates(
     fixed: Array,
     turn_deg: float = 0.0,
 ) -> Iterator[Push]:
-    """Yield pushes of an object that start collision-free and end on the surface, the paper's direction first.
+    """Yield pushes that start collision-free and end on the surface, the paper's direction first.
 
     The object may be pushed against other objects, but not over the edge or against furniture or basket. The tool
     touches the object at the height of the target, or at the nearest free height above it.
@@ -115,7 +115,7 @@ def push_direction(rng: np.random.Generator, center: Array, target: Array) -> Ar
 
 
 def extent_behind(points: Array, center: Array, direction: Array, height: float) -> float | None:
-    """Return d_ext of the paper: the extent of an object from its centre against the push direction, m, or None.
+    """Return d_ext of the paper: extent of an object from its centre against the push, m, or None.
 
     Only points that the tool can touch count: within the tool radius of the line and 1 cm of the height. None: there is
     no such point.

@@ -45,7 +45,7 @@ def to_arm_base_frame(obstacles_in_world: Iterable[Obstacle], arm_base_in_world:
 
 
 class PlanningScene:
-    """View of one environment (``num_envs`` = 1) for planning: poses (4x4) and clouds in the arm's base frame.
+    """View of one environment for planning: poses (4x4) and clouds in the arm's base frame.
 
     Planners use bodies (`obstacles`); geometric tests use clouds of surface points (`points_in_base`).
     """
@@ -71,7 +71,7 @@ class PlanningScene:
                 yield asset.asset.id, asset, SPACING, from_wxyz(poses[slot])
 
     def sample_surfaces(self) -> None:
-        """Sample the surface points of all bodies once per process; samples drawn in a forked process are lost."""
+        """Sample surface points of all bodies before the first fork; a forked process loses samples."""
         for _, part, spacing, _ in self._bodies((), None):
             part.surface_points(spacing)
 
@@ -129,7 +129,7 @@ class PlanningScene:
         exclude: int | Collection[int] = (),
         exclude_link: tuple[str, str] | None = None,
     ) -> list[Obstacle]:
-        """Return the same bodies as `obstacles`, with ``pose_in_base`` in the world frame (see `to_arm_base_frame`)."""
+        """Return the bodies of `obstacles` with poses in the world frame; see `to_arm_base_frame`."""
         excluded = {exclude} if isinstance(exclude, int) else exclude
         return [Obstacle(name, part_shape(part), pose) for name, part, _, pose in self._bodies(excluded, exclude_link)]
 

@@ -108,7 +108,10 @@ def convex_hull(vertices: Array) -> tuple[Array, NDArray[np.int32], Array]:
 
 
 def inflate_hull(vertices: Array, margin: float) -> tuple[Array, NDArray[np.int32]]:
-    """Return corners and triangles of a convex hull with faces moved out by ``margin`` (m), less at sharp edges."""
+    """Return corners and triangles of a hull with faces moved out by ``margin`` (m).
+
+    Corners at sharp edges move at most twice the margin.
+    """
     corners, faces, normals = convex_hull(vertices)
     square, total = np.tile(1e-3 * np.eye(3), (len(corners), 1, 1)), np.zeros((len(corners), 3))
     for corner in faces.T:  # least squares over the faces that meet at a corner

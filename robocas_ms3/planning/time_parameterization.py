@@ -64,7 +64,7 @@ class JointPath:
 
 
 def round_corners(waypoints: Array, radius: float) -> JointPath:
-    """Round the corners of a polyline (m, n) by parabolas that start at most ``radius`` rad before a corner."""
+    """Round corners of a polyline (m, n) by parabolas that start at most ``radius`` rad before them."""
     points = np.asarray(waypoints, dtype=np.float64)
     steps = np.diff(points, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
@@ -143,7 +143,7 @@ def _bounds(dof: int, velocity: float, acceleration: float) -> list[Any]:
 
 
 def time_with_stops(waypoints: Array, *, velocity: float, acceleration: float, dt: float) -> Trajectory:
-    """Time a polyline (m, n) as straight segments with a stop at each waypoint: slow, but exactly on the path."""
+    """Time a polyline (m, n) with a stop at each waypoint: slow, but exactly on the path."""
     points = np.asarray(waypoints, dtype=np.float64)
     steps = np.diff(points, axis=0)
     largest = np.abs(steps).max(axis=1)  # the joint with the largest displacement determines the time

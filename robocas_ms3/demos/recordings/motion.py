@@ -1,4 +1,4 @@
-"""Sample the control steps of an episode at the rate of a dataset, and compute motion and commands in between.
+"""Sample episodes at the rate of a dataset; compute motion and commands between samples.
 
 An episode of S control steps has states 0..S. With a stride of k control steps per dataset step, the dataset contains
 the states 0, k, 2k, ... and the last state S, so that the goal is always included. If k is not a divisor of S, the last
@@ -201,7 +201,7 @@ class Motion:
 
 
 def gripper_commands(actions: NDArray[np.floating], control_mode: str) -> NDArray[np.floating]:
-    """Return the gripper commands (S,) of actions (S, A): column 6 in ``_ee_`` control modes, else column 7."""
+    """Return gripper commands (S,) of actions (S, A): column 6 in ``_ee_`` modes, else column 7."""
     return actions[:, 6 if "_ee_" in control_mode else 7]
 
 

@@ -83,7 +83,7 @@ def open_trajectory(path: Path) -> h5py.File:
 
 
 def open_episode(file: h5py.File, number: int) -> h5py.Group:
-    """Return an episode of an open trajectory; raise ``DatasetError`` if it contains links to other places."""
+    """Return an episode of an open trajectory; raise ``DatasetError`` if it contains links."""
     name = f"traj_{number}"
     where = f"{file.filename}, {name}"
     bad_links: list[bytes] = []

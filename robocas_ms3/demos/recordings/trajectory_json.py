@@ -94,7 +94,7 @@ class RunRecord(_Record):
 
 
 class TrajectoryRecord(_Record):
-    """The file. Episode entries are validated one by one, so that one damaged entry does not affect the others."""
+    """The file. Episode entries are validated one by one, so that a damaged one affects no other."""
 
     env_info: _EnvRecord
     episodes: list[_ListedRecord]

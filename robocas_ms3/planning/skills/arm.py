@@ -164,7 +164,7 @@ class Arm:
 
 
 def first_plan(candidates: Iterable[T], plan: Callable[[T], Plan], failure: PlanningError) -> Plan:
-    """Return the plan of the first feasible candidate; raise the last error, or ``failure`` without candidates."""
+    """Return the plan of the first feasible candidate; raise the last error, or ``failure``."""
     for candidate in candidates:
         try:
             return plan(candidate)

@@ -76,7 +76,7 @@ def _try_base_poses(arm: Arm, drive_to: Callable[[bool], None], act: Callable[[]
 
 
 def drive_to_object(arm: Arm, slot: int, *, relocate: bool = False) -> None:
-    """Fold the arm and drive within comfortable reach of an object; skip this in reach unless ``relocate``."""
+    """Drive with a folded arm to where an object is in reach; stay if it is, unless ``relocate``."""
     if not arm.executor.drives_base:
         return
     with arm.planning_time():
@@ -105,7 +105,7 @@ def drive_to_object(arm: Arm, slot: int, *, relocate: bool = False) -> None:
 
 
 def drive_to_handle(arm: Arm, *, relocate: bool = False) -> None:
-    """Fold the arm and drive to where it can pull the handle; skip this in reach unless ``relocate``."""
+    """Drive with a folded arm to where the handle can be pulled; stay if it can, unless ``relocate``."""
     if not arm.executor.drives_base:
         return
     part = MovingPart.of(arm)
@@ -192,7 +192,7 @@ def find_clear_grasps(arm: Arm, slot: int) -> Array:
 def reachable_fraction(
     arm: Arm, base: Array, grasps: Array, others: list[Obstacle], *, thorough: bool = False
 ) -> float:
-    """Return the fraction of grasps (with pre-grasps) that the arm reaches from a base pose without collisions.
+    """Return the fraction of grasps (with pre-grasps) that are reachable from a base pose.
 
     Args:
         arm: context of the attempt.
@@ -217,7 +217,7 @@ def reachable_fraction(
 
 
 def _sample_grasp_poses(arm: Arm, frame: Array, grasps: Array, count: int) -> Array:
-    """Return poses (4K, 4, 4) in an arm's base frame: K <= ``count`` grasps, their half turns, and pre-grasps."""
+    """Return poses (4K, 4, 4) of K <= ``count`` grasps, their half turns, and pre-grasps."""
     chosen = _graspable_from(arm, frame, grasps)
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(count, len(chosen))).round().astype(int)]
     poses = inverse(frame) @ np.concatenate([chosen, chosen @ HALF_TURN])

@@ -115,7 +115,7 @@ def find_best_route(
 
 
 def find_free_route(arm: Arm, start: Array, goal: Array, around: Surroundings, *, leaving: bool) -> list[Array] | None:
-    """Return base poses of a free route, straight or via a pose behind its narrow end; None without a free route.
+    """Return base poses of a free route, straight or via a pose behind its narrow end, or None.
 
     With ``leaving``, the narrow end is ``start``, and the robot drives back first. Else it is ``goal``, and the robot
     drives forward last.

@@ -53,7 +53,7 @@ def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, skip_kinds: int = 0
 
 
 def plan_grasp(arm: Arm, slot: int, lift_height: float, skip_kinds: int = 0) -> tuple[Trajectory, ExitMotions]:
-    """Plan motions to the best feasible grasp and out of the object's surroundings; return approach and exit."""
+    """Plan the approach to the best feasible grasp and the exit from the object's surroundings."""
     planner, failure = arm.planner, PlanningError("grasp_sampling", "no_feasible_grasp")
     everything, others = arm.scene.obstacles(), arm.scene.obstacles(exclude=slot)
     with_room = arm.scene.obstacles(clearance=CLEARANCE)
@@ -156,7 +156,7 @@ def _skip_kinds(tcp: Array, count: int) -> list[int]:
 
 
 def _filter_clear(tcp_in_base: Array, order: NDArray[np.int_], points_in_base: Array) -> Iterator[int]:
-    """Yield grasps in ``order`` whose gripper touches no point during the approach; tested in small batches."""
+    """Yield grasps in ``order`` whose gripper touches no point during the approach."""
     for first in range(0, len(order), CLEARED_AT_ONCE):
         some = order[first : first + CLEARED_AT_ONCE]
         yield from some[is_gripper_clear(tcp_in_base[some], points_in_base)].tolist()

@@ -55,7 +55,9 @@ def load_object_meshes(arm: Arm) -> None:
 
 
 def hidden_fraction(arm: Arm, slot: int) -> float:
-    """Return the share of an object that other objects hide from the gripper's camera; 1 where it is out of view.
+    """Return the fraction of an object hidden from the gripper camera by other objects.
+
+    It is 1 for an object out of view.
 
     By ray casting, so that no renderer is needed; the robot is left out.
     """

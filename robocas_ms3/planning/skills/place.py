@@ -26,7 +26,7 @@ MAX_OFFSET_FRACTION = 0.25  # maximum offset of the centre of mass from the midd
 
 @dataclass(frozen=True)
 class ContainerInterior:
-    """Interior box of a container: corners ``low`` and ``high`` (3,), m, in the frame of the container (4x4)."""
+    """Interior box of a container: corners ``low`` and ``high`` (3,), m, in the container's frame."""
 
     container_in_base: Array
     low: Array
@@ -130,7 +130,7 @@ def attach_held(arm: Arm, slot: int) -> None:
 
 
 def sample_drop_poses(arm: Arm, slot: int, arm_base_in_world: Array) -> Array:
-    """Sample TCP poses (N, 4, 4) that hold an object above the basket, in the frame of an arm's base (4x4)."""
+    """Sample TCP poses (N, 4, 4) that hold an object above the basket, in the arm's base frame."""
     object_in_tcp, vertices = held_object(arm, slot)
     center_of_mass = np.array([arm.env.object_assets[0][slot].asset.center_of_mass])
     return sample_drops(

@@ -154,7 +154,7 @@ def upright_rotation(vertices: Array, center_of_mass: Array) -> Array:
 def find_free_places(
     vertices: Array, others: Array, frame: Array, half: Array, margin: float = EDGE_MARGINS[-1]
 ) -> Array:
-    """Return transforms (n, 4, 4) of a held object to free positions on a surface, with several yaw angles.
+    """Return transforms (n, 4, 4) of a held object to free positions on a surface.
 
     Args:
         vertices: (V, 3) vertices of the held object in the arm's base frame, m.
