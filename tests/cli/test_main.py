@@ -102,7 +102,6 @@ MISTAKES = {  # arguments -> text of the error, printed before anything heavy is
     "convert missing.h5 --out o --overwrite --append": "--overwrite: ",
     "eval report": "DIR: missing result folder",
     "plan status missing": "missing: not the output folder of a plan",
-    "plan join missing": "missing: not the output folder of a plan",
     "import-robocas missing": "missing: no dataset here",
     "eval pik": "Did you mean pick?",
     "eval comparre x": "Did you mean compare?",

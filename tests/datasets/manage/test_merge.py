@@ -228,7 +228,7 @@ def test_command(parts, tmp_path, capsys):
 
 def test_the_command_wants_datasets(tmp_path, capsys):
     assert run(["merge", "--out", str(tmp_path / "out")]) == 1
-    assert "no datasets to merge" in capsys.readouterr().err
+    assert "missing dataset folders" in capsys.readouterr().err
 
 
 def test_a_merged_dataset_can_be_appended_to(parts, tmp_path):
