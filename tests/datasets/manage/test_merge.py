@@ -227,7 +227,7 @@ def test_command(parts, tmp_path, capsys):
 
 
 def test_the_command_wants_datasets(tmp_path, capsys):
-    assert run(["merge", "--out", str(tmp_path / "out")]) == 1
+    assert run(["merge", "--out", str(tmp_path / "out")]) == 2
     assert "missing dataset folders" in capsys.readouterr().err
 
 
