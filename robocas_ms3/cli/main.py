@@ -98,9 +98,9 @@ def run(argv: Sequence[str]) -> int:
     if arguments[:1] == ["--version"]:
         return _write_line(f"robocas {__version__}", sys.stdout, 0)
     if not debug:
-        # ManiSkill's logger (the blank is in its name) remarks on its own installation, and on CPUs without a GPU.
+        # ManiSkill warns about its own installation and about machines without a GPU (its name ends with a blank)
         logging.getLogger("mani_skill ").addFilter(lambda record: record.levelno >= logging.ERROR)
-        logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # it says that it looks for fonts
+        logging.getLogger("matplotlib.font_manager").setLevel(logging.ERROR)  # it logs each search for fonts
     escape_log_lines()
     try:
         command, settings = parse(arguments)
