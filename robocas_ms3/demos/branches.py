@@ -149,7 +149,7 @@ class ForkedDecisions:
         except CandidatesExhaustedError:
             succeeded = False
         except PlanningError as error:
-            self._result.failed(error)
+            self._result.add_failure(error)
             succeeded = False
         except BaseException as error:
             if self._pipe is not None:
@@ -178,7 +178,7 @@ class ForkedDecisions:
                     if again is None:
                         return candidate
                     if isinstance(failure, PlanningError) or not self._continue_as(again):
-                        self._result.failed(PlanningError("branch", "crashed"))
+                        self._result.add_failure(PlanningError("branch", "crashed"))
         finally:
             self._kill_children()
 
@@ -233,7 +233,7 @@ class ForkedDecisions:
         except ForkedProcessCrashError:
             return False
         except ForkedProcessError as error:
-            self._result.failed(PlanningError("branch", str(error)))
+            self._result.add_failure(PlanningError("branch", str(error)))
             return True
         finally:
             self._kill(child)

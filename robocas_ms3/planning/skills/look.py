@@ -57,9 +57,7 @@ def load_object_meshes(arm: Arm) -> None:
 def hidden_fraction(arm: Arm, slot: int) -> float:
     """Return the fraction of an object hidden from the gripper camera by other objects.
 
-    It is 1 for an object out of view.
-
-    By ray casting, so that no renderer is needed; the robot is left out.
+    The fraction is 1 for an object out of view. It is computed by ray casting without the robot, which needs no renderer.
     """
     env = arm.env
     config = _camera_config(arm)
@@ -69,8 +67,8 @@ def hidden_fraction(arm: Arm, slot: int) -> float:
     slots = np.flatnonzero(env.present[0].cpu().numpy()).tolist()
     poses = np.stack([arm.scene.arm_base_in_world @ arm.scene.object_in_base(s) for s in slots])
     scenery = MeshScene([object_mesh(env.object_assets[0][s]) for s in slots], poses)
-    share = float(scenery.visible_fractions(camera)[slots.index(slot)])
-    return 1.0 if np.isnan(share) else 1.0 - share
+    fraction = float(scenery.visible_fractions(camera)[slots.index(slot)])
+    return 1.0 if np.isnan(fraction) else 1.0 - fraction
 
 
 def camera_in_base(arm: Arm) -> Array:
@@ -85,10 +83,10 @@ def camera_in_base(arm: Arm) -> Array:
 
 
 def _shift(arm: Arm) -> Array:
-    by = arm.env.task_config.randomisation.cameras
-    if by is None:
+    randomisation = arm.env.task_config.randomisation.cameras
+    if randomisation is None:
         return np.eye(4)
-    return draw_camera_shift(by, arm.env.agent.cameras.index(_hand_camera(arm)), arm.env.scene_seeds[0])
+    return draw_camera_shift(randomisation, arm.env.agent.cameras.index(_hand_camera(arm)), arm.env.scene_seeds[0])
 
 
 def _hand_camera(arm: Arm) -> CameraSpec:
