@@ -147,7 +147,7 @@ def test_a_pull_opens_by_contact_and_leaves_the_handle(tmp_path):
         open_furniture_part(arm)
         assert set(touched) == {part.handle.link}  # and nothing else in the scene
         assert touched[part.handle.link] < 0.002
-        assert part.position(arm) == pytest.approx(0.95 * part.end, abs=0.01)
+        assert part.position(arm) == pytest.approx(0.95 * part.open_limit, abs=0.01)
         assert bool(arm.env.furniture_opened()[0])
         # the gripper is open and off the handle
         bar = part.in_world(arm, np.array([part.position(arm)]))[0] @ part.grasp_in_part
