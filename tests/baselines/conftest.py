@@ -1,11 +1,11 @@
-"""A made-up baseline, and a small dataset for real ones."""
+"""A registered stub baseline, and a small dataset for real baselines."""
 
 import os
 from dataclasses import replace
 
 import pytest
 from short_protocols import shorten
-from stub_baseline import MADE_UP
+from stub_baseline import STUB
 from synthetic_dataset import synthetic_dataset
 from training_runs import train
 
@@ -14,20 +14,20 @@ from robocas_ms3.cli.train import COMMANDS, PluginBaseline, command
 
 
 @pytest.fixture
-def made_up(monkeypatch):
-    """A function that changes the made-up baseline, which is registered."""
+def stub(monkeypatch):
+    """Register the stub baseline; return a function that changes it."""
 
     def change(**values):
-        monkeypatch.setitem(BASELINES.builtin, "made-up", lambda: replace(MADE_UP, **values))
+        monkeypatch.setitem(BASELINES.builtin, "stub", lambda: replace(STUB, **values))
 
     change()
-    monkeypatch.setitem(COMMANDS, "made-up", command("made-up", PluginBaseline))
+    monkeypatch.setitem(COMMANDS, "stub", command("stub", PluginBaseline))
     return change
 
 
 @pytest.fixture(scope="session")
 def short(tmp_path_factory):
-    """A protocol: three episodes of paper-v1, 60 steps each."""
+    """Return a protocol with three episodes of paper-v1, 60 steps each."""
     return str(shorten("paper-v1", tmp_path_factory.mktemp("protocol") / "short", 60, episodes=3))
 
 
@@ -46,12 +46,12 @@ def usual_umask():
 
 
 @pytest.fixture
-def whole(usual_umask, made_up, data, tmp_path):
-    train("made-up", data, tmp_path / "whole")
+def whole(usual_umask, stub, data, tmp_path):
+    train("stub", data, tmp_path / "whole")
     return tmp_path / "whole"
 
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
-    """A dataset of six episodes of seven steps, 64 x 48 images, that nobody may change; five are to train on."""
+    """Return a read-only dataset of six episodes of seven steps, 64 x 48 images; five are in the training split."""
     return synthetic_dataset(tmp_path_factory.mktemp("baselines"))

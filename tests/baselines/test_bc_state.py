@@ -1,4 +1,4 @@
-"""`bc-state`: what it reads from a trajectory and caches, and what it refuses."""
+"""`bc-state`: reading and caching of states, and refused trajectories."""
 
 import json
 from importlib.metadata import version
@@ -25,7 +25,7 @@ def read(path, **config):
 
 @pytest.fixture
 def simulator(monkeypatch, tmp_path):
-    """Replaces the simulator by one with given states, one after the other, the last for good; counts its envs."""
+    """Replace the simulator by a stub that returns given states in turn (then the last one) and counts its envs."""
     monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "cache"))
     env, made = SimpleNamespace(reset=lambda **_: None, close=lambda: None, unwrapped=None), []
     monkeypatch.setattr(RecordedEnv, "make", lambda self, **_: made.append(1) or env)
@@ -71,10 +71,10 @@ def change_json(path, change):
         lambda values: values["env_info"]["env_kwargs"].update(config="pick_upstream_eval"),
         lambda values: values["episodes"][0]["reset_kwargs"].update(seed=17),
         *("robocas-ms3", "mani_skill", "sapien"),  # another version of these
-        *(0, 50, 400),  # bytes that are left of the cache
+        *(0, 50, 400),  # remaining bytes of the cache file
     ],
 )
-def test_other_data_another_version_or_a_damaged_cache_is_read_again(
+def test_states_are_read_again_for_other_data_versions_or_a_damaged_cache(
     simulator, trajectory, tmp_path, monkeypatch, change
 ):
     made = simulator([1.0])
@@ -96,10 +96,10 @@ def test_other_data_another_version_or_a_damaged_cache_is_read_again(
     [
         ([[1.0, np.nan]], ", state"),
         ([[1.0, 2.0], [np.inf, 2.0], [1.0, 2.0]], ", state"),
-        ([*[[1.0, 2.0]] * 7, [1.0, 2.0, 3.0]], ", episode 1"),  # as many as are sampled of the first episode
+        ([*[[1.0, 2.0]] * 7, [1.0, 2.0, 3.0]], ", episode 1"),  # one per sample of the first episode
     ],
 )
-def test_states_that_can_not_be_learned_from(simulator, trajectory, tmp_path, states, where):
+def test_invalid_states_are_refused(simulator, trajectory, tmp_path, states, where):
     simulator(*states)
     with pytest.raises(DatasetError) as caught:
         read(trajectory)
@@ -107,7 +107,7 @@ def test_states_that_can_not_be_learned_from(simulator, trajectory, tmp_path, st
     assert not cached(tmp_path)
 
 
-def test_what_is_no_trajectory_with_successes(simulator, tmp_path):
+def test_files_without_successful_episodes_are_refused(simulator, tmp_path):
     simulator([1.0])
     failed = write_trajectory(tmp_path / "F.h5", seeds=(3,), failed=(0,))
     for path in (failed, tmp_path, tmp_path / "data_info.json"):
@@ -116,8 +116,8 @@ def test_what_is_no_trajectory_with_successes(simulator, tmp_path):
         assert caught.value.where == path
 
 
-def test_samples_are_learned_and_a_policy_sees_the_same(simulator, trajectory):
-    """The loss falls, and the policy does what the network predicts for the sample of a step."""
+def test_samples_are_learned_and_the_policy_has_the_same_inputs(simulator, trajectory):
+    """The loss falls, and the policy executes the network's prediction for the sample of a step."""
     simulator([1.0, 2.0])
     config = BcStateConfig(width=64, blocks=2, dropout=0, noise=0)
     samples = read(trajectory)

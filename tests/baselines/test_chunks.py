@@ -1,4 +1,4 @@
-"""Chunks of poses: their encoding, what they are trained by, and how a policy follows them."""
+"""Action chunks of poses: encoding, loss and policy."""
 
 from types import SimpleNamespace
 
@@ -22,16 +22,16 @@ from robocas_ms3.baselines.chunks import (
 from robocas_ms3.evaluation.policy import PolicySpec
 
 
-def test_a_chunk_by_hand():
+def test_encoding_of_a_chunk():
     poses = np.tile(np.eye(4), (3, 1, 1))
-    quarter = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]  # about z
+    quarter = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]  # 90 degrees about z
     poses[0, :3, :3] = quarter
     poses[1, :3, 3] = poses[2, :3, 3] = 0, 0.5, 0.25
     rows = encode_chunks(poses, [True, True, False], 3)
-    # along y of the base is along x of a TCP that is turned by a quarter; its x axis then points along the base's y
+    # y of the base is x of a TCP rotated by 90 degrees; its x axis then points along y of the base
     assert np.allclose(rows[0, 0], [0.5, 0, 0.25, 0, -1, 0, 1, 0, 0, 1])
     assert np.allclose(rows[0, 1, 9], 0)
-    assert np.allclose(rows[0, 2], rows[0, 1])  # beyond the end it stays
+    assert np.allclose(rows[0, 2], rows[0, 1])  # after the end the last pose repeats
     assert np.allclose(rows[2], [0, 0, 0, 1, 0, 0, 0, 1, 0, 0])
 
 
@@ -57,15 +57,15 @@ def test_any_prediction_becomes_a_rotation(seed):
     assert np.allclose(np.linalg.det(poses[:, :3, :3]), 1)
 
 
-def test_key_poses_are_where_the_gripper_moves_next():
+def test_key_poses_are_at_the_next_gripper_command():
     poses = np.tile(np.eye(4), (7, 1, 1))
     poses[:, 0, 3] = [0, 1, 2, 3, 4, 5, 6]
-    # commanded to close between steps 2 and 3, to open between 4 and 5: it does so at 2 and 4; then the end
+    # commands: close after step 2, open after step 4; then the end of the episode
     keys = next_key_poses(poses, [1, 1, 1, 0, 0, 1, 1])
     assert keys[:, 0].tolist() == [2, 1, 0, 1, 0, 1, 0]
 
 
-def test_scale_and_back():
+def test_scale_and_inverse():
     motions = np.array([[[0.0] * 9], [[1.0] * 9]])  # two samples of one step: mean 0.5, deviation 0.5
     scale = Scale(**scale_statistics(motions))
     assert torch.allclose(scale(torch.ones(1, 9)), torch.ones(1, 9))
@@ -87,14 +87,14 @@ def losses(near_distance):
     return chunk_losses(model, {"chunk": chunk, "key": key}, found, key + 0.003)
 
 
-def test_losses_by_hand():
+def test_losses():
     found = losses(near_distance=0.0)
     assert found["motion"].item() == pytest.approx(0.3 / 9 / 2)
-    assert found["gripper"].item() == pytest.approx(0.693147)  # even odds
+    assert found["gripper"].item() == pytest.approx(0.693147)  # log(2): probability 0.5
     assert found["keys"].item() == pytest.approx(0.003)
     assert found["loss"].item() == pytest.approx(0.3 / 18 + 0.5 * 0.693147 + 2 * 0.003)
     assert found["first_mm"].item() == found["last_mm"].item() == pytest.approx(150)
-    assert found["near_mm"].tolist() == [2 * found["key_mm"].item(), 2.0]  # of both
+    assert found["near_mm"].tolist() == [2 * found["key_mm"].item(), 2.0]  # of both samples
     assert found["key_mm"].item() == pytest.approx(3 * 3**0.5)
     weighted = losses(near_distance=0.1)["motion"].item()
     assert weighted == pytest.approx(0.3 / 9 * 2 / 3)  # weights 1/2 and 1/4 with 0.1 m
@@ -108,7 +108,7 @@ HERE = [0.5, 0, 0.3, 1, 0, 0, 0]
 
 
 def policy(*chunks, n_action_steps=1, temporal_ensemble_coeff=0.0, reopen=0.0):
-    """A policy of envs 0 and 1 that predicts given chunks, one after the other."""
+    """Return a policy for envs 0 and 1 that predicts the given chunks in turn."""
     rest = iter(chunks)
     made = ChunkPolicy(
         PolicySpec(),
@@ -127,19 +127,19 @@ def act(policy, *tcps, envs=(0,), width=0.0):
     return policy.act(observe(envs, tcp_in_base=tcps, gripper_width=widths))
 
 
-def test_a_first_chunk_is_followed():
+def test_first_chunk_is_executed():
     acting = policy([row(0.1), row(0.2)])
     assert act(acting) == pytest.approx(np.array([[0.1, 0, 0, 0, 0, 0, 1]]), abs=1e-6)
 
 
-def test_older_predictions_are_of_the_same_step_and_frame():
-    """Sent to 0.1 then 0.2, it stays where it was; then sent to 0.4: the mean of 0.2, predicted before, and 0.4."""
+def test_older_predictions_are_for_the_same_step_and_frame():
+    """The TCP stays where it was; an older chunk says 0.2 for this step, the new one 0.4: the target is their mean."""
     acting = policy([row(0.1), row(0.2)], [row(0.4), row(0.5)])
     act(acting)
     assert act(acting)[0, 0] == pytest.approx(0.3)
     acting = policy([row(0.1), row(0.2)], [row(0.1), row(0.2)])
     act(acting)
-    late = [0.56, *HERE[1:]]  # 0.04 short of where it was to be: before 0.7 was wanted now, and now 0.66
+    late = [0.56, *HERE[1:]]  # 0.04 short of its target: the older prediction is 0.7, the newer 0.66
     assert act(acting, late)[0, 0] == pytest.approx((0.7 + 0.66) / 2 - 0.56)
 
 
@@ -151,15 +151,15 @@ def test_newer_predictions_weigh_more():
     assert action[6] == 1.0
 
 
-def test_a_chunk_is_followed_before_the_next():
-    """For two of three steps; then the mean of its third row and the first of the next."""
+def test_n_action_steps_are_executed_before_the_next_prediction():
+    """Two of three steps; then the mean of the third row and the first row of the next chunk."""
     acting = policy([row(0.1), row(0.2), row(0.3)], [row(0.5), row(), row()], n_action_steps=2)
     assert acting.spec.observe_every == 2
     assert [act(acting)[0, 0] for _ in range(3)] == pytest.approx([0.1, 0.2, 0.4])
 
 
 def test_each_env_has_its_own_chunks():
-    """A reset forgets those of one env."""
+    """A reset drops the chunks of one env."""
     acting = policy(*[[row(0.2), row(0.2)]] * 2, *[[row(0.4), row()]] * 2)
     act(acting, envs=(0, 1))
     acting.reset([start(1)])
@@ -176,26 +176,26 @@ CLOSED = [row(0.0, 0.0), row(0.0, 0.0)]
 @pytest.mark.parametrize(
     ("reopen", "width", "moved", "opened"),
     [
-        (0.02, 0.001, 0.015, 1.0),  # it closed on nothing and waits
+        (0.02, 0.001, 0.015, 1.0),  # closed on nothing, not moving
         (0.0, 0.001, 0.0, 0.0),  # switched off
-        (0.02, 0.03, 0.0, 0.0),  # it holds something
-        (0.02, 0.001, 0.025, 0.0),  # it pushes
+        (0.02, 0.03, 0.0, 0.0),  # holds an object
+        (0.02, 0.001, 0.025, 0.0),  # pushes
     ],
 )
-def test_the_reopen_heuristic(reopen, width, moved, opened):
+def test_reopen_heuristic(reopen, width, moved, opened):
     acting = policy(CLOSED, CLOSED, temporal_ensemble_coeff=2.0, reopen=reopen)
     assert act(acting, width=width)[0, 6] == 0.0
     assert act(acting, [HERE[0] + moved, *HERE[1:]], width=width)[0, 6] == opened
 
 
 def test_older_chunks_do_not_keep_an_empty_gripper_closed():
-    """All predictions have the same weight, and five of six want it closed."""
+    """Five of six predictions, of equal weight, say closed."""
     acting = policy(*[[row(0.0, 0.0)] * 8] * 6, reopen=0.02)
-    path = [[HERE[0] + 0.1 * place, *HERE[1:]] for place in range(5)]  # it moves, then stays
+    path = [[HERE[0] + 0.1 * place, *HERE[1:]] for place in range(5)]  # moves, then stops
     assert [act(acting, here)[0, 6] for here in [*path, path[-1]]] == [0, 0, 0, 0, 0, 1]
 
 
-def test_the_reopen_heuristic_forgets_where_another_episode_ended():
+def test_reopen_heuristic_is_reset_with_the_episode():
     acting = policy(CLOSED, CLOSED, temporal_ensemble_coeff=2.0, reopen=0.02)
     for _ in range(2):
         acting.reset([start(0)])
@@ -203,6 +203,6 @@ def test_the_reopen_heuristic_forgets_where_another_episode_ended():
 
 
 def test_motions_are_in_the_frame_of_the_tcp():
-    turned = [0.5, 0, 0.3, np.sqrt(0.5), 0, 0, np.sqrt(0.5)]  # a quarter about z
-    quarter = [0.1, 0, 0, 0, 1, 0, -1, 0, 0, 0.2]  # on by 0.1 along its x, and turned by a quarter about its z
+    turned = [0.5, 0, 0.3, np.sqrt(0.5), 0, 0, np.sqrt(0.5)]  # 90 degrees about z
+    quarter = [0.1, 0, 0, 0, 1, 0, -1, 0, 0, 0.2]  # 0.1 along its x axis, and 90 degrees about its z axis
     assert act(policy([quarter]), turned)[0] == pytest.approx([0.1, 0, 0, 0, 0, np.pi / 2, 0], abs=1e-6)

@@ -1,4 +1,4 @@
-"""Datasets whose mobile base drives, or whose TCP is turned, are refused; a base that trembles stands."""
+"""Refused datasets: base motion, rotated TCP frame, NaN, missing cameras or embeddings."""
 
 import json
 import shutil
@@ -29,7 +29,7 @@ def read(name, path, split="train"):
 
 
 def spoil_arrays(folder, number, **columns):
-    """Write a NaN, or add values to columns of an array."""
+    """Write a NaN, or add values, to columns of an array."""
     path = folder / f"episode_{number:07d}" / "episode_info.npz"
     arrays = dict(np.load(path))
     for key, change in columns.items():
@@ -46,7 +46,7 @@ def set_values(folder, name="conversion.json", **values):
 @pytest.mark.parametrize(
     "values", [{"embeddings": False}, {"cameras": ["base_camera"]}, {"cameras": []}, {"rate_hz": 10.0}], ids=str
 )
-def test_a_dataset_without_what_a_baseline_needs(name, values, folder, tmp_path):
+def test_missing_cameras_embeddings_or_another_rate_are_refused(name, values, folder, tmp_path):
     copy = shutil.copytree(folder, tmp_path / "dataset")
     set_values(copy, **values)
     with pytest.raises(DatasetError) as caught:
@@ -55,7 +55,7 @@ def test_a_dataset_without_what_a_baseline_needs(name, values, folder, tmp_path)
 
 
 @pytest.mark.parametrize("name", LEARNERS)
-def test_a_split_without_episodes(name, folder, tmp_path):
+def test_empty_split_is_refused(name, folder, tmp_path):
     copy = shutil.copytree(folder, tmp_path / "dataset")
     set_values(copy, "data_info.json", val_eps=[])
     with pytest.raises(EmptySplitError):
@@ -66,7 +66,7 @@ def test_a_split_without_episodes(name, folder, tmp_path):
     ("name", "key"),
     [("rt1", "rel_pos"), ("rt1", "language_embedding"), ("small", "ee_pos"), ("small", "gripper_width")],
 )
-def test_nan_is_found_before_the_first_step(name, key, folder, tmp_path):
+def test_nan_is_found_before_training(name, key, folder, tmp_path):
     copy = shutil.copytree(folder, tmp_path / "dataset")
     number = open_source(copy).split("train")[-1]
     spoil_arrays(copy, number, **{key: lambda values: np.nan})
@@ -75,7 +75,7 @@ def test_nan_is_found_before_the_first_step(name, key, folder, tmp_path):
     assert str(caught.value.where).endswith(f"episode {number}, {key}")
 
 
-def test_a_base_that_trembles_stands():
+def test_small_base_motion_is_allowed():
     motion = np.zeros((200, 3), np.float32)
     motion[::2], motion[1::2] = 1e-4, -1e-4
     check_base_is_fixed(motion, "here")
@@ -84,7 +84,7 @@ def test_a_base_that_trembles_stands():
 
 @pytest.mark.parametrize("column", [0, 1, 2])
 @pytest.mark.parametrize("rows", [[0.02, 0, 0], [0.02, -0.02, 0], [0.002] * 10, [-0.002] * 10, [0, np.nan, 0]])
-def test_a_base_that_drives_in_one_step_or_slowly(column, rows):
+def test_fast_and_slow_base_motion_is_refused(column, rows):
     motion = np.zeros((len(rows), 3))
     motion[:, column] = rows
     with pytest.raises(DatasetError) as caught:
@@ -93,7 +93,7 @@ def test_a_base_that_drives_in_one_step_or_slowly(column, rows):
 
 
 @pytest.mark.parametrize(("name", "split"), [("rt1", "train"), ("small", "val")])
-def test_baselines_refuse_a_base_that_drives(folder, tmp_path, name, split):
+def test_baselines_refuse_base_motion(folder, tmp_path, name, split):
     copy = shutil.copytree(folder, tmp_path / "dataset")
     number = open_source(copy).split(split)[0]
     spoil_arrays(copy, number, rel_agv_pose=lambda motion: motion + np.float32([0.08, 0, 0]))
@@ -102,7 +102,7 @@ def test_baselines_refuse_a_base_that_drives(folder, tmp_path, name, split):
     assert caught.value.where == f"{copy}, episode {number}"
 
 
-def test_bc_state_refuses_it_before_it_makes_an_environment(tmp_path, monkeypatch):
+def test_bc_state_refuses_base_motion_before_making_an_environment(tmp_path, monkeypatch):
     monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "cache"))
     path = write_trajectory(tmp_path / "F.h5")
     with h5py.File(path, "r+") as file:
@@ -115,7 +115,7 @@ def test_bc_state_refuses_it_before_it_makes_an_environment(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(("name", "camera", "turn"), [("rt1", (0.0, 0.05), -90), ("small", (0.0, -0.05), 90)])
-def test_actions_of_a_turned_tcp_are_refused(folder, tmp_path, name, camera, turn):
+def test_actions_in_a_rotated_tcp_frame_are_refused(folder, tmp_path, name, camera, turn):
     """ManiSkill's gripper camera is on the x side of its TCP."""
     copy = shutil.copytree(folder, tmp_path / "dataset")
     for path in copy.glob("episode_*/gripper_camera/cam_pos*_wrt_ee.npy"):
@@ -123,15 +123,15 @@ def test_actions_of_a_turned_tcp_are_refused(folder, tmp_path, name, camera, tur
         pose[:2, 3] = camera
         np.save(path, pose)
     read(name, copy)  # a configuration may move the camera
-    for episode in copy.glob("episode_*"):  # as of a dataset made elsewhere
+    for episode in copy.glob("episode_*"):  # as in a dataset of another package
         set_values(episode, "scene.json", env_info=None)
     with pytest.raises(DatasetError) as caught:
         read(name, copy)
     assert f"{turn} degrees" in caught.value.found and "import-robocas" in caught.value.fix
 
 
-def test_without_a_gripper_camera_a_scene_is_needed(folder, tmp_path):
-    """RoboCAS-v0's episodes have none."""
+def test_without_gripper_camera_scene_json_is_needed(folder, tmp_path):
+    """Episodes of RoboCAS-v0 have no scene.json."""
     copy = shutil.copytree(folder, tmp_path / "dataset")
     set_values(copy, cameras=["base_camera"])
     check_tcp_frame(open_source(copy), 0)

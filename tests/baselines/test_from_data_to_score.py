@@ -1,4 +1,4 @@
-"""From demonstrations to a score: generate, convert, train, eval."""
+"""End-to-end: generate, convert, train, eval."""
 
 import json
 
@@ -15,7 +15,7 @@ TINY += ["--set", "views.gripper_camera={rendered: [64, 48], size: [64, 48]}", "
 
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory):
-    """Two episodes in the scenes of paper-v1; the seeds of one of them validate."""
+    """Return two episodes in the scenes of paper-v1; one is the validation split."""
     out = tmp_path_factory.mktemp("demos") / "pick"
     words = ["generate", "pick", "--config", "pick_upstream_eval", "-n", "2", "--seed", str(SEED), "--out", str(out)]
     assert run([*words, "--check-rate", "0"]) == 0
@@ -41,9 +41,11 @@ def test_bc_state(demos, tmp_path, monkeypatch):
 
     samples = BASELINE.data(BcStateConfig(), demos, "train", lambda done, total: None)
     batch = samples.__getitems__(list(range(len(samples))))
-    to_target = batch["inputs"][:, -19:-16].numpy()  # tcp_to_target; then 3 towards the goal, 3 extents, 10 of the arm
-    assert np.linalg.norm(to_target[0]) > 0.1  # it begins away from the target,
-    assert np.linalg.norm(to_target, axis=1).min() < 0.03  # and takes it
+    to_target = batch["inputs"][
+        :, -19:-16
+    ].numpy()  # tcp_to_target; after it 3 values to the goal, 3 extents, 10 of the arm
+    assert np.linalg.norm(to_target[0]) > 0.1  # it starts away from the target,
+    assert np.linalg.norm(to_target, axis=1).min() < 0.03  # and grasps it
 
 
 @pytest.mark.slow

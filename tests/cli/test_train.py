@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from stub_baseline import MADE_UP
+from stub_baseline import STUB
 
 from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.cli.main import run
@@ -13,9 +13,9 @@ from robocas_ms3.cli.train import COMMANDS, PluginBaseline, Training, command, c
 
 
 @pytest.fixture
-def made_up(monkeypatch):
-    monkeypatch.setitem(BASELINES.builtin, "made-up", lambda: MADE_UP)
-    monkeypatch.setitem(COMMANDS, "made-up", command("made-up", PluginBaseline))
+def stub(monkeypatch):
+    monkeypatch.setitem(BASELINES.builtin, "stub", lambda: STUB)
+    monkeypatch.setitem(COMMANDS, "stub", command("stub", PluginBaseline))
 
 
 def test_options_override_the_file_and_later_options_earlier_ones(tmp_path):
@@ -38,33 +38,33 @@ def test_options_override_the_file_and_later_options_earlier_ones(tmp_path):
         ("widht: 3", "c.yaml: unknown key 'widht'.*Did you mean width"),
     ],
 )
-def test_invalid_configuration_files(made_up, tmp_path, capsys, content, expected):
+def test_invalid_configuration_files(stub, tmp_path, capsys, content, expected):
     file, data = tmp_path / "c.yaml", tmp_path / "data.h5"
     data.write_text("demonstrations")
     if content is not None:
         file.write_text(content)
-    words = ["train", "made-up", "--data", str(data), "--out", str(tmp_path / "run"), "--config", str(file)]
+    words = ["train", "stub", "--data", str(data), "--out", str(tmp_path / "run"), "--config", str(file)]
     assert run(words) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert re.search(f"^error: .*{expected}", line)
     assert not (tmp_path / "run").exists()
 
 
-def test_unknown_key_of_set_exits_with_2(made_up, tmp_path, capsys):
+def test_unknown_key_of_set_exits_with_2(stub, tmp_path, capsys):
     data, file = tmp_path / "data.h5", tmp_path / "c.yaml"
     data.write_text("demonstrations")
     file.write_text("width: 3\n")
-    words = ["train", "made-up", "--data", str(data), "--out", str(tmp_path / "run"), "--config", str(file)]
+    words = ["train", "stub", "--data", str(data), "--out", str(tmp_path / "run"), "--config", str(file)]
     assert run([*words, "--set", "widht=4"]) == 2
     assert "error: --set: unknown key 'widht'" in capsys.readouterr().err
 
 
-def test_training_from_the_command_line(made_up, tmp_path, monkeypatch, capsys):
+def test_training_from_the_command_line(stub, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("data.h5").write_text("demonstrations")
     options = ["--steps", "8", "--batch-size", "2", "--seed", "5", "--set", "width=3", "--device", "cpu"]
-    assert run(["train", "made-up", "--data", "data.h5", *options]) == 0
-    made = Path("runs") / f"made-up-{tmp_path.name}"  # named by the folder of the trajectory
+    assert run(["train", "stub", "--data", "data.h5", *options]) == 0
+    made = Path("runs") / f"stub-{tmp_path.name}"  # named by the folder of the trajectory
     record = json.loads((made / "run.json").read_text())
     assert record["config"]["width"] == 3
     assert [record["config"]["train"][key] for key in ("steps", "batch_size", "seed")] == [8, 2, 5]

@@ -84,14 +84,14 @@ def read_samples(config, folder, split, on_read):
     return StubSamples(*(bad if split == "train" else (-1, -1)))
 
 
-MADE_UP = Baseline("made-up", 1, StubConfig, StubModel, lambda config, facts, model: StubPolicy(), read_samples)
+STUB = Baseline("stub", 1, StubConfig, StubModel, lambda config, facts, model: StubPolicy(), read_samples)
 
 
 if __name__ == "__main__":
-    BASELINES.builtin["made-up"] = lambda: MADE_UP
+    BASELINES.builtin["stub"] = lambda: STUB
     data, out = map(Path, sys.argv[1:])
-    train("made-up", data, out / "whole")
+    train("stub", data, out / "whole")
     try:
-        train("made-up", data, out / "again", progress=stop_at(17, RuntimeError("stopped")))
+        train("stub", data, out / "again", progress=stop_at(17, RuntimeError("stopped")))
     except RuntimeError:
-        train("made-up", data, out / "again")
+        train("stub", data, out / "again")

@@ -1,4 +1,4 @@
-"""What LeRobot's policies train on, made of a small dataset of ours."""
+"""`prepare` on a small LeRobot export."""
 
 # ruff: noqa: E402
 
@@ -27,7 +27,7 @@ EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
-    """Two episodes with an instruction each."""
+    """Return an export of two episodes with different instructions."""
     folder = tmp_path_factory.mktemp("source")
     convert_lerobot(
         ConversionSettings(write_trajectory(folder / "F.h5", seeds=(3, 4)), folder / "dataset", open_renderer=RayCaster)
@@ -36,7 +36,7 @@ def source(tmp_path_factory):
 
 
 def embed(texts):
-    """Unit vectors, of which one is at the seed that the instruction names."""
+    """Return unit vectors whose nonzero component is the seed in the instruction."""
     return np.stack([np.eye(384, dtype=np.float32)[int(text.split()[3])] for text in texts])
 
 
@@ -50,7 +50,7 @@ def out(source, tmp_path):
     return tmp_path / "out"
 
 
-def test_columns_are_what_the_socket_shows(source, out):
+def test_columns_are_those_of_the_policy_socket(source, out):
     was, now = pq.read_table(source / DATA), pq.read_table(out / DATA)
     assert set(now.column_names) == {
         *(STATE, EMBEDDING, "action", "timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -59,7 +59,7 @@ def test_columns_are_what_the_socket_shows(source, out):
     old, new = numbers(source / DATA, STATE), numbers(out / DATA, STATE)
     np.testing.assert_allclose(new[:, :3], old[:, :3])
     np.testing.assert_allclose(new[:, 9:], old[:, 7:15])
-    x, y, z, w = old[:, 3:7].T  # the rotation's first column, by hand
+    x, y, z, w = old[:, 3:7].T  # first column of the rotation matrix
     np.testing.assert_allclose(
         new[:, 3:6].T, [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)], atol=1e-6
     )
@@ -74,7 +74,7 @@ def test_instructions_are_those_of_their_frames(out):
     assert vectors.max() == pytest.approx(19.5959, abs=1e-4)
 
 
-def test_meta_says_the_same(source, out):
+def test_meta_agrees_with_the_columns(source, out):
     info = json.loads((out / "meta/info.json").read_text())
     assert info["features"][STATE] == {"dtype": "float32", "shape": [17], "names": list(STATE_NAMES)}
     assert info["features"][EMBEDDING]["shape"] == [384]
@@ -103,7 +103,7 @@ def test_videos_are_the_same_files(source, out):
 
 
 @pytest.mark.parametrize("key, value", [("action", np.nan), ("action.base", 0.02)])
-def test_nan_and_a_base_that_drives_are_refused(source, tmp_path, key, value):
+def test_nan_and_base_motion_are_refused(source, tmp_path, key, value):
     spoiled = tmp_path / "spoiled"
     shutil.copytree(source, spoiled)
     table = pq.read_table(spoiled / DATA)
@@ -116,7 +116,7 @@ def test_nan_and_a_base_that_drives_are_refused(source, tmp_path, key, value):
     assert not (tmp_path / "out").exists()
 
 
-def test_other_datasets_are_refused_in_one_line(source, tmp_path, capsys):
+def test_other_datasets_are_one_line_errors(source, tmp_path, capsys):
     convert_lerobot(ConversionSettings(source, tmp_path / "old", lerobot_version="2.1"))
     for path in (tmp_path, tmp_path / "old"):
         assert main([str(path), str(tmp_path / "out"), "--no-language"]) == 1
@@ -125,7 +125,7 @@ def test_other_datasets_are_refused_in_one_line(source, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_disk_without_links_gets_copies(source, tmp_path, monkeypatch):
+def test_videos_are_copied_without_hard_links(source, tmp_path, monkeypatch):
     def refuse(*_):
         raise OSError("no links here")
 

@@ -1,4 +1,4 @@
-"""Actions and observations of ppo: the same in training and evaluation."""
+"""Actions and observations of ppo, which are equal in training and evaluation."""
 
 import numpy as np
 import pytest
@@ -23,21 +23,21 @@ def see(count, state=4):
 
 
 def policy_with(numbers):
-    """Whatever it sees."""
+    """Return an agent with constant actions."""
     agent = BASELINE.model(PpoConfig(width=4), FACTS)
     torch.nn.init.zeros_(agent.actor[-1].weight)
     agent.actor[-1].bias.data = torch.tensor(numbers)
     return BASELINE.policy(PpoConfig(width=4), FACTS, agent)
 
 
-def test_five_numbers_are_seven():
+def test_5d_actions_expand_to_7d_actions():
     found = expand_action(torch.tensor([[0.5, -1.0, 2.0, 0.4, 0.1], [0, 0, 0, 0, -0.1]]))
     torch.testing.assert_close(
         found, torch.tensor([[0.25, -0.5, 0.5, 0, 0, 0.2, 1.0], [0, 0, 0, 0, 0, 0, -1.0]]), atol=1e-6, rtol=0
     )
 
 
-def test_actions_are_the_same_in_evaluation_and_training():
+def test_actions_are_equal_in_evaluation_and_training():
     policy = policy_with([0.5, -1.0, 0.3, 0.4, -0.2])
     assert control_mode(policy.spec.convention) == "pd_ee_delta_pose"
     motion = CONVENTIONS[policy.spec.convention].decode(policy.act(see(1)))

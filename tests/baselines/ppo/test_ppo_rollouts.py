@@ -1,4 +1,4 @@
-"""Advantages and outcomes, worked out by hand."""
+"""Advantages and outcomes of rollouts."""
 
 import torch
 from stub_envs import LeftOrRight
@@ -14,15 +14,15 @@ from robocas_ms3.baselines.ppo.train import (
 
 
 def test_advantages():
-    """An episode's end stops the sum; 0.25 is discount times lambda."""
+    """The end of an episode stops the sum; 0.25 is discount times lambda."""
     deltas = torch.tensor([[1.0, 0.0, 0.0], [-3.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
     truncated = torch.zeros(3, 3, dtype=torch.bool)
     truncated[0, 1] = True
     assert advantages(deltas, truncated, 0.25).T.tolist() == [[0.25, -3.0, 0.0], [0.0, 1.0, 0.0], [0.25, 1.0, 0.0]]
 
 
-def test_the_value_after_a_truncation_counts():
-    """Episodes end when their time is up, so their last steps have a future."""
+def test_value_after_a_truncation_counts():
+    """Episodes end by a time limit, so the last step has a future value."""
     config = PpoConfig(envs=1, gamma=0.5, gae_lambda=0.0, train={"batch_size": LeftOrRight.STEPS})
     agent = Agent(1, 1, 4)
     torch.nn.init.zeros_(agent.critic[-1].weight)
@@ -35,7 +35,7 @@ def test_the_value_after_a_truncation_counts():
     assert collector.last_outcomes()[0, 0] == reward.sum()
 
 
-def test_outcomes_are_those_of_the_envs_that_ended():
+def test_outcomes_of_ended_envs():
     final = {
         "episode": {"return": torch.tensor([4.0, 2.0, 1.0])},
         "reward_terms": {"grasp": torch.tensor([1.0, 0.0, 1.0])},

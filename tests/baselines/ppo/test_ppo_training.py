@@ -1,4 +1,4 @@
-"""PPO in an environment of a few lines: it learns, is interrupted and continues; and once in the simulator."""
+"""PPO in a stub environment: learning, interruption and continuation; one short run in the simulator."""
 
 from dataclasses import replace
 
@@ -18,12 +18,12 @@ SMALL = {"width": 16, "envs": 4, "test_episodes": 20, "layouts": 10, "train": {"
 
 
 @pytest.fixture
-def made_up(monkeypatch):
+def stub(monkeypatch):
     monkeypatch.setitem(BASELINES.builtin, "ppo", lambda: replace(BASELINE, environments=StubEnvironments))
     monkeypatch.setattr(StubEnvironments, "made", [])
 
 
-def test_it_learns(made_up, tmp_path):
+def test_agent_learns(stub, tmp_path):
     record = train("ppo", None, tmp_path / "run", SMALL)
     assert (record.data.name, record.data.hash, record.data.episodes) == ("left or right", "1234", 10)
     rows = read_log(tmp_path / "run", "train")
@@ -34,7 +34,7 @@ def test_it_learns(made_up, tmp_path):
     assert RunPolicy(tmp_path / "run").describe()["steps"] == 1280
 
 
-def test_after_ctrl_c_a_run_continues_with_the_whole_checkpoint(made_up, tmp_path):
+def test_run_continues_after_ctrl_c(stub, tmp_path):
     run = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
         train("ppo", None, run, SMALL, progress=stop_at(640, KeyboardInterrupt()))
@@ -52,21 +52,21 @@ def test_after_ctrl_c_a_run_continues_with_the_whole_checkpoint(made_up, tmp_pat
     assert [int(row["step"]) for row in read_log(run, "train")] == list(range(64, 1281, 64))
     assert load_file(run / "weights.safetensors")["count"].item() == pytest.approx(1280, abs=1e-3)
     first, second = (StubEnvironments.made[number].seeds[0] for number in (0, -1))
-    assert (first, second) == (0, 640 // LeftOrRight.STEPS % 10)  # the layouts after those that were played
+    assert (first, second) == (0, 640 // LeftOrRight.STEPS % 10)  # the layouts after those already used
     before = (run / "weights.safetensors").read_bytes()
-    train("ppo", None, run)  # what is done is done
+    train("ppo", None, run)  # a finished run does nothing
     assert (run / "weights.safetensors").read_bytes() == before
     assert len(read_log(run, "val")) == 1
 
 
-def test_a_nan_gradient_is_not_saved(made_up, monkeypatch, tmp_path):
-    """Not even that of an update's last step, whose losses are numbers."""
+def test_a_nan_gradient_is_not_saved(stub, monkeypatch, tmp_path):
+    """Also in the last step of an update, whose losses are finite."""
     clip, calls = torch.nn.utils.clip_grad_norm_, []
 
     def spoil(parameters, most):
         parameters = list(parameters)
         calls.append(len(parameters))
-        if len(calls) == 2 * 10 * 4:  # updates, epochs, minibatches: the last of all
+        if len(calls) == 2 * 10 * 4:  # updates, epochs, minibatches: the last minibatch
             parameters[0].grad.fill_(torch.nan)
         return clip(parameters, most)
 
@@ -78,7 +78,7 @@ def test_a_nan_gradient_is_not_saved(made_up, monkeypatch, tmp_path):
     assert all(tensor.isfinite().all() for tensor in saved.values())
 
 
-def test_data_is_refused(made_up, tmp_path):
+def test_data_is_refused(stub, tmp_path):
     with pytest.raises(TrainingError) as caught:
         train("ppo", tmp_path, tmp_path / "run", SMALL)
     assert caught.value.where == "--data"
@@ -87,7 +87,7 @@ def test_data_is_refused(made_up, tmp_path):
     assert caught.value.where == "--data"
 
 
-def test_a_run_of_other_scenes_is_not_continued(made_up, monkeypatch, tmp_path):
+def test_run_with_other_scenes_is_not_continued(stub, monkeypatch, tmp_path):
     train("ppo", None, tmp_path / "run", SMALL | {"test_episodes": 0, "train": {"steps": 64, "batch_size": 64}})
     monkeypatch.setattr(StubEnvironments, "hash", "5678")
     with pytest.raises(OutputExistsError):

@@ -1,4 +1,4 @@
-"""A small network and a batch that tests of rt1 share."""
+"""Small network and batch of rt1."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from robocas_ms3.baselines.rt1.config import RT1Config
 
 @pytest.fixture
 def facts():
-    """Of a dataset of 64 x 48 images."""
+    """Return the facts of a dataset of 64 x 48 images."""
     cameras = {"base_camera": [64, 48], "gripper_camera": [64, 48]}
     return {"rate_hz": 5.0, "cameras": cameras, "action_low": [-0.1] * 6, "action_high": [0.1] * 6}
 
@@ -22,7 +22,7 @@ def config():
 
 @pytest.fixture
 def model(config, facts, batch):
-    """With weights that depend on images and language, which initial ones hardly do."""
+    """Return a network whose output depends on images and language; initial weights hardly do."""
     torch.manual_seed(0)
     made = BASELINE.model(config, facts)
     with torch.no_grad():
@@ -36,7 +36,7 @@ def model(config, facts, batch):
 
 @pytest.fixture
 def batch():
-    """Two samples of six frames, of which the first four of the first are padding."""
+    """Return two samples of six frames; the first four frames of the first sample are padding."""
     torch.manual_seed(1)
     mask = torch.ones(2, 6, dtype=torch.bool)
     mask[0, :4] = False

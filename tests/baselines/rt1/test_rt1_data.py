@@ -1,4 +1,4 @@
-"""Samples of rt1, datasets and configurations that it refuses, and that a run continues to the bit."""
+"""Samples of rt1, and refused configurations."""
 
 import json
 
@@ -23,8 +23,8 @@ def samples(folder):
     return read(folder)
 
 
-def test_a_batch(samples, folder):
-    """Episodes of seven steps: six actions, the last of which ends it."""
+def test_batch(samples, folder):
+    """Episodes of seven steps have six actions; the last action is terminal."""
     assert (len(samples), samples.episodes, read(folder, "val").episodes) == (30, 5, 1)
     batch = samples.__getitems__([0, 5, 10])  # steps 0 and 5 of the first episode, 4 of the second
     assert batch["rgb"].shape == (3, 6, 2, 3, 48, 64)
@@ -67,7 +67,7 @@ def test_facts(samples, folder):
         ({"layer": 3}, "layers"),
     ],
 )
-def test_invalid_configurations_are_one_line(changes, message):
+def test_invalid_configurations_are_one_line_errors(changes, message):
     with pytest.raises(TrainingError, match=message) as caught:
         parse(RT1Config, changes, TrainingError, where="rt1")
     assert "\n" not in str(caught.value)

@@ -1,4 +1,4 @@
-"""From images to tokens: crops, FiLM, TokenLearner, EfficientNet, and its weights from a file."""
+"""Image tokens of rt1: crops, FiLM, TokenLearner, EfficientNet and its weights."""
 
 import pytest
 import torch
@@ -14,18 +14,18 @@ from robocas_ms3.evaluation.policy import describe
 
 
 def rows_of(images):
-    """The number of each row of images made by `striped`: (N, h)."""
+    """Return the row numbers (N, h) of images of `striped`."""
     return images[:, 0, :, 0]
 
 
 def striped(count, height=256, width=4):
-    """Images whose rows hold their own number, and whose last column holds 7."""
+    """Return images whose rows have their row number as value, and whose last column is 7."""
     images = torch.arange(height, dtype=torch.uint8)[:, None].repeat(count, 3, 1, width)
     images[..., -1] = 7
     return images
 
 
-def test_acting_uses_the_middle_rows():
+def test_evaluation_uses_the_middle_rows():
     rows = rows_of(crop_rows(striped(2), 236, random=False))
     assert rows.dtype == torch.float32
     assert rows.tolist() == [list(range(10, 246))] * 2
@@ -37,7 +37,7 @@ def test_training_crops_each_image_at_random():
     assert seen.shape == (100, 3, 2, 3, 236, 4)
     flat = seen.flatten(0, 2)
     first = rows_of(flat)[:, 0]
-    assert set(first.tolist()) == set(range(21))  # 256 - 236 and none
+    assert set(first.tolist()) == set(range(21))  # 0 to 256 - 236
     assert torch.equal(rows_of(flat), first[:, None] + torch.arange(236))
     assert (flat[..., -1] == 7).all()  # columns stay
     assert torch.equal(flat[:, 0], flat[:, 2])  # colours are cropped together
@@ -45,7 +45,7 @@ def test_training_crops_each_image_at_random():
     assert torch.equal(crop_rows(striped(600).view(100, 3, 2, 3, 256, 4), 236, random=True), seen)
 
 
-def test_film_by_hand():
+def test_film():
     film = FiLM(2)
     features = torch.ones(1, 2, 1, 3)
     with torch.no_grad():
@@ -56,7 +56,7 @@ def test_film_by_hand():
     assert film(features, language)[0, :, 0].tolist() == [[2.5] * 3, [17.0] * 3]
 
 
-def test_language_changes_nothing_at_first_and_something_once_learned(config):
+def test_film_layers_start_as_identity_and_use_language_after_training(config):
     torch.manual_seed(0)
     encoder = ImageEncoder(config)
     images, words = torch.randn(2, 3, 40, 64), torch.randn(2, 384)
@@ -64,7 +64,7 @@ def test_language_changes_nothing_at_first_and_something_once_learned(config):
         settle(encoder, images, words)
         plain = encoder.features(images, torch.zeros(2, 384))
         assert torch.equal(encoder.features(images, words), plain)
-        # so it is transformers' EfficientNet, and the convolution after it
+        # equal to transformers' EfficientNet with the convolution after it
         wanted = encoder.project(encoder.net(images).last_hidden_state)
         assert torch.allclose(plain, wanted, atol=1e-6)
         for number in (0, len(encoder.films) - 1):
@@ -76,7 +76,7 @@ def test_language_changes_nothing_at_first_and_something_once_learned(config):
         assert not torch.allclose(encoder.features(images, words), plain, rtol=1e-3)
 
 
-def test_token_learner_weighs_places():
+def test_token_learner_weights_positions():
     learner = TokenLearner(2, 3, 2)
     with torch.no_grad():
         learner.score.weight.zero_()
@@ -84,17 +84,17 @@ def test_token_learner_weighs_places():
     features = torch.tensor([[[1.0, 5.0], [3.0, -1.0], [2.0, 2.0]]])
     assert torch.allclose(learner(features), torch.tensor([[[2.0, 2.0], [2.0, 2.0]]]))  # the mean, for each token
     with torch.no_grad():
-        # normed, the places are about (-1, 1), (1, -1) and (0, 0); the first hidden one is gelu(100 first)
+        # normalised, the positions are about (-1, 1), (1, -1) and (0, 0); the first hidden unit is gelu(100 first)
         learner.hidden.weight.zero_()
         learner.hidden.bias.zero_()
         learner.hidden.weight[0, 0] = 100.0
         learner.score.weight[1, 0] = 1.0
     found = learner(features)
     assert torch.allclose(found[0, 0], torch.tensor([2.0, 2.0]))
-    assert torch.allclose(found[0, 1], torch.tensor([3.0, -1.0]), atol=1e-5)  # the second place alone
+    assert torch.allclose(found[0, 1], torch.tensor([3.0, -1.0]), atol=1e-5)  # the second position alone
 
 
-def test_a_branch_is_skipped_for_whole_images():
+def test_stochastic_depth_skips_whole_images():
     torch.manual_seed(0)
     skip, branch = StochasticDepth(0.25), torch.randn(400, 2, 2, 2)
     kept = skip(branch)
@@ -107,7 +107,7 @@ def test_a_branch_is_skipped_for_whole_images():
 
 @pytest.fixture
 def weights(config):
-    """Those of another network of this size, by transformers' names, with those of a classifier."""
+    """Return weights of another network of this size, with transformers' names and a classifier."""
     torch.manual_seed(5)
     made = {f"efficientnet.{name}": value + 1 for name, value in efficientnet(config).state_dict().items()}
     return {**made, "classifier.weight": torch.zeros(10, 320)}
@@ -146,7 +146,7 @@ def test_a_trained_network_does_not_need_the_file(weights, facts, tmp_path, batc
         model.train()(batch)
     model.load_state_dict(trained.state_dict())
     assert describe(BASELINE.policy(config, facts, model))["image_weights"] == "b3.safetensors"
-    model.train()(batch)  # so an interrupted training goes on
+    model.train()(batch)  # an interrupted training continues without the file
 
 
 WEIGHT = "efficientnet.encoder.blocks.2.depthwise_conv.depthwise_conv.weight"

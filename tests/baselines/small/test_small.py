@@ -103,7 +103,7 @@ def test_objects_get_instructions_that_name_them(folder, monkeypatch, caplog):
         return SceneObjects(len(poses), "apple", ["apple", "pear"], nowhere, np.zeros((2, 3)))
 
     read(folder)
-    (line,) = caplog.messages  # the made-up dataset has no layouts
+    (line,) = caplog.messages  # the synthetic dataset has no layouts
     assert line.startswith(f"{folder}: no object poses in scene.json")
     caplog.clear()
     monkeypatch.setattr(data, "locate_objects", made)

@@ -1,4 +1,4 @@
-"""Checkpoints and weights: whole or not there, of one run only, and damage is an error."""
+"""Checkpoint files: atomic writes, metadata of the run, damaged files."""
 
 import pytest
 import torch
@@ -14,7 +14,7 @@ def path(tmp_path):
     return tmp_path / "c.safetensors"
 
 
-def test_there_and_back(path):
+def test_save_and_load(path):
     checkpoints.save(path, {"a.b": torch.arange(3.0), "a.c.d": torch.tensor(2), "e": torch.zeros(1)}, ABOUT, 7)
     checkpoint = checkpoints.load(path, ABOUT)
     assert checkpoint.step == 7 and checkpoint.tensors.keys() == {"a.b", "a.c.d", "e"}
@@ -25,7 +25,7 @@ def test_there_and_back(path):
 
 
 def test_equal_contents_are_equal_files(path):
-    """safetensors itself writes metadata in any order."""
+    """safetensors itself writes metadata in random order."""
     about = {f"key{number}": "x" * number for number in range(20)}
     tensors = {"b": torch.arange(7, dtype=torch.uint8), "a": torch.arange(3.0), "c": torch.tensor(2)}
     contents = set()
@@ -38,7 +38,7 @@ def test_equal_contents_are_equal_files(path):
 
 
 @pytest.mark.parametrize("key", ABOUT)
-def test_another_run_s_file_is_refused(path, key):
+def test_file_of_another_run_is_refused(path, key):
     checkpoints.save(path, {"a": torch.zeros(1)}, ABOUT, 1)
     with pytest.raises(TrainingError) as caught:
         checkpoints.load(path, {**ABOUT, key: "other"})

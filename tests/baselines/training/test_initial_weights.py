@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file
-from stub_baseline import MADE_UP
+from stub_baseline import STUB
 from training_runs import assert_same, change_record, stop_at, train
 
 from robocas_ms3.baselines.training.session import Progress, combine_facts, load_initial_weights
@@ -21,7 +21,7 @@ SIMULATION = {"observation_size": 30, "horizon": 100}
 
 def combine(whole, facts, own):
     change_record(whole, facts=facts)
-    initial = load_initial_weights(MADE_UP, whole, None, whole)
+    initial = load_initial_weights(STUB, whole, None, whole)
     return combine_facts(own, initial, None if facts is SIMULATION else Path("data"))
 
 
@@ -61,9 +61,9 @@ def test_initial_weights_with_other_inputs_are_refused(whole, facts, own, found)
 
 
 @pytest.mark.parametrize("changes", [{"widht": 3}, {"train": {"steps": 0}}, {"width": "wide"}], ids=str)
-def test_invalid_options(made_up, data, tmp_path, changes):
+def test_invalid_options(stub, data, tmp_path, changes):
     with pytest.raises(TrainingError):
-        train("made-up", data, tmp_path / "run", changes)
+        train("stub", data, tmp_path / "run", changes)
     assert not (tmp_path / "run").exists()
 
 
@@ -81,16 +81,16 @@ def test_invalid_options(made_up, data, tmp_path, changes):
 def test_a_run_with_other_data_or_settings_is_not_continued(whole, data, change, where):
     change(whole, data)
     with pytest.raises((TrainingError, OutputExistsError)) as error:
-        train("made-up", data, whole)
+        train("stub", data, whole)
     assert error.value.where == whole / where
     assert (whole / "weights.safetensors").is_file()
 
 
-def test_initial_weights_and_configuration_come_from_another_run(made_up, data, tmp_path):
+def test_initial_weights_and_configuration_come_from_another_run(stub, data, tmp_path):
     first, second = tmp_path / "first", tmp_path / "second"
-    train("made-up", data, first, {"width": 8, "train": {"steps": 8, "learning_rate": 0.002}})
+    train("stub", data, first, {"width": 8, "train": {"steps": 8, "learning_rate": 0.002}})
     data.write_text("more")
-    record = train("made-up", data, second, {"train": {"steps": 1, "learning_rate": 1e-9, "ema": 0}}, init_from=first)
+    record = train("stub", data, second, {"train": {"steps": 1, "learning_rate": 1e-9, "ema": 0}}, init_from=first)
     assert record.config["width"] == 8 and record.config["train"]["batch_size"] == 4  # the baseline's default
     before, after = (load_file(folder / "weights.safetensors") for folder in (first, second))
     assert all(torch.allclose(before[key], after[key], atol=1e-6) for key in before)
@@ -101,7 +101,7 @@ def test_initial_weights_and_configuration_come_from_another_run(made_up, data, 
     change_record(second, facts={"inputs": 3, "image_sizes": {"base_camera": [64, 48]}})
     for start, options in ((tmp_path, {}), (first, {"width": 5}), (second, {})):  # no run; other sizes; other images
         with pytest.raises(TrainingError):
-            train("made-up", data, tmp_path / "other", options, init_from=start)
+            train("stub", data, tmp_path / "other", options, init_from=start)
     assert not (tmp_path / "other").exists()
 
 
@@ -111,17 +111,17 @@ def test_a_run_with_initial_weights_continues_with_the_same_weights(whole, data,
     other = shutil.copytree(whole, tmp_path / "other")
     out, few = tmp_path / "next", {"train": {"steps": 12}}
     with pytest.raises(RuntimeError):
-        train("made-up", data, out, few, init_from=whole, progress=stop_at(step, RuntimeError("gone")))
+        train("stub", data, out, few, init_from=whole, progress=stop_at(step, RuntimeError("gone")))
     if step == 3:
         with pytest.raises(TrainingError) as caught:
-            train("made-up", data, out)
+            train("stub", data, out)
         assert caught.value.where == out and "--init-from" in caught.value.fix
     for folder in (out, whole):
         with pytest.raises(OutputExistsError, match="init_from: "):
-            train("made-up", data, folder, init_from=other)
-    train("made-up", data, out, init_from=whole)
-    train("made-up", data, out)
-    train("made-up", data, tmp_path / "unbroken", few, init_from=whole)
+            train("stub", data, folder, init_from=other)
+    train("stub", data, out, init_from=whole)
+    train("stub", data, out)
+    train("stub", data, tmp_path / "unbroken", few, init_from=whole)
     assert_same(tmp_path / "unbroken", out)
 
 
@@ -129,7 +129,7 @@ def test_configuration_keys_newer_than_the_run_have_their_defaults(whole, data):
     config = json.loads((whole / "run.json").read_text())["config"]
     del config["width"]
     change_record(whole, config=config)
-    train("made-up", data, whole)
+    train("stub", data, whole)
 
 
 @pytest.mark.parametrize(
@@ -144,6 +144,6 @@ def test_hardware_changes_are_recorded(whole, data, recorded, changes):
     changes = [change.format(threads=torch.get_num_threads()) for change in changes]  # other tests change it
     change_record(whole, **recorded)
     messages = []
-    train("made-up", data, whole, progress=Progress(message=messages.append))
+    train("stub", data, whole, progress=Progress(message=messages.append))
     assert json.loads((whole / "run.json").read_text())["hardware_changes"] == changes
     assert all(any(change in message for message in messages) for change in changes)

@@ -1,4 +1,4 @@
-"""What a run keeps of its data and its weights."""
+"""Hashes of data and weights in the record of a run."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from robocas_ms3.baselines.training.record import WEIGHTS, hash_dataset, hash_we
 from robocas_ms3.core.errors import TrainingError
 
 
-def test_a_trajectory_is_both_of_its_files(tmp_path):
+def test_hash_of_a_trajectory_has_both_files(tmp_path):
     path = tmp_path / "trajectory.h5"
     path.write_text("states")
     alone = hash_dataset(path)
@@ -17,7 +17,7 @@ def test_a_trajectory_is_both_of_its_files(tmp_path):
     assert len({alone, hash_dataset(path)}) == 2
 
 
-def test_a_folder_is_its_arrays_and_sizes_of_images(tmp_path):
+def test_hash_of_a_folder_has_arrays_and_image_sizes(tmp_path):
     for name, text in (("data_info.json", "{}"), ("episode_0/rgb/0.png", "abc"), ("preview/0.png", "a")):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
@@ -34,12 +34,14 @@ def test_a_folder_is_its_arrays_and_sizes_of_images(tmp_path):
     assert len(hashes) == 5
 
 
-def test_nothing_is_no_dataset(tmp_path):
+def test_missing_dataset_is_an_error(tmp_path):
     with pytest.raises(TrainingError, match="no such dataset"):
         hash_dataset(tmp_path / "nowhere")
 
 
-def test_weights(tmp_path):
+def test_hash_of_weights(tmp_path):
     assert hash_weights(tmp_path) == ""
     (tmp_path / WEIGHTS).write_bytes(b"")
-    assert hash_weights(tmp_path) == "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"  # of nothing
+    assert (
+        hash_weights(tmp_path) == "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
+    )  # of an empty file

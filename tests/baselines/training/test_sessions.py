@@ -31,13 +31,13 @@ def test_files_of_a_run_and_its_policy(whole):
         *("run.json", "metrics.csv", "tensorboard", "checkpoint.safetensors", "weights.safetensors")
     }
     record = json.loads((whole / "run.json").read_text())
-    assert (record["baseline"], record["data"]["episodes"], record["data"]["samples"]) == ("made-up", 3, 30)
+    assert (record["baseline"], record["data"]["episodes"], record["data"]["samples"]) == ("stub", 3, 30)
     assert record["config"]["train"]["steps"] == 40 and record["facts"] == {"inputs": 3}
     assert {"torch", "numpy", "robocas-ms3"} <= record["versions"].keys()
     assert record["threads"] == torch.get_num_threads()
     assert {path.stat().st_mode & 0o777 for path in whole.glob("*.safetensors")} == {0o644}  # for everybody to read
     description = make_policy(str(whole)).describe()
-    assert (description["baseline"], description["steps"], description["data"]["samples"]) == ("made-up", 40, 30)
+    assert (description["baseline"], description["steps"], description["data"]["samples"]) == ("stub", 40, 30)
 
 
 def test_metrics_of_a_run(whole):
@@ -59,8 +59,8 @@ def test_a_stopped_run_continues_bit_identically(whole, data, tmp_path, step, er
     """Ctrl-C loses no step, a crash loses the steps after the last checkpoint."""
     out, steps = tmp_path / "again", []
     with pytest.raises(error):
-        train("made-up", data, out, progress=stop_at(step, error("stopped")))
-    train("made-up", data, out, progress=Progress(on_step=lambda done, total: steps.append(done)))
+        train("stub", data, out, progress=stop_at(step, error("stopped")))
+    train("stub", data, out, progress=Progress(on_step=lambda done, total: steps.append(done)))
     assert steps[0] == continued_at
     assert_same(whole, out)
 
@@ -71,7 +71,7 @@ def test_weights_are_repaired_from_the_checkpoint(whole, data, damage):
     damage(whole / "weights.safetensors")
     with pytest.raises(TrainingError):
         RunPolicy(whole)
-    train("made-up", data, whole)
+    train("stub", data, whole)
     assert (whole / "weights.safetensors").read_bytes() == before
 
 
@@ -79,7 +79,7 @@ def test_weights_are_repaired_from_the_checkpoint(whole, data, damage):
 def test_a_full_disk_is_an_error_and_the_run_continues(whole, data, small_disk, capsys, room):
     """On a real small disk with ``room`` kB: writing the record, log, curves or checkpoint fails."""
     out = small_disk / "run"
-    words = ["train", "made-up", "--data", str(data), "--out", str(out), "--device", "cpu"]
+    words = ["train", "stub", "--data", str(data), "--out", str(out), "--device", "cpu"]
     filler = small_disk / "filler"
     with suppress(OSError), filler.open("wb", buffering=0) as file:
         while True:
@@ -106,73 +106,73 @@ def test_an_interrupted_validation_is_repeated(whole, data, tmp_path, monkeypatc
     with monkeypatch.context() as patch:
         patch.setattr(Learner, "evaluate", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            train("made-up", data, tmp_path / "again")
+            train("stub", data, tmp_path / "again")
     assert str(step) not in {row["step"] for row in read_log(tmp_path / "again", "val")}
-    train("made-up", data, tmp_path / "again")
+    train("stub", data, tmp_path / "again")
     assert_same(whole, tmp_path / "again")
 
 
 def test_a_finished_run_is_unchanged_and_seeds_differ(whole, data, tmp_path):
     before = (whole / "weights.safetensors").read_bytes()
-    train("made-up", data, whole)
+    train("stub", data, whole)
     assert (whole / "weights.safetensors").read_bytes() == before
-    train("made-up", data, tmp_path / "other", {"train": {"seed": 1}})
+    train("stub", data, tmp_path / "other", {"train": {"seed": 1}})
     first, second = (load_file(folder / "weights.safetensors") for folder in (whole, tmp_path / "other"))
     assert not torch.equal(first["net.0.weight"], second["net.0.weight"])
 
 
-def test_unknown_baseline_and_missing_data(made_up, data, tmp_path):
+def test_unknown_baseline_and_missing_data(stub, data, tmp_path):
     with pytest.raises(TrainingError, match="small"):
         train("smal", data, tmp_path / "run")
     with pytest.raises(TrainingError) as caught:
-        train("made-up", tmp_path / "none.h5", tmp_path / "run")
+        train("stub", tmp_path / "none.h5", tmp_path / "run")
     assert caught.value.where == tmp_path / "none.h5"
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_a_folder_with_other_files_is_refused(made_up, data, tmp_path, overwrite):
+def test_a_folder_with_other_files_is_refused(stub, data, tmp_path, overwrite):
     """For example notes, and the log of another trainer."""
     out = tmp_path / "mine"
     out.mkdir()
     (out / ".draft.tmp.txt").write_text("mine")
     (out / "metrics.csv").write_text("epoch,loss\n3,0.5\n")
     with pytest.raises(OutputExistsError):
-        train("made-up", data, out, overwrite=overwrite)
+        train("stub", data, out, overwrite=overwrite)
     assert (out / "metrics.csv").read_text() == "epoch,loss\n3,0.5\n"
     assert len(list(out.iterdir())) == 2
 
 
 def test_overwrite_starts_again(whole, data):
-    train("made-up", data, whole, {"train": {"steps": 4}}, overwrite=True)
+    train("stub", data, whole, {"train": {"steps": 4}}, overwrite=True)
     assert len(read_log(whole)) == 2
 
 
 @pytest.mark.parametrize(
     "changes", [{"broken_at": 7}, {"steep_at": 7}, {"steep_at": 7, "train": {"clip_norm": 0.0}}], ids=str
 )
-def test_a_nan_ends_the_run_and_the_last_checkpoint_stays(made_up, data, tmp_path, changes):
+def test_a_nan_ends_the_run_and_the_last_checkpoint_stays(stub, data, tmp_path, changes):
     """A NaN in the loss, or in the gradient alone."""
     out, done = tmp_path / "run", []
     changes = merge_configs(changes, {"train": {"save_every": 1}})
     progress = Progress(on_step=lambda step, _: done.append(step))
     with pytest.raises(TrainingError):
-        train("made-up", data, out, changes, progress=progress)
+        train("stub", data, out, changes, progress=progress)
     assert_finite(out)
     for name in ("checkpoint", "weights"):
         assert checkpoints.load(out / f"{name}.safetensors", {}).step == done[-1] > 0
     assert load_file(out / "checkpoint.safetensors")["optimizer.0.step"] == done[-1]
 
 
-def test_an_unchecked_nan_is_not_saved(made_up, data, tmp_path, monkeypatch):
+def test_an_unchecked_nan_is_not_saved(stub, data, tmp_path, monkeypatch):
     """As on a GPU, where values are checked late, and without log lines, which would end the run."""
     monkeypatch.setattr(Learner, "check_finite", lambda self, step, **values: None)
     changes = {"steep_at": 7, "train": {"save_every": 1, "log_every": 100, "validate_every": 100}}
-    train("made-up", data, tmp_path / "run", changes)
+    train("stub", data, tmp_path / "run", changes)
     assert_finite(tmp_path / "run")
 
 
-def test_a_removed_folder_is_an_error(made_up, data, tmp_path, monkeypatch):
+def test_a_removed_folder_is_an_error(stub, data, tmp_path, monkeypatch):
     """Between two steps, and during a write."""
     out, save = tmp_path / "run", checkpoints.save
 
@@ -185,50 +185,50 @@ def test_a_removed_folder_is_an_error(made_up, data, tmp_path, monkeypatch):
         save(path, *what)
 
     with pytest.raises(RobocasError) as caught:
-        train("made-up", data, out, progress=Progress(on_step=remove))
+        train("stub", data, out, progress=Progress(on_step=remove))
     assert caught.value.where == out
     monkeypatch.setattr(checkpoints, "save", remove_and_save)
     with pytest.raises(RobocasError) as caught:
-        train("made-up", data, out)
+        train("stub", data, out)
     assert caught.value.where == out
 
 
-def test_a_baseline_cannot_end_the_process(made_up, data, tmp_path):
-    made_up(model=lambda config, facts: sys.exit(0))
+def test_a_baseline_cannot_end_the_process(stub, data, tmp_path):
+    stub(model=lambda config, facts: sys.exit(0))
     with pytest.raises(ExtensionError) as caught:
-        train("made-up", data, tmp_path / "run")
-    assert caught.value.where == "baseline made-up"
+        train("stub", data, tmp_path / "run")
+    assert caught.value.where == "baseline stub"
 
 
-def test_a_baseline_that_changes_the_working_directory(made_up, data, tmp_path, monkeypatch):
+def test_a_baseline_that_changes_the_working_directory(stub, data, tmp_path, monkeypatch):
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path)
     make = stub_baseline.StubModel
-    made_up(model=lambda *args: os.chdir(tmp_path / "elsewhere") or make(*args))
-    assert run(["train", "made-up", "--data", data.name, "--out", "run", "--steps", "4", "--device", "cpu"]) == 0
+    stub(model=lambda *args: os.chdir(tmp_path / "elsewhere") or make(*args))
+    assert run(["train", "stub", "--data", data.name, "--out", "run", "--steps", "4", "--device", "cpu"]) == 0
     assert (tmp_path / "run" / "run.json").is_file()
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
-def test_a_validation_split_may_be_empty_but_not_damaged(made_up, data, tmp_path):
+def test_a_validation_split_may_be_empty_but_not_damaged(stub, data, tmp_path):
     data.write_text("few")
-    train("made-up", data, tmp_path / "run")
+    train("stub", data, tmp_path / "run")
     assert {row["split"] for row in read_log(tmp_path / "run")} == {"train"}
     data.write_text("damaged")
     with pytest.raises(DatasetError):
-        train("made-up", data, tmp_path / "other")
+        train("stub", data, tmp_path / "other")
 
 
-def test_batch_size_must_be_a_multiple_of_the_processes(made_up, data, tmp_path, monkeypatch):
+def test_batch_size_must_be_a_multiple_of_the_processes(stub, data, tmp_path, monkeypatch):
     monkeypatch.setattr(run_folder, "make_accelerator", lambda *_: SimpleNamespace(num_processes=3))
     with pytest.raises(TrainingError) as caught:
-        train("made-up", data, tmp_path / "run")
+        train("stub", data, tmp_path / "run")
     assert caught.value.where == "train.batch_size"
 
 
-def test_worker_processes_report_errors_of_the_samples(made_up, data, tmp_path):
+def test_worker_processes_report_errors_of_the_samples(stub, data, tmp_path):
     with pytest.raises(DatasetError) as caught:
-        train("made-up", data, tmp_path / "run", {"damaged_at": 7, "train": {"workers": 1}})
+        train("stub", data, tmp_path / "run", {"damaged_at": 7, "train": {"workers": 1}})
     assert caught.value.where == "sample 7"
 
 
@@ -282,9 +282,9 @@ def test_each_process_continues_with_its_own_random_state(shared):
 
 
 @pytest.mark.slow
-def test_a_run_continues_with_the_same_number_of_processes(made_up, shared):
+def test_a_run_continues_with_the_same_number_of_processes(stub, shared):
     with pytest.raises(TrainingError, match="num_processes 2"):
-        train("made-up", shared / "data.h5", shared / "whole")
+        train("stub", shared / "data.h5", shared / "whole")
 
 
 @pytest.mark.parametrize("name", devices_check.CHANGES)

@@ -1,4 +1,4 @@
-"""The log of a run that goes on: whole lines of before, and none of what came after the checkpoint."""
+"""Log of a continued run: complete lines up to the checkpoint."""
 
 import math
 
@@ -9,7 +9,7 @@ from robocas_ms3.baselines.training.metrics import MetricsLog
 HEAD = "step,split,epoch,seconds,learning_rate,loss\n"
 
 
-def test_it_is_cut_back(tmp_path):
+def test_lines_after_the_checkpoint_are_removed(tmp_path):
     path = tmp_path / "metrics.csv"
     path.write_text(HEAD + "1000,train,1,60,0.1,2\n1000,val,1,61,0.1,3\n1050,train,1,63,0.1,1.5\n")
     log = MetricsLog(tmp_path, 1000)
@@ -19,8 +19,8 @@ def test_it_is_cut_back(tmp_path):
     assert log.has(1000, "val") and not log.has(1050, "train")
 
 
-def test_a_line_that_was_cut_off_is_none(tmp_path):
-    """As a full disk leaves it: 10 of 1050 is no step 10."""
+def test_truncated_line_is_removed(tmp_path):
+    """As after a full disk: the truncated step 1050 must not be read as step 10."""
     path = tmp_path / "metrics.csv"
     path.write_text(HEAD + "1000,train,1,60,0.1,2\n10")
     log = MetricsLog(tmp_path, 1000)
@@ -30,8 +30,8 @@ def test_a_line_that_was_cut_off_is_none(tmp_path):
     assert log.seconds == 60
 
 
-def test_a_run_without_a_checkpoint_begins_its_curves_anew(tmp_path):
-    """What TensorBoard has of before goes."""
+def test_run_without_checkpoint_starts_new_curves(tmp_path):
+    """Older TensorBoard events are removed."""
     for loss in (5.0, 1.0):
         log = MetricsLog(tmp_path, 0)
         for step in (50, 100) if loss == 5.0 else (50,):
@@ -41,18 +41,18 @@ def test_a_run_without_a_checkpoint_begins_its_curves_anew(tmp_path):
     assert shown(tmp_path, "train/loss") == [(50, 1.0)]
 
 
-def test_a_run_that_goes_on_shows_nothing_of_what_came_after_its_checkpoint(tmp_path):
+def test_continued_run_hides_events_after_its_checkpoint(tmp_path):
     for first, losses in ((0, {50: 3.0, 100: 2.0, 150: 9.0}), (100, {150: 1.0, 200: math.nan})):
         log = MetricsLog(tmp_path, first)
         for step, loss in losses.items():
             log.add(step, "train", {"epoch": 1.0, "seconds": 1.0, "learning_rate": 0.5}, {"loss": loss})
-            assert shown(tmp_path, "train/learning_rate")[-1] == (step, 0.5)  # at once
+            assert shown(tmp_path, "train/learning_rate")[-1] == (step, 0.5)  # without buffering
         log.close()
     assert shown(tmp_path, "train/loss") == [(50, 3.0), (100, 2.0), (150, 1.0)]
 
 
 def shown(folder, name):
-    """(step, value) of a curve, as TensorBoard has it."""
+    """Return (step, value) of a curve as TensorBoard reads it."""
     board = EventAccumulator(str(folder / "tensorboard"))
     board.Reload()
     return [(point.step, point.value) for point in board.Scalars(name)]

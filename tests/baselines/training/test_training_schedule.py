@@ -1,4 +1,4 @@
-"""Which samples a step is of, and how fast it learns, by hand."""
+"""Batches and learning rate of each step."""
 
 import math
 from collections import Counter
@@ -13,14 +13,14 @@ def settings(**values):
     return TrainSettings(**values)
 
 
-def test_an_epoch_has_every_sample_once_and_runs_into_the_next():
-    batches = list(batch_indices(10, settings(steps=5, batch_size=4)))  # 20 places: two epochs
+def test_each_epoch_has_every_sample_once():
+    batches = list(batch_indices(10, settings(steps=5, batch_size=4)))  # 20 samples: two epochs
     places = [index for batch in batches for index in batch]
     assert Counter(places[:10]) == Counter(range(10)) == Counter(places[10:])
     assert places[:10] != places[10:]
 
 
-def test_batches_follow_from_seed_and_step():
+def test_batches_depend_on_seed_and_step_only():
     whole = list(batch_indices(10, settings(steps=6, batch_size=4)))
     assert list(batch_indices(10, settings(steps=6, batch_size=4), first=3)) == whole[3:]
     assert list(batch_indices(10, settings(steps=6, batch_size=4, seed=1))) != whole
@@ -32,17 +32,17 @@ def test_processes_share_a_batch():
     assert [sorted(one + other) for one, other in zip(*parts, strict=True)] == [sorted(batch) for batch in whole]
 
 
-def test_cosine_and_constant_by_hand():
+def test_cosine_and_constant_schedules():
     chosen = settings(steps=110, warmup_steps=10, learning_rate=1.0, min_learning_rate=0.2)
     assert learning_rate(0, 99, chosen) == pytest.approx(0.1)
     assert learning_rate(9, 99, chosen) == pytest.approx(1.0)
     assert learning_rate(10, 99, chosen) == pytest.approx(1.0)
-    assert learning_rate(60, 99, chosen) == pytest.approx(0.6)  # half way
+    assert learning_rate(60, 99, chosen) == pytest.approx(0.6)  # halfway
     assert learning_rate(110, 99, chosen) == pytest.approx(0.2)
     assert learning_rate(77, 99, chosen.model_copy(update={"schedule": "constant"})) == 1.0
 
 
-def test_restarts_by_hand():
+def test_restart_schedule():
     """Periods of 2, 4, 8 epochs of 5 steps: restarts after 10 and 30 steps."""
     chosen = settings(
         steps=100,
