@@ -199,7 +199,7 @@ def _read(folders: tuple[Path, ...]) -> Result:
 
 
 def _protocol_of(result: Result, given: str | None) -> LoadedProtocol:
-    """Load the given protocol, or the bundled protocol of a result; folders named in a result are not read."""
+    """Load the given protocol, or the bundled protocol of a result; a result names no folder."""
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
 

@@ -14,7 +14,9 @@ from robocas_ms3.cli.options import Several
 
 @dataclass
 class ServePolicy:
-    """Serve a policy to evaluations on other machines (robocas eval --policy ws://HOST:PORT). Stop with Ctrl-C.
+    """Serve a policy to evaluations on other machines; stop with Ctrl-C.
+
+    The evaluation runs with robocas eval --policy ws://HOST:PORT.
 
     There is no password: everyone who can reach the port can use the policy. Keep the loopback address and use ssh -L.
 

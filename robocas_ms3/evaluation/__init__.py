@@ -1,4 +1,4 @@
-"""Evaluation of policies: frozen protocols, sessions that run their episodes, results, statistics and reports.
+"""Evaluation of policies: frozen protocols, sessions, results, statistics and reports.
 
 `session` runs episodes, `results` reads and writes their outcomes, `report` shows them. `policies` are chosen by name;
 `remote` connects to a policy behind a socket, `harness` to the evaluation loops of other packages. Public names are

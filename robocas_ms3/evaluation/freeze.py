@@ -69,7 +69,7 @@ class ProtocolPart(ConfigVariant):
     split: str = "test"
     instruction: Literal["correct", "wrong", "empty"] = Field(
         default="correct",
-        description="the target's instruction, one that names another object, or an empty text",
+        description="correct: names the target; wrong: names another object; empty: no text",
     )
 
     @property

@@ -101,7 +101,9 @@ def read_sum(info: dict[str, Any], name: str) -> Any:
 
 
 class RetrievalOrder:
-    """Policy steps at which the objects of each env were first moved. Call `update` after each control step.
+    """Policy steps at which the objects of each env were first moved.
+
+    Call `update` after each control step and `end_step` after each policy step.
 
     An object counts as moved if it was displaced by more than 3 cm or had fallen over (`disturbed`) before the target
     was first held. It was **needed** if at the reset it hid or hemmed in the target (an obstacle of

@@ -87,7 +87,9 @@ CONVENTIONS: dict[str, Convention] = {
 
 @dataclass(frozen=True)
 class PolicySpec:
-    """Specification that a policy declares; a policy that does not fit the protocol is refused before the first step.
+    """Specification that a policy declares.
+
+    A policy that does not fit the protocol is refused before the first step.
 
     Attributes:
         convention: action convention, one of `CONVENTIONS`.
@@ -245,7 +247,7 @@ def policy_spec_values(spec: PolicySpec) -> dict[str, Any]:
 
 
 def describe(policy: Policy) -> dict[str, Any]:
-    """Return the description of a policy for results: class, specification, and its optional ``describe()``."""
+    """Return the description of a policy for results: class, specification and ``describe()``."""
     where = f"policy {_class_name(policy)}, describe()"
     with policy_exit_guard(policy):
         spec, added = policy_spec_values(policy.spec), getattr(policy, "describe", dict)()

@@ -179,7 +179,9 @@ class LoadedProtocol:
         return chosen
 
     def played_as(self, tasks: Sequence[str]) -> dict[str, str]:
-        """Return the tasks without own episodes that are evaluated in the episodes of another task, as in RoboCAS-v0.
+        """Return the tasks that are evaluated in the episodes of another task, as in RoboCAS-v0.
+
+        Only tasks without own episodes in this protocol are returned, with the other task.
 
         Raises:
             EvaluationError: both tasks are in ``tasks``; their episodes would be the same.
@@ -190,7 +192,7 @@ class LoadedProtocol:
             return {}
         for task, other in found.items():
             if other in tasks:
-                what, fix = "two tasks have the same episodes in this protocol", f"Evaluate {task} in a run of its own."
+                what, fix = "two tasks have the same episodes in this protocol", f"Evaluate {task} in a separate run."
                 raise EvaluationError(what, where=self.rules.name, found=f"{task}, {other}", fix=fix)
         return found
 
@@ -213,9 +215,11 @@ class LoadedProtocol:
             raise EvaluationError(what, where=self.rules.name, found=found, fix=fix)
 
     def config_file(self, config: str) -> Path:
+        """Return the YAML file of a configuration."""
         return self.folder / CONFIGS / f"{config}.yaml"
 
     def layouts_file(self, config: str) -> Path:
+        """Return the NumPy file of the scene layouts of a configuration."""
         return self.folder / LAYOUTS / f"{config}.npy"
 
     def training_configs(self) -> list[Path]:

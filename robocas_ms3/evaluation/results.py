@@ -1,4 +1,4 @@
-"""Results of evaluations: a record of the settings, and one line per episode, appended as the episode ends.
+"""Results of evaluations: a record of the settings, and one line per episode.
 
 ::
 
@@ -136,7 +136,7 @@ class Result:
         return success_rate(sum(held), len(held))
 
     def repeats_scenes(self) -> bool:
-        """Return whether a scene occurs in several episodes, such as splits; these episodes must not be pooled."""
+        """Return whether episodes share scenes, such as splits do; such episodes must not be pooled."""
         return len({(one.task, one.seed) for one in self.outcomes.values()}) < len(self.outcomes)
 
     def error_count(self) -> int:
@@ -155,7 +155,7 @@ class Result:
 def open_result(
     folder: Path, run: RunRecord, *, overwrite: bool = False, retry_errors: bool = False
 ) -> Iterator[dict[int, Outcome]]:
-    """Lock a result folder, start or continue the result, and yield the existing outcomes by episode number.
+    """Lock a result folder, start or continue the result, and yield its outcomes by episode number.
 
     With ``retry_errors`` the outcomes of episodes that an error ended are dropped, so that these episodes run again.
 

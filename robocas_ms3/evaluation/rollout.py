@@ -237,7 +237,7 @@ def rollout(batch: EpisodeBatch, policy: Policy, episodes: Sequence[EpisodeSpec]
 
 
 def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list[NDArray[np.floating]]]) -> None:
-    """Request action chunks for running envs without actions; if the policy fails, set the error of the episode."""
+    """Request chunks for running envs without actions; set the error of episodes if the policy fails."""
     running = batch.running
     envs = [env for env in running if not chunks[env]]
     if not envs:

@@ -138,7 +138,7 @@ class EvaluationSession:
         )
 
     def run_episodes(self, episodes: Sequence[ProtocolEpisode], max_steps: int | None = None) -> Iterator[Outcome]:
-        """Run episodes with the policy, configuration by configuration; yield each outcome as its episode ends.
+        """Run episodes with the policy, one configuration after another; yield outcomes as episodes end.
 
         ``max_steps`` replaces the protocol's maximum number of policy steps per episode.
 

@@ -72,7 +72,7 @@ class EvaluationSettings:
         parse_shard(self.shard, EvaluationError)
 
     def folder(self, protocol: str, played_as: Iterable[str] = ()) -> Path:
-        """Return the output folder; tasks that are played as another task have a folder of their own by default."""
+        """Return the output folder; by default results with ``played_as`` have a separate folder."""
         suffixes = [*played_as, *(["weld"] if self.weld else [])]
         name = "_".join([re.sub(r"[^\w.-]+", "_", self.policy), *suffixes])
         return self.out or (Path("eval") / protocol / name).absolute()

@@ -1,4 +1,4 @@
-"""Statistics of success counts: rates with intervals, paired comparisons over the same scenes, and their power."""
+"""Statistics of success counts: rates with intervals, paired comparisons, and their power."""
 
 from __future__ import annotations
 
@@ -55,14 +55,17 @@ class Comparison:
 
     @property
     def n(self) -> int:
+        """Return the number of scenes."""
         return self.both + self.only_a + self.only_b + self.neither
 
     @property
     def successes_a(self) -> int:
+        """Return the number of scenes in which A succeeded."""
         return self.both + self.only_a
 
     @property
     def successes_b(self) -> int:
+        """Return the number of scenes in which B succeeded."""
         return self.both + self.only_b
 
     @property

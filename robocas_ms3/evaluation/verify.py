@@ -46,7 +46,7 @@ def _find_outcome_violations(
         if getattr(outcome, name) != value:
             yield f"{name} is {getattr(outcome, name)}, expected {value}"
     if ("welds" in outcome.measures) != run.weld:
-        yield f"{'no number of welds' if run.weld else 'a number of welds'}, but the run has weld: {run.weld}"
+        yield f"{'missing' if run.weld else 'unexpected'} value measures.welds: the run has weld: {run.weld}"
     rate = rules.rate_hz or run.policy.spec.get("rate_hz") or DEFAULT_HZ
     limit = rules.step_limit(episode.task, rate)
     if limit is not None and outcome.steps > limit:

@@ -144,12 +144,12 @@ def test_images_are_rendered_only_when_the_policy_observes_them(monkeypatch):
     base: Any = env.unwrapped
     rendered, capture = [], base.capture_sensor_data
     monkeypatch.setattr(base, "capture_sensor_data", lambda: (rendered.append(1), capture()))
-    for every, looks in ((1, [1, 1, 1]), (2, [0, 1, 0])):
+    for every, rendered_steps in ((1, [1, 1, 1]), (2, [0, 1, 0])):
         stepped = PolicyActionWrapper(env, PolicySpec("robocas", "tcp", observe_every=every), "upstream")
         for _ in range(2):  # a reset restarts the count
             obs, _ = stepped.reset(seed=3)
             assert obs["sensor_data"]["base_camera"]["rgb"].any()
-            for expected in looks:
+            for expected in rendered_steps:
                 rendered.clear()
                 obs, *_, info = stepped.step(along(0.08))
                 assert len(rendered) == expected
@@ -158,7 +158,7 @@ def test_images_are_rendered_only_when_the_policy_observes_them(monkeypatch):
                 assert [bool(rgb.any()) for rgb in seen.values()] == [bool(expected)] * len(seen)
                 now = base.get_obs()["sensor_data"]["base_camera"]["rgb"]
                 assert not expected or torch.equal(seen["base_camera"], now)
-            assert int(info["elapsed_steps"]) > len(looks)
+            assert int(info["elapsed_steps"]) > len(rendered_steps)
     env.close()
 
 

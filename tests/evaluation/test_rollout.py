@@ -61,15 +61,15 @@ def test_chunks_are_played_to_their_end_before_the_policy_is_asked_again():
     assert policy.asked == [[0, 1], [0, 1], [1]]
 
 
-@pytest.mark.parametrize(("chunk", "looks", "fits"), [(6, 3, True), (1, 3, True), (3, 6, False), (6, 4, False)])
-def test_chunks_begin_with_images(chunk, looks, fits):
+@pytest.mark.parametrize(("chunk", "observe_every", "fits"), [(6, 3, True), (1, 3, True), (3, 6, False), (6, 4, False)])
+def test_chunk_lengths_must_be_multiples_of_observe_every(chunk, observe_every, fits):
     """A policy without chunks may have any length."""
     policy = Obedient(chunk)
-    policy.spec = PolicySpec(state=True, observe_every=looks)
+    policy.spec = PolicySpec(state=True, observe_every=observe_every)
     if fits:
         assert [one.steps for one in play(CountingEnv(1, None), policy, starts(4), 7)] == [4]
     else:
-        with pytest.raises(EvaluationError, match=f"a multiple of {looks} steps"):
+        with pytest.raises(EvaluationError, match=f"a multiple of {observe_every} steps"):
             play(CountingEnv(1, None), policy, starts(4), 7)
 
 

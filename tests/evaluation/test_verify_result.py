@@ -92,12 +92,12 @@ def test_values_out_of_range_are_refused(folder, values):
 def test_another_protocol_or_pack_or_an_impossible_weld_is_found(folder, protocol):
     tamper(folder, 0, measures=read_result(folder).outcomes[0].measures | {"welds": 1.0})
     assert find_violations(read_result(folder), protocol) == [
-        "episode 0: a number of welds, but the run has weld: False"
+        "episode 0: unexpected value measures.welds: the run has weld: False"
     ]
     tamper_run(folder, weld=True)
     found = find_violations(read_result(folder), protocol)
     assert "weld: true, but the weld needs RoboCAS-v0's steps" in found
-    assert "episode 1: no number of welds, but the run has weld: True" in found
+    assert "episode 1: missing value measures.welds: the run has weld: True" in found
     assert len(found) == 8
     tamper_run(folder, protocol_hash="ef" * 32, pack_hashes={"builtin": "00"})
     protocol_and_pack = find_violations(read_result(folder), protocol)[:2]

@@ -20,7 +20,7 @@ from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 @EnvConfig.register_subclass("robocas")
 @dataclass
 class RoboCASEnvConfig(EnvConfig):
-    """Configuration of RoboCAS environments in LeRobot; the defaults fit the LeRobot datasets of this package.
+    """Configuration of RoboCAS environments in LeRobot; the defaults fit our LeRobot datasets.
 
     Attributes:
         task: short names of tasks, separated by commas; ``all``: all tasks of the protocol.

@@ -1,4 +1,4 @@
-"""Robot state in observations of LeRobot environments, with the values and names of our LeRobot datasets."""
+"""Robot state in observations of LeRobot environments, with the columns of our LeRobot datasets."""
 
 from __future__ import annotations
 

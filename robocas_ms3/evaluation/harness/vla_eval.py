@@ -154,7 +154,7 @@ class RoboCAS:
         return time.monotonic() - self._started
 
     async def get_result(self) -> dict[str, Any]:
-        """Return the outcome of the episode, whether each flag ever held, and the protocol and package versions."""
+        """Return the outcome of the episode, whether each flag ever held, protocol and package versions."""
         outcome, episode = self._session.outcomes.get(0), self._episode
         if outcome is None or episode is None:
             what, fix = (

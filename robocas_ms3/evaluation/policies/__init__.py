@@ -1,4 +1,7 @@
-"""Registry of policies: built-in, of installed packages, ``replay:DATASET``, ``module:Class``, ``ws://host:port``.
+"""Registry of policies by name.
+
+Names are built-in names, names of installed packages, ``replay:TRAJECTORY.h5``, ``module:Class``, ``ws://host:port``
+and folders of policies.
 
 A package registers policies as entry points of the group `POLICY_GROUP` (docs/extending.md). A folder that holds a
 policy, such as a run of `robocas train`, is opened by an entry point of the group `POLICY_FOLDER_GROUP`; the name of

@@ -1,4 +1,4 @@
-"""Policies that follow a track of joint targets or TCP poses; `ReplayPolicy` replays recorded episodes."""
+"""Policies that follow tracks of joint targets or TCP poses; `ReplayPolicy` replays recordings."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class JointTrack:
 
 @dataclass
 class PoseTrack:
-    """A track of TCP poses, one per policy step; each action moves from the present TCP pose to the next pose.
+    """A track of TCP poses, one per policy step; each action moves from the present to the next pose.
 
     Attributes:
         poses: (S, 4, 4) in the frame of the arm's base; with S = 0 the arm does not move.

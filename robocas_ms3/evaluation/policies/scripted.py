@@ -26,7 +26,7 @@ _OFFSET_STREAM = 411  # random stream of the offset
 
 
 class ScriptedPolicy(TrackPolicy):
-    """Policy that plans each episode from privileged state in an environment of its own and replays the plan.
+    """Policy that plans each episode from privileged state in a separate environment and replays the plan.
 
     Its success rate is the rate of the scripted policies under the conditions of learned policies. It does not move in
     episodes without a demonstration, and it does not drive the base.
@@ -68,7 +68,7 @@ class ScriptedPolicy(TrackPolicy):
             generator.close()
 
     def _generator_of(self, episode: EpisodeSpec) -> EpisodeGenerator:
-        """Return the generator for the scenes of an episode; close the least recently used one if too many are open."""
+        """Return the generator for an episode; close the least recently used generator if too many are open."""
         for name in ("config_file", "layouts_file", "pack"):
             if not getattr(episode, name):
                 what, fix = "the policy server has no such file or pack", "Start the server with --protocol FOLDER."
@@ -93,7 +93,7 @@ class ScriptedPolicy(TrackPolicy):
 
 
 def offset(seed: int) -> NDArray[np.floating]:
-    """Return the horizontal offset (2,) of the poses of an episode, m in the frame of the arm's base (`OFFSETS`)."""
+    """Return the horizontal offset (2,) of an episode, m in the frame of the arm's base (`OFFSETS`)."""
     generator = np.random.default_rng([seed, _OFFSET_STREAM])
     angle, distance = generator.uniform(0, 2 * np.pi), generator.uniform(*OFFSETS)
     return distance * np.array([np.cos(angle), np.sin(angle)])

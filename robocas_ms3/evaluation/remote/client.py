@@ -166,7 +166,7 @@ class RemotePolicy:
             self._connections[_SHARED].envs.discard(env)
 
     async def _ask(self, envs: list[int], messages: list[dict[str, Any]], starting: set[int]) -> dict[int, Any]:
-        """Send one message per env and return the answer or error by row; envs in ``starting`` start an episode."""
+        """Send one message per env; return answers or errors by row. Envs in ``starting`` start an episode."""
         answers: dict[int, Any] = {}
         size = min(self._metadata.max_batch or 1, LARGEST_BATCH)
         slots = asyncio.Semaphore(1 if self._metadata.max_batch else self._address.max_in_flight or len(envs))
@@ -264,7 +264,7 @@ class RemotePolicy:
         await asyncio.gather(*(close_connection(connection.socket) for connection in found))
 
     def _spec_of(self, metadata: ServerMetadata) -> PolicySpec:
-        """Return the specification of the policy from its server or the address; raise if both have a specification."""
+        """Return the specification of the policy, from either the server or the address."""
         url, given = self._address.url, self._address.spec
         if metadata.spec is None:
             return given or PolicySpec()

@@ -97,7 +97,7 @@ def read_address(text: str) -> Address:
 
 
 def enable_tcp_keepalive(connection: Any) -> None:
-    """Enable TCP keepalive: the kernel closes an idle connection 60 s after the other machine stops answering.
+    """Enable TCP keepalive: an idle connection closes 60 s after the other machine stops answering.
 
     The kernel of the other machine answers the probes, so a busy process keeps its connections. The kernel sends no
     probes while sent data are unacknowledged; pings and ``timeout_s`` detect a lost network in this case.

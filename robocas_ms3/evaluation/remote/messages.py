@@ -224,7 +224,7 @@ def parse_batch(message: Any, least: int, most: int) -> list[dict[str, Any]]:
 
 
 def request_size_limit(spec: PolicySpec, max_batch: int = 1) -> int:
-    """Return the size limit of a request in bytes: 8 MiB plus the images of ``max_batch`` envs, at least of 4."""
+    """Return the size limit of a request in bytes: 8 MiB plus the images of at least 4 envs."""
     return min(MAX_BYTES, _OTHER_BYTES + max(4, max_batch) * _image_bytes(spec))
 
 

@@ -1,4 +1,7 @@
-"""Encoding of messages: msgpack, with arrays in the format of openpi-client. Received bytes are not trusted."""
+"""Encoding of messages: msgpack, with arrays in the format of openpi-client.
+
+Received bytes are not trusted.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,9 @@ def pack(value: Any) -> bytes:
 
 
 def unpack(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
-    """Decode a message; arrays are writable copies in native byte order, NumPy scalars become Python numbers.
+    """Decode a message.
+
+    Arrays are writable copies in native byte order. NumPy scalars become Python numbers.
 
     Raises:
         WireError: the bytes are no valid message, or exceed a limit.

@@ -1,4 +1,7 @@
-"""A result as a single HTML page without other files. The SVG images contain no text, so they can be stretched."""
+"""A result as a single HTML page without other files.
+
+The SVG images contain no text, so they can be stretched.
+"""
 
 from __future__ import annotations
 

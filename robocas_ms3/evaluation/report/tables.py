@@ -112,7 +112,7 @@ def title(result: Result) -> str:
 
 
 def notes(result: Result) -> list[str]:
-    """Return the conditions that readers of a result need: the weld, aliases of tasks, and the paper's rules."""
+    """Return the conditions of a result: the weld, aliases of tasks, and differences from the paper."""
     played_as = [
         f"{task} was evaluated in the episodes of {other} (played_as), as RoboCAS-v0's evaluator does."
         for task, other in result.run.played_as.items()
@@ -145,6 +145,7 @@ def outcomes_of_first_split(result: Result) -> list[Outcome]:
 
 
 def mean(values: Sequence[float]) -> float:
+    """Return the arithmetic mean."""
     return sum(values) / len(values)
 
 

@@ -74,7 +74,7 @@ def record_videos(
 
 
 class _VideoRecorder:
-    """Wrapper of a vector environment with one env; adds an image to ``writer`` every ``period`` policy steps."""
+    """Wrapper of a vector environment with one env that writes an image every ``period`` policy steps."""
 
     num_envs = 1
 
