@@ -1,4 +1,4 @@
-"""Convex pieces of furniture, part by part, so that drawers stay hollow and what is open stays open."""
+"""Decompose furniture into convex pieces part by part, so that drawers and compartments stay open."""
 
 from __future__ import annotations
 
@@ -19,30 +19,33 @@ from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray
 
-TOLERANCE, FINE = 0.02, 0.005  # m between hull and surface, nine tenths of it; fine: what fingers reach behind
-FARTHEST = 2.25  # times that, anywhere
-BOARD = 0.08  # m: thinner parts are their hull, unless there is a hole right through
-SMALL = 0.08  # m: smaller parts are their hull
-TINY = 0.015  # m: smaller parts are left out
-SHEET = 0.01  # m: what has no thickness gets this: downward, so that things stand where it is seen, or else inward
+TOLERANCE, FINE = (
+    0.02,
+    0.005,
+)  # m, 90th percentile between hull and surface; FINE for handles, behind which fingers reach
+FARTHEST = 2.25  # times the tolerance, maximum distance
+BOARD = 0.08  # m: thinner parts become their hull, unless they have a through hole
+SMALL = 0.08  # m: smaller parts become their hull
+TINY = 0.015  # m: smaller parts are dropped
+SHEET = 0.01  # m, thickness given to sheets: downward, so that the visible surface stays, or else inward
 FLAT = 0.0005  # m
 LEVEL = 0.9  # of a normal's z
-FILLED = 0.1  # share of the surface that closing may add; more is a lid on something open
-LARGEST_FACETS = 40  # of an open shell
+FILLED = 0.1  # added fraction of the surface by closing; more would be a lid on an open part
+LARGEST_FACETS = 40  # maximum number of walls of an open shell
 SLENDER = 0.95 * MAX_SLENDERNESS
-MOST = 40  # pieces of a link
+MOST = 40  # maximum number of pieces of a link
 SAMPLES = 300
-DENSE = 1000  # triangles: of carved work; distances from more are measured to points on it
-CUTS, STEPS, DEPTH = 6, 5, 4  # planes tried across each axis at faces and evenly, cuts one after the other
+DENSE = 1000  # triangles; for more, distances are measured to sampled points
+CUTS, STEPS, DEPTH = 6, 5, 4  # tried planes per axis: at faces and evenly spaced; maximum depth of successive cuts
 
 
 @dataclass(frozen=True)
 class CollisionPart:
-    """A part of the furniture, as PartNet names it.
+    """A part of the furniture in PartNet.
 
     Attributes:
-        name: ``drawer_side-23``.
-        meshes: (F, 3, 3) triangles of each of its meshes, m.
+        name: name of the part, such as ``drawer_side-23``.
+        meshes: (F, 3, 3) triangles of each mesh, m.
     """
 
     name: str
@@ -50,29 +53,29 @@ class CollisionPart:
 
 
 def make_pieces(parts: Sequence[CollisionPart], middle: Array) -> list[Array]:
-    """Corners (V, 3) of the convex pieces of a link's parts, at most 40.
+    """Return the corners (V, 3) of at most 40 convex pieces of a link's parts.
 
-    A part that nearly fills its hull is one piece. Others are split: into their meshes, these into loose components,
-    open shells into their walls, and what remains by the planes that save most hull volume. Furniture being made of
-    boards, such planes are exact where a general decomposition would leave slopes, and are found much sooner.
+    A part that nearly fills its hull is one piece. Other parts are split into their meshes, meshes into connected
+    components, open shells into walls, and the rest by the planes that reduce the hull volume most. For furniture made
+    of boards, such planes are more exact and faster than a general decomposition.
 
     Args:
-        parts: of the link.
-        middle: (3,) of the furniture: upright sheets without thickness grow towards it.
+        parts: parts of the link.
+        middle: (3,) centre of the furniture; vertical sheets are thickened towards it.
 
     Raises:
-        AssetError: there is nothing to make a hull of.
+        AssetError: all parts are too small.
     """
     found: list[Array] = []
     for part in parts:
         fine = "handle" in part.name or "knob" in part.name
-        # of what else than handles is that slender nothing leans on
+        # slender parts other than handles do not support objects
         found += [piece for piece in _split(part.meshes, fine, middle) if _size(piece, 0 if fine else 1) >= TINY]
     hulls = [reduce_vertices(piece, bevel=0) for piece in found]
     hulls = _without_hidden(hulls)
     if not hulls:
         where, expected = ", ".join(part.name for part in parts)[:80], f"a part of {TINY * 1000:g} mm"
-        raise AssetError("nothing to touch", where=where, expected=expected, found="smaller ones")
+        raise AssetError("no collision shape", where=where, expected=expected, found="smaller parts only")
     if len(hulls) > MOST:
         order = np.argsort([-np.ptp(hull, axis=0).max() for hull in hulls], kind="stable")[:MOST]
         hulls = [hulls[index] for index in sorted(order)]
@@ -80,7 +83,7 @@ def make_pieces(parts: Sequence[CollisionPart], middle: Array) -> list[Array]:
 
 
 def limit_for_gpu(hull: Array) -> list[Array]:
-    """A hull (V, 3); where it is too slender for a GPU its two halves, or the box around it, which may be slender."""
+    """Return a hull (V, 3), or, if it is too slender for a GPU, its two halves or its bounding box."""
     if _sturdy(hull):
         return [hull]
     axis = int(np.ptp(hull, axis=0).argmax())
@@ -98,7 +101,7 @@ def _sturdy(hull: Array) -> bool:
 
 
 def _size(points: Array, rank: int) -> float:
-    """Longest (0), middle (1) or shortest (2) extent, m."""
+    """Return the longest (0), middle (1) or shortest (2) extent in m."""
     return float(np.sort(np.ptp(points, axis=0))[2 - rank])
 
 
@@ -119,7 +122,7 @@ def _split(meshes: Sequence[Array], fine: bool, middle: Array) -> list[Array]:
 
 
 def _is_shell(body: trimesh.Trimesh) -> bool:
-    """Whether it takes a lid to close it."""
+    """Return whether a mesh is an open shell, which only a lid could close."""
     if body.is_watertight:
         return False
     try:
@@ -129,7 +132,7 @@ def _is_shell(body: trimesh.Trimesh) -> bool:
 
 
 def _cut(triangles: Array, fine: bool, depth: int) -> list[Array]:
-    """Points of nearly convex pieces of a closed mesh, cut by planes across x, y or z."""
+    """Cut a closed mesh by planes across x, y or z into nearly convex pieces; return their points."""
     points = triangles.reshape(-1, 3)
     size = np.ptp(points, axis=0)
     if depth == 0 or size.max() <= TINY or _fits(triangles, True, TINY if fine else SMALL):
@@ -138,7 +141,7 @@ def _cut(triangles: Array, fine: bool, depth: int) -> list[Array]:
     for axis, place in _places(triangles, size > (0 if fine else BOARD / 2)):
         found = [_half(triangles, axis, place, side) for side in (1.0, -1.0)]
         volume = sum(_hull_volume(half) for half in found)
-        # beside an opening the first cut saves nothing yet: among equals the first is best
+        # next to an opening the first cut does not reduce the volume: the first of equal cuts is used
         if min(map(len, found)) and volume < 0.98 * best:
             best, halves = volume, found
     if not halves:
@@ -154,11 +157,11 @@ def _cut(triangles: Array, fine: bool, depth: int) -> list[Array]:
 
 
 def _places(triangles: Array, across: Array) -> list[tuple[int, float]]:
-    """Where to try cuts: axis and place of the largest faces across x, y and z, where notches end; then even steps.
+    """Return axes and positions of cuts to try: at the largest faces across x, y and z, then at even steps.
 
     Args:
         triangles: (F, 3, 3).
-        across: (3,) which axes to cut across: boards are not split into thinner ones.
+        across: (3,) whether to cut across each axis; boards are not split into thinner boards.
     """
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     level = np.abs(cross) > 0.99 * np.linalg.norm(cross, axis=1, keepdims=True)
@@ -198,7 +201,7 @@ def _welded(triangles: Array) -> trimesh.Trimesh:
 
 
 def _flat_hull(points: Array, middle: Array) -> Array | None:
-    """The hull of points in a plane, given some thickness; none: they aren't in a plane."""
+    """Return the thickened hull of coplanar points, or None if they are not coplanar."""
     center = points.mean(axis=0)
     spread = np.linalg.svd(points - center, full_matrices=False)
     normal = spread[2][-1]
@@ -208,13 +211,13 @@ def _flat_hull(points: Array, middle: Array) -> Array | None:
 
 
 def _thickness(normal: Array, inward: Array) -> Array:
-    """The way in which a sheet of a normal grows, m."""
+    """Return the vector in m by which a sheet with this normal is thickened."""
     level = abs(normal[2]) > LEVEL
     return normal * (SHEET if (-normal[2] if level else normal @ inward) > 0 else -SHEET)
 
 
 def _fits(triangles: Array, fine: bool, small: float = SMALL) -> bool:
-    """Whether a part's convex hull stands for it well enough."""
+    """Return whether the convex hull of a part approximates it well enough."""
     points = triangles.reshape(-1, 3)
     if np.ptp(points, axis=0).max() <= small:
         return True
@@ -240,7 +243,7 @@ def _distances(body: trimesh.Trimesh, points: Array) -> Array:
 
 
 def _walls(body: trimesh.Trimesh) -> list[Array]:
-    """A slab for each flat face of an open shell, its thickness inward."""
+    """Return an inward slab for each flat face of an open shell."""
     groups = [np.asarray(group) for group in body.facets]
     single = np.setdiff1d(np.arange(len(body.faces)), np.concatenate(groups) if groups else [])
     groups += [np.array([face]) for face in single]
@@ -259,7 +262,7 @@ def _walls(body: trimesh.Trimesh) -> list[Array]:
 
 
 def _convex_outlines(triangles: Array) -> list[Array]:
-    """Convex polygons (V, 2) that cover triangles (F, 3, 2) of a plane, joined where the sum is convex."""
+    """Return convex polygons (V, 2) that cover coplanar triangles (F, 3, 2); join them if the union is convex."""
     shapes = [Polygon(triangle) for triangle in triangles]
     union = unary_union(shapes)
     whole = [one for one in (union.geoms if isinstance(union, MultiPolygon) else [union]) if isinstance(one, Polygon)]
@@ -283,7 +286,7 @@ def _convex_outlines(triangles: Array) -> list[Array]:
 
 
 def _without_hidden(hulls: list[Array]) -> list[Array]:
-    """Leave out pieces that lie inside of another."""
+    """Remove pieces that are inside another piece."""
     planes = [ConvexHull(hull).equations for hull in hulls]
     sizes = [ConvexHull(hull).volume for hull in hulls]
     kept = []

@@ -1,4 +1,4 @@
-"""The faces of a model's shapes: mesh files and primitives; what can't be used is left out and reported."""
+"""Read the faces of a model's shapes (mesh files and primitives); skip and report unusable shapes."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from robocas_ms3.core.errors import AssetError
 Array = np.ndarray
 
 MOST_TRIANGLES = 3_000_000  # of a model: 0.4 GB
-FORMATS = (".obj", ".stl")  # of others, URDF readers disagree about the axis that points up
+FORMATS = (".obj", ".stl")  # for other formats, URDF readers disagree about the up axis
 SCHEMES = ("package://", "model://")
 SIDES = 32  # of a cylinder
 
 
 class Geometry:
-    """Reads the shapes of one model, each mesh file once.
+    """Reader of the shapes of one model; it reads each mesh file once.
 
     Args:
-        folder: of the model; nothing outside of it is read.
+        folder: of the model; files outside of it are not read.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -38,22 +38,22 @@ class Geometry:
         self._left = MOST_TRIANGLES
 
     def check(self, link: str, visuals: Sequence[Visual]) -> None:
-        """Check that the files of a link are there, without reading them.
+        """Check that the files of a link exist, without reading them.
 
         Raises:
-            AssetError: most are missing, or one is outside of the folder or in a format that is not read.
+            AssetError: most files are missing, or a file is outside of the folder or has an unsupported format.
         """
         self._check_most(link, [self._missing(one.shape) for one in visuals])
 
     def faces(self, link: str, visuals: Sequence[Visual]) -> list[tuple[str, str, Faces]]:
-        """Return the faces of a link, in the furniture's frame, with the part and the file each belongs to.
+        """Return part name, file and faces of each shape of a link, in the furniture's frame.
 
         Args:
-            link: its name, for messages.
-            visuals: its shapes.
+            link: name of the link, for messages.
+            visuals: shapes of the link.
 
         Raises:
-            AssetError: a file can't be read, or most of the shapes can't be used.
+            AssetError: a file cannot be read, or most of the shapes are unusable.
         """
         found: list[tuple[str, str, Faces]] = []
         reasons = []
@@ -71,35 +71,33 @@ class Geometry:
             source = visual.shape.filename or f"shape {index}"
             found += [(visual.part, source, replace(one, corners=one.corners @ turn.T + shift)) for one in shown]
         self._check_most(link, reasons)
-        self.repairs += [f"left out a shape of {link or 'the body'}: {reason}" for reason in reasons if reason]
+        self.repairs += [f"skipped a shape of {link or 'the body'}: {reason}" for reason in reasons if reason]
         return found
 
     def _check_most(self, link: str, reasons: Sequence[str]) -> None:
-        """Refuse a link of which more is missing than there is."""
+        """Raise AssetError if more than half of a link's shapes are missing."""
         lost = [reason for reason in reasons if reason]
         if len(lost) > len(reasons) / 2:
-            what = f"most shapes of {f'the link {link}' if link else 'the fixed body'} can't be used"
+            what = f"most shapes of {f'the link {link}' if link else 'the fixed body'} are unusable"
             found = f"{len(lost)} of {len(reasons)}: {lost[0]}"
             raise AssetError(what, where=self.files.root / URDF, found=found, fix="Download the model again.")
 
     def _missing(self, shape: Shape) -> str:
-        """Why a shape can't be used; empty: it can."""
+        """Return the reason why a shape is unusable; empty if it is usable."""
         if shape.kind in SIZES:
             return ""
         if shape.kind != "mesh":
-            return f"a <{shape.kind}> is no shape of a URDF"
+            return f"<{shape.kind}> is not a shape of URDF"
         path = self._path(shape)
         if path is None:
             return f"{shape.filename or 'a mesh without a file name'} is missing"
         if path.suffix.lower() not in FORMATS:
-            expected, fix = " or ".join(FORMATS), "Convert it to OBJ, and name that in the URDF."
-            raise AssetError(
-                "a mesh format that is not read", where=path, expected=expected, found=path.suffix, fix=fix
-            )
+            expected, fix = " or ".join(FORMATS), "Convert it to OBJ, and use the OBJ in the URDF."
+            raise AssetError("unsupported mesh format", where=path, expected=expected, found=path.suffix, fix=fix)
         return ""
 
     def _path(self, shape: Shape) -> Path | None:
-        """The mesh file that a URDF names; ``package://NAME/`` is the model's folder, or a folder in it."""
+        """Return the path of a mesh file in a URDF; ``package://NAME/`` is the model's folder, or a folder in it."""
         name, root = shape.filename, self.files.root
         if name.startswith(SCHEMES):
             package, _, inside = unquote(name.partition("://")[2]).partition("/")
@@ -117,7 +115,7 @@ class Geometry:
         if key not in self._read:
             read = read_obj if path.suffix.lower() == ".obj" else _read_stl
             self._read[key] = read(path, self.files, visual.color)
-        # a mirror image would show its inside
+        # a mirrored mesh would show its inside
         order = slice(None, None, -1 if np.prod(shape.size) < 0 else 1)
         return [
             replace(one, corners=(one.corners * shape.size)[:, order], uv=one.uv[:, order]) for one in self._read[key]

@@ -1,4 +1,4 @@
-"""A PartNet-Mobility model with its annotation, as what furniture is built from."""
+"""Convert a PartNet-Mobility model with its annotation to the source of furniture."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from asset_tools.partnet.clearance import trim_pieces
 from asset_tools.partnet.collision import CollisionPart, limit_for_gpu, make_pieces
 from asset_tools.partnet.geometry import Geometry
 from asset_tools.partnet.obj import Faces
-from asset_tools.partnet.textures import merged
-from asset_tools.partnet.urdf import URDF, Mobility, MovingLink, Visual, read_urdf, urdf_of
+from asset_tools.partnet.textures import merge_faces
+from asset_tools.partnet.urdf import URDF, MovingLink, PartnetModel, Visual, find_urdf, read_urdf
 from asset_tools.pipeline import AssetJob, content_hash, make_failing_job
 from asset_tools.readers.files import LARGEST_FILE, files_below
 from asset_tools.readers.limits import reading_limits
@@ -30,53 +30,55 @@ Array = np.ndarray
 
 LICENCE = "PartNet-Mobility terms: research use only"
 ATTRIBUTION = "PartNet-Mobility (SAPIEN, UCSD; PartNet, Stanford; ShapeNet)"
-DENSITY = 300.0  # kg/m3 of moving parts whose mass nobody gave: boards with air between
-FRICTION = 0.05  # of joints, as PhysX has it
+DENSITY = 300.0  # kg/m3 of moving parts without a given mass: hollow parts made of boards
+FRICTION = 0.05  # of joints, in PhysX's units
 DAMPING = {"prismatic": 8.0, "revolute": 0.8}  # N s/m, N m s/rad
 SMALLEST = 0.01  # m of the longest side
-MOST_REPAIRS = 30  # lines in the manifest
-# of files that a model may be made of
+MOST_REPAIRS = 30  # maximum number of lines in the manifest
+# suffixes of the files of a model
 SUFFIXES = {".obj", ".stl", ".mtl", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".webp", ".gif"}
-EDGE = 0.002  # m that a surface may reach beyond the model
+EDGE = 0.002  # m, tolerance for surfaces beyond the model's bounds
 
 
 def read_partnet(folder: Path, annotation: ModelAnnotation) -> FurnitureSource:
-    """Read a model: collision pieces, one textured mesh a link, joints, surfaces and handles.
+    """Read a model: collision pieces, one textured mesh per link, joints, surfaces and handles.
 
-    The frame is upstream's: the model's origin, x out of its front, z up; joints closed at 0. Links and joints keep
-    the URDF's names, as far as these can be names in a pack.
+    The frame is that of RoboCAS-v0: origin of the model, x out of its front, z up; joints are closed at 0. Links and
+    joints keep the URDF's names if these are valid in a pack.
 
     Args:
-        folder: of the model; its name is the id, and nothing outside of it is read.
-        annotation: what the model doesn't say of itself.
+        folder: of the model; its name is the id. Files outside of it are not read.
+        annotation: annotation of the model.
 
     Raises:
-        AssetError: naming the file that is missing or wrong, or what of the annotation doesn't fit the model.
+        AssetError: a file is missing or invalid, or the annotation does not fit the model.
     """
     folder = folder.resolve()
     model = read_urdf(folder, annotation.joints, annotation.scale)
     geometry = Geometry(folder)
     with reading_limits(folder):
-        looks = {name: geometry.faces(name, visuals) for name, visuals in _groups(model)}
+        faces_by_link = {name: geometry.faces(name, visuals) for name, visuals in _groups(model)}
     corners = np.concatenate(
-        [np.zeros((0, 3))] + [faces.corners.reshape(-1, 3) for group in looks.values() for _, _, faces in group]
+        [np.zeros((0, 3))] + [faces.corners.reshape(-1, 3) for group in faces_by_link.values() for _, _, faces in group]
     )
-    empty = next((name for name, group in looks.items() if not group), None)
+    empty = next((name for name, group in faces_by_link.items() if not group), None)
     if empty is not None:
         what = f"the moving link {empty} has no mesh" if empty else "the fixed body has no mesh"
-        fix = "Hold a joint in the annotation: `fixed: true`."
+        fix = "Fix the joint in the annotation: `fixed: true`."
         raise AssetError(what, where=folder / URDF, expected="a <visual> of each body", fix=fix)
     bounds = np.array([corners.min(axis=0), corners.max(axis=0)])
     _check_size(bounds, folder.name)
     _check(model, annotation, bounds)
     if annotation.mass is not None and model.links:
-        fix = "Leave `mass` out; that of moving parts goes under `joints`."
-        raise AssetError("furniture with moving parts stands fixed", where=folder.name, found="a mass", fix=fix)
+        fix = "Remove `mass`; masses of moving parts belong under `joints`."
+        raise AssetError(
+            "furniture with moving parts must be fixed", where=folder.name, expected="no mass", found="a mass", fix=fix
+        )
     repairs = [*model.repairs, *geometry.repairs]
     ids = _ids([link.name for link in model.links], repairs)
     joint_ids = _ids([link.joint for link in model.links], repairs)
     middle = bounds.mean(axis=0)
-    pieces = {name: _for_gpu(make_pieces(_parts(group), middle)) for name, group in looks.items()}
+    pieces = {name: _for_gpu(make_pieces(_parts(group), middle)) for name, group in faces_by_link.items()}
     joints = {link.name: _joint(link, joint_ids[link.joint], annotation) for link in model.links}
     for link in model.links:
         others = [piece for name, group in pieces.items() if name not in _carried(model, link.name) for piece in group]
@@ -85,7 +87,7 @@ def read_partnet(folder: Path, annotation: ModelAnnotation) -> FurnitureSource:
     for link in model.links:
         note = annotation.joints.get(link.joint, JointAnnotation())
         volume = sum(ConvexHull(piece).volume for piece in pieces[link.name])
-        mesh = merged([faces for _, _, faces in looks[link.name]])
+        mesh = merge_faces([faces for _, _, faces in faces_by_link[link.name]])
         mass = note.mass or max(0.3, round(DENSITY * volume, 2))
         parent = ids[link.parent] if link.parent else ""
         links.append(LinkSource(ids[link.name], joints[link.name], mesh, pieces[link.name], mass, parent))
@@ -94,7 +96,7 @@ def read_partnet(folder: Path, annotation: ModelAnnotation) -> FurnitureSource:
         id=object_id(folder.name),
         name=annotation.name,
         category=annotation.category,
-        mesh=merged([faces for _, _, faces in looks[""]]),
+        mesh=merge_faces([faces for _, _, faces in faces_by_link[""]]),
         pieces=pieces[""],
         mass=annotation.mass,
         origin_height=annotation.origin_lift,
@@ -114,13 +116,13 @@ def read_partnet(folder: Path, annotation: ModelAnnotation) -> FurnitureSource:
     )
 
 
-def _groups(model: Mobility) -> list[tuple[str, list[Visual]]]:
-    """Shapes of the fixed body, whose name is empty, and of each moving link."""
+def _groups(model: PartnetModel) -> list[tuple[str, list[Visual]]]:
+    """Return name and shapes of the fixed body, whose name is empty, and of each moving link."""
     return [("", model.body), *((link.name, link.visuals) for link in model.links)]
 
 
 def _ids(names: Sequence[str], repairs: list[str]) -> dict[str, str]:
-    """Names of a URDF -> names in a pack: small letters, digits and underscores, all of them different."""
+    """Map names of a URDF to unique names in a pack: lower-case letters, digits and underscores."""
     ids: dict[str, str] = {}
     taken = {BODY}
     for name in names:
@@ -131,15 +133,15 @@ def _ids(names: Sequence[str], repairs: list[str]) -> dict[str, str]:
         taken.add(found)
         ids[name] = found
         if found != name:
-            repairs.append(f"called {name!r} {found}")
+            repairs.append(f"renamed {name!r} to {found}")
     return ids
 
 
 def _short(repairs: Sequence[str]) -> tuple[str, ...]:
-    """Each line once, and not too many of them."""
+    """Remove duplicate lines, and limit the number of lines."""
     lines = list(dict.fromkeys(repairs))
     left = len(lines) - MOST_REPAIRS
-    return (*lines[:MOST_REPAIRS], *([f"{left} more like these"] if left > 0 else []))
+    return (*lines[:MOST_REPAIRS], *([f"{left} more lines"] if left > 0 else []))
 
 
 def _for_gpu(pieces: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -147,14 +149,14 @@ def _for_gpu(pieces: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 
 def partnet_jobs(folders: Sequence[Path], annotations: Path | None = None) -> list[AssetJob]:
-    """What is to be made of models.
+    """Return the jobs that import models.
 
     Args:
-        folders: of the models, each with a ``mobility.urdf``; their names are the ids.
-        annotations: folder of the user's ``<id>.yaml``; they go before those shipped.
+        folders: folders of the models with ``mobility.urdf``; their names are the ids.
+        annotations: folder of the user's ``<id>.yaml`` files, which have priority over bundled ones.
 
     Returns:
-        Jobs; those that can only fail come first, so that an import that is to stop does so before anything is made.
+        Jobs; failing jobs come first, so that an import stops before it builds an asset.
     """
     good: dict[str, AssetJob] = {}
     bad: dict[str, AssetJob] = {}
@@ -162,7 +164,7 @@ def partnet_jobs(folders: Sequence[Path], annotations: Path | None = None) -> li
         name = object_id(folder.name)
         try:
             if name in good or name in bad:
-                raise AssetError("two models would get the same id", where=folder, found=name, fix="Rename one.")
+                raise AssetError("two models have the same id", where=folder, found=name, fix="Rename one of them.")
             good[name] = _job(name, folder, annotations)
         except AssetError as error:
             label = name if name not in good and name not in bad else object_id(str(folder))
@@ -171,7 +173,7 @@ def partnet_jobs(folders: Sequence[Path], annotations: Path | None = None) -> li
 
 
 def _job(name: str, folder: Path, annotations: Path | None) -> AssetJob:
-    urdf_of(folder)  # else the annotation would be what is missing
+    find_urdf(folder)  # otherwise the error would be a missing annotation
     annotation = find_annotation(folder.name, annotations)
     model, geometry = read_urdf(folder, annotation.joints, annotation.scale), Geometry(folder)
     for link, visuals in _groups(model):
@@ -181,11 +183,11 @@ def _job(name: str, folder: Path, annotations: Path | None) -> AssetJob:
 
 
 def _files(folder: Path) -> list[Path]:
-    """The files that a model may be made of."""
+    """Return the files that a model may use."""
     found = [folder / URDF]
     for path in files_below(folder):
         inside = path.suffix.lower() in SUFFIXES and path.is_file() and path.resolve().is_relative_to(folder)
-        if inside and path.stat().st_size <= LARGEST_FILE:  # larger ones are not read
+        if inside and path.stat().st_size <= LARGEST_FILE:  # larger files are not read
             found.append(path)
     return found
 
@@ -206,7 +208,7 @@ def _parts(group: Sequence[tuple[str, str, Faces]]) -> list[CollisionPart]:
 def _joint(link: MovingLink, name: str, annotation: ModelAnnotation) -> Joint:
     note, limits = annotation.joints.get(link.joint, JointAnnotation()), link.limits
     if not limits[0] <= 0 <= limits[1] or limits[0] == limits[1]:
-        raise AssetError("a joint's range doesn't hold 0, which is closed", where=link.joint, found=limits)
+        raise AssetError("limits of a joint must include 0 (closed)", where=link.joint, found=limits)
     x, y, z = (float(value) for value in np.round(link.axis, 9) + 0.0)
     a, b, c = (float(value) for value in np.round(link.origin, 9) + 0.0)
     return Joint(
@@ -220,8 +222,8 @@ def _joint(link: MovingLink, name: str, annotation: ModelAnnotation) -> Joint:
     )
 
 
-def _carried(model: Mobility, name: str) -> set[str]:
-    """A link and all that hangs on it."""
+def _carried(model: PartnetModel, name: str) -> set[str]:
+    """Return the names of a link and all links that it carries."""
     carried = {name}
     for link in model.links:
         if link.parent in carried:
@@ -229,26 +231,26 @@ def _carried(model: Mobility, name: str) -> set[str]:
     return carried
 
 
-def _check(model: Mobility, annotation: ModelAnnotation, bounds: Array) -> None:
+def _check(model: PartnetModel, annotation: ModelAnnotation, bounds: Array) -> None:
     where = model.folder.name
     moving = {link.joint for link in model.links}
     for name in annotation.joints:
         if name not in model.joints:
             expected = f"one of {', '.join(sorted(model.joints)) or '(none)'}"
-            raise AssetError("the annotation names an unknown joint", where=where, expected=expected, found=name)
+            raise AssetError("unknown joint in the annotation", where=where, expected=expected, found=name)
     for name, handle in annotation.handles.items():
         if handle.joint not in moving:
             expected = f"one of {', '.join(sorted(moving)) or '(none)'}"
             found, known = handle.joint, handle.joint in model.joints
-            what = f"the handle {name!r} is of {'a joint that is held closed' if known else 'an unknown joint'}"
-            fix = "Give the joint `limits` in the annotation, or leave the handle out." if known else ""
+            what = f"handle {name!r} of {'a fixed joint' if known else 'an unknown joint'}"
+            fix = "Give the joint `limits` in the annotation, or remove the handle." if known else ""
             raise AssetError(what, where=where, expected=expected, found=found, fix=fix)
     links = {"", *(link.name for link in model.links)}
     for name, surface in annotation.surfaces.items():
         if surface.link not in links:
             expected = f"one of {', '.join(sorted(links - {''})) or '(none)'}"
             found = surface.link
-            raise AssetError(f"the surface {name!r} is of an unknown link", where=where, expected=expected, found=found)
+            raise AssetError(f"surface {name!r} of an unknown link", where=where, expected=expected, found=found)
         _check_surface(name, surface, bounds, where)
 
 
@@ -256,8 +258,8 @@ def _check_size(bounds: Array, where: str) -> None:
     size = float((bounds[1] - bounds[0]).max())
     if size < SMALLEST or np.abs(bounds).max() > LARGEST:
         expected, found = f"{SMALLEST} to {LARGEST:g} m", f"{size:.4g} m"
-        fix = "Set `scale` in the annotation: metres of one unit of the model."
-        raise AssetError("the model has no size of furniture", where=where, expected=expected, found=found, fix=fix)
+        fix = "Set `scale` in the annotation: metres per unit of the model."
+        raise AssetError("implausible size of furniture", where=where, expected=expected, found=found, fix=fix)
 
 
 def _check_surface(name: str, surface: Surface, bounds: Array, where: str) -> None:
@@ -265,4 +267,4 @@ def _check_surface(name: str, surface: Surface, bounds: Array, where: str) -> No
     if (low < bounds[0] - EDGE).any() or (high > bounds[1] + EDGE).any():
         span = " ".join(f"{axis} {a:.3f}..{b:.3f}" for axis, a, b in zip("xyz", *bounds, strict=True))
         found = f"{[round(float(value), 3) for value in low]} to {[round(float(value), 3) for value in high]}"
-        raise AssetError(f"the surface {name!r} lies outside of the model", where=where, expected=span, found=found)
+        raise AssetError(f"surface {name!r} is outside of the model", where=where, expected=span, found=found)

@@ -1,4 +1,4 @@
-"""PartNet-Mobility's OBJ files with their materials; nothing is merged, both sides of a face may be there."""
+"""Read PartNet-Mobility's OBJ files with materials; faces are not merged and may be double-sided."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from robocas_ms3.core.errors import AssetError
 Array = np.ndarray
 
 GREY = (0.7, 0.7, 0.7)
-MOST_REPEATS = 1000  # of a texture on faces of one material; it is written out as often as it repeats
+MOST_REPEATS = 1000  # repetitions of a texture on faces of one material, each of which is written out
 FARTHEST_UV = 1e6
 OBJ_LIMIT = 64 * 2**20  # bytes; the largest of PartNet-Mobility have some 10 MB
 
 
 @dataclass(frozen=True)
 class Material:
-    """How faces look.
+    """Material of faces.
 
     Attributes:
-        color: (3,) 0 to 1.
-        image: of the texture, which then is all there is to see, its links followed; none: plain.
+        color: (3,) in 0..1, used without a texture.
+        image: resolved path of the texture, or None.
     """
 
     color: tuple[float, float, float] = GREY
@@ -38,8 +38,8 @@ class Faces:
 
     Attributes:
         corners: (F, 3, 3) m.
-        uv: (F, 3, 2), v upward; zeros where the file has none.
-        material: how they look.
+        uv: (F, 3, 2), v upward; zeros if missing.
+        material: material of the faces.
     """
 
     corners: Array
@@ -48,15 +48,15 @@ class Faces:
 
 
 def read_obj(path: Path, files: ModelFiles, color: tuple[float, float, float] | None) -> list[Faces]:
-    """Read a mesh; empty where it has no faces with an area.
+    """Read a mesh; return [] if all faces are degenerate.
 
     Args:
         path: of the mesh.
-        files: of the model; gets notes of what is missing.
-        color: (3,) 0 to 1, of faces whose material is not known.
+        files: files of the model; notes on missing files are added.
+        color: (3,) in 0..1, for faces with an unknown material.
 
     Raises:
-        AssetError: a file can't be read, or leads out of the model's folder.
+        AssetError: a file cannot be read, or is outside of the model's folder.
     """
     data = files.read(path)
     if len(data) > OBJ_LIMIT:
@@ -68,7 +68,7 @@ def read_obj(path: Path, files: ModelFiles, color: tuple[float, float, float] | 
         raise AssetError("the mesh has vertices that are NaN or infinite", where=path)
     if not has_area(corners):
         return []
-    uvs = np.concatenate([mesh.uvs, np.zeros((1, 2))])[mesh.face_uvs]  # index -1: the zeros
+    uvs = np.concatenate([mesh.uvs, np.zeros((1, 2))])[mesh.face_uvs]  # index -1: zeros
     found = _materials(mesh, path, files)
     groups = []
     for index in np.unique(mesh.face_materials, return_index=True)[0].tolist():
@@ -76,21 +76,21 @@ def read_obj(path: Path, files: ModelFiles, color: tuple[float, float, float] | 
         look, folder = found.get(index, (None, path.parent))
         material = Material(color or GREY) if look is None else _material(look, folder, files)
         uv = uvs[own] if look is None else uvs[own] * look.uv_scale + look.uv_offset
-        if not (np.abs(uv) <= FARTHEST_UV).all() or np.ptp(uv) > MOST_REPEATS:  # NaN is not
-            files.notes.append(f"{path.name}: texture coordinates that can't be used; the faces are plain")
+        if not (np.abs(uv) <= FARTHEST_UV).all() or np.ptp(uv) > MOST_REPEATS:  # false for NaN
+            files.notes.append(f"{path.name}: invalid texture coordinates; the faces have a plain colour")
             uv, material = np.zeros_like(uv), Material(material.color)
         groups.append(Faces(corners[own], uv, material))
     return groups
 
 
 def has_area(corners: Array) -> bool:
-    """Whether triangles (F, 3, 3) are more than points and lines."""
+    """Return whether any of the triangles (F, 3, 3) is not degenerate."""
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     return len(areas) > 0 and bool(areas.max() > 0)
 
 
 def _materials(mesh: ObjMesh, path: Path, files: ModelFiles) -> dict[int, tuple[MtlMaterial, Path]]:
-    """Material of each index of the mesh, with the folder that its images are relative to."""
+    """Return material index -> material and the folder of its images."""
     known: dict[str, MtlMaterial] = {}
     homes: dict[str, Path] = {}
     for file in _libraries(mesh, path, files):
@@ -105,12 +105,12 @@ def _materials(mesh: ObjMesh, path: Path, files: ModelFiles) -> dict[int, tuple[
         if look is not None:
             found[index] = look, homes[look.name]
         elif known or name:
-            files.notes.append(f"{path.name}: no material {name!r}; the faces are plain")
+            files.notes.append(f"{path.name}: no material {name!r}; the faces have a plain colour")
     return found
 
 
 def _libraries(mesh: ObjMesh, path: Path, files: ModelFiles) -> list[Path]:
-    """The MTL files that a mesh names; where one is missing, that of the mesh's own name."""
+    """Return the MTL files of a mesh; a missing file is replaced by the file with the mesh's name."""
     found = []
     for line in mesh.libraries:
         whole = files.find(line, path.parent)
@@ -118,7 +118,7 @@ def _libraries(mesh: ObjMesh, path: Path, files: ModelFiles) -> list[Path]:
             library = whole or files.find(name, path.parent)
             own = path.with_suffix(".mtl")
             if library is None and own.is_file():
-                files.notes.append(f"{path.name}: took {own.name} for the missing {name}")
+                files.notes.append(f"{path.name}: used {own.name} instead of the missing {name}")
                 library = own
             if library is None:
                 files.notes.append(f"{path.name}: the material file {name} is missing")

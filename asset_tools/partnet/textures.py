@@ -72,7 +72,7 @@ class _Tile:
         return Image.fromarray(pixels).resize(size, Image.Resampling.BICUBIC, box=inside)
 
 
-def merged(faces: Sequence[Faces]) -> trimesh.Trimesh:
+def merge_faces(faces: Sequence[Faces]) -> trimesh.Trimesh:
     """A mesh with one texture that looks like all of the faces.
 
     Carved and turned parts of thousands of faces are simplified. Textures that repeat are written out as often as they

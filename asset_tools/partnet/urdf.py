@@ -1,4 +1,4 @@
-"""PartNet-Mobility's ``mobility.urdf``: which shapes hang on which joints, in one frame with every joint closed."""
+"""Read PartNet-Mobility's ``mobility.urdf``: shapes and joints of all links, in one frame with closed joints."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Array = np.ndarray
 
 URDF = "mobility.urdf"
 URDF_LIMIT = 16 * 2**20  # bytes; the largest of PartNet-Mobility has 1 MB
-# PartNet's URDFs look along -x; furniture here looks along +x, as upstream turns them
+# the front of PartNet's URDFs is -x; here it is +x, as in RoboCAS-v0
 TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])
 KINDS: dict[str, Literal["prismatic", "revolute"]] = {
     "prismatic": "prismatic",
@@ -32,12 +32,12 @@ KINDS: dict[str, Literal["prismatic", "revolute"]] = {
 SIZES = {"box": ("size", 3), "cylinder": ("radius length", 2), "sphere": ("radius", 1)}  # attributes, numbers
 MOST_LINKS, MOST_SHAPES = 1000, 2000
 MOST_MOVING = 60  # PhysX simulates articulations of at most 64 bodies
-FAR = 1e6  # greatest number of a position, size or angle
+FAR = 1e6  # largest position, size or angle
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A `<geometry>`: its tag; scale of a mesh, size of a box, radius and length, or radius, m; a mesh file."""
+    """A `<geometry>`: tag, dimensions in m (mesh scale; box size; radius and length; radius) and mesh file."""
 
     kind: str
     size: tuple[float, ...] = ()
@@ -46,10 +46,10 @@ class Shape:
 
 @dataclass(frozen=True)
 class Visual:
-    """A shape of a part such as ``drawer_side-23``, at a pose 4x4 in the furniture's frame, joints closed.
+    """A shape of a part such as ``drawer_side-23``, with its pose (4, 4) in the furniture's frame, joints closed.
 
     Attributes:
-        color: (3,) 0 to 1, of a shape without a material of its own.
+        color: (3,) in 0..1, for a shape without a material.
     """
 
     part: str
@@ -60,9 +60,9 @@ class Visual:
 
 @dataclass(frozen=True)
 class MovingLink:
-    """A link that moves, in the furniture's frame with joints closed; metres, radians.
+    """A moving link in the furniture's frame with joints closed; metres, radians.
 
-    Its parent is a moving link, or empty for the fixed body; its shapes include those of links fixed to it.
+    ``parent`` is a moving link, or empty for the fixed body. The shapes include those of links fixed to this link.
     """
 
     name: str
@@ -76,8 +76,8 @@ class MovingLink:
 
 
 @dataclass(frozen=True)
-class Mobility:
-    """A model: shapes of the fixed body, moving links (parents first), names of all joints that could move, repairs."""
+class PartnetModel:
+    """A model: shapes of the fixed body, moving links (parents first), names of all movable joints, repairs."""
 
     folder: Path
     body: list[Visual]
@@ -96,16 +96,16 @@ class _Joint:
     element: ET.Element
 
 
-def read_urdf(folder: Path, notes: Mapping[str, JointAnnotation] | None = None, scale: float = 1.0) -> Mobility:
-    """Read a model's links and joints. Joints without a finite range (casters) are fixed unless a note gives limits.
+def read_urdf(folder: Path, notes: Mapping[str, JointAnnotation] | None = None, scale: float = 1.0) -> PartnetModel:
+    """Read the links and joints of a model; joints without finite limits are fixed unless a note gives limits.
 
     Args:
-        folder: of the model; holds ``mobility.urdf``.
-        notes: of an annotation, by joint.
-        scale: metres of one unit of the URDF.
+        folder: of the model, with ``mobility.urdf``.
+        notes: annotations by joint.
+        scale: metres per unit of the URDF.
 
     Raises:
-        AssetError: no URDF, or one that can't be read, or names or joints in it that can't be used.
+        AssetError: the URDF is missing or invalid, or has unsupported names or joints.
     """
     return _Reader(folder, notes or {}, scale).read()
 
@@ -116,7 +116,7 @@ class _Reader:
         self._repairs: list[str] = []
         self._colors: dict[str, tuple[float, float, float]] = {}
 
-    def read(self) -> Mobility:
+    def read(self) -> PartnetModel:
         root = _parse(self._folder)
         named = root.findall("link"), root.findall("joint")
         shapes = max(len(root.findall(f"link/{tag}")) for tag in ("visual", "collision"))
@@ -131,10 +131,10 @@ class _Reader:
         joints = [self._joint(*both) for both in zip(self._names(named[1]), named[1], strict=True)]
         body, moving = self._placed(visuals, joints)
         if len(moving) > MOST_MOVING:
-            expected, fix = f"at most {MOST_MOVING}", "Hold some of their joints: `fixed: true`."
+            expected, fix = f"at most {MOST_MOVING}", "Fix some of their joints in the annotation: `fixed: true`."
             raise AssetError("too many moving links", where=self._path, expected=expected, found=len(moving), fix=fix)
         could_move = frozenset(joint.name for joint in joints if joint.kind != "fixed")
-        return Mobility(self._folder, body, moving, could_move, tuple(self._repairs))
+        return PartnetModel(self._folder, body, moving, could_move, tuple(self._repairs))
 
     def _placed(
         self, visuals: Mapping[str, list[Visual]], joints: list[_Joint]
@@ -149,13 +149,13 @@ class _Reader:
         roots = [name for name in visuals if name not in children]
         if len(roots) != 1 or len(children) != len(joints):
             found = ", ".join(roots) or "a loop"
-            raise AssetError("the links are no tree", where=self._path, expected="one root", found=found)
+            raise AssetError("the links do not form a tree", where=self._path, expected="one root", found=found)
         body: list[Visual] = []
         links: list[MovingLink] = []
         queue: list[tuple[str, Array, MovingLink | None]] = [(roots[0], TURNED, None)]
         for name, pose, carrier in queue:
             (carrier.visuals if carrier else body).extend(
-                Visual(one.part, one.shape, pose @ one.pose, one.color) for one in visuals[name]
+                Visual(shape.part, shape.shape, pose @ shape.pose, shape.color) for shape in visuals[name]
             )
             for joint in below[name]:
                 frame = pose @ joint.pose
@@ -171,21 +171,23 @@ class _Reader:
                 queue.append((joint.child, frame @ _motion(kind, axis, closed), links[-1]))
         if len(queue) != len(visuals):
             lost = sorted(visuals.keys() - {name for name, _, _ in queue})
-            raise AssetError("the links are no tree", where=self._path, expected="one root", found=f"a loop of {lost}")
+            raise AssetError(
+                "the links do not form a tree", where=self._path, expected="one root", found=f"a loop of {lost}"
+            )
         return body, links
 
     def _range(self, joint: _Joint) -> tuple[float, tuple[float, float]] | None:
-        """Return the closed position in the URDF's count, and the limits from there; None: the joint is fixed."""
+        """Return the closed position in the URDF's units, and the limits relative to it; None for a fixed joint."""
         note = self._notes.get(joint.name, JointAnnotation())
         if joint.kind == "fixed" or note.fixed:
             return None
         if joint.kind not in KINDS:
-            fix = f"Hold it in the annotation: `joints: {{{joint.name}: {{fixed: true}}}}`."
+            fix = f"Fix it in the annotation: `joints: {{{joint.name}: {{fixed: true}}}}`."
             expected = ", ".join(["fixed", *KINDS])
             found = f"{joint.name}: {joint.kind!r}"
             raise AssetError("a joint of an unknown type", where=self._path, expected=expected, found=found, fix=fix)
         if joint.element.find("mimic") is not None:
-            self._repairs.append(f"the joint {joint.name} moves on its own: `mimic` is not simulated")
+            self._repairs.append(f"the joint {joint.name} moves independently: `mimic` is not simulated")
         unit = self._scale if joint.kind == "prismatic" else 1.0
         low, high = self._limits(joint, note, unit)
         finite = np.isfinite([low, high]).all()
@@ -195,13 +197,13 @@ class _Reader:
         if note.limits is not None:
             return closed, note.limits
         if not finite or low == high:
-            why = "it has no range" if finite else "it has no finite limits"
-            self._repairs.append(f"held the joint {joint.name} closed: {why}")
+            reason = "it has no range" if finite else "it has no finite limits"
+            self._repairs.append(f"fixed the joint {joint.name} in its closed position: {reason}")
             return None
         return closed, (low - closed, high - closed)
 
     def _limits(self, joint: _Joint, note: JointAnnotation, unit: float) -> tuple[float, float]:
-        """Return limits in m or rad, in the URDF's count; infinite where there are none."""
+        """Return the limits in m or rad, relative to the URDF's zero; infinite if missing."""
         limit = joint.element.find("limit")
         if limit is None or joint.kind == "continuous":
             return -np.inf, np.inf
@@ -213,9 +215,9 @@ class _Reader:
         usable = low <= high and not (np.isfinite(ends) & (np.abs(ends) > LARGEST)).any()
         if not usable and note.limits is None:
             found = f"{joint.name}: {limit.get('lower', '0')} to {limit.get('upper', '0')}"
-            fix = "Give the joint `limits` in the annotation, or hold it: `fixed: true`."
+            fix = "Give the joint `limits` in the annotation, or fix it: `fixed: true`."
             expected = f"lower <= upper, at most {LARGEST:g} m or rad, or `inf`"
-            raise AssetError("limits that can't be used", where=self._path, expected=expected, found=found, fix=fix)
+            raise AssetError("invalid limits of a joint", where=self._path, expected=expected, found=found, fix=fix)
         return (low, high) if usable else (-np.inf, np.inf)
 
     def _names(self, elements: list[ET.Element]) -> list[str]:
@@ -223,22 +225,22 @@ class _Reader:
         for element in elements:
             name = check_name(element.get("name", ""), AssetError, where=f"{self._path}, name of a <{element.tag}>")
             if name in names:
-                raise AssetError(f"two {element.tag}s have the same name", where=self._path, found=repr(name))
+                raise AssetError(f"duplicate name of a {element.tag}", where=self._path, found=repr(name))
             names[name] = None
         return list(names)
 
     def _visuals(self, name: str, link: ET.Element) -> list[Visual]:
-        """Return the shapes of a link in its frame: visual ones, or else those for collision."""
+        """Return the visual shapes of a link in its frame, or else its collision shapes."""
         found, tag = link.findall("visual"), "visual"
         if not found and link.find("collision") is not None:
             found, tag = link.findall("collision"), "collision"
             self._repairs.append(f"the link {name} has no <visual>: shows its <collision>")
         visuals = []
-        for index, one in enumerate(found):
+        for index, item in enumerate(found):
             where = f"{self._path}, <{tag}> {index} of the link {name}"
-            part = one.get("name") or f"part-{index}"
-            shape, pose = self._shape(one.find("geometry"), where), self._pose(one.find("origin"), where)
-            material = one.find("material")
+            part = item.get("name") or f"part-{index}"
+            shape, pose = self._shape(item.find("geometry"), where), self._pose(item.find("origin"), where)
+            material = item.find("material")
             visuals.append(Visual(part, shape, pose, None if material is None else self._color(material)))
         return visuals
 
@@ -249,18 +251,18 @@ class _Reader:
         if shape.tag == "mesh":
             factors = _numbers(shape.get("scale", "1 1 1"), where, (1, 3)) * self._scale
             if not factors.all():
-                raise AssetError("a mesh scaled to nothing", where=where, found=factors.tolist())
+                raise AssetError("zero scale of a mesh", where=where, found=factors.tolist())
             return Shape("mesh", tuple(np.broadcast_to(factors, 3).tolist()), shape.get("filename", ""))
         if shape.tag not in SIZES:
             return Shape(shape.tag)
         names, count = SIZES[shape.tag]
         sizes = _numbers(" ".join(shape.get(name, "") for name in names.split()), where, (count,)) * self._scale
         if not (sizes > 0).all():
-            raise AssetError("a shape without a size", where=where, expected="sizes > 0", found=sizes.tolist())
+            raise AssetError("invalid size of a shape", where=where, expected="sizes > 0", found=sizes.tolist())
         return Shape(shape.tag, tuple(sizes.tolist()))
 
     def _color(self, material: ET.Element) -> tuple[float, float, float] | None:
-        """Return the colour of a material, which may be declared elsewhere in the file by its name."""
+        """Return the colour of a material, which may be defined elsewhere in the file by name."""
         name, color = material.get("name", ""), material.find("color")
         if color is None:
             return self._colors.get(name)
@@ -281,7 +283,7 @@ class _Reader:
         axis = _numbers("1 0 0" if element is None else element.get("xyz", "1 0 0"), where, (3,))
         length = float(np.linalg.norm(axis))
         if length < 1e-9:
-            raise AssetError("an axis of no length", where=where, found=axis.tolist())
+            raise AssetError("zero axis of a joint", where=where, found=axis.tolist())
         return axis / length
 
     def _pose(self, origin: ET.Element | None, where: str) -> Array:
@@ -292,17 +294,17 @@ class _Reader:
         return pose
 
 
-def urdf_of(folder: Path) -> Path:
-    """Return the URDF of a model; AssetError where there is none."""
+def find_urdf(folder: Path) -> Path:
+    """Return the path of a model's URDF; raise AssetError if it is missing."""
     path = folder / URDF
     if not path.exists():
         expected = "the folder of a PartNet-Mobility model"
-        raise AssetError("no such file", where=path, expected=expected, fix="Give its folder.")
+        raise AssetError("no such file", where=path, expected=expected, fix="Pass the folder of the model.")
     return path
 
 
 def _parse(folder: Path) -> ET.Element:
-    path = urdf_of(folder)
+    path = find_urdf(folder)
     data = read_file(path, folder)
     if len(data) > URDF_LIMIT:
         expected, found = f"at most {URDF_LIMIT >> 20} MB", f"{len(data) >> 20} MB"
@@ -312,16 +314,16 @@ def _parse(folder: Path) -> ET.Element:
     reader.StartDoctypeDeclHandler = partial(_refuse_doctype, path)
     try:
         reader.Parse(data, True)
-    except (expat.ExpatError, LookupError, ValueError) as error:  # also of unknown encodings
-        raise AssetError("the URDF can't be read", where=path, found=error) from error
+    except (expat.ExpatError, LookupError, ValueError) as error:  # also for unknown encodings
+        raise AssetError("cannot read the URDF", where=path, found=error) from error
     root = tree.close()
     if root.tag != "robot":
-        raise AssetError("the file is no URDF", where=path, expected="<robot>", found=f"<{root.tag[:40]}>")
+        raise AssetError("the file is not a URDF", where=path, expected="<robot>", found=f"<{root.tag[:40]}>")
     return root
 
 
 def _refuse_doctype(path: Path, *_: object) -> None:
-    # a few lines of entities can stand for gigabytes, or for another file
+    # a few lines of entities can expand to gigabytes, or include other files
     fix = "Remove the line `<!DOCTYPE ...>` and the entities in it."
     raise AssetError("the URDF declares a document type", where=path, expected="plain XML", fix=fix)
 
@@ -331,9 +333,9 @@ def _numbers(text: str, where: str, counts: tuple[int, ...]) -> Array:
         values = np.array([float(word) for word in text.split()])
     except ValueError:
         values = np.zeros(0)
-    if len(values) not in counts or not (np.abs(values) <= FAR).all():  # NaN is not
+    if len(values) not in counts or not (np.abs(values) <= FAR).all():  # false for NaN
         expected = f"{' or '.join(map(str, counts))} numbers, at most {FAR:g}"
-        raise AssetError("numbers that can't be read", where=where, expected=expected, found=repr(text[:80]))
+        raise AssetError("invalid numbers", where=where, expected=expected, found=repr(text[:80]))
     return values
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import sapien
 from sapien import physx
 
-from asset_tools.quality.furniture_scene import Model, Stage, model_of
-from asset_tools.quality.overlap import convex, deepest, distances
-from asset_tools.quality.surfaces import BLOCKED, Probe, clearances, probes
+from asset_tools.quality.furniture_scene import FurnitureModel, FurnitureScene, make_model
+from asset_tools.quality.overlap import distances, make_convex_body, max_overlap
+from asset_tools.quality.surfaces import BLOCKED, Probe, clearances, make_probes
 from asset_tools.sources import FurnitureSource
 from robocas_ms3.assets.hulls import convex_faces
 from robocas_ms3.assets.kinematics import link_poses
@@ -107,7 +107,7 @@ def measure_furniture(furniture: FurnitureSource | LoadedFurniture) -> Furniture
         AssetError: the physics engine refuses a hull.
     """
     report = examine_furniture(furniture)
-    hulls = [piece for pieces in model_of(furniture).pieces.values() for piece in pieces]
+    hulls = [piece for pieces in make_model(furniture).pieces.values() for piece in pieces]
     return FurnitureQuality(
         hull_count=len(hulls),
         hull_vertices=max(len(convex_faces(hull)[0]) for hull in hulls),
@@ -122,7 +122,7 @@ def examine_furniture(furniture: FurnitureSource | LoadedFurniture) -> Furniture
     Raises:
         AssetError: the physics engine refuses a hull.
     """
-    model = model_of(furniture)
+    model = make_model(furniture)
     with engine_settings():
         joints = {link.joint.name: _try_joint(model, link) for link in model.links}
         return FurnitureReport(joints, {name: _try_surface(model, surface) for name, surface in model.surfaces.items()})
@@ -133,8 +133,8 @@ def _share(flags: Iterable[bool]) -> float | None:
     return sum(found) / len(found) if found else None
 
 
-def _try_joint(model: Model, link: Link) -> JointReport:
-    joint, stage = link.joint, Stage(model)
+def _try_joint(model: FurnitureModel, link: Link) -> JointReport:
+    joint, stage = link.joint, FurnitureScene(model)
     far = max(joint.limits, key=abs)
     fastest, bounded = 0.0, True
 
@@ -168,23 +168,23 @@ def _try_joint(model: Model, link: Link) -> JointReport:
     return JointReport(reached[0], reached[1], drifted, fastest, bounded, _jam(model, link), _grip(model, link))
 
 
-def _jam(model: Model, link: Link) -> float:
+def _jam(model: FurnitureModel, link: Link) -> float:
     """How deep a part, with all that hangs on it, reaches into the rest, the other joints closed, m."""
     carried = {link.name}
     for other in model.links:
         if other.parent in carried:
             carried.add(other.name)
-    moving = [convex(piece) for name in model.pieces if name in carried for piece in model.pieces[name]]
-    rest = [convex(piece) for name in model.pieces if name not in carried for piece in model.pieces[name]]
+    moving = [make_convex_body(piece) for name in model.pieces if name in carried for piece in model.pieces[name]]
+    rest = [make_convex_body(piece) for name in model.pieces if name not in carried for piece in model.pieces[name]]
     low, high = link.joint.limits
     found = 0.0
     for share in (*STOPS, -low / (high - low)):
         pose = link_poses(model.links, {link.joint.name: low + share * (high - low)})[link.name]
-        found = max(found, deepest([body.moved(pose) for body in moving], rest))
+        found = max(found, max_overlap([body.moved(pose) for body in moving], rest))
     return found
 
 
-def _grip(model: Model, link: Link) -> float:
+def _grip(model: FurnitureModel, link: Link) -> float:
     """How far the worst handle is from its part, m; infinite where an open finger would stand in something."""
     worst = 0.0
     everything = [piece for pieces in model.pieces.values() for piece in pieces]
@@ -220,7 +220,7 @@ def _lever(link: Link, point: Array) -> float:
     return float(np.linalg.norm(np.cross(link.joint.axis, point - np.asarray(link.joint.origin))))
 
 
-def _pull(stage: Stage, link: Link, point: Array, way: float, reach: float) -> None:
+def _pull(stage: FurnitureScene, link: Link, point: Array, way: float, reach: float) -> None:
     """Push with the hand for one step along the way the point can move."""
     pose = stage.matrix(link.name)
     axis, place = pose[:3, :3] @ link.joint.axis, pose[:3, :3] @ point + pose[:3, 3]
@@ -232,14 +232,14 @@ def _pull(stage: Stage, link: Link, point: Array, way: float, reach: float) -> N
     stage.links[link.name].add_force_at_point((way * force * axis).tolist(), place.tolist())
 
 
-def _try_surface(model: Model, surface: Surface) -> SurfaceReport:
+def _try_surface(model: FurnitureModel, surface: Surface) -> SurfaceReport:
     """Put things down with everything closed and, on a moving part, with it open as well."""
     states: list[dict[str, float]] = [{}]
     for link in model.links:
         level = link.joint.kind == "prismatic" or abs(link.joint.axis[2]) > 1 - 1e-6
         if link.name == surface.link and level:
             states.append({link.joint.name: OPEN * max(link.joint.limits, key=abs)})
-    things = probes(surface)
+    things = make_probes(surface)
     closed = [piece for pieces in model.pieces.values() for piece in pieces]
     spots = np.array([(*thing.xy, surface.z + BLOCKED) for thing in things]).reshape(-1, 3)
     room = float(clearances(closed, spots)[1].min() + BLOCKED) if things else 0.0
@@ -249,10 +249,10 @@ def _try_surface(model: Model, surface: Surface) -> SurfaceReport:
 
 
 def _put_down(
-    model: Model, surface: Surface, things: Sequence[Probe], state: Mapping[str, float]
+    model: FurnitureModel, surface: Surface, things: Sequence[Probe], state: Mapping[str, float]
 ) -> tuple[float, float, float]:
     """The farthest that things moved along their surface in a second and then were off its height, m; their speed."""
-    stage = Stage(model, state)
+    stage = FurnitureScene(model, state)
     start = link_poses(model.links, state)[surface.link] if surface.link else np.eye(4)
     bodies = []
     for thing in things:

@@ -20,7 +20,7 @@ Array = np.ndarray
 
 
 @dataclass(frozen=True)
-class Model:
+class FurnitureModel:
     """What is measured of a piece of furniture, read from its files or still to be written.
 
     Attributes:
@@ -38,14 +38,14 @@ class Model:
     friction: float
 
 
-def model_of(furniture: FurnitureSource | LoadedFurniture) -> Model:
+def make_model(furniture: FurnitureSource | LoadedFurniture) -> FurnitureModel:
     """What is measured of furniture."""
     if isinstance(furniture, LoadedFurniture):
         facts = furniture.asset
         pieces = {"": furniture.hulls} | {name: part.hulls for name, part in furniture.links.items()}
-        return Model(pieces, facts.links, facts.surfaces, facts.handles, facts.friction)
+        return FurnitureModel(pieces, facts.links, facts.surfaces, facts.handles, facts.friction)
     pieces = {"": furniture.pieces} | {link.name: link.pieces for link in furniture.links}
-    return Model(
+    return FurnitureModel(
         pieces,
         tuple(link.to_link() for link in furniture.links),
         furniture.surfaces,
@@ -54,10 +54,10 @@ def model_of(furniture: FurnitureSource | LoadedFurniture) -> Model:
     )
 
 
-class Stage:
+class FurnitureScene:
     """A scene with the furniture in it, its body fixed, its frame the world's."""
 
-    def __init__(self, model: Model, positions: Mapping[str, float] | None = None) -> None:
+    def __init__(self, model: FurnitureModel, positions: Mapping[str, float] | None = None) -> None:
         self.scene = make_scene()
         self.material = physx.PhysxMaterial(model.friction, model.friction, 0.0)
         self.links: dict[str, physx.PhysxArticulationLinkComponent] = {}

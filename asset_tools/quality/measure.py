@@ -74,7 +74,7 @@ def measure_object(
     )
 
 
-def remeasure(loaded: LoadedObject) -> ObjectQuality:
+def measure_again(loaded: LoadedObject) -> ObjectQuality:
     """Measure hull sizes, drops and grasps of an object of a pack anew.
 
     How close the hulls are to the closed mesh is taken over from the manifest, since packs don't keep that mesh.
@@ -103,7 +103,7 @@ def top_grasps(annotations: Annotations) -> NDArray[np.intp]:
     return np.argsort(annotations.grasp_qualities, kind="stable")[:TOP_GRASPS]
 
 
-def judge(assets: Mapping[str, ObjectAsset]) -> list[Violation]:
+def check_objects(assets: Mapping[str, ObjectAsset]) -> list[Violation]:
     """Say which promises a pack's objects break, object by object and then over all.
 
     Args:
@@ -140,12 +140,12 @@ def judge(assets: Mapping[str, ObjectAsset]) -> list[Violation]:
     return found + _judge_medians([asset.quality for asset in assets.values()])
 
 
-def differences(loaded: LoadedObject, measured: ObjectQuality) -> list[Violation]:
+def compare_with_manifest(loaded: LoadedObject, measured: ObjectQuality) -> list[Violation]:
     """Say where the manifest tells other numbers of an object than its files and its simulation do.
 
     Args:
         loaded: the object.
-        measured: what `remeasure` found of it.
+        measured: what `measure_again` found of it.
     """
     asset = loaded.asset
     said, found = asset.quality.model_dump(), measured.model_dump()
@@ -165,7 +165,7 @@ HEADER = ("object", "kind", "hulls", "IoU (stored)", "p95 mm (stored)", "rest %"
 )
 
 
-def rows(qualities: Mapping[str, ObjectQuality]) -> list[tuple[str, ...]]:
+def object_rows(qualities: Mapping[str, ObjectQuality]) -> list[tuple[str, ...]]:
     """The table: a row of text for each object, as `HEADER` names it, and a last one of the medians.
 
     Those are over what is judged: of IoU over compact objects, of p95 over the others, of grasps held over those that

@@ -40,7 +40,7 @@ class ConvexBody:
         return ConvexBody(self.points @ pose[:3, :3].T + pose[:3, 3], self.normals @ pose[:3, :3].T)
 
 
-def convex(points: Array) -> ConvexBody:
+def make_convex_body(points: Array) -> ConvexBody:
     """The convex hull of points (V, 3)."""
     hull = ConvexHull(points)
     return ConvexBody(points[hull.vertices], np.unique(np.round(hull.equations[:, :3], 6), axis=0))
@@ -62,7 +62,7 @@ def overlap(moving: ConvexBody, other: ConvexBody, gap: float = 0.0) -> tuple[fl
     return float(depths[best]), np.append(normals[best], -edges[best])
 
 
-def deepest(bodies: Sequence[ConvexBody], others: Sequence[ConvexBody]) -> float:
+def max_overlap(bodies: Sequence[ConvexBody], others: Sequence[ConvexBody]) -> float:
     """The greatest depth in m to which one of some bodies reaches into one of others; 0 where none touch."""
     return max((overlap(body, other)[0] for body in bodies for other in others), default=0.0)
 

@@ -7,7 +7,7 @@ from functools import partial
 from typing import NoReturn
 
 from asset_tools.quality.furniture import measure_furniture
-from asset_tools.quality.measure import HULL_VERTICES, Violation, remeasure
+from asset_tools.quality.measure import HULL_VERTICES, Violation, measure_again
 from robocas_ms3.assets.manifest import FurnitureQuality, ObjectQuality
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Pack
 from robocas_ms3.core.errors import AssetError
@@ -16,7 +16,7 @@ from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 Quality = ObjectQuality | FurnitureQuality
 
 
-def remeasure_pack(pack: Pack, processes: int = 1) -> Iterator[tuple[str, Quality]]:
+def measure_pack(pack: Pack, processes: int = 1) -> Iterator[tuple[str, Quality]]:
     """Yield the id and the quality of each asset of a pack, objects first, in the pack's order.
 
     Raises:
@@ -43,7 +43,7 @@ def furniture_rows(qualities: Mapping[str, FurnitureQuality]) -> list[tuple[str,
     ]
 
 
-def judge_furniture(qualities: Mapping[str, FurnitureQuality]) -> list[Violation]:
+def check_furniture(qualities: Mapping[str, FurnitureQuality]) -> list[Violation]:
     """Say which pieces of furniture have joints that stick, surfaces that don't hold, or hulls too fine for a GPU."""
     found = []
     for name, quality in qualities.items():
@@ -56,7 +56,7 @@ def judge_furniture(qualities: Mapping[str, FurnitureQuality]) -> list[Violation
 
 
 def _measure(asset: LoadedObject | LoadedFurniture) -> tuple[str, Quality]:
-    return asset.asset.id, remeasure(asset) if isinstance(asset, LoadedObject) else measure_furniture(asset)
+    return asset.asset.id, measure_again(asset) if isinstance(asset, LoadedObject) else measure_furniture(asset)
 
 
 def _raise_crash(asset: LoadedObject | LoadedFurniture, why: str) -> NoReturn:

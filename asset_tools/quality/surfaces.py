@@ -33,7 +33,7 @@ class Probe:
     corners: Array
 
 
-def probes(surface: Surface) -> list[Probe]:
+def make_probes(surface: Surface) -> list[Probe]:
     """Boxes and cylinders on a grid over a surface, out to its edges; none if it is too small for one."""
     low = np.add(surface.min_xy, WIDTH / 2 + EDGE)
     high = np.subtract(surface.max_xy, WIDTH / 2 + EDGE)

@@ -168,8 +168,8 @@ def sheet(command: Sheet) -> int:
 
 def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
     require_mesh_tools()
-    from asset_tools.quality.measure import HEADER, differences, judge, rows
-    from asset_tools.quality.packs import FURNITURE_HEADER, furniture_rows, judge_furniture, remeasure_pack
+    from asset_tools.quality.measure import HEADER, check_objects, compare_with_manifest, object_rows
+    from asset_tools.quality.packs import FURNITURE_HEADER, check_furniture, furniture_rows, measure_pack
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_table, table_console
     from robocas_ms3.core.files import write_json
@@ -178,19 +178,21 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
     measured: dict[str, Any] = {}
     with ProgressBar("assets measured") as bar:
         bar.start(total)
-        for name, found in remeasure_pack(pack, jobs):
+        for name, found in measure_pack(pack, jobs):
             measured[name] = found
             bar.advance()
     objects = {name: measured[name] for name in pack.objects}
     furniture = {name: measured[name] for name in pack.furniture}
     console = table_console()
-    for header, cells in ((HEADER, rows(objects)), (FURNITURE_HEADER, furniture_rows(furniture))):
+    for header, cells in ((HEADER, object_rows(objects)), (FURNITURE_HEADER, furniture_rows(furniture))):
         print_table(header, cells)
     remeasured = {
         name: pack.objects[name].asset.model_copy(update={"quality": found}) for name, found in objects.items()
     }
-    violations = [*judge(remeasured), *judge_furniture(furniture)]
-    violations += [other for name, found in objects.items() for other in differences(pack.objects[name], found)]
+    violations = [*check_objects(remeasured), *check_furniture(furniture)]
+    violations += [
+        other for name, found in objects.items() for other in compare_with_manifest(pack.objects[name], found)
+    ]
     for violation in violations:
         where = violation.asset or "the pack"
         console.print(f"{where}: {violation.what} is {violation.found}, expected {violation.expected}", style="red")

@@ -12,8 +12,8 @@ from asset_tools.builtin.build import build_asset, builtin_jobs
 from asset_tools.builtin.catalogue import products
 from asset_tools.builtin.furniture import MAKERS
 from asset_tools.graspnet.catalogue import ENTRIES
-from asset_tools.quality.measure import judge
-from asset_tools.quality.packs import judge_furniture
+from asset_tools.quality.measure import check_objects
+from asset_tools.quality.packs import check_furniture
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import AssetError
 
@@ -41,8 +41,8 @@ def test_stands_in_for_the_objects_of_upstream(pack):
 
 
 def test_is_as_good_as_packs_should_be(pack):
-    assert judge({id_: loaded.asset for id_, loaded in pack.objects.items()}) == []
-    assert judge_furniture({id_: loaded.asset.quality for id_, loaded in pack.furniture.items()}) == []
+    assert check_objects({id_: loaded.asset for id_, loaded in pack.objects.items()}) == []
+    assert check_furniture({id_: loaded.asset.quality for id_, loaded in pack.furniture.items()}) == []
 
 
 @each

@@ -12,7 +12,7 @@ from asset_tools.partnet.importer import partnet_jobs, read_partnet
 from asset_tools.partnet.template import make_template
 from asset_tools.pipeline import write_pack
 from asset_tools.quality.furniture import examine_furniture
-from asset_tools.quality.overlap import convex, deepest
+from asset_tools.quality.overlap import make_convex_body, max_overlap
 from robocas_ms3.assets.hulls import find_box
 from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.pack import load_pack
@@ -66,7 +66,9 @@ def chest(tmp_path):
 def overlap(link, others, share):
     """How deep a moving part reaches into others at a share of its range, m."""
     motion = joint_motion(link.joint, share * max(link.joint.limits, key=abs))
-    return deepest([convex(piece).moved(motion) for piece in link.pieces], [convex(other) for other in others])
+    return max_overlap(
+        [make_convex_body(piece).moved(motion) for piece in link.pieces], [make_convex_body(other) for other in others]
+    )
 
 
 def read(folder, **more):

@@ -9,7 +9,7 @@ from asset_entries import QUALITY, object_asset
 from asset_tools.grasps import sample_grasps
 from asset_tools.quality import measure
 from asset_tools.quality.drops import DropReport
-from asset_tools.quality.measure import differences, judge, measure_object, rows
+from asset_tools.quality.measure import check_objects, compare_with_manifest, measure_object, object_rows
 from asset_tools.resting_poses import resting_poses
 from robocas_ms3.assets.annotations import Annotations, compute_footprints
 from robocas_ms3.assets.pack import LoadedObject
@@ -52,7 +52,7 @@ def test_a_block_passes_all(block):
     assert (quality.compact, quality.hull_count, quality.hull_vertices) == (True, 1, 8)
     assert quality.volume_iou == 1 and quality.surface_p95 == 0
     assert quality.rest_share == 1 and quality.grasps_tried == 20 and quality.grasps_held >= 0.95
-    assert judge({"block": object_asset(quality=quality)}) == []
+    assert check_objects({"block": object_asset(quality=quality)}) == []
     assert measure_object(mesh, solid, notes) == quality
 
 
@@ -61,15 +61,17 @@ def test_an_object_without_grasps(block):
     quality = measure_object(mesh, solid, annotate(mesh, solid))
     assert (quality.grasps_tried, quality.grasps_held) == (0, 0)
     assert (
-        judge({"cube": object_asset(quality=quality, grasp_count=0, no_grasps_because="wide"), "b": object_asset()})
+        check_objects(
+            {"cube": object_asset(quality=quality, grasp_count=0, no_grasps_because="wide"), "b": object_asset()}
+        )
         == []
     )
-    found = judge({"cube": object_asset(quality=quality, grasp_count=0)})
+    found = check_objects({"cube": object_asset(quality=quality, grasp_count=0)})
     assert [(broken.asset, broken.what) for broken in found] == [
         ("cube", "number of grasps"),
         ("", "number of objects that can be grasped"),
     ]
-    assert rows({"cube": quality})[0][-1] == "-"
+    assert object_rows({"cube": quality})[0][-1] == "-"
 
 
 @pytest.mark.parametrize(
@@ -86,21 +88,21 @@ def test_an_object_without_grasps(block):
 )
 def test_each_limit_of_an_object(change, what):
     pack = {"a": object_asset(), "b": object_asset(), "bad": but(**change)}
-    assert [(broken.asset, broken.what) for broken in judge(pack)] == [("bad", what)]
+    assert [(broken.asset, broken.what) for broken in check_objects(pack)] == [("bad", what)]
 
 
 def test_medians_of_the_pack():
     weak = dict(volume_iou=0.85, hull_count=9, grasps_held=0.75)
     one = {"a": object_asset(), "b": object_asset(), "c": but(**weak)}
-    assert judge(one) == []
+    assert check_objects(one) == []
     most = {"a": object_asset(), "b": but(**weak), "c": but(**weak)}
-    found = judge(most)
+    found = check_objects(most)
     assert [(broken.asset, broken.what, broken.expected, broken.found) for broken in found] == [
         ("", "median volume IoU", ">= 0.90", "0.85"),
         ("", "median hulls", "<= 8", "9"),
         ("", "median of grasps held", ">= 80%", "75%"),
     ]
-    assert judge({}) == []
+    assert check_objects({}) == []
 
 
 def test_what_the_manifest_says_is_compared():
@@ -108,8 +110,8 @@ def test_what_the_manifest_says_is_compared():
         notes = SimpleNamespace(grasp_widths=np.zeros(grasps))
         return cast(LoadedObject, SimpleNamespace(asset=object_asset(), annotations=notes))
 
-    assert differences(loaded(60), QUALITY) == []
-    found = differences(loaded(59), QUALITY.model_copy(update=dict(rest_share=0.95, grasps_held=0.85)))
+    assert compare_with_manifest(loaded(60), QUALITY) == []
+    found = compare_with_manifest(loaded(59), QUALITY.model_copy(update=dict(rest_share=0.95, grasps_held=0.85)))
     assert [(broken.what, broken.expected, broken.found) for broken in found] == [
         ("measured rest_share", "1, as the manifest says", "0.95"),
         ("measured grasps_held", "0.9, as the manifest says", "0.85"),
