@@ -1,4 +1,4 @@
-"""Training and acting on a GPU. Without a CUDA device all of it is skipped; `scripts/gpu_checks.sh` runs it."""
+"""Training and acting on a GPU; skipped without a CUDA device. `scripts/gpu_checks.sh` runs these tests."""
 
 import devices
 import pytest
@@ -20,5 +20,5 @@ def dataset(tmp_path_factory):
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 @pytest.mark.parametrize("name", devices.CHANGES)
-def test_a_run_is_broken_off_goes_on_and_acts(dataset, tmp_path, name, precision):
+def test_interrupted_training_continues_and_its_policy_acts(dataset, tmp_path, name, precision):
     devices.check(dataset, tmp_path, name, precision, "cuda")

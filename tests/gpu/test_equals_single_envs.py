@@ -13,7 +13,7 @@ from robocas_ms3.tasks import TASKS
 JOINT_MODES = ("pd_joint_pos", "pd_joint_delta_pos", "pd_joint_pos_base", "pd_joint_delta_pos_base")
 END_EFFECTOR_MODES = ("pd_ee_delta_pose", "pd_ee_pose", "pd_ee_delta_pose_base", "pd_ee_pose_base")
 MODES = {task: ("pd_joint_pos", "pd_ee_delta_pose_base") for task in TASKS}
-MODES["pick"] = (*JOINT_MODES, *END_EFFECTOR_MODES)  # a controller is the same in all tasks
+MODES["pick"] = (*JOINT_MODES, *END_EFFECTOR_MODES)  # controllers do not depend on the task
 
 pytestmark = [
     pytest.mark.gpu,
@@ -32,7 +32,7 @@ def test_states_stages_rewards_and_observations(task):
 
 
 @pytest.mark.parametrize("name", ["rigid_dynamic_data", "articulation_qpos", "articulation_target_position"])
-def test_a_missing_apply_is_found(monkeypatch, name):
+def test_missing_apply_is_detected(monkeypatch, name):
     mode = "pd_joint_pos"
     batch = make_batch("pick", emulated_envs(), control_mode=mode)
     singles = make_singles("pick", emulated_envs(), control_mode=mode)

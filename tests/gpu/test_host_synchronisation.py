@@ -1,4 +1,4 @@
-"""A step does not make the host wait for the GPU, in all tasks and control modes."""
+"""A step does not synchronise with the GPU, in all tasks and control modes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def batch(request):
 
 @pytest.mark.parametrize("base", ["", "_base"])
 @pytest.mark.parametrize("arm", ["pd_joint_pos", "pd_joint_delta_pos", "pd_ee_delta_pose", "pd_ee_pose"])
-def test_a_step_does_not_wait(batch, arm, base):
+def test_step_does_not_synchronise(batch, arm, base):
     mode = arm + base
     set_control_mode([batch], mode)
     env: Any = batch.unwrapped  # gymnasium's time limit reads flags of all envs
@@ -39,7 +39,7 @@ def test_a_step_does_not_wait(batch, arm, base):
             env.step(action)
 
 
-def test_a_step_that_waits_is_found(batch, monkeypatch):
+def test_synchronising_step_is_detected(batch, monkeypatch):
     env: Any = batch.unwrapped
     set_control_mode([batch], "pd_joint_pos")
     env.reset(seed=0)

@@ -40,12 +40,12 @@ def envs(request: pytest.FixtureRequest) -> Iterator[VectorEnv]:
 
 
 def hold_still(envs: VectorEnv) -> torch.Tensor:
-    """(N, 8) actions that keep the arm where it is, with open fingers."""
+    """Return actions (N, 8) that hold the arm in place with an open gripper."""
     base: Any = envs.unwrapped
     return torch.cat([base.agent.robot.get_qpos()[:, 3:10], torch.ones(ENVS, 1, device=base.device)], dim=1)
 
 
-def test_envs_that_end_are_reset_in_the_same_step(envs):
+def test_ended_envs_are_reset_in_the_same_step(envs):
     assert isinstance(envs, RoboCASVectorEnv)
     observation, _ = envs.reset(seed=0)
     assert observation.shape == envs.observation_space.shape and observation.is_cuda
@@ -65,7 +65,7 @@ def test_envs_that_end_are_reset_in_the_same_step(envs):
     assert info["elapsed_steps"].tolist() == info["episode"]["episode_len"].tolist() == [1] * ENVS
 
 
-def test_a_reset_of_some_envs_leaves_the_others_and_their_metrics(envs):
+def test_partial_reset_keeps_other_envs_and_their_metrics(envs):
     base: Any = envs.unwrapped
     envs.reset(seed=0)
     for _ in range(2):
@@ -85,8 +85,8 @@ def test_a_reset_of_some_envs_leaves_the_others_and_their_metrics(envs):
     assert info["elapsed_steps"].tolist() == [2 if i in SOME else 0 for i in range(ENVS)]
 
 
-def test_a_step_waits_once(envs):
-    """`ManiSkillVectorEnv` asks whether any env has ended."""
+def test_step_synchronises_once(envs):
+    """`ManiSkillVectorEnv` reads whether any env has ended."""
     envs.reset(seed=0)
     action = hold_still(envs)
     envs.step(action)  # fills caches

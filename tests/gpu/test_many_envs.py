@@ -1,4 +1,4 @@
-"""Contracts of a batch of envs, on a GPU (`scripts/gpu_checks.sh`) or on the emulated interface of one."""
+"""Contracts of a batch of envs, on a GPU (`scripts/gpu_checks.sh`) or on its emulated interface."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytestmark = [
 ENVS = emulated_envs() or 16
 SOME = [1, 3]  # envs of a partial reset
 MODES = ["pd_joint_pos", "pd_ee_delta_pose"]
-STILL = 0.003  # m in a second, of what a layout calls at rest
+STILL = 0.003  # m per second, greatest shift of an object at rest
 only_gpu = pytest.mark.skipif(emulated_envs() > 0, reason="the emulation has no limits of memory")
 
 
@@ -37,7 +37,7 @@ def many(request):
 
 
 def moved(env: gym.Env, seed: int, count: int) -> None:
-    """Move every arm at random."""
+    """Move each arm by random actions."""
     base: Any = env.unwrapped
     generator = torch.Generator().manual_seed(seed)
     rest = base.agent.robot.get_qpos()[:, 3:10]
@@ -57,7 +57,7 @@ def test_contract(name, count):
         assert observation.shape[0] == count
         moved(env, 0, 3)
         states.append(base.get_state().clone())
-    torch.testing.assert_close(*states[1:], atol=1e-4, rtol=0)  # a GPU adds up in any order
+    torch.testing.assert_close(*states[1:], atol=1e-4, rtol=0)  # a GPU sums in any order
     observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
     for value in (observation, reward, terminated, truncated, *info.values()):
         if isinstance(value, torch.Tensor):
@@ -70,7 +70,7 @@ def test_contract(name, count):
 
 
 @pytest.mark.parametrize("name", sorted(TASKS))
-def test_scenes_are_those_of_a_cpu(name):
+def test_scenes_equal_those_on_a_cpu(name):
     count = emulated_envs() or 8
     env = make_batch(name, count, obs_mode="none")
     one = gym.make(TASKS[name].env_id, obs_mode="none", render_backend="none", sim_backend="physx_cpu")
@@ -88,7 +88,7 @@ def test_scenes_are_those_of_a_cpu(name):
     one.close()
 
 
-def test_what_is_at_rest_stays(many):
+def test_objects_at_rest_are_stable(many):
     base: Any = many.unwrapped
     many.reset(seed=0)
     before = base.object_poses.clone()
@@ -100,19 +100,19 @@ def test_what_is_at_rest_stays(many):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_partial_reset_leaves_the_other_envs_unchanged(many, mode):
-    """To the bit on the emulation; a GPU rounds differently."""
+def test_partial_reset_leaves_other_envs_unchanged(many, mode):
+    """Exactly equal on the emulation; a GPU rounds differently."""
     set_control_mode([many], mode)
     check_partial_reset(many, SOME, mode, exact=emulated_envs() > 0)
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_state_that_is_set_is_the_one_that_was_read(many, mode):
+def test_setting_a_state_restores_it(many, mode):
     set_control_mode([many], mode)
     check_state_round_trip(many, SOME, mode)
 
 
-def test_heaps_are_tried_by_this_engine_and_resets_gather_what_stays(tmp_path):
+def test_heaps_are_checked_by_this_engine_and_resets_use_stable_ones(tmp_path):
     count = 2 if emulated_envs() else 4
     pairs = dict(objects=f"0:{count}", seeds=f"0:{count}")
     command = Build("search_table_small_heap", **pairs, jobs=2, out=tmp_path, engine="gpu")
@@ -142,15 +142,15 @@ def test_heaps_are_tried_by_this_engine_and_resets_gather_what_stays(tmp_path):
 
 
 @only_gpu
-def test_contact_buffers_hold_what_256_heaps_need():
+def test_contact_buffers_are_large_enough_for_256_heaps():
     env = gym.make("RoboCASSearch-v1", num_envs=256, obs_mode="none", render_backend="none")
     env.reset(seed=0)
-    moved(env, 0, 40)  # an overflow would be an error of ours
+    moved(env, 0, 40)  # an overflow would raise a SimulationError
     env.close()
 
 
 @pytest.mark.emulated_gpu_full
-def test_cameras_see_something():
+def test_cameras_render_images():
     size = dict(width=64, height=48)
     env = gym.make("RoboCASPick-v1", num_envs=4, obs_mode="rgb", sensor_configs=size)
     observation, _ = env.reset(seed=0)

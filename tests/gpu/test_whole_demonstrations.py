@@ -28,7 +28,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module", params=sorted(TASKS))
 def recordings(request, tmp_path_factory) -> tuple[str, list[Recording]]:
-    """A task, and one demonstration for each env."""
+    """Return a task, and one demonstration per env."""
     folder = tmp_path_factory.mktemp(request.param) / "demos"
     command = [sys.executable, ROOT / "robocas_cli.py", "generate", request.param, "-n", str(emulated_envs())]
     subprocess.run([*command, "--out", folder, "--jobs", "2", "--check-rate", "0"], check=True, cwd=ROOT)
@@ -37,7 +37,7 @@ def recordings(request, tmp_path_factory) -> tuple[str, list[Recording]]:
 
 
 def test_whole_demonstrations_succeed_in_a_batch(recordings, monkeypatch):
-    # the step decides in which order PhysX solves contacts; single envs on a CPU do not make it
+    # this step decides the order in which PhysX solves contacts; single envs on a CPU do not make it
     monkeypatch.setattr(EmulatedGpuSystem, "steps_on_init", False)
     task, episodes = recordings
     seeds = [episode.seed for episode in episodes]
@@ -62,5 +62,5 @@ def test_whole_demonstrations_succeed_in_a_batch(recordings, monkeypatch):
 
 
 def _held(actions: np.ndarray, steps: int) -> np.ndarray:
-    """Actions (T, A) and the last one again, (steps, A)."""
+    """Return actions (T, A), padded by the last one to (steps, A)."""
     return np.concatenate([actions, np.repeat(actions[-1:], steps - len(actions), axis=0)])

@@ -45,8 +45,8 @@ def test_articulated_furniture_is_closed_again_after_a_reset():
 
 
 @pytest.mark.slow
-def test_finishes_and_levels_are_seen(needs_renderer):
-    """The floor's colour is that of the finish; both levels of detail render nearly the same image."""
+def test_finishes_and_levels_of_detail_are_visible(needs_renderer):
+    """The floor has the colour of its finish; both levels of detail render nearly the same image."""
     rendered = {}
     for name, floor, level in (("oak", "oak_parquet", "fast"), ("blue", "carpet", "fast"), ("full", "carpet", "full")):
         data = pick_config(room={"asset": "room", "finishes": {"floor": floor}})
@@ -54,7 +54,7 @@ def test_finishes_and_levels_are_seen(needs_renderer):
         env.reset(seed=0)
         rendered[name] = env.render()[0].cpu().numpy().astype(float)
         env.close()
-    corner = np.s_[380:, :120]  # floor beside the robot
+    corner = np.s_[380:, :120]  # floor next to the robot
     oak, blue = rendered["oak"][corner].mean(axis=(0, 1)), rendered["blue"][corner].mean(axis=(0, 1))
     assert oak[0] > oak[2] + 20 and blue[2] > blue[0] + 10
     assert 0 < np.abs(rendered["full"] - rendered["blue"]).mean() < 3
@@ -65,7 +65,7 @@ def test_an_unknown_level_of_detail_is_an_error():
         gym.make("RoboCASPick-v1", visual_level="fulll", render_backend="none")
 
 
-def test_an_asset_is_built_once_for_all_envs_that_have_it_and_bodies_are_in_the_order_of_envs(monkeypatch):
+def test_asset_is_built_once_for_all_its_envs_in_their_order(monkeypatch):
     import sapien
     from mani_skill.envs.scene import ManiSkillScene
     from mani_skill.envs.utils.system.backend import parse_sim_and_render_backend
@@ -110,7 +110,7 @@ def objects_of(ids):
     return find_objects(load_pack("builtin"), TaskConfig.model_validate(pick_config(objects={"ids": ids, "count": 2})))
 
 
-def test_objects_by_id_or_by_graspnet_number():
+def test_objects_by_id_or_graspnet_number():
     assert objects_of([5, "apple", 31]) == ["banana", "apple", "toy_airplane_k"]
     assert len(objects_of("all")) == 46
 

@@ -1,4 +1,4 @@
-"""The layout cache returns what was made, makes what is missing, and knows what layouts depend on."""
+"""The layout cache returns stored layouts, samples missing ones, and depends on everything that affects layouts."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ def assert_same(one: Layout, two: Layout) -> None:
         np.testing.assert_array_equal(a, b, err_msg=field.name)
 
 
-def test_a_layout_is_made_once_and_comes_back_the_same(tmp_path, monkeypatch):
+def test_layout_is_sampled_once_and_read_back_unchanged(tmp_path, monkeypatch):
     scene = load_scene()
     made = LayoutCache(scene, tmp_path).get(1, 1)
     assert_same(made, sample_layout(scene, 1, 1))
     assert_same(layout_source(scene, None)(1, 1), made)
-    monkeypatch.setattr(cache_module, "sample_layout", None)  # making it again would fail
+    monkeypatch.setattr(cache_module, "sample_layout", None)  # sampling again would fail
     cache = LayoutCache(scene, tmp_path)
     assert_same(cache.get(1, 1), made)
     assert cache.missing(seed_pairs(range(3))) == [(0, 0), (2, 2)]
     assert count_layouts(cache.folder) == 1
 
 
-def test_objects_of_one_seed_and_arrangement_of_another_are_kept_apart(tmp_path):
+def test_layouts_of_different_objects_seeds_have_different_files(tmp_path):
     cache = LayoutCache(load_scene(), tmp_path)
     assert not np.allclose(cache.get(1, 1).object_poses, cache.get(1, 2).object_poses)
     assert cache.get(1, 2).object_ids == cache.get(1, 1).object_ids
@@ -64,11 +64,11 @@ def test_objects_of_one_seed_and_arrangement_of_another_are_kept_apart(tmp_path)
         ({"objects": {"ids": "all", "count": 9}}, False),
     ],
 )
-def test_what_layouts_depend_on_is_in_the_name(tmp_path, changes, same):
+def test_folder_name_depends_on_everything_that_affects_layouts(tmp_path, changes, same):
     assert (LayoutCache(load_scene(**changes), tmp_path).folder == LayoutCache(load_scene(), tmp_path).folder) is same
 
 
-def test_changed_furniture_has_layouts_of_its_own(tmp_path):
+def test_changed_furniture_has_its_own_cache(tmp_path):
     scene = load_scene()
     table = scene.furniture["table"]
     top = table.asset.surfaces["top"]
@@ -77,7 +77,7 @@ def test_changed_furniture_has_layouts_of_its_own(tmp_path):
     assert LayoutCache(changed, tmp_path).folder != LayoutCache(scene, tmp_path).folder
 
 
-def test_a_table_keeps_what_an_earlier_one_holds_and_what_is_known_of_it(tmp_path):
+def test_table_keeps_layouts_and_statuses_of_an_earlier_table(tmp_path):
     cache = LayoutCache(load_scene(), tmp_path)
     assert cache.table("cpu") is None
     for pair in ((0, 0), (0, 1), (2, 1)):
@@ -85,7 +85,7 @@ def test_a_table_keeps_what_an_earlier_one_holds_and_what_is_known_of_it(tmp_pat
     cache.write_table("cpu", [(0, 0), (0, 1)])
     cache.write_statuses("cpu", {(0, 1): LayoutStatus.UNSTABLE})
     cache.path(0, 0).unlink()
-    table = cache.write_table("cpu", [(2, 1), (2, 9)])  # of the last there is no layout yet
+    table = cache.write_table("cpu", [(2, 1), (2, 9)])  # the last pair has no layout yet
     assert table is not None
     assert table.pairs() == [(0, 0), (0, 1), (2, 1)]
     assert table.pairs(LayoutStatus.UNSTABLE) == [(0, 1)]
@@ -96,7 +96,7 @@ def test_a_table_keeps_what_an_earlier_one_holds_and_what_is_known_of_it(tmp_pat
     assert cache.table("gpu") is None
 
 
-def test_a_table_is_changed_by_one_process_at_a_time(tmp_path):
+def test_table_is_written_by_one_process_at_a_time(tmp_path):
     cache, other = LayoutCache(load_scene(), tmp_path), LayoutCache(load_scene(), tmp_path)
     cache.get(0, 0)
     cache.get(1, 1)
@@ -112,7 +112,7 @@ def test_a_table_is_changed_by_one_process_at_a_time(tmp_path):
 
 
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_objects_that_can_not_be_laid_out_are_tried_once_and_leave_nothing_behind(jobs, tmp_path):
+def test_objects_without_layout_are_tried_once_and_leave_no_files(jobs, tmp_path):
     cache = LayoutCache(load_scene(**NO_TARGET), tmp_path)
     problems = dict(cache.fill(seed_pairs([0, 1, 2], [1]), jobs))
     assert problems.keys() == {(1, 1), (1, 0), (1, 2)}
@@ -129,7 +129,7 @@ def gpu(monkeypatch):
     monkeypatch.setattr(physx, "is_gpu_enabled", lambda: True)
 
 
-def test_the_worker_samples_the_same_layouts_is_replaced_and_ends_with_its_object(gpu):
+def test_sampling_worker_gives_equal_layouts_is_replaced_and_ends_with_the_sampler(gpu):
     scene, before = load_scene(), psutil.Process().children()
     sampler = LayoutSampler(scene)
 
@@ -147,8 +147,8 @@ def test_the_worker_samples_the_same_layouts_is_replaced_and_ends_with_its_objec
     assert psutil.wait_procs([process], timeout=30)[0] == [process]
 
 
-class Deadly:
-    """Object ids that kill the process that unpickles them."""
+class KillingIds:
+    """Object ids that kill the process that unpickles them (stands for a crash of PhysX)."""
 
     def __reduce__(self):
         return kill_this_process, ()
@@ -158,14 +158,14 @@ def kill_this_process():
     os.kill(os.getpid(), signal.SIGSEGV)
 
 
-def test_a_process_that_dies_twice_is_not_a_missing_layout(gpu):
+def test_process_that_crashes_twice_is_no_missing_layout(gpu):
     with pytest.raises(SimulationError) as caught:
-        LayoutSampler(load_scene()).make(0, 1, Deadly())  # pyright: ignore[reportArgumentType]
+        LayoutSampler(load_scene()).make(0, 1, KillingIds())  # pyright: ignore[reportArgumentType]
     assert (caught.value.where, caught.value.found) == ("seed 1", "SIGSEGV")
 
 
 @pytest.mark.slow
-def test_a_process_whose_physx_has_a_gpu_makes_the_same_layouts():
+def test_process_with_physx_on_a_gpu_makes_equal_layouts():
     program = (
         "import sys\nfrom sapien import physx\n"
         "if sys.argv[1] == 'gpu':\n    physx._enable_gpu()\n"
@@ -187,6 +187,6 @@ def test_a_process_whose_physx_has_a_gpu_makes_the_same_layouts():
     assert said[0] == said[1]
 
 
-def test_each_object_seed_goes_with_itself_and_all_layout_seeds():
+def test_seed_pairs_of_each_objects_seed():
     assert seed_pairs([0, 1]) == [(0, 0), (1, 1)]
     assert seed_pairs([0, 1], [1, 7]) == [(1, 1), (1, 0), (7, 7), (7, 0), (7, 1)]

@@ -1,4 +1,4 @@
-"""Scenes that can't be are refused when they are loaded, saying which two things, by how much, and what to change."""
+"""Impossible scenes are errors at loading, with the two things, the distance and the fix."""
 
 from dataclasses import replace
 
@@ -46,12 +46,12 @@ TABLE = {"asset": "table", "pose": at(0.9, 1.0, yaw=-90)}
         ({"robot": at(0.7, -1.2, yaw=90)}, "^surface 'top' is out of the arm's reach"),
     ],
 )
-def test_what_can_not_be_is_refused(changes, said):
+def test_impossible_scenes_are_errors(changes, said):
     with pytest.raises(ConfigError, match=said):
         load_scene(**changes)
 
 
-def test_an_arm_that_begins_inside_of_something_is_refused():
+def test_arm_that_starts_inside_of_furniture_is_an_error():
     above = {"asset": "side_table", "pose": at(0.7, 0.15, 0.62)}
     with pytest.raises(ConfigError, match=r"arm starts inside of another body \(found furniture.above\). Move or turn"):
         load_scene(furniture={"table": TABLE, "above": above})
@@ -66,11 +66,11 @@ def test_a_base_that_drives_reaches_farther():
         load_scene(basket={"asset": "basket", "pose": at(3.7, 0.15)}, base_motion=True)
 
 
-def test_what_a_seed_moves_is_not_judged_by_where_it_is_configured():
+def test_configured_poses_of_randomised_things_are_not_checked():
     load_scene(basket={"asset": "basket", "pose": at(1.3, 0.9, 0.5)}, randomisation={"basket": {"position": 0.1}})
 
 
-def test_all_that_is_shipped_can_be():
+def test_bundled_configurations_have_clearance():
     pack = load_pack("builtin")
     configs = [name for name in bundled_configs() if "partnet" not in name]
     for config in [*configs, *protocols_dir().glob("*/configs/*.yaml")]:
@@ -81,11 +81,11 @@ def hull(mesh: trimesh.Trimesh) -> Hull:
     return Hull(np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
-def test_overlaps_by_numbers_worked_out_by_hand():
+def test_overlaps_equal_hand_computed_depths():
     cube = trimesh.creation.box((1, 1, 1))
     assert overlap(hull(cube), hull(cube.copy().apply_translation((0.7, 0.2, 0)))) == pytest.approx(0.3)
     assert overlap(hull(cube), hull(cube.copy().apply_translation((1.1, 0, 0)))) == 0
-    # two edges, crossed at right angles: faces alone would have them meet
+    # two crossed edges: the face normals alone do not separate them
     one, other = cube.copy(), cube.copy()
     one.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 4, (0, 1, 0)))
     other.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 4, (1, 0, 0)))
@@ -94,7 +94,7 @@ def test_overlaps_by_numbers_worked_out_by_hand():
         assert overlap(hull(one), hull(moved)) == pytest.approx(max(-gap, 0))
 
 
-def test_another_robot_is_judged_by_its_own_reach_and_one_of_which_nothing_is_known_is_not():
+def test_reach_is_checked_with_the_envelope_of_the_robot():
     far = load_task_config("pick_table_scattered").model_dump(mode="json") | {"robot": at(0.7, -1.2, yaw=90)}
     config, pack, panda = load_task_config(far), load_pack("builtin"), PANDA.description
     longer = replace(panda, envelope=replace(panda.envelope, reach=2.0))
@@ -104,7 +104,7 @@ def test_another_robot_is_judged_by_its_own_reach_and_one_of_which_nothing_is_kn
         SceneModel.load(config, pack, pack, robot=robot)
 
 
-def test_what_is_known_of_the_arm_is_so():
+def test_envelope_contains_the_arm():
     urdf, robot = PANDA.files().urdf, PANDA.description
     base = chain_poses(urdf, robot.root_link, robot.arm_base_link, np.zeros((1, 3)))[0]
     for start, qpos in (("rest", robot.arm_rest), ("evaluation", robot.arm_evaluation_start)):

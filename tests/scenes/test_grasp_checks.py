@@ -12,8 +12,8 @@ from robocas_ms3.scenes.grasp_checks import check_directions, is_gripper_clear
 @pytest.mark.parametrize(
     ("approach", "lean", "heading", "from_there", "from_the_robots_side"),
     [
-        ("top", 0, 0, True, True),  # straight down comes from no side
-        ("top", 10, 180, True, True),  # hardly leaning
+        ("top", 0, 0, True, True),  # a vertical approach has no side
+        ("top", 10, 180, True, True),  # nearly vertical
         ("top", 20, 180, True, False),  # from behind the object
         ("top", 30, 44, True, True),
         ("top", 30, 46, True, False),
@@ -27,7 +27,7 @@ from robocas_ms3.scenes.grasp_checks import check_directions, is_gripper_clear
         ("front", 90, 44, True, True),
         ("front", 90, 46, True, False),
         ("front", 90, 180, True, False),  # from behind the object
-        ("front", 10, 180, False, False),  # nothing passes for leaning little
+        ("front", 10, 180, False, False),  # no exception for nearly vertical approaches
     ],
 )
 def test_approach_directions(approach, lean, heading, from_there, from_the_robots_side):
@@ -57,7 +57,7 @@ def test_the_closing_axis_may_tilt_by_60_degrees(closing, level):
         ((0.0, 0.039, 0.0), True),
         ((0.0, 0.042, 0.0), False),  # in a pad
         ((0.0, -0.042, 0.008), False),  # at the other pad's end, 8 mm beyond the TCP
-        ((0.0, 0.042, 0.010), True),  # just below it
+        ((0.0, 0.042, 0.010), True),  # just below the pad
         ((0.011, 0.042, 0.0), True),  # beside it
         ((0.0, 0.055, 0.0), True),  # outside of it
         ((0.0, 0.055, -0.05), False),  # in the knuckle
@@ -77,7 +77,7 @@ def test_points_in_the_open_gripper(point, clear):
         assert is_gripper_clear(pose[None], inside[None])[0] == clear
 
 
-def test_many_grasps_among_many_points_are_judged_as_each_alone():
+def test_batch_of_grasps_equals_single_checks():
     rng = np.random.default_rng(0)
     grasps = np.stack([grasp(*rng.uniform(-60, 60, 3)) for _ in range(40)])
     grasps[:, :3, 3] += rng.uniform(-0.3, 0.3, (40, 3))
@@ -100,10 +100,10 @@ def test_many_grasps_among_many_points_are_judged_as_each_alone():
         ((0.0, 0.052, 0.0), True),
         ((0.014, 0.042, 0.0), False),  # 4 mm beside it
         ((0.016, 0.042, 0.0), True),
-        ((0.0, 0.042, 0.010), True),  # below it: its sides alone leave room
+        ((0.0, 0.042, 0.010), True),  # below the pad: the clearance applies to the sides only
     ],
 )
-def test_a_free_grasp_leaves_room_at_its_sides(point, clear):
+def test_free_grasp_has_side_clearance(point, clear):
     pose = grasp(30, 10)
     there = pose[:3, :3] @ np.array(point) + pose[:3, 3]
     assert is_gripper_clear(pose[None], there[None], side_clearance=0.005)[0] == clear

@@ -1,4 +1,4 @@
-"""Heaps of shipped objects: they lie on the plane, in each other's way, in the region, and repeat."""
+"""Heaps of bundled objects: on the plane, inside the region, occluding each other, and reproducible."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ REGION = Region((-0.05, -0.25), (0.25, 0.15), 0.61)
 
 
 LAYOUT = StackedLayout(kind="stacked")
-# Origins of three objects of each of three seeds, m, from before the layout had keys for walls, order and time
+# Origins of three objects of each of three seeds, m, recorded before the layout had keys for walls, order and time
 BEFORE = {
     0: [[0.16646, -0.0009616, 0.6232153], [0.1101041, -0.1502432, 0.6489264], [0.1065183, -0.0054217, 0.6447076]],
     1: [[0.1871869, 0.0199118, 0.7035184], [0.0779445, -0.0612329, 0.6347642], [0.1049845, 0.0871008, 0.6446248]],
@@ -33,14 +33,14 @@ def make_heap(seed: int, count: int = 12, **keys):
 
 
 @pytest.mark.slow
-def test_objects_lie_on_the_plane_and_on_each_other():
+def test_objects_rest_on_the_plane_and_on_each_other():
     on_others = []
     for seed in range(3):
         assets, poses = make_heap(seed)
         low = np.array(
             [transform_points(p, np.concatenate(a.hulls))[:, 2].min() for a, p in zip(assets, poses, strict=True)]
         )
-        assert low.min() > REGION.z - 0.002  # nothing has sunk in
+        assert low.min() > REGION.z - 0.002  # no object penetrates the plane
         on_others.append((low > REGION.z + 0.01).sum())
         for asset, pose in zip(assets, poses, strict=True):
             center = transform_points(pose, np.array([asset.asset.center_of_mass]))[0, :2]
@@ -48,11 +48,11 @@ def test_objects_lie_on_the_plane_and_on_each_other():
             assert (center <= np.array(REGION.max_xy) + SPREAD).all()
         camera = top_down_camera(np.array([0.1, -0.05]), REGION.z, size=128)
         shares = MeshScene([object_mesh(a) for a in assets], poses).visible_fractions(camera)
-        assert (shares < 0.9).sum() >= 2  # something is hidden
+        assert (shares < 0.9).sum() >= 2  # some objects are hidden
     assert sum(on_others) >= len(on_others)
 
 
-def test_a_heap_that_runs_over_is_an_error():
+def test_heap_over_the_edges_is_an_error():
     pack = load_pack("builtin")
     with pytest.raises(LayoutError, match="no heap of 2 objects"):
         tiny = Region((0.0, 0.0), (0.001, 0.001), 0.0)
@@ -60,7 +60,7 @@ def test_a_heap_that_runs_over_is_an_error():
         drop_heap(np.random.default_rng(0), assets, tiny, LAYOUT)
 
 
-def test_small_objects_rather_fall_first_without_noise_always_and_with_null_any():
+def test_order_noise_decides_which_objects_fall_first():
     assets = [load_pack("builtin").objects[i] for i in ("power_drill", "soap", "padlock")]
 
     def firsts(noise):
@@ -74,7 +74,7 @@ def test_small_objects_rather_fall_first_without_noise_always_and_with_null_any(
 
 
 @pytest.mark.parametrize("seed", BEFORE)
-def test_the_defaults_are_the_heaps_of_before(seed):
+def test_default_heaps_are_unchanged(seed):
     np.testing.assert_allclose(make_heap(seed, 3)[1][:, :3, 3], BEFORE[seed], atol=1e-6)
 
 
@@ -93,7 +93,7 @@ def test_objects_fall_into_the_middle_of_the_bucket_or_all_over_it():
     assert (strewn > low + 0.02).all() and (strewn < high - 0.02).all()  # clear of the walls
 
 
-def test_an_outline_is_the_object_but_for_its_hollows():
+def test_outline_approximates_the_convex_hull():
     assets = load_pack("builtin").objects
     for name in ("sugar_box", "mug", "apple"):
         points, outline = np.concatenate(assets[name].hulls), heap.outline(assets[name])

@@ -1,4 +1,4 @@
-"""Layouts in one file, tables and frozen ones, are those that were written."""
+"""Layout tables and frozen layouts are read back as written."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def assert_same(found: Layout, wanted: Layout) -> None:
         np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), atol=1e-6, err_msg=name)
 
 
-def test_layouts_come_back(layouts, table):
+def test_layouts_are_read_back(layouts, table):
     for pair, wanted in layouts.items():
         found = table.layout(pair)
         assert found is not None
@@ -69,7 +69,7 @@ def test_layouts_come_back(layouts, table):
     assert table.pairs() == sorted(layouts)
 
 
-def test_what_it_lacks_it_does_not_make_up(layouts, tmp_path):
+def test_missing_layouts_are_reported_as_missing(layouts, tmp_path):
     del layouts[5, 20]
     path = tmp_path / "table.npy"
     write_table(path, NAMES, layouts)
@@ -82,7 +82,7 @@ def test_what_it_lacks_it_does_not_make_up(layouts, tmp_path):
     assert states.tolist() == [LayoutStatus.UNCHECKED, LayoutStatus.MISSING, LayoutStatus.MISSING]
 
 
-def test_what_is_found_of_layouts_is_kept(layouts, table, tmp_path):
+def test_statuses_of_layouts_are_stored(layouts, table, tmp_path):
     found = {
         (5, 40): LayoutStatus.UNSTABLE,
         (2, 10): LayoutStatus.STABLE,
@@ -90,12 +90,12 @@ def test_what_is_found_of_layouts_is_kept(layouts, table, tmp_path):
         (9, 9): LayoutStatus.UNSTABLE,
         (5, 15): LayoutStatus.STABLE,
     }
-    write_statuses(tmp_path / "table.npy", NAMES, found)  # some of which it lacks
+    write_statuses(tmp_path / "table.npy", NAMES, found)  # some of these are not in the table
     marked = LayoutTable(tmp_path / "table.npy", NAMES)
     assert marked.pairs(LayoutStatus.UNSTABLE) == [(5, 40)]
     assert marked.pairs(LayoutStatus.STABLE) == [(2, 10)]
     assert len(marked.pairs(LayoutStatus.UNCHECKED)) == len(layouts) - 2
-    assert not table.pairs(LayoutStatus.UNSTABLE)  # that was opened before
+    assert not table.pairs(LayoutStatus.UNSTABLE)  # opened before the change
     assert marked.pairs() == sorted(layouts)
     known = marked.layout((5, 40))
     assert known is not None
@@ -111,7 +111,7 @@ def test_what_is_found_of_layouts_is_kept(layouts, table, tmp_path):
     ]
 
 
-def test_a_damaged_one_is_named(tmp_path):
+def test_error_names_the_damaged_file(tmp_path):
     path = tmp_path / "table.npy"
     for content in (b"", b"no table", b"\x93NUMPY"):
         path.write_bytes(content)
@@ -124,7 +124,7 @@ def test_a_damaged_one_is_named(tmp_path):
             LayoutTable(path, NAMES)
 
 
-def test_frozen_parts_make_the_file_of_the_whole(tmp_path):
+def test_joined_parts_equal_the_whole_file(tmp_path):
     layouts = {seed: replace(layout(seed), relation=said) for seed, said in ((3, ""), (4, "nearest"), (9, "left"))}
     write_frozen_layouts(tmp_path / "whole.npy", NAMES, layouts)
     for seed, one in layouts.items():
@@ -139,7 +139,7 @@ def test_frozen_parts_make_the_file_of_the_whole(tmp_path):
             found(*pair)
 
 
-def test_what_can_not_be_joined_is_refused_and_nothing_written(tmp_path):
+def test_files_that_can_not_be_joined_are_errors_and_nothing_is_written(tmp_path):
     write_frozen_layouts(tmp_path / "a.npy", NAMES, {1: layout(1)})
     write_frozen_layouts(tmp_path / "b.npy", NAMES, {2: layout(2, slots=4)})
     (tmp_path / "c.npy").write_bytes((tmp_path / "a.npy").read_bytes()[:-5])

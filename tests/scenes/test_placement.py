@@ -1,4 +1,4 @@
-"""Places worked out by hand, and the laws of any of them: scattered, and in columns."""
+"""Scattered and orderly placement: positions computed by hand, and general laws."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def outline(a: float, b: float) -> np.ndarray:
 
 
 def box(width: float, depth: float, height: float = 0.1) -> PlaceableObject:
-    """A box that stands or lies on its side."""
+    """Return a box that stands or lies on its side."""
     standing, lying = np.eye(4), np.eye(4)
     standing[2, 3], lying[2, 3] = height / 2, depth / 2
     lying[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
@@ -58,8 +58,8 @@ def test_objects_that_do_not_fit_are_an_error_with_the_fix():
         scatter([box(0.1, 0.1)] * 10, Region((0, 0), (0.2, 0.2), 0), max_tries=300)
 
 
-def test_where_it_is_tight_objects_are_packed(monkeypatch):
-    """Eleven discs of 9 cm, 1 cm apart, on 43 x 33 cm: in rows they fit (twelve would), strewn at random they don't."""
+def test_objects_are_packed_if_space_is_short(monkeypatch):
+    """Eleven discs of 9 cm, 1 cm apart, fit on 43 x 33 cm in rows (twelve would), but not at random positions."""
     angles = np.arange(24) * np.pi / 12
     disc = 0.045 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     things = [PlaceableObject(f"disc_{i}", np.eye(4)[None], np.ones(1), [disc]) for i in range(11)]
@@ -84,7 +84,7 @@ def test_objects_repeat_only_when_there_are_too_few():
 
 
 def standing(width: float, depth: float, name: str = "a") -> PlaceableObject:
-    """Its label is on the side at -y, ``width`` wide; the second pose is more probable, the first is upright."""
+    """Return an object with its label on the -y side; the first pose is upright, the second more probable."""
     pose = np.eye(4)
     pose[2, 3] = 0.05
     outlines = [outline(width, depth)] * 2
@@ -92,7 +92,7 @@ def standing(width: float, depth: float, name: str = "a") -> PlaceableObject:
 
 
 def kinds(names: str, *sizes: tuple[float, float]) -> list[PlaceableObject]:
-    """Objects of kinds, each kind a column; sizes of all or of each."""
+    """Return objects of several kinds with one size, or one size per kind."""
     return [standing(*size, name) for name, size in zip(names, sizes * (len(names) // len(sizes)), strict=True)]
 
 
@@ -107,7 +107,7 @@ def columns(things, **options):
     return poses
 
 
-def test_a_column_begins_at_the_front_edge_and_goes_back():
+def test_column_starts_at_the_front_edge():
     poses = columns(kinds("aaa", (0.06, 0.04)))
     # the front edge is at x = 0; depths of 4 cm with 1 cm between
     np.testing.assert_allclose(poses[:, 0, 3], [0.02, 0.07, 0.12])
@@ -116,21 +116,21 @@ def test_a_column_begins_at_the_front_edge_and_goes_back():
 
 
 @pytest.mark.parametrize("front", [(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)])
-def test_labels_look_out_of_the_front(front):
+def test_labels_point_to_the_front(front):
     poses = columns(kinds("a", (0.06, 0.04)), front=front)
     np.testing.assert_allclose(poses[0, :3, :3] @ [0, -1, 0], [*front, 0], atol=1e-12)
     middle = {(-1.0, 0.0): 0.02, (1.0, 0.0): 0.28, (0.0, -1.0): -0.38, (0.0, 1.0): 0.38}[front]  # 2 cm from the edge
     assert poses[0, 0 if front[0] else 1, 3] == pytest.approx(middle)
 
 
-def test_columns_are_apart_by_their_spacing():
+def test_columns_have_their_spacing():
     poses = columns(kinds("ab", (0.06, 0.04), (0.10, 0.04)), column_spacing=1.5)
     assert abs(poses[0, 1, 3] - poses[1, 1, 3]) == pytest.approx(1.5 * 0.08)
 
 
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10_000), jitter=st.floats(0, 17), count=st.integers(1, 4))
-def test_everything_in_columns_is_inside_and_apart(seed, jitter, count):
+def test_objects_in_columns_are_inside_and_apart(seed, jitter, count):
     things = kinds("aabbccdd"[: 2 * count], (0.08, 0.05))
     poses = columns(things, seed=seed, yaw_jitter_deg=jitter)
     outlines = []
@@ -169,7 +169,7 @@ def test_columns_are_kept_as_long_as_they_fit():
     assert arrange(kinds("aaabbb", (0.05, 0.12)), keep_what_fits=True)[1].tolist() == [True, True, False] * 2
 
 
-def test_a_column_is_turned_as_one():
+def test_objects_of_a_column_are_turned_together():
     yaws = []
     for seed in range(20):
         fronts = columns(kinds("aabbcc", (0.06, 0.04)), seed=seed, column_yaw="random")[:, :2, 1]

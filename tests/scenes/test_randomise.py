@@ -1,4 +1,4 @@
-"""Draws of looks: seeded, within their bounds, independent of each other."""
+"""Random appearance: seeded, within bounds, with independent parts."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -16,7 +16,7 @@ def config(**blocks) -> TaskConfig:
     return load_task_config({**data, "randomisation": blocks})
 
 
-def test_nothing_is_drawn_unless_asked_for():
+def test_nothing_is_random_without_randomisation():
     plain = config()
     room = load_pack("builtin").furniture["room"]
     for seed in range(5):
@@ -26,7 +26,7 @@ def test_nothing_is_drawn_unless_asked_for():
         np.testing.assert_allclose(lights.direction * np.linalg.norm(plain.lights.direction), plain.lights.direction)
 
 
-def test_finishes_may_be_some_of_those_there_are():
+def test_finishes_may_be_restricted_to_some():
     room = load_pack("builtin").furniture["room"]
     asked = config(room=["floor", "wall"], finishes={"floor": ["carpet", "checker"]})
     drawn = [draw_finishes(asked, room, seed) for seed in range(40)]
@@ -58,7 +58,7 @@ def test_camera_shifts_are_rigid_and_small(seed, camera):
 
 @settings(max_examples=50, deadline=None)
 @given(seed=st.integers(0, 2**31 - 1))
-def test_camera_shifts_are_no_smaller_than_the_least_and_go_both_ways(seed):
+def test_camera_shifts_exceed_the_minimum_in_both_directions(seed):
     far = CameraRandomisation(position=0.1, rotation_deg=8, min_position=0.05, min_rotation_deg=4)
     shift, near = draw_camera_shift(far, 1, seed), draw_camera_shift(CameraRandomisation(position=0.1), 1, seed)
     assert (np.abs(shift[:3, 3]) >= 0.05).all()

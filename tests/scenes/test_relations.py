@@ -1,4 +1,4 @@
-"""Relations between identical objects, worked out by hand. The robot looks along x; its left is +y."""
+"""Relations between identical objects, computed by hand. The robot looks along x; its left is +y."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ def test_four_objects(relation, expected):
 
 
 @pytest.mark.parametrize(("order", "expected"), [([0, 1, 3], 1), ([3, 1, 0], 1), ([1, 0, 3], 0), ([0, 3, 1], 2)])
-def test_the_middle_of_three_wherever_it_is_listed(order, expected):
+def test_middle_of_three_in_any_order(order, expected):
     assert select_by_relation("middle", FOUR[order]) == expected
 
 
-def test_of_two_only_the_ends_are_named():
+def test_two_objects_have_no_middle():
     two = FOUR[:2]
     found = {relation: select_by_relation(relation, two) for relation in RELATIONS}
     assert {relation for relation, index in found.items() if index is not None} == {
@@ -50,7 +50,7 @@ def test_of_two_only_the_ends_are_named():
 
 
 @pytest.mark.parametrize(("gap", "clear"), [(0.029, False), (0.031, True)])
-def test_neighbours_closer_than_3_cm_are_not_told_apart(gap, clear):
+def test_neighbours_closer_than_3_cm_are_ambiguous(gap, clear):
     row = np.array([[0.5, gap], [0.5, 0.0], [0.5, -0.2]])
     assert (select_by_relation("leftmost", row) == 0) is clear
     assert (select_by_relation("middle", row) == 1) is clear  # it has that neighbour too
@@ -65,7 +65,7 @@ POINTS = st.lists(
 
 
 @given(POINTS)
-def test_left_and_right_swap_in_a_mirror(points):
+def test_mirror_image_swaps_left_and_right(points):
     here, mirrored = np.array(points), np.array(points) * [1, -1]
     for one, other in (("leftmost", "rightmost"), ("second_from_left", "second_from_right"), ("middle", "middle")):
         assert select_by_relation(one, here) == select_by_relation(other, mirrored)
@@ -73,7 +73,7 @@ def test_left_and_right_swap_in_a_mirror(points):
 
 
 @given(POINTS)
-def test_what_is_named_differs_from_all_others(points):
+def test_named_object_differs_from_all_others(points):
     here = np.array(points)
     for relation, key in (("leftmost", here[:, 1]), ("farthest", np.linalg.norm(here, axis=1))):
         found = select_by_relation(relation, here)

@@ -1,4 +1,4 @@
-"""Where basket and robot can stand, and that a seed moves them nowhere else."""
+"""Valid poses of basket and robot, and randomised poses."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def shifted(pose: np.ndarray, x: float = 0, y: float = 0, z: float = 0) -> np.nd
     return moved
 
 
-def test_a_basket_stands_where_all_that_lies_in_it_has_something_below():
+def test_basket_is_stable_with_support_below_its_corners():
     scene = load_scene()
     table = scene.furniture["table"].asset.surfaces["top"]
     edge = (scene.support_pose @ [*table.max_xy, 0, 1])[0]  # in x
@@ -25,14 +25,14 @@ def test_a_basket_stands_where_all_that_lies_in_it_has_something_below():
     at_edge = shifted(scene.basket_pose, x=edge - scene.basket_pose[0, 3])
     assert is_basket_stable(scene, scene.basket_pose)
     assert is_basket_stable(scene, shifted(at_edge, x=-inner))
-    assert not is_basket_stable(scene, shifted(at_edge, x=-0.02))  # not with something on the wrong side
+    assert not is_basket_stable(scene, shifted(at_edge, x=-0.02))  # not with a load on the outer side
     assert not is_basket_stable(scene, shifted(at_edge, x=0.05))
     assert not is_basket_stable(scene, shifted(scene.basket_pose, z=0.1))  # in the air
     on_floor = load_scene("pick_side_table_scattered")
     assert is_basket_stable(on_floor, on_floor.basket_pose)
 
 
-def test_a_basket_that_would_hang_over_the_edge_is_drawn_again():
+def test_basket_pose_over_the_edge_is_drawn_again():
     scene = load_scene(randomisation={"basket": {"position": 0.5, "yaw_deg": 20}})
     by = scene.config.randomisation.basket
     redrawn = 0
@@ -48,14 +48,14 @@ def test_a_basket_that_would_hang_over_the_edge_is_drawn_again():
     assert is_basket_stable(scene, layout.basket_pose)
 
 
-def test_a_basket_that_stands_nowhere_says_what_to_change():
+def test_error_of_an_unstable_basket_has_the_fix():
     scene = load_scene(randomisation={"basket": {"position": 0.0}})
     air = SceneModel(**{**scene.__dict__, "basket_pose": shifted(scene.basket_pose, z=0.5)})
     with pytest.raises(LayoutError, match=r"randomisation.basket: the basket can't stand.*50 places.*Lower random"):
         place_basket(air, scene.robot_pose, np.random.default_rng(0))
 
 
-def test_a_robot_that_would_stand_in_furniture_is_drawn_again():
+def test_robot_pose_inside_furniture_is_drawn_again():
     scene = load_scene(randomisation={"robot": {"position": 0.5, "yaw_deg": 10}})
     redrawn = 0
     for seed in range(30):
@@ -67,14 +67,14 @@ def test_a_robot_that_would_stand_in_furniture_is_drawn_again():
     assert is_body_clear(sample_layout(scene, 2, 2).robot_pose, scene.furniture_points)
 
 
-def test_what_nothing_moves_stays_and_draws_nothing():
+def test_poses_without_randomisation_stay_and_draw_nothing():
     scene, rng = load_scene(), np.random.default_rng(0)
     assert place_robot(scene, rng) is scene.robot_pose
     assert place_basket(scene, scene.robot_pose, rng) is scene.basket_pose
     assert rng.uniform() == np.random.default_rng(0).uniform()
 
 
-def test_the_robots_body_is_low_and_wide_high_and_narrow_and_above_the_floor():
+def test_robot_body_boxes():
     root = from_xyz_yaw(1.0, 2.0, 0.0, np.pi / 2)  # ahead is +y
     for hit in ([1.0, 2.27, 0.2], [1.22, 2.0, 0.2], [1.0, 2.14, 0.6]):
         assert not is_body_clear(root, np.array([hit]))

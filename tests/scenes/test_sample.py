@@ -1,4 +1,4 @@
-"""From seeds to layouts of the shipped pack."""
+"""Layouts of the builtin pack from seeds."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.sample import draw_object_set, overlaps_basket, sample_layout
 
 
-def test_objects_and_their_places_have_seeds_of_their_own():
+def test_objects_and_poses_have_separate_seeds():
     scene = load_scene()
     one, again, moved, other = (sample_layout(scene, *seeds) for seeds in ((4, 4), (4, 4), (4, 5), (5, 5)))
     np.testing.assert_array_equal(one.object_poses, again.object_poses)
@@ -25,7 +25,7 @@ def test_objects_and_their_places_have_seeds_of_their_own():
     assert not np.allclose(one.object_poses, moved.object_poses)
 
 
-def test_objects_among_which_no_target_is_found_give_way_to_others(monkeypatch):
+def test_objects_without_a_target_are_replaced(monkeypatch):
     scene, choose, asked = load_scene(), sample.choose_target, []
 
     def fussy(rng, arrangement):
@@ -40,7 +40,7 @@ def test_objects_among_which_no_target_is_found_give_way_to_others(monkeypatch):
     assert sample_layout(scene, 4, 5, found.object_ids).object_ids == found.object_ids
 
 
-def test_objects_that_do_not_fit_give_way_to_others(monkeypatch):
+def test_objects_that_do_not_fit_are_replaced(monkeypatch):
     scene, arrange, tried = load_scene(), sample._arrange, []
 
     def fussy(rng, model, assets):
@@ -51,16 +51,16 @@ def test_objects_that_do_not_fit_give_way_to_others(monkeypatch):
 
     monkeypatch.setattr(sample, "_arrange", fussy)
     assert sample_layout(scene, 4, 4).object_ids == draw_object_set(scene, 4, 1)
-    assert len(tried) == 2  # it tries often itself
+    assert len(tried) == 2  # the function tries many times itself
     tried[:] = []
     with pytest.raises(LayoutError, match="no room"):
         sample_layout(scene, 4, 4, draw_object_set(scene, 4))
 
 
-def test_objects_and_kinds_may_be_drawn_again():
+def test_objects_and_kinds_may_repeat():
     ids = {"ids": ["mug", "soap_box", "sugar_box"], "count": 4, "repeats": True}
     scattered = [draw_object_set(load_scene(objects=ids), seed) for seed in range(20)]
-    assert max(chosen.count(i) for chosen in scattered for i in chosen) > 2  # by turns it would be 2
+    assert max(chosen.count(i) for chosen in scattered for i in chosen) > 2  # without repeats it would be 2
     layout = {"kind": "orderly", "copies": 2, "rows": 2}
     for chosen in (draw_object_set(load_scene(objects=ids, layout=layout), seed) for seed in range(20)):
         assert chosen[0] == chosen[1] and chosen[2] == chosen[3]
@@ -79,18 +79,18 @@ def test_columns_that_do_not_fit_leave_their_slots_empty():
     heights = layout.object_poses[:, 2, 3]
     assert (heights[layout.present] > 0.61).all()
     assert (heights[~layout.present] < PARKING_HEIGHT + 0.3).all()
-    # which columns come first is of the layout's seed: of the same objects others may be there
+    # the layout's seed decides the order of columns, so other objects may be present
     assert sample_layout(scene, 1, 2).present.tolist() != layout.present.tolist()
 
 
 @pytest.mark.parametrize("name", [name for name in bundled_configs() if "_upstream" in name])
-def test_upstreams_scenes_have_layouts_beside_the_basket(name):
+def test_upstream_scenes_have_layouts_next_to_the_basket(name):
     scene = load_scene(name)
     region = np.array([[*scene.region.min_xy, scene.region.z], [*scene.region.max_xy, scene.region.z]])
     low, high = np.sort(transform_points(scene.support_pose, region)[:, :2], axis=0)
     walls = transform_points(scene.basket_pose, np.concatenate(scene.basket.hulls))[:, :2]
     apart = np.maximum(low - walls.max(axis=0), walls.min(axis=0) - high).max()
-    assert apart > -1e-6  # of the second versions they touch
+    assert apart > -1e-6  # in the second versions they touch
     for seed in range(2):
         layout = sample_layout(scene, seed, seed)
         used = [
@@ -99,7 +99,7 @@ def test_upstreams_scenes_have_layouts_beside_the_basket(name):
         assert not overlaps_basket(used, layout.object_poses[layout.present], scene.basket, layout.basket_pose)
 
 
-def test_columns_leave_out_what_has_no_display_pose_and_say_so_once(caplog):
+def test_columns_exclude_objects_without_display_pose_with_one_warning(caplog):
     objects = load_pack("builtin").objects
     lying = [i for i in ("banana", "scissors", "apple") if objects[i].annotations.display_pose < 0]
     assert lying
@@ -110,12 +110,12 @@ def test_columns_leave_out_what_has_no_display_pose_and_say_so_once(caplog):
     told = [record.getMessage() for record in caplog.records]
     assert len(told) == 1 and told[0].endswith(": " + ", ".join(lying))
     caplog.clear()
-    draw_object_set(load_scene(layout={"kind": "orderly"}), 0)  # all that can stand: nothing to tell
+    draw_object_set(load_scene(layout={"kind": "orderly"}), 0)  # all objects with a display pose: no warning
     assert not caplog.records
 
 
 def under(height: float, **changes) -> SceneModel:
-    """The table, under something that leaves so much room."""
+    """Return a table scene with a given headroom, m."""
     scene = load_scene(**changes)
     table = scene.furniture["table"]
     surfaces = {"top": table.asset.surfaces["top"].model_copy(update={"headroom": height})}
@@ -125,7 +125,7 @@ def under(height: float, **changes) -> SceneModel:
 
 
 def height_of(scene: SceneModel, layout) -> float:
-    """Of the highest object, above the surface, m."""
+    """Return the height of the highest object above the surface, m."""
     objects = scene.object_pack.objects
     parts = [
         transform_points(pose, np.concatenate(objects[i].hulls))
@@ -139,7 +139,7 @@ def test_nothing_stands_higher_than_the_headroom(kind, room):
     changes = {
         "layout": {"kind": kind},
         "objects": {"ids": ["mustard_bottle", "sugar_box", "mug"], "count": 4},
-        "target": {"min_free_grasps": 0},  # what lies is wide; this is not about targets
+        "target": {"min_free_grasps": 0},  # this test is not about targets
     }
     free, low = load_scene(**changes), under(room, **changes)
     assert max(height_of(free, sample_layout(free, seed, seed)) for seed in range(3)) > room + 0.02
@@ -174,7 +174,7 @@ def test_counts_and_distractors_use_some_of_the_slots():
 def test_robot_and_basket_move_within_bounds_and_leave_the_objects():
     plain = sample_layout(load_scene(), 3, 3)
     moved = sample_layout(load_scene(randomisation={"robot": {"position": 0.04, "yaw_deg": 6}, "basket": {}}), 3, 3)
-    np.testing.assert_allclose(plain.object_poses, moved.object_poses, atol=1e-4)  # settled beside another basket
+    np.testing.assert_allclose(plain.object_poses, moved.object_poses, atol=1e-4)  # settled next to another basket
     shift = moved.robot_pose[:3, 3] - plain.robot_pose[:3, 3]
     assert 0 < np.abs(shift).max() <= 0.04
     assert shift[2] == 0
@@ -183,7 +183,7 @@ def test_robot_and_basket_move_within_bounds_and_leave_the_objects():
     assert not np.allclose(plain.basket_pose, moved.basket_pose)
 
 
-def test_nothing_stands_in_a_basket_that_was_moved_among_the_objects():
+def test_no_object_is_in_a_randomised_basket():
     moving = load_scene(randomisation={"basket": {"position": 0.25, "yaw_deg": 20}})
     for seed in (5, 6, 7):
         layout = sample_layout(moving, seed, seed)
@@ -201,7 +201,7 @@ def rows(copies: int, relations: list[str] | None, count: int = 10, **objects) -
 
 
 @pytest.mark.parametrize("relations", [["middle"], ["nearest", "second_from_left", "second_nearest"]])
-def test_relations_of_three_need_three(relations):
+def test_relations_of_three_objects_need_three(relations):
     for wrong in ({"copies": 2}, {"copies": 3, "count": 2}):
         with pytest.raises(ConfigError, match="target.relations"):
             rows(relations=relations, **wrong)
@@ -209,7 +209,7 @@ def test_relations_of_three_need_three(relations):
     rows(2, relations, count=6, ids=["mug", "soap_box"])  # four mugs, or four boxes
     rows(2, relations, repeats=True)
     rows(2, ["nearest", "farthest", "leftmost", "rightmost"])
-    rows(2, list(rows(2, None).config.target.relations))  # all: those that can be
+    rows(2, list(rows(2, None).config.target.relations))  # all relations: those that are possible
 
 
 @pytest.mark.parametrize(
@@ -234,7 +234,7 @@ def test_relations_of_three_need_three(relations):
         ({"room": {"asset": "room", "finishes": {"floor": "lava"}}}, "room.finishes.floor", "lava"),
     ],
 )
-def test_blocks_that_cannot_be(changes, key, words):
+def test_invalid_randomisation_blocks_are_errors(changes, key, words):
     with pytest.raises(ConfigError) as caught:
         load_scene(**changes)
     assert key in str(caught.value) and words in str(caught.value)

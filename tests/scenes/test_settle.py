@@ -1,4 +1,4 @@
-"""Objects that stay, and objects that fall or move."""
+"""Stable objects, and objects that fall or move."""
 
 import numpy as np
 import pytest
@@ -23,14 +23,14 @@ def run(model, names, poses):
     return settle([model.object_pack.objects[n] for n in names], np.stack(poses), model, model.basket_pose)
 
 
-def test_objects_in_resting_poses_stay(model):
+def test_objects_in_resting_poses_are_stable(model):
     poses = [on_table(model, "sugar_box"), on_table(model, "mug", 1.0, 1.1)]
     settled, stable = run(model, ["sugar_box", "mug"], poses)
     assert stable
     assert np.abs(settled - poses).max() < 0.003
 
 
-def test_an_object_that_falls_a_little_settles_first_always_the_same(model):
+def test_object_that_falls_settles_deterministically(model):
     runs = [run(model, ["sugar_box"], [on_table(model, "sugar_box", lift=0.02)]) for _ in range(2)]
     np.testing.assert_array_equal(runs[0][0], runs[1][0])
     settled, stable = runs[0]
@@ -43,7 +43,7 @@ def test_an_object_that_falls_a_little_settles_first_always_the_same(model):
     [(2.5, 0.0, 0.0), (0.9, 0.08, 0.0), (0.9, 0.0, 0.5)],
     ids=["beside the table", "comes to rest elsewhere", "tips over"],
 )
-def test_objects_that_do_not_stay(model, y, lift, lean):
+def test_unstable_objects_are_detected(model, y, lift, lean):
     pose = on_table(model, "drink", y=y, lift=lift)
     turn = np.array([[np.cos(lean), 0, np.sin(lean)], [0, 1, 0], [-np.sin(lean), 0, np.cos(lean)]])
     pose[:3, :3] = turn @ pose[:3, :3]

@@ -1,4 +1,4 @@
-"""What holds of every task's row."""
+"""Rules for the specification of every task."""
 
 import inspect
 
@@ -13,7 +13,7 @@ from robocas_ms3.scenes.task_specs import TASKS
 
 
 @pytest.mark.parametrize("spec", TASKS.values(), ids=list(TASKS))
-def test_what_a_row_names_is_there(spec):
+def test_import_paths_of_a_task_spec_exist(spec):
     assert TASKS[spec.name] is spec
     assert load_config_for(spec).task == spec.name
     assert isinstance(load_object(spec.target), TargetRule)
@@ -27,10 +27,10 @@ def test_what_a_row_names_is_there(spec):
 @pytest.mark.parametrize(
     ("name", "standard", "slow"), [("pick", 800, 200), ("search", 2400, 600), ("open_pick", 2000, 500)]
 )
-def test_a_horizon_is_as_many_seconds_at_any_rate(name, standard, slow):
+def test_horizon_in_seconds_is_independent_of_the_rate(name, standard, slow):
     assert (TASKS[name].max_episode_steps, TASKS[name].steps(5)) == (standard, slow)
 
 
-def test_a_configuration_of_another_task_is_refused():
+def test_configuration_of_another_task_is_an_error():
     with pytest.raises(ConfigError, match=r"RoboCASPick-v1 can't run .*select_table_orderly .expected task: pick"):
         load_config_for(TASKS["pick"], "select_table_orderly")

@@ -1,4 +1,4 @@
-"""p_vis: areas worked out by hand, and laws."""
+"""p_vis: areas computed by hand, and general laws."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def shares(*poses, camera=HIGH) -> np.ndarray:
     return MeshScene([PLATE] * len(poses), np.asarray(poses)).visible_fractions(camera)
 
 
-def test_shares_by_hand():
+def test_visible_fractions_by_hand():
     assert shares(at(0, 0, 0), at(0.05, 0, 0.01)) == pytest.approx([0.5, 1.0], abs=0.01)
     assert shares(at(0, 0, 0), at(0, 0.075, 0.01)) == pytest.approx([0.75, 1.0], abs=0.01)
     assert shares(at(0, 0.075, 0.01), at(0, 0, 0)) == pytest.approx([1.0, 0.75], abs=0.01)
@@ -33,7 +33,7 @@ def test_shares_by_hand():
     assert shares().shape == (0,)
 
 
-def test_the_share_depends_on_where_the_camera_is():
+def test_visible_fraction_depends_on_the_camera_position():
     wall = trimesh.creation.box((0.01, 1.0, 1.0))
     scenery = MeshScene([PLATE, wall], np.stack([at(0, 0, 0), at(0.3, 0, 0)]))
     behind, above = np.eye(4), top_down_camera(np.zeros(2), 0.0)
@@ -43,7 +43,7 @@ def test_the_share_depends_on_where_the_camera_is():
     assert scenery.visible_fractions(above)[0] == 1
 
 
-def test_pixels_are_where_the_camera_sees_things():
+def test_pixels_are_at_the_projected_positions():
     camera = PinholeCamera(np.eye(4), 100, 80, np.pi / 2)  # looks along x: y is left, z up
     ids = MeshScene([trimesh.creation.box((0.1, 0.1, 0.1))], at(2.0, 0.5, 0.5)[None]).segmentation(camera)[0]
     rows, columns = np.nonzero(ids == 0)
@@ -63,7 +63,7 @@ def test_the_selection_camera_looks_down_with_the_worlds_x_up():
     assert [ids[148, 148], ids[148, 64], ids[85, 128], ids[2, 2]] == [0, 1, 2, -1]
 
 
-def test_a_mesh_that_is_changed_is_seen_as_it_is_now():
+def test_changed_mesh_file_is_loaded_again():
     plate = PLATE.copy()
     before = MeshScene([plate], np.eye(4)[None]).segmentation(HIGH)[1][0]
     plate.apply_scale(0.5)
@@ -78,17 +78,17 @@ def test_meshes_are_in_the_assets_frame():
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_laws(seed):
+def test_visibility_laws(seed):
     rng = np.random.default_rng(seed)
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[:, :3, :3] = Rotation.random(5, random_state=rng).as_matrix()
     poses[:, :3, 3] = rng.uniform([-0.1, -0.1, 0], [0.1, 0.1, 0.2], (5, 3))
     camera = top_down_camera(np.zeros(2), 0.0, size=128)
     few, more = shares(*poses[:4], camera=camera), shares(*poses, camera=camera)[:4]
-    seen = ~np.isnan(few)  # a plate on edge is not seen at all
+    seen = ~np.isnan(few)  # a plate seen edge-on is not visible
     np.testing.assert_array_equal(seen, ~np.isnan(more))
     assert ((few[seen] >= 0) & (few[seen] <= 1)).all()
-    assert (more[seen] <= few[seen]).all()  # more cover shows no more
+    assert (more[seen] <= few[seen]).all()  # more occluders do not increase p_vis
     alone = [MeshScene([PLATE], pose[None]).segmentation(camera) for pose in poses]
     ids, full = MeshScene([PLATE] * 5, poses).segmentation(camera)
     np.testing.assert_array_equal(full, [one[1][0] for one in alone])

@@ -1,4 +1,4 @@
-"""Rays against SAPIEN's own segmentation: every object of a heap, from above and from the side."""
+"""Ray casting agrees with SAPIEN's segmentation for every object of a heap, from above and from the side."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Segmentation = Callable[[PinholeCamera, np.ndarray, list[int]], np.ndarray]
 
 @pytest.fixture(scope="module")
 def rendered(needs_renderer) -> Iterator[tuple[list[LoadedObject], Segmentation]]:
-    """Eight objects, and the index of the object that each pixel shows, -1: none, of those that are shown."""
+    """Return eight objects, and a function that renders the index of the object in each pixel (-1: none)."""
     import sapien
     from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
 
@@ -53,7 +53,7 @@ def rendered(needs_renderer) -> Iterator[tuple[list[LoadedObject], Segmentation]
 
 
 def slanted_camera() -> PinholeCamera:
-    """As the gripper's camera looks at a heap: from 0.45 m, 60 degrees above it."""
+    """Return a camera 0.45 m from the heap, 60 degrees above it, like the gripper's camera."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("ZYX", [40, 60, 25], degrees=True).as_matrix()
     pose[:3, 3] = [0, 0, 0.08] - 0.45 * pose[:3, 0]
@@ -64,7 +64,7 @@ def slanted_camera() -> PinholeCamera:
     "camera", [top_down_camera(np.zeros(2), 0.0, size=SIZE), slanted_camera()], ids=["top", "side"]
 )
 @pytest.mark.parametrize("seed", [0, 1])
-def test_shares_agree_with_the_segmentation(rendered, seed, camera):
+def test_visible_fractions_agree_with_the_segmentation(rendered, seed, camera):
     assets, segmentation = rendered
     rng = np.random.default_rng(seed)
     poses = np.tile(np.eye(4), (COUNT, 1, 1))
@@ -78,5 +78,5 @@ def test_shares_agree_with_the_segmentation(rendered, seed, camera):
     shares = scenery.visible_fractions(camera)
     assert large.sum() >= 6
     assert shares[large] == pytest.approx(visible[large] / full[large], abs=0.02)
-    assert shares[large].min() < 0.6  # something is hidden
+    assert shares[large].min() < 0.6  # some objects are hidden
     assert (scenery.segmentation(camera)[0] != together).mean() < 0.0005  # the same pixels, edges aside

@@ -1,4 +1,4 @@
-"""What tests of terms and rewards share."""
+"""Fixture for tests of terms and rewards."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 
 @pytest.fixture(params=["torch", "numpy"])
 def make(request):
-    """Arrays of both kinds that terms take, as they lie on a GPU and on a CPU: float32, or bool, or int64."""
+    """Return a function that makes native arrays of a GPU or a CPU (float32, bool or int64)."""
 
     def as_kind(values):
         tensor = torch.as_tensor(values)

@@ -1,4 +1,4 @@
-"""Several envs of a GPU's batch, without a simulator."""
+"""Several envs of a batch on a GPU, without a simulator."""
 
 from typing import NamedTuple
 from unittest.mock import Mock
@@ -11,7 +11,7 @@ from robocas_ms3.tasks import RoboCASPickEnv
 
 
 def several(folder, monkeypatch, num_envs=4, **arguments) -> tuple[RoboCASPickEnv, list]:
-    """An environment of several envs, made as `gym.make` does, but for the simulator; and the layouts it asked for."""
+    """Return an environment of several envs without a simulator, and the list of requested layouts."""
     asked = []
 
     def resets(env, seed=None, options=None):
@@ -40,7 +40,7 @@ def several(folder, monkeypatch, num_envs=4, **arguments) -> tuple[RoboCASPickEn
 
 
 class Thing(NamedTuple):
-    """What stands for a layout."""
+    """A stand-in for a layout."""
 
     objects: int
     seed: int

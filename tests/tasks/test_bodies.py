@@ -1,4 +1,4 @@
-"""What is read at once is what ManiSkill reads actor by actor, also right after something was set."""
+"""States read in one call equal those that ManiSkill reads per actor, also directly after setting a state."""
 
 from types import SimpleNamespace
 
@@ -31,13 +31,13 @@ def env():
     env.close()
 
 
-def maniskills(base) -> torch.Tensor:
+def read_by_maniskill(base) -> torch.Tensor:
     parts = base.scene.get_sim_state()
     return torch.cat([state for found in parts.values() for state in found.values()], dim=1)
 
 
-def set_everything(base):
-    """Change one thing after the other, each by its own setter."""
+def change_state(base):
+    """Change one part of the state after the other, each by its own setter."""
     drawer = next(f for f in base.fixtures.furniture.values() if isinstance(f, Articulation))
     robot, thing = base.agent.robot, base.objects[1]
     yield thing.set_pose(Pose.create_from_pq(torch.tensor([[1.0, 2.0, 3.0]])))
@@ -52,27 +52,27 @@ def set_everything(base):
     yield base.scene.step()
 
 
-def test_a_read_is_never_out_of_date(env):
+def test_read_is_always_current(env):
     base = env.unwrapped
     before, seen = base.get_state(), []
-    for _ in set_everything(base):
+    for _ in change_state(base):
         seen.append(base.bodies.read())
-        assert torch.equal(seen[-1], maniskills(base))
-        assert torch.equal(base.get_state()[:, : seen[-1].shape[1]], maniskills(base))
+        assert torch.equal(seen[-1], read_by_maniskill(base))
+        assert torch.equal(base.get_state()[:, : seen[-1].shape[1]], read_by_maniskill(base))
         assert torch.equal(base.object_poses, torch.stack([a.pose.raw_pose for a in base.objects], dim=1))
         assert torch.equal(base.basket_pose, base.fixtures.basket.pose.raw_pose)
     assert not any(torch.equal(one, two) for one, two in zip(seen, seen[1:], strict=False))  # and none was written over
     base.set_state(before)
-    assert torch.equal(base.bodies.read(), maniskills(base))
+    assert torch.equal(base.bodies.read(), read_by_maniskill(base))
     rng = np.random.default_rng(0)
     for _ in range(5):
         env.step(np.array([*(MOBILE_PANDA.arm_rest + rng.normal(0, 0.2, 7)), -1], np.float32))
-        assert torch.equal(base.bodies.read(), maniskills(base))
+        assert torch.equal(base.bodies.read(), read_by_maniskill(base))
     env.reset(seed=1)
-    assert torch.equal(base.bodies.read(), maniskills(base))
+    assert torch.equal(base.bodies.read(), read_by_maniskill(base))
 
 
-def test_others_stay_the_same_while_only_the_robot_moves(env):
+def test_state_except_robot_is_unchanged_while_only_the_robot_moves(env):
     base = env.unwrapped
     robot, before = base.agent.robot, base.bodies.read()
     others = base.bodies.state_except_robot
@@ -80,14 +80,14 @@ def test_others_stay_the_same_while_only_the_robot_moves(env):
     robot.set_pose(sapien.Pose([0.1, 0.2, 0.3]))
     assert not torch.equal(base.bodies.read(), before)
     assert base.bodies.state_except_robot == others
-    for _, moved in zip(range(6), set_everything(base), strict=False):
+    for _, moved in zip(range(6), change_state(base), strict=False):
         assert moved is None
         base.bodies.read()
         assert base.bodies.state_except_robot != others
         others = base.bodies.state_except_robot
 
 
-def test_a_state_dict_is_maniskills(env):
+def test_state_dict_equals_that_of_maniskill(env):
     base = env.unwrapped
     ours, theirs = base.get_state_dict(), base.scene.get_sim_state()
     assert list(theirs) == ["actors", "articulations"]
@@ -97,10 +97,10 @@ def test_a_state_dict_is_maniskills(env):
         for name, state in found.items():
             assert torch.equal(ours[kind][name], state)
     ours["actors"]["basket"][:] = 0  # belongs to whoever asked for it
-    assert torch.equal(base.bodies.read(), maniskills(base))
+    assert torch.equal(base.bodies.read(), read_by_maniskill(base))
 
 
-def test_another_layout_of_packed_states_is_an_error(env, monkeypatch):
+def test_unexpected_packed_state_is_an_error(env, monkeypatch):
     scene = env.unwrapped.scene
     packed = scene.px.pack()
     system = SimpleNamespace(

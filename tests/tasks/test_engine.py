@@ -1,4 +1,4 @@
-"""What is set aside on a GPU, and what is made of the engine's complaints. Neither needs one."""
+"""Memory limits of PhysX on a GPU, and errors from its messages, tested without a GPU."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ HARMLESS = (
 
 
 @pytest.mark.parametrize(("num_envs", "sim_backend"), [(2, "auto"), (1, "physx_cuda"), (1, "gpu")])
-def test_a_library_for_gpus_that_cannot_be_downloaded(monkeypatch, num_envs, sim_backend):
+def test_failed_download_of_the_gpu_library_is_an_error(monkeypatch, num_envs, sim_backend):
     def enable() -> None:
         raise ConnectionError("Failed to resolve 'github.com'")
 
@@ -45,7 +45,7 @@ def test_a_library_for_gpus_that_cannot_be_downloaded(monkeypatch, num_envs, sim
         check_engine(num_envs, "full", sim_backend)
 
 
-def test_few_envs_take_no_more_than_maniskills():
+def test_few_envs_have_the_limits_of_maniskill():
     assert gpu_memory(1, 15) == gpu_memory(16, 10) == GPUMemoryConfig()
 
 
@@ -60,8 +60,8 @@ def test_capacities_grow_with_envs_and_objects_by_hand():
 
 
 @contextmanager
-def listening() -> Iterator[EngineErrors]:
-    """Not a fixture: between fixtures and tests pytest replaces standard error itself."""
+def capture_errors() -> Iterator[EngineErrors]:
+    """Monitor standard error. Not a fixture, since pytest replaces standard error between fixtures and tests."""
     errors = EngineErrors()
     errors.open()
     try:
@@ -70,46 +70,46 @@ def listening() -> Iterator[EngineErrors]:
         errors.close()
 
 
-def heard(errors: EngineErrors) -> None:
-    """Check until something is heard, for a second at most."""
+def wait_for_error(errors: EngineErrors) -> None:
+    """Check for an error repeatedly, for at most one second."""
     for _ in range(100):
         errors.check()
         time.sleep(0.01)
 
 
-def test_an_overflow_is_an_error_that_says_what_to_do_and_is_passed_on(capfd):
-    with listening() as errors:
+def test_overflow_is_an_error_with_a_fix_and_is_still_printed(capfd):
+    with capture_errors() as errors:
         os.write(2, f"{COMPLAINT}\n{COMPLAINT}\nand something else\n".encode())
         with pytest.raises(SimulationError, match=r"ran out of memory.*its size to 9.*gpu_memory_config"):
-            heard(errors)
+            wait_for_error(errors)
         errors.check()  # once
     assert f"{COMPLAINT}\n{COMPLAINT}\nand something else\n" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("line", OTHERS)
-def test_other_complaints_are_understood(line, capfd):
-    with listening() as errors:
+def test_other_messages_of_physx_are_recognised(line, capfd):
+    with capture_errors() as errors:
         os.write(2, f"{line}\n".encode())
         with pytest.raises(SimulationError):
-            heard(errors)
+            wait_for_error(errors)
 
 
-def test_what_others_write_is_not_minded(capfd):
-    with listening() as errors:
+def test_unrelated_output_is_ignored(capfd):
+    with capture_errors() as errors:
         os.write(2, "\n".join(HARMLESS).encode() + b"\n")
         time.sleep(0.2)
         errors.check()
 
 
-def test_two_envs_of_a_process_hear_it(capfd):
-    with listening() as one, listening() as other:
+def test_two_envs_of_a_process_get_the_error(capfd):
+    with capture_errors() as one, capture_errors() as other:
         os.write(2, f"{COMPLAINT}\n".encode())
         for errors in (one, other):
             with pytest.raises(SimulationError):
-                heard(errors)
+                wait_for_error(errors)
 
 
-def test_what_a_crashing_process_says_is_not_lost():
+def test_output_of_a_crashing_process_is_kept():
     program = (
         "import faulthandler, os\nfrom robocas_ms3.tasks.engine import EngineErrors\nfaulthandler.enable()\n"
         "errors = EngineErrors()\nerrors.open()\nos.write(2, b'x' * 300_000 + b'\\n')\nos.abort()\n"
@@ -121,7 +121,7 @@ def test_what_a_crashing_process_says_is_not_lost():
 
 
 @pytest.mark.slow
-def test_one_stays_from_one_environment_to_the_next_which_sees_the_same(needs_renderer):
+def test_render_system_is_kept_between_environments(needs_renderer):
     seen = []
     for seed in (1, 0, 1):
         env = gym.make(

@@ -1,4 +1,4 @@
-"""Layouts are tried by the engine that runs them."""
+"""Checks of layouts in the physics engine that runs them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from robocas_ms3.tasks.layout_stability import check_layouts, status_of, uncheck
 
 @pytest.fixture
 def cache(tmp_path) -> LayoutCache:
-    """Of small heaps, two sets of objects with two layouts each; in one of them an object hangs in the air."""
+    """Return a cache of small heaps: two sets of objects with two layouts each; in one an object hangs in the air."""
     pack = load_pack("builtin")
     cache = LayoutCache(SceneModel.load(load_task_config("search_table_small_heap"), pack, pack), tmp_path)
     pairs = seed_pairs([0, 1], [0, 1])
@@ -32,7 +32,7 @@ def cache(tmp_path) -> LayoutCache:
 
 
 @pytest.mark.slow
-def test_a_heap_that_moves_is_found(cache):
+def test_unstable_heap_is_found(cache):
     assert unchecked_layouts(cache, "gpu") == {}
     seeds = unchecked_layouts(cache, "cpu")
     assert seeds == {0: [0, 1], 1: [0, 1]}
@@ -45,11 +45,11 @@ def test_a_heap_that_moves_is_found(cache):
     assert table is not None
     assert table.pairs(LayoutStatus.STABLE) == [(0, 0), (0, 1), (1, 1)]
     assert unchecked_layouts(cache, "cpu") == {1: [0]}
-    assert count_layouts(cache.folder) == 4  # none was made on the way
+    assert count_layouts(cache.folder) == 4  # the check added no layouts
 
 
 @pytest.mark.slow
-def test_what_was_found_before_an_interruption_is_kept(cache, monkeypatch):
+def test_statuses_found_before_an_interruption_are_stored(cache, monkeypatch):
     def tried(*args, **kwargs):
         yield (0, 0), 0.001
         yield (0, 1), 0.02

@@ -1,4 +1,4 @@
-"""Clutter around a target: plates of points at known places."""
+"""Clutter around a target, made of plates of points at known positions."""
 
 import math
 
@@ -21,14 +21,14 @@ from robocas_ms3.tasks.occlusion import (
 
 
 def plate(x: tuple[float, float], y: tuple[float, float], z: float) -> torch.Tensor:
-    """(3, 1681) points of a level rectangle, at most 2.5 mm apart for one of 0.1 m."""
+    """Return (3, 1681) points of a horizontal rectangle, at most 2.5 mm apart for a side of 0.1 m."""
     u, v = (torch.linspace(low, high, 41) for low, high in (x, y))
     return torch.stack([*(g.flatten() for g in torch.meshgrid(u, v, indexing="ij")), torch.full((41 * 41,), z)])
 
 
 TARGET = plate((-0.05, 0.05), (-0.05, 0.05), 0.65)
 FAR = plate((0.3, 0.4), (0.0, 0.1), 0.8)
-HIGH_ABOVE = torch.tensor([0.0, 0.0, 200.0])  # so far that everything is seen from straight above
+HIGH_ABOVE = torch.tensor([0.0, 0.0, 200.0])  # so far away that all rays are vertical
 
 
 def measure(*others: torch.Tensor, present: list[bool] | None = None, eye: torch.Tensor = HIGH_ABOVE) -> Clutter:
@@ -37,7 +37,7 @@ def measure(*others: torch.Tensor, present: list[bool] | None = None, eye: torch
     return clutter(points, flags, torch.tensor([0]), eye)
 
 
-def test_nothing_near_is_clear():
+def test_target_without_neighbours_is_clear():
     found = measure(FAR)
     assert found.hidden_fraction.tolist() == [0]
     assert not found.obstacles.any()
@@ -45,13 +45,13 @@ def test_nothing_near_is_clear():
 
 
 @pytest.mark.parametrize(("edge", "share"), [(0.0, 0.5), (0.03, 0.2), (-0.05, 1.0)])
-def test_hidden_share_is_the_share_of_cells_under_a_plate(edge, share):
+def test_hidden_fraction_is_the_fraction_of_cells_under_a_plate(edge, share):
     found = measure(plate((edge, 0.05), (-0.05, 0.05), 0.7))
     assert found.hidden_fraction.item() == pytest.approx(share, abs=0.05)  # one row of 20 cells
     assert found.obstacles.tolist() == [[False, True]]
 
 
-def test_what_is_nearer_to_the_camera_hides_more():
+def test_object_nearer_to_the_camera_hides_more():
     eye = torch.tensor([0.0, 0.0, 1.15])  # 0.5 m above the target
     half_way = plate((0.0, 0.025), (-0.025, 0.025), 0.9)  # 0.25 m below the camera, so it appears at twice its size
     assert measure(half_way, eye=eye).hidden_fraction.item() == pytest.approx(0.5, abs=0.05)
@@ -60,20 +60,20 @@ def test_what_is_nearer_to_the_camera_hides_more():
     assert measure(half_way, eye=beside).hidden_fraction.item() == pytest.approx(0.25, abs=0.05)
 
 
-def test_where_points_appear_by_hand():
+def test_projected_points_by_hand():
     points = torch.tensor([[0.1, 0.2, 0.6], [0.1, 0.2, 0.8], [0.1, 0.2, 2.0]]).T[None, None]
     seen = project_down(points, torch.tensor([0.0, 0.1, 1.0]), torch.tensor([0.4]))
     expected = torch.tensor([[0.1, 0.1], [0.2, 0.2], [0.8, 0.8]])  # the last is above the camera: 5 cm below it
     assert torch.allclose(seen[0, 0].T, expected)
 
 
-def test_what_lies_under_the_target_hides_nothing():
+def test_object_below_the_target_hides_nothing():
     found = measure(plate((-0.05, 0.05), (-0.05, 0.05), 0.62))
     assert found.hidden_fraction.item() == 0
     assert not found.obstacles.any()
 
 
-def test_a_neighbour_within_a_centimetre_and_higher_is_an_obstacle():
+def test_higher_neighbour_within_1_cm_is_an_obstacle():
     def beside(gap: float, z: float) -> torch.Tensor:
         return plate((0.05 + gap, 0.15 + gap), (-0.05, 0.05), z)
 
@@ -90,12 +90,12 @@ def test_two_obstacles_are_too_many():
     assert measure(right, left, present=[True, True, False]).cleared.tolist() == [True]
 
 
-def test_an_obstacle_under_another_is_not_seen():
+def test_obstacle_below_another_is_not_visible():
     low, high = plate((-0.05, 0.05), (-0.05, 0.05), 0.7), plate((-0.06, 0.06), (-0.06, 0.06), 0.75)
     assert measure(low, high).obstacles.tolist() == [[False, False, True]]
 
 
-def test_envs_do_not_mix():
+def test_envs_are_independent():
     cover = plate((-0.05, 0.05), (-0.05, 0.05), 0.7)
     points = torch.stack([torch.stack([TARGET, cover]), torch.stack([TARGET, FAR]), torch.stack([TARGET, cover])])
     found = clutter(points, torch.ones(3, 2, dtype=torch.bool), torch.tensor([0, 0, 1]), HIGH_ABOVE)
@@ -105,12 +105,12 @@ def test_envs_do_not_mix():
 
 @settings(max_examples=20, deadline=None)
 @given(x=st.floats(-1, 1), y=st.floats(-1, 1), yaw=st.floats(-math.pi, math.pi))
-def test_the_share_hangs_on_the_arrangement_only(x, y, yaw):
+def test_hidden_fraction_is_invariant_to_rigid_motion(x, y, yaw):
     pose = torch.tensor([x, y, 0.1, math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)])
     points = torch.stack([TARGET, plate((0.0, 0.05), (-0.05, 0.05), 0.7)])[None]
     moved = surface_points(pose.expand(1, 2, 7), points)
     found = clutter(moved, torch.ones(1, 2, dtype=torch.bool), torch.tensor([0]), HIGH_ABOVE)
-    # of 20 or 21 rows of cells those in which the upper plate begins and ends count whole: 10 to 12
+    # the plate covers 10 to 12 of 20 or 21 rows of cells, since partly covered rows count
     assert found.hidden_fraction.item() == pytest.approx(0.5, abs=1.5 / 21 + 1e-3)
 
 
@@ -122,7 +122,7 @@ def test_points_follow_their_object():
     assert torch.allclose(moved[..., 0], torch.tensor([[[1.0, 2.1, 3], [0, 0, 0.1]]]), atol=1e-6)
 
 
-def test_what_is_too_far_to_count_as_motion_changes_nothing():
+def test_objects_beyond_the_motion_check_do_not_change_the_clutter():
     side = torch.linspace(-0.05, 0.05, 21)
     ball = torch.stack([x.flatten() for x in torch.meshgrid(side, side, indexing="ij")] + [torch.zeros(441)])
     ball = ball[:, torch.linalg.vector_norm(ball, dim=0) <= 0.05 + 1e-6]
@@ -141,7 +141,7 @@ def test_what_is_too_far_to_count_as_motion_changes_nothing():
     assert not counted(0.1151)
 
 
-def test_what_moves_far_away_does_not_count_as_motion():
+def test_motion_far_away_is_ignored():
     def at(*places: tuple[float, float]) -> torch.Tensor:
         return torch.tensor([[[x, y, 0.7, 1, 0, 0, 0] for x, y in places]])
 
@@ -158,24 +158,24 @@ def test_what_moves_far_away_does_not_count_as_motion():
     assert moved(at((0, 0), (0.11, 0)), at((0, 0), (0.2, 0)))  # leaves
 
 
-def test_a_push_begins_between_the_target_and_the_highest_obstacle():
+def test_push_starts_between_the_target_and_the_highest_obstacle():
     low, high = plate((0.06, 0.10), (-0.05, 0.05), 0.66), plate((-0.14, -0.06), (-0.05, 0.05), 0.7)
     points = torch.stack([TARGET, low, high, FAR])[None].repeat(3, 1, 1, 1)
     obstacles = torch.tensor([[False, True, True, False], [False, True, False, False], [False] * 4])
     found = push_point(points, obstacles, torch.zeros(3, dtype=torch.long))
-    # 2 cm inwards of the edge at x = -0.06; of that at 0.06; the target itself
+    # 2 cm inside of the edges at x = -0.06 and 0.06; the target itself
     expected = torch.tensor([[-0.04, 0, 0.7], [0.04, 0, 0.66], [0, 0, 0.65]])
     assert torch.allclose(found, expected, atol=1e-5)
 
 
-def test_a_push_of_what_lies_on_top_of_the_target_is_finite():
+def test_push_point_of_an_obstacle_above_the_target_is_finite():
     points = torch.stack([TARGET, TARGET + torch.tensor([[0.0], [0.0], [0.1]])])[None]
     found = push_point(points, torch.tensor([[False, True]]), torch.tensor([0]))
     assert torch.isfinite(found).all()
     assert found[0, 2] == pytest.approx(0.75)
 
 
-def test_what_is_near_in_the_image_is_near():
+def test_motion_near_the_target_in_the_image_counts():
     eye, radii = torch.tensor([0.0, 0.0, 1.0]), torch.full((1, 2), 0.02)
 
     def moved(x: float, z: float) -> bool:
@@ -184,13 +184,13 @@ def test_what_is_near_in_the_image_is_near():
         now[0, 1, 0] += 1e-3
         return bool(has_moved_near(now, before, radii, torch.tensor([0]), eye))
 
-    assert moved(0.1, 0.75)  # right in front of the target
+    assert moved(0.1, 0.75)  # between camera and target
     assert not moved(0.1, 0.5)
-    assert not moved(0.2, 0.75)  # right above it, but seen far off: at 0.4 where the target is
+    assert not moved(0.2, 0.75)  # above it in the world, but seen at 0.4 m from it at the target's depth
 
 
 @pytest.mark.slow
-def test_hidden_shares_are_what_rays_say():
+def test_hidden_fractions_agree_with_ray_casting():
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.scenes.cache import layout_source
     from robocas_ms3.scenes.config import load_task_config
@@ -216,8 +216,8 @@ def test_hidden_shares_are_what_rays_say():
     assert np.nanpercentile(differences, 95) < 0.12
 
 
-def test_how_much_of_each_object_every_other_one_covers():
-    """A plate of 10 cm, half of it under one that is higher, which is itself under a small one; another one aside."""
+def test_pairwise_occlusion_by_hand():
+    """A plate of 10 cm is half below a higher one, which is below a small one; another plate is next to them."""
     target, lid = plate((0, 0.1), (0, 0.1), 0.5), plate((0.05, 0.15), (0, 0.1), 0.55)
     small, aside = plate((0.1, 0.15), (0, 0.05), 0.6), plate((0.4, 0.5), (0, 0.1), 0.9)
     points = torch.stack([target, lid, small, aside])[None].expand(2, -1, -1, -1)

@@ -1,4 +1,4 @@
-"""Stage ``furniture_opened``, pulls that are felt by both fingers, and base motion in actions and records."""
+"""Stage ``furniture_opened``, pulls with contact at both fingers, and base motion in actions and recordings."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CONFIGS = ["open_pick_container", "open_pick_refrigerator"]  # sliding and hinge
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_it_is_opened_from_the_configured_share_on(name):
+def test_furniture_is_open_from_the_configured_fraction(name):
     assert name in bundled_configs()
     env = gym.make("RoboCASOpenPick-v1", config=name, **STATE_ONLY)
     env.reset(seed=0)
@@ -53,7 +53,7 @@ def test_it_is_opened_from_the_configured_share_on(name):
 
 @contextmanager
 def done_early():
-    """Policies that end before the task has succeeded count all the same: what is tested here comes before."""
+    """Accept episodes without success, since these tests end before it."""
     flag = Executor.flag
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Executor, "flag", lambda self, name: name == "success" or flag(self, name))
@@ -63,7 +63,7 @@ def done_early():
 
 @pytest.fixture(scope="module")
 def driven(tmp_path_factory):
-    """A record in which the base goes 0.2 m ahead, 0.1 m to the right, and turns by 0.3 rad; and what was seen then."""
+    """Record an episode in which the base drives 0.2 m forward and 0.1 m right, and turns by 0.3 rad."""
     folder = tmp_path_factory.mktemp("driven")
     generator = EpisodeGenerator(EpisodeSettings("open_pick", "open_pick_cabinet_door", "builtin", max_attempts=1))
     seen = {}
@@ -82,7 +82,7 @@ def driven(tmp_path_factory):
     return folder / "driven.h5", seen
 
 
-def test_a_drive_is_in_the_actions_and_the_arm_stands_still(driven):
+def test_drive_is_in_the_actions_and_the_arm_is_still(driven):
     path, seen = driven
     with TrajectoryFile(path) as file:
         actions = file.recording(0).actions
@@ -97,14 +97,14 @@ def test_a_drive_is_in_the_actions_and_the_arm_stands_still(driven):
     assert moved == pytest.approx([0.2, -0.1], abs=0.01)
 
 
-def test_a_drive_is_in_the_datasets_base_motion(driven):
+def test_drive_is_in_the_base_motion_of_the_dataset(driven):
     path, seen = driven
     with TrajectoryFile(path) as file:
         recording = file.recording(0)
     samples = sample_states(recording.control_steps, 4)
     motion = recording.motion(samples)
     x, y, yaw = motion.agv_pose.T
-    base = np.tile(np.eye(4), (len(x), 1, 1))  # what rendering reads from the arm's base link
+    base = np.tile(np.eye(4), (len(x), 1, 1))  # as rendering reads it from the arm's base link
     base[:, 0, 0] = base[:, 1, 1] = np.cos(yaw)
     base[:, 1, 0] = np.sin(yaw)
     base[:, 0, 1] = -base[:, 1, 0]
@@ -120,7 +120,7 @@ def test_a_drive_is_in_the_datasets_base_motion(driven):
 
 
 def watch(arm) -> dict[str, float]:
-    """What the robot touches from now on, and how deep it overlaps with it at most, m: filled step by step."""
+    """Return a dictionary, filled in each step, of touched things and their greatest overlap with the robot, m."""
     touched: dict[str, float] = {}
     step = arm.executor._step
     robot = {link._objs[0].entity.name for link in arm.env.agent.robot.links}
@@ -138,7 +138,7 @@ def watch(arm) -> dict[str, float]:
     return touched
 
 
-def test_a_pull_opens_by_contact_and_leaves_the_handle(tmp_path):
+def test_pull_opens_by_contact_and_releases_the_handle(tmp_path):
     generator = EpisodeGenerator(EpisodeSettings("open_pick", "open_pick_container", "builtin", max_attempts=1))
 
     def policy(arm) -> None:
@@ -163,7 +163,7 @@ def test_a_pull_opens_by_contact_and_leaves_the_handle(tmp_path):
 
 
 def farther_back(name: str, distance: float) -> dict:
-    """A shipped configuration with the robot farther from everything, and allowed to drive."""
+    """Return a bundled configuration with the robot farther away, and with base motion."""
     config = load_task_config(name).model_dump(mode="json")
     robot = config["robot"]
     yaw = np.deg2rad(robot.get("yaw_deg", 0.0))
@@ -173,7 +173,7 @@ def farther_back(name: str, distance: float) -> dict:
     return config | {"base_motion": True}
 
 
-def test_it_drives_to_a_handle_that_is_out_of_reach(tmp_path):
+def test_robot_drives_to_a_handle_out_of_reach(tmp_path):
     config = farther_back("open_pick_container", 0.5)
     generator = EpisodeGenerator(EpisodeSettings("open_pick", config, "builtin", max_attempts=1))
 
@@ -186,7 +186,7 @@ def test_it_drives_to_a_handle_that_is_out_of_reach(tmp_path):
         assert share(arm) < 0.5
         drive_to_handle(arm)
         assert current_base_pose(arm)[0] > 0.1
-        stands = current_base_pose(arm)  # where it is within comfortable reach: it drives no further
+        stands = current_base_pose(arm)  # within comfortable reach, the base stops
         drive_to_handle(arm)
         assert (current_base_pose(arm) == stands).all()
 
@@ -196,7 +196,7 @@ def test_it_drives_to_a_handle_that_is_out_of_reach(tmp_path):
     generator.close()
 
 
-def test_pick_drives_to_a_target_that_is_out_of_reach(tmp_path):
+def test_robot_drives_to_a_target_out_of_reach(tmp_path):
     config = farther_back("pick_table_scattered", 0.4)
     settings = EpisodeSettings("pick", config, "builtin", max_attempts=4)
     generator = EpisodeGenerator(settings)

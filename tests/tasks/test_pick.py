@@ -1,4 +1,4 @@
-"""Stages and success of pick, by putting bodies where they matter and asking the environment."""
+"""Stages and success of pick, tested by setting the poses of bodies."""
 
 import gymnasium as gym
 import numpy as np
@@ -34,7 +34,7 @@ def put_target_into_basket(env) -> None:
     target.set_pose(Pose.create_from_pq(base.fixtures.basket.pose.p + torch.tensor([[0, 0, 0.05]]), target.pose.q))
 
 
-def test_an_object_that_was_never_lifted_does_not_count(env):
+def test_object_that_was_never_lifted_is_no_success(env):
     env.reset(seed=0)
     put_target_into_basket(env)
     flags = settle(env, 40)
@@ -77,8 +77,8 @@ def test_stages_are_sticky_until_the_next_reset(env):
     assert not any(bool(info[stage][0]) for stage in STAGES)
 
 
-def test_a_reset_forgets_the_contacts_of_before(env, monkeypatch):
-    """Until the first step the engine tells the contacts of the last episode, where nothing is built anew."""
+def test_reset_ignores_contacts_of_the_last_episode(env, monkeypatch):
+    """Until the first step the engine reports contacts of the last episode if the scene is not rebuilt."""
     base = env.unwrapped
     forces = np.full((1, 3, len(base.objects), 3), 5.0, np.float32)
     monkeypatch.setattr(Contacts, "forces", lambda *_: forces)
@@ -93,7 +93,7 @@ def test_the_instruction_names_the_target(env):
     assert env.unwrapped.get_language_instruction() == [f"grasp the {name} on the table and move it to the basket"]
 
 
-def test_the_arm_begins_where_the_configuration_says():
+def test_arm_starts_in_the_configured_pose():
     for start, joints in (
         ("rest", [0, -1.02, 0, -2.51, 0, 1.35, 0.78]),
         ("evaluation", [-0.0276, 0.1581, 0, -1.8899, -0.0688, 2.7705, 0.7514]),
@@ -102,7 +102,7 @@ def test_the_arm_begins_where_the_configuration_says():
         env.reset(seed=0)
         robot = env.unwrapped.agent.robot
         np.testing.assert_allclose(robot.get_qpos()[0], [0, 0, 0, *joints, 0.04, 0.04], atol=1e-6)
-        settle(env, 5)  # it is told to stay there, too
+        settle(env, 5)  # the controller holds this pose
         np.testing.assert_allclose(robot.get_qpos()[0, 3:10], joints, atol=2e-3)
         env.close()
 
@@ -132,10 +132,10 @@ def changed(**changes) -> dict:
     return {**load_task_config("pick_table_scattered").model_dump(mode="json"), **changes}
 
 
-def test_the_result_stays_while_nothing_moves(env):
+def test_result_is_reused_while_nothing_moves(env):
     env.reset(seed=0)
     base = env.unwrapped
-    settle(env, 60)  # what was laid out comes to rest
+    settle(env, 60)  # wait until all objects are at rest
     before = base.success_check.state
     flags = settle(env, 10)
     assert base.success_check.state is before
@@ -143,11 +143,11 @@ def test_the_result_stays_while_nothing_moves(env):
     target.set_pose(Pose.create_from_pq(target.pose.p + torch.tensor([[0, 0, 0.5]]), target.pose.q))
     base.evaluate()
     assert base.success_check.state is not before
-    base.success_check.stages["target_lifted"][:] = True  # what was reached counts too
+    base.success_check.stages["target_lifted"][:] = True  # reached stages are part of the result
     assert bool(base.evaluate()["target_lifted"][0])
     assert not flags["target_lifted"]
 
 
-def test_images_without_a_renderer_are_refused_in_words():
+def test_images_without_a_renderer_are_an_error():
     with pytest.raises(ConfigError, match="render_backend: images need a renderer.*obs_mode='rgb'"):
         gym.make("RoboCASPick-v1", obs_mode="rgb", render_backend="none")

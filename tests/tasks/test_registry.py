@@ -1,4 +1,4 @@
-"""Contract of every registered task: it makes, resets, steps, and repeats for the same seed."""
+"""Contract of every registered task: make, reset, step, and equal scenes for equal seeds."""
 
 import re
 import warnings
@@ -83,7 +83,7 @@ def test_same_seed_same_scene_other_seed_other_scene(env):
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_layouts_are_settled_and_as_their_kind_says(env, seed):
+def test_layouts_are_settled_and_match_their_kind(env, seed):
     env.reset(seed=seed)
     base = env.unwrapped
     kind = base.task_config.layout.kind
@@ -116,8 +116,8 @@ def test_layouts_are_settled_and_as_their_kind_says(env, seed):
 
 
 @lru_cache
-def complaints(env_id: str, mode: str) -> tuple[str, list[str]]:
-    """What gymnasium's checker says of an environment: its error, and its warnings but for the environment's name."""
+def checker_messages(env_id: str, mode: str) -> tuple[str, list[str]]:
+    """Return the error and the warnings of gymnasium's checker, without the environment's name."""
     size = dict(width=32, height=24)
     env = CPUGymWrapper(gym.make(env_id, control_mode="pd_joint_delta_pos", obs_mode=mode, sensor_configs=size))
     error = ""
@@ -132,10 +132,10 @@ def complaints(env_id: str, mode: str) -> tuple[str, list[str]]:
 
 
 @pytest.mark.parametrize(("name", "mode"), [*((name, "state") for name in sorted(TASKS)), ("pick", "rgb")])
-def test_gymnasiums_checker_finds_nothing_that_it_does_not_find_in_pick_cube(name, mode, needs_renderer):
+def test_gymnasium_checker_finds_no_more_than_in_pick_cube(name, mode, needs_renderer):
     import mani_skill.envs  # noqa: F401  (registers PickCube-v1)
 
-    error, warned = complaints(TASKS[name].env_id, mode)
-    theirs = complaints("PickCube-v1", mode)
+    error, warned = checker_messages(TASKS[name].env_id, mode)
+    theirs = checker_messages("PickCube-v1", mode)
     assert error == theirs[0]
     assert set(warned) <= set(theirs[1])

@@ -1,4 +1,4 @@
-"""A state that was taken in the middle of an episode is come back to, with what the next actions hang on."""
+"""Restoring a state in the middle of an episode, with the targets from which the next actions start."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import robocas_ms3  # noqa: F401
 from robocas_ms3.robots.description import MOBILE_PANDA
 
 MODES = ("pd_joint_pos", "pd_joint_delta_pos", "pd_ee_delta_pose", "pd_ee_pose", "pd_joint_pos_base")
-FREE_FALL = 1e-5  # m, rad: contacts are found anew, and nothing else is
+FREE_FALL = 1e-5  # m, rad: only contacts are computed again
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def env(request):
 
 
 def actions(env, count: int, seed: int) -> list[np.ndarray]:
-    """Small motions about where the arm rests, whatever the control mode."""
+    """Return small motions about the arm's rest pose for any control mode."""
     rng, mode = np.random.default_rng(seed), env.unwrapped.control_mode
     size = env.action_space.shape[0]
     if mode == "pd_ee_pose":
@@ -46,7 +46,7 @@ def play(env, todo: list[np.ndarray]) -> tuple[torch.Tensor, dict, dict]:
 
 
 @pytest.mark.parametrize("env", MODES, indirect=True)
-def test_what_follows_is_what_followed(env):
+def test_restored_state_repeats_the_motion(env):
     base = env.unwrapped
     env.reset(seed=0)
     play(env, actions(env, 10, seed=1))
@@ -59,7 +59,7 @@ def test_what_follows_is_what_followed(env):
     for part, value in seen["agent"].items():
         if isinstance(value, torch.Tensor):
             torch.testing.assert_close(again["agent"][part], value, atol=1e-6, rtol=0, msg=part)
-    for name, targets in seen["agent"].get("controller", {}).items():  # as the controller has them now
+    for name, targets in seen["agent"].get("controller", {}).items():  # equal to the controller's targets
         for what, value in targets.items():
             torch.testing.assert_close(again["agent"]["controller"][name][what], value, atol=1e-6, rtol=0)
     restored, same, _ = play(env, todo)
@@ -69,7 +69,7 @@ def test_what_follows_is_what_followed(env):
     )
 
 
-def test_stages_come_back_too(env):
+def test_stages_are_restored(env):
     base = env.unwrapped
     env.reset(seed=0)
     base.success_check.reached[0, 0] = True
@@ -79,11 +79,11 @@ def test_stages_come_back_too(env):
     base.set_state_dict(kept)
     assert base.evaluate()[base.STAGES[0]]
     assert not base.evaluate()[base.STAGES[1]]
-    base.set_state_dict({kind: kept[kind] for kind in ("actors", "articulations")})  # as others record it
+    base.set_state_dict({kind: kept[kind] for kind in ("actors", "articulations")})  # as in recordings of other tools
     assert base.evaluate()[base.STAGES[0]]
 
 
-def test_a_state_without_targets_starts_from_where_the_robot_is():
+def test_state_without_targets_starts_from_the_robot_pose():
     env = gym.make("RoboCASPick-v1", obs_mode="none", control_mode="pd_ee_delta_pose", render_backend="none")
     base = env.unwrapped
     env.reset(seed=0)

@@ -1,4 +1,4 @@
-"""Terms of the dense rewards against numbers worked out by hand, and how stages and weights make a reward of them."""
+"""Terms of the dense rewards, and weighted rewards, compared with numbers computed by hand."""
 
 import re
 from pathlib import Path
@@ -15,42 +15,42 @@ TABLES = {"transfer": rewards.TRANSFER, "search": rewards.SEARCH, "open_pick": r
 
 
 def floats(array) -> list[float]:
-    """What is in an array, which has to be float32."""
+    """Return the values of an array after checking that it is float32."""
     assert str(array.dtype).endswith("float32")
     return array.tolist()
 
 
-def test_closeness_halves_every_so_far(make):
+def test_closeness_by_distance(make):
     goals = make([[0.0, 0, 0]] * 4)
     points = make([[0.0, 0, 0], [0.06, 0.08, 0], [0, 0, 0.3], [0.9, 0, 0]])
     assert floats(rewards.closeness(points, goals)) == pytest.approx([1, 0.5, 0.25, 0.1])
     assert floats(rewards.closeness(points, goals, half=0.3))[2] == pytest.approx(0.5)
 
 
-def test_rise_is_the_share_of_the_way_either_way(make):
+def test_progress_fraction_in_both_directions(make):
     heights, starts = make([0.60, 0.615, 0.63, 0.8, 0.5]), make([0.60] * 5)
     assert floats(rewards.progress_fraction(heights, starts, 0.03)) == pytest.approx([0, 0.5, 1, 1, 0], abs=1e-5)
     # a joint that opens backwards
     assert floats(rewards.progress_fraction(make([0.0, -0.5, -2.0, 0.1]), 0.0, -1.0)) == pytest.approx([0, 0.5, 1, 0])
 
 
-def test_uncovered_is_full_where_a_target_is_cleared(make):
+def test_clear_fraction_is_1_for_a_cleared_target(make):
     hidden, obstacles = make([0.0, 0.2, 0.6, 1.0, 1.0]), make([0, 1, 1, 6, 9])
     assert floats(rewards.clear_fraction(hidden, obstacles)) == pytest.approx([1, 1, 0.75, 0, 0], abs=1e-6)
 
 
-def test_let_go_is_held_then_touched_then_free(make):
+def test_release_fraction_of_held_touched_and_free_targets(make):
     held, touched = make([True, True, False, False]), make([True, False, True, False])
     assert floats(rewards.release_fraction(held, touched)) == [0, 0, 0.5, 1]
 
 
-def test_calm_counts_both_velocities(make):
+def test_stillness_depends_on_both_velocities(make):
     linear = make([[0.0, 0, 0], [0, 0.15, 0], [0, 0, 0], [0.15, 0, 0], [3.0, 0, 0]])
     angular = make([[0.0, 0, 0], [0, 0, 0], [0, 0, 2.5], [1.25, 0, 0], [0, 0, 0]])
     assert floats(rewards.stillness(linear, angular)) == pytest.approx([1, 0.5, 0.5, 0.25, 0], abs=1e-6)
 
 
-def test_penalties_are_shares(make):
+def test_penalties_are_fractions(make):
     assert floats(rewards.count_fraction(make([0, 1, 3, 7]))) == pytest.approx([0, 1 / 3, 1, 1])
     before = make([[1.0, 0, 0]] * 3)
     after = make([[1.0, 0, 0], [1.03, 0.04, 0], [0, 0, 0]])
@@ -60,7 +60,7 @@ def test_penalties_are_shares(make):
     assert floats(rewards.action_rate(actions, last)) == pytest.approx([1, 0.125])
 
 
-def test_the_furthest_stage_counts(make):
+def test_furthest_stage_is_the_last_true_one(make):
     held, over = make([False, True, False, True]), make([False, False, True, True])
     assert rewards.furthest_stage(make([0, 0, 0, 0]), [(held, 2), (over, 5)]).tolist() == [0, 2, 5, 5]
 
@@ -68,7 +68,7 @@ def test_the_furthest_stage_counts(make):
 TABLE = RewardTable({"near": {"reach": 2.0, "grasp": 1.0}, "far": {"carry": 4.0, "success": 1.0}}, {"shift": 0.25})
 
 
-def test_weigh_by_hand(make):
+def test_weighted_reward_by_hand(make):
     stage = make([0, 0, 1, 1, 2])
     terms = {name: make([0.5] * 5) for name in ("reach", "carry")} | {"grasp": make([0.0, 1, 0, 0, 0])}
     shift = {"shift": make([0.0, 0.4, 0.0, 1.0, 1.0])}
@@ -82,7 +82,7 @@ def test_weigh_by_hand(make):
     assert list(counted) == list(TABLE.weights)
 
 
-def test_a_success_is_worth_the_total_exactly(make):
+def test_reward_of_success_is_the_total(make):
     odd = RewardTable({"a": {"x": 0.1, "y": 0.7}, "b": {"z": 0.3}}, {"p": 0.5})
     reward, _ = rewards.weighted_reward(odd, make([2]), {}, {"p": make([1.0])})
     assert floats(reward / odd.total) == [1.0]
@@ -93,7 +93,7 @@ SHARES = st.floats(0, 1, width=32)
 
 @given(data=st.data())
 @pytest.mark.parametrize("name", TABLES)
-def test_a_later_stage_is_worth_at_least_what_any_earlier_one_is(name, data):
+def test_later_stage_has_at_least_the_reward_of_an_earlier_one(name, data):
     table = TABLES[name]
     count = len(table.stages)
     early, late = sorted(data.draw(st.lists(st.integers(0, count), min_size=2, max_size=2, unique=True)))
@@ -111,7 +111,7 @@ def test_a_later_stage_is_worth_at_least_what_any_earlier_one_is(name, data):
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_tables_are_sound(name):
+def test_reward_tables_are_consistent(name):
     table = TABLES[name]
     terms = [term for own in table.stages.values() for term in own]
     assert len(set(terms)) == len(terms)

@@ -1,4 +1,4 @@
-"""Keyword arguments to train with: by hand, and taken by the environments."""
+"""Keyword arguments for training: expected values, and use by the environments."""
 
 import gymnasium as gym
 import numpy as np
@@ -28,7 +28,7 @@ def test_horizons_fit_the_configuration(task, config):
     assert robocas_ms3.rl_kwargs(TASKS[task].env_id, config) == kwargs
 
 
-def test_all_of_them():
+def test_all_keyword_arguments():
     assert robocas_ms3.rl_kwargs("pick") == {
         "obs_mode": "state",
         "reward_mode": "normalized_dense",
@@ -47,7 +47,7 @@ def test_all_of_them():
         (("pick", "search_table_stacked"), r"RoboCASPick-v1 can't run the configuration search_table_stacked"),
     ],
 )
-def test_what_is_not_there_is_an_error(arguments, message):
+def test_unknown_tasks_and_configurations_are_errors(arguments, message):
     with pytest.raises(ConfigError, match=message):
         robocas_ms3.rl_kwargs(*arguments)
 
@@ -56,7 +56,7 @@ def test_what_is_not_there_is_an_error(arguments, message):
     ("task", "config", "numbers"),
     [("pick", None, 7), ("open_pick", "open_pick_refrigerator", 10)],
 )
-def test_environments_take_them_and_stop_at_the_horizon(task, config, numbers):
+def test_environments_accept_the_arguments_and_stop_at_the_horizon(task, config, numbers):
     kwargs = robocas_ms3.rl_kwargs(task, config)
     env = gym.make(TASKS[task].env_id, **kwargs | {"max_episode_steps": 2})
     env.reset(seed=0)

@@ -1,4 +1,4 @@
-"""The stage that search adds, and its scripted policy, in a small heap."""
+"""The stage ``obstacles_cleared`` and the scripted policy of search, in a small heap."""
 
 import json
 from typing import Any
@@ -29,21 +29,21 @@ def env():
 
 
 def hold(env) -> bool:
-    """Step until the heap has been looked at again, with the arm held still; give `obstacles_cleared`."""
+    """Hold the arm until the clutter has been measured again; return `obstacles_cleared`."""
     qpos = env.unwrapped.agent.robot.get_qpos()[0, 3:10].numpy()
     for _ in range(env.unwrapped.control_freq // MEASUREMENTS_PER_SECOND):
         *_, info = env.step(np.append(qpos, 1.0).astype(np.float32))
     return bool(info["obstacles_cleared"][0])
 
 
-def take_away_the_others(base) -> None:
+def remove_other_objects(base) -> None:
     for slot, actor in enumerate(base.objects):
         if slot != int(base.target_slot[0]):
             actor.set_pose(Pose.create_from_pq(torch.tensor([[-2.0, slot * 0.3 - 2.0, 0.1]]), actor.pose.q))
 
 
-def covered_seed(env) -> int:
-    """A seed whose target is not clear at the beginning."""
+def find_covered_seed(env) -> int:
+    """Return a seed whose target is not clear at the start."""
     for seed in range(20):
         _, info = env.reset(seed=seed)
         if not bool(info["obstacles_cleared"][0]):
@@ -51,7 +51,7 @@ def covered_seed(env) -> int:
     raise AssertionError("every target is clear at once")
 
 
-def test_the_target_of_a_heap_is_hidden_in_part(env):
+def test_target_of_a_heap_is_partly_hidden(env):
     env.reset(seed=0)
     base = env.unwrapped
     layout = base.layout()
@@ -62,12 +62,12 @@ def test_the_target_of_a_heap_is_hidden_in_part(env):
     assert not bool(found.obstacles[0, layout.target])
 
 
-def test_taking_the_others_away_clears_the_target_until_the_next_reset(env):
-    seed = covered_seed(env)
+def test_removing_other_objects_clears_the_target_until_the_next_reset(env):
+    seed = find_covered_seed(env)
     base = env.unwrapped
     before = base.get_state()
     assert not hold(env)
-    take_away_the_others(base)
+    remove_other_objects(base)
     assert hold(env)
     assert base.hidden_fraction.tolist() == [0]
     base.set_state(before)
@@ -76,11 +76,11 @@ def test_taking_the_others_away_clears_the_target_until_the_next_reset(env):
     assert not bool(info["obstacles_cleared"][0])
 
 
-def test_the_heap_is_looked_at_five_times_a_second(env):
-    env.reset(seed=covered_seed(env))
+def test_clutter_is_measured_five_times_per_second(env):
+    env.reset(seed=find_covered_seed(env))
     base = env.unwrapped
     qpos = base.agent.robot.get_qpos()[0, 3:10].numpy()
-    take_away_the_others(base)
+    remove_other_objects(base)
     seen = []
     for _ in range(4):
         *_, info = env.step(np.append(qpos, 1.0).astype(np.float32))
@@ -89,7 +89,7 @@ def test_the_heap_is_looked_at_five_times_a_second(env):
     assert seen == [False, False, False, True]
 
 
-def test_a_target_that_lies_clear_from_the_beginning_is_told_from_one_that_was_cleared(env, monkeypatch):
+def test_cleared_at_reset_reports_a_target_that_was_clear_at_the_start(env, monkeypatch):
     monkeypatch.setattr(occlusion.Clutter, "cleared", property(lambda found: found.hidden_fraction <= 1))
     _, info = env.reset(seed=0)
     assert bool(info["obstacles_cleared"][0])
@@ -97,15 +97,15 @@ def test_a_target_that_lies_clear_from_the_beginning_is_told_from_one_that_was_c
     *_, info = env.step(np.append(env.unwrapped.agent.robot.get_qpos()[0, 3:10].numpy(), 1.0).astype(np.float32))
     assert bool(info["cleared_at_reset"][0])
     monkeypatch.undo()
-    _, info = env.reset(seed=covered_seed(env))
+    _, info = env.reset(seed=find_covered_seed(env))
     assert not bool(info["cleared_at_reset"][0])
 
 
-def test_a_restored_heap_is_looked_at_at_once(env):
-    seed = covered_seed(env)
+def test_restored_heap_is_measured_in_the_next_step(env):
+    seed = find_covered_seed(env)
     base = env.unwrapped
     before, share = base.get_state_dict(), base.hidden_fraction.clone()
-    take_away_the_others(base)
+    remove_other_objects(base)
     assert hold(env)
     cleared = base.get_state_dict()
     base.set_state_dict(before)
@@ -115,18 +115,18 @@ def test_a_restored_heap_is_looked_at_at_once(env):
     env.reset(seed=seed)
     base.set_state_dict(cleared)
     info = base.get_info()
-    assert base.hidden_fraction.tolist() == [0]  # it is not looked at any more
-    base.set_state_dict({**cleared, "task": {"stages": cleared["task"]["stages"]}})  # what is missing stays
+    assert base.hidden_fraction.tolist() == [0]  # it is not measured any more
+    base.set_state_dict({**cleared, "task": {"stages": cleared["task"]["stages"]}})  # missing entries stay unchanged
     assert base.hidden_fraction.tolist() == [0]
     assert bool(info["obstacles_cleared"][0])
     assert not bool(info["cleared_at_reset"][0])
 
 
-def test_a_target_that_was_pulled_out_or_fell_has_not_been_cleared(env):
-    seed = covered_seed(env)
+def test_target_that_was_pulled_out_or_fell_is_not_cleared(env):
+    seed = find_covered_seed(env)
     base = env.unwrapped
-    base.success_check.stages["target_grasped"][:] = True  # and let go of since
-    take_away_the_others(base)
+    base.success_check.stages["target_grasped"][:] = True  # and was released since
+    remove_other_objects(base)
     assert not hold(env)
     env.reset(seed=seed)
     target = base.objects[int(base.target_slot[0])]
@@ -134,7 +134,7 @@ def test_a_target_that_was_pulled_out_or_fell_has_not_been_cleared(env):
     assert not hold(env)
 
 
-def test_the_policy_finds_the_target_and_says_what_it_moved(tmp_path):
+def test_policy_finds_the_target_and_reports_moved_objects(tmp_path):
     generator = EpisodeGenerator(EpisodeSettings("search", "search_table_small_heap", "builtin", max_attempts=6))
     try:
         result = next(r for s in (3, 4) if (r := generator.generate(s, tmp_path, f"episode_{s}")).success)
@@ -149,7 +149,7 @@ def test_the_policy_finds_the_target_and_says_what_it_moved(tmp_path):
     assert result.steps < 2400
 
 
-def test_envs_are_due_before_their_first_step_and_every_period_after():
+def test_schedule_is_due_before_the_first_step_and_every_period():
     schedule = PeriodicSchedule(4, 3, "cpu")
     found = []
     for step in range(10):

@@ -1,4 +1,4 @@
-"""Seeds of episodes, layouts and looks. Several envs are tested without a simulator, which on a CPU has but one env."""
+"""Seeds of episodes, layouts and appearance. Several envs run without a simulator, which has one env on a CPU."""
 
 from unittest.mock import Mock
 
@@ -20,7 +20,7 @@ STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos", "obs_mod
 
 
 class FourEnvs(RoboCASEnv):
-    """Four envs' seeds and layouts, and nothing else of an environment."""
+    """Seeds and layouts of four envs, without a simulator."""
 
     device = torch.device("cpu")
 
@@ -41,7 +41,7 @@ def states(env: FourEnvs) -> list[tuple]:
 
 
 @pytest.mark.parametrize("seeds", [[20, 21], None])
-def test_a_partial_reset_leaves_the_other_envs_alone(seeds):
+def test_partial_reset_does_not_change_other_envs(seeds):
     env = FourEnvs()
     env.seed([7, 8, 9, 10])
     assert env.seeds.layout_seeds.tolist() == [7, 8, 9, 10]
@@ -61,7 +61,7 @@ def test_a_partial_reset_leaves_the_other_envs_alone(seeds):
 
 def test_unseeded_resets_draw_from_the_given_range():
     env = FourEnvs(seed_range=(100, 109))
-    env.seed([7, 8, 9, 10])  # asked for: taken as they are
+    env.seed([7, 8, 9, 10])  # requested seeds are used unchanged
     assert env.seeds.layout_seeds.tolist() == [7, 8, 9, 10]
     seen = set()
     for _ in range(30):
@@ -83,7 +83,7 @@ def test_an_unseeded_reset_of_one_env_draws_its_episode_seed_from_the_range():
     env.close()
 
 
-def test_one_seed_for_several_envs_is_the_first_ones_and_the_others_follow_within_the_range(monkeypatch):
+def test_single_seed_of_several_envs_is_continued_within_the_range(monkeypatch):
     monkeypatch.setattr(tasks.base, "layout_source", lambda model, folder: Thing)
     env, asked = several(None, monkeypatch, seeds=(10, 13))
     env.reset(seed=12)
@@ -96,7 +96,7 @@ def test_one_seed_for_several_envs_is_the_first_ones_and_the_others_follow_withi
     assert [seed for _, seed in asked[-1]] == [4, 3, 2, 1]
 
 
-def test_only_the_seed_that_was_asked_for_must_have_a_layout(monkeypatch):
+def test_only_a_requested_seed_must_have_a_layout(monkeypatch):
     def layouts(objects, seed):
         if seed in (2, 11):
             raise LayoutError("none", where="layout")
@@ -123,7 +123,7 @@ def test_invalid_arguments():
     env.close()
 
 
-def test_several_envs_draw_from_a_range_without_being_told_and_beyond_it_share_objects(monkeypatch):
+def test_several_envs_have_a_default_range_of_seeds(monkeypatch):
     low, high = SEVERAL_ENVS_SEEDS
     monkeypatch.setattr(tasks.base, "layout_source", lambda model, folder: Thing)
     env, asked = several(None, monkeypatch, num_envs=high - low + 3)
@@ -136,7 +136,7 @@ def test_several_envs_draw_from_a_range_without_being_told_and_beyond_it_share_o
 
 
 def without(*pairs):
-    """A source that has no layout for some pairs of seeds, and the pairs it was asked for."""
+    """Return a source without layouts for some seed pairs, and the list of requested pairs."""
     asked = []
 
     def source(objects, seed):
@@ -148,7 +148,7 @@ def without(*pairs):
     return source, asked
 
 
-def test_an_unseeded_reset_goes_on_to_a_seed_that_has_a_layout(monkeypatch, caplog):
+def test_unseeded_reset_draws_until_a_seed_has_a_layout(monkeypatch, caplog):
     bad = [(objects, seed) for objects in (1, 2) for seed in range(100) if seed % 2 and seed != objects]
     source, asked = without(*bad)
     monkeypatch.setattr(tasks.base, "layout_source", lambda model, folder: source)
@@ -156,16 +156,16 @@ def test_an_unseeded_reset_goes_on_to_a_seed_that_has_a_layout(monkeypatch, capl
     for _ in range(30):
         env.reset()
     assert not set(bad) & {pair for one in chosen for pair in one}
-    assert {objects for one in chosen for objects, _ in one} == {0, 1, 2, 3}  # objects stay
+    assert {objects for one in chosen for objects, _ in one} == {0, 1, 2, 3}  # objects stay the same
     failed = set(bad) & set(asked)
     assert failed
     assert all(asked.count(pair) == 1 for pair in failed)
     assert "env 1: no layout for seed" in caplog.text
-    with pytest.raises(LayoutError, match="no object qualifies"):  # asked for: an error
+    with pytest.raises(LayoutError, match="no object qualifies"):  # a requested seed: an error
         env.reset([0, 1, 3, 3])
 
 
-def test_that_there_is_no_layout_at_all_is_said_soon(monkeypatch):
+def test_configuration_without_layouts_fails_early(monkeypatch):
     source, asked = without(*((seed, seed) for seed in range(100)))
     monkeypatch.setattr(tasks.base, "layout_source", lambda model, folder: source)
     with pytest.raises(LayoutError, match="no object qualifies"):
@@ -173,7 +173,7 @@ def test_that_there_is_no_layout_at_all_is_said_soon(monkeypatch):
     assert len(asked) <= 3
 
 
-def test_one_env_starts_over_with_another_seed_unless_it_was_asked_for(monkeypatch, caplog):
+def test_one_env_replaces_a_seed_without_layout_unless_requested(monkeypatch, caplog):
     sample, failed = cache.sample_layout, []
 
     def fussy(model, objects, seed, object_ids):
@@ -196,7 +196,7 @@ def test_one_env_starts_over_with_another_seed_unless_it_was_asked_for(monkeypat
     env.close()
 
 
-def test_a_refused_reset_leaves_the_only_env_as_it_was(monkeypatch):
+def test_failed_reset_does_not_change_a_single_env(monkeypatch):
     env = gym.make("RoboCASPick-v1", **STATE_ONLY)
     base = env.unwrapped
     env.reset(seed=3)
@@ -212,7 +212,7 @@ def test_a_refused_reset_leaves_the_only_env_as_it_was(monkeypatch):
 
 
 @pytest.mark.slow
-def test_looks_follow_the_seed_and_leave_the_layout(needs_renderer):
+def test_appearance_depends_on_the_seed_and_does_not_change_the_layout(needs_renderer):
     data = load_task_config("pick_table_scattered").model_dump(mode="json")
     blocks = {"room": ["wall", "floor"], "lights": {}, "cameras": {}}
 

@@ -30,7 +30,7 @@ SELECT = sorted(name for name in bundled_configs() if name.startswith("select_")
 
 
 @pytest.mark.parametrize("name", [name for name in SELECT if load_task_config(name).target.relations])
-def test_the_named_one_is_told_apart(name):
+def test_relation_identifies_the_target(name):
     model = load(name)
     layout = sample_layout(model, 3, 3)
     target = layout.object_ids[layout.target]
@@ -46,7 +46,7 @@ def test_the_named_one_is_told_apart(name):
 
 
 @pytest.mark.parametrize("name", [name for name in SELECT if not load_task_config(name).target.relations])
-def test_without_relations_it_is_the_nearest_of_its_kind(name):
+def test_target_without_relation_is_the_nearest_of_its_kind(name):
     model = load(name)
     count = model.config.objects.count
     for seed in range(3):
@@ -56,10 +56,10 @@ def test_without_relations_it_is_the_nearest_of_its_kind(name):
         distance = np.linalg.norm((layout.object_poses[:, :2, 3] - layout.robot_pose[:2, 3]), axis=1)
         kind = np.array(layout.object_ids) == layout.object_ids[layout.target]
         assert distance[layout.target] == distance[kind & layout.present].min()
-        assert (layout.object_poses[~layout.present, 2, 3] < 0).all()  # they wait
+        assert (layout.object_poses[~layout.present, 2, 3] < 0).all()  # parked below the floor
 
 
-def test_slots_that_are_left_out_stand_still_and_are_not_asked_for():
+def test_unused_slots_are_still_and_no_targets():
     settings = {"config": "select_upstream", "render_backend": "none", "obs_mode": "none"}
     env = gym.make("RoboCASSelect-v1", control_mode="pd_joint_pos", **settings)
     env.reset(seed=0)
@@ -75,7 +75,7 @@ def test_slots_that_are_left_out_stand_still_and_are_not_asked_for():
     env.close()
 
 
-def test_the_wrong_instance_in_the_basket_spoils_it():
+def test_wrong_instance_in_the_basket_prevents_success():
     env = gym.make("RoboCASSelect-v1", render_backend="none", control_mode="pd_joint_pos", obs_mode="none")
     env.reset(seed=3)
     base: Any = env.unwrapped
@@ -92,7 +92,7 @@ def test_the_wrong_instance_in_the_basket_spoils_it():
     for actor in base.objects:
         actor.set_linear_velocity(torch.zeros(1, 3))
     assert bool(base.evaluate()["success"][0])
-    put(other)  # clutter does no harm
+    put(other)  # other objects do not matter
     assert bool(base.evaluate()["success"][0])
     put(alike)
     found = base.evaluate()
@@ -109,7 +109,7 @@ class TestOnAShelf:
         yield generator
         generator.close()
 
-    def test_an_episode_leaves_the_neighbours_standing(self, generator, tmp_path):
+    def test_episode_keeps_the_neighbours_standing(self, generator, tmp_path):
         result = generator.generate(1, tmp_path, "episode")
         assert result.success, result.failures
         episode = json.loads((tmp_path / "episode.json").read_text())["episodes"][0]

@@ -1,4 +1,4 @@
-"""Resets from the table of a cache, and what its engine has found of layouts. No GPU."""
+"""Resets from a layout table with statuses of layouts. No GPU."""
 
 import shutil
 from dataclasses import fields
@@ -22,7 +22,7 @@ STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos", "obs_mod
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """A cache folder for objects of two seeds and layouts of three, with their table."""
+    """Return a cache folder with a table of two objects seeds and three layout seeds."""
     folder = tmp_path_factory.mktemp("layouts")
     command = Build("pick_table_scattered", objects="0:2", seeds="0:3", jobs=1, out=folder, engine="cpu")
     assert build(command) == 0
@@ -31,7 +31,7 @@ def built(tmp_path_factory):
 
 @pytest.fixture
 def tabled(built, tmp_path, monkeypatch):
-    """The same with the table of a GPU, which no GPU has tried, and nothing else: making or reading one would fail."""
+    """Return a cache folder with only an unchecked table of a GPU; sampling or reading a layout would fail."""
     shutil.copytree(built, tmp_path, dirs_exist_ok=True)
     assert cache.count_layouts(next(tmp_path.iterdir())) == 6
     table = next(tmp_path.glob("*/table-cpu.npy"))
@@ -62,14 +62,14 @@ def test_several_envs_reset_from_a_table_built_for_them(tabled, monkeypatch):
     assert env.layouts[0].object_ids == env.seeds.object_ids[2] == env.seeds.object_ids[0] != env.seeds.object_ids[1]
 
 
-def test_what_moves_where_it_would_run_is_drawn_no_more_and_an_error_where_it_is_asked_for(tabled, monkeypatch):
+def test_unstable_layouts_are_not_drawn_and_are_errors_when_requested(tabled, monkeypatch):
     env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
     layouts: Any = env.seeds.layouts
     layouts.write_statuses(
         "gpu", {(0, 1): LayoutStatus.UNSTABLE, (1, 1): LayoutStatus.UNSTABLE, (1, 2): LayoutStatus.STABLE}
     )
     env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
-    assert env.seeds.objects_seeds.tolist() == [0, 1]  # env 1 keeps its objects, and begins with another layout of them
+    assert env.seeds.objects_seeds.tolist() == [0, 1]  # env 1 keeps its objects, and starts with another layout
     for _ in range(20):
         env.reset()
         assert env.seeds.find_initial_states(np.arange(2), env.device).targets.shape == (2,)
@@ -78,7 +78,7 @@ def test_what_moves_where_it_would_run_is_drawn_no_more_and_an_error_where_it_is
         env.reset(seed=[1, 0])
 
 
-def test_many_layouts_may_move_and_all_of_some_objects(tabled, monkeypatch, caplog):
+def test_objects_without_stable_layout_are_not_used(tabled, monkeypatch, caplog):
     env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
     layouts: Any = env.seeds.layouts
     layouts.write_statuses("gpu", {pair: LayoutStatus.UNSTABLE for pair in [(0, 0), (0, 2), (1, 0), (1, 1), (1, 2)]})
@@ -92,7 +92,7 @@ def test_many_layouts_may_move_and_all_of_some_objects(tabled, monkeypatch, capl
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
 
 
-def test_a_reset_that_is_refused_leaves_the_envs_as_they_were(tabled, monkeypatch):
+def test_failed_reset_does_not_change_the_envs(tabled, monkeypatch):
     env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
     layouts: Any = env.seeds.layouts
     layouts.write_statuses("gpu", {(0, 1): LayoutStatus.UNSTABLE})
@@ -106,10 +106,10 @@ def test_a_reset_that_is_refused_leaves_the_envs_as_they_were(tabled, monkeypatc
     np.testing.assert_array_equal([env.layout(i).object_poses for i in range(2)], before)
     layouts.write_statuses("gpu", {(0, 1): LayoutStatus.STABLE})
     env.reset(options={"reconfigure": True}, seed=[0, 1])
-    env.reset(seed=[1, 2])  # nothing is remembered of what it was
+    env.reset(seed=[1, 2])  # the failed reset left no state
 
 
-def test_where_a_table_lacks_layouts_the_bank_makes_them(built, tmp_path, monkeypatch):
+def test_layouts_missing_in_the_table_come_from_the_cache(built, tmp_path, monkeypatch):
     shutil.copytree(built, tmp_path, dirs_exist_ok=True)
     table = next(tmp_path.glob("*/table-cpu.npy"))
     table.rename(table.with_name("table-gpu.npy"))

@@ -12,7 +12,7 @@ YAW_90 = [math.sqrt(0.5), 0, 0, math.sqrt(0.5)]
 UPRIGHT = [1.0, 0, 0, 0]
 
 
-def test_rotations_are_scipys(make):
+def test_rotations_equal_those_of_scipy(make):
     found = Rotation.random(5, random_state=0)
     quaternions = make(found.as_quat()[:, [3, 0, 1, 2]].astype("float32").reshape(1, 5, 4))
     vectors = np.random.default_rng(0).uniform(-1, 1, (1, 5, 3)).astype(np.float32)
@@ -25,7 +25,7 @@ def test_rotations_are_scipys(make):
         assert abs(np.asarray(turned)[0] - expected).max() < 1e-6
 
 
-def test_arrays_of_a_cpu_are_numpys_and_share_memory():
+def test_native_arrays_on_a_cpu_are_numpy_arrays_with_shared_memory():
     tensor = torch.zeros(2)
     arrays.to_native(tensor)[1] = 3.0
     assert tensor.tolist() == [0, 3]
@@ -35,7 +35,7 @@ def test_arrays_of_a_cpu_are_numpys_and_share_memory():
 
 
 def test_inside_box_follows_the_frame(make):
-    # a box long in its own x, at (1, 0, 0); the second env has it turned by 90 degrees
+    # a box that is long in its x axis, at (1, 0, 0); in the second env it is turned by 90 degrees
     low, high = make([-0.2, -0.1, 0.0]), make([0.2, 0.1, 0.3])
     points = make([[1.15, 0, 0.1], [1.15, 0, 0.1], [1.0, 0.15, 0.1], [1.0, 0, -0.01]])
     position = make([[1.0, 0, 0]] * 4)
@@ -51,14 +51,14 @@ def test_inside_box_of_several_objects_an_env(make):
     assert inside.tolist() == [[True, False, True], [False, True, False]]
 
 
-def test_another_of_its_kind_is_neither_the_target_nor_of_another_kind(make):
+def test_other_object_of_the_kind_is_not_the_target(make):
     kinds = make([[0, 0, 2, 2], [0, 1, 0, 1], [0, 0, 2, 2]])
     marked = make([[True, False, True, True], [False, True, True, False], [True, False, False, True]])
     target = make([0, 0, 1])
     assert terms.is_any_other_of_kind(marked, kinds, target).tolist() == [False, True, True]
 
 
-def test_finger_grasps_needs_both_fingers_pressed_apart(make):
+def test_grasp_needs_both_fingers_pressed_apart(make):
     closing = make([[0.0, 1, 0]])
     left = make([[[0, 2.0, 0], [0, 2.0, 0], [0, 0.4, 0], [0, -2.0, 0], [3.0, 0.1, 0]]])
     right = make([[[0, -2.0, 0], [0, 0.0, 0], [0, -2.0, 0], [0, 2.0, 0], [-3.0, -0.1, 0]]])
@@ -66,28 +66,30 @@ def test_finger_grasps_needs_both_fingers_pressed_apart(make):
     assert terms.is_grasped(left, right, closing).tolist() == [[True, False, False, False, False]]
 
 
-def test_pressed_asks_for_both_fingers_but_no_direction(make):
+def test_pressing_needs_both_fingers_in_any_direction(make):
     left = make([[[0, 2.0, 0], [0, 2.0, 0], [0, -2.0, 0]]])
     right = make([[[3.0, 0, 0], [0, 0.4, 0], [0, 0.0, 0]]])
     assert terms.is_pressed(left, right).tolist() == [[True, False, False]]
 
 
 @pytest.mark.parametrize(("degrees", "shift", "expected"), [(29.0, 0.0, False), (31.0, 0.0, True), (0.0, 0.031, True)])
-def test_disturbed_is_moved_or_fallen_over(make, degrees, shift, expected):
+def test_disturbed_object_is_shifted_or_fallen(make, degrees, shift, expected):
     half = math.radians(degrees) / 2
     start = make([[[1.0, 2.0, 3.0, *UPRIGHT]]])
     now = make([[[1.0 + shift, 2.0, 3.0, math.cos(half), 0, math.sin(half), 0]]])
     assert terms.is_disturbed(now, start).tolist() == [[expected]]
 
 
-def test_disturbed_goes_with_what_objects_stand_on(make):
+def test_disturbance_is_relative_to_the_support(make):
     start = make([[[1.0, 0, 0, *UPRIGHT], [1.0, 0, 0, *UPRIGHT]]])
-    now = make([[[0.0, 1.0, 0, *YAW_90], [1.0, 0, 0, *UPRIGHT]]])  # the first went along, the second did not
+    now = make(
+        [[[0.0, 1.0, 0, *YAW_90], [1.0, 0, 0, *UPRIGHT]]]
+    )  # the first object moved with the support, the second did not
     back = make([[[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]]), make([[0.0, 0, 0]])
     assert terms.is_disturbed(now, start, back).tolist() == [[False, True]]
 
 
-def test_a_drawer_is_brought_back(make):
+def test_inverse_motion_of_a_drawer(make):
     # a cabinet at (1, 2, 0), facing y; its drawer was 0.5 m along the cabinet's own x, and is out by another 0.2 m
     body, part = make([[1.0, 2, 0, *YAW_90]]), make([[1.0, 2.7, 0, *YAW_90]])
     before = make([[1.0, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -104,7 +106,7 @@ def hinge_at_1() -> list[list[float]]:
     return [[1.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 
 
-def test_touched_is_any_body(make):
+def test_touching_any_body_counts(make):
     forces = torch.zeros(2, 3, 4, 3)
     forces[0, 2, 1, 0] = 0.5
     forces[1, 0, 3, 2] = 1e-4  # noise
@@ -116,7 +118,7 @@ def test_lifted_needs_height_and_grasp(make):
     assert terms.is_lifted(height, rest, make([[True, False, True]])).tolist() == [[True, False, False]]
 
 
-def test_at_rest_limits_both_velocities(make):
+def test_rest_limits_both_velocities(make):
     linear = make([[0.02, 0, 0], [0.04, 0, 0], [0, 0, 0]])
     angular = make([[0.1, 0, 0], [0, 0, 0], [0, 0, 0.6]])
     assert terms.is_at_rest(linear, angular).tolist() == [True, False, False]
@@ -136,20 +138,20 @@ def test_basket_stands_up_to_10_cm_and_may_turn(make):
     assert not terms.is_basket_standing(make([[0.08, 0.08, 0]]), upright, make([[0.0, 0, 0]]), upright).any()
 
 
-def test_a_target_fell_off_below_what_it_stood_on_beside_the_basket_and_out_of_the_gripper(make):
+def test_fallen_target_is_below_the_surface_outside_of_basket_and_gripper(make):
     height = make([0.57, 0.54, 0.54, 0.54])  # of a surface at 0.6
     above, touched = make([False, False, True, False]), make([False, False, False, True])
     assert terms.has_target_fallen(height, 0.6, above, touched).tolist() == [False, True, False, False]
 
 
 @pytest.mark.parametrize(("degrees", "drop", "expected"), [(59, 0.09, False), (61, 0.0, True), (0, 0.11, True)])
-def test_a_basket_has_fallen_when_it_lies_or_lies_lower(make, degrees, drop, expected):
+def test_basket_has_fallen_if_tilted_or_lower(make, degrees, drop, expected):
     half = math.radians(degrees) / 2
     tilted, upright = make([[math.cos(half), math.sin(half), 0, 0]]), make([UPRIGHT])
     at, before = make([[0.5, 0, 0.7 - drop]]), make([[0.0, 0, 0.7]])
     assert terms.has_basket_fallen(at, tilted, before, upright).tolist() == [expected]
 
 
-def test_of_target_picks_one_slot_per_env(make):
+def test_select_target_picks_one_slot_per_env(make):
     values = make([[0, 1, 2], [3, 4, 5]])
     assert terms.select_target(values, make([2, 0])).tolist() == [2, 3]

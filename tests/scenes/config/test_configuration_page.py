@@ -1,4 +1,4 @@
-"""The examples of docs/configuration.md do what the page says, and its reference is that of the declared form."""
+"""The examples of docs/configuration.md work as described, and its reference equals the models."""
 
 import re
 import runpy
@@ -23,7 +23,7 @@ def blocks(language: str, heading: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", section, re.DOTALL | re.MULTILINE)
 
 
-def test_the_files_load(tmp_path, monkeypatch):
+def test_files_of_the_page_load(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for text in blocks("yaml", "Extending a configuration"):
         (tmp_path / text.splitlines()[0].removeprefix("# ")).write_text(text)
@@ -34,7 +34,7 @@ def test_the_files_load(tmp_path, monkeypatch):
     assert load_task_config("mine.yaml", changes={"objects": {"count": 8}}).objects.count == 8
 
 
-def test_the_cameras_of_the_page(tmp_path):
+def test_cameras_of_the_page(tmp_path):
     (text,) = blocks("yaml", "Cameras")
     (tmp_path / "five_cameras.yaml").write_text(text)
     base, hand, static, side, wrist = load_task_config(tmp_path / "five_cameras.yaml").cameras_of(MOBILE_PANDA)
@@ -47,12 +47,12 @@ def test_the_cameras_of_the_page(tmp_path):
 @pytest.mark.parametrize(
     "change", ["bse_camera.width=320", "base_camera.widht=320", "top.position=[0,0,2]", "base_camera.width=321"]
 )
-def test_wrong_cameras(change):
+def test_invalid_cameras_are_errors(change):
     with pytest.raises(ConfigError):
         load_task_config("pick_table_scattered", overrides=[f"cameras.{change}"]).cameras_of(MOBILE_PANDA)
 
 
-def test_the_commands_set_keys_that_there_are():
+def test_commands_of_the_page_set_existing_keys():
     (text,) = blocks("", "Changing keys on the command line")
     for line in text.splitlines():
         words = shlex.split(line)[1:]
@@ -67,7 +67,7 @@ def test_the_commands_set_keys_that_there_are():
             assert load_task_config(name, overrides=overrides) != load_task_config(name)
 
 
-def test_the_reference_is_that_of_the_declared_form():
+def test_reference_equals_the_models():
     assert PAGE.endswith(f"\n\n{REFERENCE}\n"), "run scripts/configuration_reference.py"
     rows = [row.split(" | ") for row in REFERENCE.splitlines() if row.startswith("| `")]
     assert [row for row in rows if not row[3].strip(" |") and row[0] != "| `kind`"] == []  # each key has a meaning

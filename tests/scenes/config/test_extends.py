@@ -1,4 +1,4 @@
-"""``extends``: which file a base is, how values are merged, and which errors name which file."""
+"""The key ``extends``: finding base files, merging values, and the file named by an error."""
 
 import os
 
@@ -47,7 +47,7 @@ def test_mappings_are_merged_other_values_replaced_and_null_removes(tmp_path, ba
     assert load_task_config(path) == load_task_config(data)
 
 
-def test_a_layout_of_another_kind_replaces_the_bases(tmp_path):
+def test_layout_of_another_kind_replaces_the_base_layout(tmp_path):
     path = write(tmp_path, mine={"extends": "pick_table_scattered", "layout": {"kind": "orderly", "copies": 1}})
     assert load_task_config(path).layout.copies == 1
 
@@ -69,7 +69,7 @@ def test_a_base_may_be_incomplete(tmp_path):
     assert error_of(tmp_path / "base.yaml").found == "nothing"
 
 
-def test_null_removes_furniture_and_the_next_name_takes_its_place(tmp_path):
+def test_null_removes_furniture_and_a_new_name_takes_its_position(tmp_path):
     table = load_task_config("pick_table_scattered").model_dump(mode="json")["furniture"]["table"]
     furniture = {"shelf": None, "desk": table}
     path = write(
@@ -83,7 +83,7 @@ def test_null_removes_furniture_and_the_next_name_takes_its_place(tmp_path):
     assert error.fix == "Did you mean side_table?"
 
 
-def test_a_wrong_key_names_the_file_of_the_chain_that_it_is_in(tmp_path):
+def test_invalid_key_names_its_file(tmp_path):
     files = {
         "mine": {"extends": "middle.yaml", "objects": {"count": 3}},
         "middle": {"extends": "base.yaml", "layout": {"min_gapp": 0.1}},
@@ -101,7 +101,7 @@ def test_a_wrong_key_names_the_file_of_the_chain_that_it_is_in(tmp_path):
     assert error_of(path).where == str(path)
 
 
-def test_a_mistake_of_several_files_names_all_of_them(tmp_path):
+def test_error_from_several_files_names_all_of_them(tmp_path):
     path = write(tmp_path, mine={"extends": "pick_table_scattered", "surface": {"min_xy": [0.4, 0.0]}})
     assert error_of(path).where == f"{path} (extends {bundled_configs()['pick_table_scattered']})"
 
@@ -148,12 +148,12 @@ def test_a_chain_has_a_limit(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["- a", "", "lights: &a {ambient: *a}"])
-def test_a_broken_base_is_named(tmp_path, text):
+def test_error_names_an_invalid_base(tmp_path, text):
     path = write(tmp_path, mine={"extends": "base.yaml"}, base=text)
     assert str(error_of(path).where).startswith(str(tmp_path / "base.yaml"))
 
 
-def test_only_files_outside_of_protocols_extend():
+def test_files_of_protocols_may_not_extend():
     with pytest.raises(ConfigError, match="extends"):
         load_task_config({"extends": "pick_table_scattered"})
     error = error_of("pick_table_scattered", changes={"extends": "pick_table_scattered"})

@@ -1,4 +1,4 @@
-"""Task configurations load, and a mistake is one line that names file, key, expected and found value."""
+"""Task configurations load; an error is one line with file, key, expected and found value."""
 
 import copy
 import logging
@@ -24,7 +24,7 @@ def changed(path: str, value: Any) -> dict:
 
 
 @pytest.mark.parametrize("name", sorted(bundled_configs()))
-def test_shipped_configurations_load_and_load_again(name):
+def test_bundled_configurations_load_repeatedly(name):
     config = load_task_config(name)
     assert config.description
     assert load_task_config(config.model_dump(mode="json")) == config
@@ -50,7 +50,7 @@ def test_shipped_configurations_load_and_load_again(name):
         ("lights", {"direction": [0, 0, 0]}, ["direction"]),
     ],
 )
-def test_mistakes_name_file_key_expected_and_found(tmp_path, path, value, words):
+def test_errors_name_file_key_expected_and_found(tmp_path, path, value, words):
     file = tmp_path / "mine.yaml"
     file.write_text(yaml.safe_dump(changed(path, value)))
     with pytest.raises(ConfigError) as error:
@@ -67,7 +67,7 @@ def test_a_missing_key_is_named():
 
 
 @pytest.mark.parametrize("text", ["task: pick\ntask: pick\n", "task: [pick"])
-def test_broken_yaml_is_an_error(tmp_path, text):
+def test_invalid_yaml_is_an_error(tmp_path, text):
     file = tmp_path / "broken.yaml"
     file.write_text(text)
     with pytest.raises(ConfigError) as error:
@@ -75,11 +75,11 @@ def test_broken_yaml_is_an_error(tmp_path, text):
     assert error.value.where == file
 
 
-def test_a_missing_file_gets_the_nearest_names(tmp_path):
+def test_missing_file_gets_the_nearest_names(tmp_path):
     with pytest.raises(ConfigError, match="Did you mean pick_table_scattered") as error:
         load_task_config("pick_table_scatered")
     assert "select_table_rows" not in str(error.value)
-    with pytest.raises(ConfigError, match="select_table_rows"):  # unlike any: all are listed
+    with pytest.raises(ConfigError, match="select_table_rows"):  # no similar name: all names are listed
         load_task_config("xyz")
     with pytest.raises(ConfigError, match="no such file") as error:
         load_task_config(tmp_path / "mine_of_the_lab.yaml")

@@ -1,4 +1,4 @@
-"""Overrides of keys, as ``--set`` has them, and what the commands do with them."""
+"""Overrides of keys (``--set``), and their effect on commands."""
 
 import json
 
@@ -41,7 +41,7 @@ def test_an_invalid_override_is_an_error(text):
     assert (caught.value.where, caught.value.found) == ("--set", text)
 
 
-def test_they_are_merged_over_a_file_in_their_order(tmp_path):
+def test_overrides_are_merged_over_a_file_in_order(tmp_path):
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(FILE_CHANGED))
     overrides = ("objects.count=6", "objects.count=7", "layout.kind=stacked")
     config = load_task_config(tmp_path / "mine.yaml", overrides=overrides)
@@ -64,12 +64,12 @@ def test_they_are_merged_over_a_file_in_their_order(tmp_path):
         ("extends=pick_heap", ["extends", "YAML files"]),
     ],
 )
-def test_a_mistake_names_the_option(text, words):
+def test_errors_name_the_option(text, words):
     with pytest.raises(ConfigError) as caught:
         load_task_config(NAME, overrides=["objects.repeats=true", text])
     assert caught.value.where == f"--set {text}"
     assert [word for word in words if word not in str(caught.value)] == []
-    with pytest.raises(ConfigError) as caught:  # a mistake between keys
+    with pytest.raises(ConfigError) as caught:  # a rule between keys is violated
         load_task_config(NAME, overrides=["surface.furniture=desk"])
     assert str(caught.value.where).endswith(f"{NAME}.yaml with --set surface.furniture=desk")
 
@@ -92,7 +92,7 @@ def test_show_prints_a_resolved_configuration_that_loads_again(tmp_path, capsys)
         ["eval", "freeze", "plan.yaml", "--out", "out"],
     ],
 )
-def test_commands_refuse_a_wrong_key_and_write_nothing(words, tmp_path, monkeypatch, capsys):
+def test_invalid_key_is_an_error_of_commands_and_writes_nothing(words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     part = {"config": NAME, "count": 1, "first_seed": 0}
     plan = {"rules": {"name": "a", "description": "b", "max_seconds": {"pick": 5}}, "parts": [part]}
@@ -103,7 +103,7 @@ def test_commands_refuse_a_wrong_key_and_write_nothing(words, tmp_path, monkeypa
 
 
 @pytest.mark.slow
-def test_a_recording_has_the_resolved_configuration_and_continues_with_no_other(tmp_path, capsys):
+def test_recording_stores_the_resolved_configuration_and_rejects_another(tmp_path, capsys):
     out = tmp_path / "out"
     words = ["generate", "pick", "-n", "1", "--out", str(out), "--check-rate", "0", "--set"]
     assert run([*words, "objects.count=3"]) == 0

@@ -1,6 +1,6 @@
-"""Shipped configurations: upstream's numbers, PartNet's annotations, and no value that changed unnoticed.
+"""Bundled configurations: numbers of RoboCAS-v0, annotations of PartNet, and hashes of all values.
 
-`python tests/scenes/config/test_shipped.py` writes `resolved.json` again, after a change of a value that is intended.
+`python tests/scenes/config/test_shipped.py` writes `resolved.json` again after an intended change of a value.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ SCENES = {
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_everything_stands_where_upstreams_does(name):
+def test_poses_equal_those_of_robocas_v0(name):
     surface, robot, basket, count = SCENES[name]
     config = load_task_config(name)
     assert config.furniture["table"].pose.model_dump() == {"position": (0.9, 1.0, 0.0), "yaw_deg": -90.0}
@@ -40,7 +40,7 @@ def test_everything_stands_where_upstreams_does(name):
     assert config.language.split == "upstream"
 
 
-def test_evaluation_is_of_its_objects_any_of_which_is_the_target():
+def test_evaluation_scenes_have_their_objects_and_any_target():
     pick, search = load_task_config("pick_upstream_eval"), load_task_config("search_upstream_eval")
     assert pick.objects.ids == [12, 13, 14, 15, 16]
     assert search.objects.ids == [12, 13, 14, 15, 16, 31, 32, *range(34, 43), 44]
@@ -74,14 +74,14 @@ def test_surfaces_handles_and_joints_are_annotated(name):
 
 STORED = Path(__file__).parent / "resolved.json"
 HASHES = json.loads(STORED.read_text(encoding="utf-8"))
-"""Name -> sha256 of the JSON of the resolved model; the order of keys counts, since furniture is built in it."""
+"""Name -> sha256 of the JSON of the resolved model. Key order matters: furniture is built in it."""
 
 
 def resolved_hash(name: str) -> str:
     return hashlib.sha256(load_task_config(name).model_dump_json().encode()).hexdigest()
 
 
-def test_each_shipped_configuration_has_a_hash():
+def test_each_bundled_configuration_has_a_hash():
     assert HASHES.keys() == bundled_configs().keys()
 
 

@@ -20,7 +20,7 @@ def without(monkeypatch, module):
     )
 
 
-def test_without_the_extra_the_error_names_it(monkeypatch):
+def test_error_names_the_missing_extra(monkeypatch):
     without(monkeypatch, "sentence_transformers")
     with pytest.raises(MissingExtraError) as found:
         embed.TextEmbedder()

@@ -41,7 +41,7 @@ def choose(seed: int, about: InstructionSlots | None = None, split: Split = "tra
         ("open_pick", "open the left door of the table, grasp the scissors and move them to the basket"),
     ],
 )
-def test_defaults_are_upstreams_word_for_word(task, text):
+def test_defaults_are_the_texts_of_robocas_v0(task, text):
     about = slots(task, "scissors")
     found = make_instruction(about)
     assert found.text == text
@@ -60,7 +60,7 @@ def test_defaults_are_upstreams_word_for_word(task, text):
         ("middle", "middle mug"),
         ("second_from_right", "second mug from the right"),
         ("rightmost", "rightmost mug"),
-        (None, "mug"),  # as upstream, which names no relation
+        (None, "mug"),  # as in RoboCAS-v0, without a relation
     ],
 )
 def test_relations(relation, phrase):
@@ -83,11 +83,11 @@ def test_number_and_preposition():
 
 
 @pytest.mark.parametrize("name", sorted(bundled_configs()))
-def test_goods_are_in_what_has_something_above_them_and_on_what_has_not(name):
+def test_preposition_is_in_for_supports_with_headroom(name):
     config = load_task_config(name)
     try:
         model = SceneModel.load(config, load_pack("builtin"), load_pack("builtin"))
-    except AssetError:  # of a pack that is made from the user's own files
+    except AssetError:  # needs a pack that the user imports
         return
     inside = np.isfinite(model.headroom) and "shelf" not in config.support
     wanted, other = ("in", "on") if inside else ("on", "in")
@@ -118,7 +118,7 @@ def test_every_draw_moves_the_generator_by_the_same_amount():
     assert len(states) == 1
 
 
-def test_held_out_shares_only_plain_words_with_train():
+def test_held_out_and_train_have_only_plain_words_in_common():
     for task in TASKS:
         train, held_out = ([choose(s, slots(task), split) for s in range(200)] for split in ("train", "held_out"))
         for attribute in ("text", "template_id"):
@@ -134,7 +134,7 @@ def test_synonyms_can_be_left_out():
     assert len({i.template_id for i in found}) == 7
 
 
-def test_no_synonym_that_could_mean_another_object_of_the_scene():
+def test_synonyms_that_fit_another_object_are_not_used():
     def words(*others):
         return {choose(seed, slots(object="mug"), others=others).object_word for seed in range(100)}
 
@@ -174,7 +174,7 @@ def test_unknown_templates(template_id):
     assert caught.value.where == template_id
 
 
-def test_unknown_objects_and_supports_go_by_their_own_names():
+def test_unknown_objects_and_supports_have_their_plain_names():
     about = slots(object="gizmo {0}", support="lectern")
     assert {choose(seed, about).object_word for seed in range(20)} == {"gizmo {0}"}
     assert "on the lectern" in make_instruction(about, "pick/train/05").text

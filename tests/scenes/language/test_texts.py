@@ -40,11 +40,11 @@ def test_every_task_has_its_paraphrases():
         assert 0.7 < len(templates.train) / (len(templates.train) + len(templates.held_out)) < 0.8
 
 
-def test_no_template_twice_and_none_on_both_sides():
+def test_templates_are_unique_over_both_splits():
     for templates in TEXTS.tasks.values():
         texts = [normal(t) for split in SPLITS for t in templates.of(split)]
         assert len(set(texts)) == len(texts)
-    # nor does one task's held-out part teach another task's
+    # held-out templates of one task are in no split of another task
     train, held_out = ({normal(t) for task in TEXTS.tasks.values() for t in task.of(s)} for s in ("train", "held_out"))
     assert not train & held_out
 
@@ -77,14 +77,14 @@ def test_every_template_renders_for_every_builtin_object():
     assert not re.search(r"[{}]|  |^ | $|,,| ,|\ban? |\bthe the\b|\bNone\b", "\n".join(texts), re.MULTILINE)
 
 
-def test_relations_are_all_there_and_say_different_things():
+def test_relations_are_complete_and_distinct():
     assert tuple(TEXTS.relations) == RELATIONS
     phrases = [p for r in TEXTS.relations.values() for p in (r.plain, *r.train, *r.held_out)]
     assert len(set(phrases)) == len(phrases)
     assert all(r.train and r.held_out for r in TEXTS.relations.values())
 
 
-def test_every_builtin_object_has_synonyms_on_both_sides():
+def test_every_builtin_object_has_synonyms_in_both_splits():
     assert len(NAMES) == 46
     assert sorted(WORDS.objects) == NAMES
     for name, words in WORDS.objects.items():
@@ -110,7 +110,7 @@ def test_no_word_could_mean_another_builtin_object():
         ("select", "take the {relation} {object}", "relation"),
     ],
 )
-def test_wrong_fields_are_refused(tmp_path, task, template, match):
+def test_invalid_fields_are_errors(tmp_path, task, template, match):
     data = yaml.safe_load(INSTRUCTIONS_FILE.read_text())
     data["tasks"][task]["train"].append(template)
     path = tmp_path / "instructions.yaml"

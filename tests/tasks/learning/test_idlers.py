@@ -1,4 +1,4 @@
-"""Dense rewards of demonstrations, and of those who leave them on the way.
+"""Dense rewards of demonstrations, and of policies that leave them on the way.
 
 Idlers stop somewhere and hold still from then on, as a policy would that has found a reward it likes. Harvesters go
 back and forth, to earn the same way twice. Neither may earn more than going on, in whatever way rewards are summed up.
@@ -21,7 +21,7 @@ from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.tasks import TASKS
 
 STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos"}
-OPEN, SHUT = 1.0, -1.0  # the gripper's command, the last number of an action
+OPEN, CLOSED = 1.0, -1.0  # the gripper's command, the last number of an action
 
 
 class Demonstration:
@@ -62,11 +62,11 @@ class Demonstration:
         self.released = int(np.flatnonzero(self.actions[:, 7] < 0)[-1])
 
     def first(self, flag: str) -> int:
-        """The step after which a flag was set for the first time."""
+        """Return the step after which a flag was first set."""
         return next(i for i, info in enumerate(self.infos) if info[flag][0])
 
     def leave(self, step: int, actions: Iterable[np.ndarray]) -> tuple[np.ndarray, list[dict]]:
-        """Levels and infos of other actions from a step on, which is not done any more."""
+        """Return rewards and infos of other actions that replace the demonstration from a step on."""
         self.env.unwrapped.set_state_dict(self._states[step])
         levels, infos = [], []
         for action in actions:
@@ -76,7 +76,7 @@ class Demonstration:
         return np.array(levels), infos
 
     def path(self, first: int, last: int, gripper: float) -> list[np.ndarray]:
-        """The actions between two steps, both included, backwards if the second is the earlier one."""
+        """Return the actions between two steps, inclusive; reversed if the second step is earlier."""
         steps = range(first, last + 1) if first <= last else range(first, last - 1, -1)
         return [np.append(self.actions[step, :7], gripper).astype(np.float32) for step in steps]
 
@@ -88,8 +88,8 @@ DEMONSTRATED = [
     ("search", "search_table_small_heap", 3),
     ("open_pick", "open_pick_drawer", 0),
 ]
-HELD = 40  # steps that an idler is watched for
-HORIZON = 1000  # steps that it goes on in the same way, beyond the demonstration's
+IDLE_STEPS = 40  # observed steps of a stopped policy
+HORIZON = 1000  # steps of the assumed continuation after the demonstration
 
 
 @pytest.fixture(scope="module", params=DEMONSTRATED, ids=lambda row: row[1])
@@ -99,14 +99,14 @@ def demonstration(request, tmp_path_factory):
     made.env.close()
 
 
-def earns_less(demonstration: Demonstration, step: int, levels: np.ndarray, stays: float) -> bool:
-    """Whether who leaves a demonstration at a step, and stays at some level in the end, earns less than it does."""
+def has_smaller_return(demonstration: Demonstration, step: int, levels: np.ndarray, stays: float) -> bool:
+    """Return whether a policy that leaves at a step, with a final reward ``stays``, has a smaller return."""
     went = demonstration.levels
     end = len(went) + HORIZON
-    # while episodes go on after a success
+    # if episodes continue after a success
     going_on = went.sum() + HORIZON * 1.0
     instead = went[:step].sum() + levels.sum() + (end - step - len(levels)) * stays
-    # where a success ends them: what an episode of `progress` sums up to
+    # if a success ends them: sum of `progress`
     return instead < going_on and stays - went[0] < 0.95 * (1 - went[0])
 
 
@@ -130,10 +130,10 @@ class TestDemonstrations:
             steps.insert(0, demonstration.first(first))
         found = [demonstration.levels[step] for step in steps]
         assert found == sorted(found)
-        assert len(set(found)) >= len(found) - 1  # what is touched may be held in the same step
+        assert len(set(found)) >= len(found) - 1  # touching and holding may start in the same step
 
-    def test_who_stops_on_the_way_earns_less(self, demonstration):
-        """In the middle of each stage, where the next begins, and just before the target is let go of."""
+    def test_policy_that_stops_has_a_smaller_return(self, demonstration):
+        """Stop in the middle of each stage, at the start of the next one, and just before the target is released."""
         changes = np.flatnonzero(np.diff(demonstration.stages)) + 1
         bounds = [0, *changes[changes < demonstration.released], demonstration.released]
         stops = sorted({*bounds, *((first + last) // 2 for first, last in zip(bounds, bounds[1:], strict=False))})
@@ -141,42 +141,42 @@ class TestDemonstrations:
         reached = []
         for stop in stops:
             held = demonstration.actions[max(stop - 1, 0)]
-            levels, infos = demonstration.leave(stop, [held] * HELD)
+            levels, infos = demonstration.leave(stop, [held] * IDLE_STEPS)
             assert not any(info["success"][0] for info in infos)
-            assert earns_less(demonstration, stop, levels, levels.max())
+            assert has_smaller_return(demonstration, stop, levels, levels.max())
             reached.append(levels[-1])
         assert reached[-1] > 0.97 * max(reached)
         assert reached[0] == min(reached)
 
-    def test_fingers_that_are_shut_earn_no_more_than_reaching(self, demonstration):
+    def test_closed_fingers_have_at_most_the_reward_of_reaching(self, demonstration):
         grasped = demonstration.first("target_grasped")
-        begin = grasped - 50  # when the target is not between them yet
-        path = demonstration.path(begin, grasped, SHUT)
-        levels, infos = demonstration.leave(begin, [*path, *path[-1:] * HELD])
+        begin = grasped - 50  # before the target is between the fingers
+        path = demonstration.path(begin, grasped, CLOSED)
+        levels, infos = demonstration.leave(begin, [*path, *path[-1:] * IDLE_STEPS])
         assert not any(info["success"][0] for info in infos)
-        assert levels[-1] < demonstration.levels[grasped]  # they may fling it up, which is a grasp for a moment
-        assert earns_less(demonstration, begin, levels, levels.max())
+        assert levels[-1] < demonstration.levels[grasped]  # the fingers may throw it up, which counts as a short grasp
+        assert has_smaller_return(demonstration, begin, levels, levels.max())
 
-    def test_going_back_and_forth_earns_no_more_than_staying(self, demonstration):
-        """With the target held; down, to let go of it and grasp it anew; with the handle, not quite open and back."""
+    def test_going_back_and_forth_has_at_most_the_return_of_staying(self, demonstration):
+        """Move the held target; release it and grasp it again; open the furniture partly and close it."""
         opens = ["opens"] if demonstration.task == "open_pick" else []
         for way in ["carries", "grasps_again", *opens]:
-            self.goes_back_and_forth(demonstration, way)
+            self.oscillate(demonstration, way)
 
-    def goes_back_and_forth(self, demonstration, way):
+    def oscillate(self, demonstration, way):
         first, path = demonstration.first, demonstration.path
         grasped, lifted = first("target_grasped"), first("target_lifted") + 3
         if way == "carries":
             begin = (lifted + demonstration.released) // 2
-            cycle = [*path(begin, lifted, SHUT), *path(lifted, begin, SHUT)]
+            cycle = [*path(begin, lifted, CLOSED), *path(lifted, begin, CLOSED)]
         elif way == "grasps_again":
-            begin, there = lifted, path(grasped, lifted, SHUT)
+            begin, there = lifted, path(grasped, lifted, CLOSED)
             cycle = [*there[::-1], *path(grasped, grasped, OPEN) * 6, *there[:1] * 6, *there]
         else:
             begin = first("furniture_opened") - 2
-            cycle = [*path(begin, begin - 30, SHUT), *path(begin - 30, begin, SHUT)]
-        stays, _ = demonstration.leave(begin, cycle[:1] * HELD)
+            cycle = [*path(begin, begin - 30, CLOSED), *path(begin - 30, begin, CLOSED)]
+        stays, _ = demonstration.leave(begin, cycle[:1] * IDLE_STEPS)
         levels, infos = demonstration.leave(begin, cycle * 2)
         assert not any(info["success"][0] for info in infos)
         assert levels.mean() < stays.max(), way
-        assert earns_less(demonstration, begin, levels, levels.max()), way
+        assert has_smaller_return(demonstration, begin, levels, levels.max()), way

@@ -1,4 +1,4 @@
-"""Dense rewards, failures and privileged observations of the environments."""
+"""Dense rewards, failures and privileged observations of environments."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def env():
 # ---------------------------------------------------------------------- modes
 
 
-def test_sparse_stays_the_default_and_costs_nothing_else():
+def test_sparse_is_the_default_and_computes_no_terms():
     env = gym.make("RoboCASPick-v1", obs_mode="none", **STATE_ONLY)
     assert env.unwrapped.reward_mode == "sparse"
     env.reset(seed=0)
@@ -82,7 +82,7 @@ def test_the_action_rate_is_that_of_the_last_two_actions(env):
     assert info["reward_terms"]["action_rate"].item() == 0
 
 
-def test_progress_sums_up_to_the_way_gone_and_swaying_earns_nothing():
+def test_progress_sums_to_the_change_and_swaying_pays_nothing():
     env = gym.make("RoboCASPick-v1", obs_mode="none", reward_mode="progress", **STATE_ONLY)
     env.reset(seed=0)
     base, start = env.unwrapped, held_still(env)
@@ -95,7 +95,7 @@ def test_progress_sums_up_to_the_way_gone_and_swaying_earns_nothing():
         levels.append(base.dense_reward.last_level.item())
     assert rewards[0] == 0
     assert np.sum(rewards) == pytest.approx(levels[-1] - levels[0], abs=1e-5)
-    assert np.ptp(levels) > 0.004  # it did come and go
+    assert np.ptp(levels) > 0.004  # the reward did change
     assert np.sum(rewards) < 0.1 * np.abs(rewards).sum()
     env.reset(seed=1)
     assert env.step(held_still(env))[1].item() == 0
@@ -105,7 +105,7 @@ def test_progress_sums_up_to_the_way_gone_and_swaying_earns_nothing():
 # ---------------------------------------------------------------------- stages, by putting things
 
 
-def test_the_nearer_the_better_and_only_the_target_counts(env):
+def test_reward_grows_with_nearness_to_the_target_only(env):
     env.reset(seed=0)
     base = env.unwrapped
     far = reward_now(base)[0]
@@ -122,7 +122,7 @@ def test_the_nearer_the_better_and_only_the_target_counts(env):
     assert terms["grasp"] == terms["carry"] == 0
 
 
-def test_a_target_thrown_into_the_basket_unlifted_earns_no_more_than_reaching(env):
+def test_unlifted_target_in_the_basket_has_at_most_the_reward_of_reaching(env):
     env.reset(seed=0)
     base = env.unwrapped
     put(target_of(base), base.basket_pose[0, :3] + torch.tensor([0, 0, 0.02]))
@@ -130,7 +130,7 @@ def test_a_target_thrown_into_the_basket_unlifted_earns_no_more_than_reaching(en
     assert not reward_now(base)[2]["fail"]
 
 
-def test_success_is_exactly_one_and_a_shifted_basket_keeps_it_below(env):
+def test_reward_is_1_on_success_and_less_with_a_shifted_basket(env):
     env.reset(seed=0)
     base = env.unwrapped
     base.success_check.stages["target_lifted"][:] = True
@@ -142,11 +142,11 @@ def test_success_is_exactly_one_and_a_shifted_basket_keeps_it_below(env):
     reward, terms, info = reward_now(base)
     assert not info["success"]
     assert terms["basket_shift"] == 1
-    assert 0.8 < reward < 0.9  # the basket only stands elsewhere
+    assert 0.8 < reward < 0.9  # the basket was only shifted
     assert not info["fail"]
 
 
-def test_a_tipped_basket_is_not_above_what_lies_beside_it(env):
+def test_target_next_to_a_tipped_basket_is_not_above_it(env):
     env.reset(seed=0)
     base = env.unwrapped
     basket, target, at = base.fixtures.basket, target_of(base), base.basket_pose[0, :3].clone()
@@ -161,10 +161,10 @@ def test_a_tipped_basket_is_not_above_what_lies_beside_it(env):
                 put(target, torch.stack([at[0] + x, at[1] + y, height]))
                 reward, _, info = reward_now(base)
                 assert not info["fail"]
-                assert reward < 0.2  # what reaching for it earns from afar
+                assert reward < 0.2  # the reward of reaching from far away
 
 
-def test_a_target_on_the_floor_is_a_failure_that_ends_the_episode(env):
+def test_target_on_the_floor_is_a_failure(env):
     env.reset(seed=0)
     base = env.unwrapped
     put(target_of(base), [-1.0, -1.0, 0.1])
@@ -174,7 +174,7 @@ def test_a_target_on_the_floor_is_a_failure_that_ends_the_episode(env):
     assert not base.get_info()["fail"]
 
 
-def test_a_basket_that_fell_is_a_failure_and_one_that_was_pushed_is_none(env):
+def test_fallen_basket_is_a_failure_and_a_pushed_one_is_not(env):
     env.reset(seed=0)
     base = env.unwrapped
     basket, at = base.fixtures.basket, base.fixtures.basket.pose.p.clone()
@@ -186,12 +186,12 @@ def test_a_basket_that_fell_is_a_failure_and_one_that_was_pushed_is_none(env):
     assert base.get_info()["fail"]
 
 
-def test_a_basket_below_the_support_is_no_pit():
+def test_target_in_a_basket_below_the_support_is_no_failure():
     env = gym.make("RoboCASPick-v1", config="pick_side_table_scattered", obs_mode="none", **STATE_ONLY)
     env.reset(seed=0)
     base: Any = env.unwrapped
     inside = base.basket_pose[0, :3]
-    assert inside[2] < base.success_check.surface - 0.1  # it stands on the floor
+    assert inside[2] < base.success_check.surface - 0.1  # the basket stands on the floor
     for height, failed in ((0.0, False), (0.3, False)):  # in it; on its way down
         put(target_of(base), inside + torch.tensor([0.1, 0, height]))
         assert bool(base.get_info()["fail"]) is failed
@@ -208,7 +208,7 @@ def test_a_failure_ends_an_episode_without_observations_too():
     env.close()
 
 
-def test_observations_are_seen_from_the_tcp(env):
+def test_observations_are_in_the_frame_of_the_tcp(env):
     obs, _ = env.reset(seed=2)
     base, extra = env.unwrapped, obs["extra"]
     tcp, target = base.agent.tcp.pose.sp, target_of(base).pose.sp
@@ -220,14 +220,14 @@ def test_observations_are_seen_from_the_tcp(env):
     assert drop[:2] == pytest.approx(basket[:2], abs=0.02)
     assert 0.1 < drop[2] - basket[2] < 0.3
     assert extra["target_extents"][0].tolist() == pytest.approx(base.target_asset().asset.extents)
-    assert list(extra)[:3] == ["object_poses", "target", "basket_pose"]  # what was there before keeps its place
+    assert list(extra)[:3] == ["object_poses", "target", "basket_pose"]  # their order is fixed
 
 
 @pytest.mark.parametrize(
     ("env_id", "names"),
     [("RoboCASSearch-v1", ["hidden_fraction"]), ("RoboCASOpenPick-v1", ["opened_fraction", "tcp_to_handle"])],
 )
-def test_tasks_add_what_is_theirs(env_id, names):
+def test_tasks_add_their_observations(env_id, names):
     config = {"RoboCASSearch-v1": "search_table_small_heap"}.get(env_id)
     env = gym.make(env_id, config=config, obs_mode="state_dict", reward_mode="normalized_dense", **STATE_ONLY)
     obs, _ = env.reset(seed=3)
@@ -254,7 +254,7 @@ def test_tasks_add_what_is_theirs(env_id, names):
         half = reward_now(base)
         assert (shut[1]["open"], half[1]["open"]) == pytest.approx((0, 0.5), abs=1e-3)
         assert half[0] > shut[0]
-        assert np.linalg.norm(base.handle_in_world()[0] - handle) > 0.1  # it moves with the door
+        assert np.linalg.norm(base.handle_in_world()[0] - handle) > 0.1  # the handle moves with the door
         qpos[:, joint] = base.model.opened_position * 1.01
         furniture.set_qpos(qpos)
         assert reward_now(base)[0] > 4 / 14

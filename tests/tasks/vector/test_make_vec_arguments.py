@@ -1,4 +1,4 @@
-"""`make_vec` without simulation: backend, arguments, and conventions on a batch that counts its steps."""
+"""`make_vec` without simulation: backends, arguments, and conventions on a batch that counts its steps."""
 
 import gymnasium as gym
 import numpy as np
@@ -23,7 +23,7 @@ from robocas_ms3.tasks.vector.worker import join_rows, split_rows
         ("gpu", "cuda:1", True, "gpu"),
     ],
 )
-def test_the_backend_follows_from_what_is_asked_and_what_is_there(monkeypatch, backend, sim_backend, gpu, chosen):
+def test_backend_depends_on_arguments_and_devices(monkeypatch, backend, sim_backend, gpu, chosen):
     with_gpu(monkeypatch, gpu)
     assert choose_backend(backend, sim_backend) == chosen
 
@@ -69,7 +69,7 @@ def test_several_envs_in_one_process_on_a_cpu_point_to_make_vec(monkeypatch, arg
 
 
 class FakeBatch(gym.Env):
-    """Three envs that count their steps: env i succeeds at step i + 2 alone, and every fourth step is the last."""
+    """Three envs that count their steps: env i succeeds only at step i + 2, and each episode has four steps."""
 
     reconfiguration_freq, device, spec = 0, torch.device("cpu"), None
     single_action_space = gym.spaces.Box(-1, 1, (2,))
@@ -117,7 +117,7 @@ def test_an_episode_that_ends_with_success_succeeded_at_its_end():
 
 
 @pytest.mark.parametrize("other", [np.full((1, 2), 0.1), np.ones((1, 4), np.float32), ["text"], None])
-def test_rows_of_some_envs_may_be_of_another_type_or_shape_no_arrays_or_missing(other):
+def test_rows_of_different_types_become_a_list(other):
     zeros = np.zeros((2, 2), np.float32)
     rows = join_rows([(2, {("x",): zeros}), (1, {} if other is None else {("x",): other})])
     first, second, last = rows["x",]

@@ -1,4 +1,4 @@
-"""An env's episodes are its own: those that it has alone, whatever the other envs do."""
+"""Episodes of an env do not depend on the other envs."""
 
 from contextlib import closing
 
@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from vector_envs import HORIZON, STATE_ONLY, doing, make
+from vector_envs import HORIZON, STATE_ONLY, make, make_actions
 
 import robocas_ms3
 from robocas_ms3.core.errors import VectorEnvError
@@ -20,7 +20,7 @@ def parse_actions(seed: int, steps: int) -> np.ndarray:
 
 
 def episodes(env, num_envs: int, first_seed: int, steps: int) -> list[list[bytes]]:
-    """What each env observes at its reset and each of its steps, over the ends of episodes, and its instruction."""
+    """Return observations of each env at its resets and steps, over the ends of episodes, and its instructions."""
     actions = np.stack([parse_actions(first_seed + i, steps) for i in range(num_envs)], 1)
     obs, _ = env.reset(seed=first_seed)
     seen = [[row.numpy().tobytes()] for row in obs]
@@ -42,7 +42,7 @@ def four():
 
 
 @slow
-def test_an_env_is_the_same_whatever_the_others_are(four):
+def test_env_does_not_depend_on_other_envs(four):
     steps = 2 * HORIZON + 2
     seen = episodes(four, 4, 10, steps)
     with closing(make(2, 1)) as two, closing(make(1, 1)) as one:
@@ -57,7 +57,7 @@ def test_an_env_is_the_same_whatever_the_others_are(four):
 
 
 @slow
-def test_an_env_is_what_gym_makes(four):
+def test_env_equals_that_of_gym_make(four):
     steps = HORIZON + 2
     seen = episodes(four, 4, 20, steps)[3]
     env = gym.make("RoboCASPick-v1", max_episode_steps=HORIZON, **STATE_ONLY)
@@ -74,19 +74,19 @@ def test_an_env_is_what_gym_makes(four):
 
 
 @slow
-def test_some_envs_are_reset_and_the_others_stay_as_they_are(four):
+def test_partial_reset_does_not_change_the_other_envs(four):
     first, _ = four.reset(seed=[50, 51, 52, 53])
-    once, *_ = four.step(doing(1, 1, 1, 1))
-    twice, *_ = four.step(doing(1, 1, 1, 1))
+    once, *_ = four.step(make_actions(1, 1, 1, 1))
+    twice, *_ = four.step(make_actions(1, 1, 1, 1))
     obs, info = four.reset(seed=[50], options={"env_idx": torch.tensor([2])})
     assert info["elapsed_steps"].tolist() == [2, 2, 0, 2]
     assert torch.equal(obs[[0, 1, 3]], twice[[0, 1, 3]])
     assert torch.equal(obs[2], first[0])
-    obs, *_ = four.step(doing(1, 1, 1, 1))
+    obs, *_ = four.step(make_actions(1, 1, 1, 1))
     assert torch.equal(obs[2], once[0])
     four.reset(seed=[50, 51, 52, 53])
     for _ in range(3):
-        undisturbed, *_ = four.step(doing(1, 1, 1, 1))
+        undisturbed, *_ = four.step(make_actions(1, 1, 1, 1))
     assert torch.equal(obs[[0, 1, 3]], undisturbed[[0, 1, 3]])
     assert torch.equal(four.reset(seed=50, options={"env_idx": [3, 1]})[0][3], first[0])  # 50 for env 3, 51 for env 1
     assert torch.equal(four.reset(options={"env_idx": np.array([False] * 4)})[0][1], first[1])
@@ -108,7 +108,7 @@ def test_envs_that_keep_their_objects_have_those_of_gym_make():
         assert isinstance(env, RoboCASVectorEnv)
         assert env.num_envs == 2
         unseeded, seeded = env.reset()[0], env.reset(seed=[5, 5])[0]
-        *_, truncated, _ = env.step(doing(0, 0))
+        *_, truncated, _ = env.step(make_actions(0, 0))
         assert truncated.tolist() == [True, True]
     assert torch.equal(unseeded[0], plain.reset()[0][0])
     assert torch.equal(seeded[0], plain.reset(seed=5)[0][0])

@@ -1,4 +1,4 @@
-"""Vector environments of a few short episodes in processes, and wrappers that misbehave when an action says so."""
+"""Vector environments with short episodes in processes, and wrappers that fail for given actions."""
 
 import os
 import signal
@@ -25,15 +25,15 @@ def make(num_envs: int, workers: int, **kwargs):
     return robocas_ms3.make_vec("RoboCASPick-v1", num_envs, workers=workers, **kwargs)
 
 
-def doing(*what: int) -> np.ndarray:
-    """Actions that begin with these numbers, one an env."""
+def make_actions(*what: int) -> np.ndarray:
+    """Return actions that start with these numbers, one per env."""
     actions = np.zeros((len(what), 8), np.float32)
     actions[:, 0] = what
     return actions
 
 
-def gone(pids: list[int]) -> bool:
-    """Whether processes end within 5 s, and leave nothing."""
+def have_ended(pids: list[int]) -> bool:
+    """Return whether processes end within 5 s and leave no zombies."""
     for _ in range(100):
         if not any(os.path.exists(f"/proc/{pid}") for pid in pids):
             return True
@@ -42,21 +42,21 @@ def gone(pids: list[int]) -> bool:
 
 
 class OwnError(Exception):
-    """Of a user's wrapper; made of two words."""
+    """Error of a user's wrapper, with two arguments."""
 
     def __init__(self, what: str, code: int) -> None:
         super().__init__(what, code)
 
 
 class Unsendable(Exception):
-    """Pickles, and can't be read again."""
+    """Error that can be pickled but not unpickled."""
 
     def __init__(self, what: str, where: str) -> None:
         super().__init__(f"{what} {where}")
 
 
-class Misbehaves(gym.Wrapper):
-    """First number of an action: 2 an error, 3 one that can't be sent, 4 the process is killed, 5 takes 3 s.
+class MisbehavingWrapper(gym.Wrapper):
+    """Wrapper that reads the first number of an action: 2 an error, 3 an unsendable error, 4 a kill, 5 a delay of 3 s.
 
     6: a lock in the info; 7 takes an hour; 8 ends the process.
     """
@@ -77,13 +77,13 @@ class Misbehaves(gym.Wrapper):
         return *result, {**info, "lock": threading.Lock()} if what == 6 else info
 
 
-class DiesWhenMade(gym.Wrapper):
+class CrashingWrapper(gym.Wrapper):
     def __init__(self, env):
         os.kill(os.getpid(), signal.SIGSEGV)
 
 
-class Wins(gym.Wrapper):
-    """Succeeds at step 2 of an episode alone, where the first number of the action is positive."""
+class SucceedingWrapper(gym.Wrapper):
+    """Wrapper that succeeds only at step 2 of an episode, if the first number of the action is positive."""
 
     def step(self, action):
         obs, _, _, truncated, info = self.env.step(action)
@@ -94,8 +94,8 @@ class Wins(gym.Wrapper):
         return obs, won.float(), won.clone(), truncated, info
 
 
-class LacksLayouts(gym.Wrapper):
-    """There is no layout for seed 5, nor every other time without a seed if the last one was ``draws_none_after``."""
+class MissingLayoutsWrapper(gym.Wrapper):
+    """Wrapper without a layout for seed 5, and for every other unseeded reset after the seed ``draws_none_after``."""
 
     def __init__(self, env):
         super().__init__(env)
