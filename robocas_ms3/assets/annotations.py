@@ -46,7 +46,7 @@ class Annotations:
     """
 
     resting_poses: Array
-    compute_footprints: Array
+    footprints: Array
     resting_probabilities: Array
     display_pose: int
     grasps_tcp_in_object: Array
