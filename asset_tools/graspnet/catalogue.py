@@ -1,4 +1,4 @@
-"""The objects of GraspNet-1Billion: their numbers, and what they are called and weigh here."""
+"""Catalogue of GraspNet-1Billion objects: numbers, ids, names and masses."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ COUNT = 88  # objects in the dataset, numbered from 0
 
 @dataclass(frozen=True)
 class CatalogueEntry:
-    """One object of the dataset.
+    """An object of the dataset.
 
     Attributes:
-        number: of the dataset.
-        id: its folder's name in a pack; the builtin pack's stand-in has the same.
-        name: for language.
-        category: its kind.
-        mass: kg; none: estimated from the volume.
-        hollow: a container, or thin: its hulls are judged by distance, not by volume.
+        number: number in the dataset.
+        id: id and folder in a pack, the same as that of the builtin stand-in.
+        name: name in instructions.
+        category: category of the object.
+        mass: kg; None: estimated from the volume.
+        hollow: whether the object is a container or thin; its hulls are then checked by distance instead of volume.
     """
 
     number: int
@@ -29,7 +29,7 @@ class CatalogueEntry:
 
     @property
     def folder(self) -> str:
-        """Its folder in ``models``, and the start of its label file's name."""
+        """Folder in ``models``, and prefix of the label file."""
         return f"{self.number:03d}"
 
 
@@ -39,8 +39,8 @@ def _entry(
     return number, CatalogueEntry(number, id, name or id.replace("_", " "), category, mass, hollow)
 
 
-# Those that RoboCAS uses. Masses of 1 to 32 and 71 are what the YCB set's own objects weigh (its fruit is plastic; its
-# airplanes are kits of 0.57 kg, split among the parts), the others those of such products when full.
+# objects of RoboCAS-v0. Masses of 1 to 32 and 71 are those of the YCB objects (plastic fruit; airplane kits of 0.57 kg,
+# split among the parts); other masses are those of full products.
 ENTRIES: dict[int, CatalogueEntry] = dict(
     [
         _entry(1, "sugar_box", "box", 0.514),

@@ -1,4 +1,4 @@
-"""GraspNet-1Billion as downloaded, as assets: ``models/NNN``, and ``grasp_label/NNN_labels.npz`` where there is one."""
+"""Import GraspNet-1Billion: ``models/NNN`` and, if it exists, ``grasp_label/NNN_labels.npz``."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ ATTRIBUTION = "GraspNet-1Billion (H.-S. Fang, C. Wang, M. Gou, C. Lu, CVPR 2020)
 
 
 def graspnet_jobs(root: Path, ids: Sequence[int] = (), inspect: Inspect = inspect_models) -> list[AssetJob]:
-    """Return the jobs that import the dataset. A model that can't be read is a job that fails.
+    """Return the jobs that import the dataset; an unreadable model gives a failing job.
 
     Args:
-        root: its folder.
-        ids: the dataset's numbers; empty: the 46 that RoboCAS uses.
-        inspect: looks at the models first; `inspect_models` with its options.
+        root: folder of the dataset.
+        ids: numbers of objects; empty: the 46 objects of RoboCAS-v0.
+        inspect: inspects the models; `inspect_models` with its options.
 
     Raises:
-        AssetError: naming all numbers that there are none of, or whose models are missing.
+        AssetError: a number is invalid, or a model is missing.
     """
     numbers = sorted(set(ids)) or list(ENTRIES)
     unknown = [number for number in numbers if not 0 <= number < COUNT]
@@ -49,7 +49,7 @@ def graspnet_jobs(root: Path, ids: Sequence[int] = (), inspect: Inspect = inspec
             where=root,
             expected=f"models/NNN for {len(numbers)} objects",
             found=f"no folder for the numbers {_listed(missing)}",
-            fix="Give the folder that holds models/, not models/ itself; choose objects with --ids.",
+            fix="Pass the folder that contains models/, not models/ itself; choose objects with --ids.",
         )
     models = {str(number): ModelSource((_mesh(root, number),), root) for number in numbers}
     inspected = inspect(models)
@@ -57,17 +57,17 @@ def graspnet_jobs(root: Path, ids: Sequence[int] = (), inspect: Inspect = inspec
 
 
 def graspnet_source(root: Path, number: int) -> ObjectSource:
-    """An object of the dataset: its model as it is, its labelled grasps where its label file is there.
+    """Return the source of an object of the dataset, with its labelled grasps if the label file exists.
 
-    Where fewer than 50 of those fit the gripper, others are sampled as well, and ``repairs`` say so. Models are in
-    metres, z up where that can be said; their frame stays, as the labels are given in it.
+    If fewer than 50 labelled grasps fit the gripper, more grasps are sampled, with a note in ``repairs``. Models are in
+    metres with z up; their frame is kept, since the labels are given in this frame.
 
     Args:
-        root: the dataset's folder.
-        number: the dataset's.
+        root: folder of the dataset.
+        number: number of the object.
 
     Raises:
-        AssetError: the model or the label file is damaged, or the model is missing or can't be closed.
+        AssetError: the model is missing, damaged or cannot be closed, or the label file is damaged.
     """
     entry = catalogue_entry(number)
     model = prepare_scan(_mesh(root, number), root=root, up="z", unit="m")
@@ -90,7 +90,7 @@ def graspnet_source(root: Path, number: int) -> ObjectSource:
 
 
 def _grasps(labels: Path, closed: trimesh.Trimesh, id_: str) -> tuple[Grasps | None, tuple[str, ...]]:
-    """The labelled grasps that fit, topped up with sampled ones where they are few, and what to say of that."""
+    """Return the labelled grasps that fit, completed by sampled grasps if needed, and notes."""
     if not labels.is_file():
         return None, ()
     found, labelled = label_grasps(labels, closed)
@@ -123,7 +123,7 @@ def _model(root: Path, number: int) -> Path:
 
 
 def _mesh(root: Path, number: int) -> Path:
-    """Return the textured mesh of a model, or its folder where there is none of that name."""
+    """Return the path of a model's textured mesh, or its folder without such a file."""
     textured = _model(root, number) / "textured.obj"
     return textured if textured.is_file() else _model(root, number)
 

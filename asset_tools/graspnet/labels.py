@@ -1,7 +1,7 @@
-"""GraspNet-1Billion's grasp labels: ``NNN_labels.npz``, hundreds of MB each, read in slices and put in our terms.
+"""Read GraspNet-1Billion's grasp labels (``NNN_labels.npz``, hundreds of MB each) and convert them to TCP poses.
 
-For each point of the object, 300 views on a Fibonacci lattice, 12 in-plane angles and 4 depths, a label says how wide
-the gripper opens, whether it hits the object, and from which friction coefficient on the grasp holds.
+For each point of the object, 300 views on a Fibonacci lattice, 12 in-plane angles and 4 depths, a label has the width
+of the gripper, a collision flag, and the smallest friction coefficient with which the grasp holds.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from robocas_ms3.core.errors import AssetError
 Array = NDArray[np.float64]
 
 VIEWS, ANGLES, DEPTHS = 300, 12, 4
-MAX_FRICTION, MAX_WIDTH = 0.3, 0.08  # what RoboCAS keeps; m
-ROUNDING = 1e-3  # labels come in single or half precision, in steps of 0.1
-SLICE_BYTES = 24e6  # of labels read at a time
-CANDIDATES = 20_000  # labels that are looked at closely; a file has up to a million good ones
-MOST_GRASPS = 800  # of those that fit, spread over directions and places
-POINTS, CHUNK = 3000, 128  # of the surface that the gripper must not hit; grasps tested at a time
+MAX_FRICTION, MAX_WIDTH = 0.3, 0.08  # limits of RoboCAS-v0; m
+ROUNDING = 1e-3  # labels are in single or half precision, in steps of 0.1
+SLICE_BYTES = 24e6  # bytes of labels per slice
+CANDIDATES = 20_000  # number of checked labels; a file has up to a million good labels
+MOST_GRASPS = 800  # maximum number, spread over directions and positions
+POINTS, CHUNK = 3000, 128  # surface points for collision checks; grasps per batch
 
 SHAPES = {
     "points": (3,),
@@ -46,12 +46,12 @@ class Labels:
     """Labels (N,) in the model's frame.
 
     Attributes:
-        points: (N, 3) the gripper is at, m.
-        views: numbers of the views.
-        angles: in-plane, rad.
-        depths: that the finger tips go beyond the point, m.
-        widths: of the opening, m.
-        frictions: lowest friction coefficient that closes the grasp.
+        points: (N, 3) points on the object, m.
+        views: indices of the views.
+        angles: in-plane angles, rad.
+        depths: distance of the finger tips beyond the point, m.
+        widths: finger opening, m.
+        frictions: smallest friction coefficient for force closure.
     """
 
     points: Array
@@ -67,38 +67,38 @@ class Labels:
 
 @dataclass(frozen=True)
 class _Member:
-    """An array of a label file: read up to somewhere, its length, its type."""
+    """An open array of a label file, with its length and type."""
 
     file: IO[bytes]
     count: int
     dtype: np.dtype
 
     def take(self, name: str, rows: int) -> NDArray:
-        """The next rows."""
+        """Read the next rows."""
         shape = (rows, *SHAPES[name])
         size = int(np.prod(shape)) * self.dtype.itemsize
         data = self.file.read(size)
         if len(data) < size:
-            raise EOFError(f"{name} is cut short")
+            raise EOFError(f"{name} is truncated")
         return np.frombuffer(data, self.dtype).reshape(shape)
 
     def end(self) -> None:
-        """Have the checksum compared, which happens at the end of the file."""
+        """Read to the end, so that the checksum is verified."""
         self.file.read(1)
 
 
 def label_grasps(path: Path, closed: trimesh.Trimesh) -> tuple[Grasps, int]:
-    """The labelled grasps that our open gripper reaches on a straight way in, spread over directions and places.
+    """Return labelled grasps that the open gripper reaches along a straight approach, spread over the object.
 
     Args:
         path: ``NNN_labels.npz``.
         closed: watertight mesh of the object in the model's frame, m.
 
     Returns:
-        The grasps, and the number of good labels (20 000 at most) that they were chosen from.
+        The grasps, and the number of good labels (at most 20 000) from which they were selected.
 
     Raises:
-        AssetError: the file is damaged or not of this format.
+        AssetError: the file is damaged or has another format.
     """
     rng = np.random.default_rng(0)
     labels = read_labels(path, rng)
@@ -107,7 +107,7 @@ def label_grasps(path: Path, closed: trimesh.Trimesh) -> tuple[Grasps, int]:
     clear = np.flatnonzero(_clear(poses, points))
     poses, frictions = poses[clear], labels.frictions[clear]
     to_center = np.asarray(closed.center_mass) - poses[:, :3, 3]
-    # Weight far off the approach line twists the object in the pads; along that line it does little harm.
+    # a centre of mass far from the approach line rotates the object in the pads
     lever = np.linalg.norm(np.cross(to_center, poses[:, :3, 2]), axis=1)
     scores = -2.0 * frictions - lever / 0.15 - np.linalg.norm(to_center, axis=1) / 0.3
     chosen = select_spread(poses, scores, MOST_GRASPS)
@@ -115,9 +115,9 @@ def label_grasps(path: Path, closed: trimesh.Trimesh) -> tuple[Grasps, int]:
 
 
 def label_checksums(path: Path) -> tuple[tuple[str, int, int], ...]:
-    """Names, sizes and CRCs of the arrays in a label file, from its directory: what it holds, without reading it all.
+    """Return names, sizes and CRCs of the arrays in a label file without reading it.
 
-    Of a file without a directory, just its size; `read_labels` says what is wrong with it.
+    For a file that is not a zip archive, return its name and size; `read_labels` raises the error.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -129,20 +129,20 @@ def label_checksums(path: Path) -> tuple[tuple[str, int, int], ...]:
 def read_labels(path: Path, rng: np.random.Generator) -> Labels:
     """Read the labels of good grasps: friction 0 < f <= 0.3, at most 0.08 m wide, not in collision.
 
-    RoboCAS lets 0 pass as well, but that isn't a friction coefficient: labels of grasps that hold start at 0.1, and
-    the dataset's own tools skip 0 along with -1, which stands for "never holds".
+    RoboCAS-v0 also accepts 0, which is not a friction coefficient: valid labels start at 0.1, and the dataset's own
+    tools skip 0 as well as -1, which means "never holds".
 
     Args:
         path: ``NNN_labels.npz``.
-        rng: chooses evenly among the good ones where there are more than 20 000.
+        rng: selects uniformly if there are more than 20 000 good labels.
 
     Returns:
-        In the order of the file.
+        Labels in file order.
 
     Raises:
-        AssetError: the file is missing, damaged or not of this format.
+        AssetError: the file is missing, damaged or has another format.
     """
-    kept = np.empty((0, 8))  # draw, place in the file, number of the point, of the view, angle, depth, width, friction
+    kept = np.empty((0, 8))  # random number, position in the file, point, view, angle, depth, width, friction
     place = start = 0
     points = _read_points(path)
     for offsets, scores, collision in _slices(path, len(points)):
@@ -160,13 +160,13 @@ def read_labels(path: Path, rng: np.random.Generator) -> Labels:
         start += len(offsets)
     kept = kept[np.argsort(kept[:, 1])]
     if not np.isfinite(kept).all():
-        raise _damaged(path, "finite numbers", "labels that are not")
+        raise _damaged(path, "finite numbers", "NaN or infinite labels")
     _, _, point, view, angles, depths, widths, frictions = kept.T
     return Labels(points[point.astype(int)], view.astype(np.int64), angles, depths, widths, frictions)
 
 
 def view_directions() -> Array:
-    """The 300 views (300, 3): unit vectors from the object outwards; the gripper approaches against them."""
+    """Return the views (300, 3): outward unit vectors, opposite to the approach of the gripper."""
     i = np.arange(VIEWS)
     z = (2 * i + 1) / VIEWS - 1
     around = 2 * np.pi * i * (np.sqrt(5) - 1) / 2
@@ -175,10 +175,10 @@ def view_directions() -> Array:
 
 
 def tcp_poses(labels: Labels) -> Array:
-    """TCP poses (N, 4, 4) in the model's frame: z approach, y closing, origin midway between the finger tips.
+    """Return TCP poses (N, 4, 4) in the model's frame: z approach, y closing, origin between the finger tips.
 
-    There the gripper's frame has x along the approach and, at angle 0, its closing axis y level; the angle turns it
-    about the approach. Finger tips reach ``depth`` beyond the point.
+    In GraspNet's gripper frame x is the approach and, at angle 0, the closing axis y is horizontal; the angle is a
+    rotation about the approach. The finger tips are ``depth`` beyond the point.
     """
     approach = -view_directions()[labels.views]
     level = np.column_stack([-approach[:, 1], approach[:, 0], np.zeros(len(labels))])  # no view is vertical
@@ -194,14 +194,14 @@ def tcp_poses(labels: Labels) -> Array:
 
 
 def _clear(poses: Array, points: Array) -> NDArray[np.bool_]:
-    """Whether the open gripper (N,), coming straight in, hits none of the points (P, 3)."""
+    """Return whether the straight approach of the open gripper hits no point (P, 3), for each pose (N,)."""
     free = np.ones(len(poses), dtype=bool)
     for start in range(0, len(poses), CHUNK):
         chunk = slice(start, start + CHUNK)
         x, y, z = local_points(points, poses[chunk, :3, :3], poses[chunk, :3, 3])
         x, y = np.abs(x), np.abs(y)
         for low, high in GRIPPER_BOXES:
-            # whatever lies behind the front of a box is hit on the way in
+            # the box sweeps all points behind its front during the approach
             free[chunk] &= ~((x <= high[0]) & (y >= low[1]) & (y <= high[1]) & (z <= high[2])).any(axis=1)
     return free
 
@@ -211,12 +211,12 @@ def _read_points(path: Path) -> Array:
         points = members["points"].take("points", members["points"].count).astype(np.float64)
         members["points"].end()
         if not np.isfinite(points).all():
-            raise _damaged(path, "finite points", "others")
+            raise _damaged(path, "finite points", "NaN or infinite points")
         return points
 
 
 def _slices(path: Path, count: int) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
-    """Offsets (K, 300, 12, 4, 3), scores and collision (K, 300, 12, 4) of some points at a time."""
+    """Yield offsets (K, 300, 12, 4, 3), scores and collision (K, 300, 12, 4) for batches of points."""
     names = ("offsets", "scores", "collision")
     with _opened(path) as members:
         size = sum(int(np.prod(SHAPES[name])) * members[name].dtype.itemsize for name in names)
@@ -230,7 +230,7 @@ def _slices(path: Path, count: int) -> Iterator[tuple[NDArray, NDArray, NDArray]
 
 @contextmanager
 def _opened(path: Path) -> Iterator[dict[str, _Member]]:
-    """The arrays of a label file, checked, each open at its first value."""
+    """Open and check the arrays of a label file; each is positioned at its first value."""
     try:
         with ExitStack() as stack:
             archive = stack.enter_context(zipfile.ZipFile(path))
@@ -240,10 +240,10 @@ def _opened(path: Path) -> Iterator[dict[str, _Member]]:
             members = {name: _member(path, name, stack.enter_context(archive.open(f"{name}.npy"))) for name in SHAPES}
             counts = {member.count for member in members.values()}
             if len(counts) > 1 or 0 in counts:
-                raise _damaged(path, "as many points in each array", ", ".join(map(str, sorted(counts))))
+                raise _damaged(path, "the same number of points in each array", ", ".join(map(str, sorted(counts))))
             yield members
     except FileNotFoundError as error:
-        raise AssetError("there is no such label file", where=path) from error
+        raise AssetError("no such label file", where=path) from error
     except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, OSError, NotImplementedError) as error:
         raise _damaged(path, "an npz archive", str(error) or type(error).__name__) from error
 

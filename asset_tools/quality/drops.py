@@ -1,4 +1,4 @@
-"""Drop an object many times: whether it comes to rest in a listed pose, without sinking in or trembling."""
+"""Drop test: measure whether an object comes to rest in a listed pose, without penetration or jitter."""
 
 from __future__ import annotations
 
@@ -26,30 +26,31 @@ Array = np.ndarray
 
 DROPS = 20
 DROP_HEIGHT = 0.05  # m, of the lowest point
-TIME_LIMIT = 2.0  # s, to be at rest within
-WATCHED = 1.0  # s, that it is watched for afterwards
-REST_ENERGY = 4.5e-4  # J per kg: an even 3 cm/s, which the tasks call at rest
-SAME, SAME_DEG = 0.003, 3.0  # m in height and distance from the axis, or what a tilt moves its far end: still one pose
-SPACING, MAX_POINTS = 0.004, 500  # m; of the points that poses are compared by
-ONE_WAY = 0.8  # of its path is what a rolling object gets ahead; what rocks comes back, what rolls just at its end
+TIME_LIMIT = 2.0  # s, limit for coming to rest
+WATCHED = 1.0  # s of observation afterwards
+REST_ENERGY = 4.5e-4  # J/kg, equal to 3 cm/s, the limit of the tasks
+SAME, SAME_DEG = 0.003, 3.0  # m and deg, tolerance for equal poses
+SPACING, MAX_POINTS = 0.004, 500  # m; points for the comparison of poses
+ONE_WAY = 0.8  # displacement over path length of a rolling object; less for rocking
 LEAST_PATH = 0.01  # m
-# An even roll has a kinetic energy of 0.7 m v^2 (a ball) to m v^2 (a pipe); in nine of ten steps, for facets bump.
+# uniform rolling has a kinetic energy of 0.7 m v^2 (ball) to m v^2 (pipe); checked in 90 % of the steps, because of
+# facets
 CARRIED, MOSTLY = 0.5, 0.9
-LOOK_EVERY = 10  # time steps between the poses in which a rolling object is looked at
+CHECK_INTERVAL = 10  # time steps between checks of the pose of a rolling object
 
 
 @dataclass(frozen=True)
 class DropReport:
-    """What became of N drops.
+    """Results of N drops.
 
     Attributes:
-        ends: (N, 4, 4) last pose of the object's frame, on the plane z = 0 under the place it fell from.
-        rest_times: (N,) s from letting go until it moved no more, or only rolled on; 3 s: it still moves.
-        matches: (N,) which resting pose it lies in; -1: none that is listed.
-        penetrations: (N,) m, deepest at the end: of corners below the plane, and of contacts as the engine sees them.
-        jitters: (N,) J, largest kinetic energy in the last of the 3 s.
-        rolling: (N,) bool: it wasn't at rest in time but for rolling on.
-        good: (N,) bool: at rest in time, in a listed pose.
+        ends: (N, 4, 4) last poses of the object, relative to the plane z = 0 below its start.
+        rest_times: (N,) s from release to rest or to uniform rolling; 3 s: still moving.
+        matches: (N,) index of the resting pose; -1: not listed.
+        penetrations: (N,) m, largest final depth of corners below the plane and of the engine's contacts.
+        jitters: (N,) J, largest kinetic energy in the last second.
+        rolling: (N,) bool: at rest in time only if uniform rolling counts as rest.
+        good: (N,) bool: at rest in time in a listed pose.
     """
 
     ends: Array
@@ -62,23 +63,24 @@ class DropReport:
 
 
 def drop_test(solid: RigidBody, resting_poses: Array, *, seed: int = 0) -> DropReport:
-    """Let an object fall 20 times from 5 cm above a table, turned at random, for 3 s; repeatable.
+    """Drop an object 20 times from 5 cm onto a table in random orientations and simulate 3 s; deterministic.
 
-    It is at rest once its kinetic energy stays below 4.5e-4 J/kg for good; so what trembles is never at rest.
+    An object is at rest from the time on at which its kinetic energy stays below 4.5e-4 J/kg; an object that trembles
+    is never at rest.
 
-    Two poses are the same if the object fills the same heights and distances from the vertical through its centre of
-    mass in both, to 3 mm or to 3 deg of its farthest point (95 % of points on its surface): this is true of poses that
-    differ by a yaw, and of those that the object's own symmetry makes alike, however it is symmetric. A ball has one
-    pose, a can has two: standing (either end up) and lying; a box has one for each pair of faces.
+    Two poses are equal if the object fills the same heights and distances from the vertical through its centre of
+    mass, with a tolerance of 3 mm, or of 3 deg at its farthest point, for 95 % of points on its surface. Poses that
+    differ by yaw or by a symmetry of the object are therefore equal. A ball has one pose; a can has two, upright
+    (either end up) and on its side; a box has one per pair of faces.
 
-    A table without rolling resistance, which the engine doesn't have, doesn't stop a can. What only rolls counts as at
-    rest from where that begins: from there to the end, for a second at least, it keeps to the listed poses in this
-    sense, and gets ahead by 80 % of its path, with its energy in that. What rocks comes back, what trembles stays.
+    The engine has no rolling resistance, so a can does not stop. Uniform rolling counts as rest from its start: from
+    then to the end, for at least 1 s, the object stays in listed poses and its displacement is at least 80 % of its
+    path. Rocking and trembling objects do not meet this condition.
 
     Args:
         solid: the object.
-        resting_poses: (S, 4, 4) ``T_plane_object``, those listed.
-        seed: of the orientations.
+        resting_poses: (S, 4, 4) ``T_plane_object``, the listed poses.
+        seed: seed of the orientations.
     """
     poses, velocities, energies, sunk = _fall(solid, seed)
     last = round(WATCHED / TIME_STEP)
@@ -89,7 +91,7 @@ def drop_test(solid: RigidBody, resting_poses: Array, *, seed: int = 0) -> DropR
     for i in range(DROPS):
         matches[i] = compare.find(poses[-1, i])
         if rest_times[i] > TIME_LIMIT and matches[i] >= 0:
-            since = compare.since(poses[::-LOOK_EVERY, i]) * LOOK_EVERY
+            since = compare.since(poses[::-CHECK_INTERVAL, i]) * CHECK_INTERVAL
             late = moving[-last:, i]
             carried = solid.mass * (velocities[-last:, i] ** 2).sum(axis=1) >= CARRIED * energies[-last:, i]
             rolling[i] = since >= last and np.mean(carried[late]) >= MOSTLY and _advances(velocities[-since:, i])
@@ -100,16 +102,18 @@ def drop_test(solid: RigidBody, resting_poses: Array, *, seed: int = 0) -> DropR
 
 
 def _advances(velocities: Array) -> bool:
-    """Whether a motion (T, 2) goes one way on the whole."""
+    """Return whether a motion with velocities (T, 2) has mainly one direction."""
     path = TIME_STEP * np.linalg.norm(velocities, axis=1).sum()
     ahead = TIME_STEP * np.linalg.norm(velocities.sum(axis=0))
     return bool(path >= LEAST_PATH and ahead >= ONE_WAY * path)
 
 
 def _fall(solid: RigidBody, seed: int) -> tuple[Array, Array, Array, Array]:
-    """Poses (T, N, 4, 4), horizontal velocities (T, N, 2), kinetic energies (T, N), final penetrations (N,)."""
+    """Return poses (T, N, 4, 4), horizontal velocities (T, N, 2), energies (T, N) in J, final penetrations (N,)."""
     vertices = np.concatenate([np.asarray(hull, float) for hull in solid.hulls])
-    turns = Rotation.from_quat(np.random.default_rng(seed).normal(size=(DROPS, 4))).as_matrix()  # evenly over all
+    turns = Rotation.from_quat(
+        np.random.default_rng(seed).normal(size=(DROPS, 4))
+    ).as_matrix()  # uniform over all rotations
     origins = grid_origins(DROPS)
     steps = round((TIME_LIMIT + WATCHED) / TIME_STEP)
     poses, velocities, energies = np.zeros((steps, DROPS, 4, 4)), np.zeros((steps, DROPS, 2)), np.zeros((steps, DROPS))
@@ -140,14 +144,14 @@ def _fall(solid: RigidBody, seed: int) -> tuple[Array, Array, Array, Array]:
 
 
 def _energy(body: physx.PhysxRigidDynamicComponent, solid: RigidBody) -> float:
-    """Kinetic energy, J."""
+    """Return the kinetic energy of a body in J."""
     speed, spin = np.asarray(body.linear_velocity), np.asarray(body.angular_velocity)
     axes = (body.entity_pose * body.cmass_local_pose).to_transformation_matrix()[:3, :3]
     return 0.5 * float(solid.mass * (speed @ speed) + solid.inertia @ (spin @ axes) ** 2)
 
 
 class _Comparison:
-    """Which of the listed poses (S, 4, 4) a pose is the same as; see `drop_test`."""
+    """Comparison of poses with the listed poses (S, 4, 4); see `drop_test`."""
 
     def __init__(self, solid: RigidBody, listed: Array) -> None:
         points = sample_surface([Hull(*convex_faces(np.asarray(hull, float))) for hull in solid.hulls], SPACING)
@@ -159,19 +163,19 @@ class _Comparison:
         self._trees = [KDTree(profile) for profile in self._listed]
 
     def find(self, pose: Array) -> int:
-        """The listed pose that is most like a pose (4, 4), or -1."""
+        """Return the index of the listed pose equal to a pose (4, 4), or -1."""
         apart = [self._apart(pose, index) for index in range(len(self._listed))]
         return int(np.argmin(apart)) if min(apart) <= self._limit else -1
 
     def since(self, poses: Array) -> int:
-        """How many of the first poses (T, 4, 4) are the same as a listed one."""
+        """Return the number of leading poses (T, 4, 4) that are equal to a listed pose."""
         likely = list(range(len(self._listed)))
         for count, pose in enumerate(poses):
             found = next((index for index in likely if self._apart(pose, index) <= self._limit), None)
             if found is None:
                 return count
             likely.remove(found)
-            likely.insert(0, found)  # the next one is much the same
+            likely.insert(0, found)  # the next pose is probably the same
         return len(poses)
 
     def _apart(self, pose: Array, index: int) -> float:
@@ -180,7 +184,7 @@ class _Comparison:
         return float(max(np.percentile(there, 95), np.percentile(back, 95)))
 
     def _profile(self, pose: Array) -> Array:
-        """Height above the plane and distance from the vertical through the centre of mass, (P, 2), m."""
+        """Return heights above the plane and distances from the vertical through the centre of mass (P, 2), m."""
         placed = (self._points - self._center) @ pose[:3, :3].T
         heights = placed[:, 2] + pose[2, :3] @ self._center + pose[2, 3]
         return np.stack([heights, np.linalg.norm(placed[:, :2], axis=1)], axis=1)

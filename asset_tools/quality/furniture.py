@@ -1,4 +1,4 @@
-"""Furniture in the physics engine: whether its parts open and close, and things stay on it."""
+"""Test furniture in the physics engine: opening and closing of joints, and objects on surfaces."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ from robocas_ms3.assets.physics import TIME_STEP, add_component, engine_settings
 
 Array = np.ndarray
 
-FORCE = 30.0  # N at the handle, about what the arm can do
-HAND_SPEED = 0.25  # m/s: the hand pushes less the nearer the handle comes to it
-OPEN, CLOSED = 0.9, 0.05  # shares of the range
-STILL = 0.01  # share of the range that a part left alone may move in a second
-FASTEST = {"prismatic": 2.0, "revolute": 10.0}  # m/s, rad/s: nothing a hand of this speed could cause
-JAMMED = 0.002  # m that a moving part may reach into others
-STOPS = (0.0, 0.02, 0.05, 0.2, 0.4, 0.6, 0.8, 1.0)  # shares of the range where that is looked at
-GRIP = 0.005  # m from a handle's TCP to what it should hold
+FORCE = 30.0  # N at the handle, about the limit of the arm
+HAND_SPEED = 0.25  # m/s; the force decreases to 0 at this speed of the handle
+OPEN, CLOSED = 0.9, 0.05  # fractions of the range
+STILL = 0.01  # fraction of the range that a part may move in 1 s without force
+FASTEST = {"prismatic": 2.0, "revolute": 10.0}  # m/s, rad/s; higher speeds cannot be caused by the hand
+JAMMED = 0.002  # m, largest overlap of a moving part with others
+STOPS = (0.0, 0.02, 0.05, 0.2, 0.4, 0.6, 0.8, 1.0)  # fractions of the range at which the overlap is checked
+GRIP = 0.005  # m, largest distance of a handle's TCP from its part
 OPENING = 0.08  # m between the open fingers
-SLID, OFF, SPEED = 0.01, 0.002, 0.01  # m along the surface and off its height, m/s: what a thing put down may do
+SLID, OFF, SPEED = 0.01, 0.002, 0.01  # m along and off the surface, m/s; limits for a placed object
 PROBE_DENSITY = 500.0  # kg/m3
 
 
 @dataclass(frozen=True)
 class JointReport:
-    """How a joint answers a force; shares of its range.
+    """Response of a joint to a force; positions are fractions of its range.
 
     Attributes:
-        opened: how far it came.
-        closed: where it ended when pushed back.
-        drifted: how far it moved by itself within a second, closed.
-        fastest: speed of any joint meanwhile, m/s or rad/s, infinite for no number.
-        bounded: whether no joint was faster than a hand could make it.
-        overlap: how deep it reaches into what doesn't move with it, anywhere on its way, m. The engine doesn't see
-            that: it ignores contacts between a link and its parent, so a drawer slides through solid wood.
-        grip: how far the worst of its handles is from the part it should take hold of, m; 0 without handles, infinite
-            where there is no room for the open fingers beside it.
+        opened: position after opening.
+        closed: position after closing.
+        drifted: largest motion within 1 s without force, closed.
+        fastest: largest speed of any joint during the test, m/s or rad/s; infinite for NaN.
+        bounded: whether all speeds could be caused by the hand.
+        overlap: largest overlap with parts that do not move with it, over the whole range, m. The engine ignores
+            contacts between a link and its parent, so that a drawer could slide through a wall.
+        grip: largest distance of a handle from its part, m; 0 without handles; infinite if the open fingers would
+            collide.
     """
 
     opened: float
@@ -60,22 +60,22 @@ class JointReport:
 
     @property
     def works(self) -> bool:
-        """Whether it opens, closes and stays still, has room to, and can be taken hold of."""
+        """Whether the joint opens, closes and stays still, without overlaps and with reachable handles."""
         moves = self.bounded and self.opened >= OPEN and abs(self.closed) <= CLOSED and self.drifted <= STILL
         return moves and self.overlap <= JAMMED and self.grip <= GRIP
 
 
 @dataclass(frozen=True)
 class SurfaceReport:
-    """What became of things put on a surface.
+    """Results of placing objects on a surface.
 
     Attributes:
-        probes: how many were put there.
-        slid: the farthest that one of them moved along the surface in a second, m.
-        off: the most that one of them then stood above or below the surface's height, m.
-        speed: of the fastest at the end, m/s.
-        headroom: the least free height found above it, m; infinite under the open sky.
-        enough: whether that is what the surface says.
+        probes: number of placed objects.
+        slid: largest motion along the surface in 1 s, m.
+        off: largest distance from the surface's height after 1 s, m.
+        speed: largest speed after 1 s, m/s.
+        headroom: smallest free height above the surface, m; infinite if nothing is above it.
+        enough: whether the headroom is at least the declared one.
     """
 
     probes: int
@@ -87,32 +87,32 @@ class SurfaceReport:
 
     @property
     def holds(self) -> bool:
-        """Whether things stay on it, and there is as much room above it as it says."""
+        """Whether objects stay on the surface, and the declared headroom is free."""
         stays = self.slid < SLID and self.off <= OFF and self.speed < SPEED
         return self.probes > 0 and stays and self.enough
 
 
 @dataclass(frozen=True)
 class FurnitureReport:
-    """What was measured of each joint and surface, by name."""
+    """Results for each joint and surface, by name."""
 
     joints: dict[str, JointReport]
     surfaces: dict[str, SurfaceReport]
 
 
 def measure_furniture(furniture: FurnitureSource | LoadedFurniture) -> FurnitureQuality:
-    """Return the shares of joints that work and surfaces that hold. The same furniture gives the same figures.
+    """Return the fractions of working joints and surfaces, with hull counts; deterministic.
 
     Raises:
-        AssetError: the physics engine refuses a hull.
+        AssetError: the physics engine rejects a hull.
     """
     report = examine_furniture(furniture)
     hulls = [piece for pieces in make_model(furniture).pieces.values() for piece in pieces]
     return FurnitureQuality(
         hull_count=len(hulls),
         hull_vertices=max(len(convex_faces(hull)[0]) for hull in hulls),
-        joints_open=_share(joint.works for joint in report.joints.values()),
-        surfaces_hold=_share(surface.holds for surface in report.surfaces.values()),
+        joints_open=_true_fraction(joint.works for joint in report.joints.values()),
+        surfaces_hold=_true_fraction(surface.holds for surface in report.surfaces.values()),
     )
 
 
@@ -120,7 +120,7 @@ def examine_furniture(furniture: FurnitureSource | LoadedFurniture) -> Furniture
     """Measure each joint and surface.
 
     Raises:
-        AssetError: the physics engine refuses a hull.
+        AssetError: the physics engine rejects a hull.
     """
     model = make_model(furniture)
     with engine_settings():
@@ -128,7 +128,7 @@ def examine_furniture(furniture: FurnitureSource | LoadedFurniture) -> Furniture
         return FurnitureReport(joints, {name: _try_surface(model, surface) for name, surface in model.surfaces.items()})
 
 
-def _share(flags: Iterable[bool]) -> float | None:
+def _true_fraction(flags: Iterable[bool]) -> float | None:
     found = list(flags)
     return sum(found) / len(found) if found else None
 
@@ -169,7 +169,7 @@ def _try_joint(model: FurnitureModel, link: Link) -> JointReport:
 
 
 def _jam(model: FurnitureModel, link: Link) -> float:
-    """How deep a part, with all that hangs on it, reaches into the rest, the other joints closed, m."""
+    """Return the largest overlap in m of a part and the links it carries with the rest, other joints closed."""
     carried = {link.name}
     for other in model.links:
         if other.parent in carried:
@@ -185,7 +185,7 @@ def _jam(model: FurnitureModel, link: Link) -> float:
 
 
 def _grip(model: FurnitureModel, link: Link) -> float:
-    """How far the worst handle is from its part, m; infinite where an open finger would stand in something."""
+    """Return the largest distance in m of a handle from its part; infinite if an open finger would collide."""
     worst = 0.0
     everything = [piece for pieces in model.pieces.values() for piece in pieces]
     for handle in model.handles.values():
@@ -200,9 +200,10 @@ def _grip(model: FurnitureModel, link: Link) -> float:
 
 
 def grip_point(link: Link, pieces: Sequence[Array], handles: Mapping[str, Handle]) -> Array:
-    """Where to pull a moving part (3,).
+    """Return the point (3,) at which a moving part is pulled.
 
-    Its first handle, or else its centre of mass (of a drawer) or the point farthest from the hinge (of a door).
+    The point is the first handle, or else the centre of mass of a drawer or the point of a door farthest from the
+    hinge.
     """
     for name in sorted(handles):
         if handles[name].link == link.name:
@@ -214,26 +215,26 @@ def grip_point(link: Link, pieces: Sequence[Array], handles: Mapping[str, Handle
 
 
 def _lever(link: Link, point: Array) -> float:
-    """Metres that a point moves for a unit of the joint's motion."""
+    """Return the motion of a point in m per unit of the joint's position."""
     if link.joint.kind == "prismatic":
         return 1.0
     return float(np.linalg.norm(np.cross(link.joint.axis, point - np.asarray(link.joint.origin))))
 
 
 def _pull(stage: FurnitureScene, link: Link, point: Array, way: float, reach: float) -> None:
-    """Push with the hand for one step along the way the point can move."""
+    """Apply the hand's force for one step along the possible motion of the point."""
     pose = stage.matrix(link.name)
     axis, place = pose[:3, :3] @ link.joint.axis, pose[:3, :3] @ point + pose[:3, 3]
     if link.joint.kind == "revolute":
         axis = np.cross(axis, place - (pose[:3, :3] @ link.joint.origin + pose[:3, 3])) / reach
     speed = way * stage.speed(link.joint.name) * reach
-    # a light part would be thrown about by the full force within a step
+    # the full force would accelerate a light part too much within a step
     force = min(FORCE, 0.5 * link.mass * HAND_SPEED / TIME_STEP) * np.clip(1 - speed / HAND_SPEED, -1, 1)
     stage.links[link.name].add_force_at_point((way * force * axis).tolist(), place.tolist())
 
 
 def _try_surface(model: FurnitureModel, surface: Surface) -> SurfaceReport:
-    """Put things down with everything closed and, on a moving part, with it open as well."""
+    """Place objects with all joints closed and, for a surface of a moving part, also with this part open."""
     states: list[dict[str, float]] = [{}]
     for link in model.links:
         level = link.joint.kind == "prismatic" or abs(link.joint.axis[2]) > 1 - 1e-6
@@ -251,7 +252,7 @@ def _try_surface(model: FurnitureModel, surface: Surface) -> SurfaceReport:
 def _put_down(
     model: FurnitureModel, surface: Surface, things: Sequence[Probe], state: Mapping[str, float]
 ) -> tuple[float, float, float]:
-    """The farthest that things moved along their surface in a second and then were off its height, m; their speed."""
+    """Return largest motion along the surface in 1 s and distance from its height in m, and largest speed in m/s."""
     stage = FurnitureScene(model, state)
     start = link_poses(model.links, state)[surface.link] if surface.link else np.eye(4)
     bodies = []

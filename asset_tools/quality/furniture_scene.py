@@ -1,4 +1,4 @@
-"""Furniture in the physics engine: its body fixed, its joints free."""
+"""Build furniture with a fixed body and free joints in the physics engine."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ Array = np.ndarray
 
 @dataclass(frozen=True)
 class FurnitureModel:
-    """What is measured of a piece of furniture, read from its files or still to be written.
+    """Properties of furniture for the tests, from files or from a source.
 
     Attributes:
-        pieces: (V, 3) corners of the hulls of each link; that of the empty name is the fixed body.
+        pieces: (V, 3) corners of the hulls of each link; the fixed body has an empty name.
         links: moving parts, parents first.
-        surfaces: where things may stand.
-        handles: of the moving parts.
-        friction: of all surfaces.
+        surfaces: surfaces for objects.
+        handles: handles of the moving parts.
+        friction: friction coefficient.
     """
 
     pieces: dict[str, list[Array]]
@@ -39,7 +39,7 @@ class FurnitureModel:
 
 
 def make_model(furniture: FurnitureSource | LoadedFurniture) -> FurnitureModel:
-    """What is measured of furniture."""
+    """Return the model of furniture from files or from a source."""
     if isinstance(furniture, LoadedFurniture):
         facts = furniture.asset
         pieces = {"": furniture.hulls} | {name: part.hulls for name, part in furniture.links.items()}
@@ -55,7 +55,7 @@ def make_model(furniture: FurnitureSource | LoadedFurniture) -> FurnitureModel:
 
 
 class FurnitureScene:
-    """A scene with the furniture in it, its body fixed, its frame the world's."""
+    """A scene with furniture, whose body is fixed and whose frame is the world frame."""
 
     def __init__(self, model: FurnitureModel, positions: Mapping[str, float] | None = None) -> None:
         self.scene = make_scene()
@@ -75,7 +75,7 @@ class FurnitureScene:
         for part in self.links.values():
             add_component(self.scene, part, sapien.Pose())
         self.articulation = root.articulation
-        # the engine has an order of its own
+        # the engine orders joints differently
         self.order = {joint.name: index for index, joint in enumerate(self.articulation.active_joints)}
         wanted = np.zeros(len(self.order), np.float32)
         for name, position in (positions or {}).items():
@@ -102,16 +102,16 @@ class FurnitureScene:
             try:
                 component.attach(make_shape(piece, self.material))
             except RuntimeError as error:
-                raise AssetError("the physics engine refused a convex hull", found=error) from error
+                raise AssetError("the physics engine rejected a convex hull", found=error) from error
 
     def position(self, joint: str) -> float:
-        """Where a joint is, m or rad."""
+        """Return the position of a joint in m or rad."""
         return float(self.articulation.qpos[self.order[joint]])
 
     def speed(self, joint: str) -> float:
-        """How fast it moves, m/s or rad/s."""
+        """Return the velocity of a joint in m/s or rad/s."""
         return float(self.articulation.qvel[self.order[joint]])
 
     def matrix(self, link: str) -> Array:
-        """Pose (4, 4) of a link."""
+        """Return the pose (4, 4) of a link."""
         return pose_matrix(self.links[link]) if self.links else np.eye(4)

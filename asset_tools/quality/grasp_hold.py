@@ -1,4 +1,4 @@
-"""Carry out grasps with the gripper alone: close, lift, shake; which of them hold."""
+"""Hold test: execute grasps with the gripper alone (close, lift, shake) and check whether they hold."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from robocas_ms3.assets.physics import (
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.poses import inverse
 
-# The fingers of robots/agent.py and robots/urdf.py: drives in N/m and N s/m, N, m, kg, kg m2
+# as in robots/agent.py and robots/urdf.py: drives in N/m and N s/m, N, m, kg, kg m2
 STIFFNESS, DAMPING, FORCE_LIMIT = 1e3, 1e2, 100.0
-OPEN, CLOSED = 0.04, -0.01  # m, drive targets of a finger; beyond closed, so that thin things are pressed too
+OPEN, CLOSED = 0.04, -0.01  # m, drive targets of a finger; below 0, so that thin objects are gripped firmly too
 FINGER_MASS, FINGER_INERTIA = 0.1, (6e-5, 6e-5, 6e-6)
 FINGER_FRICTION, PATCH_RADIUS = 0.99, 0.1
-PAD_HALF_WIDTH = 0.009  # m; GRIPPER_BOXES' tip is a millimetre wider, for clearance
+PAD_HALF_WIDTH = 0.009  # m; the tip in GRIPPER_BOXES is 1 mm wider for clearance
 
 CLOSING, LIFTING, SHAKING = 0.5, 0.5, 1.5  # s
 LIFT = 0.1  # m
 SWAY, BOB, TILT_DEG = 0.03, 0.03, 20.0  # +-m sideways, +-m up and down, +-deg
 SWAY_HZ, BOB_HZ, TILT_HZ = 2.0, 2.0, 1.0
-FADE = 0.375  # s, in which the shaking swells and dies down; with it, peaks are 6 m/s2 and 25 rad/s2
-SLIPPED, TURNED_DEG = 0.02, 30.0  # m and degrees in the hand, since it closed: more is dropped
+FADE = 0.375  # s, duration of fade-in and fade-out of the shaking; peaks are 6 m/s2 and 25 rad/s2
+SLIPPED, TURNED_DEG = 0.02, 30.0  # m and deg of motion in the closed hand; more counts as dropped
 
 _CARRIAGE_MASS, _CARRIAGE_INERTIA = 1.0, (0.01, 0.01, 0.01)
-_CARRIAGE_STIFFNESS, _CARRIAGE_DAMPING = 1e6, 1e4  # gives way by 0.1 mm under the heaviest object
-_HEIGHT = 0.5  # m above the origin of each hand's place
+_CARRIAGE_STIFFNESS, _CARRIAGE_DAMPING = 1e6, 1e4  # deflects by 0.1 mm with the heaviest object
+_HEIGHT = 0.5  # m above the grid position of each hand
 _DOWN = np.diag([1.0, -1.0, -1.0, 1.0])  # the TCP's z points to the ground
-_DIAGONAL = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)  # between the closing axis and the pads' width, across both
+_DIAGONAL = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)  # diagonal between the closing axis and the width of the pads
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,12 @@ class _Hand:
 
 
 def hold_test(solid: RigidBody, grasps_tcp_in_object: Array) -> NDArray[np.bool_]:
-    """Say for each grasp whether the object stays in the hand. The same input gives the same answer.
+    """Return for each grasp whether the object stays in the hand; deterministic.
 
-    The hand points down around an object that floats in the pose of the grasp. It closes, and from then on gravity
-    acts. It rises by 10 cm within 0.5 s; then for 1.5 s it sways by 3 cm across the diagonal of the pads at 2 Hz, bobs
-    by as much (up to 6 m/s2) and tilts by 20 deg at 1 Hz (up to 25 rad/s2). A grasp holds if after all
-    that the object has moved by less than 2 cm at its centre of mass and turned by less than 30 deg in the hand since
-    it closed.
+    The hand points down around an object that floats in the pose of the grasp. The hand closes, then gravity is
+    switched on. The hand rises by 10 cm in 0.5 s. For 1.5 s it moves by 3 cm along the diagonal of the pads at 2 Hz, by
+    3 cm up and down (up to 6 m/s2), and tilts by 20 deg at 1 Hz (up to 25 rad/s2). A grasp holds if the object has
+    moved by less than 2 cm at its centre of mass and rotated by less than 30 deg in the hand since it closed.
 
     Args:
         solid: the object.
@@ -73,7 +72,7 @@ def hold_test(solid: RigidBody, grasps_tcp_in_object: Array) -> NDArray[np.bool_
         return np.zeros(0, bool)
     turned = np.linalg.det(np.asarray(grasps_tcp_in_object)[:, :3, :3])
     if not np.allclose(turned, 1, atol=1e-3):
-        raise AssetError("a grasp is no rigid pose", expected="determinant 1", found=float(turned.min()))
+        raise AssetError("a grasp is not a rigid pose", expected="determinant 1", found=float(turned.min()))
     with engine_settings():
         scene = make_scene(TIME_STEP)
         hands, objects = [], []
@@ -103,7 +102,7 @@ def hold_test(solid: RigidBody, grasps_tcp_in_object: Array) -> NDArray[np.bool_
 
 
 def _motion() -> NDArray[np.float64]:
-    """Positions and speeds (T, 3, 2) of the carriages: up (m), sideways (m), tilt (rad)."""
+    """Return positions and velocities (T, 3, 2) of the carriages: up (m), sideways (m), tilt (rad)."""
     rise = np.arange(1, round(LIFTING / TIME_STEP) + 1) * TIME_STEP / LIFTING
     time = np.arange(1, round(SHAKING / TIME_STEP) + 1) * TIME_STEP
     swell = np.clip(np.minimum(time, SHAKING - time) / FADE, 0, 1)
@@ -118,12 +117,12 @@ def _motion() -> NDArray[np.float64]:
 
 
 def _in_hand(hands: list[_Hand], objects: list[physx.PhysxRigidDynamicComponent]) -> Array:
-    """Poses (N, 4, 4) of the objects in the TCP's frame."""
+    """Return the poses (N, 4, 4) of the objects in the TCP frame."""
     return np.array([inverse(pose_matrix(h.palm)) @ pose_matrix(o) for h, o in zip(hands, objects, strict=True)])
 
 
 def _add_hand(scene: sapien.Scene, tcp_in_world: Array) -> _Hand:
-    """An open hand on carriages; all its frames are the TCP's at the start."""
+    """Add an open hand on carriages; initially all its frames are the TCP frame."""
     builder = scene.create_articulation_builder()
     builder.set_initial_pose(sapien.Pose(tcp_in_world))
     link = builder.create_link_builder()
@@ -143,7 +142,7 @@ def _add_hand(scene: sapien.Scene, tcp_in_world: Array) -> _Hand:
         finger = builder.create_link_builder(palm)
         finger.set_mass_and_inertia(FINGER_MASS, sapien.Pose(), FINGER_INERTIA)
         frame = _along(np.array([0.0, side, 0.0]))
-        # its frame is the TCP's when it is closed, so that its boxes are those of the open hand, moved in
+        # the finger's frame is the TCP frame when closed, so its boxes are those of the open hand, shifted inwards
         finger.set_joint_properties("prismatic", [[0.0, OPEN]], frame, frame)
         rubber = physx.PhysxMaterial(FINGER_FRICTION, FINGER_FRICTION, 0.0)
         for number, (low, high) in enumerate(GRIPPER_BOXES[:2]):
@@ -171,6 +170,6 @@ def _add_hand(scene: sapien.Scene, tcp_in_world: Array) -> _Hand:
 
 
 def _along(axis: Array) -> sapien.Pose:
-    """A joint frame whose x is along an axis (3,)."""
+    """Return a joint frame whose x axis is along ``axis`` (3,)."""
     turn = Rotation.align_vectors([axis], [[1.0, 0.0, 0.0]])[0].as_quat()
     return sapien.Pose(q=turn[[3, 0, 1, 2]])

@@ -1,4 +1,4 @@
-"""How well convex hulls stand for the closed mesh they were made from."""
+"""Measure how well convex hulls approximate the closed source mesh."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray
 
-# m. A surface that is off by e all over changes the overlap by about e A / V = 2 e / t, t = 2 V / A being the mean
-# thickness: below 1 cm a millimetre, which no grasp feels, costs the 0.2 that compact objects may lose.
+# m. An offset e of the whole surface changes the overlap by about e A / V = 2 e / t with mean thickness t = 2 V / A.
+# Below 1 cm, an offset of 1 mm, which is irrelevant for grasps, costs 0.2, the tolerance of compact objects.
 THIN = 0.010
-SAMPLES = 4000  # points from which distances are taken, on each surface
-TARGETS = 20000  # points on the other surface, to find the triangles near by
+SAMPLES = 4000  # query points on each surface
+TARGETS = 20000  # points on the other surface, for finding close triangles
 NEAREST = 4
-SLIT = 0.001  # m, narrower is no gap: a decomposition cuts along planes and leaves both sides
+SLIT = 0.001  # m; narrower slits are ignored: they are cutting planes of the decomposition
 
 
 @dataclass(frozen=True)
 class HullQuality:
-    """What was measured of an object's hulls.
+    """Quality of an object's hulls.
 
     Attributes:
-        compact: False: thin or hollow, so to be judged by ``surface_p95`` and not by ``volume_iou``.
-        hull_count: how many.
-        hull_vertices: of the largest.
+        compact: False: thin or hollow; check ``surface_p95`` instead of ``volume_iou``.
+        hull_count: number of hulls.
+        hull_vertices: number of vertices of the largest hull.
         volume_iou: overlap of the union of the hulls with the closed mesh.
         surface_p95: 95th percentile of the distances from either surface to the other, m; the larger of both ways.
     """
@@ -45,15 +45,15 @@ class HullQuality:
 
 
 def hull_quality(closed: trimesh.Trimesh, hulls: list[Array], *, hollow: bool = False) -> HullQuality:
-    """Measure hulls against the body they were made from. The same input gives the same numbers.
+    """Compare hulls with their source mesh; deterministic.
 
     Args:
         closed: watertight, m.
         hulls: (V, 3) vertices each, in its frame.
-        hollow: a container, to be judged by distance whatever the thickness of its walls.
+        hollow: whether the object is a container, which is checked by distance for any wall thickness.
 
     Raises:
-        AssetError: the mesh is no solid.
+        AssetError: the mesh is not a solid.
     """
     overlap = volume_iou(closed, hulls)
     union = _union(hulls).to_mesh()
@@ -71,18 +71,18 @@ def hull_quality(closed: trimesh.Trimesh, hulls: list[Array], *, hollow: bool = 
 
 
 def volume_iou(closed: trimesh.Trimesh, hulls: list[Array]) -> float:
-    """Volume of the intersection over that of the union, of a body and the union of convex hulls.
+    """Return the volume IoU of a body and the union of convex hulls.
 
     Args:
         closed: watertight mesh.
         hulls: (V, 3) vertices each, in its frame.
 
     Raises:
-        AssetError: the mesh is no solid.
+        AssetError: the mesh is not a solid.
     """
     solid = to_solid(closed)
     if solid is None:
-        raise AssetError("the mesh is no solid", expected="watertight", fix="Close it first.")
+        raise AssetError("the mesh is not a solid", expected="watertight", fix="Close it first.")
     union = _union(hulls)
     shared = (solid ^ union).volume()
     return float(shared / (solid.volume() + union.volume() - shared))
@@ -93,17 +93,17 @@ def _union(hulls: list[Array]) -> Manifold:
 
 
 def mean_thickness(closed: trimesh.Trimesh) -> float:
-    """2 V / A in m: the thickness of a plate; half the diameter of a rod, a third of that of a ball."""
+    """Return 2 V / A in m: the thickness of a plate, 1/2 of the diameter of a rod, 1/3 of that of a ball."""
     return float(2 * closed.volume / closed.area)
 
 
 def _samples(mesh: trimesh.Trimesh, count: int) -> tuple[Array, Array]:
-    """Points (P, 3) on a surface and the faces (P,) they lie on."""
+    """Return points (P, 3) on a surface and their faces (P,)."""
     return surface_samples(mesh, count, np.random.default_rng(0))
 
 
 def _outside_of_slits(union: trimesh.Trimesh, samples: tuple[Array, Array]) -> Array:
-    """The points of samples on hulls that one could touch: not those in a slit between two hulls side by side."""
+    """Return the points of samples on hulls that are not in a slit between two hulls."""
     points, faces = samples
     normals = np.asarray(union.face_normals)[faces]
     caster = RayMeshIntersector(union)
@@ -116,7 +116,7 @@ def _outside_of_slits(union: trimesh.Trimesh, samples: tuple[Array, Array]) -> A
 
 
 def _distance_p95(points: Array, target: trimesh.Trimesh) -> float:
-    """95th percentile of the distances of points (P, 3) from a surface: from the triangles of the nearest samples."""
+    """Return the 95th percentile of distances of points (P, 3) from the triangles of the nearest samples."""
     samples, faces = _samples(target, TARGETS)
     nearest = faces[KDTree(samples).query(points, k=NEAREST)[1]]
     starts = np.repeat(points, NEAREST, axis=0)

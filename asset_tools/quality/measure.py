@@ -1,4 +1,4 @@
-"""Measure an object of a pack, and hold what was measured against what a pack promises."""
+"""Measure the objects of a pack, and check the values against the requirements for a pack."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from robocas_ms3.assets.physics import RigidBody
 
 TOP_GRASPS = 20
 
-# What a pack promises. Of each object:
-COMPACT_OVERLAP = 0.80  # volume IoU of hulls and closed mesh, of compact objects
-SURFACE_DISTANCE = 0.004  # m, 95th percentile, of thin or hollow ones
-HULL_VERTICES = 64  # more don't go into a GPU's hull
-REST_SHARE = 0.90  # of drops
+# requirements for each object
+COMPACT_OVERLAP = 0.80  # volume IoU of hulls and closed mesh, for compact objects
+SURFACE_DISTANCE = 0.004  # m, 95th percentile, for thin or hollow objects
+HULL_VERTICES = 64  # limit of PhysX on a GPU
+REST_SHARE = 0.90  # fraction of drops
 REST_TIME = 2.0  # s
 PENETRATION = 0.002  # m
-JITTER = 0.05  # J per kg, of any drop that doesn't roll, at rest or not: a tenth of what it fell with
-GRASPS = 50  # of an object, or the manifest says why it has fewer
-# Of the medians over the pack:
+JITTER = 0.05  # J/kg, for all drops that do not roll; a tenth of the energy of the fall
+GRASPS = 50  # per object, or a reason in the manifest
+# requirements for medians over the pack
 MEDIAN_OVERLAP = 0.90
 MEDIAN_HULLS = 8
-MEDIAN_HELD = 0.80  # of the top grasps
+MEDIAN_HELD = 0.80  # fraction of the top grasps
 
 
 @dataclass(frozen=True)
 class Violation:
-    """A promise that is broken.
+    """A requirement that is not met.
 
     Attributes:
-        asset: its id; empty: the pack as a whole.
-        what: was measured.
-        expected: of it.
-        found: instead.
+        asset: id of the asset; empty: the whole pack.
+        what: measured quantity.
+        expected: required value.
+        found: measured value.
     """
 
     asset: str
@@ -55,13 +55,13 @@ class Violation:
 def measure_object(
     closed: trimesh.Trimesh, solid: RigidBody, annotations: Annotations, *, hollow: bool = False
 ) -> ObjectQuality:
-    """Measure an object when it is made. The same input gives the same numbers.
+    """Measure an object during its build; deterministic.
 
     Args:
-        closed: watertight mesh that the hulls were made from, m, the asset's frame.
-        solid: the object as the engine knows it; hulls as they are read back from ``hulls.obj``.
-        annotations: its resting poses and grasps.
-        hollow: a container, to be judged by the distance of the surfaces.
+        closed: watertight source mesh of the hulls, m, asset's frame.
+        solid: the object with hulls as read from ``hulls.obj``.
+        annotations: resting poses and grasps.
+        hollow: whether the object is a container, which is checked by surface distance.
     """
     hulls = hull_quality(closed, list(solid.hulls), hollow=hollow)
     return ObjectQuality(
@@ -75,9 +75,9 @@ def measure_object(
 
 
 def measure_again(loaded: LoadedObject) -> ObjectQuality:
-    """Measure hull sizes, drops and grasps of an object of a pack anew.
+    """Repeat the measurement of hull sizes, drops and grasps for an object of a pack.
 
-    How close the hulls are to the closed mesh is taken over from the manifest, since packs don't keep that mesh.
+    The comparison of the hulls with the closed mesh is read from the manifest, since packs do not contain this mesh.
     """
     facts = loaded.asset
     solid = RigidBody(
@@ -99,15 +99,15 @@ def measure_again(loaded: LoadedObject) -> ObjectQuality:
 
 
 def top_grasps(annotations: Annotations) -> NDArray[np.intp]:
-    """Which grasps (K,) are the best: lowest friction first, equals in the order of the annotations."""
+    """Return indices (K,) of the best grasps, by friction, then in the order of the annotations."""
     return np.argsort(annotations.grasp_qualities, kind="stable")[:TOP_GRASPS]
 
 
 def check_objects(assets: Mapping[str, ObjectAsset]) -> list[Violation]:
-    """Say which promises a pack's objects break, object by object and then over all.
+    """Return unmet requirements for each object and for the medians of a pack.
 
     Args:
-        assets: by id; their quality may have been measured anew.
+        assets: objects by id, with measured quality.
     """
     found: list[Violation] = []
     for name, asset in assets.items():
@@ -137,25 +137,24 @@ def check_objects(assets: Mapping[str, ObjectAsset]) -> list[Violation]:
             what = "distance of the surfaces"
             checks.append((distance <= SURFACE_DISTANCE, what, _mm_below(SURFACE_DISTANCE), _mm(distance)))
         found += [Violation(name, what, limit, str(value)) for good, what, limit, value in checks if not good]
-    return found + _judge_medians([asset.quality for asset in assets.values()])
+    return found + _check_medians([asset.quality for asset in assets.values()])
 
 
 def compare_with_manifest(loaded: LoadedObject, measured: ObjectQuality) -> list[Violation]:
-    """Say where the manifest tells other numbers of an object than its files and its simulation do.
+    """Return differences between the manifest of an object and a new measurement.
 
     Args:
         loaded: the object.
-        measured: what `measure_again` found of it.
+        measured: result of `measure_again`.
     """
     asset = loaded.asset
-    said, found = asset.quality.model_dump(), measured.model_dump()
-    pairs = [(name, said[name], found[name]) for name in said if said[name] != found[name]]
+    stored, found = asset.quality.model_dump(), measured.model_dump()
+    pairs = [(name, stored[name], found[name]) for name in stored if stored[name] != found[name]]
     grasps = len(loaded.annotations.grasp_widths)
     if asset.grasp_count != grasps:
         pairs.append(("grasp_count", asset.grasp_count, grasps))
     return [
-        Violation(asset.id, f"measured {name}", f"{value:g}, as the manifest says", f"{other:g}")
-        for name, value, other in pairs
+        Violation(asset.id, f"measured {name}", f"{value:g} (manifest)", f"{other:g}") for name, value, other in pairs
     ]
 
 
@@ -166,10 +165,11 @@ HEADER = ("object", "kind", "hulls", "IoU (stored)", "p95 mm (stored)", "rest %"
 
 
 def object_rows(qualities: Mapping[str, ObjectQuality]) -> list[tuple[str, ...]]:
-    """The table: a row of text for each object, as `HEADER` names it, and a last one of the medians.
+    """Return table rows with the columns of `HEADER` for each object, and a last row of medians.
 
-    Those are over what is judged: of IoU over compact objects, of p95 over the others, of grasps held over those that
-    have grasps, of the rest over all.
+    Medians are over the applicable objects: IoU over compact objects, p95 over the others, held grasps over objects
+        with
+    grasps.
     """
 
     def row(name: str, kind: str, numbers: Sequence[float]) -> tuple[str, ...]:
@@ -200,7 +200,7 @@ def object_rows(qualities: Mapping[str, ObjectQuality]) -> list[tuple[str, ...]]
 
 
 def _physics(solid: RigidBody, annotations: Annotations) -> dict[str, Any]:
-    """The fields of `ObjectQuality` that come out of the engine."""
+    """Return the fields of `ObjectQuality` that are measured by simulation."""
     dropped = drop_test(solid, annotations.resting_poses)
     grasps = np.asarray(annotations.grasps_tcp_in_object, float)[top_grasps(annotations)]
     held = hold_test(solid, grasps)
@@ -216,12 +216,12 @@ def _physics(solid: RigidBody, annotations: Annotations) -> dict[str, Any]:
 
 
 def _jitter(dropped: DropReport) -> float:
-    """Largest kinetic energy in the second after the time limit, J, of drops that don't roll, at rest or not."""
+    """Return the largest kinetic energy in J in the last second of drops that do not roll."""
     return float(max(dropped.jitters[~dropped.rolling], default=0.0))
 
 
-def _judge_medians(qualities: list[ObjectQuality]) -> list[Violation]:
-    """Promises of the pack as a whole. Thin or hollow objects don't count in the overlap."""
+def _check_medians(qualities: list[ObjectQuality]) -> list[Violation]:
+    """Return unmet requirements for the medians; the overlap is over compact objects only."""
     medians = [
         ("median volume IoU", [q.volume_iou for q in qualities if q.compact], MEDIAN_OVERLAP, ".2f", True),
         ("median hulls", [q.hull_count for q in qualities], MEDIAN_HULLS, "g", False),

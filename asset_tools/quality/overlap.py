@@ -1,4 +1,4 @@
-"""How deep convex hulls reach into each other."""
+"""Compute overlaps and distances of convex hulls."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class ConvexBody:
 
     Attributes:
         points: (V, 3) corners, m.
-        normals: (N, 3) of its faces, outward.
+        normals: (N, 3) outward normals of its faces.
     """
 
     points: Array
@@ -27,29 +27,29 @@ class ConvexBody:
 
     @cached_property
     def low(self) -> Array:
-        """Lower corner (3,) of its bounding box."""
+        """Lower corner (3,) of the bounding box."""
         return self.points.min(axis=0)
 
     @cached_property
     def high(self) -> Array:
-        """Upper corner (3,) of its bounding box."""
+        """Upper corner (3,) of the bounding box."""
         return self.points.max(axis=0)
 
     def moved(self, pose: Array) -> ConvexBody:
-        """The same, moved by a rigid motion (4, 4)."""
+        """Return the body transformed by a rigid motion (4, 4)."""
         return ConvexBody(self.points @ pose[:3, :3].T + pose[:3, 3], self.normals @ pose[:3, :3].T)
 
 
 def make_convex_body(points: Array) -> ConvexBody:
-    """The convex hull of points (V, 3)."""
+    """Return the convex hull of points (V, 3)."""
     hull = ConvexHull(points)
     return ConvexBody(points[hull.vertices], np.unique(np.round(hull.equations[:, :3], 6), axis=0))
 
 
 def overlap(moving: ConvexBody, other: ConvexBody, gap: float = 0.0) -> tuple[float, Array | None]:
-    """How much must come off a moving body for a gap to another, m, and the plane (4,) to cut it at; else 0 and none.
+    """Return the depth in m of the cut that leaves a gap between two bodies, and its plane (4,); or 0 and None.
 
-    Directions are those of the faces of both, so for other bodies than boxes the depth is an upper bound.
+    Only directions of face normals are tried, so for bodies other than boxes the depth is an upper bound.
     """
     if (moving.low > other.high + gap).any() or (other.low > moving.high + gap).any():
         return 0.0, None
@@ -63,12 +63,12 @@ def overlap(moving: ConvexBody, other: ConvexBody, gap: float = 0.0) -> tuple[fl
 
 
 def max_overlap(bodies: Sequence[ConvexBody], others: Sequence[ConvexBody]) -> float:
-    """The greatest depth in m to which one of some bodies reaches into one of others; 0 where none touch."""
+    """Return the largest overlap in m of any of ``bodies`` with any of ``others``; 0 without contact."""
     return max((overlap(body, other)[0] for body in bodies for other in others), default=0.0)
 
 
 def distances(pieces: Sequence[Array], points: Array) -> Array:
-    """Distances (P,) in m of points (P, 3) from the nearest of convex hulls (V, 3); 0 within, infinite without any."""
+    """Return distances (P,) in m of points (P, 3) from the nearest hull (V, 3); 0 inside, infinite without hulls."""
     nearest = np.full(len(points), np.inf)
     for piece in pieces:
         hull = ConvexHull(piece)

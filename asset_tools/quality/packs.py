@@ -1,4 +1,4 @@
-"""Measure the assets of a whole pack anew, in parallel; what is asked of its furniture."""
+"""Measure all assets of a pack in parallel, and check the requirements for furniture."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def measure_pack(pack: Pack, processes: int = 1) -> Iterator[tuple[str, Quality]
     """Yield the id and the quality of each asset of a pack, objects first, in the pack's order.
 
     Raises:
-        AssetError: the process that measured one died.
+        AssetError: a process that measured an asset crashed.
     """
     assets = [*pack.objects.values(), *pack.furniture.values()]
     workers = processes if min(processes, len(assets)) > 1 else 0
@@ -28,28 +28,31 @@ def measure_pack(pack: Pack, processes: int = 1) -> Iterator[tuple[str, Quality]
         yield from pool.map(assets)
 
 
-FURNITURE_HEADER = ("furniture", "hulls", "vertices", "joints that work %", "surfaces that hold %")
+FURNITURE_HEADER = ("furniture", "hulls", "vertices", "working joints %", "stable surfaces %")
 
 
 def furniture_rows(qualities: Mapping[str, FurnitureQuality]) -> list[tuple[str, ...]]:
-    """The table: a row of text for each piece of furniture, as `FURNITURE_HEADER` names it."""
+    """Return table rows with the columns of `FURNITURE_HEADER`."""
 
-    def share(value: float | None) -> str:
+    def percent(value: float | None) -> str:
         return "-" if value is None else f"{100 * value:.0f}"
 
     return [
-        (name, str(q.hull_count), str(q.hull_vertices), share(q.joints_open), share(q.surfaces_hold))
+        (name, str(q.hull_count), str(q.hull_vertices), percent(q.joints_open), percent(q.surfaces_hold))
         for name, q in qualities.items()
     ]
 
 
 def check_furniture(qualities: Mapping[str, FurnitureQuality]) -> list[Violation]:
-    """Say which pieces of furniture have joints that stick, surfaces that don't hold, or hulls too fine for a GPU."""
+    """Return unmet requirements for joints, surfaces and hull sizes of furniture."""
     found = []
     for name, quality in qualities.items():
-        for what, share in (("joints that work", quality.joints_open), ("surfaces that hold", quality.surfaces_hold)):
-            if share is not None and share < 1:
-                found.append(Violation(name, what, "100%", f"{share:.0%}"))
+        for what, fraction in (
+            ("working joints", quality.joints_open),
+            ("stable surfaces", quality.surfaces_hold),
+        ):
+            if fraction is not None and fraction < 1:
+                found.append(Violation(name, what, "100%", f"{fraction:.0%}"))
         if quality.hull_vertices > HULL_VERTICES:
             found.append(Violation(name, "vertices of a hull", f"<= {HULL_VERTICES}", str(quality.hull_vertices)))
     return found
@@ -59,6 +62,6 @@ def _measure(asset: LoadedObject | LoadedFurniture) -> tuple[str, Quality]:
     return asset.asset.id, measure_again(asset) if isinstance(asset, LoadedObject) else measure_furniture(asset)
 
 
-def _raise_crash(asset: LoadedObject | LoadedFurniture, why: str) -> NoReturn:
-    fix = "Is memory short? Use fewer --jobs."
-    raise AssetError("the process that measured it died", where=asset.asset.id, found=why, fix=fix)
+def _raise_crash(asset: LoadedObject | LoadedFurniture, reason: str) -> NoReturn:
+    fix = "If the memory is short, use fewer --jobs."
+    raise AssetError("the process that measured the asset crashed", where=asset.asset.id, found=reason, fix=fix)

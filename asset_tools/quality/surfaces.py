@@ -1,4 +1,4 @@
-"""Small things to put on a surface, and how much room there is above it."""
+"""Make probe objects for a surface, and measure the free height above it."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from robocas_ms3.assets.manifest import Surface
 
 Array = np.ndarray
 
-WIDTH = 0.05  # m, of a thing put down
-HEIGHT = 0.1  # m at most
-EDGE = 0.005  # m it keeps from the surface's edge
-SPACING = 0.15  # m between things, at least
-MOST = 5  # along a side
-BLOCKED = 0.01  # m: what lies lower above the surface than this is the surface itself
+WIDTH = 0.05  # m, width of a probe
+HEIGHT = 0.1  # m, largest height of a probe
+EDGE = 0.005  # m, distance from the surface's edge
+SPACING = 0.15  # m, smallest distance between probes
+MOST = 5  # maximum number of probes along a side
+BLOCKED = 0.01  # m; geometry up to this height above the surface belongs to the surface
 
 
 @dataclass(frozen=True)
 class Probe:
-    """A thing to put down.
+    """A probe object for a surface.
 
     Attributes:
-        xy: (2,) where its middle goes, m, in the furniture's frame.
-        corners: (V, 3) m, its bottom at z = 0.
+        xy: (2,) position of its centre in the furniture's frame, m.
+        corners: (V, 3) corners with the bottom at z = 0, m.
     """
 
     xy: Array
@@ -34,7 +34,7 @@ class Probe:
 
 
 def make_probes(surface: Surface) -> list[Probe]:
-    """Boxes and cylinders on a grid over a surface, out to its edges; none if it is too small for one."""
+    """Return boxes and cylinders on a grid over a whole surface; [] if the surface is too small."""
     low = np.add(surface.min_xy, WIDTH / 2 + EDGE)
     high = np.subtract(surface.max_xy, WIDTH / 2 + EDGE)
     if (high < low - 1e-9).any():
@@ -56,14 +56,14 @@ def _prism(sides: int, height: float) -> Array:
 
 
 def clearances(pieces: Sequence[Array], points: Array) -> tuple[Array, Array]:
-    """Free height below and above points, m.
+    """Return the free heights below and above points in m.
 
     Args:
         pieces: (V, 3) corners of convex hulls.
-        points: (P, 3).
+        points: (P, 3) points.
 
     Returns:
-        (P,) distances straight down and straight up to the nearest hull: infinite where there is none, 0 within one.
+        Vertical distances (P,) down and up to the nearest hull: infinite without a hull, 0 inside a hull.
     """
     below, above = np.full(len(points), np.inf), np.full(len(points), np.inf)
     for piece in pieces:

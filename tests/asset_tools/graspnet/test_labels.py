@@ -148,7 +148,7 @@ def _flip(path):
         (lambda path: path.write_bytes(b"no archive"), "npz archive"),
         (lambda path: path.unlink(), "no such label file"),
         (lambda path: np.savez(path, points=np.zeros((2, 3))), "found points"),
-        (lambda path: np.savez(path, **arrays() | {"points": np.zeros((2, 3))}), "as many points"),
+        (lambda path: np.savez(path, **arrays() | {"points": np.zeros((2, 3))}), "same number of points"),
         (lambda path: np.savez(path, **arrays() | {"points": np.full((1, 3), np.nan)}), "finite points"),
         (lambda path: np.savez(path, **arrays() | {"scores": np.zeros((1, 300, 12, 5))}), "scores"),
         (lambda path: np.savez(path, **arrays() | {"scores": np.zeros((1, 300, 12, 4), int)}), "int64"),

@@ -113,9 +113,9 @@ def test_what_the_manifest_says_is_compared():
     assert compare_with_manifest(loaded(60), QUALITY) == []
     found = compare_with_manifest(loaded(59), QUALITY.model_copy(update=dict(rest_share=0.95, grasps_held=0.85)))
     assert [(broken.what, broken.expected, broken.found) for broken in found] == [
-        ("measured rest_share", "1, as the manifest says", "0.95"),
-        ("measured grasps_held", "0.9, as the manifest says", "0.85"),
-        ("measured grasp_count", "60, as the manifest says", "59"),
+        ("measured rest_share", "1 (manifest)", "0.95"),
+        ("measured grasps_held", "0.9 (manifest)", "0.85"),
+        ("measured grasp_count", "60 (manifest)", "59"),
     ]
 
 
