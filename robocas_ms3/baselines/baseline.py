@@ -111,7 +111,7 @@ class Samples(Protocol):
 
 @dataclass(frozen=True)
 class Baseline:
-    """Definition of a baseline, which learns from demonstrations (``data``) or in simulation (``environments``).
+    """Baseline that learns from demonstrations (``data``) or in simulation (``environments``).
 
     For demonstrations, the network's ``forward(batch)`` returns metrics by name, with ``loss``: means over the batch,
     shape (). A metric that only some samples have is a sum and the number of these samples, shape (2,).

@@ -87,7 +87,7 @@ class BcStateConfig(BaselineConfig):
 
 
 class StateSamples:
-    """Training samples of `bc-state`: batches of ``inputs`` (B, D), ``chunk`` (B, K, 10) and ``key`` (B, 9)."""
+    """Training samples of `bc-state`: ``inputs`` (B, D), ``chunk`` (B, K, 10) and ``key`` (B, 9)."""
 
     def __init__(self, config: BcStateConfig, path: Path, split: Split, on_read: OnRead) -> None:
         arrays = load_states(path, config.rate_hz, on_read)
@@ -126,7 +126,7 @@ class StateSamples:
 def make_inputs(
     state: NDArray[np.floating], poses: NDArray[np.floating], widths: NDArray[np.floating]
 ) -> NDArray[np.float32]:
-    """Return inputs (N, D + 10): privileged state (N, D) and proprioception of TCP poses and gripper widths."""
+    """Return inputs (N, D + 10): privileged state (N, D) and proprioception (N, 10)."""
     return np.concatenate([state, encode_proprioception(poses, widths)], axis=1).astype(np.float32)
 
 
@@ -234,7 +234,7 @@ class BcStateModel(nn.Module):
         self.out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, config.chunk * ROW + 9))
 
     def predict(self, inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return normalised chunks (B, K, 10) with logits of the gripper commands, and normalised key poses (B, 9)."""
+        """Return normalised chunks (B, K, 10), with logits of gripper commands, and key poses (B, 9)."""
         scaled = self.input_scale(inputs).clamp(-5, 5)
         if self.training and self.config.noise:
             scaled = scaled + self.config.noise * torch.randn_like(scaled)
@@ -254,6 +254,7 @@ class BcStateModel(nn.Module):
 
 
 def make_policy(config: BcStateConfig, facts: dict[str, Any], model: BcStateModel) -> ChunkPolicy:
+    """Make the policy of a trained network, on the device of its weights."""
     device, size = next(model.parameters()).device, len(facts["inputs"]["mean"])
 
     def predict(seen: Observations, row: int) -> NDArray[np.floating]:

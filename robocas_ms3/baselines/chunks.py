@@ -31,7 +31,7 @@ Predict = Callable[[Observations, int], NDArray[np.floating]]
 
 
 def encode_proprioception(poses: NDArray[np.floating], widths: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return proprioception (N, 10) for TCP poses (N, 4, 4) in the arm's base frame and gripper widths (N,) in m."""
+    """Return proprioception (N, 10): TCP poses (N, 4, 4) in the arm's base frame, gripper widths (N,) m."""
     return _rows(poses, widths / 0.08)
 
 
@@ -52,7 +52,10 @@ def encode_chunks(poses: Array, opened: NDArray[Any], steps: int) -> NDArray[np.
 
 
 def next_key_poses(poses: Array, opened: NDArray[Any]) -> NDArray[np.float32]:
-    """Return the TCP pose (T, 9) at the next change of the gripper command or at the end, encoded as in a chunk."""
+    """Return the next key poses (T, 9), encoded as in a chunk.
+
+    The next key pose of a step is the TCP pose at the next change of the gripper command, or at the end of the episode.
+    """
     length = len(poses)
     changes = np.flatnonzero(np.diff(np.asarray(opened, np.int8))).tolist()  # last steps before a change
     key_steps = np.array([next((change for change in changes if change >= t), length - 1) for t in range(length)])
@@ -60,7 +63,7 @@ def next_key_poses(poses: Array, opened: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def decode_chunk(rows: NDArray[np.floating], tcp: NDArray[np.floating]) -> tuple[Array, NDArray[np.float64]]:
-    """Decode rows (..., 10) to poses (..., 4, 4) in the arm's base frame and gripper commands, given the TCP pose."""
+    """Decode rows (..., 10) to poses (..., 4, 4) in the arm's base frame and gripper commands (...)."""
     rows = np.asarray(rows, np.float64)
     first = rows[..., 3:6] / np.maximum(np.linalg.norm(rows[..., 3:6], axis=-1, keepdims=True), 1e-9)
     second = rows[..., 6:9] - (first * rows[..., 6:9]).sum(-1, keepdims=True) * first
@@ -147,7 +150,7 @@ def chunk_losses(model: ChunkModel, batch: Batch, chunk: torch.Tensor, key: torc
 
 
 def _l1(predicted: torch.Tensor, poses: torch.Tensor, scale: Scale, near_distance: float) -> torch.Tensor:
-    """Return the mean error of normalised poses (..., 9), weighted by distance; ``near_distance`` 0: equal weights."""
+    """Return the mean error of normalised poses (..., 9), weighted by distance, see `chunk_losses`."""
     error = (predicted - scale(poses)).abs().mean(dim=-1)
     if not near_distance:
         return error.mean()

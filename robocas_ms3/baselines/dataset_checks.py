@@ -50,7 +50,15 @@ def check_dataset(
 
 
 def check_base_is_fixed(motion: NDArray[np.floating], where: object) -> None:
-    """Check that the base does not move, which 7-D actions cannot express: motions (T, 3) in m, m, rad per step."""
+    """Check that the base does not move, which 7-D actions cannot express.
+
+    Args:
+        motion: (T, 3) motion of the base per step, m, m, rad.
+        where: place of the episode, for the error.
+
+    Raises:
+        DatasetError: the base moves.
+    """
     path = np.cumsum(motion, axis=0, dtype=np.float64)
     furthest = float(np.abs(np.concatenate([motion, path])).max(initial=0))
     if not furthest <= _MAX_BASE_MOTION:  # NaN is refused too

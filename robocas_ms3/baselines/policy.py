@@ -81,7 +81,7 @@ class RunPolicy:
         self._policy.reset(episodes)
 
     def protocol_warnings(self, configs: dict[str, TaskConfig]) -> list[str]:
-        """Return a warning if configurations have tasks, scenes, objects or cameras that the training data lacks.
+        """Return a warning about tasks, scenes, objects and cameras that the training data lacks.
 
         Each policy object warns once.
         """
@@ -99,7 +99,7 @@ class RunPolicy:
 
 @contextmanager
 def _damaged_facts(path: Path) -> Iterator[None]:
-    """Raise errors of building a network or policy from damaged facts as a TrainingError that names their file."""
+    """Convert errors of building a network from damaged facts to a TrainingError with their file."""
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:

@@ -142,6 +142,7 @@ def _link(source: str, target: str) -> None:
 
 
 def main(words: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit status."""
     parser = argparse.ArgumentParser(
         description="Reduce a LeRobot export to what the policy socket sends, for the training of LeRobot's policies."
     )

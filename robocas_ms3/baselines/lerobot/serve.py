@@ -74,6 +74,7 @@ def read_rate(info: Path) -> float:
 
 
 def main(words: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit status."""
     parser = argparse.ArgumentParser(description="Serve a LeRobot checkpoint over the policy socket.")
     parser.add_argument("run", type=Path, help="output folder of train_lerobot.sh, or pretrained_model of a checkpoint")
     parser.add_argument(

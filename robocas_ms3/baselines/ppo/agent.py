@@ -21,7 +21,7 @@ _SCALE = np.array([POSITION_SCALE] * 3 + [ROTATION_SCALE] * 3 + [1.0])
 
 
 class Agent(nn.Module):
-    """Policy and value network of two hidden layers each; observations are normalised by running statistics.
+    """Policy and value network, with running statistics that normalise observations.
 
     Args:
         observation_size: size of an observation, O.
@@ -69,6 +69,7 @@ class Agent(nn.Module):
 
 
 def make_agent(config: PpoConfig, facts: dict[str, Any]) -> Agent:
+    """Make an agent with random weights."""
     return Agent(facts["observation_size"], facts["action_size"], config.width)
 
 

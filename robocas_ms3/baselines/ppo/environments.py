@@ -27,12 +27,15 @@ ACTION_SIZE = 5
 
 
 def expand_action(action: torch.Tensor) -> torch.Tensor:
-    """Expand 5-D actions (..., 5) to actions (..., 7) of ``pd_ee_delta_pose`` that keep the gripper's direction.
+    """Expand 5-D actions to 7-D actions of ``pd_ee_delta_pose`` that keep the gripper's direction.
 
     1 is a translation by 5 cm or a rotation by 0.25 rad. The gripper opens or closes fully, as in an evaluation.
 
     Args:
         action: (..., 5) translation along the TCP axes, rotation about the TCP's z axis, gripper; clipped to [-1, 1].
+
+    Returns:
+        (..., 7) actions.
     """
     x, y, z, yaw, gripper = action.clip(-1, 1).unbind(-1)
     zero = torch.zeros_like(x)
@@ -123,6 +126,7 @@ class PpoEnvironments:
 
 
 def load_scenes(config: PpoConfig) -> TaskConfig:
+    """Load the task configuration of a training; default: a single fruit on a table."""
     if config.scenes is not None:
         return load_task_config(config.scenes)
     return load_task_config(load_task_config("pick_table_scattered").model_dump(mode="json") | ONE_FRUIT)

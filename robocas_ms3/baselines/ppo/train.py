@@ -137,6 +137,7 @@ class _TrainingState:
             torch.cuda.set_rng_state(tensors["random.cuda"])
 
     def tensors(self) -> dict[str, torch.Tensor]:
+        """Return the tensors of a checkpoint."""
         random = {"cpu": torch.get_rng_state()}
         if self._agent.mean.is_cuda:
             random["cuda"] = torch.cuda.get_rng_state()
@@ -192,6 +193,7 @@ class RolloutCollector:
 
     @torch.no_grad()
     def collect(self) -> Rollout:
+        """Step the environments and return the rollout."""
         agent, config = self._agent, self._config
         steps = []
         for _ in range(steps_per_env(config)):
@@ -224,7 +226,10 @@ def steps_per_env(config: PpoConfig) -> int:
 
 
 def advantages(deltas: torch.Tensor, truncated: torch.Tensor, decay: float) -> torch.Tensor:
-    """Return generalised advantages (T, N) of temporal differences; decay: gamma * lambda (Schulman et al. 2016)."""
+    """Return generalised advantages (T, N) of temporal differences (Schulman et al. 2016).
+
+    ``decay`` is gamma * lambda.
+    """
     result, last = torch.zeros_like(deltas), torch.zeros_like(deltas[0])
     for t in reversed(range(len(deltas))):
         last = result[t] = deltas[t] + decay * ~truncated[t] * last

@@ -19,9 +19,10 @@ _KERAS_STD = (0.47853944, 0.4732864, 0.47434163)
 
 
 class RT1Train(TrainSettings):
-    """Training settings of RT-1; 140 000 steps are the paper's 20 epochs of about 2800 episodes of 60 steps.
+    """Training settings of RT-1.
 
-    A subclass, so that a configuration that changes one value keeps the other defaults of RT-1.
+    140 000 steps are the paper's 20 epochs of about 2800 episodes of 60 steps. A subclass keeps the other defaults of
+    RT-1 when a configuration changes one value.
     """
 
     steps: int = Field(default=140_000, ge=1)

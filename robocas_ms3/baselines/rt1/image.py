@@ -20,7 +20,7 @@ _EXPECTED = "weights of transformers' EfficientNetModel"
 
 
 class FiLM(nn.Module):
-    """FiLM layer (Perez et al. 2018): language scales and shifts the channels; initialised to the identity."""
+    """FiLM layer (Perez et al. 2018), initialised to the identity: language scales and shifts channels."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -35,7 +35,7 @@ class FiLM(nn.Module):
 
 
 class TokenLearner(nn.Module):
-    """TokenLearner V1.1 (Ryoo et al. 2021): each token is an attention-weighted mean of an image's features."""
+    """TokenLearner V1.1 (Ryoo et al. 2021): tokens are attention-weighted means of image features."""
 
     def __init__(self, width: int, bottleneck: int, tokens: int) -> None:
         super().__init__()
@@ -49,7 +49,7 @@ class TokenLearner(nn.Module):
 
 
 class StochasticDepth(nn.Module):
-    """Stochastic depth (Huang et al. 2016): skips a block per image; transformers uses plain dropout instead."""
+    """Stochastic depth (Huang et al. 2016) per image; transformers uses plain dropout instead."""
 
     def __init__(self, rate: float) -> None:
         super().__init__()
@@ -89,7 +89,7 @@ class ImageEncoder(nn.Module):
         return self.film(self.project(hidden), language)
 
     def forward(self, images: torch.Tensor, language: torch.Tensor) -> torch.Tensor:
-        """Return tokens (N, image_tokens, token_width) for normalised images (N, 3, h, w) and embeddings (N, 384)."""
+        """Return tokens (N, image_tokens, token_width) of images (N, 3, h, w) and embeddings (N, 384)."""
         return self.learner(self.features(images, language).flatten(2).transpose(1, 2))
 
     def load_efficientnet(self, path: Path) -> None:

@@ -22,9 +22,10 @@ FRAME_TOKENS = ACTION_TOKENS + 1
 
 
 class ActionBins(nn.Module):
-    """Discretisation of actions into bins of equal width over the range of each axis; 0..1 for the gripper.
+    """Discretisation of actions into bins of equal width over the range of each axis.
 
-    A value outside its range is in the first or last bin. An axis without a range has one value.
+    The range of the gripper is 0..1. A value outside its range is in the first or last bin. An axis without a range
+    has one value.
 
     Args:
         low, high: (6,) limits of the motion, m and rad.
@@ -52,7 +53,7 @@ class ActionBins(nn.Module):
 
 
 class Layer(nn.Module):
-    """Transformer layer with residual connections; its feed-forward part is a single linear map, as in RT-1."""
+    """Transformer layer; its feed-forward part is a single linear map, as in RT-1."""
 
     def __init__(self, config: RT1Config) -> None:
         super().__init__()
@@ -134,7 +135,12 @@ class RT1Model(nn.Module):
         self.register_buffer("from_imagenet", torch.tensor(has_weights))
 
     def encode(self, images: torch.Tensor, language: torch.Tensor) -> torch.Tensor:
-        """Return tokens (N, images, token_width) of uint8 images (N, cameras, 3, h, w) and embeddings (N, 384)."""
+        """Return image tokens (N, images, token_width).
+
+        Args:
+            images: (N, cameras, 3, h, w) uint8.
+            language: (N, 384) embeddings.
+        """
         scaled = (crop_rows(images, self.config.crop_height, random=self.training) - self.mean) / self.std
         return torch.cat([encoder(scaled[:, view], language) for view, encoder in enumerate(self.encoders)], dim=1)
 
@@ -169,7 +175,7 @@ class RT1Model(nn.Module):
 
 
 def likeliest_tokens(logits: torch.Tensor) -> torch.Tensor:
-    """Return the most probable tokens (..., 8) for logits (..., 8, bins); the terminate token has two values."""
+    """Return the most probable tokens (..., 8) for logits (..., 8, bins)."""
     action, end = logits[..., :ACTION_TOKENS, :], logits[..., ACTION_TOKENS:, : TERMINATE + 1]
     return torch.cat([action.argmax(-1), end.argmax(-1)], dim=-1)
 

@@ -213,7 +213,7 @@ def _check_memory(config: SmallConfig, count: int, path: Path) -> None:
 
 
 def _height_statistics(state: NDArray[np.floating], keys: NDArray[np.floating]) -> dict[str, float]:
-    """Return mean and deviation of the heights of key poses (N, 9) in the arm's base frame, m; states (N, 10)."""
+    """Return mean and deviation of the heights of key poses (N, 9), m, for states (N, 10)."""
     x, y = state[:, 3:6], state[:, 6:9]
     axes = np.stack([x[:, 2], y[:, 2], np.cross(x, y)[:, 2]], axis=1)  # the last row of the TCP's rotation
     heights = (axes * keys[:, :3]).sum(axis=1) + state[:, 2]

@@ -93,7 +93,12 @@ class CellAttention(nn.Module):
         return scores / math.sqrt(cells.shape[1])
 
     def forward(self, features: torch.Tensor, query: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return a token (B, width) and cell logits (B, h w) for feature maps (B, C, h, w) and a query (B, width)."""
+        """Return a token (B, width) and cell logits (B, h w).
+
+        Args:
+            features: (B, C, h, w) feature maps.
+            query: (B, width).
+        """
         logits = self.logits(features, query[:, None])[:, 0]
         probability = logits.softmax(dim=1)
         attended = torch.einsum("bn,bcn->bc", probability, features.flatten(2).float())
@@ -179,7 +184,13 @@ class Unproject(nn.Module):
         return points, torch.cat([coarse, fine, probability[:, None]], dim=1)
 
     def locate(self, pixels: torch.Tensor, heights: torch.Tensor, tcp: torch.Tensor) -> torch.Tensor:
-        """Return points (B, 3) in the TCP frame, m, for pixels (B, 2) and heights (B,) in the arm's base frame, m."""
+        """Return points (B, 3) in the TCP frame, m.
+
+        Args:
+            pixels: (B, 2) in the view.
+            heights: (B,) in the arm's base frame, m.
+            tcp: (B, 4, 4) TCP pose in the arm's base frame.
+        """
         flat = (pixels - self.intrinsic[2:]) / self.intrinsic[:2]
         ray = _rotate(self.mount[:3, :3], torch.cat([flat, torch.ones_like(flat[:, :1])], dim=1))
         origin = self.mount[:3, 3].expand_as(ray)
@@ -191,7 +202,14 @@ class Unproject(nn.Module):
     def loss(
         self, features: torch.Tensor, queries: torch.Tensor, pixels: torch.Tensor, heights: torch.Tensor
     ) -> torch.Tensor:
-        """Return the mean error () for labels of Q queries: pixels (B, Q, 2), heights (B, Q) in the base frame, m."""
+        """Return the mean error () of Q queries.
+
+        Args:
+            features: (B, C, h, w) feature maps.
+            queries: (B, Q, width).
+            pixels: (B, Q, 2) labels; NaN or outside the view: no label.
+            heights: (B, Q) labels in the arm's base frame, m.
+        """
         cells = pixel_to_cell(pixels, self._view)
         visible, at = cells != NOWHERE, cells.clamp(min=0)
         offsets = self.offsets(features).flatten(2).float().gather(2, at[:, None].expand(-1, 2, -1)).transpose(1, 2)

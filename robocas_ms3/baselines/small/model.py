@@ -241,7 +241,7 @@ class SmallModel(nn.Module):
         return Prediction(chunk, next_key, encoded, query, cells, points)
 
     def _shift(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return images (B, h, w, 3), shifted at random in training, and the shifts (B, 2) or (1, 2) in pixels."""
+        """Shift images (B, h, w, 3) at random in training; return them and the shifts (B or 1, 2), pixels."""
         if not (self.training and self.config.shift):
             return images, torch.zeros(1, 2, device=images.device)
         limit = self.config.shift
@@ -249,7 +249,7 @@ class SmallModel(nn.Module):
         return shift_images(images, shift), shift
 
     def _normalize(self, images: torch.Tensor) -> torch.Tensor:
-        """Scale images (B, h, w, 3) uint8 to (B, 3, h, w) in [-1, 1]; in training vary brightness and contrast."""
+        """Scale uint8 images (B, h, w, 3) to (B, 3, h, w) in [-1, 1], with color augmentation in training."""
         scaled = images.permute(0, 3, 1, 2).contiguous().float()  # group norms are slow in channels-last memory
         if not (self.training and self.config.brightness):
             return scaled / 127.5 - 1

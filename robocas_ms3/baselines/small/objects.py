@@ -84,7 +84,10 @@ def locate_objects(
 def calibration(
     episode: SourceEpisode, camera: str, arrays: Mapping[str, NDArray[Any]], stored: tuple[int, int], view: View
 ) -> dict[str, Any]:
-    """Return the ``camera`` argument of `Unproject`; world cameras are relative to the first pose of the arm's base."""
+    """Return the ``camera`` argument of `Unproject`.
+
+    The pose of a world camera is relative to the first pose of the arm's base.
+    """
     mount, parent = episode.camera_in_parent(camera), episode.camera_parent(camera)
     if parent == "world":
         mount = inverse(_base(arrays))[0] @ mount
@@ -100,7 +103,7 @@ def same_calibration(one: dict[str, Any], other: dict[str, Any], keys: Sequence[
 
 
 def in_camera_parent(parent: Parent, points: Array, tcp_in_base: Array, arrays: Mapping[str, NDArray[Any]]) -> Array:
-    """Transform points (T, N, 3) from the arm's base to the frame of a camera's parent; ``tcp_in_base`` (T, 4, 4)."""
+    """Transform points (T, N, 3) from the arm's base frame to the frame of a camera's parent."""
     if parent == "ee":
         return transform_points(inverse(tcp_in_base), points)
     return transform_points(_base(arrays), points) if parent == "world" else points

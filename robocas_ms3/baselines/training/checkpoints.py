@@ -83,7 +83,7 @@ def save(path: Path, tensors: Tensors, metadata: Mapping[str, str], step: int) -
 
 
 def _sort_header(content: bytes) -> bytes:
-    """Sort the header keys: safetensors writes metadata in random order, and results record the file's hash."""
+    """Sort the header keys; safetensors writes metadata in random order, and results record the hash."""
     end = 8 + int.from_bytes(content[:8], "little")
     header = json.dumps(json.loads(content[8:end]), sort_keys=True, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 8)  # aligns the tensors

@@ -40,7 +40,10 @@ class Learner:
             run.checkpoint.load_optimizer(self._optimizer)
 
     def update(self, batch: Batch, learning_rate: float) -> None:
-        """Take an optimiser step. On a GPU, NaN values raise in the next `take_means`, to avoid synchronisation."""
+        """Take an optimiser step.
+
+        On a GPU, a NaN raises in the next `take_means` only, to avoid synchronisation.
+        """
         for group in self._optimizer.param_groups:
             group["lr"] = learning_rate
         self._model.train()
@@ -80,6 +83,7 @@ class Learner:
         return sums_to_means(self._reduce(sums))
 
     def check_finite(self, step: int, **values: torch.Tensor | float) -> None:
+        """Raise TrainingError if one of the named values is NaN or infinite."""
         for name, value in values.items():
             if not math.isfinite(value):
                 raise self._run.make_error(f"the {name} is NaN or infinite", step)

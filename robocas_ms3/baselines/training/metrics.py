@@ -25,7 +25,7 @@ def mean_of_sum(sum_and_count: torch.Tensor) -> torch.Tensor:
 
 
 def batch_sum(metric: torch.Tensor, samples: int) -> torch.Tensor:
-    """Return sum and count (2,) float64 of a batch metric: a mean () of ``samples``, or sum and count (2,)."""
+    """Return sum and count (2,) float64 of a batch metric: a mean () or sum and count (2,)."""
     metric = metric.detach().double()
     return metric if metric.ndim else torch.stack([metric * samples, torch.full_like(metric, samples)])
 
@@ -62,6 +62,7 @@ class MetricsLog:
         return (step, split) in self._written
 
     def add(self, step: int, split: str, about: Mapping[str, float], metrics: Mapping[str, float]) -> None:
+        """Add metrics of a step; ``about`` has epoch, seconds and learning rate."""
         row = {"step": step, "split": split, **about, **metrics}
         is_first = not self._columns
         if is_first:
@@ -113,6 +114,7 @@ class TensorBoardWriter:
             self._write(step=first, session_log=log(status=log.START))
 
     def add(self, step: int, values: Mapping[str, float]) -> None:
+        """Write an event with scalars by name."""
         summary = self._summaries.Summary
         scalars = [summary.Value(tag=name, simple_value=value) for name, value in values.items()]
         self._write(step=step, summary=summary(value=scalars))

@@ -102,6 +102,7 @@ def read_run(folder: Path) -> RunRecord:
 
 
 def package_versions() -> dict[str, str]:
+    """Return the versions of the packages that a training depends on."""
     return {name: version(name) for name in _PACKAGES}
 
 

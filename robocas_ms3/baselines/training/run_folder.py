@@ -88,7 +88,7 @@ class RunFolder:
         self._log.add(step, split, {"epoch": epoch, "seconds": seconds, "learning_rate": learning_rate}, metrics)
 
     def save(self, step: int, state: Tensors, weights: Tensors) -> None:
-        """Write the weights of the policy, then the checkpoint: the weights of the last step are never missing."""
+        """Write the weights of the policy, then the checkpoint, so that weights are never missing."""
         if not self.accelerator.is_main_process:
             return
         self._output.check_exists()
@@ -97,6 +97,7 @@ class RunFolder:
             checkpoints.save(self._output.path / CHECKPOINT, state, self.record.metadata, step)
 
     def make_error(self, message: str, step: int) -> TrainingError:
+        """Make the error of a failed step."""
         return TrainingError(
             message,
             where=f"{self._output.path}, step {step}",
@@ -137,7 +138,7 @@ def make_accelerator(device: str, precision: Precision) -> Accelerator:
 
 
 def describe_hardware(accelerator: Accelerator) -> dict[str, Any]:
-    """Return the values of a `RunRecord` that determine rounding: device, precision, number of CPU threads."""
+    """Return the values of a `RunRecord` that determine rounding: device, precision, CPU threads."""
     device = accelerator.device.type
     threads = torch.get_num_threads() if device == "cpu" else 0
     return {"device": device, "precision": str(accelerator.mixed_precision), "threads": threads}

@@ -98,7 +98,7 @@ def scene_settings(config: TaskConfig, cameras: Collection[str] | None = None) -
 
 
 def _select_cameras(settings: Mapping[str, Any], cameras: Collection[str]) -> dict[str, Any]:
-    """Leave out the settings of cameras that are not named; no camera: also their random poses and the lights."""
+    """Remove settings of unused cameras; without cameras also those of lights and room."""
     unused = {"static_camera"} - set(cameras)
     if not cameras:
         unused |= {"lights", "room", "randomisation.lights", "randomisation.room", "randomisation.finishes"}
@@ -111,7 +111,7 @@ def _select_cameras(settings: Mapping[str, Any], cameras: Collection[str]) -> di
 
 
 def _object_ids(config: TaskConfig) -> set[str]:
-    """Return the asset ids of the objects of a configuration; as they are written, if the pack is not installed."""
+    """Return the asset ids of a configuration's objects; ids of other packs as written."""
     try:
         return set(find_objects(load_pack("builtin"), config))
     except ConfigError:  # ids of another pack

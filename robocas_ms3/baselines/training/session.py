@@ -182,7 +182,11 @@ def load_initial_weights(
 
 
 def combine_facts(own: dict[str, Any], initial: InitialWeights | None, data: Path | None) -> dict[str, Any]:
-    """Return the facts of a run: those of the run of its initial weights, whose scales fit the weights, if any."""
+    """Return the facts of a run: its own, or those that fit its initial weights.
+
+    Raises:
+        TrainingError: the inputs differ from those of the run of the initial weights.
+    """
     if initial is None:
         return own
     others = initial.record.facts

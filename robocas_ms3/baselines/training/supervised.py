@@ -117,7 +117,7 @@ def learning_rate(step: int, count: int, settings: TrainSettings) -> float:
 
 
 def _validation_batches(run: RunFolder, samples: Samples, settings: TrainSettings) -> Iterator[tuple[int, Batch]]:
-    """Yield this process's validation batches with their sizes; the samples are the same at each validation."""
+    """Yield this process's validation batches with their sizes, the same at each validation."""
     accelerator = run.accelerator
     count = min(len(samples), settings.validation_samples)
     indices = torch.linspace(0, len(samples) - 1, count).long().tolist()
@@ -146,7 +146,10 @@ def _read_batches(run: RunFolder, samples: Samples, indices: Iterable[list[int]]
 
 
 class _CaughtErrors:
-    """Samples that return errors instead of raising: from a worker process an error would arrive as traceback text."""
+    """Samples that return errors instead of raising them.
+
+    From a worker process, a raised error would arrive as traceback text.
+    """
 
     def __init__(self, samples: Samples) -> None:
         self._samples = samples
