@@ -150,11 +150,11 @@ def load_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArra
 
 
 def _cache_path(path: Path, rate_hz: float) -> Path:
-    digest = hashlib.sha256(f"{_CACHE_VERSION} {rate_hz!r}\n".encode_chunks())
+    digest = hashlib.sha256(f"{_CACHE_VERSION} {rate_hz!r}\n".encode())
     for file in (path, path.with_suffix(".json")):
-        digest.update(f"{hash_dataset(file) if file.is_file() else None}\n".encode_chunks())
+        digest.update(f"{hash_dataset(file) if file.is_file() else None}\n".encode())
     for package in _PACKAGES:
-        digest.update(f"{package} {version(package)}\n".encode_chunks())
+        digest.update(f"{package} {version(package)}\n".encode())
     return cache_dir() / "bc-state" / f"{digest.hexdigest()[:32]}.npz"
 
 

@@ -10,7 +10,7 @@ from training_runs import stop_at, train
 
 from robocas_ms3.baselines.policy import RunPolicy
 
-VIEW = {"rendered": [64, 48], "size": [64, 48]}
+VIEW = {"image_size": [64, 48], "size": [64, 48]}
 CHANGES = {
     "small": {"views": {"base_camera": VIEW, "gripper_camera": VIEW}, "channels": 8, "width": 32, "heads": 2},
     "rt1": SIZES,

@@ -43,7 +43,7 @@ class LeftOrRight:
 
 
 class StubEnvironments:
-    name, hash, facts = "left or right", "1234", {"observed": 1, "acted": 1, "rate_hz": 5}  # noqa: RUF012
+    name, hash, facts = "left or right", "1234", {"observation_size": 1, "action_size": 1, "rate_hz": 5}  # noqa: RUF012
     made = []  # noqa: RUF012
 
     def __init__(self, config, device):

@@ -20,7 +20,7 @@ from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 class RT1Policy:
     """Policy that executes the most probable action for the last six frames.
 
-    At the start of an episode the first frame is repeated. Each frame is encoded once, with the instruction of its step.
+    At the start of an episode the first frame is repeated. Each frame is encoded once with the instruction of its step.
     After an action with the terminate token, the policy does not move and repeats the last gripper command.
 
     Images are rendered in the size of the dataset and scaled as the training samples: images rendered at 320 x 256 have
