@@ -75,7 +75,7 @@ def test_a_configuration_is_found_beside_the_plan(tmp_path, monkeypatch):
     (tmp_path / "plans" / "plan.yaml").write_text(yaml.safe_dump(plan))
     read = read_plan(tmp_path / "plans" / "plan.yaml")
     assert [part.file for part in read.parts] == ["mine-mine", "pick_table_scattered-mine"]
-    assert [scene.changed().task for scene in (*read.parts, *read.train)] == ["pick"] * 4
+    assert [scene.resolve().task for scene in (*read.parts, *read.train)] == ["pick"] * 4
 
 
 @pytest.mark.parametrize("text", ["parts: []", "rules: [", "rules: {}\nparts: [{config: x}]"])

@@ -123,8 +123,14 @@ def test_a_configuration_that_extends_another_file_is_refused(folder, inside, ke
         (lambda f: change_episode(f, 1, seed=-1), "episodes.jsonl:2: invalid episode.*seed"),
         (lambda f: change_episode(f, 1, episode=0), "episodes.jsonl:2: episode out of order.*expected 1, found 0"),
         (lambda f: change_episode(f, 1, config="../x"), "episodes.jsonl:2: invalid episode.*config"),
-        (lambda f: (f / "configs" / "open_pick_drawer.yaml").unlink(), "open_pick_drawer.yaml: a protocol's file"),
-        (lambda f: (f / "layouts" / "open_pick_drawer.npy").unlink(), "open_pick_drawer.npy: a protocol's file"),
+        (
+            lambda f: (f / "configs" / "open_pick_drawer.yaml").unlink(),
+            "open_pick_drawer.yaml: missing file of the protocol",
+        ),
+        (
+            lambda f: (f / "layouts" / "open_pick_drawer.npy").unlink(),
+            "open_pick_drawer.npy: missing file of the protocol",
+        ),
         (lambda f: (f / RULES).unlink(), "unknown protocol"),
     ],
 )
@@ -138,10 +144,10 @@ def test_damaged_protocols_are_errors_of_one_line(folder, damage, said):
 def test_step_limits_and_valid_action_rates():
     rules = load_protocol("smoke").rules
     assert rules.step_limit("pick", 20) == 800
-    assert rules.model_copy(update={"max_steps": 30}).steps("pick", 5) == 30
-    assert rules.model_copy(update={"max_steps": 300}).steps("pick", 5) == 200
+    assert rules.model_copy(update={"max_steps": 30}).step_limit("pick", 5) == 30
+    assert rules.model_copy(update={"max_steps": 300}).step_limit("pick", 5) == 200
     upstream = load_protocol("paper-v1").rules
-    assert upstream.steps("pick", 5) == upstream.steps("search", 5) == 150
-    assert [rules.action_rate(PolicySpec()), rules.rate(PolicySpec(rate_hz=10))] == [20, 10]
+    assert upstream.step_limit("pick", 5) == upstream.step_limit("search", 5) == 150
+    assert [rules.action_rate(PolicySpec()), rules.action_rate(PolicySpec(rate_hz=10))] == [20, 10]
     with pytest.raises(EvaluationError, match="divisor of 100"):
         rules.action_rate(PolicySpec(rate_hz=30))

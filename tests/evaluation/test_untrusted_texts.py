@@ -55,7 +55,7 @@ def test_descriptions_that_cannot_be_recorded_are_refused(description, key):
 
 def test_description_round_trips_and_does_not_rename_the_policy(tmp_path):
     policy = Policy({"name": 5, "sizes": (1, 2), "note": HOSTILE})
-    run = EvaluationSession(policy, EvaluationSettings(policy="mine", protocol="smoke", backend="processes")).record
+    run = EvaluationSession(policy, EvaluationSettings(policy="mine", protocol="smoke", backend="processes")).run_record
     with results.open_result(tmp_path / "out", run):
         results.append_outcome(tmp_path / "out", outcome(0))
     assert results.read_result(tmp_path / "out").run.policy.name == "mine"

@@ -165,4 +165,4 @@ def test_verify_command_fails_on_violations_and_ignores_folders_named_in_a_resul
     assert verify(Verify((folder,), protocol="easy")) == 0
     tamper(folder, 3, seed=5)
     assert verify(Verify((folder,), protocol="easy")) == 1
-    assert "episode 3: seed is 5, not 110001" in capsys.readouterr().out
+    assert "episode 3: seed is 5, expected 110001" in capsys.readouterr().out

@@ -46,7 +46,7 @@ class RecordingPolicy:
 
     def __init__(self, spec: PolicySpec | None = None) -> None:
         self.spec = spec or PolicySpec()
-        self.starts: list[EpisodeSpec] = []
+        self.episodes: list[EpisodeSpec] = []
         self.seen: list[Observations] = []
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:

@@ -73,7 +73,7 @@ def test_texts_of_clients_are_not_used_as_paths(tmp_path, monkeypatch, name):
     with serving(policy) as url:
         for path in (f"{tmp_path}/secret.yaml", f"smoke/configs/../../{tmp_path}/secret.yaml", "new", "a\0b"):
             answer, _ = ask(url, message(start={name: path}))
-            assert getattr(policy.starts[-1], name) == ""
+            assert getattr(policy.episodes[-1], name) == ""
             assert isinstance(answer, str) and len(answer.splitlines()) == 1
             assert "hunter2" not in answer
     assert {entry.name for entry in tmp_path.iterdir()} == {"secret.yaml", "new"}
@@ -144,7 +144,7 @@ def test_invalid_request_is_one_line_for_the_client(request_):
     with serving(policy, max_batch=4) as url:
         answer, code = ask(url, request_)
     assert isinstance(answer, str) and answer.isprintable()
-    assert (code, policy.seen, policy.starts) == (GARBAGE, [], [])
+    assert (code, policy.seen, policy.episodes) == (GARBAGE, [], [])
 
 
 def test_embeddings_of_a_batch_must_have_equal_length():

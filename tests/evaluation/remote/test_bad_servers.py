@@ -148,7 +148,7 @@ class FailingEveryThird(RecordingPolicy):
     """Policy that raises in every third episode."""
 
     def act(self, observations):
-        if self.starts[-1].episode % 3 == 2:
+        if self.episodes[-1].episode % 3 == 2:
             raise RuntimeError("out of memory")
         return super().act(observations)
 

@@ -40,7 +40,7 @@ def test_served_policy_gets_the_same_observations_and_returns_the_same_actions()
         seen = make_observations(0, cameras=True)
         np.testing.assert_array_equal(remote.act(seen), RecordingPolicy().act(seen))
         remote.close()
-    assert policy.starts == [make_episode()]
+    assert policy.episodes == [make_episode()]
     for field in fields(seen):
         sent, got = getattr(seen, field.name), getattr(policy.seen[0], field.name)
         for one, other in zip(*(x.values() if isinstance(x, dict) else [x] for x in (sent, got)), strict=True):
@@ -76,7 +76,7 @@ def run_eight_episodes(policy):
     return [replace(one, inference_seconds=0.0) for one in play(env, policy, starts, 9)], env.actions
 
 
-def test_a_remote_run_is_equal_to_a_local_run_bit_for_bit():
+def test_remote_run_equals_local_run_bit_for_bit():
     local, served = SharedNoise(), SharedNoise()
     expected, expected_actions = run_eight_episodes(local)
     with serving(served) as url:
@@ -85,7 +85,7 @@ def test_a_remote_run_is_equal_to_a_local_run_bit_for_bit():
         remote.close()
     assert served.calls == local.calls
     assert any(envs != sorted(envs) for _, envs in local.calls), "the order of rows would not be tested"
-    assert served.starts == local.starts
+    assert served.episodes == local.episodes
     assert played == expected
     assert [step.tobytes() for step in actions] == [step.tobytes() for step in expected_actions]
 
@@ -131,7 +131,7 @@ def test_batches_are_split_and_failures_end_only_their_episodes():
         remote.reset([make_episode(1, episode=9)])
         assert remote.act(make_observations(0, 1)).shape == (2, 3, 7)
         remote.close()
-    assert policy.starts[6:] == [make_episode(1, episode=9)]
+    assert policy.episodes[6:] == [make_episode(1, episode=9)]
 
 
 def test_with_n_action_steps_each_observation_has_images():
@@ -149,7 +149,7 @@ def test_two_clients_have_separate_envs():
             remote = RemotePolicy(url)
             remote.reset([make_episode(0)])
             remote.act(make_observations(0))
-    assert [start.env for start in policy.starts] == [0, 1]
+    assert [start.env for start in policy.episodes] == [0, 1]
 
 
 def test_forked_process_opens_its_own_connection():
@@ -209,7 +209,7 @@ def test_next_episode_reconnects_to_a_restarted_server_with_the_same_policy():
         with pytest.raises(PolicyError, match="lost connection") as failed:
             remote.act(make_observations(0, 1))
         assert failed.value.reasons.keys() == {0}
-        assert policy.starts == [make_episode(1, episode=9)]
+        assert policy.episodes == [make_episode(1, episode=9)]
     with serving(RecordingPolicy(PolicySpec(convention="delta_euler")), port):
         remote.reset([make_episode(0)])
         with pytest.raises(EvaluationError, match="now serves another policy"):
@@ -237,7 +237,7 @@ def test_openpi_client_with_our_server():
             del message[key]
         for _ in range(2):
             assert client.infer(message)["actions"].shape == (3, 7)
-        assert [start.instruction for start in policy.starts] == ["take the apple"]
+        assert [start.instruction for start in policy.episodes] == ["take the apple"]
         with pytest.raises(RuntimeError, match="missing or invalid array"):
             client.infer({"prompt": "take the apple"})
 

@@ -127,7 +127,9 @@ def test_timeout_ends_only_the_episode_of_its_env():
         with pytest.raises(PolicyError) as failed:
             remote.act(make_observations(*range(ENVS)))
         ended.set()
-        assert failed.value.reasons == {2: "no answer from the policy server within 1 s"}
+        assert failed.value.reasons == {
+            2: "no answer from the policy server within 1 s. Increase timeout_s in the address."
+        }
         assert failed.value.actions[[0, 1, 3, 4], 0, 0].tolist() == [0, 1, 3, 4]
         remote.reset([make_episode(2)])
         assert remote.act(make_observations(2, 3))[:, 0, 0].tolist() == [2, 3]
@@ -190,7 +192,7 @@ def test_both_ends_detect_a_lost_network(fast_pings):
             other.reset([make_episode(0)])
             other.act(make_observations(0))
             other.close()
-            if policy.starts[-1].env == 0:
+            if policy.episodes[-1].env == 0:
                 return
             time.sleep(0.2)
         pytest.fail("the server keeps the env of a client that is gone")

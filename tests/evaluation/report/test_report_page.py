@@ -126,7 +126,7 @@ def test_columns(result, monkeypatch, capsys):
     assert "episodes.parquet was not written: pyarrow is missing" in capsys.readouterr().out
 
 
-def test_commands_on_parts(tmp_path, capsys):
+def test_commands_on_partial_results(tmp_path, capsys):
     parts = [tmp_path / name for name in "abc"]
     for number, part in enumerate(parts):
         write(part, [outcome(number)], **({"policy": {"name": "other"}} if part.name == "c" else {}))
@@ -136,7 +136,7 @@ def test_commands_on_parts(tmp_path, capsys):
     assert (tmp_path / "all" / "report.html").is_file()
     write(tmp_path / "d", [outcome(1)], policy={"name": "other"})
     assert compare(Compare((*parts, tmp_path / "d"))) == 0
-    assert "1 episode of made_up that both have" in capsys.readouterr().out
+    assert "1 episode of made_up in both results" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
