@@ -1,4 +1,4 @@
-"""Contact sheets: every asset of a pack in one PNG, looks, hulls, resting poses, grasps, surfaces, joints."""
+"""Draw contact sheets: all assets of a pack in one PNG, with appearance, hulls, resting poses, grasps and joints."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from robocas_ms3.core.poses import from_wxyz
 Array = NDArray[np.float64]
 LabelledImage = tuple[str, Image.Image]
 
-CELLS = 5  # images of an asset, side by side
-LARGE, SMALL = 220, 154  # px, an image's side: of packs with few and with many assets
+CELLS = 5  # images per asset in a row
+LARGE, SMALL = 220, 154  # px, size of an image for packs with few and with many assets
 FEW = 16
-GAP, CAPTION, LABEL = 6, 33, 14  # px between assets, of the text above the images, of that below
+GAP, CAPTION, LABEL = 6, 33, 14  # px: gap between assets, height of the text above and below the images
 POSES = 4
 GROUND, GREY, RED = (0.80, 0.80, 0.78), (0.55, 0.55, 0.55), (0.9, 0.1, 0.1)
 INK, FAINT = (25, 25, 25), (120, 120, 120)
@@ -34,42 +34,42 @@ FINGER = 0.003  # m, thickness of drawn grippers
 
 
 def write_contact_sheet(pack: Pack, path: Path, ids: Sequence[str] | None = None) -> None:
-    """Draw a pack, furniture last.
+    """Draw the assets of a pack, objects first.
 
     Args:
-        pack: what to draw.
+        pack: the pack.
         path: of the PNG.
-        ids: only these assets, in this order; none: all.
+        ids: ids of the assets to draw, in order; None: all.
 
     Raises:
-        AssetError: no such asset, or there is nothing to render with.
+        AssetError: an id is unknown, or no render device is available.
     """
     assets: dict[str, LoadedObject | LoadedFurniture] = {**pack.objects, **pack.furniture}
     unknown = [id_ for id_ in ids or () if id_ not in assets]
     if unknown:
-        raise AssetError("no such assets in the pack", where=pack.name, found=", ".join(unknown))
+        raise AssetError("unknown assets of the pack", where=pack.name, found=", ".join(unknown))
     chosen = [assets[id_] for id_ in ids or assets]
     size, columns = (LARGE, 2) if len(chosen) <= FEW else (SMALL, 3)
     columns = min(columns, len(chosen))
-    studio = Renderer(size)
+    renderer = Renderer(size)
     width, height = CELLS * size, CAPTION + size + LABEL
     rows = -(-len(chosen) // columns)
     sheet = Image.new("RGB", (columns * (width + GAP) + GAP, rows * (height + GAP) + GAP), "white")
     for i, asset in enumerate(chosen):
-        strip = _strip(studio, asset)
+        strip = _strip(renderer, asset)
         sheet.paste(strip, (GAP + i % columns * (width + GAP), GAP + i // columns * (height + GAP)))
     path.parent.mkdir(parents=True, exist_ok=True)
     sheet.save(path)
 
 
-def _strip(studio: Renderer, asset: LoadedObject | LoadedFurniture) -> Image.Image:
+def _strip(renderer: Renderer, asset: LoadedObject | LoadedFurniture) -> Image.Image:
     if isinstance(asset, LoadedObject):
-        title, line, images = asset.asset.id, _object_line(asset.asset), _object_images(studio, asset)
+        title, line, images = asset.asset.id, _object_line(asset.asset), _object_images(renderer, asset)
         if asset.asset.graspnet_id is not None:
             title += f"  ({asset.asset.graspnet_id})"
     else:
-        title, line, images = asset.asset.id, _furniture_line(asset), _furniture_images(studio, asset)
-    size = studio.size
+        title, line, images = asset.asset.id, _furniture_line(asset), _furniture_images(renderer, asset)
+    size = renderer.size
     strip = Image.new("RGB", (CELLS * size, CAPTION + size + LABEL), PAPER)
     draw = ImageDraw.Draw(strip)
     draw.text((4, 0), title, INK, _font(15))
@@ -100,7 +100,7 @@ def _furniture_line(furniture: LoadedFurniture) -> str:
     return ", ".join(parts)
 
 
-def _object_images(studio: Renderer, asset: LoadedObject) -> list[LabelledImage]:
+def _object_images(renderer: Renderer, asset: LoadedObject) -> list[LabelledImage]:
     notes = asset.annotations
     points, tried = np.concatenate(asset.hulls), top_grasps(notes)
     fast = RenderBody(points, file=asset.visual("fast"))
@@ -114,29 +114,29 @@ def _object_images(studio: Renderer, asset: LoadedObject) -> list[LabelledImage]
     best = _shown_poses(notes)
     chances = " ".join(f"{notes.resting_probabilities[i]:.0%}" for i in best)
     return [
-        ("fast", studio.image([fast], -60, 25)),
-        ("full, from behind", studio.image([RenderBody(points, file=asset.visual("full"))], 120, 25)),
-        ("hulls", studio.image(hull_bodies(asset.hull_meshes), -60, 25)),
-        (f"rests {chances}", studio.image(place_in_row(fast, notes.resting_poses[best]), -60, 30)),
-        (f"best {len(grippers)} of {len(notes.grasp_widths)} grasps", studio.image([fast, *grippers], -60, 30)),
+        ("fast", renderer.image([fast], -60, 25)),
+        ("full, from behind", renderer.image([RenderBody(points, file=asset.visual("full"))], 120, 25)),
+        ("hulls", renderer.image(hull_bodies(asset.hull_meshes), -60, 25)),
+        (f"rests {chances}", renderer.image(place_in_row(fast, notes.resting_poses[best]), -60, 30)),
+        (f"best {len(grippers)} of {len(notes.grasp_widths)} grasps", renderer.image([fast, *grippers], -60, 30)),
     ]
 
 
 def _shown_poses(notes: Annotations) -> list[int]:
-    """The likeliest resting poses, the upright one first, however rare it is."""
+    """Return indices of the most probable resting poses, with the upright pose first."""
     order = [int(i) for i in np.argsort(-notes.resting_probabilities, kind="stable")]
     if notes.display_pose >= 0:
         order = [notes.display_pose, *(i for i in order if i != notes.display_pose)]
     return order[:POSES]
 
 
-def _furniture_images(studio: Renderer, furniture: LoadedFurniture) -> list[LabelledImage]:
+def _furniture_images(renderer: Renderer, furniture: LoadedFurniture) -> list[LabelledImage]:
     asset = furniture.asset
     parts = {"": furniture, **furniture.links}
     wide = {link.joint.name: max(link.joint.limits, key=abs) for link in asset.links}
     shut, open_ = ({"": np.eye(4), **link_poses(asset.links, at)} for at in ({}, wide))
 
-    def looks(poses: dict[str, Array]) -> list[RenderBody]:
+    def render_bodies(poses: dict[str, Array]) -> list[RenderBody]:
         bodies = [
             RenderBody(np.concatenate(part.hulls), file=part.visual("fast"), pose=poses[name])
             for name, part in parts.items()
@@ -157,20 +157,20 @@ def _furniture_images(studio: Renderer, furniture: LoadedFurniture) -> list[Labe
     for handle in asset.handles.values():
         grasp = from_wxyz(np.array([*handle.position, *handle.wxyz]))
         marks.append(_solid(gripper_faces(handle.width, thick), RED, open_[handle.link] @ grasp))
-    points = np.concatenate([body.points for body in looks(shut)])
+    points = np.concatenate([body.points for body in render_bodies(shut)])
     edges = _solid(frame_faces(points.min(axis=0), points.max(axis=0), thick / 2), GREY)
     front, behind = ("closed", "open") if asset.links else ("front", "behind")
     return [
-        (front, studio.image(looks(shut), 30, 25)),
-        (behind, studio.image(looks(open_), 30 if asset.links else 210, 25)),
-        ("hulls", studio.image(hulls, 30, 25)),
-        ("surfaces, handles", studio.image([edges, *marks], 30, 25)),
-        ("from above", studio.image([*looks(open_), *marks], 30, 70)),
+        (front, renderer.image(render_bodies(shut), 30, 25)),
+        (behind, renderer.image(render_bodies(open_), 30 if asset.links else 210, 25)),
+        ("hulls", renderer.image(hulls, 30, 25)),
+        ("surfaces, handles", renderer.image([edges, *marks], 30, 25)),
+        ("from above", renderer.image([*render_bodies(open_), *marks], 30, 70)),
     ]
 
 
 def hull_bodies(hulls: Sequence[Hull], *, pose: Array | None = None, first_colour: int = 0) -> list[RenderBody]:
-    """Hulls in colours of their own, each drawn a little smaller than it is, so that all are seen."""
+    """Return hulls in different colours, each slightly shrunk so that all are visible."""
     bodies = []
     for i, hull in enumerate(hulls):
         middle = hull.vertices.mean(axis=0)
@@ -183,7 +183,7 @@ def hull_bodies(hulls: Sequence[Hull], *, pose: Array | None = None, first_colou
 
 
 def place_in_row(body: RenderBody, poses: Array) -> list[RenderBody]:
-    """Copies of a body in resting poses, side by side on a slab."""
+    """Return copies of a body in resting poses in a grid on a slab."""
     turned = [body.points @ pose[:3, :3].T + pose[:3, 3] for pose in poses]
     step = 1.12 * np.max([np.ptp(points[:, :2], axis=0) for points in turned], axis=0) + 0.01
     bodies = []
@@ -197,7 +197,7 @@ def place_in_row(body: RenderBody, poses: Array) -> list[RenderBody]:
 
 
 def gripper_faces(width: float, thick: float = FINGER) -> Array:
-    """Triangles (F, 3, 3) of a gripper of thin boxes, open by so much (m), in the TCP's frame."""
+    """Return triangles (F, 3, 3) of a gripper of thin boxes with an opening ``width`` in m, in the TCP frame."""
     half, t = width / 2, thick / 2
     fingers = [((-t, y - t, -0.04), (t, y + t, 0.0085)) for y in (-half - t, half + t)]
     palm = ((-t, -half - thick, -0.04 - thick), (t, half + thick, -0.04))
@@ -206,7 +206,7 @@ def gripper_faces(width: float, thick: float = FINGER) -> Array:
 
 
 def frame_faces(low: Array, high: Array, half: float) -> Array:
-    """Triangles (F, 3, 3) of bars along the edges of a box."""
+    """Return triangles (F, 3, 3) of bars along the edges of a box."""
     bars = []
     for a, b in ((1, 2), (0, 2), (0, 1)):
         for i, j in np.ndindex(2, 2):
@@ -225,12 +225,12 @@ def _count(number: int, thing: str) -> str:
 
 
 def _hue(i: int) -> Colour:
-    """Colours that differ much from one to the next."""
+    """Return the i-th of a series of distinct colours."""
     return colorsys.hsv_to_rgb(0.07 + i * 0.618034 % 1, 0.62, 0.9 - 0.25 * (i % 3 == 2))
 
 
 def _tone(friction: float) -> Colour:
-    """Green for grasps that need no friction to speak of, red for those that need 0.8."""
+    """Return a colour from green (friction 0) to red (friction 0.8)."""
     return colorsys.hsv_to_rgb(max(0.0, 0.33 * (1 - friction / 0.8)), 0.9, 0.8)
 
 

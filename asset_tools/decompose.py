@@ -1,4 +1,4 @@
-"""Convex hulls of a closed mesh: one where that is close enough, else CoACD's, merged to few."""
+"""Decompose a closed mesh into convex hulls: one hull if it is close enough, else merged hulls of CoACD."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 
-GPU_LIMIT = 64  # vertices, and faces, of a hull on a GPU; PhysX cuts off what is more
-MAX_VERTICES = 34  # they make 64 triangles; more only where enough of them share flat faces
-UNFELT = 0.0007  # m: PhysX drops vertices that lie less than this outside of the hull of others
-BEVEL, THIN = 0.001, 8  # m, and a share (1 / 8) of the thickness, that what is squared may measure
-FLAT, BROAD = 0.0001, 0.5  # m, and share of the extents, that make a face one that things stand on
+GPU_LIMIT = 64  # vertices and faces of a hull on a GPU; PhysX drops more
+MAX_VERTICES = 34  # at most 64 triangles; more vertices only if they share flat faces
+UNFELT = 0.0007  # m: PhysX drops vertices closer than this to the hull of the others
+BEVEL, THIN = 0.001, 8  # m, and fraction (1 / 8) of the thickness; largest bevel that is squared
+FLAT, BROAD = 0.0001, 0.5  # m, and fraction of the extents; flat and broad base faces
 MAX_HULLS = 32
-WANTED_OVERLAP = 0.9  # the fewest hulls that reach it are taken
+WANTED_OVERLAP = 0.9  # the smallest number of hulls with this IoU is used
 THRESHOLDS = (0.2, 0.12, 0.08, 0.05)  # CoACD's concavity, coarse first
-FINE = (0.05, 0.03)  # for hollow things, whose walls coarse cuts fill the inside with
-SMOOTHED = 0.002  # of the diagonal: detail that CoACD is spared
-HOLLOW = 0.5  # volume over that of the convex hull, below which a thing is hollow or thin
-WANTED_DISTANCE = 0.002  # m, 95th percentile between the surfaces of a hollow thing and of its hulls
-BOX = 8  # vertices: as few are left as they are
-TRIES = 8  # mergers in a row that are too much
-LOST_OVERLAP = 0.02  # that merging the hulls of a hollow thing may cost
-SLIVER = 1e-4  # of the body's volume: parts below it are left out
-SLENDER = 0.95 * MAX_SLENDERNESS  # slenderness that hulls are thickened to
+FINE = (0.05, 0.03)  # for hollow objects, whose inside coarse cuts would fill
+SMOOTHED = 0.002  # of the diagonal: details removed before CoACD
+HOLLOW = 0.5  # volume over that of the convex hull; less is hollow or thin
+WANTED_DISTANCE = 0.002  # m, 95th percentile of the distance between a hollow object and its hulls
+BOX = 8  # hulls with at most this number of vertices stay unchanged
+TRIES = 8  # failed mergers in a row before stopping
+LOST_OVERLAP = 0.02  # IoU that merging the hulls of a hollow object may cost
+SLIVER = 1e-4  # of the body's volume: smaller parts are dropped
+SLENDER = 0.95 * MAX_SLENDERNESS  # slenderness after thickening
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ class Decomposition:
     """Convex hulls of a body.
 
     Attributes:
-        hulls: (V, 3) vertices each, m.
-        volume_iou: overlap of their union with the body they were made from.
+        hulls: vertices (V, 3) of each hull, m.
+        volume_iou: IoU of their union and the body.
     """
 
     hulls: list[Array]
@@ -53,16 +53,16 @@ class Decomposition:
 
 
 def decompose(closed: trimesh.Trimesh) -> Decomposition:
-    """Decompose a closed mesh; the same mesh gives the same hulls.
+    """Decompose a closed mesh; deterministic.
 
     Args:
         closed: watertight, metres.
 
     Raises:
-        AssetError: the mesh isn't closed, or CoACD makes nothing of it.
+        AssetError: the mesh is not closed, or CoACD finds no hulls.
     """
     if not closed.is_watertight or closed.volume <= 0:
-        raise AssetError("can't decompose a mesh that isn't closed", expected="watertight, volume > 0")
+        raise AssetError("cannot decompose an open mesh", expected="watertight, volume > 0")
     found = _decompose(closed)
     hulls = [limit_for_engine(hull) for hull in found.hulls]
     if all(hull is old for hull, old in zip(hulls, found.hulls, strict=True)):
@@ -94,16 +94,16 @@ def _decompose(closed: trimesh.Trimesh) -> Decomposition:
 
 
 def reduce_vertices(points: Array, *, bevel: float = BEVEL) -> Array:
-    """Vertices of the convex hull of points, m, thinned to what the engine keeps: same volume, most of its shape.
+    """Return the vertices of a convex hull, reduced to those that the engine keeps, with the same volume.
 
-    Small bevels around broad faces across x, y or z are squared: the engine would keep a corner or two of one, on which
-    a bottle rocks. Then, beginning with a few extreme ones, the vertex farthest outside of the hull so far is added,
-    again and again, until none is felt: at most 34, or 64 where their hull has no more than 64 flat faces. What is left
-    lies inside of the hull, so that it is blown up a little, about its centre, to the hull's volume.
+    Small bevels around broad faces across x, y or z are squared, since the engine would keep a few corners of a bevel,
+    on which a bottle rocks. Starting with a few extreme vertices, the vertex farthest outside of the current hull is
+    added repeatedly until the distance is negligible: at most 34 vertices, or 64 if the hull has at most 64 flat faces.
+    The result is scaled about its centre to the volume of the original hull.
 
     Args:
         points: (P, 3) m.
-        bevel: the largest that is squared, m; 0 for parts that fit each other.
+        bevel: largest bevel that is squared, m; 0 for parts that fit each other.
     """
     points = _without_bevels(points, bevel)
     hull = ConvexHull(points)
@@ -118,8 +118,8 @@ def reduce_vertices(points: Array, *, bevel: float = BEVEL) -> Array:
         if outside[farthest] <= UNFELT:
             break
         chosen.append(farthest)
-    unfelt = min(UNFELT, hull.volume / hull.area / 2)  # a quarter of a thin plate's thickness
-    for index in list(chosen):  # the first ones were taken whether they are felt or not
+    unfelt = min(UNFELT, hull.volume / hull.area / 2)  # a quarter of the thickness of a thin plate
+    for index in list(chosen):  # the initial vertices may be negligible
         others = [other for other in chosen if other != index]
         if _outside(vertices[[index]], vertices[others])[0] <= unfelt:
             chosen = others
@@ -131,10 +131,10 @@ def reduce_vertices(points: Array, *, bevel: float = BEVEL) -> Array:
 
 
 def limit_for_engine(points: Array) -> Array:
-    """Return the vertices (V, 3) of a convex hull so that the physics engine builds it, on a CPU and a GPU.
+    """Return vertices (V, 3) of a convex hull that the physics engine can build on CPU and GPU.
 
-    A hull that is too slender is stretched along its thin axes. One that loses too much is what the engine makes of it.
-    One that the engine refuses becomes a box around it. Boxes stay as they are.
+    A hull that is too slender is stretched along its thin axes. A hull that shrinks too much is replaced by the
+    engine's own hull. A hull that the engine rejects is replaced by its bounding box. Boxes stay unchanged.
     """
     if find_box(points) is not None:
         return points
@@ -156,7 +156,7 @@ def limit_for_engine(points: Array) -> Array:
 
 
 def _without_bevels(points: Array, bevel: float) -> Array:
-    """Points (P, 3) with those next to a broad face across x, y or z put into it."""
+    """Move points (P, 3) close to a broad face across x, y or z into this face."""
     squared, extents = np.array(points), np.ptp(points, axis=0)
     for axis in range(3):
         for extreme in (points[:, axis].min(), points[:, axis].max()):
@@ -168,9 +168,9 @@ def _without_bevels(points: Array, bevel: float) -> Array:
 
 
 def _outside(points: Array, corners: Array) -> Array:
-    """Return how far points (P, 3) are outside of the convex hull of others (V, 3); negative within, m.
+    """Return the signed distances of points (P, 3) from the convex hull of corners (V, 3) in m; negative inside.
 
-    Where the others are in one plane, so that their hull is flat, it is the distance from that plane plus 1 m.
+    If the corners are coplanar, return the distance from their plane plus 1 m.
     """
     try:
         planes = ConvexHull(corners).equations
@@ -184,12 +184,12 @@ def _outside(points: Array, corners: Array) -> Array:
 
 
 def count_flat_faces(points: Array) -> int:
-    """How many faces the convex hull of points (V, 3) has, triangles in one plane being one."""
+    """Count the faces of the convex hull of points (V, 3); coplanar triangles are one face."""
     return len(np.unique(np.round(ConvexHull(points).equations, 6), axis=0))
 
 
 def is_hollow(closed: trimesh.Trimesh) -> bool:
-    """Whether a body is a container, or thin and bent: it fills less than half of its convex hull."""
+    """Return whether a body is hollow, or thin and bent: it fills less than half of its convex hull."""
     return bool(closed.volume < HOLLOW * closed.convex_hull.volume)
 
 
@@ -200,7 +200,7 @@ def _good_enough(closed: trimesh.Trimesh, found: Decomposition, hollow: bool, le
 
 
 def _merged(closed: trimesh.Trimesh, found: Decomposition, hollow: bool) -> Decomposition:
-    """Two hulls made one, those that add the least volume first, as long as the result is good enough."""
+    """Merge pairs of hulls, smallest added volume first, as long as the result is good enough."""
     least = found.volume_iou - LOST_OVERLAP
     hulls, volumes = dict(enumerate(found.hulls)), {i: ConvexHull(hull).volume for i, hull in enumerate(found.hulls)}
 
@@ -243,11 +243,11 @@ def _run_coacd(body: trimesh.Trimesh, threshold: float) -> list[Array]:
         coacd.Mesh(vertices, faces),
         threshold=threshold,
         max_convex_hull=MAX_HULLS,
-        preprocess_mode="off",  # it thickens thin walls; what comes in is closed already
+        preprocess_mode="off",  # preprocessing thickens thin walls; the input is closed already
         resolution=500,
         mcts_iterations=20,
         mcts_nodes=20,
-        mcts_max_depth=1,  # cuts that are not looked ahead for are mended by merging, in a tenth of the time
+        mcts_max_depth=1,  # merging corrects greedy cuts ten times faster than a deeper search
         seed=0,
     )
     return [
@@ -256,7 +256,7 @@ def _run_coacd(body: trimesh.Trimesh, threshold: float) -> list[Array]:
 
 
 def _volume(points: Array) -> float:
-    """Return the volume of the convex hull of points (V, 3); 0 where they are in one plane."""
+    """Return the volume of the convex hull of points (V, 3); 0 if they are coplanar."""
     try:
         return float(ConvexHull(points).volume)
     except (QhullError, ValueError):

@@ -1,4 +1,4 @@
-"""Small images of meshes, rendered with SAPIEN. Metres, z up."""
+"""Render small images of meshes with SAPIEN; metres, z up."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from robocas_ms3.core.errors import AssetError
 Array = NDArray[np.float64]
 Colour = tuple[float, float, float]  # 0 to 1
 
-PAPER = (244, 244, 241)  # behind everything
+PAPER = (244, 244, 241)  # background colour
 OVERSAMPLING = 2
 _SHADER = str(Path(sapien.__file__).parent / "vulkan_shader" / "default")
-MARGIN = 1.06  # of the frame around what it shows
+MARGIN = 1.06  # size of the frame over that of its content
 
 
 @dataclass(frozen=True)
 class RenderBody:
-    """Something to look at.
+    """A body in an image, given by a mesh file or by triangles.
 
     Attributes:
-        points: (N, 3) that the image must hold, in its frame; none: it may stick out.
-        file: of its mesh; or
-        faces: (F, 3, 3) corners of its triangles, shaded flat.
-        colour: of the faces.
-        pose: 4x4.
+        points: (N, 3) points in the body's frame that must be in the image; may be empty.
+        file: mesh file, or None.
+        faces: (F, 3, 3) corners of flat-shaded triangles, or None.
+        colour: colour of the triangles.
+        pose: (4, 4) pose of the body.
     """
 
     points: Array
@@ -42,13 +42,13 @@ class RenderBody:
 
 
 class Renderer:
-    """A room with lights and a camera that sees all lines in parallel.
+    """A scene with lights and an orthographic camera.
 
     Args:
-        size: of the images, pixels.
+        size: width and height of the images, pixels.
 
     Raises:
-        AssetError: there is nothing to render with.
+        AssetError: no render device is available.
     """
 
     def __init__(self, size: int) -> None:
@@ -57,18 +57,18 @@ class Renderer:
             self._scene = sapien.Scene([sapien.render.RenderSystem()])
         except RuntimeError as error:
             fix = "Install a Vulkan driver; see `robocas doctor`."
-            raise AssetError("no render device to draw with", found=error, fix=fix) from error
+            raise AssetError("no render device", found=error, fix=fix) from error
         self._scene.set_ambient_light([0.45, 0.45, 0.45])
         self._sun = self._scene.add_directional_light([0, 0, -1], [1.7, 1.7, 1.7])
         self._fill = self._scene.add_directional_light([0, 0, -1], [0.6, 0.6, 0.6])
-        # By name: environments made in this process set another shader and format of images for all cameras.
+        # the shader is given by name, since environments in this process change the default shader of all cameras
         self._camera = sapien.render.RenderCameraComponent(size * OVERSAMPLING, size * OVERSAMPLING, _SHADER)
         holder = sapien.Entity()
         holder.add_component(self._camera)
         self._scene.add_entity(holder)
 
     def image(self, bodies: Sequence[RenderBody], azimuth: float, elevation: float) -> Image.Image:
-        """What a camera sees that looks at the bodies from a direction, degrees from +x and above the horizon."""
+        """Render the bodies from a direction: azimuth from +x and elevation above the horizon, degrees."""
         entities = [self._entity(body) for body in bodies]
         for entity in entities:
             self._scene.add_entity(entity)
@@ -101,7 +101,7 @@ class Renderer:
         self._camera.set_orthographic_parameters(reach * 0.01, reach * 3, half)
         for light, turn, down in ((self._sun, 0.9, 1.1), (self._fill, -0.8, 0.5)):
             away = forward + turn * left - down * np.array([0, 0, 1])
-            light.set_entity_pose(sapien.Pose(q=_turning_x_to(away).tolist()))
+            light.set_entity_pose(sapien.Pose(q=_rotation_from_x(away).tolist()))
 
     @staticmethod
     def _entity(body: RenderBody) -> sapien.Entity:
@@ -129,14 +129,14 @@ class Renderer:
 
 
 def box_faces(low: Iterable[float], high: Iterable[float]) -> Array:
-    """Triangles (12, 3, 3) of an axis-aligned box."""
+    """Return the triangles (12, 3, 3) of an axis-aligned box."""
     corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), dtype=float).reshape(3, 8).T
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     return np.array([[corners[a], corners[b], corners[c]] for q in quads for a, b, c in (q[:3], (q[0], q[2], q[3]))])
 
 
-def _turning_x_to(direction: Array) -> Array:
-    """Quaternion (wxyz) of a turn that takes +x to a direction."""
+def _rotation_from_x(direction: Array) -> Array:
+    """Return the quaternion wxyz of a rotation from +x to a direction (3,)."""
     direction = direction / np.linalg.norm(direction)
     if direction[0] < -0.999999:
         return np.array([0.0, 0.0, 0.0, 1.0])

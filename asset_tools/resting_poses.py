@@ -1,4 +1,4 @@
-"""Poses in which an object rests on a plane: found on its convex hull, then proved in the physics engine."""
+"""Find resting poses of an object on a plane from its convex hull, and verify them in the physics engine."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray
 
-ROUNDS = 6  # seconds an object may roll until it stays
-MOVED, TURNED_DEG = 0.001, 2.0  # in one second, afresh: less is at rest
-YAWS = tuple(np.arange(8) * 0.8)  # rad: it must stay however it is turned, for the engine's contacts depend on it
-DROP = 0.0005  # m above the plane at the start: scenes leave a gap as well
-MIN_TOPPLING_DEG = 3.0  # a pose that gives way to less is no pose to put things down in, unless it only rocks
-STEPS = 100  # of TIME_STEP
-RAREST = 0.02  # probability of a pose
+ROUNDS = 6  # simulated seconds until an object has to be at rest
+MOVED, TURNED_DEG = 0.001, 2.0  # m and deg of motion in 1 s; less counts as rest
+YAWS = tuple(np.arange(8) * 0.8)  # rad; a pose must be stable for each yaw, since the engine's contacts depend on it
+DROP = 0.0005  # m above the plane at the start, as in scenes
+MIN_TOPPLING_DEG = 3.0  # poses with a smaller toppling angle are dropped, unless they only rock
+STEPS = 100  # number of time steps
+RAREST = 0.02  # minimum probability of a pose
 
 LIFT = np.zeros((4, 4))
 LIFT[2, 3] = DROP
@@ -50,12 +50,12 @@ for _turn, _yaw in zip(TURNS, YAWS, strict=True):
 
 @dataclass(frozen=True)
 class RestingPoses:
-    """How an object rests on a plane. S poses, the most probable first.
+    """The S resting poses of an object, by descending probability.
 
     Attributes:
-        poses: (S, 4, 4) ``T_plane_object``: the object's frame in a frame whose z = 0 is the plane, the centre of
-            mass at x = y = 0; turned from the object's own axes the shortest way, so with no yaw of their own.
-        probabilities: (S,) share of random drops that end in each; they sum to 1.
+        poses: (S, 4, 4) ``T_plane_object``: pose of the object in a frame with the plane at z = 0 and the centre of
+            mass at x = y = 0; the rotation is the shortest one, without yaw.
+        probabilities: (S,) fraction of random drops that end in each pose; the sum is 1.
         display_pose: index of the pose in which the object's +z points up within 10 deg, or -1.
     """
 
@@ -67,35 +67,35 @@ class RestingPoses:
 @dataclass(frozen=True)
 class _Body:
     solid: RigidBody
-    points: Array  # (K, 3) corners of the hull of everything
-    cooked: Array  # (L, 3) the same of the shapes that the engine makes of it
+    points: Array  # (K, 3) corners of the hull of all hulls
+    cooked: Array  # (L, 3) corners of the hull of the engine's shapes
 
     def rest(self, up: Array) -> Array:
-        """Pose (4, 4) that stands the object on the plane with a direction (3,) of its own frame up."""
+        """Return the pose (4, 4) on the plane in which a direction (3,) of the object's frame points up."""
         pose = np.eye(4)
         pose[:3, :3] = _turn_up(up)
         pose[:2, 3] = -(pose[:2, :3] @ self.solid.center_of_mass)
-        # the engine's shapes touch the plane, but corners it dropped may not reach far below
+        # the engine's shapes touch the plane; corners that it dropped may be at most BELOW under it
         pose[2, 3] = max(-(self.cooked @ pose[2, :3]).min(), -(self.points @ pose[2, :3]).min() - BELOW)
         return pose
 
 
 def resting_poses(solid: RigidBody) -> RestingPoses:
-    """Find the poses in which an object stays where it is put. The same input gives the same poses.
+    """Find the poses in which a placed object stays; deterministic.
 
-    Poses of less than 2 % are left out, unless all are rare. Those of one height count together: a cylinder has many
-    on its side.
+    Poses with a probability below 2 % are dropped, unless all are rare. Probabilities of poses with equal height are
+    added, since a cylinder has many poses on its side.
 
     Args:
         solid: the object; the table's friction is 0.99.
 
     Raises:
-        AssetError: the hulls are flat, the centre of mass is outside of them, or no pose stays.
+        AssetError: the hulls are flat, the centre of mass is outside of them, or no pose is stable.
     """
     vertices = np.concatenate([np.asarray(hull, float) for hull in solid.hulls])
     try:
         points = vertices[ConvexHull(vertices).vertices]
-        # the engine drops corners of detailed hulls: what is stable is decided on the shapes it really has
+        # the engine drops corners of detailed hulls, so stability is computed from its shapes
         hull = ConvexHull(np.concatenate([_cooked(np.asarray(piece, float)) for piece in solid.hulls]))
     except (QhullError, ValueError, RuntimeError) as error:
         raise AssetError("the convex hulls enclose no volume", found=str(error).split("\n")[0]) from error
@@ -106,7 +106,9 @@ def resting_poses(solid: RigidBody) -> RestingPoses:
     settled, which = _settle(body, directions[kept])
     settled, which = _firm(body, settled, which)
     if not which:
-        raise AssetError("the object stays in no pose", expected=f"one of {len(kept)} to hold", fix="Check its mass.")
+        raise AssetError(
+            "the object has no stable pose", expected=f"one of {len(kept)} poses to be stable", fix="Check its mass."
+        )
     directions, probabilities, _ = merge_poses(settled, probabilities[which], np.zeros(len(which)))
     poses = np.array([body.rest(up) for up in directions])
     upright = np.flatnonzero(poses[:, 2, 2] > np.cos(np.radians(UPRIGHT_DEG)))
@@ -114,12 +116,12 @@ def resting_poses(solid: RigidBody) -> RestingPoses:
 
 
 def _cooked(piece: Array) -> Array:
-    """Return the corners (V, 3) of the engine's shape of a convex hull; boxes are exact."""
+    """Return the corners (V, 3) of the engine's shape for a convex hull; boxes are exact."""
     return piece if find_box(piece) is not None else cook(piece, physx.PhysxMaterial(1, 1, 0)).vertices
 
 
 def _turn_up(up: Array) -> Array:
-    """Shortest rotation (3, 3) that takes a unit vector to +z; half a turn about x for -z."""
+    """Return the shortest rotation (3, 3) of a unit vector to +z; a half turn about x for -z."""
     x, y, z = up
     if z < -1 + 1e-9:
         return np.diag([1.0, -1.0, -1.0])
@@ -128,10 +130,10 @@ def _turn_up(up: Array) -> Array:
 
 
 def _settle(body: _Body, directions: Array) -> tuple[Array, list[int]]:
-    """Put the object down in each pose, and afresh in the one it ends in, until it stays where it was put.
+    """Place the object in each pose, and again in the pose that it reaches, until it stays.
 
     Returns:
-        the up directions (M, 3) that stay, and which of the given ones led there.
+        Stable up directions (M, 3), and the indices of the initial directions.
     """
     waiting, ups, found = list(range(len(directions))), directions.copy(), {}
     points = np.stack([body.solid.center_of_mass, np.zeros(3)])
@@ -150,7 +152,7 @@ def _settle(body: _Body, directions: Array) -> tuple[Array, list[int]]:
             if stays.all():
                 found[i] = ups[i]
             else:
-                ups[i] = landed[int(stays.argmin())]  # where the first that moved came to lie
+                ups[i] = landed[int(stays.argmin())]  # final pose of the first object that moved
         waiting = [i for i in waiting if i not in found]
         if not waiting:
             break
@@ -159,7 +161,7 @@ def _settle(body: _Body, directions: Array) -> tuple[Array, list[int]]:
 
 
 def _firm(body: _Body, directions: Array, which: list[int]) -> tuple[Array, list[int]]:
-    """Leave out poses that a touch would topple, unless there are no others; arguments and result as of `_settle`."""
+    """Drop poses with small toppling angles, unless there are no others; arguments and result as in `_settle`."""
     if len(directions) == 0:
         return directions, which
     margins = np.array([toppling_angle(body.cooked, body.solid.center_of_mass, up) for up in directions])
@@ -169,7 +171,7 @@ def _firm(body: _Body, directions: Array, which: list[int]) -> tuple[Array, list
 
 
 def _simulate(body: _Body, starts: Array) -> Array:
-    """Poses (N, 4, 4) one second after the object was put down in each of the poses (N, 4, 4), one object each."""
+    """Return the poses (N, 4, 4) after 1 s of objects placed in poses (N, 4, 4)."""
     offsets = grid_origins(len(starts))
     with engine_settings():
         scene = make_scene()

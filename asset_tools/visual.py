@@ -1,4 +1,4 @@
-"""Light copies of scanned meshes for rendering: few faces, one small texture."""
+"""Make copies of meshes for rendering, with few faces and one small texture."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
 
-CREASE = np.cos(np.deg2rad(40))  # faces that meet more sharply get an edge, not a smooth normal
-SAMPLES = 150_000  # on the original surface, to find the face that a texel shows
-NEAR = 20  # samples whose faces are compared where looks are layered
-NORMAL_WEIGHT = 0.02  # of the diagonal; keeps the two sides of a thin shell apart, hardly moves anything else
+CREASE = np.cos(np.deg2rad(40))  # cosine of the angle above which an edge stays sharp
+SAMPLES = 150_000  # on the original surface, for finding the face of a texel
+NEAR = 20  # compared faces for layered surfaces
+NORMAL_WEIGHT = 0.02  # of the diagonal; separates the two sides of a thin shell
 
 
 def to_display(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: int = 512) -> trimesh.Trimesh:
-    """A copy of a mesh with few faces and one small texture, in the same frame, its normals outward.
+    """Return a copy of a mesh with few faces, one small texture and outward normals, in the same frame.
 
-    A textured mesh within the limit keeps its vertices and UVs. A larger one is simplified and unwrapped anew, and
-    its colours are baked into the new texture; so are vertex and face colours. One of a single colour has no texture.
+    A textured mesh within the limit keeps its vertices and UVs. A larger mesh is simplified and unwrapped again, and
+    its colours are baked into a new texture, like vertex and face colours. A mesh of one colour has no texture.
     Transparency is dropped.
 
     Args:
         mesh: textured, coloured or plain; any unit.
-        triangles: most faces of the result; up to six times as many where it has many holes or pieces.
-        texture_size: largest side of its texture, pixels.
+        triangles: maximum number of faces; up to six times this number for meshes with many holes or pieces.
+        texture_size: largest side of the texture, pixels.
 
     Returns:
         A mesh with a ``PBRMaterial`` and vertex normals.
 
     Raises:
-        AssetError: the mesh has no faces, or is not finite.
+        AssetError: the mesh has no faces, or has NaN or infinite vertices.
     """
     if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
         raise AssetError(
-            "can't show this mesh", expected="faces, and finite vertices", found=f"{len(mesh.faces)} faces"
+            "cannot render this mesh", expected="faces, and finite vertices", found=f"{len(mesh.faces)} faces"
         )
     source = Appearance(mesh)
     if len(mesh.faces) <= triangles and (source.plain or source.single is not None):
@@ -65,7 +65,7 @@ def to_display(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: in
         if not source.plain:
             origin, faces, uv = _unwrapped(body, texture_size)
             texture = _baked(mesh, source, body, uv[faces], corner_normals, texture_size, same_faces=kept)
-        # a vertex for every different pair of UV vertex and normal
+        # one vertex per pair of UV vertex and normal
         keys = np.column_stack([faces.reshape(-1), np.rint(corner_normals.reshape(-1, 3) * 1e4)])
         _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         vertices = np.asarray(body.vertices)[origin[faces.reshape(-1)[first]]]
@@ -82,17 +82,17 @@ def to_display(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: in
 
 
 class Appearance:
-    """What a mesh looks like: images and UVs with linear tints, or else colours of the corners, sRGB, 0 to 255.
+    """Appearance of a mesh: images and UVs with linear tints, or colours of the corners (sRGB, 0 to 255).
 
     Attributes:
-        images: RGB; empty: colours alone.
+        images: RGB images; empty: only colours.
         texture: (F,) index of the image of each face.
-        uv: (V, 2).
-        tints: (F, 3, 3) linear, of the corners; None: none.
-        colors: (F, 3, 3) of the corners, where there are no images.
-        plain: one colour everywhere.
-        factor: (3,) or (4,) linear colour that the material of the result keeps, 0 to 255.
-        roughness: that it keeps.
+        uv: (V, 2) texture coordinates.
+        tints: (F, 3, 3) linear tints of the corners, or None.
+        colors: (F, 3, 3) colours of the corners, if there are no images.
+        plain: whether the mesh has one colour.
+        factor: (3,) or (4,) linear colour factor of the resulting material, 0 to 255.
+        roughness: roughness of the resulting material.
     """
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
@@ -110,7 +110,7 @@ class Appearance:
         elif isinstance(material, PBRMaterial):
             images, self.factor = [material.baseColorTexture], get_rgba(material.baseColorFactor)
         else:
-            images = [getattr(material, "image", None)]  # a diffuse colour next to it is a mere default
+            images = [getattr(material, "image", None)]  # a diffuse colour in addition to an image is a default value
         self.images = [] if uv is None else [image.convert("RGB") for image in images if image is not None]
         self.colors = np.full((len(mesh.faces), 3, 3), 255.0)
         if visual.kind == "face":
@@ -125,21 +125,21 @@ class Appearance:
 
     @property
     def layered(self) -> bool:
-        """Whether surfaces of different looks may be close together."""
+        """Whether surfaces of different appearance may be close to each other."""
         return len(self.images) > 1 or self.tints is not None
 
     @property
     def single(self) -> Image.Image | None:
-        """The image, where it is all there is to see."""
+        """The only image of a mesh without tints, or None."""
         return self.images[0] if len(self.images) == 1 and self.tints is None else None
 
     def at(self, faces: NDArray, face: NDArray, weights: Array) -> Array:
         """Return colours (N, 3) of points, sRGB, 0 to 255.
 
         Args:
-            faces: (F, 3) of the mesh.
-            face: (N,) that each point is on.
-            weights: (N, 3) of its corners.
+            faces: (F, 3) faces of the mesh.
+            face: (N,) face of each point.
+            weights: (N, 3) barycentric weights.
         """
         if not self.images:
             return np.einsum("nc,ncd->nd", weights, self.colors[face])
@@ -149,7 +149,7 @@ class Appearance:
             own = self.uv[faces[self.texture == index]]
             spread = _double_area(own).sum() / 2 * pixels.width * pixels.height / max(1, len(here))
             scale = min(max(1, round(np.sqrt(spread))), max(pixels.size))
-            image = pixels.reduce(scale)  # finer detail would only alias
+            image = pixels.reduce(scale)  # finer details would alias
             spots = np.einsum("nc,ncd->nd", weights[here], self.uv[faces[face[here]]])
             colors[here] = _bilinear(np.asarray(image, dtype=np.float32), spots)
         if self.tints is not None:
@@ -167,9 +167,9 @@ def _shrunk(image: Image.Image, size: int) -> Image.Image:
 
 
 def _shaded(mesh: trimesh.Trimesh) -> tuple[Array, NDArray, Array, NDArray]:
-    """Return vertices, faces and normals of a mesh, and the vertex that each comes from.
+    """Return vertices, faces and normals of a mesh, and the original index of each vertex.
 
-    Where the mesh has no normals of its own, vertices are split at sharp edges.
+    If the mesh has no normals, vertices are split at sharp edges.
     """
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     own = mesh._cache.cache.get("vertex_normals")
@@ -185,7 +185,7 @@ def _shaded(mesh: trimesh.Trimesh) -> tuple[Array, NDArray, Array, NDArray]:
 
 
 def _crease_normals(body: trimesh.Trimesh) -> Array:
-    """(F, 3, 3) normals of the corners: the mean of those faces round the vertex that bend away little."""
+    """Return corner normals (F, 3, 3): the mean over adjacent faces without a sharp edge in between."""
     faces = np.asarray(body.faces)
     corner_vertex = faces.reshape(-1)
     order = np.argsort(corner_vertex, kind="stable")
@@ -205,7 +205,7 @@ def _crease_normals(body: trimesh.Trimesh) -> Array:
 
 
 def _unwrapped(body: trimesh.Trimesh, size: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """The vertex that each UV vertex comes from, faces of UV vertices and (V, 2) UVs in 0 to 1, without overlaps."""
+    """Unwrap a mesh; return the vertex of each UV vertex, faces of UV vertices, and UVs (V, 2) without overlaps."""
     import xatlas
 
     scaled = (np.asarray(body.vertices) - body.bounds[0]) / np.linalg.norm(body.extents)
@@ -228,16 +228,16 @@ def _baked(
     *,
     same_faces: bool = False,
 ) -> Image.Image:
-    """Return the new texture: every texel shows the point of the original surface next to it.
+    """Bake a new texture: each texel gets the colour of the closest point on the original surface.
 
     Args:
-        mesh: the original.
-        source: what it looks like.
-        body: what the texture is for.
-        corner_uv: (F, 3, 2) of it.
-        corner_normals: (F, 3, 3) of it.
-        size: of the texture, pixels.
-        same_faces: the faces of ``body`` are those of ``mesh``, in the same order.
+        mesh: the original mesh.
+        source: appearance of the original mesh.
+        body: simplified mesh for the texture.
+        corner_uv: (F, 3, 2) UVs of its corners.
+        corner_normals: (F, 3, 3) normals of its corners.
+        size: size of the texture, pixels.
+        same_faces: whether ``body`` has the faces of ``mesh`` in the same order.
     """
     rows, columns, face, weights = _rasterised(corner_uv, size)
     if same_faces:
@@ -253,12 +253,12 @@ def _baked(
     pixels[rows, columns] = np.clip(np.rint(colors), 0, 255)
     empty[rows, columns] = False
     near: Any = distance_transform_edt(empty, return_distances=False, return_indices=True)
-    return Image.fromarray(pixels[near[0], near[1]])  # gaps show their neighbours, so that no seam is dark
+    return Image.fromarray(pixels[near[0], near[1]])  # fill gaps with their neighbours, to avoid dark seams
 
 
 def _rasterised(corner_uv: Array, size: int) -> tuple[NDArray, NDArray, NDArray, Array]:
-    """Row, column, face and (N, 3) barycentric weights of each texel that a face covers, or that lies one beside."""
-    corners = corner_uv * (size, -size) + (-0.5, size - 0.5)  # (F, 3, 2) column, row; whole numbers are centres
+    """Return row, column, face and barycentric weights (N, 3) of texels that a face covers, with a margin of 1."""
+    corners = corner_uv * (size, -size) + (-0.5, size - 0.5)  # (F, 3, 2) column, row; integers are centres of texels
     areas = _double_area(corners)
     index = np.flatnonzero(areas > 1e-9)
     low = np.clip(np.floor(corners[index].min(axis=1)).astype(int), 0, size - 1)
@@ -273,20 +273,20 @@ def _rasterised(corner_uv: Array, size: int) -> tuple[NDArray, NDArray, NDArray,
     edges = np.linalg.norm(corners[:, [2, 0, 1]] - corners[:, [1, 2, 0]], axis=2)
     inside = (weights * areas[face, None] / edges[face]).min(axis=1)  # distance to the nearest edge, texels
     keep = np.flatnonzero(inside > -1)
-    keep = keep[np.argsort(inside[keep], kind="stable")][::-1]  # the face that holds a texel best comes first
+    keep = keep[np.argsort(inside[keep], kind="stable")][::-1]  # the face that contains a texel best comes first
     _, first = np.unique(row[keep] * size + column[keep], return_index=True)
     keep = keep[first]
     return row[keep], column[keep], face[keep], _clamped(weights[keep])
 
 
 def _closest(mesh: trimesh.Trimesh, points: Array, normals: Array, *, layered: bool) -> tuple[NDArray, Array]:
-    """Return the face of the original next to each point, and (N, 3) weights of its corners.
+    """Return the closest face of the original mesh for each point, and barycentric weights (N, 3).
 
     Args:
-        mesh: the original.
-        points: (N, 3).
-        normals: (N, 3); faces that look another way are far.
-        layered: surfaces of different looks may be close together, such as a label on a bottle.
+        mesh: the original mesh.
+        points: (N, 3) points.
+        normals: (N, 3) normals; faces with other directions count as far.
+        layered: whether surfaces of different appearance may be close, such as a label on a bottle.
     """
     triangles = np.asarray(mesh.triangles)
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -305,7 +305,7 @@ def _closest(mesh: trimesh.Trimesh, points: Array, normals: Array, *, layered: b
         return face[near], _clamped(_barycentric(triangles, face[near], points))
     best, weights = np.zeros(len(points), int), np.zeros((len(points), 3))
     shortest = np.full(len(points), np.inf)
-    for candidates in face[near].T:  # samples tell layers apart only where they are dense
+    for candidates in face[near].T:  # samples alone distinguish layers only if they are dense
         spread = _clamped(_barycentric(triangles, candidates, points))
         distance = np.linalg.norm(np.einsum("nc,ncd->nd", spread, triangles[candidates]) - points, axis=1)
         nearer = distance < shortest
@@ -314,7 +314,7 @@ def _closest(mesh: trimesh.Trimesh, points: Array, normals: Array, *, layered: b
 
 
 def _barycentric(triangles: Array, face: NDArray, points: Array) -> Array:
-    """(N, 3) weights of points, projected to the plane of their face, in any dimension."""
+    """Return barycentric weights (N, 3) of points, projected to the plane of their face, in any dimension."""
     first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     aa, ab, bb = (first * first).sum(axis=1), (first * second).sum(axis=1), (second * second).sum(axis=1)
     scale = 1 / np.maximum(aa * bb - ab * ab, 1e-300)
@@ -336,7 +336,7 @@ def _double_area(corners: Array) -> Array:
 
 
 def _bilinear(image: NDArray[np.float32], uv: Array) -> Array:
-    """(N, 3) colours at (N, 2) UVs, v upward; outside of 0 to 1 the image repeats."""
+    """Return colours (N, 3) at UVs (N, 2), v upward; the image repeats outside of 0..1."""
     height, width = image.shape[:2]
     column, row = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
     left, top = np.floor(column).astype(int), np.floor(row).astype(int)

@@ -203,7 +203,7 @@ def rhinoceros() -> Model:
 
 
 def monkey() -> Model:
-    """Brown, sitting: round ears, a tan face, arms on its knees, the tail curled beside it."""
+    """Brown, sitting: round ears, a tan face, arms on its knees, the tail curled at its side."""
     brown: Colour = (120, 74, 44)
     tan: Colour = (232, 190, 146)
     face = polygon([(float(y), float(z)) for y, z in _heart(0, 60.5, 13.0, 12.5)])

@@ -85,7 +85,7 @@ def turned(axis: str, center: Point, profile: Sequence[tuple[float, float]], rad
         profile: (along, radius) from one end to the other.
         radius: of its rounded edges.
     """
-    # The closing edge lies on the axis: it is no surface.
+    # The closing edge is on the axis and gives no surface.
     line = polygon([(profile[0][0], 0.0), *profile, (profile[-1][0], 0.0)], closed=False)
 
     def field(points: np.ndarray) -> np.ndarray:
@@ -164,7 +164,7 @@ def polygon(corners: Sequence[tuple[float, float]], *, closed: bool = True) -> F
 
 
 def both_sides(field: Field) -> Field:
-    """What lies at y > 0, and its mirror image."""
+    """Return the part at y > 0 and its mirror image."""
     return lambda points: field(np.column_stack([points[:, 0], np.abs(points[:, 1]), points[:, 2]]))
 
 

@@ -64,7 +64,7 @@ def bottle(
 
 
 def flip_top_bottle(size: Size, *, exponent: float, cap_height: float, taper: float, waist: float) -> Shape:
-    """An oval bottle with a waist, whose shoulders go on into a wide oval cap.
+    """An oval bottle with a waist, whose shoulders continue in a wide oval cap.
 
     Args:
         size: see ``shapes``. exponent: of its section.
@@ -152,7 +152,7 @@ def tube(size: Size, *, cap_radius: float, cap_height: float, flare: float = 1.0
     Args:
         size: see ``shapes``; the depth is the diameter of the round end.
         cap_radius: of the cap where it meets the tube, m. cap_height: m.
-        flare: how much wider the cap is where the tube stands on it.
+        flare: additional width of the cap at its base.
     """
     r, h, thick = size[1] / 2, size[2], 0.0008
     perimeter = 2 * np.pi * r
@@ -194,7 +194,7 @@ def _bottle(
     Args:
         size: see ``shapes``. side, shoulder, cap: rings, upwards.
         cuts: see ``stacked_pieces``. pieces: convex ones, instead of those cut there.
-        spout: a part of its own.
+        spout: a separate part.
     """
     a, b, _, n, _ = side[0]
     shoulder, cap = [(*side[-1][:4], 0), *shoulder], [(*shoulder[-1][:4], 0), *cap]

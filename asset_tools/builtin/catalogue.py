@@ -85,10 +85,10 @@ class Product(StrictModel):
 
     Attributes:
         id: its folder's name, and its key in the file. category: its kind.
-        size: outer size (x, y, z), upright or as it usually lies, m.
+        size: outer size (x, y, z), upright or in its usual pose, m.
         mass: kg.
         roughness: of the surface, 0 mirror to 1 chalk.
-        graspnet_id: of the object of GraspNet-1Billion that it stands in for.
+        graspnet_id: of the object of GraspNet-1Billion that it replaces.
         spoken: name for language; empty: made of the id.
         hollow: a container, or thin: its hulls are judged by distance, not by volume.
         shape: makes the shape of that size. paint: makes its texture.

@@ -1,4 +1,4 @@
-"""What walls and floors are covered with: pictures of 2 x 2 m that tile.
+"""What walls and floors are covered with: images of 2 x 2 m that tile.
 
 Joints are soft: cameras see them from afar, and renderers without mip maps would tear sharp ones into dashes.
 """

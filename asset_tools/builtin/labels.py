@@ -43,7 +43,7 @@ class Label(StrictModel):
         base, accent: the package's colours. ink: of the letters. outline: around the title's letters, or none.
         amount_ink: of the amount, where the ground there differs.
         style: how the accent colour is laid out.
-        motif: a picture of ``MOTIFS``.
+        motif: an image of ``MOTIFS``.
         cap: colour of lids, caps and nozzles. ridged: with grooves to turn it by; otherwise it flips open.
         turn: degrees by which the front is turned (tubes: 90).
         facts: the table on the back, of ``FACTS``.

@@ -1,4 +1,4 @@
-"""Materials as pictures that tile: wood, paint, metal, stone, wickerwork.
+"""Materials as images that tile: wood, paint, metal, stone, wickerwork.
 
 A paint is called with a `Grid` and a generator and gives colours (h, w, 3), 0 to 255, top row first.
 """
@@ -24,12 +24,12 @@ RED: Colour = (184, 34, 30)
 
 @dataclass(frozen=True)
 class Grid:
-    """Where the pixels of a picture are.
+    """Positions of the pixels of an image.
 
     Attributes:
         x: (h, w) to the right, m; the grain of wood runs this way.
         y: (h, w) upwards, m.
-        size: width and height of the picture, m.
+        size: width and height of the image, m.
     """
 
     x: Array
@@ -38,14 +38,14 @@ class Grid:
 
     @classmethod
     def of(cls, size: tuple[float, float], pixels: tuple[int, int]) -> Grid:
-        """The grid of a picture of so many metres and pixels, width and height."""
+        """Make the grid of an image from its size in m and in pixels (width, height)."""
         right = (np.arange(pixels[0]) + 0.5) / pixels[0] * size[0]
         up = (np.arange(pixels[1])[::-1] + 0.5) / pixels[1] * size[1]
         x, y = np.meshgrid(right, up)
         return cls(x, y, size)
 
     def noise(self, rng: np.random.Generator, feature: tuple[float, float], *, slope: float = 2.0) -> Array:
-        """Noise (h, w) of mean 0 and deviation 1 that repeats with the picture.
+        """Noise (h, w) of mean 0 and deviation 1 that repeats with the image.
 
         Args:
             rng: which noise.
@@ -62,12 +62,12 @@ class Grid:
         return result / result.std()
 
     def cells(self, cell: tuple[float, float], *, shift: float = 0.0, phase: float = 0.5) -> Cells:
-        """Rows of rectangles that fit the picture a whole number of times; a row of one rectangle is endless.
+        """Rows of rectangles that fit the image a whole number of times; a row of one rectangle is endless.
 
         Args:
             cell: width and height, m.
             shift: by how many cells each row is pushed against the one before.
-            phase: share of a cell by which all are moved, so that no joint lies on the picture's border.
+            phase: share of a cell by which all are moved, so that no joint lies on the image's border.
         """
         columns, rows = (round(self.size[i] / cell[i]) for i in (0, 1))
         wide, high = self.size[0] / columns, self.size[1] / rows
@@ -94,11 +94,11 @@ class Cells:
         """A number in -1 to 1 for each cell, at its pixels (h, w)."""
         return rng.uniform(-1, 1, self.count)[self.row, self.column]
 
-    def shuffled(self, picture: Array, rng: np.random.Generator) -> Array:
-        """Each cell shows another place of a picture that tiles."""
-        down, right = (rng.integers(0, n, self.count)[self.row, self.column] for n in picture.shape[:2])
-        rows, columns = np.indices(picture.shape[:2])
-        return picture[(rows + down) % picture.shape[0], (columns + right) % picture.shape[1]]
+    def shuffled(self, image: Array, rng: np.random.Generator) -> Array:
+        """Each cell shows another place of an image that tiles."""
+        down, right = (rng.integers(0, n, self.count)[self.row, self.column] for n in image.shape[:2])
+        rows, columns = np.indices(image.shape[:2])
+        return image[(rows + down) % image.shape[0], (columns + right) % image.shape[1]]
 
 
 Paint = Callable[[Grid, np.random.Generator], Array]
@@ -110,7 +110,7 @@ class Material:
 
     Attributes:
         size: of the sample, m, along the grain first.
-        paint: its picture.
+        paint: its image.
         detail: how many times more pixels per metre it gets than others in the same texture.
     """
 

@@ -49,7 +49,7 @@ class Model:
         parts: united in this order; each point of the surface has the colour of the nearest.
         low, high: box that holds the body.
         decorate: paints details over the parts' colours.
-        floor: level below which everything is cut off, so that it stands.
+        floor: level below which the shape is cut off to get a flat base.
         step, triangles: of the mesh, see ``mesh_of``.
         texture_size: pixels.
         hulls: boxes (low, high); what the body has in each makes one convex collision piece.
@@ -118,7 +118,7 @@ class Model:
         return paint_in_space(shape, colours)
 
     def _pieces(self) -> list[np.ndarray]:
-        """Points (k, 3) of what lies in each box, mm."""
+        """Return points (k, 3) in each box, mm."""
         import manifold3d
 
         solid = manifold3d.Manifold(
@@ -164,12 +164,12 @@ def paint_in_space(shape: Shape, colours: Callable[[np.ndarray, np.ndarray], np.
     points = np.einsum("nc,ncd->nd", weights, shape.vertices[corners])
     normals = np.einsum("nc,ncd->nd", weights, shape.normals[corners])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    picture = np.zeros((size, size, 3), np.uint8)
+    pixels = np.zeros((size, size, 3), np.uint8)
     empty = np.ones((size, size), bool)
-    picture[row, column] = np.clip(np.rint(colours(points, normals)), 0, 255)
+    pixels[row, column] = np.clip(np.rint(colours(points, normals)), 0, 255)
     empty[row, column] = False
     near = distance_transform_edt(empty, return_distances=False, return_indices=True)
-    return as_jpeg(Image.fromarray(picture[near[0], near[1]]).reduce(OVERSAMPLING), 85)  # type: ignore[index]
+    return as_jpeg(Image.fromarray(pixels[near[0], near[1]]).reduce(OVERSAMPLING), 85)  # type: ignore[index]
 
 
 def _texels(uv: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Small pictures for labels, drawn into a square of given centre and radius (pixels)."""
+"""Small images for labels, drawn into a square of given centre and radius (pixels)."""
 
 from __future__ import annotations
 

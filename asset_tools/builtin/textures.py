@@ -201,7 +201,7 @@ class Painter:
 
 
 def as_jpeg(image: Image.Image, quality: int = 88) -> Image.Image:
-    """The same picture, loaded back from JPEG, so that exporters embed it as such."""
+    """The same image, loaded back from JPEG, so that exporters embed it as such."""
     data = io.BytesIO()
     image.convert("RGB").save(data, "JPEG", quality=quality, subsampling=0, optimize=True)
     data.seek(0)

@@ -27,7 +27,7 @@ SILVER: Colour = (206, 208, 212)
 
 
 def power_drill() -> Model:
-    """Cordless: an orange housing, a black chuck and grip; it stands on its battery."""
+    """Cordless: an orange housing, a black chuck and grip; the battery is its base."""
     orange: Colour = (236, 98, 22)
 
     def decorate(points, normals, colours, rng):
@@ -226,7 +226,7 @@ def padlock() -> Model:
 
 
 def both_sides_x(field):
-    """What lies at x > 0, and its mirror image."""
+    """Return the part at x > 0 and its mirror image."""
     turned_field = both_sides(lambda points: field(points[:, [1, 0, 2]]))
     return lambda points: turned_field(points[:, [1, 0, 2]])
 

@@ -40,7 +40,7 @@ def rubiks_cube(size: Size) -> Shape:
         u, v = np.meshgrid(line, line)
         u_groove, v_groove = np.meshgrid(is_groove, is_groove)
         u_edge, v_edge = np.meshgrid(is_edge, is_edge)
-        # A point sinks below every face it lies on: by grooves across that face, and by the bevel along its edges.
+        # A point sinks below each of its faces: by grooves across that face, and by the bevel along its edges.
         points = np.zeros((*u.shape, 3))
         on_edge = u_edge.astype(int) + v_edge
         sink = np.where(u_groove | v_groove, SINK, 0.0)
@@ -104,7 +104,7 @@ def paint_racquetball(shape: Shape, rng: np.random.Generator) -> Image.Image:
     def colours(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         x, y, z = (1000 * points).T
         result = np.tile(np.array([24, 78, 190], float), (len(points), 1))
-        # The seam of two halves; it lies level as on a ball that was just moulded.
+        # The horizontal seam of the two moulded halves.
         result *= (1 - 0.45 * np.exp(-((z / 0.45) ** 2)) + 0.22 * np.exp(-(((np.abs(z) - 1.2) / 0.5) ** 2)))[:, None]
         front = y < 0
         result[front & lettering("PRO", x, z - 11.5, 7.0)] = (240, 244, 250)

@@ -44,7 +44,7 @@ def block(low: Corner, high: Corner, bevel: float = 0.0) -> Array:
 
 
 def disc(center: Vec3, radius: float, thickness: float, *, sides: int = 28, bevel: float = 0.0) -> Array:
-    """Corners of an upright prism that stands for a cylinder; the centre is its bottom's."""
+    """Return the corners of a vertical prism that approximates a cylinder; the centre is that of its bottom."""
     angles = (np.arange(sides) + 0.5) * 2 * np.pi / sides
     ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     levels = [(0.0, radius), (thickness, radius)]
@@ -106,7 +106,7 @@ class Body:
     def bar_handle(
         self, middle: Corner, length: float, material: str, *, along: Literal["y", "z"], bar: float = BAR
     ) -> None:
-        """Add a bar on two posts in front of a face that looks along x; ``middle`` is the bar's axis' middle."""
+        """Add a bar on two posts in front of a face with normal x; ``middle`` is the bar's axis' middle."""
         x, *_ = middle
         axis = 1 if along == "y" else 2
         half = np.full(3, bar / 2)

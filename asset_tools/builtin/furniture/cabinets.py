@@ -147,7 +147,7 @@ def container() -> FurnitureSource:
     y = (divider - 0.03, inner[1] - clear)
     z = (layers[0] + clear, height - board - clear)
     door.board((x, y[0], z[0]), (x + 0.021, y[1], z[1]), "wood", bevel=0.002, grain=2)
-    grip = (0.378, 0.672, 0.557)  # upstream's, whose origin lies 0.557 m above the floor
+    grip = (0.378, 0.672, 0.557)  # as in RoboCAS-v0, whose origin is 0.557 m above the floor
     door.bar_handle(np.array(grip), 0.30, "steel", along="z")
     joint = slide("door_slide", (0.0, -1.0, 0.0), 0.55)
     ceilings = (layers[1] - board, height - board)

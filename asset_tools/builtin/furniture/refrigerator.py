@@ -22,7 +22,7 @@ GLASS = coat((196, 218, 216))
 
 
 def refrigerator() -> FurnitureSource:
-    """Both doors hang on the left edge; origin on the floor under its middle."""
+    """Both doors have hinges on the left edge; the origin is on the floor under the centre."""
     body = Body({"enamel": ENAMEL, "liner": LINER, "glass": GLASS, "dark": DARK}, seed=9, texture=256, roughness=0.35)
     inner = HALF - WALL
     bottom = 0.10

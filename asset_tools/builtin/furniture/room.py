@@ -25,7 +25,7 @@ def room(pixels: int = PIXELS) -> FurnitureSource:
     """A closed room around the world's origin, seen from inside; it has no door.
 
     Args:
-        pixels: width of the pictures of its walls and floors.
+        pixels: width of the images of its walls and floors.
     """
     outer = HALF + SLAB
     pieces = [block((-outer, -outer, -SLAB), (outer, outer, 0))]
@@ -87,8 +87,8 @@ def _picture(paint: Paint, pixels: int) -> Image.Image:
     return Image.fromarray(np.clip(colours, 0, 255).astype(np.uint8))
 
 
-def _tiled(quads: list[Quad], picture: Image.Image) -> trimesh.Trimesh:
-    """Each quad shows the whole picture."""
+def _tiled(quads: list[Quad], image: Image.Image) -> trimesh.Trimesh:
+    """Each quad shows the whole image."""
     points = np.concatenate([[corner, corner + right, corner + right + up, corner + up] for corner, right, up in quads])
     normals = np.concatenate([[np.cross(right, up)] * 4 for _, right, up in quads])
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
@@ -96,7 +96,7 @@ def _tiled(quads: list[Quad], picture: Image.Image) -> trimesh.Trimesh:
     faces = (first + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
     uv = np.tile([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], (len(quads), 1))
     material = PBRMaterial(
-        baseColorTexture=picture, baseColorFactor=[255, 255, 255, 255], metallicFactor=0.0, roughnessFactor=0.8
+        baseColorTexture=image, baseColorFactor=[255, 255, 255, 255], metallicFactor=0.0, roughnessFactor=0.8
     )
     return trimesh.Trimesh(
         points,

@@ -22,7 +22,7 @@ ROUNDING_STEPS = 3
 
 
 def basket() -> FurnitureSource:
-    """A red woven basket, open on top; its origin lies 0.096 m above its bottom."""
+    """A red woven basket, open on top; its origin is 0.096 m above its bottom."""
     side = Material((1.2, 0.19), partial(woven, cell=(0.014, 0.01)))
     paints = {"rim": Material((1.2, 0.04), plaited)} | dict.fromkeys(("side", "inside", "floor", "bottom"), side)
     shape, pieces, floor, inside, top = _vessel(
