@@ -1,4 +1,4 @@
-"""A result for tests of branches, with failures as text."""
+"""Episode result for tests of decisions, with failures as text."""
 
 from __future__ import annotations
 

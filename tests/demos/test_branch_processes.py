@@ -1,4 +1,4 @@
-"""Branches as processes: killed, crashing, slow, interrupted, printing, and gone with their parents."""
+"""Forked decisions with killed, crashing, slow, interrupted and printing processes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def forked(decide, notes=None):
 
 
 @pytest.mark.parametrize("signal_", [signal.SIGSEGV, signal.SIGKILL])
-def test_a_child_that_crashes_is_played_once_more_and_passed_over(signal_, tmp_path):
+def test_crashed_candidate_is_played_once_more_and_then_skipped(signal_, tmp_path):
     def play(letter):
         with (tmp_path / "played").open("a") as file:
             file.write(letter)
@@ -53,7 +53,7 @@ def test_a_child_that_crashes_is_played_once_more_and_passed_over(signal_, tmp_p
     assert (tmp_path / "played").read_text() == "aab"
 
 
-def test_a_crash_further_on_is_a_failed_attempt():
+def test_crash_after_the_decision_is_a_failed_attempt():
     def decide(runner):
         if runner.choose("ab", lambda letter: 0.0) == "a":
             os.kill(os.getpid(), signal.SIGSEGV)
@@ -64,8 +64,8 @@ def test_a_crash_further_on_is_a_failed_attempt():
 
 
 @pytest.mark.parametrize("moment", ["it plays", "it goes on", "it waits"])
-def test_a_child_that_is_killed_once_changes_nothing(tmp_path, moment):
-    """Three candidates are compared; b is the best. It, or a later decision's, is killed from outside, once."""
+def test_child_killed_once_does_not_change_the_episode(tmp_path, moment):
+    """Three candidates are compared, b is the best. Its process or that of a later decision is killed once."""
 
     def kill_once(when):
         if when == moment and not (tmp_path / "killed").exists():
@@ -100,7 +100,7 @@ def test_a_child_that_is_killed_once_changes_nothing(tmp_path, moment):
     assert notes.texts == ["end: ba", "end: bb"]
 
 
-def test_a_child_that_takes_too_long_is_ended(monkeypatch):
+def test_child_that_exceeds_the_time_limit_is_killed(monkeypatch):
     monkeypatch.setattr(branches, "CANDIDATE_TIMEOUT", 0.2)
 
     def play(letter):
@@ -114,7 +114,7 @@ def test_a_child_that_takes_too_long_is_ended(monkeypatch):
     assert forked(decide)[0]
 
 
-def test_a_child_that_dies_in_the_middle_of_a_message_is_gone():
+def test_child_that_ends_during_a_message_has_crashed():
     def decide(runner):
         def play(letter):
             if letter == "a":
@@ -129,7 +129,7 @@ def test_a_child_that_dies_in_the_middle_of_a_message_is_gone():
     assert (ended, notes.texts) == (True, [])
 
 
-def test_a_broken_pipe_of_the_attempt_is_its_error_not_a_crash(tmp_path):
+def test_broken_pipe_error_of_the_attempt_is_not_a_crash(tmp_path):
     def decide(runner):
         runner.choose("a", lambda letter: 0.0)
         with (tmp_path / "gone_on").open("a") as file:
@@ -141,7 +141,7 @@ def test_a_broken_pipe_of_the_attempt_is_its_error_not_a_crash(tmp_path):
     assert (tmp_path / "gone_on").read_text() == "a"
 
 
-def test_where_no_process_can_be_started_the_error_says_what_to_do(monkeypatch):
+def test_error_of_fork_names_a_fix(monkeypatch):
     def refuse():
         raise BlockingIOError(11, "Resource temporarily unavailable")
 
@@ -150,7 +150,7 @@ def test_where_no_process_can_be_started_the_error_says_what_to_do(monkeypatch):
         forked(lambda runner: runner.choose("a", lambda letter: 0.0))
 
 
-def test_an_interrupt_while_a_child_says_its_last_word_ends_the_child(monkeypatch, tmp_path):
+def test_interrupt_during_the_last_message_ends_the_child(monkeypatch, tmp_path):
     class Interrupted(Connection):
         def send(self, obj):
             raise KeyboardInterrupt
@@ -176,8 +176,8 @@ def test_an_interrupt_while_a_child_says_its_last_word_ends_the_child(monkeypatc
     assert (ended, notes.texts) == (True, [])
 
 
-def test_threads_that_write_do_not_hold_up_branches(capfd):
-    """As progress bars do: their locks may be held at the moment of a fork, by threads that the child has not."""
+def test_writing_threads_do_not_block_forked_processes(capfd):
+    """Threads such as progress bars may hold locks of streams during a fork; the child does not have them."""
     over = threading.Event()
 
     def write():
@@ -206,7 +206,7 @@ def test_threads_that_write_do_not_hold_up_branches(capfd):
     assert capfd.readouterr().err.count("in a branch\n") >= 20
 
 
-def test_an_error_says_where_in_a_child_it_came_from():
+def test_error_of_a_child_has_its_traceback():
     def divide(letter):
         return 1 / 0
 
@@ -223,7 +223,7 @@ def test_an_error_says_where_in_a_child_it_came_from():
     assert text.count("Traceback") == 1
 
 
-def test_an_interrupt_in_a_new_child_ends_the_run_not_its_siblings(monkeypatch):
+def test_interrupt_in_a_new_child_ends_the_run(monkeypatch):
     set_up_forked_process, me = branches.set_up_forked_process, os.getpid()
 
     def interrupted(parent):
@@ -247,7 +247,7 @@ def test_an_interrupt_in_a_new_child_ends_the_run_not_its_siblings(monkeypatch):
             os._exit(1)
 
 
-def test_what_children_print_comes_once_and_streams_may_be_missing(capfd, monkeypatch):
+def test_output_of_children_is_printed_once_and_streams_may_be_missing(capfd, monkeypatch):
     def decide(runner):
         print("before", end="")
         runner.choose("ab", lambda letter: 0.0)
@@ -278,7 +278,7 @@ runner.run(attempt)
 """
 
 
-def test_children_die_with_their_parent():
+def test_children_end_with_their_parent():
     with subprocess.Popen([sys.executable, "-c", SLEEPER], stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
         last = int(parent.stdout.readline())
@@ -297,7 +297,7 @@ def alive(pid: int) -> bool:
         return False
 
 
-def test_where_a_process_must_not_be_forked(monkeypatch):
+def test_reasons_not_to_fork(monkeypatch):
     assert reason_not_to_fork(renders=True) == "a renderer is open"
     assert reason_not_to_fork(renders=False) == ("" if sys.platform == "linux" else "this is not Linux")
     monkeypatch.setattr(sys, "platform", "darwin")

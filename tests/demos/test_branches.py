@@ -1,4 +1,4 @@
-"""Decisions that are undone: by forking, and by running again. A list of letters stands for the simulator."""
+"""Backtracking by forking and by simulating again, with a list of letters as the simulator."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ RUNNERS = [ForkedDecisions, ResimulatedDecisions]
 
 
 class World:
-    """Its state is all that was done since the reset."""
+    """Simulator stand-in whose state is the sequence of actions since the reset."""
 
     def __init__(self) -> None:
         self.done = ""
@@ -24,7 +24,7 @@ class World:
 
 
 def search(decide, good):
-    """Run an attempt that `decide`s; the outcome and the failures."""
+    """Run an attempt with `decide`; return success, outcome and failures."""
     found = []
     for make in RUNNERS:
         notes, world = Notes(), World()
@@ -62,7 +62,7 @@ A_FEW, ALL = {"a": 1.0, "b": 3.0, "c": 2.0}, {"a": 1.0, "b": 2.0, "c": 3.0}  # s
         ),  # the next two
     ],
 )
-def test_ways_are_tried_in_order_until_one_ends_well(good, limits, scores, outcome, failures):
+def test_candidates_are_tried_in_order_until_the_attempt_succeeds(good, limits, scores, outcome, failures):
     def decide(world, runner):
         def play(letter):
             world.act(letter)
@@ -75,7 +75,7 @@ def test_ways_are_tried_in_order_until_one_ends_well(good, limits, scores, outco
     assert found == (bool(outcome), outcome, [f"end: {end}" for end in failures.split()])
 
 
-def test_enough_ends_the_comparison():
+def test_sufficient_score_ends_the_comparison():
     scores = {"a": 1.0, "b": 5.0, "c": 9.0}
 
     def decide(world, runner):
@@ -86,7 +86,7 @@ def test_enough_ends_the_comparison():
     assert search(decide, {"b"}) == (True, "b", [])
 
 
-def test_a_candidate_that_can_not_be_played_is_passed_over():
+def test_infeasible_candidate_is_skipped():
     def decide(world, runner):
         def play(letter):
             world.act(letter)
@@ -100,7 +100,7 @@ def test_a_candidate_that_can_not_be_played_is_passed_over():
     assert search(decide, {"c!"}) == (True, "c!", [])
 
 
-def test_where_no_candidate_can_be_played_the_policy_may_do_something_else():
+def test_policy_may_continue_without_a_feasible_candidate():
     def decide(world, runner):
         def no(letter):
             world.act(letter)
@@ -114,7 +114,7 @@ def test_where_no_candidate_can_be_played_the_policy_may_do_something_else():
     assert search(decide, {"y"}) == (True, "y", ["end: x"])
 
 
-def test_without_undoing_the_first_that_can_be_played_stays():
+def test_irreversible_decisions_take_the_first_feasible_candidate():
     world = World()
 
     def play(letter):
@@ -132,7 +132,7 @@ def test_without_undoing_the_first_that_can_be_played_stays():
     assert world.done == "bc"
 
 
-def test_candidates_are_taken_as_they_are_needed():
+def test_candidates_are_evaluated_lazily():
     def candidates():
         yield "a"
         raise AssertionError("nobody asked for another")
@@ -144,7 +144,7 @@ def test_candidates_are_taken_as_they_are_needed():
         order.send(None)
 
 
-def test_attempts_are_counted():
+def test_failed_attempts_are_counted():
     order = order_candidates("abc", SearchLimits(), notes := Notes(max_attempts=1))
     assert (next(order), order.send(0.0)) == (("a", False), ("a", True))
     notes.add_failure(PlanningError("end", "a"))

@@ -1,4 +1,4 @@
-"""End to end on the builtin pack: generation, the record, determinism, resuming, replay."""
+"""End-to-end tests with the builtin pack: generation, recordings, determinism, resume, replay."""
 
 import hashlib
 import json
@@ -72,7 +72,7 @@ def state(group) -> dict[str, np.ndarray]:
     return found
 
 
-def test_the_record_is_maniskills_with_what_it_lacks(run):
+def test_recording_has_maniskills_format_with_additional_keys(run):
     summary, out = run
     assert summary.episodes == SEEDS
     data = read_json(summary.trajectory)
@@ -97,7 +97,7 @@ def test_the_record_is_maniskills_with_what_it_lacks(run):
     assert not (out / "episodes").exists()
 
 
-def test_motion_is_a_robots(run):
+def test_motion_respects_the_limits_of_the_robot(run):
     for episode in load(run[0].trajectory).values():
         arm = episode["actions"][:, :7]
         speed = np.abs(np.diff(arm, axis=0)) * 20
@@ -109,7 +109,7 @@ def test_motion_is_a_robots(run):
         assert longest <= 10  # 0.5 s
 
 
-def test_the_same_seed_gives_the_same_episode_bit_for_bit_and_a_run_continues(run, pick_generator, tmp_path):
+def test_same_seed_gives_the_same_episode_bit_for_bit_and_a_run_is_resumed(run, pick_generator, tmp_path):
     summary, _ = run
     whole, last = load(summary.trajectory), read_json(summary.trajectory)["episodes"][-1]
     assert pick_generator.generate(last["episode_seed"], tmp_path, "again").success  # first here, last there
@@ -132,29 +132,29 @@ def test_action_replay_is_exact_and_ee_deltas_succeed(run):
     assert all(r.success for r in replay(ReplaySettings(summary.trajectory, control_mode="pd_ee_delta_pose")))
 
 
-def call_it_done(monkeypatch):
-    """Let policies that only stir count as successful: what is tested is how attempts are kept or undone."""
+def accept_all_attempts(monkeypatch):
+    """Accept all attempts as successful, to test how attempts are kept or undone."""
     flag = Executor.flag
     monkeypatch.setattr(Executor, "flag", lambda self, name: name == "success" or flag(self, name))
     monkeypatch.setattr(OpenLoopChecks, "check", lambda *args, **how: None)
 
 
-def waiting(steps):
-    """A policy that waits, each attempt as many control steps as the next number says; -1: and then fails."""
-    begun, numbers = [], iter(steps)
+def waiting_policy(steps):
+    """Return a policy that waits for a number of control steps per attempt and fails after negative numbers."""
+    starts, numbers = [], iter(steps)
 
     def policy(arm):
-        begun.append(len(arm.executor.actions))
+        starts.append(len(arm.executor.actions))
         number = next(numbers)
         arm.executor.move_gripper(1.0, arm.qpos, seconds=abs(number) * arm.executor.dt)
         if number < 0:
             raise PlanningError("grasp", "missed")
 
-    return policy, begun
+    return policy, starts
 
 
 @pytest.mark.parametrize(
-    ("keep", "steps", "begins"),
+    ("keep", "steps", "expected_starts"),
     [
         (False, [12, 10], [0, 0]),  # one step too many would be 11
         (True, [12, 10], [0, 0]),
@@ -162,16 +162,16 @@ def waiting(steps):
         (True, [-12, 4], [0, 0]),  # failed, and too long for anything to follow
     ],
 )
-def test_what_takes_longer_than_an_episode_may_is_undone(tmp_path, monkeypatch, pick_generator, keep, steps, begins):
+def test_attempt_beyond_the_horizon_is_undone(tmp_path, monkeypatch, pick_generator, keep, steps, expected_starts):
     change(monkeypatch, pick_generator, max_attempts=len(steps), keep_recoveries=keep)
-    call_it_done(monkeypatch)
-    policy, begun = waiting(steps)
+    accept_all_attempts(monkeypatch)
+    policy, starts = waiting_policy(steps)
     monkeypatch.setattr(pick_generator, "policy", policy)
     monkeypatch.setattr(pick_generator, "horizon", 10)
     result = pick_generator.generate(1, tmp_path, "timed")
     assert result.success
-    assert begun[-1] == 0
-    assert begins is None or begun == begins
+    assert starts[-1] == 0
+    assert expected_starts is None or starts == expected_starts
     too_long = [failure.attempt for failure in result.failures if (failure.stage, failure.reason) == TOO_LONG]
     assert too_long == [i for i, number in enumerate(steps[:-1]) if number > 0]
     data = read_json(tmp_path / "timed.h5")["episodes"][0]
@@ -179,25 +179,25 @@ def test_what_takes_longer_than_an_episode_may_is_undone(tmp_path, monkeypatch, 
     assert data["robocas"]["recoveries"] == []
 
 
-def test_a_horizon_at_another_rate_is_the_environments_too():
+def test_horizon_at_another_rate_equals_that_of_the_environment():
     generator = EpisodeGenerator(replace(PICK, control_freq=5))
     assert find_max_episode_steps_value(generator.env) == generator.horizon == 200
     generator.close()
 
 
-def test_that_a_policy_is_done_is_no_success(tmp_path, monkeypatch, pick_generator):
+def test_finished_policy_without_success_is_a_failed_attempt(tmp_path, monkeypatch, pick_generator):
     change(monkeypatch, pick_generator, max_attempts=2)
-    policy, begun = waiting([3, 3])
+    policy, starts = waiting_policy([3, 3])
     monkeypatch.setattr(pick_generator, "policy", policy)
     result = pick_generator.generate(1, tmp_path, "nothing")
     assert not result.success
-    assert begun == [0, 0]
+    assert starts == [0, 0]
     assert [(failure.stage, failure.reason) for failure in result.failures] == [("episode", "no_success")] * 2
     assert not list(tmp_path.iterdir())
 
 
-def stirring(log):
-    """A policy that stirs the heap, may come back there, stirs on and fails at first; notes what it found."""
+def stirring_policy(log):
+    """Return a policy that stirs the heap before and after a backtracking point and fails at first; log states."""
 
     def stir(arm, steps):
         for _ in range(steps):
@@ -220,11 +220,11 @@ def stirring(log):
 
 
 @pytest.mark.parametrize("fork", [True, False])
-def test_the_way_back_to_a_decision_leaves_no_trace(tmp_path, monkeypatch, search_generator, fork):
-    call_it_done(monkeypatch)
+def test_backtracking_to_a_decision_restores_the_state(tmp_path, monkeypatch, search_generator, fork):
+    accept_all_attempts(monkeypatch)
     change(monkeypatch, search_generator, max_attempts=2)
     monkeypatch.setattr(search_generator, "_fork", fork)
-    monkeypatch.setattr(search_generator, "policy", stirring(tmp_path / "log"))
+    monkeypatch.setattr(search_generator, "policy", stirring_policy(tmp_path / "log"))
     result = search_generator.generate(1, tmp_path, "stirred")
     assert [(failure.stage, failure.reason) for failure in result.failures] == [("stir", "enough")]
     first, again = map(json.loads, (tmp_path / "log").read_text().splitlines())
@@ -237,8 +237,8 @@ def test_the_way_back_to_a_decision_leaves_no_trace(tmp_path, monkeypatch, searc
     assert len(load(tmp_path / "stirred.h5")["traj_0"]["actions"]) == 18
 
 
-def test_forked_or_not_a_search_is_the_same_and_replays_bit_for_bit(tmp_path, monkeypatch, search_generator):
-    """Even where a branch is killed from outside while it goes on."""
+def test_search_with_and_without_fork_is_identical_and_replays_bit_for_bit(tmp_path, monkeypatch, search_generator):
+    """This includes a forked process that is killed from outside while it continues."""
     send = ForkedProcess.send
 
     def send_and_kill_the_first(child, result):
@@ -266,14 +266,14 @@ def test_forked_or_not_a_search_is_the_same_and_replays_bit_for_bit(tmp_path, mo
     assert replayed.state_error == 0.0
 
 
-def test_recoveries_stay_unless_the_episode_is_lost(tmp_path, monkeypatch, search_generator):
-    call_it_done(monkeypatch)
+def test_recoveries_are_kept_unless_the_episode_cannot_succeed(tmp_path, monkeypatch, search_generator):
+    accept_all_attempts(monkeypatch)
     change(monkeypatch, search_generator, max_attempts=4, keep_recoveries=True)
     failures = iter([PlanningError("grasp", "missed"), UnrecoverableError("clear", "fell_off_table")])
-    begun = []
+    starts = []
 
     def policy(arm):
-        begun.append(len(arm.executor.actions))
+        starts.append(len(arm.executor.actions))
         arm.executor.move_gripper(-1.0, arm.qpos, seconds=0.2)
         failure = next(failures, None)
         if failure:
@@ -282,31 +282,31 @@ def test_recoveries_stay_unless_the_episode_is_lost(tmp_path, monkeypatch, searc
     monkeypatch.setattr(search_generator, "policy", policy)
     result = search_generator.generate(1, tmp_path, "kept")
     assert result.attempts == 3
-    assert begun[0] == 0
-    assert begun[1] > 4  # what failed stays, and the arm's way out of it
-    assert begun[2] == 0  # all of it undone
+    assert starts[0] == 0
+    assert starts[1] > 4  # what failed stays, and the arm's way out of it
+    assert starts[2] == 0  # all of it undone
     assert read_json(tmp_path / "kept.h5")["episodes"][0]["robocas"]["recoveries"] == []
 
 
 @pytest.mark.parametrize("reason", ["no_success", "clipped", "target_displaced"])
-def test_an_attempt_whose_own_actions_do_not_come_out_the_same_is_undone(tmp_path, monkeypatch, pick_generator, reason):
+def test_attempt_that_fails_the_open_loop_check_is_undone(tmp_path, monkeypatch, pick_generator, reason):
     change(monkeypatch, pick_generator, check_failures=2)
-    world, spoilt = pick_generator.open_loop_envs[-1], []
+    world, modified = pick_generator.open_loop_envs[-1], []
     step, settle = world.step, world.settle
 
     def spoil(action):
         step(action)
-        if not spoilt:
+        if not modified:
             world.clipped += reason == "clipped"
             if reason == "target_displaced":
                 target = world.env.objects[int(world.env.target_slot[0])]
                 target.set_pose(Pose.create_from_pq(target.pose.p + torch.tensor([[0.3, 0.0, 0.0]]), target.pose.q))
             if reason != "no_success":
-                spoilt.append(reason)
+                modified.append(reason)
 
     def fail():
-        spoilt.append(reason)
-        return False if len(spoilt) == 1 and reason == "no_success" else settle()
+        modified.append(reason)
+        return False if len(modified) == 1 and reason == "no_success" else settle()
 
     monkeypatch.setattr(world, "step", spoil)
     monkeypatch.setattr(world, "settle", fail)
@@ -318,10 +318,10 @@ def test_an_attempt_whose_own_actions_do_not_come_out_the_same_is_undone(tmp_pat
     assert (data["check_rate"], data["check_trials"]) == (5, 1)
 
 
-def test_where_noise_alone_spoils_attempts_an_episode_counts_without(tmp_path, monkeypatch, pick_generator):
+def test_after_failures_with_noise_an_episode_is_checked_without_noise(tmp_path, monkeypatch, pick_generator):
     change(monkeypatch, pick_generator, check_failures=2)
     monkeypatch.setattr(pick_generator.open_loop_envs[1], "settle", lambda: False)
-    result = pick_generator.generate(1, tmp_path, "spoilt")
+    result = pick_generator.generate(1, tmp_path, "modified")
     assert result.success
     assert [failure.reason for failure in result.failures].count("no_success_with_noise") == 2
-    assert read_json(tmp_path / "spoilt.h5")["episodes"][0]["robocas"]["check_trials"] == 0
+    assert read_json(tmp_path / "modified.h5")["episodes"][0]["robocas"]["check_trials"] == 0

@@ -1,4 +1,4 @@
-"""Neither an interruption nor a crash of a worker changes what a run ends with: runs on recordings of no content."""
+"""Interrupted runs and worker crashes do not change the result of a run; recordings are stand-ins."""
 
 import json
 import shutil
@@ -16,7 +16,7 @@ from robocas_ms3.demos.recordings.trajectory_json import read_json
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings
 
 SETTINGS = EpisodeSettings("pick")
-HOPELESS = 2  # a seed without an episode
+SKIPPED = 2  # a seed without an episode
 FAILED = {1: ["reach: far"], 2: ["reach: far", "lift: slipped"], 4: ["grasp: missed", "reach: far"]}
 
 
@@ -29,12 +29,12 @@ def failures_of(seed):
 
 
 def lines_of(seed):
-    """What the ledger says of a seed."""
-    return [*failures_of(seed), *([FailedAttempt(seed, -1, "episode", "skipped", 0.0)] if seed == HOPELESS else [])]
+    """Return the lines of ``failures.jsonl`` for a seed."""
+    return [*failures_of(seed), *([FailedAttempt(seed, -1, "episode", "skipped", 0.0)] if seed == SKIPPED else [])]
 
 
 def record(folder, seed):
-    """The file of an episode that a worker has finished."""
+    """Write the file of an episode that a worker has finished."""
     path = folder / f"{shard_name(seed)}.h5"
     with h5py.File(path, "w") as file:
         file.create_group("traj_0").attrs["seed"] = seed
@@ -49,23 +49,23 @@ def record(folder, seed):
 
 @pytest.fixture(autouse=True)
 def made(monkeypatch):
-    """Seeds that were generated, in the order in which they were."""
+    """Record the seeds that are generated, in order."""
     seeds_made = []
 
     def make(settings, seeds, folder, make_roll_in):
         for seed in seeds:
             seeds_made.append(seed)
-            if seed != HOPELESS:
+            if seed != SKIPPED:
                 record(folder, seed)
             failures = failures_of(seed)
-            yield EpisodeResult(seed, seed != HOPELESS, 10 + seed, 1 + len(failures), failures=failures)
+            yield EpisodeResult(seed, seed != SKIPPED, 10 + seed, 1 + len(failures), failures=failures)
 
     monkeypatch.setattr(module, "generate_seeds", make)
     return seeds_made
 
 
 def seeds_of(out):
-    """Seeds of the episodes in the merged file; its JSON and its HDF5 agree."""
+    """Return the seeds of the merged file; check that JSON and HDF5 agree."""
     episodes = read_json(out / "trajectory.h5")["episodes"]
     with h5py.File(out / "trajectory.h5") as file:
         assert sorted(file) == sorted(f"traj_{episode['episode_id']}" for episode in episodes)
@@ -75,8 +75,8 @@ def seeds_of(out):
     return [episode["episode_seed"] for episode in episodes]
 
 
-def begun(out, shards, lines=()):
-    """A run that was killed: workers had finished some seeds, not all of them in their order."""
+def write_killed_run(out, shards, lines=()):
+    """Write the files of a killed run in which workers had finished some seeds out of order."""
     run = {"settings": asdict(SETTINGS), "first_seed": 0}
     (out / "episodes").mkdir(parents=True)
     (out / "run.json").write_text(json.dumps(run))
@@ -86,16 +86,16 @@ def begun(out, shards, lines=()):
 
 
 @pytest.mark.parametrize(
-    ("shards", "given_up", "missing"),
+    ("shards", "skipped", "missing"),
     [((0, 1), (), [2, 3]), ((0, 1, 5), (), [2, 3]), ((0, 4, 6), (2,), [1, 3]), ((1, 3, 4), (), [0, 2])],
 )
-def test_seeds_that_workers_had_finished_ahead_are_in_nobodys_place(tmp_path, made, shards, given_up, missing):
+def test_seeds_finished_out_of_order_are_merged_in_order(tmp_path, made, shards, skipped, missing):
     out = tmp_path / "out"
-    begun(out, shards, [line for seed in given_up for line in lines_of(seed)])
+    write_killed_run(out, shards, [line for seed in skipped for line in lines_of(seed)])
     summary = generate(out, episodes=3)
     assert made == missing
     assert seeds_of(out) == [0, 1, 3]
-    assert (summary.episodes, summary.seeds, summary.skipped) == (3, 4, [HOPELESS])
+    assert (summary.episodes, summary.seeds, summary.skipped) == (3, 4, [SKIPPED])
     assert not (out / "episodes").exists()
 
 
@@ -111,10 +111,10 @@ def test_seeds_that_workers_had_finished_ahead_are_in_nobodys_place(tmp_path, ma
         ((0, 1, 3, 4, 5), [*lines_of(1), *lines_of(2), *lines_of(4), *lines_of(5)]),
     ],
 )
-def test_failures_are_told_as_if_it_had_not_been(tmp_path, shards, lines):
-    """Of all attempts, once each, in the order of the seeds."""
+def test_failures_of_a_resumed_run_are_those_of_an_uninterrupted_run(tmp_path, shards, lines):
+    """Each attempt has one line, in the order of the seeds."""
     started = []
-    begun(tmp_path / "out", shards, lines)
+    write_killed_run(tmp_path / "out", shards, lines)
     found = generate(tmp_path / "out", episodes=4, on_start=started.append)
     whole = generate(tmp_path / "whole", episodes=4)
     assert (tmp_path / "out" / FAILURES_FILE).read_text() == (tmp_path / "whole" / FAILURES_FILE).read_text()
@@ -126,9 +126,9 @@ def test_failures_are_told_as_if_it_had_not_been(tmp_path, shards, lines):
 
 @pytest.mark.parametrize("suffix", [".h5", ".json"])
 @pytest.mark.parametrize("left", [0.5, 0.99, 0])
-def test_what_was_cut_off_is_made_again(tmp_path, made, suffix, left):
+def test_truncated_episodes_are_recorded_again(tmp_path, made, suffix, left):
     out = tmp_path / "out"
-    begun(out, (0, 1), lines_of(1))
+    write_killed_run(out, (0, 1), lines_of(1))
     path = (out / "episodes" / shard_name(1)).with_suffix(suffix)
     path.write_bytes(path.read_bytes()[: int(left * path.stat().st_size)])
     generate(out, episodes=3)
@@ -137,7 +137,7 @@ def test_what_was_cut_off_is_made_again(tmp_path, made, suffix, left):
     assert JsonLinesFile(out / FAILURES_FILE, FailedAttempt).read() == [*lines_of(1), *lines_of(2)]
 
 
-def test_killed_when_all_was_merged_already(tmp_path, made):
+def test_resume_after_a_kill_after_the_merge(tmp_path, made):
     out = tmp_path / "out"
     generate(out, episodes=2)
     (out / "episodes").mkdir()
@@ -148,7 +148,7 @@ def test_killed_when_all_was_merged_already(tmp_path, made):
     assert made == [0, 1, 2, 3]
 
 
-def test_killed_between_the_two_merged_files(tmp_path, made):
+def test_resume_after_a_kill_between_the_two_merged_files(tmp_path, made):
     out = tmp_path / "out"
     generate(out, episodes=2)
     (out / "episodes").mkdir()
@@ -161,7 +161,7 @@ def test_killed_between_the_two_merged_files(tmp_path, made):
     assert made == [0, 1, 2]
 
 
-def test_fewer_than_there_are(tmp_path, made):
+def test_request_for_fewer_episodes_than_exist(tmp_path, made):
     out = tmp_path / "out"
     before = generate(out, episodes=4)
     after = generate(out, episodes=2)
@@ -170,7 +170,7 @@ def test_fewer_than_there_are(tmp_path, made):
     assert made == [0, 1, 2, 3, 4]
 
 
-def test_an_output_folder_that_vanishes_is_one_clear_line(tmp_path, made):
+def test_removed_output_folder_is_a_one_line_error(tmp_path, made):
     out = tmp_path / "out"
     with pytest.raises(RobocasError):
         generate(out, episodes=5, on_result=lambda result: shutil.rmtree(out))

@@ -1,4 +1,4 @@
-"""Actions played without any correction: those of a demonstration succeed again, spoiled ones do not."""
+"""Open-loop replay: actions of demonstrations succeed, modified actions fail."""
 
 import numpy as np
 import pytest
@@ -19,12 +19,12 @@ SEED = 1  # a light target: one that hangs heavily off the gripper bends the arm
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A world to play in, a recording, and the actions that its trials played, one list a world."""
+    """Return an open-loop environment, a recording, and the actions of its open-loop checks per environment."""
     generator = EpisodeGenerator(EpisodeSettings("pick", "pick_table_scattered", "builtin"))
     played = [[], []]
 
-    def listen(world, actions):
-        reset, step = world.reset, world.step
+    def listen(env, actions):
+        reset, step = env.reset, env.step
 
         def reset_(seed, options=None):
             actions.clear()
@@ -34,14 +34,14 @@ def recorded(tmp_path_factory):
             actions.append(np.array(action))
             step(action)
 
-        world.reset, world.step = reset_, step_
+        env.reset, env.step = reset_, step_
         return reset, step
 
-    plain = [listen(world, actions) for world, actions in zip(generator.open_loop_envs, played, strict=True)]
+    plain = [listen(env, actions) for env, actions in zip(generator.open_loop_envs, played, strict=True)]
     folder = tmp_path_factory.mktemp("recorded")
     assert generator.generate(SEED, folder, "one").success
-    for world, (reset, step) in zip(generator.open_loop_envs, plain, strict=True):
-        world.reset, world.step = reset, step
+    for env, (reset, step) in zip(generator.open_loop_envs, plain, strict=True):
+        env.reset, env.step = reset, step
     with TrajectoryFile(folder / "one.h5") as file:
         yield generator.open_loop_envs[0], file.recording(0), [np.array(actions) for actions in played]
     generator.close()
@@ -54,15 +54,15 @@ def own_actions(recording):
     return episode_actions(arrays)[:-1], arrays["ee_pos"]
 
 
-def play(world, actions):
-    world.reset(SEED)
-    return world.replay(actions)
+def play(env, actions):
+    env.reset(SEED)
+    return env.replay(actions)
 
 
-def test_a_demonstrations_own_actions_succeed_again(recorded):
-    world, recording, _ = recorded
+def test_actions_of_a_demonstration_succeed_open_loop(recorded):
+    env, recording, _ = recorded
     actions, tcp = own_actions(recording)
-    played = play(world, actions)
+    played = play(env, actions)
     assert played.success
     assert played.clipped == 0
     error = np.linalg.norm(played.tcp_in_base - tcp, axis=1)
@@ -70,7 +70,7 @@ def test_a_demonstrations_own_actions_succeed_again(recorded):
     assert error.max() < 0.02
 
 
-def test_a_trial_plays_what_a_dataset_will_hold_to_the_last_bit(recorded):
+def test_open_loop_check_replays_the_actions_of_the_dataset_bit_for_bit(recorded):
     _, recording, (clean, noisy) = recorded
     actions, _ = own_actions(recording)
     np.testing.assert_array_equal(clean, actions)
@@ -81,23 +81,23 @@ def test_a_trial_plays_what_a_dataset_will_hold_to_the_last_bit(recorded):
 
 
 @pytest.mark.parametrize(("part", "value"), [(np.s_[:, 6], 1), (np.s_[:2, 0], 0.05)], ids=["open gripper", "beside"])
-def test_spoilt_actions_do_not_succeed(recorded, part, value):
-    world, recording, _ = recorded
+def test_modified_actions_do_not_succeed(recorded, part, value):
+    env, recording, _ = recorded
     actions = own_actions(recording)[0].copy()
     actions[part] = value if value == 1 else actions[part] + value
-    assert not play(world, actions).success
+    assert not play(env, actions).success
 
 
-def test_motion_beyond_a_step_is_counted(recorded):
-    world, *_ = recorded
+def test_clipped_actions_are_counted(recorded):
+    env, *_ = recorded
     actions = np.array([[0, 0, -0.15, 0, 0, 0, 1], [0, 0, 0.01, 0, 0, 0, 1], [0, 0, 0, 0.4, 0, 0.4, 1]])
-    played = play(world, actions)  # the last: 0.57 rad in one step
-    assert len(world.layout.object_ids) == 10
+    played = play(env, actions)  # the last: 0.57 rad in one step
+    assert len(env.layout.object_ids) == 10
     assert played.clipped == 2
     assert not played.success
 
 
 @pytest.mark.parametrize("rate", [0, 2.5, 7])
-def test_rates_that_physics_does_not_know(rate):
+def test_rate_that_does_not_divide_the_rate_of_physics_is_an_error(rate):
     with pytest.raises(DatasetError, match="cannot be replayed at this rate"):
         OpenLoopEnv({"env_id": "robocas_ms3:RoboCASPick-v1", "env_kwargs": {}}, rate)

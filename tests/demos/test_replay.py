@@ -1,4 +1,4 @@
-"""A replay checks that the scene is the recorded one, and compares final states."""
+"""Replay: checks that the scene fits the recording, and comparison of final states."""
 
 # pyright: reportIndexIssue=false, reportArgumentType=false
 import json
@@ -24,7 +24,7 @@ def entry(trajectory):
 
 
 def env_like(recorded, **changes):
-    """What `check_compatible` asks of an environment: one step of the recording, as tensors of one env."""
+    """Return a stand-in for an environment in `check_compatible`: one recorded state as tensors of one env."""
     bodies = {kind: {n: torch.tensor(row)[None] for n, row in of.items()} for kind, of in recorded.states[0].items()}
     return SimpleNamespace(
         control_mode=changes.get("control_mode", recorded.control_mode),
@@ -33,7 +33,7 @@ def env_like(recorded, **changes):
     )
 
 
-def test_only_a_scene_like_the_recorded_one_fits(trajectory):
+def test_incompatible_scene_is_an_error(trajectory):
     recorded = RecordedEpisode.read(trajectory, entry(trajectory))
     recorded.check_compatible(env_like(recorded))
     recorded.check_compatible(env_like(recorded, control_mode="pd_ee_pose", actions=7))
@@ -58,13 +58,13 @@ def tensors(state):
     return {kind: {name: torch.tensor(value)[None] for name, value in of.items()} for kind, of in state.items()}
 
 
-def test_the_greatest_difference_of_any_number():
+def test_state_distance_is_the_greatest_difference():
     assert state_distance(tensors(state((1.0, 2.0), robot=(0.0, -0.5))), state((1.25, 2.0))) == 0.5
 
 
 @pytest.mark.parametrize("where", [{"cube": (np.nan, 0.0)}, {"cup": (0.0, np.nan)}, {"robot": (np.nan, 1.0)}])
 @pytest.mark.parametrize("swapped", [False, True])
-def test_a_number_that_is_none_is_no_small_difference(where, swapped):
+def test_state_distance_is_nan_for_nan(where, swapped):
     sides = tensors(state(**{"cube": (0.0, 0.0), **where})), state((9.0, 0.0))
     if swapped:
         sides = tensors(sides[1]), state(**{"cube": (0.0, 0.0), **where})

@@ -1,4 +1,4 @@
-"""A wrong argument is one line, before anything is written or a bar is shown."""
+"""Invalid arguments are one-line errors, before files are written or progress is shown."""
 
 import json
 from dataclasses import asdict, replace
@@ -53,7 +53,7 @@ def recording(tmp_path):
         ("replay --save x.txt", "x.txt: "),
     ],
 )
-def test_a_wrong_argument_is_one_line_and_leaves_nothing(tmp_path, recording, capsys, words, message):
+def test_invalid_argument_is_a_one_line_error_without_files(tmp_path, recording, capsys, words, message):
     command, *words = words.split()
     of_command = {"generate": ["pick", "--out", str(tmp_path / "a" / "out")], "replay": [str(recording.parent)]}
     before = sorted(tmp_path.rglob("*"))
@@ -66,7 +66,7 @@ def test_a_wrong_argument_is_one_line_and_leaves_nothing(tmp_path, recording, ca
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_settings_are_resolved_once_and_for_all():
+def test_resolved_settings_do_not_change_again():
     settings = GenerateSettings(EpisodeSettings("pick"), set=("objects.count=6",), check_noise=(1.0, 2.0)).resolve()
     assert settings == settings.resolve()
     assert isinstance(settings.episode.config, dict)
@@ -76,26 +76,26 @@ def test_settings_are_resolved_once_and_for_all():
 
 
 def killed_run(out, **record):
-    """Write what a run leaves that was killed after it gave a seed up."""
-    given_up = {"seed": 0, "attempt": -1, "stage": "episode", "reason": "skipped", "seconds": 0.0}
+    """Write the files of a run that was killed after a skipped seed."""
+    skipped = {"seed": 0, "attempt": -1, "stage": "episode", "reason": "skipped", "seconds": 0.0}
     out.mkdir(exist_ok=True)
     (out / "run.json").write_text(json.dumps({"settings": asdict(SETTINGS), "first_seed": 0, **record}))
-    (out / "failures.jsonl").write_text(json.dumps(given_up) + "\n")
+    (out / "failures.jsonl").write_text(json.dumps(skipped) + "\n")
     return out
 
 
 @pytest.fixture
-def hopeless(monkeypatch):
-    """Every seed is given up."""
+def skipping_generator(monkeypatch):
+    """Replace the generator by one that skips all seeds."""
 
-    def give_up(settings, seeds, folder, make_roll_in):
+    def skip_all(settings, seeds, folder, make_roll_in):
         for seed in seeds:
             yield EpisodeResult(seed, success=False, failures=[FailedAttempt(seed, 0, "reach", "far", 0.0)])
 
-    monkeypatch.setattr(module, "generate_seeds", give_up)
+    monkeypatch.setattr(module, "generate_seeds", skip_all)
 
 
-def test_a_run_without_a_finished_seed_leaves_nothing(tmp_path, monkeypatch):
+def test_run_without_a_finished_seed_leaves_no_files(tmp_path, monkeypatch):
     def interrupted(settings, seeds, folder, make_roll_in):
         (folder / "seed_000000000.json").write_text("{")
         raise KeyboardInterrupt
@@ -107,7 +107,7 @@ def test_a_run_without_a_finished_seed_leaves_nothing(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_replay_never_replaces_what_it_replays(recording):
+def test_replay_does_not_overwrite_its_recording(recording):
     with pytest.raises(RobocasError, match="the recording itself"):
         replay(ReplaySettings(recording, save=recording, overwrite=True))
     other = recording.with_name("other.h5")
@@ -138,8 +138,8 @@ DEFAULTS = ("planner", "check_failures", "after_policy", "after_steps")
         (replace(SETTINGS, after_policy="random"), {WEIGHTS: "abc"}, WEIGHTS),
     ],
 )
-def test_a_run_continues_with_its_settings_only(tmp_path, hopeless, settings, record, change):
-    """Settings and versions that an older version of the package did not record had their defaults."""
+def test_run_is_resumed_with_the_same_settings_only(tmp_path, skipping_generator, settings, record, change):
+    """Settings and versions that an older version did not record have their defaults."""
     known = asdict(settings) if change == WEIGHTS else asdict(SETTINGS)
     older = {key: value for key, value in known.items() if key not in DEFAULTS or change == WEIGHTS}
     out, there = killed_run(tmp_path / "out", settings=older, **record), []
@@ -157,7 +157,7 @@ def test_a_run_continues_with_its_settings_only(tmp_path, hopeless, settings, re
     "change",
     [{"episode_seed": None}, {"robocas": {"seconds": {}}}, {"robocas": {"attempts": 1, "seconds": {"ik": "x"}}}],
 )
-def test_a_trajectory_of_something_else_is_not_continued(tmp_path, hopeless, change):
+def test_trajectory_of_another_tool_is_not_resumed(tmp_path, skipping_generator, change):
     path = write_trajectory(killed_run(tmp_path / "out") / "trajectory.h5", seeds=(3,))
     content = json.loads(path.with_suffix(".json").read_text())
     about = {"attempts": 1, "seconds": {"ik": 0.5}}

@@ -1,4 +1,4 @@
-"""A table scene of known boxes, and the arm's links as its URDF has them."""
+"""Table scene of known boxes, and the links of the arm according to its URDF."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ REST = np.array([0, -1.02, 0, -2.51, 0, 1.35, 0.78])
 
 @dataclass(frozen=True)
 class Box:
-    """A box in the arm's base frame: centre, edge lengths (m), turn about z (rad)."""
+    """Box in the arm's base frame: centre, edge lengths (m), yaw (rad)."""
 
     center: tuple[float, float, float]
     size: tuple[float, float, float]
@@ -42,7 +42,7 @@ class Box:
 
 
 def table_scene(seed: int, count: int = 15) -> list[Box]:
-    """A table top 4 cm below the arm's base and boxes on it."""
+    """Return a table top 4 cm below the arm's base with boxes on it."""
     rng = np.random.default_rng(seed)
     boxes = [Box((0.6, 0.0, -0.045), (0.5, 0.7, 0.01))]
     for _ in range(count):
@@ -57,7 +57,7 @@ def cloud(boxes: list[Box], spacing: float = 0.005) -> np.ndarray:
 
 
 class Checker:
-    """Poses of links by the URDF, and the collision shapes in it."""
+    """Link poses and collision shapes according to the URDF."""
 
     def __init__(self, urdf: Path) -> None:
         self._file = RobotXml(urdf)
@@ -83,7 +83,7 @@ class Checker:
 
 
 def top_down(x: float, y: float, z: float, yaw: float = 0.0) -> np.ndarray:
-    """The TCP pointing straight down at a place; at yaw 0 its x axis is the base's."""
+    """Return a TCP pose that points straight down; at yaw 0 its x axis is that of the base."""
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("z", yaw).as_matrix() @ np.diag([1.0, -1.0, -1.0])
     pose[:3, 3] = x, y, z
@@ -94,9 +94,9 @@ def corners(x: float, y: float, z: float) -> np.ndarray:
     return np.array(list(itertools.product((-x, x), (-y, y), (-z, z))))
 
 
-def pose_error(found: np.ndarray, wanted: np.ndarray) -> tuple[float, float]:
+def pose_error(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
     """Return the distance (m) and the angle (rad) between two poses (4, 4)."""
-    cosine = (np.trace(found[:3, :3].T @ wanted[:3, :3]) - 1) / 2
-    sine = np.linalg.norm(found[:3, :3] - wanted[:3, :3]) / (2 * np.sqrt(2))  # sin(angle / 2), exact for small angles
+    cosine = (np.trace(found[:3, :3].T @ expected[:3, :3]) - 1) / 2
+    sine = np.linalg.norm(found[:3, :3] - expected[:3, :3]) / (2 * np.sqrt(2))  # sin(angle / 2), exact for small angles
     angle = 2 * np.arcsin(min(1.0, float(sine))) if cosine > 0 else float(np.arccos(np.clip(cosine, -1, 1)))
-    return float(np.linalg.norm(found[:3, 3] - wanted[:3, 3])), angle
+    return float(np.linalg.norm(found[:3, 3] - expected[:3, 3])), angle

@@ -22,8 +22,8 @@ def world(panda_files) -> CollisionChecker:
     return CollisionChecker(panda_files.arm_urdf, panda_files.arm_srdf, MOBILE_PANDA)
 
 
-def test_a_cloud_of_5_mm_spacing_has_no_holes(world):
-    """A pad driven 4 mm into a plane is noticed everywhere; 1 cm above it is free."""
+def test_cloud_with_5_mm_spacing_has_no_holes(world):
+    """A pad 4 mm inside a plane collides everywhere; 1 cm above the plane it is free."""
     rng = np.random.default_rng(0)
     tcp = world.tcp(REST)
     lowest = tcp[:3, 3] + 0.008 * tcp[:3, 2]  # pads end 8 mm beyond the TCP
@@ -38,7 +38,7 @@ def test_a_cloud_of_5_mm_spacing_has_no_holes(world):
         assert world.is_free(REST[None])[0]
 
 
-def test_cached_clouds_give_the_same_verdicts(world):
+def test_cached_clouds_give_the_same_results(world):
     wide = cloud([Box(tuple(world.tcp(REST)[:3, 3]), (0.09, 0.09, 0.03))])
     clouds = [cloud([Box((0.6, 0, 0.1 * i), (0.1, 0.1, 0.1))]) for i in range(20)]
     for _ in range(2):
@@ -49,7 +49,7 @@ def test_cached_clouds_give_the_same_verdicts(world):
             assert world.is_free(REST[None])[0]
 
 
-def test_points_in_the_base_and_out_of_reach_are_dropped(world):
+def test_points_inside_the_base_and_out_of_reach_are_dropped(world):
     grid = np.arange(-0.5, 0.5, 0.005)
     x, y = (axis.ravel() for axis in np.meshgrid(grid, grid))
     inside_pedestal = np.stack([x, y, np.full(len(x), -0.001)], axis=1)
@@ -63,7 +63,7 @@ def test_points_in_the_base_and_out_of_reach_are_dropped(world):
     np.testing.assert_array_equal(world.is_obstacle_point(points), [False, False, False, True, True, False, True])
 
 
-def test_points_beyond_the_octree_are_no_obstacles(world):
+def test_points_outside_the_octree_are_ignored(world):
     """Keys of octomap have 16 bits: 327.68 m away a point has the key of a point at the TCP."""
     at_tcp = Shape(points=world.tcp(REST)[None, :3, 3] + np.array([[0, 0, 0], [0.042, 0, 0], [0, 0.042, 0]]))
     world.set_scene([Obstacle("near", at_tcp, np.eye(4))])
@@ -89,8 +89,8 @@ def body(box: Box) -> Obstacle:
     return Obstacle("box", Shape((corners(*(np.array(box.size) / 2)),)), pose)
 
 
-def test_bodies_and_their_clouds_give_the_same_verdicts(world):
-    """Random configurations over a table of boxes: as FCL finds them with a tree of points, within the margin."""
+def test_bodies_and_their_clouds_give_the_same_results(world):
+    """Random configurations over a table of boxes give the results of an FCL octree, within the margin."""
     boxes = table_scene(0)
     low, high = world.chain.lower, world.chain.upper
     qpos = np.clip(REST + np.random.default_rng(0).normal(0, 0.6, (400, 7)), low, high)
@@ -108,8 +108,8 @@ def test_bodies_and_their_clouds_give_the_same_verdicts(world):
     assert world.all_free(qpos[by_bodies])
 
 
-def verdicts(panda_files) -> bytes:
-    """The verdicts of a world of its own on the same configurations, obstacles and held object."""
+def check_configurations(panda_files) -> bytes:
+    """Return the results of a separate checker for the same configurations, obstacles and held object."""
     world, boxes = CollisionChecker(panda_files.arm_urdf, panda_files.arm_srdf, MOBILE_PANDA), table_scene(0)
     qpos = REST + np.random.default_rng(0).uniform(-0.8, 0.8, (300, 7))
     found = []
@@ -122,16 +122,16 @@ def verdicts(panda_files) -> bytes:
     return np.array(found).tobytes()
 
 
-def test_worlds_in_threads_and_forks_give_the_same_verdicts(panda_files):
-    here = verdicts(panda_files)
+def test_checkers_in_threads_and_forks_give_the_same_results(panda_files):
+    here = check_configurations(panda_files)
     with ThreadPoolExecutor(4) as pool:
-        assert set(pool.map(verdicts, [panda_files] * 4)) == {here}
+        assert set(pool.map(check_configurations, [panda_files] * 4)) == {here}
     with ProcessPoolExecutor(1, get_context("fork")) as pool:
-        assert pool.submit(verdicts, panda_files).result() == here
+        assert pool.submit(check_configurations, panda_files).result() == here
 
 
-def test_obstacles_that_share_a_shape_are_all_checked(world):
-    """Also in the next scene, which uses the same FCL objects again at other places."""
+def test_all_obstacles_with_a_common_shape_are_checked(world):
+    """The next scene reuses the same FCL objects at other positions."""
     cube, tcp = Shape((corners(0.02, 0.02, 0.02),)), world.tcp(REST)
     near, far = np.eye(4), np.eye(4)
     near[:3, 3], far[:3, 3] = tcp[:3, 3], (0.6, 0.5, 0.8)
@@ -142,8 +142,8 @@ def test_obstacles_that_share_a_shape_are_all_checked(world):
         assert {"far"} == {name for name in world.collisions(REST, 0.0) if "panda" not in name}
 
 
-def test_the_comparison_of_boxes_loses_no_contact(world, monkeypatch):
-    """The verdicts are those of checking every pair of parts, and every part with every obstacle."""
+def test_broad_phase_misses_no_contact(world, monkeypatch):
+    """The results equal those of checking all pairs of parts and obstacles."""
 
     def everything(self, rotations, positions, width, obstacles):
         rows, moving = range(rotations.shape[1]), self._moving

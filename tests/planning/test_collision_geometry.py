@@ -1,4 +1,4 @@
-"""Collision geometry from a URDF: every supported type, hulls of meshes, and what is refused."""
+"""Collision geometry from a URDF: supported types, hulls of meshes, and errors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ AHEAD = np.array([0, 0, 0.6])  # in the hand's frame, far from all links
 
 @pytest.fixture
 def files(panda_files, tmp_path) -> Path:
-    """A copy of the arm's files that a test can change."""
+    """Return a copy of the arm's files that a test can change."""
     for path in (panda_files.arm_urdf, panda_files.arm_srdf):
         shutil.copyfile(path, tmp_path / path.name)
     shutil.copytree(panda_files.folder / "collision", tmp_path / "collision")
@@ -38,7 +38,7 @@ def load(files: Path) -> CollisionChecker:
 
 
 def replace_hand(files: Path, shape: Element, *, position: str = "0 0 0.6", angles: str = "0 0 0") -> None:
-    """Give the hand one collision geometry, far ahead of it."""
+    """Replace the collision geometry of the hand by a shape far ahead of it."""
     tree = ElementTree.parse(files / "panda_arm.urdf")
     hand = tree.find("link[@name='panda_hand']")
     for collision in hand.findall("collision"):
@@ -50,7 +50,7 @@ def replace_hand(files: Path, shape: Element, *, position: str = "0 0 0.6", angl
 
 
 def touches_cube(world: CollisionChecker, checker: Checker, position: np.ndarray) -> bool:
-    """Whether the hand touches a cube of 5.2 mm with its margin, at a position relative to ``AHEAD``."""
+    """Return whether the hand touches a cube of 5.2 mm (margin included) at a position relative to ``AHEAD``."""
     pose = checker.link_pose("panda_hand", REST).copy()
     pose[:3, 3] += pose[:3, :3] @ (AHEAD + position)
     world.set_scene([Obstacle("cube", Shape((corners(*[0.0026 - MARGIN] * 3),)), pose)])
@@ -65,7 +65,7 @@ def touches_cube(world: CollisionChecker, checker: Checker, position: np.ndarray
         ("box", {"size": "0.4 0.3 0.5"}, (0.2, 0.15, 0.25)),
     ],
 )
-def test_primitives_have_their_size(files, checker, tag, size, reach):
+def test_primitives_have_the_size_of_the_urdf(files, checker, tag, size, reach):
     replace_hand(files, Element(tag, size))
     world = load(files)
     for axis, side in itertools.product(range(3), (-1, 1)):
@@ -85,7 +85,7 @@ def test_geometries_are_placed_by_their_origin(files, checker):
 
 
 def test_mesh_without_a_hull_file_is_replaced_by_its_convex_hull(files, checker):
-    """Two balls 40 cm apart in one file: what is between them counts too."""
+    """Two balls 40 cm apart in one file are one convex hull."""
     balls = [trimesh.creation.icosphere(radius=0.05).apply_translation((x, 0, 0)) for x in (-0.2, 0.2)]
     trimesh.util.concatenate(balls).export(files / "collision" / "balls.stl")
     replace_hand(files, Element("mesh", filename="collision/balls.stl"))
@@ -98,31 +98,31 @@ def test_mesh_without_a_hull_file_is_replaced_by_its_convex_hull(files, checker)
     assert not touches_cube(world, checker, np.array([0.14, 0, 0]))
 
 
-def test_a_hull_file_is_preferred(files, checker):
+def test_hull_file_is_preferred_to_the_mesh(files, checker):
     trimesh.creation.box((0.02, 0.02, 1.4)).export(files / f"{HAND}.convex.stl")
     assert touches_cube(load(files), checker, np.array([0, 0, 0.09]))
     (files / f"{HAND}.convex.stl").unlink()
     assert not touches_cube(load(files), checker, np.array([0, 0, 0.09]))
 
 
-def refused(files: Path) -> RobotDescriptionError:
+def load_error(files: Path) -> RobotDescriptionError:
     with pytest.raises(RobotDescriptionError) as caught:
         load(files)
     assert caught.value.fix
     return caught.value
 
 
-def test_a_mesh_that_is_missing_unreadable_or_flat_is_refused(files):
+def test_missing_unreadable_or_flat_mesh_is_an_error(files):
     hull = files / f"{HAND}.convex.stl"
     for content in (b"", b"no mesh", b"solid x\nendsolid x\n"):
         hull.write_bytes(content)
-        assert refused(files).where == hull
+        assert load_error(files).where == hull
     flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], [[0, 1, 2], [1, 3, 2]])
     flat.export(hull)
-    assert refused(files).where == hull
+    assert load_error(files).where == hull
     for path in (files / HAND, hull):
         path.unlink()
-    error = refused(files)
+    error = load_error(files)
     assert error.where == files / HAND
     assert "panda_hand" in error.what
 
@@ -142,18 +142,18 @@ def test_a_mesh_that_is_missing_unreadable_or_flat_is_refused(files):
         ("panda_arm.srdf", None, None),
     ],
 )
-def test_a_damaged_description_is_refused(files, name, old, new):
+def test_damaged_description_is_an_error(files, name, old, new):
     path = files / name
     if old is None:
         path.unlink()
     else:
         assert old in path.read_text()
         path.write_text(path.read_text().replace(old, new))
-    assert refused(files).where == path
+    assert load_error(files).where == path
 
 
-def test_boxes_hold_the_real_fingers_and_hand(panda_files, checker):
-    """Every collision shape of the open left finger and of the hand lies in the boxes, to 1.5 mm."""
+def test_bounding_boxes_contain_fingers_and_hand(panda_files, checker):
+    """All collision shapes of the open left finger and the hand are inside the boxes, to 1.5 mm."""
 
     def vertices(link):
         return np.concatenate([of for name, of in checker.parts if name == link])

@@ -1,4 +1,4 @@
-"""After the same seed the same calls give the same bits: again, in other processes, under load, after anything."""
+"""The same seed and calls give the same bits: repeated, in other processes, under load, after other calls."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SCENE = [*table_scene(0), Box((0.55, 0.0, 0.15), (0.4, 0.03, 0.4))]
 
 
 def session(planner) -> str:
-    """A digest of everything a run of calls returns, failures included."""
+    """Return a hash of the results of a sequence of calls, errors included."""
     digest, here = hashlib.sha256(), REST
     planner.attach(None)
     planner.set_scene(cloud(SCENE))
@@ -53,7 +53,7 @@ def test_same_seed_in_one_process_gives_the_same_paths(make_planner):
     assert session(other) == first
 
 
-# Where programs run in real time, busy ones that did not step down would take the machine for ever.
+# With real-time scheduling, busy processes would block the machine, so they switch to normal scheduling.
 BUSY = """
 import os
 if hasattr(os, "sched_setscheduler"):
@@ -74,7 +74,7 @@ print(session(planner))
 
 
 @pytest.mark.slow
-def test_in_another_process_under_load(make_planner, panda_files):
+def test_another_process_under_load_gives_the_same_paths(make_planner, panda_files):
     planner = make_planner()
     planner.seed(7)
     here = session(planner)

@@ -12,7 +12,7 @@ def drops():
     return sample_drops(np.random.default_rng(0), 200, INSIDE, BOX, np.array([0, 0, 0.05]))
 
 
-def test_objects_hang_above_the_container_clear_of_its_rim():
+def test_held_objects_are_above_the_container_clear_of_its_rim():
     poses = drops()
     rim = 0.1 + 0.1
     for pose in poses:
@@ -36,7 +36,7 @@ def test_approach_points_down_and_tilts_away_from_the_arm():
     assert np.linalg.det(poses[:, :3, :3]) == pytest.approx(np.ones(200))
 
 
-def test_overhang_is_what_sticks_out_sideways():
+def test_overhang_is_the_sideways_extent_beyond_the_opening():
     # straight down above the middle; the container's opening is 0.4 along the base's y, 0.2 along its x
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[:3, 3] = [0.6, 0.2, 0.5]

@@ -1,4 +1,4 @@
-"""Grasp choice, by hand; see `grasp_poses`."""
+"""Grasp choice compared with values computed by hand."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def filtered(poses, widths, approach="top"):
     return filter_grasps(notes, OBJECT, BASE, approach)  # pyright: ignore[reportArgumentType]
 
 
-def test_grasps_from_the_right_side_stay_and_get_a_turned_twin():
+def test_grasps_from_the_approach_side_are_kept_with_a_half_turn():
     poses = [grasp(), grasp(), grasp(100), grasp(40, 180), grasp(80, 0, 80)]
     kept = filtered(poses, [0.05, 0.09, 0.05, 0.05, 0.05])  # too wide, from below, from behind, closing not level
     np.testing.assert_array_equal(kept.index, [0, 0])
@@ -61,7 +61,7 @@ def test_scores(poses, qualities, turns, approach, order):
     assert np.argsort(-scores, kind="stable").tolist() == order
 
 
-def test_chance_differs_between_retries_and_repeats_with_the_seed():
+def test_order_depends_on_the_random_generator_only():
     orders = [sample_order(np.random.default_rng(seed), np.ones(20)).tolist() for seed in (0, 0, 1)]
     assert orders[0] == orders[1] != orders[2]
     assert sorted(orders[0]) == list(range(20))
@@ -70,7 +70,7 @@ def test_chance_differs_between_retries_and_repeats_with_the_seed():
     assert np.mean(first) == pytest.approx(1 / (1 + np.e), abs=0.04)
 
 
-def test_batch_gives_the_counts_of_single_grasps():
+def test_batches_of_grasps_give_the_counts_of_single_grasps():
     asset = load_pack("builtin").objects["sugar_box"]
     notes, pose = asset.annotations, np.eye(4)
     pose[:3] = notes.resting_poses[notes.display_pose][:3]

@@ -1,4 +1,4 @@
-"""Pulls about a joint, and what driving checks: pure maths, against values worked out by hand."""
+"""Pulls along a joint, and collision checks of drives, compared with values computed by hand."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ HINGE = Joint(
 
 
 def level_hold(x: float, y: float, z: float) -> np.ndarray:
-    """TCP that points ahead (+x) and holds an upright bar: its x is down, its closing direction level."""
+    """Return a TCP pose that points along +x and holds a vertical bar: x down, horizontal closing axis."""
     pose = np.eye(4)
     pose[:3, :3] = np.column_stack([(0, 0, -1), (0, 1, 0), (1, 0, 0)])
     pose[:3, 3] = x, y, z
@@ -39,7 +39,7 @@ def angle_about_bar(found: np.ndarray, goal: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize(("joint", "end"), [(SLIDE, 0.25), (HINGE, 0.9)])
-def test_every_pose_of_a_pull_holds_the_bar_where_the_joint_has_it(reachability, joint, end):
+def test_all_poses_of_a_pull_hold_the_bar_at_the_joint_position(reachability, joint, end):
     hold = level_hold(0.7, 0.1, 0.5)
     goals = np.array([joint_motion(joint, q) @ hold for q in np.linspace(0, end, 25)])
     solved, start = reachability.nearest_solutions(goals[:1], np.array(REST))
@@ -56,7 +56,7 @@ def test_every_pose_of_a_pull_holds_the_bar_where_the_joint_has_it(reachability,
     assert max(slips) <= MAX_SLIP + 5e-3
 
 
-def test_pull_ends_at_the_limit_of_the_reach(reachability):
+def test_pull_ends_at_the_limit_of_reach(reachability):
     hold = level_hold(0.6, 0.1, 0.5)
     away = Joint(name="away", kind="prismatic", axis=(1, 0, 0), limits=(0, 2), friction=0, damping=0)
     goals = np.array([joint_motion(away, q) @ hold for q in np.arange(0, 1.0, 0.02)])
@@ -69,7 +69,7 @@ def test_pull_ends_at_the_limit_of_the_reach(reachability):
     assert np.isfinite(path[:count]).all()
 
 
-def test_drive_keeps_the_held_object_free_of_collisions(planner):
+def test_route_keeps_the_held_object_collision_free(planner):
     robot = SimpleNamespace(pose=SimpleNamespace(raw_pose=torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]])))
     env = SimpleNamespace(agent=SimpleNamespace(robot=robot))
     arm = SimpleNamespace(env=env, robot=MOBILE_PANDA, planner=planner, qpos=np.array(REST))
@@ -87,7 +87,7 @@ def test_drive_keeps_the_held_object_free_of_collisions(planner):
     assert find_free_route(arm, start, goal, spot, leaving=False) is None
 
 
-def standing_at(position, joint, monkeypatch):
+def part_at(position, joint, monkeypatch):
     monkeypatch.setattr(MovingPart, "position", lambda self, arm: position)
     handle = Handle(link="door", position=(0, 0, 0), wxyz=(1, 0, 0, 0), width=0.02)
     return MovingPart("cabinet", handle, joint)
@@ -97,11 +97,11 @@ def standing_at(position, joint, monkeypatch):
 def test_pull_continues_from_the_position_of_the_joint(towards, monkeypatch):
     limits = tuple(sorted((0.0, towards * 0.4)))
     joint = Joint(name="slide", kind="prismatic", axis=(1, 0, 0), limits=limits, friction=0, damping=0)
-    way = standing_at(towards * 0.1, joint, monkeypatch).pull_positions(None)
+    way = part_at(towards * 0.1, joint, monkeypatch).pull_positions(None)
     assert way[[0, -1]] == pytest.approx([towards * 0.1, towards * 0.38])  # 0.95 of the range
     assert len(way) == 20  # 0.28 m in steps of at most 0.015 m
-    part = standing_at(towards * 0.35, joint, monkeypatch)
+    part = part_at(towards * 0.35, joint, monkeypatch)
     assert part.min_pull(None) == pytest.approx(0.03)  # a quarter of the range is more than what is left
     for position in (0.37, 0.38, 0.4):
         with pytest.raises(PlanningError, match="already_open"):
-            standing_at(towards * position, joint, monkeypatch).pull_positions(None)
+            part_at(towards * position, joint, monkeypatch).pull_positions(None)

@@ -1,4 +1,4 @@
-"""Rotation vectors, errors between poses, and straight lines of the TCP."""
+"""Rotation vectors, pose errors, and straight lines of the TCP."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_rotation_vectors_invert_rotation_matrices(angle):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_line_is_straight_and_ends_at_its_goal(chain, checker, seed):
+def test_line_is_straight_and_ends_at_its_goal(chain, checker, seed):
     rng = np.random.default_rng(seed)
     above = top_down(rng.uniform(0.4, 0.6), rng.uniform(-0.2, 0.2), 0.3, yaw=rng.uniform(-1, 1))
     goal = above @ np.block(
@@ -50,20 +50,20 @@ def test_a_line_is_straight_and_ends_at_its_goal(chain, checker, seed):
     assert np.max(steps, axis=0)[0] <= 0.01 + 1e-6 and np.max(steps, axis=0)[1] <= np.deg2rad(3) + 1e-6
 
 
-def refusal(chain, start, goal) -> str:
+def line_error(chain, start, goal) -> str:
     with pytest.raises(PlanningError) as caught:
         follow_line(chain, start, goal, stage="here")
     assert caught.value.stage == "here"
     return caught.value.reason
 
 
-def test_a_line_out_of_reach_is_refused(chain):
+def test_line_out_of_reach_is_an_error(chain):
     start = Reachability(chain).distinct_solutions(top_down(0.5, 0, 0.3), REST)[0]
-    assert refusal(chain, start, top_down(1.2, 0, 0.3)) in ("line_unreachable", "line_joint_jump")
+    assert line_error(chain, start, top_down(1.2, 0, 0.3)) in ("line_unreachable", "line_joint_jump")
 
 
-def test_a_line_through_a_joint_limit_is_refused(chain):
-    """The last joint starts near its limit and would have to turn further."""
+def test_line_through_a_joint_limit_is_an_error(chain):
+    """The last joint starts near its limit and would have to exceed it."""
     start = max(Reachability(chain).distinct_solutions(top_down(0.5, 0, 0.3), REST), key=lambda qpos: qpos[6])
     assert len(follow_line(chain, start, top_down(0.5, 0, 0.3, yaw=1.0), stage="x")) > 15
-    assert refusal(chain, start, top_down(0.5, 0, 0.3, yaw=-2.0)) == "line_unreachable"
+    assert line_error(chain, start, top_down(0.5, 0, 0.3, yaw=-2.0)) == "line_unreachable"

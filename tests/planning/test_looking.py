@@ -1,4 +1,4 @@
-"""Where policies take the gripper's camera to be is where it is rendered from."""
+"""The camera pose of the policies equals the pose that is rendered."""
 
 import gymnasium as gym
 import numpy as np
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 
 class Looking(Arm):
-    """An arm that only looks."""
+    """Arm without motions."""
 
     def __init__(self, env):
         self._env, self.scene = env, PlanningScene(env)
@@ -22,7 +22,7 @@ class Looking(Arm):
     env = property(lambda self: self._env)
 
 
-def test_the_cameras_shift_is_known():
+def test_camera_pose_includes_the_random_shift():
     config = load_task_config("search_table_small_heap").model_dump(mode="json")
     config["randomisation"]["cameras"] = {"position": 0.1, "rotation_deg": 15}
     made = gym.make("RoboCASSearch-v1", config=config, obs_mode="none")

@@ -1,4 +1,4 @@
-"""ManiSkill's motion-planning verbs: errors, dry runs, frames, obstacles and gripper, on ManiSkill's stock Panda."""
+"""Methods of ManiSkill's motion-planning solver with ManiSkill's Panda: errors, frames, obstacles and gripper."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def made(request):
 
 @pytest.fixture
 def env(made):
-    """The stock Panda at its rest keyframe, on a root that is moved and turned."""
+    """Environment with ManiSkill's Panda at its rest keyframe, on a moved and rotated root."""
     made.reset(seed=0)
     agent = made.unwrapped.agent
     agent.reset(agent.keyframes["rest"].qpos)
@@ -60,7 +60,7 @@ def distance(a: sapien.Pose, b: sapien.Pose) -> float:
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_a_plan_leads_to_its_pose_and_one_that_fails_steps_nothing(env, verb):
+def test_motion_reaches_its_pose_and_failed_plan_does_not_step(env, verb):
     solver, goal = PandaArmMotionPlanningSolver(env), sapien.Pose([0, 0.1, 0.1]) * tcp(env)
     with pytest.raises(PlanningError) as caught:
         getattr(solver, verb)(sapien.Pose([2.0, 0, 0.2], [0, 1, 0, 0]))
@@ -76,7 +76,7 @@ def test_a_plan_leads_to_its_pose_and_one_that_fails_steps_nothing(env, verb):
     assert distance(tcp(env), sapien.Pose([0.05, 0, -0.05]) * goal) < 1e-3
 
 
-def test_options_change_the_plan(env):
+def test_limits_change_the_plan(env):
     goal, moved = sapien.Pose([0, 0, -0.1]) * tcp(env), sapien.Pose([0, 0, 0.2])
     planned = PandaArmMotionPlanningSolver(env).move_to_pose_with_screw(goal, dry_run=True)
     elsewhere = PandaArmMotionPlanningSolver(env, base_pose=moved * TURNED)
@@ -96,7 +96,7 @@ def add_points(solver: PandaArmMotionPlanningSolver, pose: sapien.Pose) -> None:
 
 
 @pytest.mark.parametrize("add", [add_box, add_points])
-def test_an_obstacle_blocks_the_straight_line_and_is_passed_on_another_path(env, add):
+def test_obstacle_blocks_the_straight_line_but_not_rrt_connect(env, add):
     solver = PandaArmMotionPlanningSolver(env)
     here, across = tcp(env), SIDEWAYS * tcp(env)
     between = sapien.Pose((here.p + across.p) / 2)
@@ -113,7 +113,7 @@ def test_an_obstacle_blocks_the_straight_line_and_is_passed_on_another_path(env,
     assert not solver.planner.is_free(straight.qpos).all()
 
 
-def test_the_gripper_moves_while_the_arm_stays_and_vis_shows_each_step(env, monkeypatch):
+def test_gripper_moves_without_the_arm_and_vis_renders_each_step(env, monkeypatch):
     shown = []
     monkeypatch.setattr(env.unwrapped, "render_human", lambda: shown.append(steps(env)))
     solver, here, robot = PandaArmMotionPlanningSolver(env), tcp(env), env.unwrapped.agent.robot
@@ -143,13 +143,13 @@ def test_the_gripper_moves_while_the_arm_stays_and_vis_shows_each_step(env, monk
         ("open_gripper", (0,), "t"),
     ],
 )
-def test_poses_and_points_that_can_not_be_are_refused_at_the_call(env, method, arguments, where):
+def test_invalid_poses_and_points_are_errors(env, method, arguments, where):
     with pytest.raises(RobocasError) as caught:
         getattr(PandaArmMotionPlanningSolver(env), method)(*arguments)
     assert (caught.value.where, steps(env)) == (where, 0)
 
 
-def test_options_of_maniskills_solver_are_accepted_and_others_are_not(env):
+def test_arguments_of_maniskills_solver_are_accepted_and_unknown_ones_are_errors(env):
     PandaArmMotionPlanningSolver(env, debug=True, visualize_target_grasp_pose=True, print_env_info=True)
     with pytest.raises(TypeError, match="print_info"):
         PandaArmMotionPlanningSolver(env, print_info=True)
@@ -159,8 +159,8 @@ def test_options_of_maniskills_solver_are_accepted_and_others_are_not(env):
         assert caught.value.where == ("planner" if name == "backend" else name)
 
 
-def test_a_solution_of_maniskill_solves_its_task(monkeypatch):
-    """The original file, loaded by its path: its package imports all solutions, some of which need mplib."""
+def test_solution_of_maniskill_solves_its_task(monkeypatch):
+    """The original file is loaded by its path, since its package imports solutions that need mplib."""
     package = "mani_skill.examples.motionplanning.panda"
     monkeypatch.setitem(sys.modules, "mplib", None)
     monkeypatch.setitem(sys.modules, f"{package}.motionplanner", motionplanner)
@@ -194,7 +194,7 @@ def test_unsupported_env_is_an_error_with_a_fix(control_mode, robot, where):
 
 
 @pytest.mark.parametrize("robot", ["panda_wristcam", "robocas_mobile_panda"])
-def test_other_robots_with_a_panda_arm(robot):
+def test_supported_robots_with_a_panda_arm(robot):
     if robot == "panda_wristcam":
         env = make(robot=robot)
         env.reset(seed=0)

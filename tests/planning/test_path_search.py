@@ -1,4 +1,4 @@
-"""The search, on a plane with a wall."""
+"""Path search in a plane with a wall."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ START, GOAL = np.array([-1.0, 0.0]), np.array([1.0, 0.0])
 
 
 def off_the_wall(q):
-    """Free unless within a wall at |x| < 0.1 that has a gap at 1.5 < y < 1.8."""
+    """Return whether a point is outside of a wall at |x| < 0.1 with a gap at 1.5 < y < 1.8."""
     return abs(q[0]) >= 0.1 or 1.5 < q[1] < 1.8
 
 
@@ -26,7 +26,7 @@ def length(path):
     return np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
 
 
-def test_path_leads_through_the_gap_and_is_free():
+def test_path_passes_the_gap_and_is_collision_free():
     path = search().connect(START, [GOAL], np.random.default_rng(0), max_checks=20000)
     assert path is not None
     np.testing.assert_array_equal(path[0], START)
@@ -36,7 +36,7 @@ def test_path_leads_through_the_gap_and_is_free():
     assert any(abs(q[0]) < 0.1 and 1.5 < q[1] < 1.8 for q in dense)
 
 
-def test_shortening_keeps_the_ends_and_comes_near_the_shortest_path():
+def test_shortened_path_keeps_its_ends_and_is_nearly_optimal():
     finder, rng = search(), np.random.default_rng(1)
     path = finder.connect(START, [GOAL], rng, max_checks=20000)
     assert path is not None

@@ -1,4 +1,4 @@
-"""What of a scene a planner sees as obstacles. No simulator."""
+"""Obstacles of a scene for a planner, without a simulator."""
 
 from types import SimpleNamespace
 
@@ -10,7 +10,7 @@ from robocas_ms3.planning.scene import PlanningScene, to_arm_base_frame
 
 
 class Parked(PlanningScene):
-    """Three objects of one point each, 1 m apart above the basket's point; furniture of a body and a door."""
+    """Scene of three objects with one point each, 1 m apart above the basket, and furniture with a door."""
 
     arm_base_in_world = property(lambda self: at(0, 0, 0))
 
@@ -49,7 +49,7 @@ def environment(present):
     ("present", "without", "heights"),
     [([1, 1, 1], (), [1, 2, 3]), ([1, 0, 1], (), [1, 3]), ([1, 0, 1], 2, [1]), ([0, 1, 1], [0, 1], [3])],
 )
-def test_objects_that_wait_elsewhere_are_no_obstacles(present, exclude, heights):
+def test_absent_objects_are_no_obstacles(present, exclude, heights):
     scene = Parked(environment(present))
     assert scene.points_in_base(exclude=exclude, radius=np.inf)[:, 2].tolist() == [0, 0, *heights]
     bodies = scene.obstacles(exclude=exclude)
@@ -57,7 +57,7 @@ def test_objects_that_wait_elsewhere_are_no_obstacles(present, exclude, heights)
     assert [body.pose_in_base[2, 3] for body in bodies[2:]] == heights
 
 
-def test_room_is_kept_to_furniture_and_basket_not_to_objects():
+def test_clearance_applies_to_furniture_and_basket_only():
     bodies = Parked(environment([1, 1, 1])).obstacles(clearance=0.02)
     assert [(body.name, body.clearance) for body in bodies[:3]] == [
         ("table", 0.02),
@@ -66,13 +66,13 @@ def test_room_is_kept_to_furniture_and_basket_not_to_objects():
     ]
 
 
-def test_only_what_is_near_a_place_is_sampled():
+def test_points_are_limited_to_a_radius():
     scene = Parked(environment([1, 1, 1]))
     assert scene.points_in_base()[:, 2].tolist() == [0, 1]  # within 1.5 m of the arm's base
     assert scene.points_in_base(radius=0.5, around=np.array([0, 0, 2.2]))[:, 2].tolist() == [2]
 
 
-def test_a_part_has_one_shape_and_a_body_is_seen_from_another_base():
+def test_shapes_are_cached_and_obstacles_are_transformed_to_another_base():
     scene = Parked(environment([1, 0, 0]))
     (*_, first), (*_, again) = scene.obstacles(), scene.obstacles()
     assert first.shape is again.shape

@@ -1,4 +1,4 @@
-"""Where pushes begin and end, and how objects are put down: geometry at known places. No simulator."""
+"""Start and end of pushes, and placement of objects: known geometry, no simulator."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ HALF = np.array([0.3, 0.5])
 
 
 def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], step: float = 0.005) -> np.ndarray:
-    """Points (P, 3) throughout an upright box."""
+    """Return points (P, 3) inside an axis-aligned box."""
     axes = [np.linspace(a, b, round((b - a) / step) + 1) for a, b in (x, y, z)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
@@ -33,7 +33,7 @@ def pushes(target=TARGET, others=NOTHING, points=OBSTACLE, half=HALF, fixed=NOTH
     return list(pushing.push_candidates(np.random.default_rng(0), points, target, others, (TABLE, half), fixed))
 
 
-def test_right_above_the_target_the_push_goes_towards_the_robot():
+def test_push_of_an_object_above_the_target_is_towards_the_robot():
     above = np.array([0.6, 0.005, 0.2])
     angles = []
     for seed in range(40):
@@ -44,7 +44,7 @@ def test_right_above_the_target_the_push_goes_towards_the_robot():
     assert 15 < max(angles) <= 30.5
 
 
-def test_the_first_push_is_the_papers():
+def test_first_push_has_the_direction_of_the_paper():
     push = pushes()[0]
     assert push.direction == pytest.approx([0, 1, 0])
     # 2 cm clear of the object's side at y = 0.07, at the target's height
@@ -60,7 +60,7 @@ def test_the_first_push_is_the_papers():
         assert np.rad2deg(np.arctan2(first[1], first[0])) == pytest.approx(90 + turn)
 
 
-def test_where_something_stands_the_tool_does_not_come_down():
+def test_tool_starts_at_free_positions_only():
     standing = box((0.58, 0.62), (0.0, 0.06), (0.1, 0.15))
     assert all(push.start[2, 3] > 0.15 for push in pushes(others=standing) if push.direction[1] > 0.99)
     wall = box((0.4, 0.8), (-0.1, 0.06), (0.1, 0.3))
@@ -73,7 +73,7 @@ def test_where_something_stands_the_tool_does_not_come_down():
 
 @settings(max_examples=30, deadline=None)
 @given(x=st.floats(0.4, 0.8), y=st.floats(-0.3, 0.3), seed=st.integers(0, 99))
-def test_every_push_ends_on_the_surface(x, y, seed):
+def test_all_pushes_end_on_the_surface(x, y, seed):
     points = OBSTACLE - OBSTACLE.mean(axis=0) + [x, y, 0.15]
     rng = np.random.default_rng(seed)
     for push in pushing.push_candidates(rng, points, np.array([0.6, 0.0, 0.12]), NOTHING, (TABLE, HALF), NOTHING):
@@ -82,7 +82,7 @@ def test_every_push_ends_on_the_surface(x, y, seed):
         assert push.start[2, 3] - pushing.TIP_BELOW_TCP >= SURFACE + pushing.TIP_CLEARANCE - 1e-9
 
 
-def test_an_object_is_not_pushed_against_a_wall_it_does_not_pass_under():
+def test_objects_are_not_pushed_against_walls():
     ahead = pushes()[0]
     assert ahead.direction == pytest.approx([0, 1, 0])
     end = 0.13 + ahead.length - pushing.STAND_OFF  # of the object's front
@@ -94,7 +94,7 @@ def test_an_object_is_not_pushed_against_a_wall_it_does_not_pass_under():
     assert pushes(fixed=above)[0].direction == pytest.approx([0, 1, 0])
 
 
-def test_free_places_are_on_the_surface_and_clear_of_everything():
+def test_free_positions_are_on_the_surface_and_collision_free():
     held = box((0.5, 0.6), (0.0, 0.04), (0.4, 0.45))
     standing = box((0.55, 0.65), (-0.2, 0.2), (SURFACE, 0.2))
     motions = find_free_places(held, standing, TABLE, HALF)
@@ -125,12 +125,12 @@ BRICK = np.array([[x, y, z] for x in (-0.01, 0.01) for y in (-0.02, 0.02) for z 
 
 
 def corners(shift):
-    """A box of 2 x 2 x 4 cm whose top is shifted along x."""
+    """Return the corners of a box of 2 x 2 x 4 cm with its top shifted along x."""
     return np.array([[x + shift * z / 0.04, y, z] for x in (0, 0.02) for y in (0, 0.02) for z in (0, 0.04)])
 
 
 @pytest.mark.parametrize("turned_deg", [(20, 0, 0), (0, -35, 0), (0, 0, 70)])
-def test_leaning_object_is_turned_upright_about_level_axes(turned_deg):
+def test_tilted_object_is_rotated_upright_about_horizontal_axes(turned_deg):
     leant = Rotation.from_euler("xyz", turned_deg, degrees=True)
     expected = leant.inv().as_matrix() if turned_deg[2] == 0 else np.eye(3)
     turn = upright_rotation(leant.apply(BRICK), np.zeros(3))
@@ -138,13 +138,13 @@ def test_leaning_object_is_turned_upright_about_level_axes(turned_deg):
     np.testing.assert_array_equal(turn[:3, 3], 0)
 
 
-def test_beyond_half_of_a_right_angle_it_is_laid_on_the_next_side():
+def test_object_tilted_beyond_45_degrees_is_rotated_to_the_next_side():
     leant = Rotation.from_euler("x", 50, degrees=True)
     turn = upright_rotation(leant.apply(BRICK), np.zeros(3))
     np.testing.assert_allclose(turn[:3, :3], Rotation.from_euler("x", 40, degrees=True).as_matrix(), atol=1e-9)
 
 
-def test_face_beside_the_centre_of_mass_is_not_a_standing_face():
+def test_face_not_below_the_centre_of_mass_is_unstable():
     # its foot reaches to x = 2 cm, its middle is at 1.5 cm, then at 2.5 cm: it falls onto the side (3, 4) cm long
     np.testing.assert_array_equal(upright_rotation(corners(0.01), corners(0.01).mean(axis=0)), np.eye(4))
     turn = upright_rotation(corners(0.03), corners(0.03).mean(axis=0))

@@ -1,4 +1,4 @@
-"""Closed-form inverse kinematics against forward kinematics, and against configurations that are known."""
+"""Closed-form inverse kinematics compared with forward kinematics and known configurations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from robocas_ms3.robots.description import MOBILE_PANDA
 
 
 def grasp_poses(count: int, seed: int) -> np.ndarray:
-    """Poses over and around a table, leaning up to 60 deg from straight down."""
+    """Return poses above and around a table, tilted up to 60 deg from straight down."""
     rng, poses = np.random.default_rng(seed), []
     for _ in range(count):
         pose = top_down(rng.uniform(0.25, 0.9), rng.uniform(-0.5, 0.5), rng.uniform(-0.05, 0.3), rng.uniform(-3, 3))
@@ -24,7 +24,7 @@ def grasp_poses(count: int, seed: int) -> np.ndarray:
     return np.array(poses)
 
 
-def test_jacobian_is_the_derivative(reachability):
+def test_jacobian_equals_the_numerical_derivative(reachability):
     qpos = np.random.default_rng(0).uniform(-1, 1, (4, 7))
     pose, jacobian = reachability.chain.jacobian(qpos)
     for joint in range(7):
@@ -34,16 +34,16 @@ def test_jacobian_is_the_derivative(reachability):
         np.testing.assert_allclose(pose_difference(pose, moved) / 1e-6, jacobian[:, :, joint], atol=1e-5)
 
 
-def anywhere(chain: ArmChain, count: int, seed: int) -> np.ndarray:
-    """Configurations (count, 7) all over the joint space, the elbow bent by more than 27 deg."""
+def random_configurations(chain: ArmChain, count: int, seed: int) -> np.ndarray:
+    """Return random configurations (count, 7) with the elbow bent by more than 27 deg."""
     qpos = np.random.default_rng(seed).uniform(chain.lower, chain.upper, (count, 7))
     qpos[:, 3] = np.minimum(qpos[:, 3], -0.48)
     return qpos
 
 
-def test_every_configuration_is_found_at_its_own_joint_7(reachability):
+def test_solver_finds_configurations_at_their_own_joint_7(reachability):
     chain = reachability.chain
-    qpos = anywhere(chain, 2000, 0)
+    qpos = random_configurations(chain, 2000, 0)
     found = PandaGeometry(chain).solve(chain.tcp(qpos), qpos[:, 6])
     away = np.nanmin(np.abs(found - qpos[:, None]).max(axis=2), axis=1)
     assert np.mean(away < 1e-6) > 0.99
@@ -52,7 +52,7 @@ def test_every_configuration_is_found_at_its_own_joint_7(reachability):
     np.testing.assert_allclose(chain.tcp(found[rows, branches]), chain.tcp(qpos)[rows], atol=1e-9)
 
 
-def test_found_configurations_reach_their_poses_inside_the_limits(reachability, checker):
+def test_solutions_reach_their_poses_within_the_limits(reachability, checker):
     poses = grasp_poses(60, 0)
     solved, qpos = reachability.nearest_solutions(poses, REST)
     assert solved.dtype == bool and qpos.shape == (60, 7)
@@ -64,7 +64,7 @@ def test_found_configurations_reach_their_poses_inside_the_limits(reachability, 
         assert np.all(found >= reachability.lower) and np.all(found <= reachability.upper)
 
 
-def test_the_preferred_configuration_decides_between_solutions(reachability):
+def test_nearest_solution_is_returned(reachability):
     for near in (REST, REST + [0.3, 0.2, -0.2, 0.1, 0.2, 0.1, -0.5]):
         pose = reachability.chain.tcp(near[None])
         solved, qpos = reachability.nearest_solutions(pose, near)
@@ -73,7 +73,7 @@ def test_the_preferred_configuration_decides_between_solutions(reachability):
         assert np.linalg.norm(reachability.distinct_solutions(pose[0], near)[0] - near) < 1e-6
 
 
-def test_solutions_of_one_pose_differ_the_nearest_first(reachability):
+def test_solutions_of_one_pose_are_distinct_and_sorted_by_distance(reachability):
     found = reachability.distinct_solutions(top_down(0.5, 0.1, 0.2), REST)
     assert len(found) > 5
     away = [float(joint_distance(qpos, REST)) for qpos in found]
@@ -85,7 +85,7 @@ def test_solutions_of_one_pose_differ_the_nearest_first(reachability):
         assert reachability.distinct_solutions(top_down(*place), REST) == []
 
 
-def test_everything_returns_all_configurations_of_all_poses(reachability):
+def test_all_solutions_returns_all_configurations_of_all_poses(reachability):
     poses = np.concatenate([grasp_poses(20, 3), top_down(1.2, 0, 0.3)[None]])  # the last one is out of reach
     qpos, of_pose = reachability.all_solutions(poses, REST)
     np.testing.assert_allclose(reachability.chain.tcp(qpos), poses[of_pose], atol=1e-9)
@@ -98,7 +98,7 @@ def test_everything_returns_all_configurations_of_all_poses(reachability):
 
 
 def test_results_do_not_depend_on_memory_alignment(reachability):
-    """numpy's arctan2 of strided numbers does: one call in a hundred differed in the last bit."""
+    """arctan2 of strided arrays depends on it: one call in a hundred differed in the last bit."""
     pose, kept = top_down(0.5, -0.25, 0.2, yaw=0.3), []
     first = np.array(reachability.distinct_solutions(pose, REST))
     for size in np.random.default_rng(0).integers(1, 400, 600):
@@ -106,7 +106,7 @@ def test_results_do_not_depend_on_memory_alignment(reachability):
         np.testing.assert_array_equal(np.array(reachability.distinct_solutions(pose, REST)), first)
 
 
-def test_closed_form_of_another_arm_is_an_error(panda_files):
+def test_closed_form_for_another_arm_is_an_error(panda_files):
     chain = ArmChain(panda_files.arm_urdf, MOBILE_PANDA)
     chain.links[2] = chain.links[2].copy()
     chain.links[2][0, 3] += 0.1

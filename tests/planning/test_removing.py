@@ -1,4 +1,4 @@
-"""A heap's topmost objects are lifted away and put down; a push moves an object away from the target. Simulated."""
+"""Simulated moves in a heap: removed objects are placed elsewhere, pushes move objects away from the target."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def generator():
     made.close()
 
 
-def begin(generator, seed):
-    """The arm at the start of an episode, and the heap's objects but the target, the highest first."""
+def start_episode(generator, seed):
+    """Return the arm at the start of an episode and the other objects of the heap, the highest first."""
     executor = Executor(generator.env, seed)
     executor.reset()
     executor.facts = {"pushes": 0, "removals": 0}
@@ -49,7 +49,7 @@ def surface(arm, slot):
 
 
 def first_that_works(skill, slots):
-    """Which object can be pushed depends on the plans that are found; what a push does must not."""
+    """Run the first feasible move, since feasibility depends on the plans that are found."""
     for slot in slots:
         try:
             skill(slot)
@@ -59,8 +59,8 @@ def first_that_works(skill, slots):
     return None
 
 
-def test_a_removed_object_stands_on_a_free_place_of_the_table(generator, monkeypatch):
-    arm, target, slots = begin(generator, 13)  # a bottle leans on what is under it
+def test_removed_object_is_upright_at_a_free_position_of_the_table(generator, monkeypatch):
+    arm, target, slots = start_episode(generator, 13)  # a bottle leans on what is under it
     before = {slot: surface(arm, slot) for slot in [*slots, target]}
     moved, turns = slots[0], []
     follow = arm.follow
@@ -85,8 +85,8 @@ def test_a_removed_object_stands_on_a_free_place_of_the_table(generator, monkeyp
     assert float(arm.env.agent.gripper_width[0]) > 0.07
 
 
-def test_a_push_moves_an_object_away_from_the_target(generator):
-    arm, target, slots = begin(generator, 4)
+def test_push_moves_an_object_away_from_the_target(generator):
+    arm, target, slots = start_episode(generator, 4)
     starts = {slot: surface(arm, slot).mean(axis=0) for slot in [*slots, target]}
     pushed = first_that_works(lambda slot: push_away(arm, slot, target), slots)
     assert pushed is not None
@@ -96,8 +96,8 @@ def test_a_push_moves_an_object_away_from_the_target(generator):
     assert np.abs(arm.env.gripper_forces()).max() == 0  # it has let go of everything
 
 
-def test_push_that_moves_nothing_is_a_failure(generator, monkeypatch):
-    arm, target, slots = begin(generator, 3)
+def test_push_without_displacement_fails(generator, monkeypatch):
+    arm, target, slots = start_episode(generator, 3)
     heap, facts = Heap(arm, target), arm.executor.facts
     pushed = arm.env.objects[slots[0]]
 
@@ -119,8 +119,8 @@ def test_push_that_moves_nothing_is_a_failure(generator, monkeypatch):
         next(heap.candidate_moves())
 
 
-def test_moves_begin_with_pushes_of_what_is_highest_and_looking_changes_nothing(generator):
-    arm, target, _ = begin(generator, 3)
+def test_candidate_moves_start_with_pushes_of_the_highest_and_queries_have_no_side_effect(generator):
+    arm, target, _ = start_episode(generator, 3)
     state = arm.rng.bit_generator.state
     seen = [(count_clear_grasps(arm, target), find_grasp_blockers(arm, target)) for _ in range(2)]
     assert seen[0] == seen[1]
@@ -134,8 +134,8 @@ def test_moves_begin_with_pushes_of_what_is_highest_and_looking_changes_nothing(
         assert moves[0] == Move("push", max(in_the_way, key=lambda slot: surface(arm, slot)[:, 2].max()))
 
 
-def test_where_nothing_can_be_moved_the_target_is_grasped_as_it_lies(generator, monkeypatch):
-    arm, *_ = begin(generator, 3)
+def test_target_is_grasped_if_no_move_is_feasible(generator, monkeypatch):
+    arm, *_ = start_episode(generator, 3)
     skills = []
 
     def refuse(*_):
@@ -149,8 +149,8 @@ def test_where_nothing_can_be_moved_the_target_is_grasped_as_it_lies(generator, 
     assert skills == ["grasp", "raise_held_object", "carry_to_basket", "release_into_basket"]
 
 
-def test_after_a_push_the_arm_rises_clear_of_furniture_and_basket(generator, monkeypatch):
-    arm, target, slots = begin(generator, 3)
+def test_arm_rises_clear_of_furniture_and_basket_after_a_push(generator, monkeypatch):
+    arm, target, slots = start_episode(generator, 3)
     pushed = first_that_works(lambda slot: push.plan_push(arm, slot, target), slots)
     assert pushed is not None
     fixed, width = push._fixed_bodies, arm.planner.finger_width
@@ -174,8 +174,8 @@ def test_after_a_push_the_arm_rises_clear_of_furniture_and_basket(generator, mon
 
 
 @pytest.mark.parametrize("which", ["target", "another"])
-def test_what_lies_on_the_floor_ends_an_attempt_even_one_that_begins_after_the_fall(generator, which):
-    arm, target, slots = begin(generator, 3)
+def test_object_on_the_floor_ends_the_attempt(generator, which):
+    arm, target, slots = start_episode(generator, 3)
     Heap(arm, target).check_objects_on_surface()
     fallen = arm.env.objects[target if which == "target" else slots[0]]
     fallen.set_pose(Pose.create_from_pq(torch.tensor([[-1.0, -1.0, 0.1]]), fallen.pose.q))

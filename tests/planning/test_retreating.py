@@ -1,4 +1,4 @@
-"""Backing out of what failed: which way, and only where it is free. A planner that leads anywhere, or nowhere."""
+"""Retreat after a failed attempt: direction, and only on free lines. The planner is a stand-in."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LEVEL[:3, 3] = 0.6, 0.1, 0.4
 
 
 class Way(Arm):
-    """An arm at a pose; lines that are checked fail while the scene holds one of ``blocking``."""
+    """Arm at a pose; checked lines fail if the exclusion of the scene is in ``blocking``."""
 
     def __init__(self, tcp, approach, blocking=()):
         self._env = SimpleNamespace(
@@ -69,7 +69,7 @@ class Way(Arm):
         (LEVEL, "front", (None,), (-0.25, 0, 0), True, TARGET),  # from the target that it stands against too
     ],
 )
-def test_the_way_out_of_a_failure(tcp, approach, blocking, moved, checked, excluded):
+def test_retreat_after_a_failure(tcp, approach, blocking, moved, checked, excluded):
     arm = Way(tcp, approach, blocking)
     recover(arm)
     ((goal, *how),) = arm.lines
@@ -80,7 +80,7 @@ def test_the_way_out_of_a_failure(tcp, approach, blocking, moved, checked, exclu
 
 
 @pytest.mark.parametrize("tcp", [LEVEL, top_down(0.6, 0.1, 0.05)])
-def test_before_a_shelf_it_stays_where_no_way_is_free(tcp):
+def test_arm_stays_in_a_shelf_without_a_free_retreat(tcp):
     arm = Way(tcp, "front", blocking=(None, TARGET))
     with pytest.raises(PlanningError, match="straight_line_blocked"):
         recover(arm)

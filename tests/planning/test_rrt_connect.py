@@ -1,4 +1,4 @@
-"""The planner as a whole: safe, exactly timed, and failing with reasons that can be counted."""
+"""The complete planner: collision-free and exactly timed trajectories, and reasons of failures."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def check_limits(start, trajectory, velocity=0.5, acceleration=0.5):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_trajectories_are_free_everywhere(make_planner, checker, seed):
+def test_trajectories_are_collision_free(make_planner, checker, seed):
     planner, rng = make_planner(dt=0.01), np.random.default_rng(seed)
     planner.seed(seed)
     planner.set_scene(cloud([*table_scene(seed), WALL]))
@@ -70,7 +70,7 @@ def shifted(z):
 
 
 @pytest.mark.parametrize("held", [None, AttachedBody(corners(0.03, 0.03, 0.1), np.eye(4))])
-def test_path_leads_around_a_wall_with_what_is_held(planner, held):
+def test_path_avoids_a_wall_with_a_held_object(planner, held):
     planner.seed(0)
     planner.set_scene(cloud([WALL]))
     planner.attach(held)
@@ -100,7 +100,7 @@ def test_short_motions_end_exactly_at_their_goals(make_planner, dt):
     assert pose_error(planner.tcp(tiny.qpos[-1]), here @ shifted(0.002))[0] < 1e-5
 
 
-def test_the_nearest_reachable_goal_is_taken(planner):
+def test_planner_uses_the_nearest_reachable_goal(planner):
     near, far = REST + 0.2, REST + np.array([-1.0, 0.3, 0, 0, 0, 0.3, 0])
     trajectory = planner.plan_to_qpos(REST, [far, near], stage="x")
     np.testing.assert_array_equal(trajectory.qpos[-1], near)
@@ -111,7 +111,7 @@ def test_the_nearest_reachable_goal_is_taken(planner):
 
 
 def reach_and_down(planner):
-    """A motion to above a place on a free table, and 10 cm straight down from there."""
+    """Return a motion to above a position on an empty table, and a line 10 cm straight down."""
     planner.set_scene([])
     goal = top_down(0.5, 0.2, 0.3)
     reach = planner.plan_to_pose(REST, goal, stage="reach")
@@ -120,7 +120,7 @@ def reach_and_down(planner):
     return reach, planner.plan_straight(reach.qpos[-1], lower, stage="approach")
 
 
-def test_joined_motions_do_not_stop_and_end_as_the_second(planner):
+def test_joined_motions_do_not_stop_and_end_like_the_second(planner):
     reach, down = reach_and_down(planner)
     joined = planner.join(REST, reach, down)
     saved = reach.duration + down.duration - joined.duration
@@ -136,7 +136,7 @@ def test_joined_motions_do_not_stop_and_end_as_the_second(planner):
     assert len(low) > 3 and np.abs(low[:, :2] - (0.5, 0.2)).max() < 0.004
 
 
-def test_motions_are_joined_only_where_all_of_the_first_is_free(planner):
+def test_motions_are_joined_only_without_collisions(planner):
     reach, down = reach_and_down(planner)
     early = reach.qpos[len(reach.qpos) // 3]
     place = planner.tcp(early)[:3, 3]
@@ -157,7 +157,7 @@ def test_joined_motions_stay_within_joint_limits(planner, panda_files):
     assert planner.join(start, first, second).qpos.tolist() == [*rise.tolist(), *fall.tolist()]
 
 
-def test_a_planner_is_made_by_its_name():
+def test_planner_is_created_by_name():
     typed = make_planner_of("rrt_connect", PANDA, dt=0.1)
     assert all(hasattr(typed, member) for member in vars(Planner) if not member.startswith("_"))
     assert typed.plan_to_qpos(REST, [REST + 0.2], stage="x").dt == 0.1
@@ -191,7 +191,7 @@ def test_failures_have_reasons(make_planner, monkeypatch):
     assert reason_of(hurried.plan_to_qpos, start, hurried.ik(top_down(0.5, -0.25, 0.1), start)[:1]) == "rrt_timeout"
 
 
-def test_a_straight_line_is_blocked_by_the_cloud_unless_told_otherwise(planner):
+def test_cloud_blocks_a_straight_line_unless_collisions_are_ignored(planner):
     start = planner.ik(top_down(0.5, 0, 0.3), REST)[0]
     goal = top_down(0.5, 0, 0.1)
     planner.set_scene(cloud([Box((0.5, 0, 0.12), (0.09, 0.09, 0.06))]))
@@ -220,8 +220,8 @@ def test_speed_scales_both_limits(planner):
         slowest = trajectory.duration
 
 
-def test_the_tcp_of_a_stretched_arm_keeps_its_speed_limit(planner):
-    """Three joints that turn at 0.5 rad/s each carry a hand 0.8 m away faster than pd_ee_delta_pose can follow."""
+def test_tcp_of_a_stretched_arm_keeps_its_speed_limit(planner):
+    """Three joints at 0.5 rad/s move a hand at 0.8 m faster than pd_ee_delta_pose can follow."""
     start = np.array([-1.2, 0.9, -0.6, -0.7, 0.0, 1.7, 0.8])
     goal = start * [-1, 1, -1, 1, 1, 1, 1]
     trajectory = planner.plan_to_qpos(start, [goal], stage="sweep")

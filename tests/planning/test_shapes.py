@@ -1,4 +1,4 @@
-"""Convex hulls with a margin, by hand, and octrees, against a decoder written from octomap's format description."""
+"""Inflated hulls compared with known ones, and octrees with a decoder of octomap's format."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from planning_scenes import corners
 from robocas_ms3.planning.shapes import DEPTH, convex_hull, encode_octree, inflate_hull
 
 
-def test_an_inflated_box_has_its_faces_moved_out():
+def test_faces_of_an_inflated_box_are_moved_out():
     box = corners(0.05, 0.03, 0.02)
     larger, faces = inflate_hull(box, 0.002)
     assert np.abs(larger).max(axis=0) == pytest.approx([0.052, 0.032, 0.022], abs=1e-4)
@@ -28,7 +28,7 @@ def test_normals_of_a_hull_point_outwards():
 
 
 def decode(stream: list[int], voxel: float) -> set[tuple[int, int, int]]:
-    """Integer coordinates of the occupied voxels, and all of the stream is read."""
+    """Decode a stream to the integer coordinates of its occupied voxels; check that all of it is read."""
     data = np.array(stream, dtype=np.int8).view("<u2").tolist()
     found, position = set(), 0
 

@@ -1,4 +1,4 @@
-"""Where the base stands: what a place is good for, judged without a simulator."""
+"""Score of base poses, without a simulator."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from robocas_ms3.robots.description import MOBILE_PANDA
 
 
 class _Planner:
-    """Rejects configurations near some, as if only those touched anything."""
+    """Planner stand-in in which only configurations near ``blocked`` collide."""
 
     def __init__(self) -> None:
         self.blocked = np.empty((0, 7))
@@ -36,7 +36,7 @@ def arm(reachability):
 
 
 def grasps_in_world(arm) -> np.ndarray:
-    """Eight top-down grasps in front of the arm, at different turns."""
+    """Return eight top-down grasps in front of the arm with different yaw angles."""
     poses = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (8, 1, 1))
     for pose, turn in zip(poses, np.linspace(-1, 1, 8), strict=True):
         c, s = np.cos(turn), np.sin(turn)
@@ -45,7 +45,7 @@ def grasps_in_world(arm) -> np.ndarray:
     return arm_base_in_world(arm, np.zeros(3)) @ poses
 
 
-def test_thorough_check_finds_a_free_configuration_besides_the_nearest(arm):
+def test_thorough_check_finds_free_configurations_other_than_the_nearest(arm):
     grasps, here = grasps_in_world(arm), np.zeros(3)
     assert base_placement.reachable_fraction(arm, here, grasps, []) == 1.0
     assert base_placement.reachable_fraction(arm, here, grasps, [], thorough=True) == 1.0
@@ -64,8 +64,8 @@ def test_a_grasp_counts_only_with_its_pregrasp(arm):
     everything, of_pose = arm.reachability.all_solutions(poses, REST)
     arm.planner.blocked = everything[of_pose >= half]  # each way in
     assert base_placement.reachable_fraction(arm, here, grasps, [], thorough=True) == 0.0
-    one_and_its_twin = np.isin(of_pose, [half, half + len(grasps)])
-    arm.planner.blocked = everything[one_and_its_twin]
+    one_and_its_half_turn = np.isin(of_pose, [half, half + len(grasps)])
+    arm.planner.blocked = everything[one_and_its_half_turn]
     assert base_placement.reachable_fraction(arm, here, grasps, [], thorough=True) == pytest.approx(7 / 8)
 
 

@@ -1,4 +1,4 @@
-"""Exact steps, limits, and the shape of rounded corners."""
+"""Time steps, limits, and the shape of rounded corners."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def derivatives(start, trajectory):
     return velocity, np.diff(velocity, axis=0) / trajectory.dt
 
 
-def test_one_straight_move_takes_the_time_of_a_trapezoid():
+def test_straight_motion_has_a_trapezoidal_velocity_profile():
     # 1 rad at 0.98 x (0.5 rad/s, 0.5 rad/s2): 1 s to speed up, 1 s to slow down, 0.51 rad left at 0.49 rad/s.
     trajectory = time_with_stops(np.array([[0.0, 0.0], [1.0, -0.5]]), dt=0.01, **LIMITS)
     expected = 2 * 1.0 + (1.0 - 0.49) / 0.49
@@ -33,7 +33,7 @@ def test_one_straight_move_takes_the_time_of_a_trapezoid():
     assert np.abs(acceleration).max() <= 0.5
 
 
-def test_a_short_straight_move_never_reaches_the_top_speed():
+def test_short_straight_motion_does_not_reach_the_maximum_velocity():
     # 0.01 rad: peak sqrt(0.01 x 0.49) = 0.07 rad/s, 2 x 0.07 / 0.49 = 0.2857 s: 6 steps of 0.05 s.
     trajectory = time_with_stops(np.array([[0.0], [0.01]]), dt=0.05, **LIMITS)
     assert len(trajectory.qpos) == 6
@@ -42,7 +42,7 @@ def test_a_short_straight_move_never_reaches_the_top_speed():
 
 
 @pytest.mark.parametrize("duration", [0.001, 0.05, 0.0500001, 0.149, 1.0])
-def test_rows_lie_at_multiples_of_the_step_and_end_on_the_goal(duration):
+def test_rows_are_at_multiples_of_the_time_step_and_end_at_the_goal(duration):
     goal = np.array([1.0 + 1e-7])
     trajectory = sample_motion(lambda t: (t / duration)[:, None], duration, goal, 0.05)
     count = len(trajectory.qpos)
@@ -61,7 +61,7 @@ def test_rounded_corner_is_a_parabola_inside_the_corner():
     np.testing.assert_allclose(path(np.array([0.8, 1.0, 1.2]), 1), [[1, 0], [0.5, 0.5], [0, 1]], atol=1e-12)
 
 
-def test_rounding_leaves_room_for_the_next_corner():
+def test_rounded_corners_do_not_overlap():
     path = round_corners(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.1], [2.0, 0.1]]), 0.3)
     dense = path.dense(0.001)
     assert np.abs(np.diff(dense, axis=0)).max() <= 0.001 + 1e-9
@@ -70,7 +70,7 @@ def test_rounding_leaves_room_for_the_next_corner():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_timed_paths_keep_to_the_limits_and_end_at_rest(seed):
+def test_timed_paths_respect_the_limits_and_end_at_rest(seed):
     points = np.random.default_rng(seed).uniform(-1, 1, (5, 7))
     trajectory = time_path(round_corners(points, 0.3), dt=0.01, **LIMITS)
     assert trajectory is not None

@@ -1,4 +1,4 @@
-"""The recorder writes what ManiSkill's own would, and nothing before it is asked to."""
+"""The recorder writes the same files as ManiSkill's recorder, and only when it is finished."""
 
 import json
 import os
@@ -19,7 +19,7 @@ STEPS = 6
 
 
 def dump(group: h5py.Group) -> dict:
-    """Everything below a group, in its order: arrays with dtypes, packing and attributes."""
+    """Return the content of a group in its order: arrays with dtypes, compression and attributes."""
     found: dict = {"attributes": dict(group.attrs)}
     for name, item in group.items():
         if isinstance(item, h5py.Group):
@@ -51,11 +51,11 @@ def play(env: gym.Env, mode: str) -> None:
 @pytest.mark.parametrize(
     ("obs_mode", "mode"), [("none", "pd_joint_pos"), ("state", "pd_ee_delta_pose"), ("state_dict", "pd_joint_pos")]
 )
-def test_files_are_those_of_maniskills_recorder(tmp_path, obs_mode, mode):
+def test_files_equal_those_of_maniskills_recorder(tmp_path, obs_mode, mode):
     compare(gym.make("RoboCASPick-v1", obs_mode=obs_mode, control_mode=mode, render_backend="none"), mode, tmp_path)
 
 
-def test_images_are_those_of_maniskills_recorder(tmp_path, needs_renderer):
+def test_images_equal_those_of_maniskills_recorder(tmp_path, needs_renderer):
     small = {"width": 16, "height": 12}
     env = gym.make("RoboCASPick-v1", obs_mode="rgb+depth", control_mode="pd_joint_pos", sensor_configs=small)
     compare(env, "pd_joint_pos", tmp_path)
@@ -90,7 +90,7 @@ def compare(env: gym.Env, mode: str, folder) -> None:
     assert ours == theirs
 
 
-def test_there_is_no_file_before_the_end_and_a_fork_writes_its_own(tmp_path):
+def test_file_is_written_at_the_end_and_forks_write_their_own(tmp_path):
     env = gym.make("RoboCASPick-v1", obs_mode="none", control_mode="pd_joint_pos", render_backend="none")
     recorder = EpisodeRecorder(env, tmp_path / "made_later", "episode")
     files = len(os.listdir("/proc/self/fd"))

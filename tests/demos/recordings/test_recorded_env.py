@@ -1,4 +1,4 @@
-"""A file chooses no code and no path."""
+"""Files cannot set code or paths."""
 
 import shutil
 import sys
@@ -15,7 +15,7 @@ from robocas_ms3.demos.recordings.environment import RecordedEnv, read_env, reco
 ID = "robocas_ms3:RoboCASPick-v1"
 
 
-def test_what_makes_the_scene_is_kept_and_the_rest_is_the_readers():
+def test_scene_arguments_are_kept_and_reader_arguments_are_dropped():
     kwargs = {
         "config": "pick_table_scattered",
         "pack": "builtin",
@@ -54,19 +54,19 @@ def test_what_makes_the_scene_is_kept_and_the_rest_is_the_readers():
         ({"env_kwargs": {"sim_config": {"a": {"b": {"c": {"d": 1}}}}}}, "env_kwargs.sim_config.a.b.c"),
     ],
 )
-def test_what_a_file_may_not_choose(info, where):
+def test_forbidden_values_of_a_file_are_errors(info, where):
     with pytest.raises(DatasetError) as error:
         read_env({"env_id": ID, "env_kwargs": {}, **info}, "F.json")
     assert str(error.value.where).startswith(f"F.json, {where}")
 
 
-def test_the_user_may_choose_a_pack(tmp_path):
+def test_user_can_set_a_pack(tmp_path):
     info = {"env_id": ID, "env_kwargs": {"pack": "../mine", "config": "pick_table_scattered"}}
     assert read_env(info, "F.json", pack=tmp_path).kwargs["pack"] == str(tmp_path)
 
 
 @pytest.mark.parametrize("use", [RecordedEnv.make, RecordedEnv.cameras])
-def test_only_registered_tasks_are_made(use):
+def test_only_registered_tasks_are_created(use):
     with pytest.raises(DatasetError, match=r"unknown task .expected one of .*RoboCASPick-v1.*found CartPole-v1"):
         use(read_env({"env_id": "CartPole-v1", "env_kwargs": {}}, "F.json"))
     with pytest.raises(DatasetError, match="unknown configuration"):
@@ -74,7 +74,7 @@ def test_only_registered_tasks_are_made(use):
 
 
 @pytest.mark.parametrize(("key", "name"), [("pack", "mine"), ("furniture_pack", "mine"), ("config", "mine.yaml")])
-def test_what_lies_in_the_folder_where_we_run_is_not_taken_for_what_is_installed(tmp_path, monkeypatch, key, name):
+def test_names_of_packs_and_configurations_are_not_resolved_in_the_current_folder(tmp_path, monkeypatch, key, name):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine").mkdir()
     shutil.copyfile(builtin_packs_dir() / "builtin" / MANIFEST, tmp_path / "mine" / MANIFEST)
@@ -87,7 +87,7 @@ def test_what_lies_in_the_folder_where_we_run_is_not_taken_for_what_is_installed
     assert env.with_pack("builtin").kwargs["pack"] == "builtin"
 
 
-def test_a_recorded_configuration_can_not_extend_a_file(tmp_path):
+def test_recorded_configuration_cannot_extend_a_file(tmp_path):
     (tmp_path / "base.yaml").write_text("extends: pick_table_scattered\n")
     config = {"extends": str(tmp_path / "base.yaml")}
     env = read_env({"env_id": ID, "env_kwargs": {"config": config}}, "F.json")
@@ -96,7 +96,7 @@ def test_a_recorded_configuration_can_not_extend_a_file(tmp_path):
 
 
 @pytest.mark.parametrize("command", [("convert",), ("replay",)])
-def test_no_module_of_a_file_is_imported(tmp_path, monkeypatch, command, capsys):
+def test_modules_named_in_a_file_are_not_imported(tmp_path, monkeypatch, command, capsys):
     path = write_trajectory(tmp_path / "F.h5", seeds=(3,))
     text = path.with_suffix(".json").read_text().replace("robocas_ms3:RoboCASPick", "evilmod:RoboCASPick")
     path.with_suffix(".json").write_text(text)

@@ -23,7 +23,7 @@ def edit_json(path, change):
     file.write_text(json.dumps(data))
 
 
-def test_what_was_written_is_read(tmp_path):
+def test_written_episode_is_read(tmp_path):
     with TrajectoryFile(write_trajectory(tmp_path / "F.h5", seeds=(3, 4, 5))) as file:
         assert file.control_freq == 20
         recording, alone = file.recording(1), file.recording(1, bodies=False)
@@ -43,7 +43,7 @@ def test_what_was_written_is_read(tmp_path):
     np.testing.assert_array_equal(motion.actions, alone.motion(np.array([0, STEPS])).actions)
 
 
-def test_reconfiguring_is_an_option(own):
+def test_reconfigure_is_a_reset_option(own):
     edit_json(own, lambda data: data["episodes"][0].update(reset_kwargs={"options": {"reconfigure": True}}))
     with TrajectoryFile(own) as file:
         assert file.entry(0).reset_options == {"reconfigure": True}
@@ -56,7 +56,7 @@ def fails(path, *words):
     assert all(word in str(caught.value) for word in words)
 
 
-def test_files_that_are_missing_or_cut_off(tmp_path, own):
+def test_missing_or_truncated_files_are_errors(tmp_path, own):
     fails(tmp_path / "G.h5", "G.h5: no such trajectory file")
     data, json_file = own.read_bytes(), own.with_suffix(".json")
     for share in (0.5, 0):
@@ -79,7 +79,7 @@ def test_files_that_are_missing_or_cut_off(tmp_path, own):
         (lambda data: data["episodes"][0]["robocas"].pop("subgoals"), "robocas.subgoals"),
     ],
 )
-def test_a_json_that_does_not_fit(own, change, words):
+def test_inconsistent_json_is_an_error(own, change, words):
     edit_json(own, change)
     fails(own, words)
 
@@ -96,21 +96,21 @@ def test_a_json_that_does_not_fit(own, change, words):
         ({"elapsed_steps": -1}, "elapsed_steps"),
     ],
 )
-def test_entries_choose_a_seed_and_reconfigure_alone(own, change, key):
+def test_entries_may_set_seed_and_reconfigure_only(own, change, key):
     edit_json(own, lambda data: data["episodes"][0].update(change))
     fails(own, "traj_0: invalid episode entry: ", key)
 
 
 @pytest.mark.parametrize("values", [np.zeros(23, np.float32), np.array([b"x"] * 23), np.float32(1)])
 @pytest.mark.parametrize("name", ["actors/object_1", f"articulations/{UID}"])
-def test_states_that_are_no_rows_of_numbers(own, name, values):
+def test_states_of_wrong_shape_or_type_are_errors(own, name, values):
     with h5py.File(own, "a") as file:
         del file[f"traj_0/env_states/{name}"]
         file[f"traj_0/env_states/{name}"] = values
     fails(own, "damaged episode")
 
 
-def test_states_of_another_robot_or_none(own):
+def test_missing_states_or_states_of_another_robot_are_errors(own):
     with h5py.File(own, "a") as file:
         file.move(f"traj_0/env_states/articulations/{UID}", "traj_0/env_states/articulations/panda_wristcam")
     fails(own, f"expected {UID} with 37 numbers per state, found ['panda_wristcam']")

@@ -1,4 +1,4 @@
-"""HDF5 files of trajectories: a disk that fills up, merged files, and files that name other files."""
+"""HDF5 files of trajectories: full disks, merged files, and files with external references."""
 
 # pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportArgumentType=false
 import errno
@@ -42,7 +42,7 @@ def fill(file):
 
 
 @pytest.mark.parametrize("size", [1, 10_000_000, None])
-def test_what_was_reserved_and_not_needed_is_given_back(tmp_path, monkeypatch, size):
+def test_unused_reserved_space_is_released(tmp_path, monkeypatch, size):
     def none(*_):
         raise OSError(errno.EOPNOTSUPP, "Operation not supported")
 
@@ -55,8 +55,8 @@ def test_what_was_reserved_and_not_needed_is_given_back(tmp_path, monkeypatch, s
     assert os.path.getsize(tmp_path / "x.h5") < DATA.nbytes + 10_000
 
 
-def test_no_room_is_an_error_before_anything_is_lost(tmp_path):
-    """No crash when HDF5 frees the file, and nothing is left."""
+def test_full_disk_is_an_error_without_data_loss(tmp_path):
+    """HDF5 does not crash when it closes the file, and no file is left."""
     with files_of_at_most(100_000):
         with pytest.raises(OSError, match="x.h5") as error, atomic_file(tmp_path / "x.h5") as tmp:
             write_whole(tmp, fill)
@@ -92,7 +92,7 @@ def with_another_number(path):
 
 
 @pytest.mark.parametrize("damage", [cut_off, without_json, without_an_action, without_an_episode, with_another_number])
-def test_damage_of_a_merged_file_is_found(tmp_path, damage):
+def test_violations_of_a_merged_file_are_found(tmp_path, damage):
     path = tmp_path / "merged.h5"
     merge([write_trajectory(tmp_path / f"{seed}.h5", seeds=(seed,)) for seed in (7, 3)], path)
     assert damage_of(path, [7, 3]) == ""
@@ -103,7 +103,7 @@ def test_damage_of_a_merged_file_is_found(tmp_path, damage):
 
 @pytest.fixture
 def whole(tmp_path):
-    """A recording, and a file of somebody else beside it."""
+    """Return a recording with another file next to it."""
     with h5py.File(tmp_path / "secret.h5", "w") as file:
         file.create_dataset("states", data=SECRET)
         file.create_dataset("actions", data=np.zeros((STEPS, 8), np.float32))
@@ -163,7 +163,7 @@ def check_refused(read, path, *words):
 
 @pytest.mark.parametrize("fill", [external_link, external_numbers, virtual, soft_link])
 @pytest.mark.parametrize("read", [by_file, by_merge, by_replay])
-def test_states_of_other_files(whole, fill, read):
+def test_states_in_other_files_are_errors(whole, fill, read):
     replaced(whole, CUBE, fill)
     if fill is soft_link:
         with h5py.File(whole, "r+") as file:
@@ -175,28 +175,28 @@ def test_states_of_other_files(whole, fill, read):
 
 @pytest.mark.parametrize("read", [by_file, by_merge, by_replay, by_policy])
 @pytest.mark.parametrize("name", ["traj_0/actions", "traj_0"])
-def test_a_link_in_place_of_actions_or_of_the_episode(whole, read, name):
+def test_links_to_actions_or_episodes_are_errors(whole, read, name):
     replaced(whole, name, external_link)
     check_refused(read, whole, "reference to other data", name.rpartition("/")[2])
 
 
 @pytest.mark.parametrize("read", [by_file, by_replay])
-def test_states_said_to_be_huge(whole, read):
-    """A kilobyte of a file can stand for terabytes: they are not asked for."""
+def test_huge_declared_states_are_an_error(whole, read):
+    """A small file can declare terabytes; they are not allocated."""
     huge = {"shape": (2**33, 2**33), "dtype": np.float32, "chunks": (1024, 1024), "compression": "gzip"}
     replaced(whole, CUBE, lambda file, name: file.create_dataset(name, **huge))
     check_refused(read, whole, "MB of arrays")
 
 
-def test_a_ring_of_groups_ends(whole):
+def test_cyclic_groups_are_handled(whole):
     with h5py.File(whole, "r+") as file:
         file["traj_0/env_states/ring"] = file["traj_0/env_states"]
     check_refused(by_replay, whole, "damaged")
     assert by_file(whole).control_steps == STEPS  # which reads bodies alone
 
 
-def test_other_threads_read_files_while_an_error_of_a_recording_is_kept(whole):
-    """The iterators of h5py hold its lock: a suite of tests hung where another thread freed the error's traceback."""
+def test_other_threads_can_read_files_while_an_error_is_referenced(whole):
+    """Iterators of h5py hold its lock: tests hung when another thread freed the traceback of the error."""
     with h5py.File(whole, "r+") as file:
         file["traj_0/env_states/ring"] = file["traj_0/env_states"]
     with pytest.raises(DatasetError) as kept:
@@ -208,7 +208,7 @@ def test_other_threads_read_files_while_an_error_of_a_recording_is_kept(whole):
 
 
 @pytest.mark.parametrize("name", ["actions", "env_states/actors/object_1"])
-def test_nan_is_not_replayed(whole, name):
+def test_nan_in_a_recording_is_an_error(whole, name):
     with h5py.File(whole, "r+") as file:
         file[f"traj_0/{name}"][4, 2] = np.nan
     for read in (by_file, by_replay, *([by_policy] if name == "actions" else [])):
