@@ -26,7 +26,7 @@ from robocas_ms3.datasets.sources.provenance import recording_entry
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
-from robocas_ms3.demos.recordings.trajectory_hdf5 import damage_of, merge
+from robocas_ms3.demos.recordings.trajectory_hdf5 import find_violation, merge
 from robocas_ms3.plans.folder import (
     DATASETS,
     DEMOS,
@@ -106,7 +106,7 @@ def _join_files(folder: PlanFolder, files: EpisodeFiles, on_stage: OnStage) -> N
     for part, episodes in files.items() if "demonstrations" in plan.stages else ():
         path, recordings = out / DEMOS / plan.name_of(part) / TRAJECTORY, [each.recording for each in episodes]
         remove_leftovers(make_folder(path.parent))
-        damage, write = partial(damage_of, path, seeds[part]), partial(merge, recordings, path)
+        damage, write = partial(find_violation, path, seeds[part]), partial(merge, recordings, path)
         _join_file(path, recordings, damage, write, partial(on_stage, f"joining demonstrations, {plan.name_of(part)}"))
 
 

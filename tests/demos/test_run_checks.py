@@ -47,8 +47,11 @@ def recording(tmp_path):
         ("generate --pack nothing", "nothing: no such asset pack"),
         ("generate --config pick_table_scatered", "Did you mean pick_table_scattered"),
         ("generate --config search_table_stacked", "(expected task: pick, found task: search)"),
-        ("replay -c pd_foo", f"(expected one of {', '.join(CONVERTIBLE)}, found pd_foo)"),
-        ("replay -o foo", "obs_mode: "),
+        (
+            "replay -c pd_foo",
+            f"--control-mode: unknown control mode (expected one of {', '.join(CONVERTIBLE)}, found pd_foo)",
+        ),
+        ("replay -o foo", "--obs-mode: "),
         ("replay --count 0", "--count: "),
         ("replay --save x.txt", "x.txt: "),
     ],

@@ -179,7 +179,7 @@ def test_solution_of_maniskill_solves_its_task(monkeypatch):
     ("control_mode", "robot", "where"),
     [
         ("pd_ee_delta_pose", "panda", "control_mode"),
-        ("pd_joint_pos", "fetch", "robot"),
+        ("pd_joint_pos", "fetch", "robot_uids"),
         ("pd_joint_pos", "panda", "num_envs"),
     ],
 )

@@ -46,7 +46,7 @@ def environment(present):
 
 
 @pytest.mark.parametrize(
-    ("present", "without", "heights"),
+    ("present", "exclude", "heights"),
     [([1, 1, 1], (), [1, 2, 3]), ([1, 0, 1], (), [1, 3]), ([1, 0, 1], 2, [1]), ([0, 1, 1], [0, 1], [3])],
 )
 def test_absent_objects_are_no_obstacles(present, exclude, heights):

@@ -235,18 +235,20 @@ def merge(shards: list[Path], out: Path) -> None:
         write_json(out.with_suffix(".json"), {**merged, "episodes": episodes}, sync=True)
 
 
-def damage_of(path: Path, seeds: Sequence[int]) -> str:
+def find_violation(path: Path, seeds: Sequence[int]) -> str:
     """Check that a merged file contains these seeds in order; return the violation, or an empty string.
 
     Only metadata is read.
     """
     try:
         with open_trajectory(path) as file:
-            said = read_json(path)["episodes"]
-            found = [one_seed(episode.get("episode_seed")) for episode in said]
+            entries = read_json(path)["episodes"]
+            found = [one_seed(episode.get("episode_seed")) for episode in entries]
             if found != list(seeds) or len(file) != len(found):
-                raise DatasetError("wrong episodes", expected=len(seeds), found=f"{len(found)}, {len(file)} as HDF5")
-            for episode in said:
+                expected = f"{len(seeds)} episodes with the given seeds in order"
+                count = f"{len(found)} in the JSON, {len(file)} in the HDF5 file"
+                raise DatasetError("wrong episodes", expected=expected, found=count)
+            for episode in entries:
                 where = f"traj_{episode['episode_id']}"
                 group: Any = open_episode(file, episode["episode_id"])
                 with readable(where):

@@ -16,7 +16,7 @@ from synthetic import STEPS, write_trajectory
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import atomic_file
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
-from robocas_ms3.demos.recordings.trajectory_hdf5 import damage_of, merge, reserved, write_whole
+from robocas_ms3.demos.recordings.trajectory_hdf5 import find_violation, merge, reserved, write_whole
 from robocas_ms3.demos.trajectory_replay import RecordedEpisode
 from robocas_ms3.evaluation.policies.replay import ReplayPolicy
 from robocas_ms3.evaluation.policy import EpisodeSpec
@@ -95,10 +95,10 @@ def with_another_number(path):
 def test_violations_of_a_merged_file_are_found(tmp_path, damage):
     path = tmp_path / "merged.h5"
     merge([write_trajectory(tmp_path / f"{seed}.h5", seeds=(seed,)) for seed in (7, 3)], path)
-    assert damage_of(path, [7, 3]) == ""
-    assert "other episodes" in damage_of(path, [3, 7])
+    assert find_violation(path, [7, 3]) == ""
+    assert "wrong episodes" in find_violation(path, [3, 7])
     damage(path)
-    assert damage_of(path, [7, 3])
+    assert find_violation(path, [7, 3])
 
 
 @pytest.fixture
