@@ -189,7 +189,7 @@ def test_unsupported_env_is_an_error_with_a_fix(control_mode, robot, where):
     with pytest.raises(RobocasError) as caught:
         PandaArmMotionPlanningSolver(env)
     assert caught.value.where == where
-    assert caught.value.found == {"robot": robot, "control_mode": control_mode, "num_envs": 4}[where]
+    assert caught.value.found == {"robot_uids": robot, "control_mode": control_mode, "num_envs": 4}[where]
     assert caught.value.fix
 
 
