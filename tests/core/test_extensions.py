@@ -1,4 +1,4 @@
-"""Registries with entry points of packages that are made here."""
+"""Registries with entry points of packages that the tests create."""
 
 import logging
 import sys
@@ -11,7 +11,7 @@ from robocas_ms3.core.extensions import Registry, load_object
 
 @pytest.fixture
 def package(tmp_path, monkeypatch):
-    """Write a package with entry points of a group; other modules of it by name."""
+    """Write a package with entry points of a group, and further modules by name."""
 
     def write(points: dict[str, str], group: str = "a.group", **modules: str) -> None:
         info = tmp_path / "stranger-1.dist-info"
@@ -31,7 +31,7 @@ def registry() -> Registry[int]:
     return Registry("number", "a.group", int, {"one": 1})
 
 
-def test_a_registry_holds_the_builtin_objects_and_those_of_packages(package):
+def test_a_registry_has_builtin_objects_and_entry_points(package):
     package({"seven": "a_stranger:SEVEN"}, a_stranger="SEVEN = 7")
     numbers = registry()
     assert dict(numbers) == {"one": 1, "seven": 7}
@@ -44,7 +44,7 @@ def test_an_entry_point_can_not_replace_a_builtin_object(package, caplog):
     assert len(caplog.messages) == 1
 
 
-def test_finding_a_broken_entry_point_raises_and_iterating_warns_once(package, caplog):
+def test_a_damaged_entry_point_raises_on_access_and_warns_once_on_iteration(package, caplog):
     package({"bad": "a_stranger:BAD", "word": "words:WORD"}, a_stranger="raise OSError('gone')", words="WORD = 'x'")
     numbers = registry()
     with caplog.at_level(logging.WARNING):
@@ -55,7 +55,7 @@ def test_finding_a_broken_entry_point_raises_and_iterating_warns_once(package, c
             numbers.find("bad")
 
 
-def test_a_name_of_several_packages_is_an_error(tmp_path, monkeypatch, caplog):
+def test_a_name_defined_by_several_packages_is_an_error(tmp_path, monkeypatch, caplog):
     for package in ("ours", "yours"):
         info = tmp_path / f"{package}-1.dist-info"
         info.mkdir()
@@ -77,7 +77,7 @@ def test_the_error_of_an_unknown_name_suggests_the_nearest_one():
     assert error.value.where == "here"
 
 
-def test_objects_by_import_path():
+def test_load_object_by_import_path():
     assert load_object("robocas_ms3.core.extensions:load") is load_object
     for path in ("robocas_ms3.core.extensions:nothing", "robocas_ms3.nothing:load", "robocas_ms3.core.extensions"):
         with pytest.raises(ExtensionError, match=f"{path}: cannot import this object .expected package.module:name"):

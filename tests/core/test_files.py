@@ -17,7 +17,7 @@ from robocas_ms3.core.files import (
 )
 
 
-def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
+def test_a_failed_write_keeps_the_old_file_and_leaves_no_temporary_file(tmp_path):
     path = tmp_path / "a.json"
     write_json(path, {"n": 1})
     with pytest.raises(ZeroDivisionError), atomic_file(path) as tmp:
@@ -27,7 +27,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
 
 
-def test_a_folder_appears_whole_and_replaces_the_old_one(tmp_path):
+def test_atomic_folder_replaces_the_old_folder(tmp_path):
     path = tmp_path / "pack"
     with atomic_folder(path) as tmp:
         (tmp / "one").write_text("1")
@@ -59,7 +59,7 @@ def test_another_process_may_replace_a_folder_at_the_same_time(tmp_path, monkeyp
     assert [p.name for p in tmp_path.iterdir()] == ["asset"]
 
 
-def test_what_a_killed_run_left_is_swept_up_a_day_later(tmp_path):
+def test_leftovers_of_a_killed_run_are_removed_after_a_day(tmp_path):
     old, young, other = (tmp_path / name for name in (".pack.a.tmp", ".pack.b.tmp", ".spack.c.tmp"))
     for folder in (old, young, other):
         folder.mkdir()
@@ -71,7 +71,7 @@ def test_what_a_killed_run_left_is_swept_up_a_day_later(tmp_path):
 
 
 @pytest.mark.parametrize(("variable", "folder"), [("ROBOCAS_CACHE", "cache"), ("ROBOCAS_DATA", "data"), ("", "out")])
-def test_a_folder_that_cannot_be_made_says_what_chooses_it(tmp_path, monkeypatch, variable, folder):
+def test_the_error_of_an_unwritable_folder_names_its_environment_variable(tmp_path, monkeypatch, variable, folder):
     (tmp_path / "file").write_text("")
     for name, place in (("ROBOCAS_CACHE", "cache"), ("ROBOCAS_DATA", "data")):
         monkeypatch.setenv(name, str(tmp_path / "file" / place))
@@ -80,7 +80,7 @@ def test_a_folder_that_cannot_be_made_says_what_chooses_it(tmp_path, monkeypatch
     assert error.value.fix.startswith(f"Set {variable} to" if variable else "Choose another")
 
 
-def test_a_full_disk_is_that_of_what_is_written_not_of_what_is_copied(tmp_path):
+def test_a_full_disk_error_names_the_target_not_the_source(tmp_path):
     full = OSError(errno.ENOSPC, "No space left on device", "/site-packages/hand.stl", None, str(tmp_path / "hand.stl"))
     with (
         pytest.raises(OSError, match="No space") as error,
@@ -94,7 +94,7 @@ def test_a_full_disk_is_that_of_what_is_written_not_of_what_is_copied(tmp_path):
     assert error.value.filename == str(tmp_path / "gone")
 
 
-def test_what_is_to_survive_a_power_cut_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+def test_sync_flushes_files_before_the_rename(tmp_path, monkeypatch):
     done = []
 
     def note(owner, name, say):
@@ -112,7 +112,7 @@ def test_what_is_to_survive_a_power_cut_is_on_the_disk_before_it_has_its_name(tm
     (_, temporary), *_ = done[1:]
     assert done[1:] == [("sync", temporary), ("rename", temporary), ("sync", tmp_path.name)]
     assert temporary.startswith(".b.")
-    assert temporary.endswith(".tmp.json")  # as `outputs.sweep` looks for it
+    assert temporary.endswith(".tmp.json")  # the pattern of `output_folder.remove_leftovers`
     done.clear()
     with atomic_folder(tmp_path / "folder", sync=True) as folder:
         (folder / "file").write_text("")
@@ -134,8 +134,8 @@ def test_only_a_regular_file_is_opened_for_append(tmp_path, kind):
     assert (target.read_text() if kind == "link" else target.exists()) == ("kept" if kind == "link" else False)
 
 
-def test_a_temporary_name_is_another_each_time(tmp_path):
-    """A symbolic link under a name known before would lead the writer to another file."""
+def test_temporary_names_are_random(tmp_path):
+    """A symbolic link at a predictable name would redirect the writer to another file."""
     names = set()
     for _ in range(3):
         with atomic_file(tmp_path / "run.json") as tmp:
@@ -149,7 +149,7 @@ def test_a_temporary_name_is_another_each_time(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["é" * 125 + ".json", "." + "b" * 254])
-def test_a_name_as_long_as_the_file_system_allows(tmp_path, name):
+def test_the_longest_file_name_can_be_written(tmp_path, name):
     write_json(tmp_path / name, {"n": 1})
     assert [path.name for path in tmp_path.iterdir()] == [name]
     with pytest.raises(OSError, match=name[:20]):
@@ -176,7 +176,7 @@ _CYCLE["a"] = _CYCLE
         (_CYCLE, "a.a"),
     ],
 )
-def test_json_that_the_package_could_not_read_is_not_written(tmp_path, value, key):
+def test_json_values_that_cannot_be_read_back_are_not_written(tmp_path, value, key):
     write_json(tmp_path / "a.json", {"n": 1})
     with pytest.raises(RobocasError) as error:
         write_json(tmp_path / "a.json", value)

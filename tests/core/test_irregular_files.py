@@ -46,7 +46,7 @@ def write_result(root):
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_it_is_an_error(tmp_path, kind, make, name, read, error):
+def test_irregular_file_is_an_error(tmp_path, kind, make, name, read, error):
     make(tmp_path / "made")
     replace_file(tmp_path / "made" / name, kind)
     with pytest.raises(error) as caught:
@@ -56,6 +56,6 @@ def test_it_is_an_error(tmp_path, kind, make, name, read, error):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_outcome_of_a_plan_is_as_if_it_were_missing(tmp_path, kind):
+def test_irregular_outcome_file_of_a_plan_counts_as_missing(tmp_path, kind):
     replace_file(tmp_path / OUTCOME, kind)
     assert SeedFiles(0, 1, tmp_path).outcome() is None

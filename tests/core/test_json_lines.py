@@ -1,4 +1,4 @@
-"""JSON lines that are appended to, cut off by a kill, damaged, and written anew."""
+"""JSON Lines files: appending, incomplete and damaged lines, rewriting."""
 
 from dataclasses import dataclass, field
 
@@ -20,7 +20,7 @@ def ledger(tmp_path) -> JsonLinesFile[Try]:
     return JsonLinesFile(tmp_path / "tries.jsonl", Try)
 
 
-def test_what_is_appended_is_read_with_its_types(ledger):
+def test_appended_records_are_read_with_their_types(ledger):
     assert ledger.read() == ledger.lines() == []
     ledger.append([])
     assert not ledger.path.exists()
@@ -33,7 +33,7 @@ def test_what_is_appended_is_read_with_its_types(ledger):
 
 
 @pytest.mark.parametrize("kept", range(1, 14))
-def test_a_line_that_was_cut_anywhere_is_no_line_and_is_written_over(ledger, kept):
+def test_an_incomplete_last_line_is_ignored_and_overwritten(ledger, kept):
     ledger.append([Try(1)])
     whole = ledger.path.read_bytes()
     ledger.path.write_bytes(whole + b'{"seed": 23}\n'[:kept])
@@ -43,7 +43,7 @@ def test_a_line_that_was_cut_anywhere_is_no_line_and_is_written_over(ledger, kep
     assert all(line.problem is None for line in ledger.lines())
 
 
-def test_damaged_lines_are_told_from_one_that_was_cut_off(ledger):
+def test_damaged_lines_differ_from_an_incomplete_last_line(ledger):
     ledger.path.write_bytes(b'{"seed": 1, "new": 0}\n\n{"seed": "1"}\n[]\n\xff\n{"seed": 2}\n{"se')
     lines = ledger.lines()
     assert [(line.number, line.record, line.cut_off) for line in lines] == [
@@ -62,7 +62,7 @@ def test_damaged_lines_are_told_from_one_that_was_cut_off(ledger):
 
 
 @pytest.mark.parametrize("number", ["NaN", "-Infinity", "1e999", "9" * 400 + ".5"])
-def test_a_number_that_is_not_finite_damages_its_line(tmp_path, number):
+def test_a_line_with_nan_or_infinity_is_damaged(tmp_path, number):
     ledger: JsonLinesFile[Try] = JsonLinesFile(tmp_path / "tries.jsonl", Try)
     ledger.path.write_text(f'{{"seed": 1, "seconds": {number}}}\n{{"seed": 2}}\n{{"seed": 3, "more": [{number}]}}\n')
     assert [line.record for line in ledger.lines()] == [None, Try(2), None]
@@ -73,12 +73,12 @@ def test_a_number_that_is_not_finite_damages_its_line(tmp_path, number):
     assert len(ledger.lines()) == 3
 
 
-def test_lines_of_any_json(tmp_path):
+def test_lines_may_have_any_json_type(tmp_path):
     plain: JsonLinesFile[dict[str, int]] = JsonLinesFile(tmp_path / "plain.jsonl", dict[str, int])
     plain.append([{"a": 1}])
     assert plain.read() == [{"a": 1}]
 
 
-def test_what_can_not_be_read_is_an_error(tmp_path):
+def test_a_folder_instead_of_a_file_is_an_error(tmp_path):
     with pytest.raises(OSError, match="Is a directory"):
         JsonLinesFile(tmp_path, Try).lines()

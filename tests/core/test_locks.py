@@ -1,4 +1,4 @@
-"""Locks on output folders: who is refused, and what is left behind."""
+"""Locks on output folders: refused processes and leftovers."""
 
 import errno
 import fcntl
@@ -13,7 +13,7 @@ from robocas_ms3.core.files import make_folder
 from robocas_ms3.core.locks import locked_folder
 
 
-def test_new_parents_are_removed_with_a_folder_that_was_never_made(tmp_path):
+def test_new_parent_folders_are_removed_if_the_folder_was_not_created(tmp_path):
     with pytest.raises(ZeroDivisionError), locked_folder(tmp_path / "a" / "b" / "out"):
         _ = 1 / 0
     assert list(tmp_path.iterdir()) == []
@@ -23,7 +23,7 @@ def test_new_parents_are_removed_with_a_folder_that_was_never_made(tmp_path):
 
 
 def test_lock_file_removed_between_opening_and_locking(tmp_path, monkeypatch):
-    """The process that held it removes it; the lock on that file protects nothing."""
+    """The process that held the lock removes the file; a lock on the removed file has no effect."""
     lock, flock, calls = tmp_path / ".out.lock", fcntl.flock, []
 
     def first_removed(*args):
@@ -50,13 +50,13 @@ def test_lock_file_that_is_a_link_is_not_written_to(tmp_path):
 
 
 @pytest.mark.skipif(not os.access("/proc", os.W_OK), reason="/proc does not look writable here")
-def test_folder_that_only_looks_writable():
+def test_folder_that_reports_wrongly_that_it_is_writable():
     with pytest.raises(RobocasError) as error, locked_folder("/proc/out"):
         pass
     assert str(error.value.where) == "/proc"
 
 
-def test_one_lock_whatever_links_lead_to_a_folder(tmp_path):
+def test_links_to_a_folder_share_its_lock(tmp_path):
     (tmp_path / "disk").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "disk")
     (tmp_path / "other").mkdir()
@@ -66,7 +66,7 @@ def test_one_lock_whatever_links_lead_to_a_folder(tmp_path):
             pass
 
 
-def test_lock_of_a_process_that_is_ending_is_waited_for(tmp_path):
+def test_locking_waits_for_a_process_that_is_ending(tmp_path):
     holding = ExitStack()
     holding.enter_context(locked_folder(tmp_path / "out"))
     threading.Timer(0.15, holding.close).start()
@@ -86,7 +86,7 @@ def test_file_system_without_locks_gives_a_warning(tmp_path, monkeypatch, caplog
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_error_of_the_disk_is_not_taken_for_another_run(tmp_path, monkeypatch):
+def test_disk_error_is_not_reported_as_another_run(tmp_path, monkeypatch):
     def flock(*_):
         raise OSError(errno.EIO, "Input/output error")
 

@@ -1,4 +1,4 @@
-"""Output folders: which are continued, refused, overwritten, and what is left behind."""
+"""Output folders: continued, refused and overwritten folders, and leftovers."""
 
 import errno
 import json
@@ -55,7 +55,7 @@ def test_other_settings_are_refused_with_all_changes(tmp_path):
 
 @pytest.mark.parametrize("overwrite", [False, True])
 @pytest.mark.parametrize("record", [None, "[]", "{", '{"protocol": "of another command"}'])
-def test_folder_of_something_else_is_left_alone(tmp_path, record, overwrite):
+def test_folder_of_another_program_is_not_changed(tmp_path, record, overwrite):
     (tmp_path / "thesis").touch()
     if record is not None:
         (tmp_path / "run.json").write_text(record)
@@ -153,7 +153,7 @@ def test_two_runs_in_one_folder(tmp_path):
         write_run(tmp_path / "out")
 
 
-def test_shared_folder_is_neither_locked_nor_swept_and_keeps_its_record(tmp_path):
+def test_shared_folder_is_not_locked_and_keeps_its_record_and_leftovers(tmp_path):
     out = tmp_path / "out"
     with OutputFolder(out, KIND, SETTINGS, shared=True) as first:
         first.start({**SETTINGS, "started": 1})
@@ -174,7 +174,7 @@ def test_shared_folder_is_neither_locked_nor_swept_and_keeps_its_record(tmp_path
             first.check_record()
 
 
-def test_output_written_in_one_go(tmp_path):
+def test_output_written_at_once_is_replaced_only_with_overwrite(tmp_path):
     out = tmp_path / "out"
     check_replaceable(out)
     out.mkdir()
@@ -201,7 +201,7 @@ def test_leftovers_are_removed_and_links_are_not_followed(tmp_path):
 
 @pytest.fixture
 def mounted(tmp_path, monkeypatch):
-    """A folder that can be written into, but neither renamed nor have anything next to it, like a container's mount."""
+    """A writable folder that cannot be renamed and has a read-only parent, such as a mount in a container."""
     out = tmp_path / "out"
     out.mkdir()
     whole, access = os.replace, os.access
@@ -224,7 +224,7 @@ def test_mounted_folder_is_locked_and_emptied_in_place(mounted):
     assert names(mounted) == ["run.json"]
 
 
-def test_mounted_folder_is_replaced_from_within(mounted):
+def test_mounted_folder_is_replaced_by_moving_entries(mounted):
     (mounted / "old").touch()
     with pytest.raises(ZeroDivisionError), atomic_folder(mounted) as folder:
         (folder / "new").touch()

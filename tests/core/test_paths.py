@@ -14,7 +14,7 @@ from robocas_ms3.core.errors import RobocasError
 
 @pytest.fixture
 def home(tmp_path, monkeypatch):
-    """A user without a folder to write to but the temporary one."""
+    """A user whose only writable folder is the temporary directory."""
     (tmp_path / "home").write_text("")
     (tmp_path / "temporary").mkdir()
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
@@ -38,7 +38,7 @@ def test_a_home_that_is_read_only_gives_a_private_cache_and_one_warning(home, ca
 
 
 @pytest.mark.parametrize("fake", ["others can write", "a link"])
-def test_a_cache_that_somebody_else_laid_out_is_not_taken(home, fake):
+def test_a_cache_folder_of_another_user_is_not_used(home, fake):
     folder = home.with_name("temporary") / f"robocas-{os.getuid()}"
     if fake == "a link":
         home.with_name("elsewhere").mkdir(mode=0o700)
@@ -49,7 +49,7 @@ def test_a_cache_that_somebody_else_laid_out_is_not_taken(home, fake):
     assert paths.cache_dir() == home / ".cache" / "robocas"  # where the error then says what to do
 
 
-def test_a_cache_that_can_be_made_is_not_made_by_asking(home):
+def test_cache_dir_does_not_create_the_folder(home):
     home.unlink()
     assert paths.cache_dir() == home / ".cache" / "robocas"
     assert not home.exists()
@@ -90,7 +90,7 @@ def test_without_a_home_folder_both_variables_are_needed(no_home, monkeypatch, t
     assert not any(tmp_path.iterdir())
 
 
-def test_an_empty_home_is_the_one_that_the_system_knows(monkeypatch):
+def test_an_empty_home_variable_is_set_to_the_users_home_folder(monkeypatch):
     monkeypatch.setenv("HOME", "")
     paths.ensure_home()
     assert os.environ["HOME"] == pwd.getpwuid(os.getuid()).pw_dir

@@ -1,4 +1,4 @@
-"""Rigid transforms: by hand, back again, and one as it is among others."""
+"""Rigid transforms: known values, round trips, single poses against batches."""
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ def transforms(draw):
     return poses.from_rotation(rng.uniform(-2, 2, (count, 2, 3)), turns)
 
 
-def test_by_hand():
+def test_transforms_of_known_poses():
     # a quarter turn about z, at (1, 2, 3): the frame's x points along the world's y
     pose = poses.from_wxyz(np.array([1, 2, 3, np.sqrt(0.5), 0, 0, np.sqrt(0.5)]))
     np.testing.assert_allclose(pose, [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], atol=1e-12)
@@ -30,7 +30,7 @@ def test_by_hand():
 
 @settings(max_examples=50, deadline=None)
 @given(transforms())
-def test_what_is_undone_is_as_before(some):
+def test_inverse_and_conversions_round_trip(some):
     np.testing.assert_allclose(poses.inverse(some) @ some, np.broadcast_to(np.eye(4), some.shape), atol=1e-12)
     np.testing.assert_allclose(poses.from_wxyz(poses.to_wxyz(some)), some, atol=1e-12)
     seven = poses.to_wxyz(some)
@@ -40,7 +40,7 @@ def test_what_is_undone_is_as_before(some):
 
 @settings(max_examples=50, deadline=None)
 @given(transforms())
-def test_one_is_as_it_is_among_others_to_the_bit(some):
+def test_a_single_pose_equals_a_batch_element_bitwise(some):
     seven = poses.to_wxyz(some)
     for index in np.ndindex(*some.shape[:-2]):
         np.testing.assert_array_equal(poses.from_wxyz(seven[index]), poses.from_wxyz(seven)[index])

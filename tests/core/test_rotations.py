@@ -31,7 +31,7 @@ def unit(values: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.15])
-def test_quaternions_of_euler_angles_are_maniskills(scale):
+def test_quaternions_from_euler_angles_match_maniskill(scale):
     angles = batch(0, 3) * np.float32(scale)
     expected = matrix_to_quaternion(euler_angles_to_matrix(torch.from_numpy(angles).double(), "XYZ"))
     expected = torch.where(expected[:, :1] < 0, -expected, expected)
@@ -40,7 +40,7 @@ def test_quaternions_of_euler_angles_are_maniskills(scale):
         same(np.asarray(found)[clear], expected[clear])
 
 
-def test_products_and_turned_vectors_are_maniskills():
+def test_products_and_rotated_vectors_match_maniskill():
     first, second, vectors = unit(batch(1, 4)), unit(batch(2, 4)), batch(3, 3)
     tensors = [torch.from_numpy(array) for array in (first, second, vectors)]
     exact = [tensor.double() for tensor in tensors]

@@ -1,4 +1,4 @@
-"""Code of others can't end a command without an error, and the second Ctrl-C ends a long native call."""
+"""Extensions cannot end a command without an error, and a second Ctrl-C ends a long native call."""
 
 import os
 import signal
@@ -120,7 +120,7 @@ def python(program: str) -> subprocess.Popen:
     ("number", "code", "seconds", "said"),
     [(signal.SIGINT, 130, 0.5, "interrupted\n"), (signal.SIGINT, 130, 100, ""), (signal.SIGTERM, 143, 100, "")],
 )
-def test_a_command_ends_once_and_soon_however_often_it_is_interrupted(number, code, seconds, said):
+def test_a_command_ends_within_seconds_after_several_interrupts(number, code, seconds, said):
     with python(ENDING.format(seconds=seconds)) as process:
         assert process.stdout is not None and process.stdout.readline() == "ready\n"
         for _ in range(3):
@@ -151,12 +151,12 @@ def test_the_second_ctrl_c_ends_a_long_native_call(around, call):
         pytest.param(UNSIGNALLED, "policy mine:Policy\n", id="an interrupt without a signal is an error of its source"),
     ],
 )
-def test_signals_are_handled_once_and_at_their_place(program, printed):
+def test_deferred_signals_are_handled_once_after_the_block(program, printed):
     with python(program) as process:
         assert (process.communicate()[0], process.returncode) == (printed, 0)
 
 
-def test_a_file_is_written_although_ctrl_c_came_twice():
+def test_a_protected_file_is_written_despite_two_interrupts():
     with python(WRITING) as process:
         assert process.stdout is not None and process.stdout.readline() == "ready\n"
         for _ in range(2):
@@ -165,12 +165,12 @@ def test_a_file_is_written_although_ctrl_c_came_twice():
         assert (process.stdout.read(), process.wait()) == ("written\nhandled\n", 0)
 
 
-def test_an_exit_is_an_error_of_its_source():
+def test_an_exit_in_an_extension_is_an_extension_error():
     with pytest.raises(ExtensionError) as caught, forbid_exit("policy mine:Policy"):
         sys.exit(0)
     assert caught.value.where == "policy mine:Policy"
     assert __file__ in str(caught.value.found)
-    with pytest.raises(KeyboardInterrupt), forbid_exit("a library has no handler of its own"):
+    with pytest.raises(KeyboardInterrupt), forbid_exit("a library has no handler"):
         raise KeyboardInterrupt
 
 

@@ -1,4 +1,4 @@
-"""What is said of mistakes in data of others, whatever its form: one line, in our words."""
+"""Messages of validation errors: one line with key, expected and found values."""
 
 from typing import Annotated, Literal
 
@@ -58,7 +58,7 @@ def test_messages_about_long_keys_are_short(values):  # a client of a policy ser
     assert "k" * 3 in str(error.value).replace(" ", "")
 
 
-def test_what_fits_is_read_as_yaml_has_it():
+def test_valid_values_are_read_from_yaml():
     shelf = parse(Shelf, {"name": "a", "things": [{"kind": "crate", "size": [1, 2]}]}, ConfigError, where="")
     assert shelf.things == [Crate(size=(1.0, 2.0))]
     with pytest.raises(ValidationError):
@@ -95,22 +95,22 @@ def test_what_fits_is_read_as_yaml_has_it():
         ),
     ],
 )
-def test_mistakes(changes, message):
+def test_messages_of_invalid_values(changes, message):
     assert said(**changes) == message
 
 
-def test_what_json_has_no_word_for_is_a_mistake_at_its_key():
+def test_a_value_without_json_type_is_reported_at_its_key():
     assert said(boards={1, 2}) == "invalid value for 'boards' (expected a whole number, found {'set': '{1, 2}'})"
     assert "has no place in this file" in said(names={(1, 2): 3})
 
 
-def test_json_itself():
+def test_invalid_json_is_an_error():
     with pytest.raises(AssetError, match=r"^f: invalid JSON .found EOF while parsing"):
         parse_json(Shelf, '{"name": ', AssetError, where="f")
     assert parse_json(Shelf, b'{"name": "a"}', AssetError, where="f").boards == 2
 
 
-def test_other_words_and_other_forms():
+def test_messages_with_custom_words_and_types():
     form = TypeAdapter(dict[str, Ball])
     with pytest.raises(ValidationError) as caught:
         form.validate_json('{"a": {"radius": "x"}, "b": 3}', strict=True)
@@ -121,7 +121,7 @@ def test_other_words_and_other_forms():
     assert str(made) == ("f: invalid value for 'a.radius' (expected a number, found 'x'). 1 more error. Make it again.")
 
 
-def test_the_nearest_words():
+def test_did_you_mean_suggests_similar_names():
     assert did_you_mean("shelv", ["table", "shelf"]) == "Did you mean shelf?"
     assert did_you_mean("sofa", ["table", "shelf"]) == ""
 
@@ -131,7 +131,7 @@ class Form(StrictModel):
 
 
 @pytest.mark.parametrize("name", ["a", "link_0", "Left Tür 1", "a.b-c", "机器人", "x" * 200])
-def test_plain_names_are_names_of_files(tmp_path, name):
+def test_valid_file_names_are_accepted(tmp_path, name):
     assert check_name(name, AssetError, where="file") == name
     (tmp_path / name).mkdir()
     assert [path.name for path in tmp_path.iterdir()] == [name]
@@ -140,7 +140,7 @@ def test_plain_names_are_names_of_files(tmp_path, name):
 @pytest.mark.parametrize(
     "name", ["", ".", "..", ".hidden", "a/b", "/a", "..\\a", "a\nb", "a\x00", "\x1b[31m", "\ud800", "ü" * 101]
 )
-def test_other_names_are_refused(name):
+def test_invalid_file_names_are_refused(name):
     with pytest.raises(AssetError) as raised:
         check_name(name, AssetError, where="file")
     assert raised.value.where == "file" and len(str(raised.value)) < 300

@@ -33,7 +33,7 @@ HOSTILE = (
 )
 
 
-def test_control_characters_are_escapes_and_all_else_stays():
+def test_only_control_characters_are_escaped():
     shown = escape_controls(HOSTILE + "\n\té 😀 \u0645\u0646")
     assert shown.isprintable()
     assert shown.encode()
@@ -57,7 +57,7 @@ def test_a_text_in_markdown_has_no_markup():
     assert escape_markdown("pick_table_scattered 0.5 \x1b") == "pick_table_scattered 0.5 \\u001b"
 
 
-def test_an_error_is_one_line():
+def test_errors_are_formatted_as_one_line():
     assert one_line(ValueError("a\n  b\x1b"), 3) == "a b"
     assert one_line(TimeoutError()) == "TimeoutError"
     assert one_line(KeyError("steps")) == "no key 'steps'"

@@ -1,4 +1,4 @@
-"""How worker processes end: with Ctrl-C, with the program however it ends, and with a pool that nobody closed."""
+"""End of worker processes: Ctrl-C, end of the program, unclosed pools."""
 
 import os
 import signal
@@ -52,7 +52,7 @@ except KeyboardInterrupt:
 
 
 def start(folder, kind):
-    """Start the program, in a session of its own."""
+    """Start the program in a new session."""
     for name in ("making", "started"):
         (folder / name).mkdir()
     (folder / "program.py").write_text(PROGRAM)
@@ -62,7 +62,7 @@ def start(folder, kind):
 
 
 def wait_for(folder, count, program):
-    """Wait for so many processes that have left a file, and return them."""
+    """Wait until ``count`` processes have written a file, and return them."""
     while len(paths := list(folder.iterdir())) < count:
         time.sleep(0.02)
         assert program.poll() is None
@@ -79,7 +79,7 @@ def have_ended(processes):
 
 
 @pytest.mark.parametrize(("kind", "count"), [("sleeps", 2), ("native", 2), ("forks", 4)])
-def test_workers_end_with_a_program_that_is_killed(tmp_path, kind, count):
+def test_workers_end_when_the_program_is_killed(tmp_path, kind, count):
     with start(tmp_path, kind) as program:
         workers = wait_for(tmp_path / "started", count, program)
         time.sleep(0.5)
@@ -108,7 +108,7 @@ def test_ctrl_c_while_processes_start_runs_no_task(tmp_path):
         assert list((tmp_path / "started").iterdir()) == []
 
 
-def test_a_pool_that_nobody_closed_does_not_keep_its_program(tmp_path):
+def test_an_unclosed_pool_does_not_block_the_end_of_the_program(tmp_path):
     with start(tmp_path, "short") as program:
         try:
             assert (program.communicate(timeout=60)[1], program.returncode) == ("", 0)

@@ -1,4 +1,4 @@
-"""The worker pool: order, errors, limits, and what the death of a worker process costs."""
+"""Worker pool: order, errors, limits and crashes of worker processes."""
 
 import errno
 import os
@@ -69,7 +69,7 @@ def tasks_of(results):
     return [task for task, *_ in results]
 
 
-def test_without_processes_tasks_run_in_this_process():
+def test_zero_workers_run_tasks_in_this_process():
     with WorkerPool(Counter, 0) as pool:
         assert list(pool.map(["a", "b"])) == [("a", os.getpid(), 1), ("b", os.getpid(), 2)]
     with WorkerPool(CannotBeMade, 0) as pool:
@@ -87,7 +87,7 @@ def test_each_process_makes_one_worker_which_runs_all_tasks(tmp_path):
     assert len(pids) <= 2
 
 
-def test_results_are_ordered_or_come_when_they_are_there_and_tasks_may_be_endless():
+def test_results_are_in_task_order_or_in_order_of_completion():
     tasks = [0.6, 0.0, 0.01, 0.02]
     with WorkerPool(Counter, 2) as pool:
         assert tasks_of(pool.map(tasks)) == tasks
@@ -104,16 +104,16 @@ def touch_or_wait(path):
     return path.name
 
 
-def test_the_other_workers_go_on_while_a_slow_task_holds_up_results_and_few_of_these_wait(tmp_path):
+def test_other_workers_continue_during_a_slow_task_with_a_limited_number_of_waiting_results(tmp_path):
     taken = []
     tasks = (taken.append(number) or tmp_path / f"{number}" for number in count())
     with WorkerPool(partial(FunctionWorker, touch_or_wait), 2, limits=Limits(seconds=60), retries=0) as pool:
         results = pool.map(tasks)
-        assert [next(results), next(results)] == ["0", "1"]  # "0" ends after "9" has begun
+        assert [next(results), next(results)] == ["0", "1"]  # "0" ends after "9" has started
         assert len(taken) < 25
 
 
-def test_after_ctrl_c_a_pool_gives_the_results_of_later_tasks():
+def test_a_pool_runs_later_tasks_after_ctrl_c():
     with WorkerPool(Counter, 1) as pool:
         pool.run("start")
         threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
@@ -128,7 +128,7 @@ class Result:
 
 
 @pytest.mark.parametrize("ordered", [True, False])
-def test_results_are_not_kept(ordered):
+def test_results_do_not_accumulate_in_memory(ordered):
     """A caller that is slower than the workers once kept all results in memory."""
     with WorkerPool(partial(FunctionWorker, Result), 1) as pool:
         results, given = pool.map(count(), ordered=ordered), []
@@ -139,7 +139,7 @@ def test_results_are_not_kept(ordered):
 
 
 @pytest.mark.parametrize("num_workers", [0, 1])
-def test_an_error_is_raised_as_it_is_and_the_worker_is_made_again(num_workers):
+def test_an_error_of_a_task_is_raised_and_the_worker_is_created_again(num_workers):
     with WorkerPool(Counter, num_workers) as pool:
         assert [pool.run("a")[2], pool.run("a")[2]] == [1, 2]
         with pytest.raises(AssetError) as caught:
@@ -149,13 +149,13 @@ def test_an_error_is_raised_as_it_is_and_the_worker_is_made_again(num_workers):
 
 
 @pytest.mark.parametrize("num_workers", [0, 2])
-def test_an_error_of_making_the_worker_is_raised_as_it_is(num_workers):
+def test_an_error_of_creating_the_worker_is_raised(num_workers):
     with WorkerPool(CannotBeMade, num_workers) as pool, pytest.raises(AssetError):
         list(pool.map(["a", "b", "c"]))
 
 
 @pytest.mark.parametrize("ordered", [True, False])
-def test_a_crash_costs_only_its_own_task(tmp_path, ordered):
+def test_a_crash_affects_only_its_own_task(tmp_path, ordered):
     tasks = ["a", "b", "die", "c", "die", "d", "e"]
     make_worker = partial(Counter, log=tmp_path / "log")
     with WorkerPool(make_worker, 2, on_crash=lambda task, reason: (f"{task}d: {reason}", 0, 0)) as pool:
@@ -192,7 +192,7 @@ def test_a_crash_in_a_pool_of_the_task_is_an_error_of_the_task(tmp_path):
     ("task", "limits", "reason"),
     [("hang", Limits(seconds=1.2), "time limit exceeded"), ("grow", Limits(memory_gb=0.3), "memory limit exceeded")],
 )
-def test_a_task_that_exceeds_a_limit_is_tried_again_once(tmp_path, caplog, task, limits, reason):
+def test_a_task_that_exceeds_a_limit_is_retried_once(tmp_path, caplog, task, limits, reason):
     def crashed(task, reason):
         return f"{task}: {reason}", 0, 0
 
@@ -211,7 +211,7 @@ def test_a_result_that_cannot_be_pickled_is_an_error():
         pool.run(1)
 
 
-def test_a_process_outlives_the_thread_that_asked_for_it_a_sigterm_and_a_fork():
+def test_a_worker_process_survives_the_calling_thread_a_sigterm_and_a_fork():
     with WorkerPool(Counter, 1) as pool:
         found = []
         thread = threading.Thread(target=lambda: found.append(pool.run("a")))
@@ -223,14 +223,14 @@ def test_a_process_outlives_the_thread_that_asked_for_it_a_sigterm_and_a_fork():
         pid = os.fork()
         if not pid:
             try:
-                os._exit(0 if pool.run("b")[2] == 1 else 1)  # by a process of its own
+                os._exit(0 if pool.run("b")[2] == 1 else 1)  # in a separate process
             finally:
                 os._exit(2)
         assert os.waitpid(pid, 0)[1] == 0
         assert pool.run("b") == ("b", process, 3)
 
 
-def test_stopping_a_pool_cancels_what_other_threads_wait_for():
+def test_stopping_a_pool_cancels_waiting_threads():
     errors = []
 
     def wait():
@@ -251,7 +251,7 @@ def test_stopping_a_pool_cancels_what_other_threads_wait_for():
     assert len(errors) == 2
 
 
-def test_a_process_that_the_system_refuses_is_an_error_and_ends_nothing(monkeypatch):
+def test_a_process_that_cannot_start_is_an_error(monkeypatch):
     def refuse(*args, **kwargs):
         raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
 
@@ -270,7 +270,7 @@ class TooLarge(Counter):
         time.sleep(1000)
 
 
-def test_a_process_that_is_too_large_before_its_first_task_blames_no_task():
+def test_a_process_over_the_memory_limit_before_its_first_task_is_a_start_error():
     with WorkerPool(TooLarge, 1, limits=Limits(memory_gb=0.2), on_crash=lambda task, reason: (task, 0, 0)) as pool:
         with pytest.raises(WorkerStartError) as caught:
             pool.run("a")
@@ -296,8 +296,8 @@ with WorkerPool(Busy, 2) as pool:
 """
 
 
-def test_a_program_from_standard_input_needs_no_guard_and_leaves_no_semaphores():
+def test_a_program_from_standard_input_needs_no_main_guard_and_leaks_no_semaphores():
     env = {**os.environ, "PYTHONPATH": ROOT}
     done = subprocess.run([sys.executable, "-"], env=env, input=PROGRAM, capture_output=True, text=True, check=True)
     assert done.stdout == "0\n"
-    assert "leaked" not in done.stderr  # the semaphore of a progress bar, of which Python would warn
+    assert "leaked" not in done.stderr  # the semaphore of a progress bar, about which Python would warn
