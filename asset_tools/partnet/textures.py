@@ -25,24 +25,24 @@ from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray
 
-HEAVY, LIGHT = 500, 200  # triangles of one side of a mesh: more than this many are reduced to this many
-SIDE = 1024  # pixels of the image at most
-DENSITY = 400.0  # pixels a metre at most
-PADDING = 2  # pixels round each tile
-PLAIN = 4  # pixels of a tile of one colour
-GRID = 16  # tiles begin and end at 1/16 of their texture, so that neighbours share them
-ENOUGH = 0.6  # of the pixels that a chart would like, to do with another's tile
+HEAVY, LIGHT = 500, 200  # triangles per side of a mesh: limit without reduction, and number after reduction
+SIDE = 1024  # pixels, maximum size of the image
+DENSITY = 400.0  # maximum pixels per metre
+PADDING = 2  # pixels around each tile
+PLAIN = 4  # pixels, size of a tile of one colour
+GRID = 16  # tiles start and end at multiples of 1/16 of their texture, so that neighbours share them
+ENOUGH = 0.6  # minimum resolution relative to the desired one for using another chart's tile
 
 
 @dataclass(frozen=True)
 class _Tile:
-    """A piece of a texture, in its UVs; or one colour."""
+    """A part of a texture in UV coordinates, or one colour."""
 
     color: tuple[int, int, int] = (0, 0, 0)
     image: Image.Image | None = None
     low: tuple[float, float] = (0.0, 0.0)
     high: tuple[float, float] = (1.0, 1.0)
-    scale: float = 1.0  # pixels a pixel of the texture
+    scale: float = 1.0  # pixels per pixel of the texture
 
     def size(self, shrink: float) -> tuple[int, int]:
         if self.image is None:
@@ -51,13 +51,13 @@ class _Tile:
         width, height = np.maximum(np.rint(pixels), 2).astype(int).tolist()
         return width, height
 
-    def drawn(self, width: int, height: int) -> Image.Image:
-        """The tile with its padding, the texture repeating without end."""
+    def draw(self, width: int, height: int) -> Image.Image:
+        """Draw the tile of a repeating texture with padding."""
         if self.image is None:
             return Image.new("RGB", (width + 2 * PADDING, height + 2 * PADDING), self.color)
         wanted = np.subtract(self.high, self.low) * self.image.size / (width, height)
         shrink = np.clip(np.floor(wanted), 1, self.image.size).astype(int).tolist()
-        image = self.image.reduce(tuple(shrink))  # what repeats fifty times in a few pixels is but its mean
+        image = self.image.reduce(tuple(shrink))  # averages textures that repeat many times in a few pixels
         columns, rows = image.size
         left, right = self.low[0] * columns, self.high[0] * columns
         top, bottom = (1 - self.high[1]) * rows, (1 - self.low[1]) * rows
@@ -73,16 +73,16 @@ class _Tile:
 
 
 def merge_faces(faces: Sequence[Faces]) -> trimesh.Trimesh:
-    """A mesh with one texture that looks like all of the faces.
+    """Merge faces to a mesh with one texture and the same appearance.
 
-    Carved and turned parts of thousands of faces are simplified. Textures that repeat are written out as often as they
-    repeat, at most 400 pixels a metre.
+    Ornamental parts with thousands of faces are simplified. Repetitions of textures are written out, with at most 400
+    pixels per metre.
 
     Args:
-        faces: in one frame, metres.
+        faces: faces in one frame, metres.
 
     Raises:
-        AssetError: a texture can't be read.
+        AssetError: a texture cannot be read.
     """
     light = [_simplified(one) for one in faces]
     materials = sorted({one.material for one in light}, key=lambda one: (str(one.image), one.color))
@@ -220,7 +220,7 @@ def _packed(tiles: Sequence[_Tile]) -> tuple[Image.Image, Array]:
             raise AssetError("the textures don't fit into one image", found=f"{len(tiles)} pieces")
     texture_image = Image.new("RGB", (width, height))
     for tile, (left, top, across, down) in zip(tiles, boxes.astype(int).tolist(), strict=True):
-        texture_image.paste(tile.drawn(across, down), (left - PADDING, top - PADDING))
+        texture_image.paste(tile.draw(across, down), (left - PADDING, top - PADDING))
     return texture_image, boxes
 
 

@@ -1,4 +1,4 @@
-"""Formats that trimesh reads: PLY, STL, OFF, COLLADA and 3MF."""
+"""Read PLY, STL, OFF, COLLADA and 3MF files with trimesh."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ BLACK = 0.02  # linear
 
 
 def read_exchange(path: Path, files: ModelFiles) -> list[MeshPart]:
-    """Read a file of one of these formats.
+    """Read a mesh file.
 
     Args:
         path: the file.
-        files: reads it and what it names; gets the warnings.
+        files: reads the file and its textures; warnings are added to its notes.
 
     Raises:
-        AssetError: the file is damaged, too large, or names a texture that is missing.
+        AssetError: the file is damaged or too large, or a texture is missing.
         MissingExtraError: COLLADA, without pycollada.
     """
     data, suffix = files.read(path), path.suffix.lower()[1:]
@@ -60,15 +60,15 @@ def read_exchange(path: Path, files: ModelFiles) -> list[MeshPart]:
         parts = [part for part in _parts(scene, textures) if len(part.faces)]
     except AssetError:
         raise
-    except Exception as error:  # whatever trimesh's parsers trip over
+    except Exception as error:  # trimesh's parsers may raise any error
         found = format_error(error, 200)
-        raise AssetError("can't read this mesh", where=path, found=found, fix="Export it again.") from error
+        raise AssetError("cannot read this mesh", where=path, found=found, fix="Export it again.") from error
     if textures.error is not None:
         raise textures.error
     count = sum(len(part.faces) for part in parts)
     if count < faces:
         found, fix = f"{count} faces", "Copy or export it again."
-        raise AssetError("the file is cut short", where=path, expected=f"{faces} faces", found=found, fix=fix)
+        raise AssetError("the file is truncated", where=path, expected=f"{faces} faces", found=found, fix=fix)
     if count > MOST_FACES:
         expected = f"at most {MOST_FACES:,}"
         raise AssetError("the mesh has too many faces", where=path, expected=expected, fix="Reduce it.")
@@ -77,7 +77,7 @@ def read_exchange(path: Path, files: ModelFiles) -> list[MeshPart]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep trimesh's log lines, with tracebacks, from the terminal: what is wrong is said by errors and notes."""
+    """Disable trimesh's log lines, which have tracebacks; problems are reported by errors and notes."""
     logger = logging.getLogger("trimesh")
     disabled, logger.disabled = logger.disabled, True
     try:
@@ -87,7 +87,7 @@ def _quiet() -> Iterator[None]:
 
 
 class _Textures(Resolver):
-    """Gives trimesh the textures that a file names, wherever they are below the model's folder."""
+    """Resolver that finds textures for trimesh anywhere below the model's folder."""
 
     def __init__(self, path: Path, files: ModelFiles) -> None:
         self._path, self._files = path, files
@@ -99,25 +99,25 @@ class _Textures(Resolver):
         self._files.notes.append(text)
 
     def get(self, name: str) -> bytes:
-        """Return the image as BMP, 8 bits a channel."""
+        """Return an image as BMP with 8 bits per channel."""
         try:
             file = self._files.find(name, self._path.parent)
             if file is None:
-                where, fix = self._path.parent / name, "Put it next to the mesh."
-                raise AssetError("a texture that the mesh names is missing", where=where, fix=fix)
+                where, fix = self._path.parent / name, "Put the file next to the mesh."
+                raise AssetError("missing texture of the mesh", where=where, fix=fix)
             image = open_texture(self._files.read(file), file, self._files.notes)
         except AssetError as error:
-            self.error, image = self.error or error, Image.new("RGB", (1, 1))  # raised when trimesh is done
+            self.error, image = self.error or error, Image.new("RGB", (1, 1))  # raised after trimesh has finished
         stream = io.BytesIO()
-        image.save(stream, format="BMP")  # no time is lost by compressing it
+        image.save(stream, format="BMP")  # BMP needs no compression time
         return stream.getvalue()
 
     def keys(self) -> list[str]:
-        """Return no names: none is known before it is asked for."""
+        """Return no names, since textures are found on demand."""
         return []
 
     def namespaced(self, namespace: str) -> _Textures:
-        """Return itself: names are those in the file."""
+        """Return itself; names are not changed."""
         return self
 
     def write(self, name: str, data: Any) -> None:
@@ -125,13 +125,13 @@ class _Textures(Resolver):
         raise NotImplementedError
 
     def shared(self, image: Image.Image) -> Image.Image:
-        """Return the same object for images of the same content."""
+        """Return the same object for images with equal content."""
         image = image.convert("RGB")
         return self._images.setdefault(image.tobytes(), image)
 
 
 def _check_archive(data: bytes, path: Path, files: ModelFiles) -> None:
-    """Check what a 3MF unpacks to before it is unpacked; warn about colours, which are not read."""
+    """Check the unpacked size of a 3MF file; warn about colours, which are not read."""
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
         size = sum(info.file_size for info in archive.infolist())
@@ -142,16 +142,16 @@ def _check_archive(data: bytes, path: Path, files: ModelFiles) -> None:
             )
         models = [archive.read(info) for info in archive.infolist() if info.filename.lower().endswith(".model")]
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, RuntimeError, EOFError) as error:
-        raise AssetError("can't read this mesh", where=path, found=error, fix="Export it again.") from error
+        raise AssetError("cannot read this mesh", where=path, found=error, fix="Export it again.") from error
     if any(b"basematerials" in model or b"colorgroup" in model for model in models):
         files.notes.append(f"warning: {path.name}: ignored the colours of a 3MF file")
 
 
 def _ply_checked(data: bytes, path: Path, textures: _Textures) -> tuple[bytes, int]:
-    """Return a PLY file with bounded counts, whose header is as trimesh reads it, and its number of faces."""
+    """Check the counts of a PLY file; return it with a header for trimesh, and its number of faces."""
     end = data.find(b"end_header", 0, LONGEST_HEADER)
     if end < 0:
-        raise AssetError("can't read this mesh", where=path, expected="a PLY header", fix="Export it again.")
+        raise AssetError("cannot read this mesh", where=path, expected="a PLY header", fix="Export it again.")
     lines = [line.strip() for line in data[:end].splitlines()]
     names = [decode_text(match[1]).strip('"') for line in lines if (match := TEXTURE_COMMENT.match(line))]
     if len(names) > 1:
@@ -172,7 +172,7 @@ def _ply_checked(data: bytes, path: Path, textures: _Textures) -> tuple[bytes, i
             header.append(line)
         elif words[:1] == [b"property"]:
             name = words[-1]
-            # trimesh shows coordinates without an image in grey, and drops the colours
+            # with UVs but no image, trimesh would drop the colours
             name = PLY_COLORS.get(name, name) if names or name not in PLY_UVS else b"unused_" + name
             header.append(b" ".join([*words[:-1], name]))
     return b"\n".join([*header, data[end:]]), faces
@@ -185,7 +185,7 @@ def _off_faces(data: bytes, path: Path, files: ModelFiles) -> int:
         files.notes.append(f"warning: {path.name}: ignored vertex colours of an OFF file")
     counts = words[1:3] if words and words[0].upper().endswith(b"OFF") else words[:2]
     if len(counts) < 2 or not all(count.isdigit() and len(count) < 12 for count in counts):
-        raise AssetError("can't read this mesh", where=path, expected="an OFF header", fix="Export it again.")
+        raise AssetError("cannot read this mesh", where=path, expected="an OFF header", fix="Export it again.")
     if int(counts[0]) > MOST_VERTICES or int(counts[1]) > MOST_FACES:
         expected = f"at most {MOST_FACES:,} faces"
         raise AssetError("the mesh has too many faces or vertices", where=path, expected=expected, fix="Reduce it.")
@@ -208,7 +208,7 @@ def _parts(scene: trimesh.Scene, textures: _Textures) -> Iterator[MeshPart]:
 
 def _part(mesh: trimesh.Trimesh, textures: _Textures) -> MeshPart:
     vertices, faces = np.array(mesh.vertices, float), np.array(mesh.faces, np.int64)
-    normals = mesh._cache.cache.get("vertex_normals")  # those of the file, no computed ones
+    normals = mesh._cache.cache.get("vertex_normals")  # normals of the file, not computed ones
     visual: Any = mesh.visual
     if visual.kind == "face":
         colors = np.repeat(decode_srgb(np.asarray(visual.face_colors)[:, :3]), 3, axis=0)
@@ -230,7 +230,7 @@ def _part(mesh: trimesh.Trimesh, textures: _Textures) -> MeshPart:
 
 
 def _plain(material: Any) -> tuple[float, float, float]:
-    """Return the linear colour of a COLLADA material; white for those of a PLY, which have none."""
+    """Return the linear colour of a COLLADA material; white for materials of PLY files."""
     if not isinstance(material, PBRMaterial) or material.baseColorFactor is None:
         return 1.0, 1.0, 1.0
     red, green, blue = (float(value) for value in decode_srgb(np.asarray(material.baseColorFactor)[:3]))

@@ -1,4 +1,4 @@
-"""Files that a model names: only regular ones, of bounded size, below the folder that the user imports."""
+"""Read files of a model: only regular files of bounded size in the imported folder."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from robocas_ms3.core.errors import AssetError
 
 LARGEST_FILE = 200 * 2**20  # bytes
 TEXTURE_FOLDERS = {"textures", "texture", "tex", "materials", "images", "maps", "thumbnails"}
-MOST_ENTRIES = 20_000  # of a folder that is searched for a file
+MOST_ENTRIES = 20_000  # maximum number of entries of a searched folder
 
 
 def read_file(path: Path, *roots: Path) -> bytes:
-    """Return the content of a regular file below the imported folder.
+    """Read a regular file in the imported folder.
 
     Args:
         path: the file.
         roots: folders that may be read, see `check_inside`.
 
     Raises:
-        AssetError: the file is missing, outside of ``roots``, not regular (a pipe, a device), or larger than 200 MB.
+        AssetError: the file is missing, outside of ``roots``, not regular (pipe, device), or larger than 200 MB.
     """
     check_inside(path, *roots)
     try:
@@ -46,25 +46,25 @@ def read_file(path: Path, *roots: Path) -> bytes:
                 )
             return file.read(LARGEST_FILE + 1)
     except OSError as error:
-        raise AssetError("can't read this file", where=path, found=error.strerror) from error
+        raise AssetError("cannot read this file", where=path, found=error.strerror) from error
 
 
 def check_inside(path: Path, *roots: Path) -> None:
-    """Check that a path, symbolic links followed, is below one of some folders, which may be links themselves.
+    """Check that a path, after resolving links, is below one of the folders, which may be links themselves.
 
     Raises:
-        AssetError: it is outside.
+        AssetError: the path is outside.
     """
     try:
         inside = any(path.resolve().is_relative_to(root.resolve()) for root in roots)
     except (OSError, RuntimeError, ValueError) as error:  # a loop of links, a null byte
-        raise AssetError("can't read this file", where=path, found=error) from error
+        raise AssetError("cannot read this file", where=path, found=error) from error
     if not inside:
         raise AssetError(
             "the path leaves the imported folder",
             where=path,
             expected=f"a file below {roots[0]}",
-            fix="Copy the file into the folder, or import the folder that holds both.",
+            fix="Copy the file into the folder, or import the folder that contains both.",
         )
 
 
@@ -73,11 +73,11 @@ class ModelFiles:
     """The files of one model.
 
     Attributes:
-        root: the folder that the user imports; only files below it, or below ``home``, are read.
-        home: the model's own folder, below which files are searched by name; may be a link to another place.
-        stem: of a mesh file that shares ``home`` with other models; None: ``home`` is the model's own.
-        notes: one line per file that is not where the model says.
-        used: the files that were read, for the content hash.
+        root: the imported folder; only files below it or below ``home`` are read.
+        home: the model's folder, in which files are searched by name; may be a link.
+        stem: stem of a mesh file that shares ``home`` with other models; None: ``home`` belongs to the model.
+        notes: notes on substituted files, one line each.
+        used: files that were read, for the content hash.
     """
 
     root: Path

@@ -1,7 +1,7 @@
-"""glTF 2.0 files, ``.gltf`` and ``.glb``: the triangles of the scene, as a viewer shows them.
+"""Read the triangles of glTF 2.0 files (``.gltf`` and ``.glb``) as shown by a viewer.
 
-Rules are those of the specification (registry.khronos.org/glTF) and of the extensions in
-`gltf_materials.READ_EXTENSIONS`. What else a viewer would show is left out with a warning.
+The reader follows the specification (registry.khronos.org/glTF) and the extensions in
+`gltf_materials.READ_EXTENSIONS`. Other visible features are ignored with a warning.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ def read_gltf(path: Path, files: ModelFiles) -> list[MeshPart]:
 
     Args:
         path: the file.
-        files: reads it and what it names; gets the warnings.
+        files: reads the file and its buffers and images; warnings are added to its notes.
 
     Raises:
-        AssetError: the file is damaged, has wrong types, is compressed, or names a file that is missing.
+        AssetError: the file is damaged or compressed, has wrong types, or needs a missing file.
     """
     tree, blob = _split(files.read(path), path)
     try:
@@ -50,7 +50,7 @@ def read_gltf(path: Path, files: ModelFiles) -> list[MeshPart]:
     compressed = sorted(COMPRESSED & set(model.extensionsRequired))
     if compressed:
         fix = "Export it without compression."
-        what = "the file is compressed in a way that can't be read"
+        what = "unsupported compression of the file"
         raise AssetError(what, where=path, found=", ".join(compressed), fix=fix)
     ignored = {f"the extension {name}" for name in set(model.extensionsRequired) - READ_EXTENSIONS}
     try:
@@ -68,17 +68,17 @@ def _split(data: bytes, path: Path) -> tuple[Any, bytes]:
     blob, text = b"", data
     if data[:4] == b"glTF":
         if len(data) < 20:
-            raise _damaged(path, "the file is cut short")
+            raise _damaged(path, "the file is truncated")
         version, _, length = struct.unpack_from("<III", data, 4)
         if version != 2:
-            raise AssetError("can't read this mesh", where=path, expected="glTF 2", found=f"version {version}")
+            raise AssetError("cannot read this mesh", where=path, expected="glTF 2", found=f"version {version}")
         text, start = data[20 : 20 + length], 20 + length
         if start + 8 <= len(data):
             blob = data[start + 8 : start + 8 + struct.unpack_from("<I", data, start)[0]]
     try:
         return decode_json(text), blob
     except ValueError as error:
-        raise _damaged(path, f"no JSON: {error}") from error
+        raise _damaged(path, f"invalid JSON: {error}") from error
 
 
 def _parts(model: schema.Gltf, blob: bytes, path: Path, files: ModelFiles, ignored: set[str]) -> list[MeshPart]:
@@ -106,7 +106,7 @@ def _parts(model: schema.Gltf, blob: bytes, path: Path, files: ModelFiles, ignor
 
 
 def _placed(model: schema.Gltf) -> list[tuple[schema.Node, Array]]:
-    """Return the nodes of the scene that have a mesh, and their 4x4 poses."""
+    """Return the nodes with a mesh of the scene, and their poses (4, 4)."""
     children = {child for node in model.nodes for child in node.children}
     if model.scenes:
         roots = entry(model.scenes, model.scene, "scenes").nodes
@@ -142,7 +142,7 @@ def _part(primitive: schema.Primitive, buffers: Buffers, materials: Materials, i
     else:
         faces = _triangles(buffers.values(primitive.indices).reshape(-1).astype(np.int64), primitive.mode)
     if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
-        raise ValueError(f"a face names vertex {int(faces.max())} of {len(vertices)}")
+        raise ValueError(f"a face refers to vertex {int(faces.max())} of {len(vertices)}")
     normals = buffers.vectors(attributes["NORMAL"], 3) if "NORMAL" in attributes else None
     colors = buffers.colors(attributes["COLOR_0"]) if "COLOR_0" in attributes else None
     uv_sets = {key.removeprefix("TEXCOORD_") for key in attributes if key.startswith("TEXCOORD_")}
@@ -170,7 +170,7 @@ def _moved(part: MeshPart, pose: Array) -> MeshPart:
     if part.normals is not None:
         turned = part.normals @ np.linalg.pinv(linear)
         part.normals = turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12)
-    with np.errstate(over="ignore"):  # of absurd scales, which the size tells
+    with np.errstate(over="ignore"):  # extreme scales are reported by the size check
         mirrored = np.linalg.det(linear) < 0
     if mirrored:
         part.faces = part.faces[:, ::-1]
@@ -185,11 +185,11 @@ def _triangles(indices: Ints, mode: int) -> Ints:
     if mode == FAN:
         return np.column_stack([np.full(len(indices) - 2, indices[0]), indices[1:-1], indices[2:]])
     faces = np.column_stack([indices[:-2], indices[1:-1], indices[2:]])
-    faces[1::2] = faces[1::2][:, [1, 0, 2]]  # every other triangle of a strip runs the other way
+    faces[1::2] = faces[1::2][:, [1, 0, 2]]  # every second triangle of a strip has the opposite orientation
     return faces
 
 
 def _damaged(path: Path, found: str) -> AssetError:
     found = found if len(found) <= 200 else f"{found[:200]}..."
     fix = "Export it again, without compression." if "compressed" in found else "Export it again."
-    return AssetError("can't read this mesh", where=path, found=found, fix=fix)
+    return AssetError("cannot read this mesh", where=path, found=found, fix=fix)

@@ -1,4 +1,4 @@
-"""The binary data of a glTF file: buffers, views of them, and the typed arrays in these."""
+"""Decode the binary data of a glTF file: buffers, buffer views and accessors."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class Buffers:
 
     Args:
         model: the JSON.
-        blob: the binary chunk of a GLB; empty: none.
+        blob: the binary chunk of a GLB file, or empty.
         path: the file.
-        files: reads what the file names.
+        files: reads the referenced files.
     """
 
     def __init__(self, model: schema.Gltf, blob: bytes, path: Path, files: ModelFiles) -> None:
@@ -39,16 +39,16 @@ class Buffers:
         self._quantised = "KHR_mesh_quantization" in model.extensionsUsed
 
     def content(self, uri: str) -> tuple[bytes, Path]:
-        """Return what a URI stands for, and the file that holds it."""
+        """Return the content of a URI and its file."""
         if uri.startswith("data:"):
             try:
                 return base64.b64decode(unquote(uri.partition(",")[2]), validate=True), self._path
             except binascii.Error as error:
-                raise ValueError(f"a data URI that can't be read: {error}") from error
+                raise ValueError(f"invalid data URI: {error}") from error
         file = self._files.find(unquote(uri), self._path.parent)
         if file is None:
-            where, fix = self._path.parent / unquote(uri), "Put it next to the mesh."
-            raise AssetError("a file this mesh names is missing", where=where, fix=fix)
+            where, fix = self._path.parent / unquote(uri), "Put the file next to the mesh."
+            raise AssetError("missing file of the mesh", where=where, fix=fix)
         return self._files.read(file), file
 
     def view(self, index: int) -> tuple[bytes, schema.BufferView]:
@@ -67,7 +67,7 @@ class Buffers:
         return data, view
 
     def values(self, index: int) -> NDArray:
-        """Return the values of an accessor, (count, width); normalised integers as floats, -1 or 0 to 1."""
+        """Return the values (count, width) of an accessor; normalised integers as floats in -1..1 or 0..1."""
         accessor = entry(self._model.accessors, index, "accessors")
         dtype, width = np.dtype(DTYPES[accessor.componentType]), WIDTHS[accessor.type]
         if accessor.bufferView is None:
@@ -85,7 +85,7 @@ class Buffers:
         return _normalised(values) if accessor.normalized else values
 
     def has_data(self, index: int) -> bool:
-        """Return whether an accessor has values of its own, not only zeros for an extension to fill."""
+        """Return whether an accessor has data, instead of zeros that an extension fills."""
         accessor = entry(self._model.accessors, index, "accessors")
         return accessor.bufferView is not None or accessor.sparse is not None
 
@@ -93,7 +93,7 @@ class Buffers:
         """Return the (V, width) vectors of an accessor.
 
         Raises:
-            ValueError: the vectors are of another width.
+            ValueError: the vectors have another width.
         """
         values = self.values(index)
         if values.shape[1] != width:
@@ -119,7 +119,7 @@ def entry(items: Sequence[Item], index: int | None, name: str) -> Item:
     """Return an entry of a list of the file.
 
     Raises:
-        ValueError: there is no such entry.
+        ValueError: the entry does not exist.
     """
     if index is None or not 0 <= index < len(items):
         raise ValueError(f"{name} has no entry {index}, of {len(items)}")
@@ -127,14 +127,14 @@ def entry(items: Sequence[Item], index: int | None, name: str) -> Item:
 
 
 def _normalised(values: NDArray) -> NDArray:
-    """Return integers as shares of the largest; floats as they are."""
+    """Divide integers by the largest value of their type; return floats unchanged."""
     if values.dtype.kind == "f":
         return values
     return np.maximum(values.astype(float) / np.iinfo(values.dtype).max, -1.0)
 
 
 def _rows(data: bytes, offset: int, stride: int | None, dtype: np.dtype, width: int, count: int) -> NDArray:
-    """Return (count, width) values that are ``stride`` bytes apart; None: one after the other."""
+    """Return values (count, width) with a distance of ``stride`` bytes; None: contiguous."""
     size = dtype.itemsize * width
     stride = stride or size
     if count and offset + stride * (count - 1) + size > len(data):

@@ -1,4 +1,4 @@
-"""Materials of a glTF file as one image and one colour: base colour, plus the light that a surface sends out."""
+"""Convert materials of a glTF file to one image and one colour: base colour plus emission."""
 
 from __future__ import annotations
 

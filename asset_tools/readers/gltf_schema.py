@@ -1,4 +1,4 @@
-"""The JSON of a glTF 2.0 file, as far as it is read here."""
+"""Models of the parts of a glTF 2.0 file that are read."""
 
 # Names are the specification's.
 # ruff: noqa: N815
@@ -20,13 +20,13 @@ REPEAT, CLAMP, MIRROR = 10497, 33071, 33648
 
 
 class Schema(BaseModel):
-    """Ignore unknown keys, refuse NaN."""
+    """Base class of models that ignore unknown keys and refuse NaN."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
 
 class SparseIndices(Schema):
-    """Which values of an accessor are replaced."""
+    """Indices of replaced values of an accessor."""
 
     bufferView: NonNegativeInt
     byteOffset: NonNegativeInt = 0
@@ -34,7 +34,7 @@ class SparseIndices(Schema):
 
 
 class SparseValues(Schema):
-    """What replaces them."""
+    """Replacement values of an accessor."""
 
     bufferView: NonNegativeInt
     byteOffset: NonNegativeInt = 0
@@ -84,7 +84,7 @@ class Image(Schema):
 
 
 class Sampler(Schema):
-    """How an image continues outside of 0 to 1."""
+    """Wrapping of an image outside of 0..1."""
 
     wrapS: int = REPEAT
     wrapT: int = REPEAT
@@ -179,7 +179,7 @@ class Node(Schema):
     extensions: dict[str, Any] = {}
 
     def transform(self) -> NDArray[np.float64]:
-        """Return the 4x4 pose in its parent."""
+        """Return the pose (4, 4) in the parent's frame."""
         if self.matrix is not None:
             return np.array(self.matrix, float).reshape(4, 4).T
         pose = np.eye(4)

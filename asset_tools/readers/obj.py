@@ -1,4 +1,4 @@
-"""Wavefront OBJ and MTL files, as exporters write them rather than as the format's description has them."""
+"""Parse Wavefront OBJ and MTL files, including common deviations of exporters from the format."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Ints = NDArray[np.int64]
 
 MOST_FACES = 1_000_000
 MOST_VERTICES = 3_000_000
-# of a map statement, by the number of its arguments; -s, -o and -t take one to three numbers
+# options of map statements: with one argument, and with up to N numbers
 FLAGS = {"-blendu", "-blendv", "-cc", "-clamp", "-imfchan", "-type", "-bm", "-boost", "-texres"}
 VECTORS = {"-s": 3, "-o": 3, "-t": 3, "-mm": 2}
 
@@ -28,14 +28,14 @@ class MtlMaterial:
     """A material of an MTL file.
 
     Attributes:
-        name: as the file has it, white space reduced to single spaces.
+        name: name in the file, with single spaces.
         color: Kd, (3,) 0 to 1, sRGB; None: not given.
-        emission: Ke, likewise.
+        emission: Ke, in the same format.
         image: name of the colour texture (``map_Kd``, else ``map_Ka``); empty: none.
         emission_image: name of the emissive texture (``map_Ke``).
         uv_scale: of the colour texture (``-s``).
         uv_offset: of the colour texture (``-o``).
-        transparent: the material lets light through (``d``, ``Tr``, ``map_d``).
+        transparent: whether the material is transparent (``d``, ``Tr``, ``map_d``).
     """
 
     name: str
@@ -58,10 +58,10 @@ class ObjMesh:
         uvs: (T, 2), v upward.
         normals: (N, 3).
         faces: (F, 3) indices of vertices.
-        face_uvs: (F, 3) indices of ``uvs``, -1 where a corner has none.
-        face_normals: (F, 3) indices of ``normals``, -1 where a corner has none.
+        face_uvs: (F, 3) indices of ``uvs``, -1 if missing.
+        face_normals: (F, 3) indices of ``normals``, -1 if missing.
         face_materials: (F,) indices of ``material_names``; -1: before the first ``usemtl``.
-        material_names: of ``usemtl``, white space reduced to single spaces.
+        material_names: names of ``usemtl``, with single spaces.
         libraries: the rest of each ``mtllib`` line.
     """
 
@@ -78,7 +78,7 @@ class ObjMesh:
 
 
 def decode_text(data: bytes) -> str:
-    """Return the text of a file: UTF-8, with or without a mark, or else Latin letters as Windows has them."""
+    """Decode a text as UTF-8, with or without a byte order mark, or else as Windows-1252."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -86,7 +86,7 @@ def decode_text(data: bytes) -> str:
 
 
 def parse_mtl(text: str) -> dict[str, MtlMaterial]:
-    """Return the materials of an MTL file by name; what can't be read of a statement is left out."""
+    """Return the materials of an MTL file by name; invalid statements are ignored."""
     found: dict[str, MtlMaterial] = {}
     current: MtlMaterial | None = None
     ambient: dict[str, str] = {}
@@ -119,7 +119,7 @@ def parse_mtl(text: str) -> dict[str, MtlMaterial]:
 
 
 def find_material(name: str, materials: dict[str, MtlMaterial]) -> MtlMaterial | None:
-    """Return the material that a ``usemtl`` names, by its exact name or else whatever the letters' case."""
+    """Return a material by its exact name, or else by its name without regard to case."""
     if name in materials:
         return materials[name]
     alike = [material for other, material in materials.items() if other.casefold() == name.casefold()]
@@ -127,14 +127,14 @@ def find_material(name: str, materials: dict[str, MtlMaterial]) -> MtlMaterial |
 
 
 def parse_obj(text: str, where: object) -> ObjMesh:
-    """Return the content of an OBJ file.
+    """Parse an OBJ file.
 
     Args:
-        text: of the file.
-        where: for errors.
+        text: content of the file.
+        where: path, for messages.
 
     Raises:
-        AssetError: a number or an index can't be read, or there are too many faces or vertices.
+        AssetError: a number or an index is invalid, or the file has too many faces or vertices.
     """
     points: list[str] = []
     uvs: list[str] = []
@@ -161,7 +161,7 @@ def parse_obj(text: str, where: object) -> ObjMesh:
                     corner = known.get(word)
                     if corner is None:
                         corner = _corner(word, len(points), len(uvs), len(normals))
-                        if "-" not in word:  # others count back from where they stand
+                        if "-" not in word:  # negative indices are relative to the current line
                             known[word] = corner
                     corners.append(corner)
                 counts.append(len(words))
@@ -180,9 +180,9 @@ def parse_obj(text: str, where: object) -> ObjMesh:
         table = np.array(corners, np.int64).reshape(-1, 3)
         for column, count, what in zip(table.T, (len(points), len(uvs), len(normals)), ("v", "vt", "vn"), strict=True):
             if len(column) and (column.max() >= count or column.min() < -1):
-                raise ValueError(f"a face names {what} {int(column.max()) + 1} of {count}")
+                raise ValueError(f"a face refers to {what} {int(column.max()) + 1} of {count}")
         if len(table) and table[:, 0].min() < 0:
-            raise ValueError("a face names vertex 0")
+            raise ValueError("a face refers to vertex 0")
         triangles = _with_concave(triangles, source, np.array(counts, np.int64), vertices[table[:, 0]])
         return ObjMesh(
             vertices,
@@ -197,12 +197,12 @@ def parse_obj(text: str, where: object) -> ObjMesh:
             libraries,
         )
     except (ValueError, IndexError, OverflowError) as error:
-        raise AssetError("can't read this mesh", where=where, found=error) from error
+        raise AssetError("cannot read this mesh", where=where, found=error) from error
 
 
 def _statements(text: str) -> Iterator[tuple[str, str]]:
-    """Yield keyword and rest of each line; comments left out, continued lines joined."""
-    # one line at a time: a list of them takes ten times the memory of the text
+    """Yield keyword and rest of each line, without comments and with continued lines joined."""
+    # an iterator, since a list of lines needs ten times the memory of the text
     for line in re.finditer(r"[^\r\n]+", re.sub(r"\\\r?\n", " ", text)):
         words = line[0].split(None, 1)
         if len(words) == 2 and not words[0].startswith("#"):
@@ -210,12 +210,12 @@ def _statements(text: str) -> Iterator[tuple[str, str]]:
 
 
 def _corner(word: str, points: int, uvs: int, normals: int) -> tuple[int, int, int]:
-    """Return the indices of ``v/vt/vn``, from 0; -1 where there is none."""
+    """Return the indices of ``v/vt/vn``, starting at 0; -1 for missing ones."""
     parts = (word.split("/") + ["", ""])[:3]
     index = [int(part) if part else 0 for part in parts]
     counts = (points, uvs, normals)
     if not index[0] or any(-value > count for value, count in zip(index, counts, strict=True)):
-        raise ValueError(f"a face names {word} of {points} vertices")
+        raise ValueError(f"a face refers to {word} of {points} vertices")
     first, second, third = (
         value - 1 if value >= 0 else count + value for value, count in zip(index, counts, strict=True)
     )
@@ -223,7 +223,7 @@ def _corner(word: str, points: int, uvs: int, normals: int) -> tuple[int, int, i
 
 
 def _fans(counts: Ints) -> tuple[Ints, Ints]:
-    """Return triangles (F, 3) of corners counted through all polygons, and (F,) the polygon of each."""
+    """Split polygons into fans; return triangles (F, 3) as corner indices, and the polygon (F,) of each triangle."""
     starts = np.cumsum(counts) - counts
     many = counts - 2
     source = np.repeat(np.arange(len(counts)), many)
@@ -233,13 +233,13 @@ def _fans(counts: Ints) -> tuple[Ints, Ints]:
 
 
 def _with_concave(triangles: Ints, source: Ints, counts: Ints, points: Array) -> Ints:
-    """Return triangles with those of concave polygons, whose fans reach outside of them, replaced.
+    """Replace the fans of concave polygons by proper triangulations.
 
     Args:
-        triangles: (F, 3) fans, of corners.
-        source: (F,) polygon of each.
-        counts: (P,) corners of the polygons.
-        points: (C, 3) of the corners.
+        triangles: (F, 3) fans as corner indices.
+        source: (F,) polygon of each triangle.
+        counts: (P,) number of corners of each polygon.
+        points: (C, 3) positions of the corners.
     """
     if (counts <= 3).all():
         return triangles
@@ -256,15 +256,15 @@ def _with_concave(triangles: Ints, source: Ints, counts: Ints, points: Array) ->
         own = int(starts[polygon]) + np.arange(int(counts[polygon]))
         outline: Any = points[own] @ plane
         ears = np.asarray(triangulate([outline]), np.int64)
-        if len(ears) == counts[polygon] - 2:  # else it crosses itself
+        if len(ears) == counts[polygon] - 2:  # otherwise the polygon intersects itself
             triangles[first[polygon] : first[polygon] + len(ears)] = own[ears]
     return triangles
 
 
 def _numbers(rows: list[str], columns: int, fill: float | None = None) -> Array:
-    """Return the first numbers of each row; ``fill`` where there are too few."""
+    """Return the first numbers of each row, completed by ``fill``."""
     found = np.empty((len(rows), columns))
-    for start in range(0, len(rows), 100_000):  # words take much more memory than numbers
+    for start in range(0, len(rows), 100_000):  # in chunks, since words need much more memory than numbers
         words = [row.split() for row in rows[start : start + 100_000]]
         if fill is not None:
             words = [line + [str(fill)] * (columns - len(line)) for line in words]
@@ -275,7 +275,7 @@ def _numbers(rows: list[str], columns: int, fill: float | None = None) -> Array:
 
 
 def _colors(rows: list[str]) -> Array | None:
-    """Return the colours of vertices (x y z r g b), white where some have none; None: no vertex has one."""
+    """Return vertex colours (x y z r g b), white if missing; None if no vertex has a colour."""
     if len(rows) == 0 or not any(len(row.split()) in (6, 7) for row in (rows[0], rows[len(rows) // 2], rows[-1])):
         return None
     words = [row.split()[3:6] for row in rows]
@@ -297,7 +297,7 @@ def _color(rest: str) -> tuple[float, float, float] | None:
 
 
 def _map(rest: str) -> tuple[str, tuple[float, float], tuple[float, float]]:
-    """Return the file name of a map statement, which may hold spaces, and scale and offset of its UVs."""
+    """Return the file name of a map statement, which may have spaces, and scale and offset of its UVs."""
     vectors: dict[str, list[float]] = {}
     left = rest.strip()
     while left.startswith("-"):

@@ -1,4 +1,4 @@
-"""OBJ files with their materials and textures."""
+"""Read OBJ files with materials and textures."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ Ints = NDArray[np.int64]
 
 IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".webp")
 BLACK = 0.02  # linear
-COLOURED = 0.05  # difference of the channels of a colour that is no grey
+COLOURED = 0.05  # minimum difference of the channels of a colour that is not grey
 MOST_MATERIALS = 1000
 
 
 def read_obj(path: Path, files: ModelFiles) -> list[MeshPart]:
-    """Read an OBJ file: one part per material.
+    """Read an OBJ file as one part per material.
 
-    Faces without a material, or of one that no MTL file has, get the only textured material there is; where there is
-    none or several, they are white.
+    Faces without a known material get the only textured material. If there is no such material, or several, the faces
+    are white.
 
     Args:
         path: the file.
-        files: reads it and what it names; gets a line per substitution.
+        files: reads the file and its materials; a note per substitution is added.
 
     Raises:
         AssetError: the file is damaged, or a material file or texture that its faces need is missing.
@@ -60,7 +60,7 @@ def read_obj(path: Path, files: ModelFiles) -> list[MeshPart]:
 
 
 def _libraries(mesh: ObjMesh, path: Path, files: ModelFiles) -> dict[str, tuple[MtlMaterial, Path]]:
-    """Return the materials of all MTL files that a mesh names, each with the file that has it."""
+    """Return the materials of all MTL files of a mesh, with their files."""
     places: list[Path] = []
     missing: list[str] = []
     for line in mesh.libraries:
@@ -72,12 +72,12 @@ def _libraries(mesh: ObjMesh, path: Path, files: ModelFiles) -> dict[str, tuple[
             else:
                 missing.append(name if len(line.split()) == 1 else line)
     if not places and (missing or mesh.material_names or (not mesh.libraries and len(mesh.uvs))):
-        beside = _beside(path, (".mtl",)) or _only_library(mesh, path, files)
-        if beside is not None:
-            places.append(beside)
-            files.notes.append(f"took {beside.name} for {missing[0] if missing else 'the material file'}")
+        sibling = _find_sibling(path, (".mtl",)) or _only_library(mesh, path, files)
+        if sibling is not None:
+            places.append(sibling)
+            files.notes.append(f"used {sibling.name} instead of {missing[0] if missing else 'the material file'}")
         elif missing and (len(mesh.uvs) or mesh.material_names):
-            what, fix = "the material file that the mesh names is missing", "Put it next to the mesh."
+            what, fix = "missing material file of the mesh", "Put the file next to the mesh."
             raise AssetError(what, where=path.parent / missing[0], fix=fix)
     found: dict[str, tuple[MtlMaterial, Path]] = {}
     for place in dict.fromkeys(places):
@@ -86,14 +86,14 @@ def _libraries(mesh: ObjMesh, path: Path, files: ModelFiles) -> dict[str, tuple[
     return found
 
 
-def _beside(path: Path, suffixes: tuple[str, ...]) -> Path | None:
-    """Return the file next to another one that has its name, in whatever letter case, and one of some suffixes."""
+def _find_sibling(path: Path, suffixes: tuple[str, ...]) -> Path | None:
+    """Return the file next to ``path`` with the same stem, ignoring case, and one of the suffixes."""
     alike = {file.suffix.lower(): file for file in path.parent.iterdir() if file.stem.lower() == path.stem.lower()}
     return next((alike[suffix] for suffix in suffixes if suffix in alike), None)
 
 
 def _only_library(mesh: ObjMesh, path: Path, files: ModelFiles) -> Path | None:
-    """Return the only MTL file next to an OBJ, if it has all materials of its faces."""
+    """Return the only MTL file next to an OBJ file, if it has all materials of the faces."""
     found = [file for file in path.parent.iterdir() if file.suffix.lower() == ".mtl"]
     if len(found) != 1 or not mesh.material_names:
         return None
@@ -104,7 +104,7 @@ def _only_library(mesh: ObjMesh, path: Path, files: ModelFiles) -> Path | None:
 def _material(
     name: str, materials: dict[str, tuple[MtlMaterial, Path]], has_uvs: bool, path: Path, files: ModelFiles
 ) -> tuple[MtlMaterial, Path] | None:
-    """Return the material of faces and the file that has it; None: white."""
+    """Return the material of faces and its file; None: white."""
     exact = find_material(name, {key: material for key, (material, _) in materials.items()}) if name else None
     if exact is not None:
         return materials[exact.name]
@@ -113,11 +113,13 @@ def _material(
     if only is None and len(materials) == 1:
         only = next(iter(materials.values()))
     if only is not None and (has_uvs or not only[0].image):
-        files.notes.append(f"took the material {only[0].name} for faces {f'of {name}' if name else 'without one'}")
+        files.notes.append(
+            f"used the material {only[0].name} for faces {f'of {name}' if name else 'without a material'}"
+        )
         return only
-    image = _beside(path, IMAGES)
+    image = _find_sibling(path, IMAGES)
     if has_uvs and image is not None and not materials:
-        files.notes.append(f"took {image.name} for faces {f'of {name}' if name else 'without a material'}")
+        files.notes.append(f"used {image.name} for faces {f'of {name}' if name else 'without a material'}")
         return MtlMaterial(name, image=image.name), path
     if materials or (name and has_uvs):
         known = ", ".join(list(materials)[:5]) or "none"
@@ -134,9 +136,9 @@ def _part(
     images: dict[str, Image.Image],
     files: ModelFiles,
 ) -> MeshPart:
-    """Return the triangles of one material, a vertex for each different corner."""
+    """Return the triangles of one material, with one vertex per distinct corner."""
     use_normals = bool((mesh.face_normals[rows] >= 0).all())
-    shown, uv_map = _look(material, place, images, files, bool((mesh.face_uvs[rows] >= 0).all()))
+    shown, uv_map = _resolve_material(material, place, images, files, bool((mesh.face_uvs[rows] >= 0).all()))
     columns = [mesh.faces[rows].reshape(-1)]
     columns.append(mesh.face_uvs[rows].reshape(-1) if shown.image is not None else np.full(3 * len(rows), -1))
     columns.append(mesh.face_normals[rows].reshape(-1) if use_normals else np.full(3 * len(rows), -1))
@@ -149,19 +151,19 @@ def _part(
     if mesh.colors is not None:
         values = mesh.colors[corners[:, 0]]
         if shown.image is None:
-            colors, shown = decode_srgb(255 * values), Material()  # Kd next to vertex colours is a mere default
+            colors, shown = decode_srgb(255 * values), Material()  # Kd in addition to vertex colours is a default value
         elif (values != 1).any():
-            files.notes.append("warning: ignored vertex colours next to a texture")
+            files.notes.append("warning: ignored vertex colours in addition to a texture")
     normals = mesh.normals[corners[:, 2]] if use_normals else None
     if normals is not None:
         normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return MeshPart(mesh.vertices[corners[:, 0]], inverse.reshape(-1, 3), uvs, colors, normals, shown)
 
 
-def _look(
+def _resolve_material(
     material: MtlMaterial | None, place: Path, images: dict[str, Image.Image], files: ModelFiles, has_uvs: bool
 ) -> tuple[Material, tuple[tuple[float, float], tuple[float, float]]]:
-    """Return what a material looks like, and scale and offset of its UVs."""
+    """Return the material for rendering, and scale and offset of its UVs."""
     plain = (1.0, 1.0), (0.0, 0.0)
     if material is None:
         return Material(), plain
@@ -175,15 +177,15 @@ def _look(
             file = files.find(name, place.parent)
             if file is None:
                 where = missing_path(name, place.parent)
-                what, fix = "the texture file that the material names is missing", "Put it next to the mesh."
+                what, fix = "missing texture file of the material", "Put the file next to the mesh."
                 raise AssetError(what, where=where, fix=fix)
             images[name] = open_texture(files.read(file), file, files.notes)
-        # a grey Kd next to a texture is a mere default: scanners write 0.8, some write 0
+        # a grey Kd in addition to a texture is a default value: scanners write 0.8 or 0
         tinted = material.color is not None and np.ptp(material.color) > COLOURED and name == material.image
         color = _linear(material.color) if tinted and material.color is not None else WHITE
         return Material(color, images[name]), (material.uv_scale, material.uv_offset)
     if name:
-        files.notes.append(f"warning: left out the texture {name}: faces without texture coordinates")
+        files.notes.append(f"warning: ignored the texture {name}: faces without texture coordinates")
     color = material.color
     if color is not None and material.emission is not None and max(color) < BLACK:
         color = material.emission

@@ -1,6 +1,6 @@
-"""What all formats are read into: parts with one material each, joined to one mesh that keeps every colour.
+"""Common representation of all formats: parts with one material each, which are joined to one mesh.
 
-Colours are linear, 0 to 1, as in glTF; images and 8-bit colours are sRGB. Transparency is dropped.
+Colours are linear in 0..1, as in glTF; images and 8-bit colours are sRGB. Transparency is dropped.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ TEXTURE, TINT = "texture", "tint"  # vertex attributes of a mesh with several te
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """What faces look like: an image times a colour.
+    """Material of faces: an image multiplied by a colour.
 
     Attributes:
         color: (3,) linear.
-        image: sRGB; None: the colour alone.
+        image: sRGB image, or None.
     """
 
     color: tuple[float, float, float] = WHITE
@@ -44,10 +44,10 @@ class MeshPart:
     Attributes:
         vertices: (V, 3) in the model's frame and unit.
         faces: (F, 3).
-        uvs: (V, 2), v upward; None: no image can be shown.
-        colors: (V, 3) linear, times those of the material; None: white.
-        normals: (V, 3) unit; None: the file has none.
-        material: of all faces.
+        uvs: (V, 2), v upward, or None.
+        colors: (V, 3) linear, multiplied by the material; None: white.
+        normals: (V, 3) unit normals of the file, or None.
+        material: material of all faces.
     """
 
     vertices: Array
@@ -59,7 +59,7 @@ class MeshPart:
 
 
 class Textures(TrimeshMaterial):
-    """The images of a mesh with several textures, or with tinted ones.
+    """Material of a mesh with several or tinted textures.
 
     The mesh has the vertex attributes `TEXTURE`, index of the image, and `TINT`, (V, 3) linear factors.
     """
@@ -74,11 +74,11 @@ class Textures(TrimeshMaterial):
         return np.full(4, 255, np.uint8)
 
     def copy(self) -> Textures:
-        """Return itself: images are not changed."""
+        """Return itself; images are immutable."""
         return self
 
     def __hash__(self) -> int:
-        """Return a number of the images."""
+        """Return a hash of the images."""
         return hash(tuple(map(id, self.images)))
 
     def __eq__(self, other: object) -> bool:
@@ -86,10 +86,10 @@ class Textures(TrimeshMaterial):
 
 
 def to_mesh(parts: Sequence[MeshPart]) -> trimesh.Trimesh:
-    """Return one mesh of all parts, which shows the same colours.
+    """Join parts to one mesh with the same colours.
 
-    Its visual is undefined where everything is white, vertex colours (sRGB) where there is no image, a
-    ``SimpleMaterial`` where there is one plain image, and `Textures` otherwise.
+    Its visual is undefined if all parts are white, has vertex colours (sRGB) without images, a ``SimpleMaterial`` for
+    one untinted image, and `Textures` otherwise.
     """
     parts = [part for part in parts if len(part.faces)]
     if not parts:
@@ -122,13 +122,13 @@ def to_mesh(parts: Sequence[MeshPart]) -> trimesh.Trimesh:
 
 
 def decode_srgb(values: NDArray) -> Array:
-    """Return linear colours, 0 to 1, of sRGB ones, 0 to 255."""
+    """Convert sRGB colours in 0..255 to linear colours in 0..1."""
     share = np.asarray(values, dtype=float) / 255
     return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
 
 def encode_srgb(values: Array) -> NDArray[np.uint8]:
-    """Return 8-bit sRGB colours of linear ones, 0 to 1."""
+    """Convert linear colours in 0..1 to 8-bit sRGB colours."""
     linear = np.clip(values, 0, 1)
     share = np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
     return np.rint(255 * share).astype(np.uint8)
