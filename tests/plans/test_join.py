@@ -59,7 +59,7 @@ def test_sources_are_kept_if_the_joined_file_is_damaged(out, monkeypatch):
 
     before = {path for path in (out / "units").rglob("*.h5")}
     monkeypatch.setattr("robocas_ms3.plans.join.merge", merge_without_last)
-    with pytest.raises(PlanError, match="demos/a/trajectory.h5: damaged after writing .found other episodes"):
+    with pytest.raises(PlanError, match="demos/a/trajectory.h5: damaged after writing .found wrong episodes"):
         run_here(out)
     assert before == {path for path in (out / "units").rglob("*.h5")}
     assert not (out / "report.json").exists()
