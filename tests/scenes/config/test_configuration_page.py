@@ -60,7 +60,7 @@ def test_commands_of_the_page_set_existing_keys():
         assert overrides
         if words[0] == "eval":
             plan = read_plan(ROOT / words[2])
-            assert {scene.changed(overrides).language.split for scene in plan.parts} == {"held_out"}
+            assert {scene.resolve(overrides).language.split for scene in plan.parts} == {"held_out"}
         else:
             name = words[words.index("--config") + 1] if "--config" in words else words[words.index("--set") - 1]
             name = words[2] if words[0] == "layouts" else name

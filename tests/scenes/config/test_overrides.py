@@ -52,7 +52,7 @@ def test_overrides_are_merged_over_a_file_in_order(tmp_path):
     plan = ProtocolPlan.model_validate(
         {"rules": {}, "parts": [{"config": NAME, "count": 1, "first_seed": 0, "change": {"objects": {"count": 3}}}]}
     )
-    assert plan.parts[0].changed(["objects.count=4"]).objects.count == 4
+    assert plan.parts[0].resolve(["objects.count=4"]).objects.count == 4
 
 
 @pytest.mark.parametrize(
