@@ -37,7 +37,7 @@ def check_directions(
 
     Args:
         tcp_in_world: (G, 4, 4) grasps.
-        base_to_object: (3,) or (2,) vector in the world, of which the horizontal part is used. Approaches may deviate
+        base_to_object: (3,) or (2,) vector in the world; only its horizontal part is used. Approaches may deviate
             from it by at most `MAX_SIDEWAYS_DEG`; nearly vertical ones (`FREE_LEAN_DEG`) have no such limit.
         approach: allowed direction of the gripper's approach.
 

@@ -183,7 +183,7 @@ def join_frozen_layouts(path: Path, parts: Sequence[Path]) -> None:
     pieces = [_open(part, load_array, "not a file of frozen layouts", dimensions=1) for part in parts]
     for part, piece in zip(parts, pieces, strict=True):
         if piece.dtype["objects"] != pieces[0].dtype["objects"]:
-            what, expected = "frozen layouts of another configuration", f"as many objects as in {parts[0]}"
+            what, expected = "frozen layouts of another configuration", f"the number of objects in {parts[0]}"
             raise LayoutError(what, where=part, expected=expected)
     _save(path, np.concatenate(pieces))
 

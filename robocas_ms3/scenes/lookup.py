@@ -88,7 +88,7 @@ def find_objects(pack: Pack, config: TaskConfig) -> list[str]:
 def _check_relations(pack: Pack, config: TaskConfig, ids: list[str]) -> None:
     """Check that layouts can have enough objects of one name for each relation.
 
-    The complete list of relations is always valid: it stands for those that the layout allows.
+    The complete list of relations is always valid: it means all relations that the layout allows.
     """
     asked, layout, random = config.target.relations, config.layout, config.randomisation
     named = "relation" in TASKS[config.task].slots

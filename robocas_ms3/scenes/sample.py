@@ -192,8 +192,8 @@ def _usable(model: SceneModel, ids: list[str], *, columns: bool = False) -> list
 @lru_cache  # once each
 def _warn_excluded(ids: tuple[str, ...]) -> None:
     _log.warning(
-        "objects excluded: %s. None of their resting poses (in an orderly layout: their display pose) fits below the "
-        "surface's headroom.",
+        "objects excluded, because no resting pose (in an orderly layout: no display pose) fits below the surface's "
+        "headroom: %s",
         ", ".join(ids),
     )
 

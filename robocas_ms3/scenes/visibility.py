@@ -20,7 +20,7 @@ from robocas_ms3.scenes.placement import Array
 
 PixelBox = tuple[slice, slice]  # rows, columns
 
-SELECTION_CAMERA_HEIGHT = 0.5  # m, of the selection camera above the support, upstream's
+SELECTION_CAMERA_HEIGHT = 0.5  # m above the support, as in RoboCAS-v0
 _FAR = 1e30  # embree returns a greater distance for a ray without a hit
 _scenes: WeakKeyDictionary[trimesh.Trimesh, EmbreeScene] = WeakKeyDictionary()
 

@@ -81,7 +81,7 @@ class EpisodeSeeds:
         object_ids: object ids of each env.
         table: layout table of the cache, if it has one.
         initial_state_table: initial states from this table, on the envs' device.
-        first_reset: whether the next reset is the one that builds the environment, whose seed was not requested.
+        first_reset: whether the next reset builds the environment, so that its seed was not requested.
     """
 
     def __init__(

@@ -26,11 +26,11 @@ TABLE = {"asset": "table", "pose": at(0.9, 1.0, yaw=-90)}
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         (
             {"furniture": {"table": TABLE, "twin": TABLE}},
-            r"^furniture\.table and furniture\.twin overlap \(expected apart, found 0\.\d+ m\)\. Move one of them by",
+            r"^furniture\.table and furniture\.twin overlap \(expected no overlap, found an overlap of 0\.\d+ m\)\. Move one of them by",
         ),
         ({"robot": at(0.9, 0.9, yaw=90)}, r"^robot and furniture\.table overlap .*Move one of them"),
         (
@@ -46,8 +46,8 @@ TABLE = {"asset": "table", "pose": at(0.9, 1.0, yaw=-90)}
         ({"robot": at(0.7, -1.2, yaw=90)}, "^surface 'top' is out of the arm's reach"),
     ],
 )
-def test_impossible_scenes_are_errors(changes, said):
-    with pytest.raises(ConfigError, match=said):
+def test_impossible_scenes_are_errors(changes, message):
+    with pytest.raises(ConfigError, match=message):
         load_scene(**changes)
 
 
@@ -62,7 +62,7 @@ def test_a_base_that_drives_reaches_farther():
     with pytest.raises(ConfigError, match="the basket is out of the arm's reach"):
         load_scene(basket=far)
     load_scene(basket=far, base_motion=True)
-    with pytest.raises(ConfigError, match=r"Move it or the robot: \d\.\d\d m"):
+    with pytest.raises(ConfigError, match=r"Move it or the robot: it is \d\.\d\d m"):
         load_scene(basket={"asset": "basket", "pose": at(3.7, 0.15)}, base_motion=True)
 
 

@@ -58,7 +58,7 @@ def test_the_closing_axis_may_tilt_by_60_degrees(closing, level):
         ((0.0, 0.042, 0.0), False),  # in a pad
         ((0.0, -0.042, 0.008), False),  # at the other pad's end, 8 mm beyond the TCP
         ((0.0, 0.042, 0.010), True),  # just below the pad
-        ((0.011, 0.042, 0.0), True),  # beside it
+        ((0.011, 0.042, 0.0), True),  # next to the pad
         ((0.0, 0.055, 0.0), True),  # outside of it
         ((0.0, 0.055, -0.05), False),  # in the knuckle
         ((0.0, 0.0, -0.06), True),  # under the palm
@@ -98,7 +98,7 @@ def test_batch_of_grasps_equals_single_checks():
     [
         ((0.0, 0.050, 0.0), False),  # 4 mm outside of a pad, which ends at y = 46 mm
         ((0.0, 0.052, 0.0), True),
-        ((0.014, 0.042, 0.0), False),  # 4 mm beside it
+        ((0.014, 0.042, 0.0), False),  # 4 mm next to it
         ((0.016, 0.042, 0.0), True),
         ((0.0, 0.042, 0.010), True),  # below the pad: the clearance applies to the sides only
     ],

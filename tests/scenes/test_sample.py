@@ -107,8 +107,8 @@ def test_columns_exclude_objects_without_display_pose_with_one_warning(caplog):
     scene = load_scene(layout={"kind": "orderly", "copies": 2, "rows": 2}, objects={"ids": ids, "count": 6})
     drawn = {i for seed in range(6) for i in draw_object_set(scene, seed)}
     assert drawn == {"mug", "soap_box", "sugar_box"}
-    told = [record.getMessage() for record in caplog.records]
-    assert len(told) == 1 and told[0].endswith(": " + ", ".join(lying))
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == 1 and messages[0].endswith(": " + ", ".join(lying))
     caplog.clear()
     draw_object_set(load_scene(layout={"kind": "orderly"}), 0)  # all objects with a display pose: no warning
     assert not caplog.records

@@ -41,7 +41,7 @@ def test_object_that_falls_settles_deterministically(model):
 @pytest.mark.parametrize(
     ("y", "lift", "lean"),
     [(2.5, 0.0, 0.0), (0.9, 0.08, 0.0), (0.9, 0.0, 0.5)],
-    ids=["beside the table", "comes to rest elsewhere", "tips over"],
+    ids=["next to the table", "comes to rest elsewhere", "tips over"],
 )
 def test_unstable_objects_are_detected(model, y, lift, lean):
     pose = on_table(model, "drink", y=y, lift=lift)

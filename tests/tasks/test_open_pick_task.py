@@ -216,4 +216,4 @@ def test_robot_drives_to_a_target_out_of_reach(tmp_path):
     assert base[-1, 0] > 0.1
     driving = np.flatnonzero(np.abs(np.diff(base, axis=0)).max(axis=1) > 0)
     assert len(driving) > 10
-    assert np.abs(np.diff(actions[:, :7], axis=0))[driving].max() == 0  # the arm stands still meanwhile
+    assert np.abs(np.diff(actions[:, :7], axis=0))[driving].max() == 0  # the arm is still

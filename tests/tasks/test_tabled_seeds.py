@@ -116,7 +116,7 @@ def test_layouts_missing_in_the_table_come_from_the_cache(built, tmp_path, monke
     env, _ = several(tmp_path, monkeypatch, num_envs=2, seeds=(0, 1))
     env.reset(seed=[1, 7])
     assert env.seeds.table is not None
-    assert env.seeds.table.state((1, 7)) == LayoutStatus.MISSING
+    assert env.seeds.table.status((1, 7)) == LayoutStatus.MISSING
     found = env.seeds.find_initial_states(np.array([0, 1]), env.device)
     assert_same(found, InitialStates.of([env.seeds.layouts(0, 1), env.seeds.layouts(1, 7)], "cpu"))
 

@@ -53,7 +53,7 @@ def make_vec(
             are passed to ``gym.make``, such as ``obs_mode``, ``control_mode``, ``config``, ``max_episode_steps``.
 
     Raises:
-        VectorEnvError: the environment or backend does not exist, or the backend needs a GPU and there is none.
+        VectorEnvError: the environment or backend does not exist, or the backend needs a missing GPU.
         VectorEnvCrashError: a process died.
         Exception: whatever making an environment raises.
     """
@@ -82,7 +82,7 @@ def choose_backend(backend: str, sim_backend: str = "auto") -> Literal["processe
         sim_backend: ManiSkill's argument: ``auto``, or the device of the physics.
 
     Raises:
-        VectorEnvError: the backend is unknown, contradicts ``sim_backend``, or needs a GPU and there is none.
+        VectorEnvError: the backend is unknown, contradicts ``sim_backend``, or needs a missing GPU.
     """
     if backend not in get_args(Backend):
         expected = f"one of {list(get_args(Backend))}"

@@ -1,7 +1,7 @@
 """Dense rewards of demonstrations, and of policies that leave them on the way.
 
 Idlers stop somewhere and hold still from then on, as a policy would that has found a reward it likes. Harvesters go
-back and forth, to earn the same way twice. Neither may earn more than going on, in whatever way rewards are summed up.
+back and forth, to collect the same reward twice. Neither may have a greater return than continuing the demonstration.
 """
 
 from __future__ import annotations
@@ -150,12 +150,12 @@ class TestDemonstrations:
 
     def test_closed_fingers_have_at_most_the_reward_of_reaching(self, demonstration):
         grasped = demonstration.first("target_grasped")
-        begin = grasped - 50  # before the target is between the fingers
-        path = demonstration.path(begin, grasped, CLOSED)
-        levels, infos = demonstration.leave(begin, [*path, *path[-1:] * IDLE_STEPS])
+        start = grasped - 50  # before the target is between the fingers
+        path = demonstration.path(start, grasped, CLOSED)
+        levels, infos = demonstration.leave(start, [*path, *path[-1:] * IDLE_STEPS])
         assert not any(info["success"][0] for info in infos)
         assert levels[-1] < demonstration.levels[grasped]  # the fingers may throw it up, which counts as a short grasp
-        assert has_smaller_return(demonstration, begin, levels, levels.max())
+        assert has_smaller_return(demonstration, start, levels, levels.max())
 
     def test_going_back_and_forth_has_at_most_the_return_of_staying(self, demonstration):
         """Move the held target; release it and grasp it again; open the furniture partly and close it."""
@@ -167,16 +167,16 @@ class TestDemonstrations:
         first, path = demonstration.first, demonstration.path
         grasped, lifted = first("target_grasped"), first("target_lifted") + 3
         if way == "carries":
-            begin = (lifted + demonstration.released) // 2
-            cycle = [*path(begin, lifted, CLOSED), *path(lifted, begin, CLOSED)]
+            start = (lifted + demonstration.released) // 2
+            cycle = [*path(start, lifted, CLOSED), *path(lifted, start, CLOSED)]
         elif way == "grasps_again":
-            begin, there = lifted, path(grasped, lifted, CLOSED)
+            start, there = lifted, path(grasped, lifted, CLOSED)
             cycle = [*there[::-1], *path(grasped, grasped, OPEN) * 6, *there[:1] * 6, *there]
         else:
-            begin = first("furniture_opened") - 2
-            cycle = [*path(begin, begin - 30, CLOSED), *path(begin - 30, begin, CLOSED)]
-        stays, _ = demonstration.leave(begin, cycle[:1] * IDLE_STEPS)
-        levels, infos = demonstration.leave(begin, cycle * 2)
+            start = first("furniture_opened") - 2
+            cycle = [*path(start, start - 30, CLOSED), *path(start - 30, start, CLOSED)]
+        stays, _ = demonstration.leave(start, cycle[:1] * IDLE_STEPS)
+        levels, infos = demonstration.leave(start, cycle * 2)
         assert not any(info["success"][0] for info in infos)
         assert levels.mean() < stays.max(), way
-        assert has_smaller_return(demonstration, begin, levels, levels.max()), way
+        assert has_smaller_return(demonstration, start, levels, levels.max()), way

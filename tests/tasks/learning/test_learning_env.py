@@ -195,7 +195,7 @@ def test_target_in_a_basket_below_the_support_is_no_failure():
     for height, failed in ((0.0, False), (0.3, False)):  # in it; on its way down
         put(target_of(base), inside + torch.tensor([0.1, 0, height]))
         assert bool(base.get_info()["fail"]) is failed
-    put(target_of(base), inside + torch.tensor([-0.5, 0.5, 0]))  # beside it
+    put(target_of(base), inside + torch.tensor([-0.5, 0.5, 0]))  # next to it
     assert base.get_info()["fail"]
     env.close()
 

@@ -92,7 +92,7 @@ def test_requested_seed_without_layout_is_an_error():
 @slow
 def test_errors_and_crashes_of_a_process(capfd):
     with closing(make(4, 2, wrappers=[MisbehavingWrapper])) as env:
-        begun, _ = env.reset(seed=0)
+        first, _ = env.reset(seed=0)
         with pytest.raises(OwnError) as error:
             env.step(make_actions(0, 0, 2, 3))
         assert error.value.args == ("gripper fell off", 7)
@@ -100,7 +100,7 @@ def test_errors_and_crashes_of_a_process(capfd):
         assert "in step\n    raise OwnError" in str(error.value.__cause__)
         with pytest.raises(VectorEnvError, match="Reset them first"):
             env.step(make_actions(0, 0, 0, 0))
-        assert torch.equal(env.reset(seed=0)[0], begun)
+        assert torch.equal(env.reset(seed=0)[0], first)
         with pytest.raises(RuntimeError, match="Unsendable: lost somewhere"):
             env.step(make_actions(3, 0, 0, 0))
         env.reset(seed=0)
@@ -116,7 +116,7 @@ def test_errors_and_crashes_of_a_process(capfd):
             env.step(make_actions(5, 0, 0, 0))
         with pytest.raises(VectorEnvError, match="interrupted"):
             env.step(make_actions(0, 0, 0, 0))
-        assert torch.equal(env.reset(seed=0)[0], begun)
+        assert torch.equal(env.reset(seed=0)[0], first)
         plain = env.step(make_actions(1, 1, 1, 1))[0]
         env.reset(seed=0)
         assert torch.equal(env.step(make_actions(1, 1, 1, 1))[0], plain)
@@ -170,9 +170,9 @@ def test_close_does_not_wait_for_a_busy_process():
     threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
     with pytest.raises(KeyboardInterrupt):
         env.step(make_actions(5))
-    begun, pids = time.monotonic(), env.unwrapped.pids
+    started, pids = time.monotonic(), env.unwrapped.pids
     env.close()
-    assert time.monotonic() - begun < 2.5
+    assert time.monotonic() - started < 2.5
     assert have_ended(pids)
 
 
