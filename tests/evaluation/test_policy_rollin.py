@@ -1,4 +1,4 @@
-"""A policy acts, the scripted one takes over: the state is handed over whole, and the episode is one like any other."""
+"""Expert interventions: the state of the first policy is taken over completely, and the recording is valid."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def settings(policy: str, steps: tuple[int, int]) -> EpisodeSettings:
 
 
 @pytest.fixture
-def player(request):
+def roll_in(request):
     made = PolicyRollIn(settings(*request.param))
     yield made
     made.close()
@@ -45,12 +45,12 @@ def generator():
 
 
 @pytest.fixture(scope="module")
-def is_intervention(generator, tmp_path_factory):
-    """A recording that begins after 31 random steps, the state there, and the TCP's position in the arm's base."""
-    folder, player = tmp_path_factory.mktemp("is_intervention"), PolicyRollIn(settings("random", (31, 31)))
-    intervention = player.run(2)
-    tcp = player._base.agent.tcp_in_arm_base.p[0].numpy().copy()
-    player.close()
+def recorded(generator, tmp_path_factory):
+    """Return a recording that starts after 31 random steps, its initial state, and the TCP position in the arm's base."""
+    folder, roll_in = tmp_path_factory.mktemp("recorded"), PolicyRollIn(settings("random", (31, 31)))
+    intervention = roll_in.run(2)
+    tcp = roll_in._base.agent.tcp_in_arm_base.p[0].numpy().copy()
+    roll_in.close()
     assert generator.generate(2, folder, "one", intervention).success
     return folder / "one.h5", intervention, tcp
 
@@ -61,25 +61,25 @@ def numbers(node, name=""):
     return {key: value for inner, of in node.items() for key, value in numbers(of, f"{name}/{inner}").items()}
 
 
-def test_steps_are_drawn_from_the_seed_both_ends_included():
+def test_number_of_steps_is_drawn_from_the_seed_with_both_ends():
     assert roll_in_steps(5, (7, 7)) == 7
     drawn = [roll_in_steps(seed, (5, 8)) for seed in range(60)]
     assert set(drawn) == {5, 6, 7, 8}
     assert drawn == [roll_in_steps(seed, (5, 8)) for seed in range(60)]
 
 
-def test_weights_of_what_acts_have_a_hash_and_other_actions_than_the_protocols_are_refused():
+def test_weights_have_a_hash_and_unsupported_actions_are_an_error():
     with pytest.raises(EvaluationError, match="joint_positions"):
         check_roll_in(settings("scripted", (5, 60)))
     assert check_roll_in(settings("random", (5, 60))) == ""
     assert check_roll_in(settings("small", (5, 60))) == hash_weights(BUNDLED / "small")
 
 
-@pytest.mark.parametrize("player", [("random", (12, 12))], indirect=True)
-def test_what_is_left_follows_from_the_seed_alone(player):
-    first = player.run(3)
-    other = player.run(4)
-    again = player.run(3)
+@pytest.mark.parametrize("roll_in", [("random", (12, 12))], indirect=True)
+def test_state_after_the_policy_depends_on_the_seed_only(roll_in):
+    first = roll_in.run(3)
+    other = roll_in.run(4)
+    again = roll_in.run(3)
     assert first.policy_steps == again.policy_steps == 12
     assert not first.skip_reason
     ours, theirs = numbers(first.state), numbers(again.state)
@@ -88,9 +88,9 @@ def test_what_is_left_follows_from_the_seed_alone(player):
     assert not np.array_equal(ours["/actors/object_0"], numbers(other.state)["/actors/object_0"])
 
 
-@pytest.mark.parametrize("player", [("scripted-ee-delta", (90, 90))], indirect=True)
-def test_there_is_nothing_to_take_over_where_the_policy_succeeded(player, generator, tmp_path):
-    intervention = player.run(4)
+@pytest.mark.parametrize("roll_in", [("scripted-ee-delta", (90, 90))], indirect=True)
+def test_seed_is_skipped_if_the_policy_succeeded(roll_in, generator, tmp_path):
+    intervention = roll_in.run(4)
     assert intervention.skip_reason == "succeeded"
     assert intervention.policy_steps < 90
     result = generator.generate(4, tmp_path, "one", intervention)
@@ -103,8 +103,8 @@ def test_there_is_nothing_to_take_over_where_the_policy_succeeded(player, genera
 
 
 @pytest.mark.slow
-def test_the_record_begins_where_the_policy_was(is_intervention, generator, tmp_path):
-    one, intervention, _ = is_intervention
+def test_recording_starts_in_the_state_of_the_policy(recorded, generator, tmp_path):
+    one, intervention, _ = recorded
     assert intervention.gripper == -1.0
     assert generator.generate(2, tmp_path, "two", intervention).success
     two = tmp_path / "two.h5"
@@ -114,10 +114,10 @@ def test_the_record_begins_where_the_policy_was(is_intervention, generator, tmp_
         for name, left in numbers(intervention.state).items():
             assert np.array_equal(group[f"env_states{name}"][0], left[0]), name
         arm = group["env_states/articulations/robocas_mobile_panda"][:, 13 + 3 : 13 + 10]
-        assert np.abs(np.diff(arm[:5], axis=0)).max() < 0.02  # rad a step: it brakes, it does not jump
-        told = group["actions"][:, 7]
-        assert (told[:4] == -1).all()  # 0.2 s
-        assert told[4] == 1  # nothing was held
+        assert np.abs(np.diff(arm[:5], axis=0)).max() < 0.02  # rad per step: the arm stops without a jump
+        commands = group["actions"][:, 7]
+        assert (commands[:4] == -1).all()  # 0.2 s
+        assert commands[4] == 1  # nothing was held
     (episode,) = read_json(one)["episodes"]
     assert episode["robocas"]["intervention"] == {"policy": "random", "policy_steps": 31}
     assert episode["robocas"]["subgoals"][0]["goal_range"][0] == 0
@@ -127,26 +127,26 @@ def test_the_record_begins_where_the_policy_was(is_intervention, generator, tmp_
     assert parse_actions(saved) == parse_actions(one)
     with TrajectoryFile(saved) as file:
         assert file.entry(0).is_intervention
-    with pytest.raises(EvaluationError, match="begin where another policy was"):
+    with pytest.raises(EvaluationError, match="cannot replay expert interventions"):
         ReplayPolicy(one)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("player", "subgoals", "commands"),
+    ("roll_in", "subgoals", "commands"),
     [
         (
             ("scripted-ee-delta", (31, 31)),
             ["transfer object"],
             1,
-        ),  # the target is in the hand: it opens above the basket
-        # in the same scene beside the target: it opens, closes where the target is, and opens above the basket
+        ),  # the target is held: it opens above the basket
+        # same scene, perturbed grasp: it opens, closes at the target, and opens above the basket
         (("scripted-perturbed", (31, 31)), ["move and grasp", "transfer object"], 3),
     ],
-    indirect=["player"],
+    indirect=["roll_in"],
 )
-def test_it_goes_on_with_what_the_gripper_holds(player, generator, tmp_path, subgoals, commands):
-    intervention = player.run(2)
+def test_intervention_continues_with_the_held_object(roll_in, generator, tmp_path, subgoals, commands):
+    intervention = roll_in.run(2)
     assert intervention.gripper == -1.0
     assert generator.generate(2, tmp_path, "one", intervention).success
     (episode,) = read_json(tmp_path / "one.h5")["episodes"]
@@ -158,8 +158,8 @@ def test_it_goes_on_with_what_the_gripper_holds(player, generator, tmp_path, sub
 
 
 @pytest.mark.slow
-def test_it_is_converted_from_where_the_policy_was(is_intervention, tmp_path, needs_renderer):
-    recording, _, tcp = is_intervention
+def test_intervention_is_converted_from_its_first_state(recorded, tmp_path, needs_renderer):
+    recording, _, tcp = recorded
     settings = {"cameras": ("base_camera",), "size": (64, 48), "depth": False, "embeddings": False, "video": False}
     convert(ConversionSettings(recording, tmp_path / "dataset", **settings))
     report = replay_dataset(tmp_path / "dataset")

@@ -16,6 +16,7 @@ from robocas_ms3.planning.decisions import IrreversibleDecisions
 from robocas_ms3.planning.executor import Executor
 from robocas_ms3.planning.protocol import Obstacle, Shape
 from robocas_ms3.planning.pushes import push_direction
+from robocas_ms3.planning.skills import heap as heap_skill
 from robocas_ms3.planning.skills import push
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.heap import Heap, Move
@@ -106,7 +107,7 @@ def test_push_without_displacement_fails(generator, monkeypatch):
             assert turn_deg == 30
             pushed.set_pose(Pose.create_from_pq(pushed.pose.p + torch.tensor([[by, 0.0, 0.0]]), pushed.pose.q))
 
-        monkeypatch.setattr(heap, "push_away", move)
+        monkeypatch.setattr(heap_skill, "push_away", move)
         heap.execute(Move("push", slots[0], 30))
 
     with pytest.raises(PlanningError, match="not_moved"):
@@ -114,7 +115,7 @@ def test_push_without_displacement_fails(generator, monkeypatch):
     assert facts == {"pushes": 0, "removals": 0}
     push(0.025)
     assert facts == {"pushes": 1, "removals": 0}
-    facts["removals"] = heap.MOVES - 1
+    facts["removals"] = heap_skill.MAX_MOVES - 1
     with pytest.raises(UnrecoverableError, match="too_many_obstacles"):
         next(heap.candidate_moves())
 
@@ -139,7 +140,7 @@ def test_target_is_grasped_if_no_move_is_feasible(generator, monkeypatch):
     skills = []
 
     def refuse(*_):
-        raise PlanningError("push", "no_room")
+        raise PlanningError("push", "no_free_push")
 
     monkeypatch.setattr(Heap, "execute", refuse)
     monkeypatch.setattr(Heap, "target_visible", True)
