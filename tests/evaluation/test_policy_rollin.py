@@ -46,7 +46,7 @@ def generator():
 
 @pytest.fixture(scope="module")
 def recorded(generator, tmp_path_factory):
-    """Return a recording that starts after 31 random steps, its initial state, and the TCP position in the arm's base."""
+    """Return a recording after 31 random steps, its initial state, and the TCP position in the arm's base."""
     folder, roll_in = tmp_path_factory.mktemp("recorded"), PolicyRollIn(settings("random", (31, 31)))
     intervention = roll_in.run(2)
     tcp = roll_in._base.agent.tcp_in_arm_base.p[0].numpy().copy()
