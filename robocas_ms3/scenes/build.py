@@ -33,7 +33,7 @@ class Fixtures:
 def build_fixtures(
     scene: ManiSkillScene, model: SceneModel, level: VisualLevel = "fast", seeds: Sequence[int] = (0,)
 ) -> Fixtures:
-    """Build room, furniture and basket in every sub-scene; the seed of a sub-scene decides the finishes of its room."""
+    """Build room, furniture and basket in every sub-scene, with room finishes drawn by its seed."""
     furniture: dict[str, Actor | Articulation] = {}
     for name, asset in model.furniture.items():
         build_one = spawn_articulation if asset.links else spawn
@@ -81,7 +81,10 @@ def build_lights(scene: ManiSkillScene, config: TaskConfig, seeds: Sequence[int]
 
 
 def shift_cameras(cameras: Sequence[RenderCamera], config: TaskConfig, seeds: Sequence[int]) -> None:
-    """Shift the cameras of every sub-scene; the shift depends on its seed and on the camera's position in the list."""
+    """Shift the cameras of every sub-scene by its seed.
+
+    The order of the cameras matters: each camera has its own random stream.
+    """
     limits = config.randomisation.cameras
     if limits is None:
         return
@@ -104,7 +107,7 @@ def build_objects(
 def build_object_slot(
     scene: ManiSkillScene, slot: int, assets: Sequence[LoadedObject], level: VisualLevel = "fast"
 ) -> Actor:
-    """Build an object slot as one actor; the body of env i is ``assets[i]``, and bodies are in the order of envs."""
+    """Build an object slot as one actor, whose body in env i is ``assets[i]``."""
     name, waiting = f"object_{slot}", sapien.Pose([slot * 0.5, 0, 20.0])
     envs_of: dict[str, list[int]] = {}
     for env, asset in enumerate(assets):

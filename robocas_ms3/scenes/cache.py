@@ -1,4 +1,4 @@
-"""The layout cache: stored layouts, sampled in advance or at the first use, so that a reset only sets poses."""
+"""The layout cache: layouts are sampled in advance or at the first use, and stored in files."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def _raise_crash(task: tuple[int, int, ObjectIds | None], reason: str) -> NoRetu
 
 
 class LayoutCache:
-    """A `LayoutSource` that stores the layouts of one configuration and its packs, one small file per layout.
+    """A `LayoutSource` that stores layouts of one configuration and its packs, one file per layout.
 
     Several processes may use a cache at once: files are written atomically, and equal seeds give equal files.
 
@@ -222,7 +222,9 @@ class LayoutCache:
         return [pair for pair in pairs if not self.path(*pair).is_file()]
 
     def fill(self, pairs: Iterable[SeedPair], jobs: int = 1) -> Generator[tuple[SeedPair, str], None, None]:
-        """Sample and store the missing layouts, first those whose two seeds are equal, which decide the objects.
+        """Sample and store the missing layouts.
+
+        Layouts with equal seeds come first, because the others take their objects from them.
 
         Args:
             pairs: seed pairs.

@@ -1,4 +1,4 @@
-"""Check that nothing in a configuration overlaps and that basket and objects are within reach. No simulator."""
+"""Check a configuration for overlaps and for things out of the robot's reach. No simulator."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def check_clearance(
     robot_pose: Array,
     robot: RobotDescription,
 ) -> None:
-    """Check that furniture, basket and robot don't overlap, and that basket and objects are within the arm's reach.
+    """Check furniture, basket and robot for overlaps, and basket and objects for reachability.
 
     `robot_placement` checks randomised poses when they are drawn. The reach includes the range of randomisation.
 
@@ -82,7 +82,7 @@ def check_clearance(
 
 
 def overlap(one: Hull, other: Hull) -> float:
-    """Return the distance in m by which one hull has to move to be clear of another; 0 if they don't overlap.
+    """Return the least distance, m, that separates two hulls; 0 if they don't overlap.
 
     The result is exact (separating axis theorem).
     """
@@ -160,7 +160,7 @@ def _check_arm(points: Array, others: list[CollisionBody]) -> None:
 
 
 def _shoulders(config: TaskConfig, robot_pose: Array, robot: RobotDescription, envelope: Envelope) -> Array:
-    """Return possible positions (P, 3) of the arm's shoulder, world, m: one, or a grid if the base can drive."""
+    """Return possible positions (P, 3) of the arm's shoulder, world, m; a grid if the base can drive."""
     ranges = robot.base_limits[:2] if config.base_motion else ((0.0, 0.0),) * 2
     spans = [np.arange(low, high + _STEP, _STEP) for low, high in ranges]
     x, y = (grid.ravel() for grid in np.meshgrid(*spans))
@@ -175,7 +175,7 @@ def _check_reach(
     shoulders: Array,
     envelope: Envelope,
 ) -> None:
-    """Check that the nearest points of region and basket are within reach of the arm, including base motion."""
+    """Check that the nearest points of region and basket are within reach of arm and base."""
     moved = config.randomisation.robot
     reach = envelope.reach + _STEP + (np.sqrt(2) * moved.position if moved else 0.0)
     area, frame = region

@@ -1,4 +1,4 @@
-"""Check annotated grasps (TCP poses) for direction and collisions of the open gripper. Geometry only, no simulator."""
+"""Check annotated grasps (TCP poses) for direction and collisions of the open gripper."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def _bounds_around(tcp_in_world: Array, low: Array, high: Array) -> tuple[Array,
 
 
 def _any_inside(tcp: Array, points: Array, low: Array, high: Array) -> NDArray[np.bool_]:
-    """Return (G,) whether a point (P, 3) is inside one of the boxes (B, 3) or its mirror image, for each TCP."""
+    """Return (G,) whether a point (P, 3) is inside a box (B, 3) or its mirror image, for each TCP."""
     x, y, z = to_tcp_frames(tcp, points)
     y = np.abs(y)
     inside = np.zeros(len(tcp), dtype=bool)

@@ -1,4 +1,4 @@
-"""Make heaps: objects drop one by one between four walls, which are then removed. Uses PhysX without ManiSkill."""
+"""Make heaps: objects drop one by one between four walls, which are then removed."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def _spread(assets: Sequence[LoadedObject], poses: Array, region: Region) -> Arr
 
 
 def outline(asset: LoadedObject) -> Array:
-    """Return at most 64 points (V, 3) whose convex hull approximates the object's, m, in the asset's frame."""
+    """Return at most 64 points (V, 3), m, asset frame, whose convex hull approximates the object's."""
     points = np.concatenate(asset.hulls)
     return points[np.unique(np.argmax(points @ _DIRECTIONS.T, axis=0))]
 

@@ -1,4 +1,4 @@
-"""The layout of a scene: poses and target at the start of an episode, and its ``.npz`` file. No simulator."""
+"""The layout of a scene (poses and target at the start of an episode), and its ``.npz`` file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Look up the assets of a configuration in the packs; an invalid name is a `ConfigError`. No simulator."""
+"""Look up the assets of a configuration in the packs; an invalid name is a `ConfigError`."""
 
 from __future__ import annotations
 

@@ -119,14 +119,14 @@ class SceneModel:
 
     @property
     def opened_position(self) -> float:
-        """Joint position, m or rad, from which the joint to open counts as open; the sign is the opening direction."""
+        """Joint position, m or rad, from which the joint to open counts as open; signed."""
         joint, opening = self.opened_joint, self.config.opening
         assert joint is not None
         assert opening is not None
         return opening.opened_at * max(joint.limits, key=abs)
 
     def joint_positions(self, name: str, *, opened: bool) -> dict[str, float]:
-        """Return the joint positions of a piece of furniture by name, at the start or when opened; others are 0."""
+        """Return joint positions of a piece of furniture by name, at the start or opened; others are 0."""
         positions = dict(self.config.furniture[name].joints)
         joint, opening = self.opened_joint, self.config.opening
         if opened and joint is not None and opening is not None and opening.furniture == name:

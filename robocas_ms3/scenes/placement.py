@@ -101,7 +101,7 @@ def _snuggest(outlines: NDArray, placed: list[shapely.Polygon], region: Region) 
 
 
 def _candidates(rng: np.random.Generator, footprint: Array, region: Region) -> tuple[Array, Array, NDArray]:
-    """Draw yaws (n,), positions (n, 2) and outlines (n,) of a footprint inside a region; n depends on its size."""
+    """Draw yaws (n,), positions (n, 2) and outlines (n,) of a footprint inside a region."""
     yaws = rng.uniform(-np.pi, np.pi, _TRIES_AT_ONCE)
     fractions = rng.uniform(0, 1, (_TRIES_AT_ONCE, 2))
     cos, sin = np.cos(yaws), np.sin(yaws)

@@ -1,4 +1,4 @@
-"""Draw the appearance of a scene: finishes of the room, lights and cameras, each from its own random stream."""
+"""Draw the appearance of a scene (room finishes, lights, cameras) from separate random streams."""
 
 from __future__ import annotations
 

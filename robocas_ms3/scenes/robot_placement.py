@@ -93,7 +93,7 @@ def is_body_clear(base_in_world: Array, cloud: Array) -> bool:
 
 
 def is_basket_stable(model: SceneModel, basket_pose: Array) -> bool:
-    """Simulate whether the basket stays at a 4x4 pose in the world with a load in each of its corners; takes 30 ms."""
+    """Simulate (30 ms) whether the basket is stable at a 4x4 pose, with a load in each of its corners."""
     assert model.basket is not None
     facts = model.basket.asset
     assert facts.inner is not None

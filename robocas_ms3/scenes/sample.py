@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 
 def draw_object_set(model: SceneModel, objects_seed: int, number: int = 0) -> ObjectIds:
-    """Draw the ``number``-th set of objects of a seed: one id per slot, first the task's objects, then distractors.
+    """Draw the ``number``-th set of objects of a seed, one id per slot; distractors come last.
 
     Raises:
         LayoutError: no object or no column of objects fits on the surface.
@@ -126,7 +126,7 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
 def overlaps_basket(
     assets: list[LoadedObject], poses: Array, basket: LoadedFurniture | None, basket_pose: Array | None
 ) -> bool:
-    """Return whether the bounding box of an object at its pose (K, 4, 4) overlaps the basket's bounding box."""
+    """Return whether an object's bounding box, at its pose (K, 4, 4), overlaps the basket's."""
     if basket is None or basket_pose is None:
         return False
     walls = np.concatenate(basket.hulls)
@@ -139,7 +139,7 @@ def overlaps_basket(
 
 
 def _failure(model: SceneModel, unarranged: list[LayoutError], unsettled: int, untargeted: int) -> LayoutError:
-    """Return the error of seeds without a layout; the target is the reason if several layouts came to rest."""
+    """Return the error of seeds without a layout, with the most likely reason."""
     if untargeted < _SEVERAL and len(unarranged) > _SETS * _TRIES // 2:
         return unarranged[-1]
     found = (
@@ -174,7 +174,7 @@ def _kinds_that_fit(rng: np.random.Generator, model: SceneModel, ids: list[str],
 
 
 def _usable(model: SceneModel, ids: list[str], *, columns: bool = False) -> list[str]:
-    """Return the ids of objects that fit below the headroom; for columns those with a display pose, if any has one."""
+    """Return the ids of objects that fit below the headroom; for columns those with a display pose."""
     if not columns and model.headroom == np.inf:
         return ids
     things = {i: make_placeable(model.object_pack.objects[i], model.headroom) for i in ids}

@@ -175,7 +175,7 @@ def selection_camera(model: SceneModel) -> PinholeCamera:
 
 
 def _by_visibility(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
-    """Choose a hidden object with a weight of 1 / distance to the robot, as RoboCAS-v0 does when it generates data.
+    """Choose a hidden object with a weight of 1 / distance to the robot, as in RoboCAS-v0's data.
 
     An object whose grasps are blocked by furniture or basket does not qualify, e.g. a flat can on its broad side.
     """

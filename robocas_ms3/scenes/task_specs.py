@@ -1,4 +1,4 @@
-"""Specifications of the tasks. Other packages add tasks by entry points of the group ``robocas_ms3.tasks``."""
+"""Specifications of the tasks. Other packages add tasks by entry points ``robocas_ms3.tasks``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ STAGES = ("furniture_opened", "reached_any", "obstacles_cleared", "reached_targe
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """Specification of a task. Code is named by import paths ``package.module:name``, so no simulator is imported.
+    """Specification of a task. Import paths ``package.module:name`` avoid importing the simulator.
 
     Attributes:
         name: short name, as in ``robocas generate pick``.

@@ -119,7 +119,7 @@ class MeshScene:
 
 
 def _depths(camera: PinholeCamera, mesh: trimesh.Trimesh, pose: Array) -> tuple[PixelBox, Array]:
-    """Return the pixel box of a mesh, and its depth in m in this box; infinite where a ray misses the mesh."""
+    """Return the pixel box of a mesh, and its depth in m in this box; infinite without a hit."""
     box = camera.pixel_box(transform_points(pose, mesh.vertices))
     # rays are cast in the mesh's frame: its search tree is built once, and single precision is sufficient
     to_mesh = pose[:3, :3].T

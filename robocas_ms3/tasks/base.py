@@ -184,7 +184,7 @@ class RoboCASEnv(BaseEnv):
         self.gripper_contacts = Contacts(self.scene, gripper, self.objects)
 
     def reset(self, seed: int | list[int] | None = None, options: dict | None = None) -> tuple[Any, dict]:
-        """Reset all envs or those of ``options["env_idx"]``; see ``BaseEnv``. A seed always gives the same layout.
+        """Reset all envs or those of ``options["env_idx"]``; a seed always gives the same layout.
 
         Args:
             seed: seed of each env; for a single seed, the first env gets it and the others get the next seeds within
@@ -286,7 +286,7 @@ class RoboCASEnv(BaseEnv):
         return self.object_assets[env][int(self.target_slot[env])]
 
     def gripper_forces(self) -> torch.Tensor:
-        """Return the forces (N, 3, K, 3) in N of each object on left finger, right finger and hand, world frame."""
+        """Return forces (N, 3, K, 3), N, world frame, of objects on left finger, right finger and hand."""
         return as_tensor(self.gripper_contacts.forces())
 
     def grasped(self) -> torch.Tensor:
@@ -360,7 +360,7 @@ class RoboCASEnv(BaseEnv):
         return info["success"].float()
 
     def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
-        """Return the reward (N,) float32 in [0, ``REWARDS.total``]; add ``reward_terms`` to the last step's info."""
+        """Return the reward (N,) in [0, ``REWARDS.total``]; add ``reward_terms`` to the info."""
         state = self.success_check.state
         penalties = {"disturbed": count_fraction(state.disturbed.sum(1)), **self.goal.penalties(state)}
         return self.dense_reward.compute(self.reward_progress(), penalties, action, info)

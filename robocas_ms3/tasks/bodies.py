@@ -1,4 +1,4 @@
-"""Read poses and velocities of all bodies, and contact forces, from a scene in one call instead of one per actor."""
+"""Read poses and velocities of all bodies, and contact forces, from a scene in one call."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Bodies:
             self._state = torch.empty(0)
 
     def read(self) -> torch.Tensor:
-        """Return the states (N, D) float32 of all envs; read only. Later steps don't change the returned tensor."""
+        """Return the states (N, D) float32 of all envs; read only, not changed by later steps."""
         if self._scene.gpu_sim_enabled:
             return self._gather()
         packed = self._px.pack()
@@ -114,7 +114,7 @@ class Bodies:
         }
 
     def _packed_order(self, robot: Articulation) -> tuple[NDArray[np.int64], slice]:
-        """Return the index of each state component in SAPIEN's packed numbers, and the robot's slice of the bytes."""
+        """Return the index of each state component in SAPIEN's packed state, and the robot's bytes."""
         dynamic: list[Any] = self._px.rigid_dynamic_components
         first = {body: i * BODY for i, body in enumerate(dynamic)}
         order = [first[actor._bodies[0]] + k for actor in self._actors for k in _PACKED_BODY]

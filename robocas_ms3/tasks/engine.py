@@ -1,4 +1,4 @@
-"""Renderer and physics engine of a process: argument checks, memory limits, shader cache, errors of PhysX."""
+"""Renderer and physics engine of a process: argument checks, memory limits, errors of PhysX."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def sim_config(num_envs: int, config: TaskConfig) -> SimConfig:
 
 
 def gpu_memory(num_envs: int, objects: int) -> GPUMemoryConfig:
-    """Return the memory limits of PhysX on a GPU for ``num_envs`` envs with ``objects`` each; at least ManiSkill's."""
+    """Return memory limits of PhysX on a GPU for envs with ``objects`` each; at least ManiSkill's."""
     least = GPUMemoryConfig()
     contacts = num_envs * (CONTACTS_PER_OBJECT * objects + BASE_CONTACTS)
     patches = num_envs * (PATCHES_PER_OBJECT * objects + BASE_PATCHES)
@@ -127,7 +127,7 @@ def step_without_observation(env: Any, action: NDArray[Any]) -> None:
 
 
 def is_collection_due(device: sapien.Device | None, resets: int) -> bool:
-    """Return whether to collect garbage after a number of resets; a scene leaves 8 MB, without renderer 0.5 MB."""
+    """Return whether to collect garbage after a number of resets (8 MB per scene, 0.5 MB unrendered)."""
     return resets % (20 if can_render(device) else 30) == 0
 
 
@@ -148,7 +148,7 @@ def _render_system() -> sapien.render.RenderSystem:
 
 
 class EngineErrors:
-    """A monitor of standard error, to which PhysX prints that it dropped contacts without raising an error."""
+    """A monitor of standard error, to which PhysX only prints that it dropped contacts."""
 
     def __init__(self) -> None:
         self._log: IO[bytes] | None = None
@@ -180,7 +180,7 @@ _tees: list[tuple[subprocess.Popen, IO[bytes], os.stat_result]] = []  # each wit
 
 
 def _log_standard_error() -> str:
-    """Copy standard error to a log file by ``tee``, which survives a crash of this process; return the file's name."""
+    """Copy standard error to a log file by ``tee``, which survives a crash; return the file's name."""
     if not _tees or not os.path.samestat(os.fstat(2), _tees[-1][2]):
         log = tempfile.NamedTemporaryFile(prefix="robocas-stderr-")  # noqa: SIM115  (removed when the process ends)
         # a new session, so that Ctrl-C does not end tee

@@ -71,11 +71,11 @@ class Goal(ABC):
         return None
 
     def is_over_goal(self, positions: Array, basket: Array | None) -> Array | None:
-        """Return (N,) which targets at positions (N, 3) m are above the goal and may fall into it; None: no target."""
+        """Return (N,) which targets at positions (N, 3) m are above the goal; None: no target."""
         return None
 
     def position(self, basket: Array | None) -> Array | None:
-        """Return the position (N, 3) m, world, to which the target's centre of mass is carried; None: no fixed one."""
+        """Return the position (N, 3) m, world, to which the target is carried; None: no fixed one."""
         return None
 
     def progress(

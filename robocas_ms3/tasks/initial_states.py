@@ -1,4 +1,4 @@
-"""Initial states of episodes as tensors, converted from single layouts or gathered from a layout table."""
+"""Initial states of episodes as tensors, from single layouts or from a layout table."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from robocas_ms3.scenes.layout_table import LayoutTable, is_usable
 
 @dataclass(frozen=True)
 class InitialStates:
-    """Layouts of E envs as tensors on the envs' device. K object slots; world frame, metres, quaternions wxyz.
+    """Layouts of E envs as tensors on their device. K object slots; world frame, m, quaternions wxyz.
 
     Attributes:
         object_poses: (E, K, 7) float32.
@@ -51,7 +51,7 @@ class InitialStates:
         )
 
     def with_rows(self, rows: NDArray[np.bool_], others: InitialStates) -> InitialStates:
-        """Return these states, in their order, in the rows (E,) that are True, and others in the remaining rows."""
+        """Return these states in the rows (E,) that are True, and others in the remaining rows."""
         order = torch.from_numpy(np.argsort(np.argsort(~rows, kind="stable"))).to(self.targets.device)
         return InitialStates(
             **{
@@ -81,7 +81,7 @@ class InitialStateTable:
         self._columns = [torch.from_numpy(np.ascontiguousarray(taken[name])).to(device) for name in names]
 
     def is_usable(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return (E,) whether layouts exist and are not known to be unstable, by env (E,) and layout seed (E,)."""
+        """Return (E,) whether layouts exist and are not marked unstable, by env (E,) and seed (E,)."""
         return is_usable(self._table.find_records(self._objects_seeds[envs], seeds)[0])
 
     def gather(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> InitialStates:

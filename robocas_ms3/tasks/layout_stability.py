@@ -29,7 +29,7 @@ def unchecked_layouts(cache: LayoutCache, engine: Engine) -> dict[int, list[int]
 def check_layouts(
     cache: LayoutCache, engine: Engine, seeds: dict[int, list[int]], **kwargs: Any
 ) -> Generator[tuple[SeedPair, float]]:
-    """Start an episode with each layout, hold the robot for one second, and measure the motion of the objects.
+    """Start an episode with each layout, hold the robot for 1 s, and measure the objects' motion.
 
     Args:
         cache: cache of the layouts.

@@ -1,4 +1,4 @@
-"""Measure which objects hide or surround a target, seen from above. Pure functions on batched tensors; N envs, K slots.
+"""Measure which objects hide or surround a target, seen from above. N envs, K slots.
 
 Objects are given as points on their surfaces, m. The points of each object are projected to a grid of square cells
 around the target; a height map keeps the highest point of each cell. Comparing height maps shows which object hides
@@ -41,7 +41,7 @@ class Clutter(NamedTuple):
 
     @property
     def cleared(self) -> Tensor:
-        """(N,) bool, the paper's rule: at most a fifth of the target is hidden, and at most one obstacle is left."""
+        """(N,) bool, the paper's rule: at most a fifth of the target is hidden, at most one obstacle left."""
         return (self.hidden_fraction <= MAX_HIDDEN_FRACTION) & (self.obstacles.sum(dim=1) <= MAX_OBSTACLES)
 
 
@@ -170,7 +170,7 @@ def pairwise_occlusion(points: Tensor, present: Tensor, eye: Tensor) -> Tensor:
 
 
 def push_point(points: Tensor, obstacles: Tensor, target: Tensor) -> Tensor:
-    """Return the start of the paper's push of the highest obstacle: clear of it, on the target's side, at mid-height.
+    """Return the start (N, 3) of the paper's push of the highest obstacle, on the target's side.
 
     Args:
         points: (N, K, 3, P) points on the objects' surfaces, world, m.
@@ -192,14 +192,14 @@ def push_point(points: Tensor, obstacles: Tensor, target: Tensor) -> Tensor:
 
 
 def _cells(points: Tensor, middle: Tensor) -> Tensor:
-    """Return (N, K, P) the index of the cell of each point (N, K, 2, P) in the grid around ``middle`` (N, 2)."""
+    """Return (N, K, P) the cell index of each point (N, K, 2, P) in the grid around ``middle`` (N, 2)."""
     cell = torch.floor((points - middle[:, None, :, None]) / CELL).long() + CELLS // 2
     inside = (cell >= 0) & (cell < CELLS)
     return torch.where(inside[:, :, 0] & inside[:, :, 1], cell[:, :, 0] * CELLS + cell[:, :, 1], _OUTSIDE)
 
 
 def _height_map(cells: Tensor, heights: Tensor) -> Tensor:
-    """Return the height (N, CELLS, CELLS) of the highest point (N, P) in each cell; ``_NOTHING``: no point."""
+    """Return the greatest height (N, CELLS, CELLS) of points (N, P) per cell; ``_NOTHING``: no point."""
     empty = torch.full((len(cells), _OUTSIDE + 1), _NOTHING, device=cells.device)
     return empty.scatter_reduce(1, cells, heights, "amax")[:, :_OUTSIDE].unflatten(1, (CELLS, CELLS))
 
@@ -210,6 +210,6 @@ def _closed(maps: Tensor) -> Tensor:
 
 
 def _widened(maps: Tensor, reach: int) -> Tensor:
-    """Return the greatest value within ``reach`` cells in both directions; much faster than `max_pool2d` on a CPU."""
+    """Return the greatest value within ``reach`` cells; on a CPU much faster than `max_pool2d`."""
     across = pad(maps, (reach, reach), value=-torch.inf).unfold(-1, 2 * reach + 1, 1).amax(dim=-1)
     return pad(across, (0, 0, reach, reach), value=-torch.inf).unfold(-2, 2 * reach + 1, 1).amax(dim=-1)

@@ -90,7 +90,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
         return rewards.progress_fraction(to_native(self.opening_position()), 0.0, self.model.opened_position)
 
     def privileged_observations(self) -> dict[str, torch.Tensor]:
-        """Return those of `RoboCASEnv`, ``opened_fraction`` (N, 1) of the required opening, and ``tcp_to_handle``."""
+        """Return those of `RoboCASEnv`, ``opened_fraction`` (N, 1) and ``tcp_to_handle`` (N, 3)."""
         tcp = self.tcp_in_world()
         return {
             **super().privileged_observations(),

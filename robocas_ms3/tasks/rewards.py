@@ -1,4 +1,4 @@
-"""Dense rewards: named terms in [0, 1], weighted by a task's table. Pure functions on arrays, as in `terms`. N envs.
+"""Dense rewards: named terms in [0, 1], weighted by a task's table. N envs; arrays as in `terms`.
 
 A task is a sequence of stages, and each env is in one stage at a time. Terms of earlier stages count in full, terms of
 the current stage count with their values, terms of later stages don't count. So a later stage always has at least the
@@ -105,7 +105,7 @@ def progress_fraction(value: Array, start: Array | float, by: float) -> Array:
 
 
 def clear_fraction(hidden_fraction: Array, obstacles: Array) -> Array:
-    """Return (N,) in [0, 1]: 1 for a cleared target, less for larger hidden fractions (N,) and more obstacles (N,)."""
+    """Return (N,) in [0, 1]: 1 for a cleared target, less with hidden fraction (N,) and obstacles (N,)."""
     hidden = clamp((hidden_fraction - MAX_HIDDEN_FRACTION) / (1 - MAX_HIDDEN_FRACTION), 0.0, 1.0)
     around = clamp((as_float(obstacles) - MAX_OBSTACLES) / _MANY_OBSTACLES, 0.0, 1.0)
     return 1 - (hidden + around) / 2

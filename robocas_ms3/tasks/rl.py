@@ -14,7 +14,7 @@ DRIVING_SECONDS = 30  # additional time if the base drives
 
 
 def rl_kwargs(task: str, config: str | Path | dict | TaskConfig | None = None) -> dict[str, Any]:
-    """Return arguments of ``gym.make`` and `make_vec` for training: state observations, dense rewards, 5 Hz.
+    """Return arguments of ``gym.make`` and `make_vec` for training: states, dense rewards, 5 Hz.
 
     ``max_episode_steps`` is long enough for a demonstration (docs/rl.md). If the base may drive (``base_motion``),
     actions include the base, and the horizon is longer.

@@ -91,7 +91,7 @@ class RoboCASSearchEnv(RoboCASEnv):
         return occlusion.pairwise_occlusion(points, self.present[envs], self._eye)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Return the result of `RoboCASEnv.evaluate`, ``obstacles_cleared`` and ``cleared_at_reset``, (N,) bool."""
+        """Return the result of `RoboCASEnv.evaluate`, ``obstacles_cleared`` and ``cleared_at_reset``."""
         found, measured = super().evaluate(), self._measured
         unchanged = (
             measured is not None and measured.others is not None and measured.others == self.bodies.state_except_robot
@@ -124,7 +124,7 @@ class RoboCASSearchEnv(RoboCASEnv):
         return ((to_native(self.elapsed_steps) % self._measure_period == 0) | to_native(self._measure_now)) & ~settled
 
     def _measure(self, due: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
-        """Measure the clutter of the due envs, store hidden fractions and obstacles, and return (N,) bool: cleared.
+        """Measure the clutter of the due envs, store it, and return (N,) bool: which targets are cleared.
 
         Args:
             due: (N,) bool, in which envs to measure.
@@ -155,7 +155,7 @@ class RoboCASSearchEnv(RoboCASEnv):
         return bool(occlusion.has_moved_near(poses, before, self._radii, self.target_slot, self._eye).any())
 
     def reward_progress(self) -> tuple[Array, dict[str, Array]]:
-        """Return stage and terms; see `RoboCASEnv`. The stage ``clear`` lasts until the target is cleared or held."""
+        """Return stage and terms; the stage ``clear`` lasts until the target is cleared or held."""
         stage, found = super().reward_progress()
         stages = self.success_check.stages
         settled = stages["obstacles_cleared"] | stages["target_grasped"]

@@ -28,7 +28,7 @@ class _UnstableLayout(LayoutError):
 
 
 def consecutive_seeds(first: int, count: int, within: tuple[int, int] | None) -> list[int]:
-    """Return consecutive seeds; if the first one is in the range ``within``, they wrap around in this range."""
+    """Return consecutive seeds, which wrap around in the range ``within`` if the first one is in it."""
     if within is None or not within[0] <= first <= within[1]:
         return [first + i for i in range(count)]
     low, high = within
@@ -38,7 +38,7 @@ def consecutive_seeds(first: int, count: int, within: tuple[int, int] | None) ->
 def check_reset_options(
     options: dict[str, Any] | None, num_envs: int, device: torch.device
 ) -> tuple[dict[str, Any], list[int]]:
-    """Return options of ``BaseEnv.reset`` with ``env_idx`` as indices, and the indices of the envs to reset.
+    """Return options of ``BaseEnv.reset`` with ``env_idx`` as indices, and the envs to reset.
 
     Raises:
         RobocasError: the options have ``reset_to_env_states``.
@@ -150,7 +150,7 @@ class EpisodeSeeds:
         return np.where((seed >= low) & (seed <= high), seed, low + seed % (high - low + 1))
 
     def set_layout_seeds(self, envs: NDArray[np.int64], seeds: NDArray[np.int64] | None, generators: Any) -> None:
-        """Set the layout seeds of some envs (E,); None: draw each one with the env's generator of a ``BatchedRNG``."""
+        """Set the layout seeds of some envs (E,); None: draw them with the envs' generators."""
         self._generators = generators
         for i, env in enumerate(envs):
             self.layout_seeds[env] = self._draw(env) if seeds is None else seeds[i]
@@ -228,7 +228,7 @@ class EpisodeSeeds:
         return layout
 
     def _first_possible(self, make: Callable[[int], _T], env: int, seeds: NDArray[np.int64]) -> _T:
-        """Return ``make`` of an env's seed; replace a seed without layout by a drawn one if it was not requested."""
+        """Return ``make`` of an env's seed; an unrequested seed without layout is replaced by a drawn one."""
         for _ in range(self._other_seeds):
             try:
                 return make(int(seeds[env]))
@@ -242,5 +242,5 @@ class EpisodeSeeds:
 
 
 def _level(error: LayoutError) -> int:
-    """Return the log level for a replaced seed; unstable layouts were already reported when they were checked."""
+    """Return the log level for a replaced seed; unstable layouts were reported by their check."""
     return logging.DEBUG if isinstance(error, _UnstableLayout) else logging.WARNING

@@ -1,4 +1,4 @@
-"""RoboCASSelect-v1: grasp one of several identical objects, named by its position, and drop it into the basket."""
+"""RoboCASSelect-v1: grasp one of several identical objects, named by its position."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class RoboCASSelectEnv(RoboCASEnv):
         return {**found, "success": found["success"] & self._others_out()}
 
     def success_conditions(self) -> dict[str, torch.Tensor]:
-        """Return those of `RoboCASEnv`, and ``others_out``: no other object of the target's name is in the basket."""
+        """Return those of `RoboCASEnv`, and ``others_out``: no other object of the name is in the basket."""
         return {**super().success_conditions(), "others_out": self._others_out()}
 
     def _others_out(self) -> torch.Tensor:

@@ -69,7 +69,7 @@ class SuccessCheck:
         self._last = None
 
     def reach(self, stage: str, now: Array) -> torch.Tensor:
-        """Mark a stage as reached in some envs (N,) bool, native (`arrays`); return (N,) bool, where it was reached."""
+        """Mark a stage as reached in envs (N,) bool, native; return (N,) bool, where it was reached."""
         row = self.stages[stage]
         row |= now
         return as_tensor(row).clone()
@@ -89,12 +89,12 @@ class SuccessCheck:
         return dict(found)
 
     def _dependencies(self, forces: Array) -> object:
-        """Return a key of the next result: equal keys mean equal results; None: unknown (GPU, or gripper contact)."""
+        """Return a key of the next result, for reuse; None: unknown (GPU, or contact of the gripper)."""
         others = self._env.bodies.state_except_robot
         return None if others is None or forces.any() else (others, self.reached.numpy().tobytes())
 
     def _check(self, forces: Array, objects: Array, basket: Array | None) -> dict[str, torch.Tensor]:
-        """Check forces (N, 3, K, 3), object states (N, K, 13) and the basket's pose (N, 7) or None, all native."""
+        """Check native forces (N, 3, K, 3), object states (N, K, 13) and basket pose (N, 7) or None."""
         env = self._env
         slot, goal = to_native(env.target_slot), env.goal
         grasped, touched = self.grasped(forces), terms.is_touched(forces)
@@ -143,18 +143,18 @@ class SuccessCheck:
         return terms.is_grasped(forces[:, 0], forces[:, 1], opening)
 
     def success_conditions(self) -> dict[str, torch.Tensor]:
-        """Return the conditions that success requires at the same time, in addition to the lift, (N,) bool each."""
+        """Return the simultaneous conditions of success in addition to the lift, (N,) bool each."""
         touched = terms.is_touched(self._env.gripper_contacts.forces())
         found = self._conditions(touched, *self._objects_and_basket(self._env.bodies.read()))
         return {name: as_tensor(measure) for name, measure in found.items()}
 
     def _objects_and_basket(self, state: torch.Tensor) -> tuple[Array, Array | None]:
-        """Return object states (N, K, 13) and basket pose (N, 7) or None, native, from the state of all bodies."""
+        """Return native object states (N, K, 13) and basket pose (N, 7) or None from the full state."""
         basket = self._env.bodies.basket(state)
         return to_native(self._env.bodies.objects(state)), None if basket is None else to_native(basket)
 
     def _conditions(self, touched: Array, objects: Array, basket: Array | None) -> dict[str, Array]:
-        """Return the native `success_conditions` from touched objects (N, K), object states and the basket's pose."""
+        """Return native `success_conditions` from touched objects (N, K), object states and basket pose."""
         goal, slot = self._env.goal, to_native(self._env.target_slot)
         target = terms.select_target(objects, slot)
         return {
@@ -165,7 +165,7 @@ class SuccessCheck:
         }
 
     def fallen_objects(self) -> Array:
-        """Return (N, K) which objects other than the target have fallen off the surface and not into the goal; native.
+        """Return (N, K) which other objects have fallen off the surface and not into the goal; native.
 
         They are at least 5 cm below the surface in `state`. The fall of the target is ``fail``.
         """
@@ -176,7 +176,7 @@ class SuccessCheck:
         return low & ~env.goal.is_at_goal(self.centers(objects), self.state.basket)
 
     def _has_failed(self, conditions: dict[str, Array], objects: Array, basket: Array | None) -> Array:
-        """Return ``fail`` (N,) bool from success conditions, object states (N, K, 13) and the basket's pose; native."""
+        """Return native ``fail`` (N,) from success conditions, object states (N, K, 13) and basket pose."""
         goal, slot = self._env.goal, to_native(self._env.target_slot)
         height = terms.select_target(objects[..., 2], slot)
         low, lost = height < self.fallen_below, goal.is_lost(basket, conditions)

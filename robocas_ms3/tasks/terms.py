@@ -46,7 +46,7 @@ def is_pressed(left_force: Array, right_force: Array) -> Array:
 
 
 def is_grasped(left_force: Array, right_force: Array, closing_axis: Array) -> Array:
-    """Return (N, K) which objects press on both fingers along their opening directions, as ``Panda.is_grasping``.
+    """Return (N, K) which objects press on both fingers along their opening directions.
 
     Args:
         left_force: (N, K, 3) force of each object on the left finger.

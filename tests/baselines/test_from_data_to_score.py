@@ -10,7 +10,14 @@ from robocas_ms3.cli.main import run
 
 SEED = 510_000
 TINY = ["--set", "views.base_camera={image_size: [64, 48], size: [64, 48]}", "--set", "width=32", "--set", "channels=8"]
-TINY += ["--set", "views.gripper_camera={image_size: [64, 48], size: [64, 48]}", "--set", "heads=2", "--set", "layers=1"]
+TINY += [
+    "--set",
+    "views.gripper_camera={image_size: [64, 48], size: [64, 48]}",
+    "--set",
+    "heads=2",
+    "--set",
+    "layers=1",
+]
 
 
 @pytest.fixture(scope="module")

@@ -16,5 +16,7 @@ def test_ray_tracing_without_a_gpu_is_an_error(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr("sapien.Device", none)
     assert run(["show", "--shader", "rt", "--out", str(tmp_path / "out")]) == 2
-    assert "--shader rt: ray tracing needs a GPU (found no CUDA device). Pass --shader default." in capsys.readouterr().err
+    assert (
+        "--shader rt: ray tracing needs a GPU (found no CUDA device). Pass --shader default." in capsys.readouterr().err
+    )
     assert not (tmp_path / "out").exists()

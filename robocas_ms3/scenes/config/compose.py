@@ -26,7 +26,7 @@ _NULL = ("~", "null", "Null", "NULL")
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads unquoted numbers with an exponent, such as ``3e-4``, as floats; YAML 1.1 reads them as strings."""
+    """A YAML loader that reads numbers such as ``3e-4`` as floats; in YAML 1.1 they are strings."""
 
 
 _EXPONENT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$")

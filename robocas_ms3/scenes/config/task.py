@@ -1,4 +1,4 @@
-"""Models of a task configuration. Lengths in m, angles in degrees if a name ends in ``_deg``, world frame z up."""
+"""Models of a task configuration. Lengths in m, angles of ``_deg`` keys in degrees, world z up."""
 
 from __future__ import annotations
 
@@ -323,6 +323,6 @@ def require_basket(config: TaskConfig) -> None:
 
 
 def require_copies(config: TaskConfig) -> None:
-    """Raise ValueError if a configuration has no columns with several objects of a kind; see `require_basket`."""
+    """Raise ValueError if no kind has several objects in columns; see `require_basket`."""
     if not (isinstance(config.layout, OrderlyLayout) and config.layout.copies > 1):
         raise ValueError(f"task {config.task} needs layout.kind orderly with layout.copies > 1")

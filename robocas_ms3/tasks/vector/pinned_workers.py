@@ -24,7 +24,7 @@ _POLL_MILLISECONDS = 200  # between two checks of signals and limits
 
 
 class PinnedWorkers(Generic[Task, Result]):
-    """Worker processes with one worker each. Each gets one task at a time; a crashed process is not replaced.
+    """Worker processes with one worker each; a crashed process is not replaced.
 
     Unlike in a `WorkerPool`, the calling thread communicates with the processes, since steps of environments are short.
     The processes start with the first tasks.

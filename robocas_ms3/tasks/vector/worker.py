@@ -40,7 +40,7 @@ class EnvSettings:
 
 
 class EnvWorker:
-    """A worker that runs commands ``(method, *arguments)``, and returns the results and the first error, if any.
+    """A worker that runs commands ``(method, *arguments)``; returns results and the first error.
 
     After an error in one env the command still runs in the others, so that an env does not depend on its process.
 
@@ -151,7 +151,7 @@ def join_rows(parts: Sequence[tuple[int, Rows]]) -> Rows:
 
 
 def _join(pieces: Sequence[Any]) -> Any:
-    """Join pieces into one new array or, if their types or shapes differ, into a list with one entry per env."""
+    """Join pieces into one new array, or into a list per env if types or shapes differ."""
     kinds = [isinstance(piece, np.ndarray) and (piece.dtype, piece.shape[1:]) for piece in pieces]
     if kinds[0] and kinds.count(kinds[0]) == len(kinds):
         return np.concatenate(pieces)
