@@ -102,7 +102,7 @@ def _lines(report: ReplayReport) -> Iterator[str]:
             yield f"{name}: none of {count} could be replayed; success rate unknown"
         else:
             yield (
-                f"{name}: {of_task['succeeded']} of {of_task['tried']} replayed episodes succeed"
-                f" ({of_task['share']:.0%}); mean tracking error {of_task['mean_error'] * 1000:.1f} mm,"
+                f"{name}: {of_task['succeeded']} of {of_task['replayed']} replayed episodes succeed"
+                f" ({of_task['success_rate']:.0%}); mean tracking error {of_task['mean_error'] * 1000:.1f} mm,"
                 f" largest {of_task['max_error'] * 1000:.0f} mm"
             )

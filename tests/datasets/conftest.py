@@ -14,7 +14,7 @@ def trajectory(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def made(trajectory, tmp_path_factory):
-    """A dataset of two episodes that nobody may change."""
+    """A dataset of two episodes, for reading only."""
     out = tmp_path_factory.mktemp("made") / "dataset"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("robocas_ms3.datasets.conversion.convert.embed_texts", stub_embeddings)
@@ -24,5 +24,5 @@ def made(trajectory, tmp_path_factory):
 
 @pytest.fixture
 def dataset(made, tmp_path):
-    """A copy to spoil."""
+    """A copy that a test may change."""
     return shutil.copytree(made, tmp_path / "dataset")

@@ -1,4 +1,4 @@
-"""What tests of managed datasets share."""
+"""Helpers of the tests of managed datasets."""
 
 import json
 import shutil
@@ -14,7 +14,7 @@ from robocas_ms3.datasets.sources.reader import Dataset
 
 
 class Bomb:
-    """Unpickling this is noticed."""
+    """Unpickling it raises an error."""
 
     def __reduce__(self):
         return exec, ("raise SystemExit('unpickled')",)
@@ -87,8 +87,8 @@ def make(folder, name, seeds, **settings):
     return folder / name
 
 
-def as_upstream(root, pose_name="cam_pos_wrt"):
-    """Leave what RoboCAS-v0 writes, with one name of the cameras' poses."""
+def as_v0(root, pose_name="cam_pos_wrt"):
+    """Reduce a dataset to the format of RoboCAS-v0, with one name of the camera pose files."""
     for path in [root / "conversion.json", *root.glob("*/scene.json")]:
         path.unlink()
     for path in root.glob("episode_*"):
@@ -100,7 +100,7 @@ def as_upstream(root, pose_name="cam_pos_wrt"):
 
 
 def problems(root, *outcomes):
-    """Episode, file and key in its folder, what was found, and what was done, of findings with these outcomes."""
+    """Return episode, place, found value and repair of the findings with an outcome."""
     return [
         (f.episode, f.violation.where.removeprefix(f"episode_{f.episode or 0:07d}/"), f.violation.found, f.repair)
         for f in survey(root).findings

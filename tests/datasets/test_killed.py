@@ -1,4 +1,4 @@
-"""Commands that write datasets, killed at any moment: the same command again makes what an undisturbed one makes."""
+"""Commands that write datasets, killed at any moment and continued."""
 
 import importlib.util
 import shutil
@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from managing import as_upstream, files_of, make
+from managing import as_v0, files_of, make
 from synthetic import RayCaster, render_by
 
 from robocas_ms3.cli.main import run
@@ -18,7 +18,7 @@ KILL_DURING = Path(__file__).parents[1] / "support" / "kill_during.py"
 CONVERT = ("convert", "F.h5", "--no-embeddings")
 LEROBOT = ("convert", "F.h5", "--to", "lerobot")
 MERGE = ("merge", "a", "b")
-IMPORT = ("import-robocas", "upstream")
+IMPORT = ("import-robocas", "v0")
 
 
 @pytest.fixture(scope="module")
@@ -26,9 +26,9 @@ def inputs(trajectory, tmp_path_factory):
     folder = tmp_path_factory.mktemp("inputs")
     for suffix in (".h5", ".json"):
         shutil.copy(trajectory.with_suffix(suffix), folder)
-    for name, seeds in (("a", (10, 11)), ("b", (20, 21)), ("upstream", (30, 31))):
+    for name, seeds in (("a", (10, 11)), ("b", (20, 21)), ("v0", (30, 31))):
         make(folder, name, seeds)
-    as_upstream(folder / "upstream")
+    as_v0(folder / "v0")
     return folder
 
 
@@ -52,7 +52,7 @@ def stub_images(monkeypatch):
     ],
     ids=lambda value: value if isinstance(value, str) else value[0],
 )
-def test_the_same_command_again_makes_the_same(inputs, tmp_path, monkeypatch, words, moment):
+def test_command_continued_after_kill_gives_the_same_files(inputs, tmp_path, monkeypatch, words, moment):
     if words == LEROBOT:
         pytest.importorskip("av", reason="needs the extra 'lerobot'")
         pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")

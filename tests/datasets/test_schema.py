@@ -32,21 +32,21 @@ def markdown():
     return "\n".join(rows)
 
 
-def test_the_documentation_is_the_schemas():
-    """Every table of the schema stands in docs/dataset.md as it is declared."""
+def test_documentation_has_the_tables_of_the_schema():
+    """docs/dataset.md contains every table of the schema."""
     text = DOCS.read_text(encoding="utf-8")
     for table in markdown().split("\n\n"):
         assert table in text, f"put this into docs/dataset.md:\n{table}"
 
 
-def test_the_keys_are_those_of_the_paper_and_two_of_the_mobile_base():
+def test_keys_are_those_of_the_paper_and_two_of_the_mobile_base():
     paper = """rel_pos rel_orn ee_pos ee_orn robot_joints arm_joint_vel base_pos base_orn base_rel_pos base_rel_orn
     gripper_width gripper_status episode_length language_goal language_embedding step_lang_goals step_goal_embs
     step_goal_type"""
     assert {spec.name for spec in schema.EPISODE_INFO} == {*paper.split(), "agv_pose", "rel_agv_pose"}
 
 
-def test_only_folders_of_episodes_have_numbers():
+def test_only_episode_folders_have_numbers():
     assert schema.episode_number(schema.episode_folder(12)) == 12
     for other in ("episode_12", "preview", "episode_00000ab", ".episode_0000012.tmp"):
         assert schema.episode_number(other) is None
@@ -59,7 +59,7 @@ def test_other_versions_are_refused():
             schema.check_version(found, Path("here"))
 
 
-def test_a_task_is_known_by_its_environment():
+def test_task_of_an_environment_id():
     from robocas_ms3.scenes.task_specs import TASKS
 
     assert [task_of(f"robocas_ms3:{spec.env_id}") for spec in TASKS.values()] == list(TASKS)

@@ -1,4 +1,4 @@
-"""Datasets to look at, without a simulator."""
+"""Datasets for the viewer, without a simulator."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from synthetic import RayCaster, write_trajectory
 
 @pytest.fixture(scope="session")
 def run_folder(tmp_path_factory):
-    """A run of three episodes: seed 4 failed once before, seed 9 was given up."""
+    """A run of three episodes: seed 4 failed once before, seed 9 was skipped."""
     folder = tmp_path_factory.mktemp("run")
     path = write_trajectory(folder / "trajectory.h5", seeds=(3, 4, 5), failed=(1,))
     metadata = json.loads(path.with_suffix(".json").read_text())
@@ -27,7 +27,7 @@ def run_folder(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def folder(run_folder, tmp_path_factory):
-    """The same as a RoboCAS folder of all three, small images, nobody may change it."""
+    """The run as a RoboCAS folder with all three episodes and small images, for reading only."""
     from robocas_ms3.datasets.conversion.convert import convert
     from robocas_ms3.datasets.conversion.settings import ConversionSettings
 

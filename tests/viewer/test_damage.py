@@ -1,4 +1,4 @@
-"""Damaged datasets on the page: the row says what is wrong, all else is shown, nothing raises."""
+"""Damaged datasets on the page: the row reports it, all other data is shown, nothing raises."""
 
 import json
 import shutil
@@ -41,7 +41,7 @@ def spoilt(folder, tmp_path):
         ({"seed": "x", "task": 3}, "scene.json, task: expected text, found 3; scene.json, seed: expected an integer"),
     ],
 )
-def test_the_row_says_what_is_wrong(spoilt, new, damage):
+def test_row_reports_damage(spoilt, new, damage):
     change(spoilt / "episode_0000001/scene.json", **new)
     (_, row, _, _) = open_content(spoilt).index()["episodes"]
     assert row["damage"].startswith(damage)
@@ -51,7 +51,7 @@ def test_the_row_says_what_is_wrong(spoilt, new, damage):
 
 @pytest.mark.parametrize("text", ["[1]", "null", "{", "\xff"])
 @pytest.mark.parametrize("name", ["episode_0000001/scene.json", "conversion.json", "data_info.json"])
-def test_files_that_hold_something_else(spoilt, name, text):
+def test_files_with_other_content(spoilt, name, text):
     (spoilt / name).write_bytes(text.encode("latin-1"))
     index, statuses = shown(open_content(spoilt))
     assert statuses == [200, 200, 200]
@@ -61,7 +61,7 @@ def test_files_that_hold_something_else(spoilt, name, text):
         assert f"`{name}` is damaged" in index["note"]
 
 
-def test_an_episode_that_is_gone_costs_the_others_no_side(spoilt):
+def test_missing_episode_does_not_change_the_split_of_others(spoilt):
     change(spoilt / "data_info.json", train_eps=[0, 1, 9], val_eps=[2])
     assert [row["split"] for row in open_content(spoilt).index()["episodes"]][:3] == ["train", "train", "val"]
 
@@ -73,7 +73,7 @@ def test_a_rate_of_zero_is_replaced_with_a_note(spoilt):
     assert index["note"].startswith("`rate_hz` of `conversion.json`")
 
 
-def test_damaged_arrays_are_an_error_of_that_episode_alone(spoilt):
+def test_damaged_arrays_are_an_error_of_their_episode_only(spoilt):
     path = spoilt / "episode_0000001/episode_info.npz"
     with np.load(path) as content:
         arrays = dict(content)
@@ -175,7 +175,7 @@ def test_control_characters_reach_the_page_as_escapes():
 LINE = '{"seed": 4, "attempt": 0, "stage": "grasp", "reason": "slipped", "seconds": 2}'
 
 
-def test_damaged_lines_of_failures_are_left_out_with_a_note(tmp_path, spoilt):
+def test_damaged_lines_of_failures_are_omitted_with_a_note(tmp_path, spoilt):
     assert Failures.read(tmp_path) == Failures({}, "")
     wrong = ['{"seed": "x"', LINE.replace("4", '"4"'), "[]", LINE.replace('"grasp"', "null"), "\xff\x00"]
     (tmp_path / "failures.jsonl").write_bytes("\n".join([LINE, *wrong, "", LINE, LINE[:30]]).encode("latin-1"))

@@ -1,4 +1,4 @@
-"""Datasets of other formats say and show what the RoboCAS folder that they were made of does."""
+"""Datasets of other formats have the same page as their RoboCAS folder."""
 
 import json
 import shutil
@@ -19,7 +19,7 @@ EPISODE = ("where", "steps", "instruction", "arrays", "read", "goals", "scene", 
 
 
 class Only:
-    """Has some attributes of another object, of which some are damaged."""
+    """Copies some attributes of an object and damages others."""
 
     def __init__(self, other, names, broken=(), **own):
         self.__dict__.update(own, _other=other, _names=names, _broken=broken)
@@ -33,7 +33,7 @@ class Only:
 
 
 def open_toy(folder, monkeypatch, broken=()):
-    """Open a folder as a format of another package, which has what an `EpisodeSource` has and nothing else."""
+    """Open a folder as a format of another package, with the interface of `EpisodeSource` only."""
 
     def read(path, *, rate_hz=None, include_failed=False):
         dataset = Dataset(path)
@@ -55,13 +55,13 @@ def page(request, folder, monkeypatch):
     return opened
 
 
-def test_it_lists_what_the_folder_lists(page, folder):
+def test_table_equals_that_of_the_folder(page, folder):
     index, wanted = page.index(), open_content(folder).index()
     for key in wanted.keys() - {"kind", "name"}:
         assert index[key] == wanted[key], key
 
 
-def test_it_shows_what_the_folder_shows(page, folder):
+def test_episode_equals_that_of_the_folder(page, folder):
     episode, wanted = page.episode(1), open_content(folder).episode(1)
     for key in ("instruction", "steps", "times", "subgoals", "facts", "failures"):
         assert episode[key] == wanted[key], key
@@ -72,7 +72,7 @@ def test_it_shows_what_the_folder_shows(page, folder):
     np.testing.assert_allclose(episode["trace"]["tcp"], wanted["trace"]["tcp"], atol=1e-5)
 
 
-def test_images_are_those_of_that_step(page, folder):
+def test_images_belong_to_the_requested_step(page, folder):
     episode = Dataset(folder).episode(1)
     for step in (0, 3, 6):
         shown = page.rgb(1, "static_camera", step)
@@ -83,12 +83,12 @@ def test_images_are_those_of_that_step(page, folder):
         np.testing.assert_array_equal(page.depth(1, "static_camera", step).clip(max=MAX_DEPTH_MM), depth)
 
 
-def test_there_is_no_such_episode_or_step(page):
+def test_unknown_episode_or_step(page):
     for address in ("/data/episode_9.js", "/images/9/base_camera/rgb/0.jpg", "/images/0/base_camera/rgb/9.jpg"):
         assert Routes(page).respond(address).status == 404
 
 
-def test_what_is_damaged_of_a_source_is_left_out(folder, monkeypatch):
+def test_damaged_values_of_a_source_are_omitted(folder, monkeypatch):
     index = open_toy(folder, monkeypatch, ("lengths", "split", "entry")).index()
     (row, *_), (wanted, *_) = index["episodes"], open_content(folder).index()["episodes"]
     assert row["damage"] == "conversion.json: damaged"
@@ -107,7 +107,7 @@ def test_the_memory_of_decoded_images_is_bounded(lerobot, monkeypatch):
     assert decoded == [0, 1, 2, 1]
 
 
-def test_another_makers_lerobot_dataset_shows_its_columns(lerobot, tmp_path):
+def test_other_lerobot_dataset_shows_its_columns(lerobot, tmp_path):
     other = shutil.copytree(lerobot, tmp_path / "other")
     shutil.rmtree(other / "meta/robocas")
     info = json.loads((other / "meta/info.json").read_text())

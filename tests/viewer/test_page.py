@@ -26,7 +26,7 @@ def browser():
 
 @pytest.fixture
 def opened(browser):
-    """The browser; at the end nothing may have gone wrong in it."""
+    """The browser; at the end its console must have no errors."""
     browser.goto("about:blank")
     browser.errors.clear()
     yield browser
@@ -98,7 +98,7 @@ def wait_for_images(page, number, kind, at):
     )
 
 
-def test_it_opens_with_the_table_and_the_first_episode(any_page):
+def test_page_opens_with_the_table_and_the_first_episode(any_page):
     page = any_page
     assert page.evaluate(ROWS) == "0,1,2,none"
     assert page.text_content("#count") == "3 episodes, 1 seed skipped"
@@ -161,7 +161,7 @@ def test_keys(page):
     assert step(page) == 0
     page.keyboard.press("ArrowUp")
     wait_for_instruction(page, "cube 3")
-    page.keyboard.press("ArrowUp")  # there is none before the first
+    page.keyboard.press("ArrowUp")  # no episode before the first
     assert page.text_content("#instruction").startswith("grasp the cube 3")
     page.select_option("#speed", "4")
     page.evaluate("document.activeElement.blur()")
@@ -233,7 +233,7 @@ def test_deep_links(any_page):
     page.errors[:] = [error for error in page.errors if "episode_77.js" not in error]  # it was asked for
 
 
-def test_a_trajectory_shows_traces_and_says_how_to_get_images(opened, serve, run_folder):
+def test_trajectory_shows_paths_and_how_to_render_images(opened, serve, run_folder):
     page = load(opened, serve(open_content(run_folder)).url)
     assert "robocas convert trajectory.h5" in page.text_content("#note")
     assert page.evaluate("document.querySelector('#cameras').hidden && document.querySelector('#views').hidden")
@@ -243,7 +243,7 @@ def test_a_trajectory_shows_traces_and_says_how_to_get_images(opened, serve, run
     assert page.text_content("#clock").startswith("step 22 / 22")
 
 
-def test_a_damaged_episode_is_shown_as_such(opened, serve, folder, tmp_path):
+def test_damaged_episode_is_marked(opened, serve, folder, tmp_path):
     spoilt = shutil.copytree(folder, tmp_path / "spoilt")
     for number, new in ((0, {"recorded": "x", "layout": {"poses": 3}}), (1, {"seed": {}, "objects": 7, "target": []})):
         path = spoilt / f"episode_000000{number}/scene.json"
@@ -271,7 +271,7 @@ def test_a_damaged_episode_is_shown_as_such(opened, serve, folder, tmp_path):
     page.errors.clear()  # the episode could not be loaded
 
 
-def test_of_a_thousand_episodes_only_visible_rows_are_made(opened, serve, folder, monkeypatch):
+def test_only_visible_rows_are_created(opened, serve, folder, monkeypatch):
     source = open_content(folder)
     index = source.index()
     lines = [{**index["episodes"][n % 3], "n": n, "seed": n} for n in range(1000)]

@@ -1,4 +1,4 @@
-"""The local server: what it gives, and what it refuses."""
+"""The local server: responses and refusals."""
 
 import http.client
 import json
@@ -111,7 +111,7 @@ def test_only_for_this_machine(server):
     assert get(server, "/", host=f"localhost:{server.server_port}")[0].status == 200
 
 
-def test_it_takes_no_orders(server):
+def test_other_methods_are_refused(server):
     for method in ("POST", "PUT", "DELETE"):
         assert get(server, "/data/index.js", method)[0].status == 501
     response, data = get(server, "/data/index.js", "HEAD")
@@ -119,7 +119,7 @@ def test_it_takes_no_orders(server):
     assert int(response.headers["Content-Length"]) > 100
 
 
-def test_it_ends_though_a_browser_keeps_its_connection(folder):
+def test_server_stops_with_open_connections(folder):
     before = set(threading.enumerate())
     with Viewer(open_content(folder)) as server:
         server.warm_up()
@@ -147,7 +147,7 @@ def test_the_number_of_connections_is_bounded(folder, monkeypatch):
         server.shutdown()
 
 
-def test_an_error_of_a_request_moves_no_cursor(server, capsys):
+def test_request_errors_are_printed_without_control_characters(server, capsys):
     try:
         raise ValueError("a\x1b[2Jb")
     except ValueError:
@@ -156,7 +156,7 @@ def test_an_error_of_a_request_moves_no_cursor(server, capsys):
     assert "\x1b" not in shown
 
 
-def test_a_port_that_is_taken(folder):
+def test_used_port(folder):
     with socket.socket() as taken:
         taken.bind((HOST, 0))
         taken.listen()

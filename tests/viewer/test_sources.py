@@ -1,4 +1,4 @@
-"""What the page is told of trajectories and datasets."""
+"""Page content of trajectories and datasets."""
 
 import json
 import shutil
@@ -24,30 +24,30 @@ def series(episode, title):
     return np.column_stack([s["values"] for s in found["series"]])
 
 
-def test_numbers_are_rounded_and_what_json_lacks_becomes_none():
+def test_numbers_are_rounded_and_nan_becomes_none():
     assert round_values([[1.000001, -0.000001]]) == [[1.0, 0.0]]
     assert str(round_values([-0.000001])) == "[0.0]"
     assert round_values([0.5, np.nan, np.inf]) == [0.5, None, None]
     assert plot("p", "m", ("x",), np.array([[1.0], [2.0]]))["series"] == [{"name": "x", "values": [1.0, 2.0]}]
 
 
-def test_camera_names_that_would_be_paths_are_left_out(folder):
+def test_camera_names_with_slashes_are_omitted(folder):
     page = open_content(folder)
     page.source.cameras = ("base_camera", "..", "../x", "a/b", "", "cam-1.left", "x" * 81)
     assert page.index()["cameras"] == ["base_camera", "cam-1.left"]
 
 
-def test_orientation_and_yaw_do_not_jump():
+def test_orientation_and_yaw_are_continuous():
     turn = np.array([[0.0, 0, 0, 1], [0, 0, -0.1, -0.995], [0, 0, 0.2, 0.98]])
     expected = [[0, 0, 0, 1], [0, 0, 0.1, 0.995], [0, 0, 0.2, 0.98]]
-    assert continuous(turn).tolist() == continuous(-turn).tolist() == expected  # whichever sign a recording begins with
+    assert continuous(turn).tolist() == continuous(-turn).tolist() == expected  # for both signs at the start
     (base,) = base_plot(np.array([[0, 0, 3.1], [0, 0, -3.1]]))
     assert base["series"][2]["values"] == [3.1, round(2 * np.pi - 3.1, 5)]
     assert base_plot(np.ones((3, 3))) == []
 
 
 @pytest.mark.parametrize("made", ["run_folder", "folder"])  # the run's folder is its trajectory
-def test_episodes_and_seeds_that_were_given_up_are_listed(request, made):
+def test_episodes_and_skipped_seeds_are_listed(request, made):
     index = open_content(request.getfixturevalue(made)).index()
     assert index == json.loads(json.dumps(index, allow_nan=False))
     rows = {key: [row[key] for row in index["episodes"]] for key in ROW}
@@ -91,8 +91,8 @@ def test_an_episode_of_a_trajectory(run_folder):
     assert [(f["stage"], f["reason"]) for f in episode["failures"]] == [("grasp", "slipped")]
 
 
-def test_objects_are_called_the_same_in_a_recording_and_in_its_dataset(run_folder, folder, tmp_path):
-    """By name, and by an id that says more; those of no pack that is here by their id."""
+def test_objects_have_the_same_names_in_recording_and_dataset(run_folder, folder, tmp_path):
+    """By name and id; objects of a missing pack by id."""
     recorded = shutil.copytree(run_folder, tmp_path / "run") / "trajectory.json"
     metadata = json.loads(recorded.read_text())
     metadata["episodes"][0]["robocas"]["objects"] = ["cube", "toy_airplane_c", "some_thing"]
@@ -107,8 +107,8 @@ def test_objects_are_called_the_same_in_a_recording_and_in_its_dataset(run_folde
         assert called - {"cube 3 (cube)"} == {"white toy airplane (toy airplane c)"} | others
 
 
-def test_an_episode_that_is_not_listed_is_on_no_side(folder, tmp_path):
-    """As after a conversion that was interrupted."""
+def test_unlisted_episode_has_no_split(folder, tmp_path):
+    """As after an interrupted conversion."""
     other = shutil.copytree(folder, tmp_path / "other")
     info = json.loads((other / "data_info.json").read_text())
     for train, val, shown in (([0], [2], ["train", "", "val"]), ([], [], [""] * 3), (["x"], 3, [""] * 3)):
@@ -128,8 +128,8 @@ def test_an_episode_of_a_folder(folder):
     assert [f["stage"] for f in episode["failures"]] == ["grasp"]
 
 
-def test_a_seed_means_a_scene_of_its_own_environment_only(run_folder, folder, tmp_path):
-    """Seeds 4 and 9 failed at one task; another task's episodes of the same seeds have nothing to do with it."""
+def test_failures_belong_to_their_environment(run_folder, folder, tmp_path):
+    """Seeds 4 and 9 failed in one task; episodes of another task with these seeds are unrelated."""
     other = write_trajectory(tmp_path / "trajectory.h5", seeds=(4, 9), steps=24)
     metadata = json.loads(other.with_suffix(".json").read_text())
     metadata["env_info"]["env_id"] = "robocas_ms3:RoboCASOpenPick-v1"
@@ -152,7 +152,7 @@ def test_a_seed_means_a_scene_of_its_own_environment_only(run_folder, folder, tm
     assert [len(source.episode(n)["failures"]) for n in range(5)] == [0, 1, 0, 1, 0]
 
 
-def test_a_folder_without_our_additions_is_shown_too(folder, tmp_path):
+def test_v0_folder_is_shown(folder, tmp_path):
     bare = shutil.copytree(folder, tmp_path / "bare")
     for path in (*bare.glob("*.json*"), *bare.glob("*/scene.json")):
         path.unlink()
@@ -164,7 +164,7 @@ def test_a_folder_without_our_additions_is_shown_too(folder, tmp_path):
     assert episode["instruction"].startswith("grasp the cube 3")
 
 
-def test_a_link_that_leads_out_is_refused(folder, tmp_path):
+def test_link_to_a_file_outside_is_refused(folder, tmp_path):
     spoilt = shutil.copytree(folder, tmp_path / "spoilt")
     secret = tmp_path / "secret.png"
     secret.write_bytes(b"secret")

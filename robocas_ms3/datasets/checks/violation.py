@@ -22,7 +22,7 @@ _WORDS = {"int_type": "an integer", "string_type": "text", "dict_type": "an obje
 class Violation:
     """Violation of the schema by a key of a file.
 
-    An empty ``key`` stands for the file as a whole, an empty ``file`` for the dataset as a whole.
+    An empty ``key`` means the file as a whole, an empty ``file`` for the dataset as a whole.
     """
 
     file: str

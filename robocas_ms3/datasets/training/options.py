@@ -37,7 +37,7 @@ class SampleOptions:
         split: ``train`` or ``val`` by ``data_info.json``, or ``all``.
         observation_horizon: number of observed steps H, including the current one; RoboCAS-v0: RT-1 6, RoboFlamingo 11.
         action_horizon: number of actions A from the current step on; RoboCAS-v0: 1.
-        padding: values outside an episode. ``hold``: the robot stands still (first image, no motion, nearest gripper
+        padding: values outside an episode. ``hold``: the robot does not move (first image, no motion, nearest gripper
             command); ``zero``: zeros; ``drop``: no samples with padding.
         cameras: names of the cameras, in the order of the stack; empty: no images.
         size: width and height to which images are scaled, pixels; None: no scaling.

@@ -1,4 +1,4 @@
-"""RoboCAS folders with pickles: what the validator, the reader, merging and the writer of overviews do with them."""
+"""RoboCAS folders with pickles: validator, reader, merge and overview writer never load them."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from robocas_ms3.datasets.manage.merge import merge
 from robocas_ms3.datasets.sources.reader import Dataset
 
 
-def test_pickles_are_loaded_nowhere(dataset, tmp_path):
+def test_pickles_are_never_loaded(dataset, tmp_path):
     for number, key in ((1, "ee_pos"), (0, "rel_pos")):
         change(dataset / f"episode_{number:07d}", **{key: np.array([Bomb()] * 7, object)})
     camera = dataset / "episode_0000000" / "base_camera" / "intrinsic.npy"
@@ -31,7 +31,7 @@ def test_pickles_are_loaded_nowhere(dataset, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_schema_versions_that_are_mixed(dataset, trajectory):
+def test_mixed_schema_versions_are_refused(dataset, trajectory):
     edit(dataset / "episode_0000000" / "scene.json", lambda scene: scene.update(schema_version=1))
     (violation,) = validate(dataset).violations
     assert (violation.file, violation.key) == ("episode_0000000/scene.json", "schema_version")
@@ -43,7 +43,7 @@ def test_schema_versions_that_are_mixed(dataset, trajectory):
     assert files_of(dataset) == before
 
 
-def test_appending_to_a_damaged_dataset_says_which_episode(trajectory, tmp_path):
+def test_appending_to_a_damaged_dataset_names_the_episode(trajectory, tmp_path):
     root = make(tmp_path, "ds", (1, 2))
     (root / "episode_0000000" / "episode_info.npz").write_bytes(b"PK")
     with pytest.raises(DatasetError, match="episode_0000000"):

@@ -1,4 +1,4 @@
-"""Each way of spoiling ``scene.json`` and ``conversion.json`` is one violation, by key, what is expected and found."""
+"""Each change of ``scene.json`` or ``conversion.json`` is one violation with key, expected and found."""
 
 import pytest
 from managing import edit
@@ -43,18 +43,18 @@ def said(violation):
     return violation.key, violation.expected, violation.found
 
 
-def test_what_is_whole_has_no_violations():
+def test_complete_scene_has_no_violations():
     assert check_values(WHOLE) == []
     assert valid_values(WHOLE) == (WHOLE, "")
 
 
-def test_what_nobody_knows_is_null():
-    """Of datasets made elsewhere: only version, rate and source are known."""
+def test_unknown_values_may_be_null():
+    """In imported datasets only version, rate and source are known."""
     known = {"schema_version": 2, "rate_hz": 5.0, "source": {"recording": None, "format": "upstream", "missing": []}}
     assert check_values({key: known.get(key) for key in SCENE_KEYS}) == []
 
 
-def test_each_key_is_missed():
+def test_each_missing_key_is_a_violation():
     for key in SCENE_KEYS:
         without = {name: value for name, value in WHOLE.items() if name != key}
         assert [said(v) for v in check_values(without)] == [(key, "this key", "no such key")]
@@ -77,13 +77,13 @@ def test_each_key_is_missed():
         ({"recorded": {"recoveries": [RECOVERY | {"range": [3]}]}}, "recorded.recoveries.0.range", "2 values", "1"),
     ],
 )  # fmt: skip
-def test_one_violation_a_fault(new, key, expected, found):
+def test_each_invalid_value_is_one_violation(new, key, expected, found):
     violations = check_values({**WHOLE, **new})
     assert [v.key for v in violations] == ([key] if key else [])
     assert expected is None or [said(v) for v in violations] == ([(key, expected, found)] if key else [])
 
 
-def test_scenes_that_are_no_objects():
+def test_scene_that_is_not_an_object():
     assert valid_values(None) == ({}, "")
     assert valid_values([1]) == ({}, "scene.json: expected an object, found [1]")
 
@@ -105,7 +105,7 @@ def test_scenes_that_are_no_objects():
         ("conversion.json", '{"schema_version": 2', "conversion.json: expected JSON"),
     ],
 )  # fmt: skip
-def test_validate_says_it_once(dataset, name, new, text):
+def test_validate_reports_a_violation_once(dataset, name, new, text):
     if isinstance(new, str):
         (dataset / name).write_text(new)
     else:
@@ -114,6 +114,6 @@ def test_validate_says_it_once(dataset, name, new, text):
     assert str(violation).startswith(text)
 
 
-def test_a_seed_in_a_list_is_that_seed(dataset):
+def test_seed_in_a_list_is_accepted(dataset):
     edit(dataset / FILE, lambda content: content.update(seed=[5]))
     assert validate(dataset).violations == []

@@ -6,7 +6,7 @@ from robocas_ms3.datasets.checks.depth import View, check, compare
 
 
 def overhead(height, *, depth=None, size=80, shift=0.0):
-    """A camera at (shift, 0, height) that looks straight down on the floor, x as the world's."""
+    """A camera at (shift, 0, height) that views the floor vertically, x as in the world frame."""
     pose = np.diag([1.0, -1, -1, 1])
     pose[:3, 3] = shift, 0, height
     depth = height if depth is None else depth
@@ -22,7 +22,7 @@ def test_points_by_hand():
     np.testing.assert_allclose(points[:, 2], 0, atol=1e-9)
 
 
-def test_nothing_seen_gives_no_points():
+def test_empty_depth_has_no_points():
     view = overhead(1.0, size=40)
     view.depth[10:20] = 0
     assert len(view.points()) == 1200
@@ -35,26 +35,26 @@ def seen(points, view):
 def test_compare_by_hand():
     floor = overhead(2.0).points()
     assert seen(floor, overhead(1.0))[1:] == (0.0, 1.0)
-    # 10 cm too deep: it looks through the floor. 10 cm too near: something may hide the floor.
+    # 10 cm too deep: it sees through the floor. 10 cm too near: something may hide the floor.
     assert seen(floor, overhead(1.0, depth=1.1))[1:] == (1.0, 0.0)
     assert seen(floor, overhead(1.0, depth=0.9))[1:] == (0.0, 0.0)
     assert seen(floor + [50, 0, 0], overhead(1.0)) == (0, 0.0, 0.0)
 
 
 def test_floor():
-    below = ["nothing below the floor", "floor at height 0"]
-    assert [law[2] for law in check([[overhead(1.0, depth=1.1)]])] == below
-    assert [law[2] for law in check([[overhead(1.0, depth=0.9)]])][0] == "floor at height 0"
+    below = ["no points below the floor", "the floor at height 0"]
+    assert [found[2] for found in check([[overhead(1.0, depth=1.1)]])] == below
+    assert [found[2] for found in check([[overhead(1.0, depth=0.9)]])][0] == "the floor at height 0"
 
 
-def test_the_gripper_may_look_at_a_drawers_bottom():
+def test_gripper_camera_may_see_the_bottom_of_a_drawer():
     seen = overhead(1.0, depth=0.945)  # 5.5 cm above the floor, level
     assert list(check([[replace(seen, on_hand=True)]])) == []
-    assert [law[2] for law in check([[seen]])] == ["floor at height 0"]
+    assert [found[2] for found in check([[seen]])] == ["the floor at height 0"]
 
 
-def test_the_foot_of_a_wall_is_no_floor():
-    """From 0.55 m, a wall 1 m ahead is seen from 5 cm above the floor on."""
+def test_lower_edge_of_a_wall_is_not_the_floor():
+    """From a height of 0.55 m, the visible part of a wall 1 m ahead starts 5 cm above the floor."""
     pose = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0.55], [0, 0, 0, 1.0]])
     wall = View("ahead", np.full((80, 80), 1000, np.uint16), np.array([80.0, 80, 40, 40]), pose)
     heights = wall.points()[:, 2]
@@ -68,25 +68,25 @@ def test_the_foot_of_a_wall_is_no_floor():
     assert list(check([[wall]])) == []
 
 
-def test_where_nobody_can_agree_nobody_has_to():
+def test_cameras_without_common_points_need_not_agree():
     alone = overhead(1.0)
     assert list(check([[alone]])) == []
     blind = View("blind", np.zeros((80, 80), np.uint16), alone.intrinsic, alone.camera_in_world)
-    assert [law[1] for law in check([[alone, blind]])] == ["blind"]
+    assert [found[1] for found in check([[alone, blind]])] == ["blind"]
     tiny = View("tiny", alone.depth[:9, :9], np.full(4, 4.5), alone.camera_in_world)  # 81 points
     assert list(check([[tiny, View("too", tiny.depth, tiny.intrinsic, tiny.camera_in_world)]])) == []
 
 
-def test_a_camera_that_looks_elsewhere_agrees_with_nobody():
+def test_camera_without_overlap_is_reported():
     away = overhead(1.0, shift=50.0)
     away = View("away", away.depth, away.intrinsic, away.camera_in_world)
-    assert {law[1:3] for law in check([[overhead(1.0), away]])} == {
-        ("overhead", "depth that agrees with another camera's"),
-        ("away", "depth that agrees with another camera's"),
+    assert {found[1:3] for found in check([[overhead(1.0), away]])} == {
+        ("overhead", "depth that agrees with another camera"),
+        ("away", "depth that agrees with another camera"),
     }
 
 
-def test_two_right_views_and_one_wrong():
+def test_wrong_view_among_correct_ones_is_reported():
     low, high, moved = overhead(1.0), overhead(2.0, shift=0.2), overhead(1.5, depth=1.56)
     named = [
         View(name, v.depth, v.intrinsic, v.camera_in_world) for name, v in zip("abc", (low, high, moved), strict=True)
@@ -94,6 +94,6 @@ def test_two_right_views_and_one_wrong():
     assert list(check([named[:2]])) == []
     # The third one's floor is 6 cm below the others'.
     broken = {(index, camera, expected) for index, camera, expected, _ in check([named[:2], named])}
-    assert (1, "c", "floor at height 0") in broken
+    assert (1, "c", "the floor at height 0") in broken
     assert (1, "c", "no view through surfaces that a sees") in broken
-    assert (0, "c", "depth that agrees with another camera's") in broken
+    assert (0, "c", "depth that agrees with another camera") in broken

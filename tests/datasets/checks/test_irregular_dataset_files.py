@@ -26,7 +26,7 @@ IMAGES = ("base_camera/rgb/0002.png", "base_camera/depth/0003.png")
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_dataset_is_validated(dataset, kind):
+def test_validate_reports_irregular_files(dataset, kind):
     names = {f"{EPISODE}/{name}" for name in IMAGES} | {f"{EPISODE}/scene.json"}
     for name in names:
         replace_file(dataset / name, kind)
@@ -40,7 +40,7 @@ def test_a_dataset_is_validated(dataset, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_readers_of_images(dataset, kind):
+def test_image_readers_refuse_irregular_files(dataset, kind):
     paths = [replace_file(dataset / EPISODE / name, kind) for name in IMAGES]
     source, content = Dataset(dataset).episode(1), open_content(dataset)
     for read in (source.rgb, lambda *place: content.rgb(1, *place)):
@@ -53,7 +53,7 @@ def test_readers_of_images(dataset, kind):
         assert error.value.where == paths[1]
 
 
-def test_readers_of_other_files(dataset, tmp_path):
+def test_other_readers_refuse_irregular_files(dataset, tmp_path):
     for kind in ("pipe", "device"):
         with pytest.raises(DatasetError):
             open_trajectory(replace_file(tmp_path / "F.h5", kind))
@@ -66,7 +66,7 @@ def test_readers_of_other_files(dataset, tmp_path):
 
 
 def png_of(width, height):
-    """A PNG whose header promises so many pixels, with few bytes."""
+    """A small PNG whose header declares a large size."""
 
     def chunk(kind, data):
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -77,7 +77,7 @@ def png_of(width, height):
 
 
 @pytest.mark.parametrize("size", [(LARGEST + 1, 1), (1, LARGEST + 1), (20_000, 20_000), (2**31 - 1, 2**31 - 1)])
-def test_images_of_too_many_pixels_are_not_decoded(tmp_path, monkeypatch, size):
+def test_too_large_images_are_not_decoded(tmp_path, monkeypatch, size):
     path = tmp_path / "a.png"
     path.write_bytes(png_of(*size))
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("the image is decoded"))
@@ -88,7 +88,7 @@ def test_images_of_too_many_pixels_are_not_decoded(tmp_path, monkeypatch, size):
     assert error.value.where == path
 
 
-def test_images_of_the_greatest_size_are_read(tmp_path):
+def test_images_of_the_largest_size_are_read(tmp_path):
     for suffix in (".png", ".jpg", ".webp"):
         path = tmp_path / f"a{suffix}"
         cv2.imwrite(str(path), np.zeros((2, LARGEST, 3), np.uint8))

@@ -1,4 +1,4 @@
-"""What `robocas validate --replay` makes of a dataset; a player that needs no simulator stands for the environment."""
+"""`robocas validate --replay`, with a stub environment that needs no simulator."""
 
 import json
 from types import SimpleNamespace
@@ -16,7 +16,7 @@ from robocas_ms3.demos.open_loop import OpenLoopResult
 
 
 class Player:
-    """Adds up what it is told: where the TCP goes depends on the actions alone. Seed 5 never succeeds."""
+    """Integrates the actions without physics. Seed 5 never succeeds."""
 
     made: list = []  # noqa: RUF012
     start = np.zeros(3)
@@ -65,14 +65,14 @@ def edit_arrays(dataset, number, **changes):
 
 
 def still(dataset, number):
-    """An episode whose TCP stands at the base's origin, so that the player follows it exactly."""
+    """An episode whose TCP starts at the origin of the base, so that the replay follows it exactly."""
     steps = 7
     turn = np.tile([0, 0, 0, 1], (steps, 1)).astype(np.float32)
     nothing = np.zeros((steps, 3), np.float32)
     edit_arrays(dataset, number, ee_pos=nothing, rel_pos=nothing, ee_orn=turn, rel_orn=turn)
 
 
-def test_actions_are_the_datasets_own(dataset, player):
+def test_replay_uses_the_actions_of_the_dataset(dataset, player):
     report = replay_dataset(dataset)
     (made,) = player.made  # one environment for all episodes of one kind
     assert (made.rate_hz, made.closed) == (5.0, True)
@@ -117,7 +117,7 @@ def test_tracking_error_by_hand(dataset):
         ({"reset_options": {"reset_to_env_states": {}}}, "reset_options: "),
     ],
 )
-def test_what_can_not_be_tried_is_named_and_the_rest_goes_on(dataset, changes, reason):
+def test_scene_that_can_not_be_rebuilt_is_skipped_with_a_reason(dataset, changes, reason):
     edit_scene(dataset, 0, **changes)
     first, second = replay_dataset(dataset).episodes
     assert first.success is None
@@ -133,7 +133,7 @@ def test_what_can_not_be_tried_is_named_and_the_rest_goes_on(dataset, changes, r
         ({"rel_orn": np.zeros((7, 4), np.float32)}, "zero norm"),
     ],
 )
-def test_arrays_that_can_not_be_played_cost_no_other_episode(dataset, changes, reason):
+def test_invalid_arrays_are_skipped_with_a_reason(dataset, changes, reason):
     edit_arrays(dataset, 0, **changes)
     first, second = replay_dataset(dataset).episodes
     assert first.success is None
@@ -141,7 +141,7 @@ def test_arrays_that_can_not_be_played_cost_no_other_episode(dataset, changes, r
     assert second.success is False
 
 
-def test_a_seed_as_maniskill_writes_it(dataset, player):
+def test_seed_in_a_list_is_replayed(dataset, player):
     edit_scene(dataset, 0, seed=[5])
     edit_scene(dataset, 1, seed=[3, 4])
     first, second = replay_dataset(dataset).episodes
@@ -150,7 +150,7 @@ def test_a_seed_as_maniskill_writes_it(dataset, player):
     assert "an integer, or a list of one" in second.skipped
 
 
-def test_a_base_that_drives_and_damage_are_named(dataset):
+def test_moving_base_and_damaged_scene_are_skipped(dataset):
     moving = np.zeros((7, 3), np.float32)
     moving[3:, 0] = 0.1
     edit_arrays(dataset, 0, base_pos=moving)
@@ -161,7 +161,7 @@ def test_a_base_that_drives_and_damage_are_named(dataset):
     assert second.skipped
 
 
-def test_the_command_tells_it_and_may_ask_for_a_share(dataset, capsys):
+def test_command_reports_replays_and_checks_min_success(dataset, capsys):
     assert run(["validate", str(dataset), "--replay"]) == 0
     out = capsys.readouterr().out
     assert "episode 1: the replay does not succeed" in out
@@ -175,14 +175,14 @@ def test_the_command_tells_it_and_may_ask_for_a_share(dataset, capsys):
 
 
 @pytest.mark.parametrize("words", ["--min-success 0.5", "--replay --min-success 50", "--replay --min-success nan"])
-def test_an_invalid_share_is_refused(dataset, player, capsys, words):
+def test_invalid_min_success_is_refused(dataset, player, capsys, words):
     assert run(["validate", str(dataset), *words.split()]) == 2
     assert capsys.readouterr().err.startswith("error: --min-success: ")
 
 
 @pytest.mark.parametrize("json_too", [(), ("--json",)])
-def test_a_share_that_nobody_could_see_is_not_enough(dataset, capsys, json_too):
-    """As where the pack is not installed, or for one of two tasks."""
+def test_min_success_fails_if_no_episode_could_be_replayed(dataset, capsys, json_too):
+    """For example if the pack is not installed, or for one of two tasks."""
     for number in (0, 1):
         edit_scene(dataset, number, env_info={"env_id": "X-v1", "env_kwargs": {"pack": "gone"}})
     command = ["validate", str(dataset), "--replay", *json_too]

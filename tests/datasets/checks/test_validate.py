@@ -108,7 +108,7 @@ def chunk(kind, data=b""):
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
-def test_a_image_without_pixels(dataset):
+def test_image_without_pixels(dataset):
     """Each checksum is right, and there is nothing between header and end."""
     path = dataset / "episode_0000001" / "base_camera" / "depth" / "0000.png"
     head = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 64, 48, 16, 0, 0, 0, 0))
@@ -234,7 +234,7 @@ WRONG_VIEWS = {
 
 
 @pytest.mark.parametrize("name", WRONG_VIEWS)
-def test_wrong_poses_intrinsics_and_depth_show_in_the_depth_of_that_episode(dataset, name):
+def test_wrong_poses_intrinsics_and_depth_are_reported_for_their_episode(dataset, name):
     camera, spoil = WRONG_VIEWS[name]
     spoil(dataset / "episode_0000001" / camera)
     violations = found(dataset)
@@ -288,7 +288,7 @@ def test_command(dataset, capsys):
     ]
 
 
-def test_the_ledger_lists_the_episodes_on_disk_each_once(dataset):
+def test_conversion_json_lists_the_episodes_on_disk(dataset):
     shutil.copytree(dataset / "episode_0000001", dataset / "episode_0000002")
     violations = found(dataset)
     assert "episode_0000002: expected each episode once, found the arrays of episode_0000001" in violations
@@ -303,7 +303,7 @@ def test_the_ledger_lists_the_episodes_on_disk_each_once(dataset):
     assert_only(dataset, "conversion.json, episodes.2: expected the episodes on disk, found no folder")
 
 
-def test_one_camera_has_none_to_agree_with(dataset):
+def test_single_camera_needs_no_agreement(dataset):
     managing.edit(dataset / "conversion.json", lambda content: content.update(cameras=["static_camera"]))
     for name in ("base_camera", "gripper_camera"):
         for folder in dataset.glob(f"*/{name}"):

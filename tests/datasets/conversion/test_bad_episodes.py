@@ -1,4 +1,4 @@
-"""One episode that can't be written costs no other: these make a whole dataset, and an error tells which and why."""
+"""An episode that can't be written is skipped: the others make a valid dataset, and an error names it."""
 
 import json
 
@@ -19,7 +19,7 @@ SEEDS = tuple(range(10, 16))
 
 
 class Breaking(RayCaster):
-    """Can't show one of the recordings."""
+    """Can't render one of the recordings."""
 
     seed = 13
 
@@ -38,7 +38,7 @@ class OfOddSeeds(RayCaster):
 
 @pytest.fixture(scope="module")
 def many(tmp_path_factory):
-    """Recordings, and what becomes of them where nothing is wrong."""
+    """Recordings, and their dataset without errors."""
     folder = tmp_path_factory.mktemp("many")
     trajectory = write_trajectory(folder / "trajectory.h5", seeds=SEEDS, steps=16)
     run(trajectory, folder / "whole")
@@ -54,7 +54,7 @@ def spoil(path, number, how):
 
 
 @pytest.mark.parametrize("how", ["no states", "NaN"])
-def test_a_broken_recording(many, tmp_path, how):
+def test_damaged_recording_is_skipped(many, tmp_path, how):
     _, whole = many
     trajectory, out = write_trajectory(tmp_path / "trajectory.h5", seeds=SEEDS, steps=16), tmp_path / "out"
     spoil(trajectory, 3, how)
@@ -76,8 +76,8 @@ def test_a_broken_recording(many, tmp_path, how):
     assert files_of(out) == files_of(whole)
 
 
-def test_the_only_one_of_its_side(many, tmp_path):
-    """It comes back to its side, whatever was resumed between."""
+def test_only_validation_episode_keeps_its_split(many, tmp_path):
+    """It gets its split back, whatever was converted in between."""
     trajectory, whole = many
     (val,) = Dataset(whole).splits[1]
 
@@ -93,7 +93,7 @@ def test_the_only_one_of_its_side(many, tmp_path):
     assert files_of(tmp_path / "out") == files_of(whole)
 
 
-def test_others_are_appended_meanwhile(many, tmp_path):
+def test_append_while_episodes_are_skipped(many, tmp_path):
     trajectory, _ = many
     more = write_trajectory(tmp_path / "more.h5", seeds=(50, 51), steps=16)
     with pytest.raises(IncompleteDatasetError):
@@ -111,7 +111,7 @@ def test_others_are_appended_meanwhile(many, tmp_path):
     assert "skipped" not in ledger
 
 
-def test_texts_that_cannot_be_read(many, tmp_path, monkeypatch):
+def test_unreadable_texts_skip_their_episode(many, tmp_path, monkeypatch):
     trajectory = write_trajectory(tmp_path / "trajectory.h5", seeds=SEEDS, steps=16)
     content = json.loads(trajectory.with_suffix(".json").read_text())
     del content["episodes"][3]["robocas"]["instruction"]
@@ -125,7 +125,7 @@ def test_texts_that_cannot_be_read(many, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("to", ["robocas", "lerobot"])
 def test_the_command(many, tmp_path, monkeypatch, capsys, to):
-    """An exit code, one line that says how to go on, and a flag with which that is all."""
+    """Exit code, one line with the fix, and --skip-errors."""
     if to == "lerobot":
         pytest.importorskip("av", reason="needs the extra 'lerobot'")
         from robocas_ms3.datasets.lerobot import convert as lerobot

@@ -21,7 +21,7 @@ from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 
 
-def test_the_folder_is_the_schemas(made):
+def test_folder_matches_the_schema(made):
     names = {path.name for path in made.iterdir()}
     assert names == {"data_info.json", "conversion.json", "episode_0000000", "episode_0000001"}
     episode = made / "episode_0000001"
@@ -39,7 +39,7 @@ def test_the_folder_is_the_schemas(made):
         np.testing.assert_array_equal(np.load(folder / "intrinsic.npy"), [24, 24, 32, 24])
 
 
-def test_failed_episodes_stay_out_and_are_numbered_without_a_gap(made, trajectory, tmp_path):
+def test_failed_episodes_are_omitted_and_numbers_have_no_gaps(made, trajectory, tmp_path):
     info = json.loads((made / "data_info.json").read_text())
     assert set(info) == set(DataInfoRecord.model_fields)
     assert sorted(info["train_eps"] + info["val_eps"]) == [0, 1]
@@ -54,7 +54,7 @@ def test_failed_episodes_stay_out_and_are_numbered_without_a_gap(made, trajector
     assert len(run(trajectory, tmp_path / "all", include_failed=True).episodes) == 3
 
 
-def test_arrays_are_those_of_the_sampled_states(made, trajectory):
+def test_arrays_equal_the_sampled_states(made, trajectory):
     samples = [0, 4, 8, 12, 16, 20, 22]
     with TrajectoryFile(trajectory) as file:
         recording = file.recording(2)
@@ -69,7 +69,7 @@ def test_arrays_are_those_of_the_sampled_states(made, trajectory):
     np.testing.assert_allclose(ee, motion.tcp_in_world, atol=1e-5)
 
 
-def test_images_are_what_was_seen(made, trajectory):
+def test_images_equal_the_rendered_ones(made, trajectory):
     source = RayCaster({}, "pd_joint_pos", None)
     with TrajectoryFile(trajectory) as file:
         frame = list(source.frames(file.recording(2), np.array([0, 4, 8, 12, 16, 20, 22])))[3]
@@ -82,8 +82,8 @@ def test_images_are_what_was_seen(made, trajectory):
         np.testing.assert_array_equal(depth, frame.depth[camera])
 
 
-def test_the_released_loader_reads_it(made):
-    """What the released loader does with paths and keys, on our files."""
+def test_v0_loader_reads_the_dataset(made):
+    """The accesses of the RoboCAS-v0 loader to paths and keys."""
     info = json.loads((made / "data_info.json").read_text())
     for index in info["train_eps"] + info["val_eps"]:
         episode = os.path.join(made, "episode_%07d" % index)  # noqa: UP031
@@ -106,7 +106,7 @@ def test_without_embeddings_and_at_another_rate(trajectory, tmp_path):
         assert len(arrays["rel_pos"]) == STEPS // 2 + 1
 
 
-def test_resume_keeps_what_is_there(trajectory, tmp_path):
+def test_resume_keeps_existing_episodes(trajectory, tmp_path):
     out = tmp_path / "out"
     run(trajectory, out)
     before = files_of(out)
@@ -144,21 +144,21 @@ def test_errors_leave_nothing_behind(trajectory, tmp_path):
     fails("no episodes to convert", write_trajectory(tmp_path / "empty.h5", seeds=()), out)
     cut = write_trajectory(tmp_path / "cut.h5")
     cut.write_bytes(cut.read_bytes()[:-5000])
-    fails("cut off", cut, out)
+    fails("truncated", cut, out)
     broken = write_trajectory(tmp_path / "broken.h5", seeds=(1,))
     with h5py.File(broken, "a") as file:
         del file["traj_0/env_states"]
     fails("damaged episode", broken, out)
 
 
-def test_a_folder_that_vanishes(trajectory, tmp_path):
+def test_removed_output_folder_is_an_error(trajectory, tmp_path):
     out = tmp_path / "out"
     with pytest.raises(RobocasError) as error:
         run(trajectory, out, on_episode=lambda episode: shutil.rmtree(out))
     assert error.value.where == out
 
 
-def test_no_render_device_is_said_before_anything_is_written(trajectory, tmp_path, monkeypatch):
+def test_missing_render_device_is_reported_before_writing(trajectory, tmp_path, monkeypatch):
     import sapien
 
     def no_device(*_):
@@ -170,7 +170,7 @@ def test_no_render_device_is_said_before_anything_is_written(trajectory, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
-def test_every_episode_says_how_it_was_made(made, trajectory):
+def test_scene_json_describes_the_recording(made, trajectory):
     scene = json.loads((made / "episode_0000001" / "scene.json").read_text())
     assert list(scene) == list(SCENE_KEYS)
     assert scene["seed"] == 5
@@ -238,7 +238,7 @@ def test_append_takes_cameras_and_size_from_the_dataset(trajectory, tmp_path):
             run(more, out, append=True, **other)
 
 
-def test_with_other_versions_it_does_not_go_on(trajectory, tmp_path):
+def test_conversion_with_other_versions_is_not_continued(trajectory, tmp_path):
     out, more = tmp_path / "out", write_trajectory(tmp_path / "more.h5", seeds=(10,))
     run(trajectory, out)
     about = json.loads((out / "conversion.json").read_text())
@@ -255,20 +255,20 @@ def test_with_other_versions_it_does_not_go_on(trajectory, tmp_path):
     assert len(run(more, out, append=True).episodes) == 1
 
 
-def test_what_would_be_numbered_alike_is_refused(trajectory, tmp_path, monkeypatch):
-    """A second conversion that begins after the first has made its plan, and would take the same numbers."""
+def test_concurrent_append_is_refused(trajectory, tmp_path, monkeypatch):
+    """A second conversion that starts after the first one assigned its numbers."""
     out = tmp_path / "out"
     more = write_trajectory(tmp_path / "more.h5", seeds=(10,))
     other = write_trajectory(tmp_path / "other.h5", seeds=(11,))
     monkeypatch.setattr("robocas_ms3.datasets.conversion.convert.embed_texts", stub_embeddings)
     run(trajectory, out, embeddings=True)
 
-    def meanwhile(file, chosen):
+    def convert_another(file, chosen):
         with pytest.raises(RobocasError, match="another process writes to this folder"):
             run(other, out, append=True, embeddings=True)
         return stub_embeddings(file, chosen)
 
-    monkeypatch.setattr("robocas_ms3.datasets.conversion.convert.embed_texts", meanwhile)
+    monkeypatch.setattr("robocas_ms3.datasets.conversion.convert.embed_texts", convert_another)
     run(more, out, append=True, embeddings=True)
     monkeypatch.setattr("robocas_ms3.datasets.conversion.convert.embed_texts", stub_embeddings)
     run(other, out, append=True, embeddings=True)
@@ -276,7 +276,7 @@ def test_what_would_be_numbered_alike_is_refused(trajectory, tmp_path, monkeypat
     assert [entry["seed"] for entry in ledger.values()] == [3, 5, 10, 11]
 
 
-def test_a_recording_that_is_there_twice_is_converted_once(tmp_path, caplog):
+def test_duplicate_recording_is_converted_once(tmp_path, caplog):
     trajectory = write_trajectory(tmp_path / "trajectory.h5", seeds=(3, 4, 3))
     done = run(trajectory, tmp_path / "out")
     assert [episode.number for episode in done.episodes] == [0, 1]

@@ -24,11 +24,11 @@ def test_a_conversion_and_its_repetition(trajectory, stub_images, tmp_path, caps
     assert printed.out.startswith(f"{tmp_path / 'out'}: 2 episodes, 14 steps, ")
     assert "episodes written: 2/2" in printed.err
     assert run(command) == 0
-    assert capsys.readouterr().out.endswith(": 0 episodes, 2 kept\n")
+    assert capsys.readouterr().out.endswith(": 0 episodes, 2 already there\n")
 
 
 def tried(path, *rates):
-    """A trajectory whose recordings' actions were tried at these rates."""
+    """A trajectory file with recordings checked open loop at these rates."""
     write_trajectory(path, seeds=tuple(range(len(rates))))
     content = json.loads(path.with_suffix(".json").read_text())
     for episode, rate in zip(content["episodes"], rates, strict=True):
@@ -46,7 +46,7 @@ def tried(path, *rates):
         (([5], "5"), 10, ""),  # not ours
     ],
 )
-def test_actions_that_were_tried_at_another_rate(tmp_path, caplog, rates, rate_hz, said):
+def test_warning_for_another_rate_than_that_of_the_open_loop_check(tmp_path, caplog, rates, rate_hz, said):
     trajectory = tried(tmp_path / "F.h5", *rates)
     convert(trajectory, tmp_path / "out", rate_hz=rate_hz)
     warnings = [record.getMessage() for record in caplog.records if record.name.startswith("robocas_ms3")]
@@ -54,7 +54,7 @@ def test_actions_that_were_tried_at_another_rate(tmp_path, caplog, rates, rate_h
     assert not said or warnings[0].startswith(said)
 
 
-def test_only_the_recordings_that_are_converted_count(tmp_path, caplog):
+def test_failed_recordings_cause_no_rate_warning(tmp_path, caplog):
     path = tried(tmp_path / "F.h5", 5, 10)
     content = json.loads(path.with_suffix(".json").read_text())
     content["episodes"][0]["success"] = False
@@ -71,7 +71,7 @@ def test_only_the_recordings_that_are_converted_count(tmp_path, caplog):
         ("--cameras base_camera base_camera", 2, "expected each name once, found base_camera base_camera"),
     ],
 )
-def test_flags_that_make_no_sense(made, trajectory, capsys, flags, code, said):
+def test_invalid_options(made, trajectory, capsys, flags, code, said):
     assert run(["convert", str(trajectory), "--out", str(made), *flags.split()]) == code
     error = capsys.readouterr().err
     assert said in error
@@ -85,7 +85,7 @@ def test_flags_that_make_no_sense(made, trajectory, capsys, flags, code, said):
         (("--overwrite",), "; the same command without --overwrite continues"),
     ],
 )
-def test_an_interrupted_conversion_says_how_to_go_on(monkeypatch, tmp_path, capsys, flags, said):
+def test_interrupted_conversion_prints_how_to_continue(monkeypatch, tmp_path, capsys, flags, said):
     def interrupted(*args, **kwargs):
         raise KeyboardInterrupt
 
@@ -95,7 +95,7 @@ def test_an_interrupted_conversion_says_how_to_go_on(monkeypatch, tmp_path, caps
     assert capsys.readouterr().err == f"interrupted{said}\n"
 
 
-def test_what_another_trajectory_left_missing_is_said(tmp_path, caplog):
+def test_warning_for_missing_episodes_of_another_trajectory(tmp_path, caplog):
     """--append of b was killed; converting a again can't make b's episodes."""
     a, b = (write_trajectory(tmp_path / f"{n}.h5", seeds=seeds) for n, seeds in (("a", (1, 2)), ("b", (3, 4, 5))))
     out = tmp_path / "out"
@@ -106,7 +106,7 @@ def test_what_another_trajectory_left_missing_is_said(tmp_path, caplog):
     assert caplog.records == []
     convert(a, out)
     said = [record.getMessage() for record in caplog.records]
-    assert said == [f"{out}: episodes 2, 4 of b.h5 are still missing: convert that with --append"]
+    assert said == [f"{out}: episodes 2, 4 of b.h5 are missing; convert them with --append"]
     hint = "found no folder (convert b.h5 again, or with --append)"
     assert [str(v) for v in validate(out).violations] == [
         f"conversion.json, episodes.{number}: expected the episodes on disk, {hint}" for number in (2, 4)

@@ -1,4 +1,4 @@
-"""Files that are cut off between two runs: the next run writes their episode again, robocas validate names them."""
+"""Truncated files: the next run writes their episode again, robocas validate reports them."""
 
 import shutil
 
@@ -25,7 +25,7 @@ FILES = (
 
 
 def harm(path, left):
-    """Cut a file off, or remove it."""
+    """Truncate a file, or remove it."""
     if left is None:
         path.unlink()
     else:
@@ -41,7 +41,7 @@ def whole(trajectory, tmp_path_factory):
 
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("left", [0.97, None])
-def test_each_file_is_found(whole, tmp_path, name, left):
+def test_each_truncated_file_is_found(whole, tmp_path, name, left):
     out = shutil.copytree(whole, tmp_path / "out")
     harm(out / "episode_0000001" / name, left)
     image_options = ImageOptions(STANDARD_CAMERA_NAMES)
@@ -50,7 +50,7 @@ def test_each_file_is_found(whole, tmp_path, name, left):
     assert any(name.rpartition("/")[2] in str(violation) for violation in validate(out).violations)
 
 
-def test_its_episode_is_written_again(whole, trajectory, tmp_path, caplog):
+def test_episode_with_a_truncated_file_is_written_again(whole, trajectory, tmp_path, caplog):
     out = shutil.copytree(whole, tmp_path / "out")
     path = out / "episode_0000001" / FILES[2]
     harm(path, 0.97)
@@ -72,11 +72,11 @@ def test_images_of_each_format(trajectory, tmp_path, image_format):
         assert find_damaged(folder, image_options) == path
 
 
-def test_a_split_that_is_cut_off_is_made_anew_if_one_wants(whole, trajectory, tmp_path):
+def test_truncated_split_is_made_again_after_deleting_it(whole, trajectory, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(whole, out)
     harm(out / "data_info.json", 0.5)
-    with pytest.raises(DatasetError, match="data_info.json: the split can't be read.*Delete it"):
+    with pytest.raises(DatasetError, match="data_info.json: the split can't be read.*Delete the file"):
         run(trajectory, out)
     (out / "data_info.json").unlink()
     run(trajectory, out)

@@ -13,7 +13,7 @@ from robocas_ms3.datasets.sources.split import split_by_seed
 
 @settings(max_examples=50, deadline=None)
 @given(st.lists(st.integers(0, 300), min_size=1, max_size=200))
-def test_the_split_is_nine_to_one_and_keeps_seeds_together(seeds):
+def test_split_is_nine_to_one_and_keeps_seeds_together(seeds):
     by_number = dict(enumerate(seeds))
     train, val = split_by_seed(by_number)
     assert sorted(train + val) == list(by_number)
@@ -23,7 +23,7 @@ def test_the_split_is_nine_to_one_and_keeps_seeds_together(seeds):
     assert len(val_seeds) == (0 if count == 1 else max(1, round(count / 10)))
 
 
-def test_the_split_depends_on_the_seeds_alone():
+def test_split_depends_only_on_the_seeds():
     seeds = {n: 100 + n for n in range(40)}
     backwards = {n: 139 - n for n in range(40)}
     chosen = {seeds[n] for n in split_by_seed(seeds)[1]}
@@ -52,7 +52,7 @@ def test_action_space_by_hand():
         ({"rel_pos": np.zeros((1, 3)), "rel_orn": np.array([[0, 0, 0, 1.0]])}, "data_info.json, action_space"),
     ],
 )
-def test_the_overview_never_holds_nan(dataset, new, place):
+def test_data_info_never_has_nan(dataset, new, place):
     for number in (0, 1)[place.startswith("episode") :]:
         change(dataset / f"episode_000000{number}", **new)
     before = (dataset / "data_info.json").read_bytes()

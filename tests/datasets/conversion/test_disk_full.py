@@ -53,7 +53,7 @@ def named_dev_full(function):
 
 
 def fills_up(monkeypatch, owner, name, last, instead):
-    """From its n-th call on a function does something else."""
+    """Replace a function from its n-th call on."""
     whole, calls = getattr(owner, name), []
 
     def counted(*args, **kwargs):
@@ -149,7 +149,7 @@ def test_a_conversion_to_lerobot(made, tmp_path, monkeypatch, capsys, moment, la
     command = ["convert", str(made), "--to", "lerobot", "--out", str(out)]
     text = PYTHON["write_text"]
     places = {
-        "video": (written, "Encoder", to_dev_full(written.Encoder, 0)),
+        "video": (written, "VideoEncoder", to_dev_full(written.VideoEncoder, 0)),
         "frames": (written.pq, "write_table", to_dev_full(written.pq.write_table, 1)),
         "episode": text,
         "joined": (Layout, "path", named_dev_full(Layout.path)),

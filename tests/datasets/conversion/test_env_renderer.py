@@ -1,4 +1,4 @@
-"""Recorded states seen through ManiSkill's own cameras."""
+"""Rendering of recorded states with the cameras of ManiSkill."""
 
 import json
 import shutil
@@ -89,7 +89,7 @@ def shown(source, recording, index):
     return frame
 
 
-def test_states_look_as_they_did(source, recording, recorded):
+def test_rendered_states_equal_the_recorded_images(source, recording, recorded):
     _, seen, tcp = recorded
     for index in (0, 4, STEPS):
         frame = shown(source, recording, index)
@@ -103,8 +103,8 @@ def test_states_look_as_they_did(source, recording, recorded):
             assert np.mean(deeper > 2) < 0.01, (index, camera)
 
 
-def test_boxes_hold_the_target(recorded, recording):
-    """Where the target's centre is visible in an image, it is in the target's box."""
+def test_boxes_contain_the_target(recorded, recording):
+    """A visible centre of the target is inside its box."""
     with TrajectoryFile(recorded[0]) as file:
         frames = EnvRenderer(file.env, "pd_joint_pos", ImageOptions(size=SIZE, boxes=True))
     frames.load(recording)
@@ -129,7 +129,7 @@ def test_boxes_hold_the_target(recorded, recording):
     assert frame.boxes.keys() <= frame.rgb.keys()
 
 
-def test_nothing_moves_while_states_are_shown(source, recording):
+def test_rendering_does_not_step_physics(source, recording):
     state = recording.state(5)
     shown(source, recording, 5)
     now = source.env.unwrapped.get_state_dict()
@@ -138,7 +138,7 @@ def test_nothing_moves_while_states_are_shown(source, recording):
             np.testing.assert_allclose(now[kind][name].numpy()[:, :7], array[:, :7], atol=1e-6, err_msg=name)
 
 
-def test_camera_poses_are_the_declared_ones(source):
+def test_camera_poses_equal_the_declared_ones(source):
     """By hand, OpenCV axes: base camera 1.2 - 0.23 m above the arm's base, 25 deg down; gripper camera along z."""
     cameras = source.cameras()
     s, c = np.sin(np.deg2rad(25)), np.cos(np.deg2rad(25))
@@ -168,12 +168,12 @@ def test_depth_agrees_with_the_cameras(source, recording):
             ]
         )
     assert list(geometry.check(steps)) == []
-    # The table's top is a plane at 0.61 m: most of what lies there does so to the millimetre.
+    # The table's top is a plane at 0.61 m: most of its points agree to the millimetre.
     heights = steps[0][-1].points()[:, 2]
     assert np.median(np.abs(heights[np.abs(heights - 0.61) < 0.01] - 0.61)) < 0.0025
 
 
-def test_another_scene_is_refused(source, recording):
+def test_different_scene_is_refused(source, recording):
     import dataclasses
 
     def spoiled(**changes):
@@ -192,7 +192,7 @@ def test_another_scene_is_refused(source, recording):
     source.load(recording)
 
 
-def test_a_scene_that_is_another_leaves_nothing_behind(recorded, tmp_path):
+def test_refused_scene_leaves_no_files(recorded, tmp_path):
     path = shutil.copy(recorded[0], tmp_path / "F.h5")
     metadata = json.loads(recorded[0].with_suffix(".json").read_text())
     metadata["episodes"][0]["episode_seed"] = 12
@@ -210,6 +210,6 @@ def test_a_real_dataset_is_valid(recorded, tmp_path, capsys):
     assert validate(out).violations == []
     with np.load(out / "episode_0000000" / "episode_info.npz") as arrays:
         assert arrays["gripper_status"].tolist() == [True, True, False, False]
-        # The mobile base stands at (0.7, 0.15), turned by 90 deg; the arm's base above it.
+        # The mobile base is at (0.7, 0.15), turned by 90 deg; the arm's base above it.
         np.testing.assert_allclose(arrays["agv_pose"], [[0.7, 0.15, np.pi / 2]] * 4, atol=1e-3)
         np.testing.assert_allclose(arrays["base_pos"][:, :2], [[0.7, 0.15]] * 4, atol=1e-3)

@@ -18,38 +18,38 @@ OTHER = FailedAttempt(9, 1, "reach", "unreachable", 1.0)
 
 
 def run_of(folder, failures, seeds=(3, 5), **kwargs):
-    """A trajectory and what went wrong with it."""
+    """A trajectory file with its failures."""
     folder.mkdir()
     JsonLinesFile(folder / "failures.jsonl", FailedAttempt).append(failures)
     return write_trajectory(folder / "trajectory.h5", seeds=seeds, **kwargs)
 
 
-def told(out, task=None):
+def failures_of(out, task=None):
     """Failures of a dataset, of one task or all."""
     lines = [json.loads(line) for line in (out / "failures.jsonl").read_text().splitlines()]
     assert all(set(line) == {*vars(SLIPPED), "task", "environment"} for line in lines)
     return [FailedAttempt(*(line[key] for key in vars(SLIPPED))) for line in lines if task in (None, line["task"])]
 
 
-def test_lost_seeds_go_along(tmp_path):
+def test_failures_are_copied_to_the_dataset(tmp_path):
     trajectory, out = run_of(tmp_path / "run", [SLIPPED, LOST]), tmp_path / "out"
     convert(trajectory, out)
-    assert told(out) == [SLIPPED, LOST]
+    assert failures_of(out) == [SLIPPED, LOST]
     assert validate(out).violations == []
     # appended: what is not there yet, once
     more = run_of(tmp_path / "more", [LOST, OTHER], seeds=(7,))
     for _ in range(2):
         convert(more, out, append=True)
-        assert told(out) == [SLIPPED, LOST, OTHER]
+        assert failures_of(out) == [SLIPPED, LOST, OTHER]
     assert validate(out).violations == []
     merge([out], tmp_path / "merged")
     assert validate(tmp_path / "merged").violations == []
     convert(more, out, overwrite=True)
-    assert told(out) == [LOST, OTHER]
+    assert failures_of(out) == [LOST, OTHER]
 
 
-def test_another_task_has_seeds_of_its_own(tmp_path):
-    """The same line of two runs is two failures."""
+def test_failures_of_two_tasks_are_distinct(tmp_path):
+    """Equal lines of two runs are two failures."""
     first, out = run_of(tmp_path / "run", [SLIPPED, LOST]), tmp_path / "out"
     second = run_of(tmp_path / "more", [LOST], seeds=(3, 7), steps=24)
     edit(second.with_suffix(".json"), lambda c: c["env_info"].update(env_id="robocas_ms3:RoboCASOpenPick-v1"))
@@ -58,8 +58,8 @@ def test_another_task_has_seeds_of_its_own(tmp_path):
     convert(first, out)
     for more in (second, second, third):
         convert(more, out, append=True)
-    assert told(out, "pick") == [SLIPPED, LOST, LOST]
-    assert told(out, "open_pick") == [LOST]
+    assert failures_of(out, "pick") == [SLIPPED, LOST, LOST]
+    assert failures_of(out, "open_pick") == [LOST]
     made_in = [json.loads(line)["environment"] for line in (out / "failures.jsonl").read_text().splitlines()]
     assert made_in[0] == made_in[1]
     assert len(set(made_in)) == 3
@@ -76,12 +76,12 @@ def test_lines_of_an_earlier_version_are_not_added_again(tmp_path):
     assert (out / "failures.jsonl").read_bytes() == before
 
 
-def test_a_run_that_was_cut_off(tmp_path):
-    """Half a line stays out; a line without an end is not run into by what is appended later."""
+def test_truncated_failures_file(tmp_path):
+    """A truncated line is ignored; appended lines start on a new line."""
     for name, text in (("run", json.dumps(vars(SLIPPED)) + '\n{"seed": 1, "att'), ("more", json.dumps(vars(LOST)))):
         (tmp_path / name).mkdir()
         (tmp_path / name / "failures.jsonl").write_text(text)
     (tmp_path / "out").mkdir()
     for name in ("more", "run"):
         add_failures(tmp_path / name, tmp_path / "out", {"env_id": "robocas_ms3:RoboCASPick-v1"})
-    assert told(tmp_path / "out", "pick") == [LOST, SLIPPED]
+    assert failures_of(tmp_path / "out", "pick") == [LOST, SLIPPED]

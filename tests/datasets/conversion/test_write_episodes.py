@@ -1,4 +1,4 @@
-"""Episodes written in this process or in others: what fails, and what the other episodes come to."""
+"""Writing of episodes in this process or in workers, with failures."""
 
 import errno
 import os
@@ -17,7 +17,7 @@ from robocas_ms3.datasets.conversion.workers import PendingEpisodes, write_episo
 
 @dataclass
 class Writer:
-    """Writes nothing, and says what its process is like."""
+    """Writes nothing, and returns the state of its process."""
 
     errors: dict[int, Exception] = field(default_factory=dict)
 
@@ -69,7 +69,7 @@ def write(job):
     return write_episodes(job, SimpleNamespace(check_exists=lambda: None), None)
 
 
-def test_torch_has_one_thread_where_images_are_rendered(job):
+def test_torch_has_one_thread_during_rendering(job):
     written, incomplete = write(job(Writer(), [1, 2]))
     assert incomplete is None
     found = [(one.number, one.steps, one.row) for one in written]
@@ -80,13 +80,13 @@ def test_torch_has_one_thread_where_images_are_rendered(job):
     assert torch.get_num_threads() == 2
 
 
-def test_torch_keeps_its_threads_where_images_are_read(job, made):
+def test_torch_keeps_its_threads_without_rendering(job, made):
     writing = job(Writer(), [1])
     writing = replace(writing, settings=ConversionSettings(made, writing.settings.out))
     assert [one.row for one in write(writing)[0]] == [(os.getpid(), 2, None)]
 
 
-def test_in_other_processes_episodes_that_fail_or_end_their_process_are_one_error_after_all_others(job):
+def test_failures_and_crashes_in_workers_are_one_error_at_the_end(job):
     writer = Deadly({5: LookupError("5 is odd")})
     written, incomplete = write(job(writer, [1, 2, 3, 4, 5], jobs=2, episode_seconds=60, memory_gb=8))
     assert [one.number for one in written] == [1, 3, 4]
@@ -98,7 +98,7 @@ def test_in_other_processes_episodes_that_fail_or_end_their_process_are_one_erro
     assert {one.row[1:] for one in written} == {(1, "1")}
 
 
-def test_an_episode_that_fails_ends_no_other(job):
+def test_failed_episode_does_not_stop_others(job):
     written, incomplete = write(job(Writer(odd(range(16))), range(16)))
     assert [one.number for one in written] == list(range(0, 16, 2))
     reasons = {n: f"{n} is odd. Don't" if n % 3 == 0 else f"LookupError: {n} is odd" for n in range(1, 16, 2)}
@@ -108,7 +108,7 @@ def test_an_episode_that_fails_ends_no_other(job):
 
 
 @pytest.mark.parametrize(("numbers", "tried"), [([1], 1), ([1, 3], 2), ([1, 3, 5, 2], 3)])
-def test_an_error_that_all_share_is_raised_as_it_is(job, numbers, tried):
+def test_error_of_the_first_episodes_is_raised(job, numbers, tried):
     attempts = []
 
     class Counting(Writer):
@@ -127,6 +127,6 @@ def test_an_error_that_all_share_is_raised_as_it_is(job, numbers, tried):
 @pytest.mark.parametrize(
     "error", [OSError(errno.ENOSPC, "full"), FileNotFoundError(errno.ENOENT, "gone"), MissingExtraError("no extra")]
 )
-def test_an_error_of_the_machine_is_raised_at_once(job, error):
+def test_system_error_is_raised_at_once(job, error):
     with pytest.raises(type(error)):
         write(job(Writer({2: error}), [1, 2, 3]))

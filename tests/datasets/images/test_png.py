@@ -48,7 +48,7 @@ def test_decodes_to_the_same(kind, height, width, tmp_path):
         )
 
 
-def test_of_views(tmp_path):
+def test_views_of_arrays(tmp_path):
     """Of a slice of RGBA, upside down, every other pixel."""
     rgba = np.random.default_rng(0).integers(0, 256, (40, 30, 4), np.uint8)
     depth = np.random.default_rng(0).integers(0, 2**16, (40, 30), np.uint16)
@@ -57,7 +57,7 @@ def test_of_views(tmp_path):
         np.testing.assert_array_equal(read_image(tmp_path / "view.png"), view)
 
 
-def test_size_is_that_of_opencv():
+def test_size_is_close_to_opencv():
     """Of images like rendered ones, shaded and grained, at the level and filter that it takes for fast."""
     rng = np.random.default_rng(0)
     shades = cv2.GaussianBlur(rng.normal(128, 2000, (240, 320, 3)), (0, 0), 12)
@@ -82,7 +82,7 @@ def test_size_is_that_of_opencv():
     ],
     ids=lambda pixels: f"{pixels.dtype}{pixels.shape}",
 )
-def test_of_other_images_there_is_none(pixels, tmp_path):
+def test_unsupported_images_are_refused(pixels, tmp_path):
     with pytest.raises(DatasetError, match="can't encode this image"):
         write_image(tmp_path / "a.png", pixels)
     assert list(tmp_path.iterdir()) == []

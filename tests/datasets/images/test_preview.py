@@ -1,4 +1,4 @@
-"""Videos and contact sheet of `robocas convert`, made from the frames as they pass."""
+"""Videos and contact sheet of `robocas convert`, made during rendering."""
 
 import imageio.v2 as imageio
 import numpy as np
@@ -31,7 +31,7 @@ def shown(out):
     return sorted(path.name for path in (out / "preview").iterdir()) if (out / "preview").is_dir() else []
 
 
-def test_shows_what_the_dataset_holds(trajectory, tmp_path, monkeypatch):
+def test_preview_shows_the_stored_images(trajectory, tmp_path, monkeypatch):
     out, settings = tmp_path / "out", {"embeddings": False, "open_renderer": RayCaster}
     with monkeypatch.context() as patch:
         patch.delattr("robocas_ms3.datasets.sources.reader.read_image")  # no image is read back
@@ -56,7 +56,7 @@ def test_shows_what_the_dataset_holds(trajectory, tmp_path, monkeypatch):
     assert validate(out).violations == []
 
 
-def test_of_what_is_new(stub_images, tmp_path):
+def test_preview_of_new_episodes(stub_images, tmp_path):
     out, sheets, times = tmp_path / "out", [], []
     for name, seeds, flags in (("a", (1, 2), ()), ("b", (3,), ("--append",)), ("b", (3,), ("--append",))):
         assert converted(tmp_path / f"{name}.h5", out, *flags, seeds=seeds) == 0
@@ -71,7 +71,7 @@ def test_of_what_is_new(stub_images, tmp_path):
     np.testing.assert_array_equal(np.asarray(Image.open(sheet)), of_images)
 
 
-def test_of_many_episodes_on_request(stub_images, tmp_path, monkeypatch, capsys):
+def test_previews_of_many_episodes_with_all_videos(stub_images, tmp_path, monkeypatch, capsys):
     hint = "no preview videos (more than 20 episodes): pass --all-videos"
     monkeypatch.setattr(conversion, "MAX_PREVIEWS", 2)  # of 20 they take seconds
     monkeypatch.setattr(video, "SHEET_EPISODES", 2)
@@ -89,16 +89,16 @@ def test_of_many_episodes_on_request(stub_images, tmp_path, monkeypatch, capsys)
     assert shown(tmp_path / "two") == ["contact_sheet.png", *videos[:2]]
 
 
-def test_none_where_they_are_not_wanted(trajectory, stub_images, tmp_path, capsys):
+def test_no_previews_with_no_video(trajectory, stub_images, tmp_path, capsys):
     assert converted(trajectory, tmp_path / "out", "--no-video") == 0
     assert shown(tmp_path / "out") == []
     assert "video" not in capsys.readouterr().out
-    assert converted(trajectory, tmp_path / "other", "--no-video", "--all-videos") == 1
+    assert converted(trajectory, tmp_path / "other", "--no-video", "--all-videos") == 2
     assert "--no-video: can't be combined with --all-videos" in capsys.readouterr().err
     assert not (tmp_path / "other").exists()
 
 
-def test_a_failed_episode_has_none(trajectory, tmp_path, monkeypatch):
+def test_failed_episode_has_no_preview(trajectory, tmp_path, monkeypatch):
     from robocas_ms3.datasets.conversion import episode_folder
 
     done, write = [], episode_folder.write_image

@@ -31,7 +31,7 @@ def test_videos_show_every_step_in_real_time(made, tmp_path):
 
 
 def test_a_failed_video_leaves_no_file(tmp_path):
-    """FFmpeg once went on after the error, and made its file again."""
+    """FFmpeg once continued after the error and wrote its file again."""
     with pytest.raises(ZeroDivisionError), atomic_file(tmp_path / "e.mp4") as tmp, open_video(tmp, 5) as video:
         video.append_data(np.zeros((16, 16, 3), np.uint8))
         _ = 1 / 0
@@ -51,7 +51,7 @@ def test_a_frame_shows_cameras_and_texts(made):
         np.testing.assert_array_equal(*middle)
     band = frame[height:]
     light = (band.min(axis=2) > 200).sum()
-    assert 500 < light < 5000, "the instruction stands there"
+    assert 500 < light < 5000, "the instruction is drawn there"
     other = video_frame(episode, 4)[height:]
     assert (band != other).any(axis=2).sum() > 300, "another sub-goal, another text"
 

@@ -10,7 +10,7 @@ from robocas_ms3.datasets.lerobot.variants import VARIANTS
 
 @pytest.fixture(scope="session")
 def versions(trajectory, tmp_path_factory):
-    """A dataset of three episodes of each version, of which the second failed; for reading only."""
+    """A dataset of three episodes per version, the second one failed; for reading only."""
     root = tmp_path_factory.mktemp("versions")
     for version in VARIANTS:
         convert(trajectory, root / version, include_failed=True, lerobot_version=version)

@@ -58,12 +58,12 @@ def test_a_valid_dataset(valid):
         ("action.base", (1, 0), 5.0, "episode 0, rel_agv_pose"),
     ],
 )
-def test_numbers_that_are_wrong(spoiled, key, cell, value, where):
+def test_wrong_numbers_are_reported(spoiled, key, cell, value, where):
     change(spoiled, key, lambda array: array.__setitem__(cell, value))
     assert (schema.STATS_FILE if where == key else DATA, where) in found(spoiled)
 
 
-def test_texts_that_are_wrong(spoiled):
+def test_wrong_texts_are_reported(spoiled):
     change(spoiled, "subgoal_type", lambda texts: ["dance", *texts[1:]])
     assert (DATA, "episode 0, subgoal_type") in found(spoiled)
     write_texts(spoiled / schema.TASKS_FILE, "task_index", ["one", "one"])
@@ -77,7 +77,7 @@ def test_scenes_of_all_episodes_are_checked(spoiled):
     assert wrong <= found(spoiled)
 
 
-def test_rows_that_are_missing(spoiled):
+def test_missing_rows_are_reported(spoiled):
     table = pq.read_table(spoiled / DATA)
     pq.write_table(table.slice(0, 12), spoiled / DATA)
     assert (DATA, "rows") in found(spoiled)
@@ -90,7 +90,7 @@ def test_rows_that_are_missing(spoiled):
     assert found(spoiled) == {(DATA, "")}
 
 
-def test_overviews_that_contradict(spoiled):
+def test_inconsistent_overviews_are_reported(spoiled):
     video = "videos/observation.images.base_camera"
     change(spoiled, "dataset_from_index", lambda array: array.__setitem__((1, 0), 8), EPISODES)
     change(spoiled, f"{video}/from_timestamp", lambda array: array.__setitem__((1, 0), 1.6), EPISODES)
@@ -107,7 +107,7 @@ def test_overviews_that_contradict(spoiled):
 
 
 @pytest.mark.parametrize("name", [VIDEO, DEPTH])
-def test_videos_that_are_wrong(spoiled, name):
+def test_wrong_videos_are_reported(spoiled, name):
     (spoiled / schema.CHECKSUMS_FILE).unlink()
     path = spoiled / name
     whole = path.read_bytes()
@@ -129,7 +129,7 @@ def test_videos_that_are_wrong(spoiled, name):
 
 
 @pytest.mark.parametrize("name", [DATA, VIDEO, DEPTH])
-def test_a_flipped_bit_shows(spoiled, name):
+def test_flipped_bit_is_reported(spoiled, name):
     """Even where a decoder conceals it."""
     data = bytearray((spoiled / name).read_bytes())
     data[len(data) // 2] ^= 1
@@ -139,7 +139,7 @@ def test_a_flipped_bit_shows(spoiled, name):
     assert (schema.CHECKSUMS_FILE, "") in found(spoiled)
 
 
-def test_datasets_without_our_own_files(spoiled):
+def test_dataset_without_robocas_files_is_valid(spoiled):
     """As LeRobot's tools write them: no checksums, no scenes, no depth."""
     shutil.rmtree(spoiled / "meta/robocas")
     shutil.rmtree(spoiled / "depth")
@@ -148,7 +148,7 @@ def test_datasets_without_our_own_files(spoiled):
     assert found(spoiled, decode=True) == set()
 
 
-def test_a_conversion_that_was_interrupted(valid, tmp_path):
-    """There is no `meta` before everything is there."""
+def test_interrupted_conversion_is_not_a_dataset(valid, tmp_path):
+    """`meta` appears last."""
     shutil.copytree(valid / "data", tmp_path / "data")
     assert found(tmp_path) == {("meta/info.json", "")}

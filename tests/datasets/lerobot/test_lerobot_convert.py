@@ -1,4 +1,4 @@
-"""Conversions to LeRobot: what they take, refuse and continue."""
+"""Conversion to LeRobot: inputs, errors and continuation."""
 
 import json
 import shutil
@@ -29,8 +29,8 @@ from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import split_by_seed
 
 
-def test_from_a_folder_as_from_the_trajectory(trajectory, made, tmp_path):
-    """Nothing is rendered the second time, and it is the same but for where it comes from."""
+def test_conversion_of_a_folder_equals_that_of_the_trajectory(trajectory, made, tmp_path):
+    """Nothing is rendered the second time; only the source differs."""
     convert(trajectory, tmp_path / "lerobot", lerobot_version="0.5")
     convert_lerobot(ConversionSettings(made, tmp_path / "out", lerobot_version="0.5"))
     before, after = files_of(tmp_path / "lerobot"), files_of(tmp_path / "out")
@@ -40,7 +40,7 @@ def test_from_a_folder_as_from_the_trajectory(trajectory, made, tmp_path):
     assert LeRobotDataset(tmp_path / "out").episode(1).scene == Dataset(made).episode(1).scene
 
 
-def test_each_video_frame_is_that_of_its_step(trajectory, tmp_path):
+def test_each_video_frame_belongs_to_its_step(trajectory, tmp_path):
     """Grey levels are numbers of frames: joining must neither drop, double nor shift one. Depth has all 16 bits."""
     noise = np.random.default_rng(0).integers(0, 65536, (7, 48, 64), np.uint16)
 
@@ -118,7 +118,7 @@ def test_errors_leave_nothing_behind(request, tmp_path, source, settings):
     assert not Path(tmp_path / "out").exists()
 
 
-def test_an_output_that_exists_is_left_alone(trajectory, tmp_path):
+def test_other_output_is_not_changed(trajectory, tmp_path):
     out = tmp_path / "out"
     convert(trajectory, out)
     before = files_of(out)
@@ -139,7 +139,7 @@ def test_an_output_that_exists_is_left_alone(trajectory, tmp_path):
 
 
 def test_an_imported_folder_can_be_resumed(dataset, tmp_path):
-    """Nobody knows its recordings, so its episodes are told by their arrays."""
+    """Recordings are unknown, so episodes are identified by their arrays."""
     for path in [dataset / "conversion.json", *dataset.glob("*/scene.json")]:
         path.unlink()
     imported, out = tmp_path / "imported", tmp_path / "out"
@@ -185,8 +185,8 @@ def shrink(path, size):
 @pytest.mark.parametrize(
     ("episode", "camera", "kind", "step"), [(0, "base_camera", "rgb", 1), (1, "static_camera", "depth", 6)]
 )
-def test_a_image_of_another_size(dataset, tmp_path, episode, camera, kind, step):
-    """An encoder would scale it without a word; what is not taken is not looked at."""
+def test_image_of_another_size_is_refused(dataset, tmp_path, episode, camera, kind, step):
+    """An encoder would scale it silently; unused images are not checked."""
     folder = dataset / f"episode_{episode:07d}"
     shrink(folder / camera / kind / f"{step:04d}.png", (48, 64))
     with pytest.raises(IncompleteDatasetError) as caught:
@@ -208,8 +208,8 @@ def splits_of(root):
     return settings["train_eps"], settings["val_eps"]
 
 
-def test_the_split_is_the_folders_own(tmp_path):
-    """What validates after --append, merge or split must not train in the copy; failed episodes stay out."""
+def test_split_of_the_folder_is_kept(tmp_path):
+    """Validation episodes after --append, merge or split stay in validation; failed episodes are omitted."""
     root = make(tmp_path, "ds", range(6))
     edit(root / "episode_0000002" / "scene.json", lambda c: c.update(success=False))
     convert_lerobot(ConversionSettings(root, tmp_path / "before", include_failed=True))
@@ -233,7 +233,7 @@ def test_the_split_is_the_folders_own(tmp_path):
 
 
 @pytest.mark.parametrize(("array", "value"), [("ee_pos", np.nan), ("gripper_width", -np.inf)])
-def test_nan_is_an_error_of_its_episode_and_array(dataset, tmp_path, array, value):
+def test_nan_error_names_episode_and_array(dataset, tmp_path, array, value):
     spoilt = arrays_of(dataset / "episode_0000001")[array]
     spoilt[3] = value
     change(dataset / "episode_0000001", **{array: spoilt})
@@ -251,7 +251,7 @@ def test_nan_in_a_scene_is_an_error(trajectory, tmp_path):
         convert_lerobot(ConversionSettings(trajectory, tmp_path / "out", open_renderer=Unknown))
 
 
-def test_a_dataset_of_others_may_have_no_videos(versions, tmp_path):
+def test_other_datasets_may_have_no_videos(versions, tmp_path):
     other = shutil.copytree(versions / "0.6", tmp_path / "other")
     info = json.loads((other / "meta/info.json").read_text())
     info["features"] = {key: feature for key, feature in info["features"].items() if "images" not in key}

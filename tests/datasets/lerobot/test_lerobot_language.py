@@ -87,7 +87,7 @@ SCENE = {
 }
 
 
-def test_paraphrases_are_those_of_training():
+def test_paraphrases_use_training_templates():
     texts = paraphrases(SCENE, "grasp the pear on the table and move it to the basket")
     assert texts[0] == "grasp the pear on the table and move it to the basket"
     assert "put the pear into the basket" in texts
@@ -142,8 +142,8 @@ def test_valid_rows():
         ([{**ROWS[0], "style": "dance"}], [[]], "style: "),
         ([*ROWS[:2], {**ROWS[2], "timestamp": 0.7}], [[]] * 7, "timestamp: "),
         (ROWS, [[]] * 3, "timestamp: "),
-        ([ROWS[2]], [[]] * 7, "subtask: one from the first"),
-        ([ROWS[0], ROWS[0]], [[]], "subtask: one at a time"),
+        ([ROWS[2]], [[]] * 7, "subtask: a subtask at the first"),
+        ([ROWS[0], ROWS[0]], [[]], "subtask: one subtask at a time"),
         (ROWS, [[{**EVENT[0], "camera": None}], *[[]] * 6], "a camera of the dataset"),
         (ROWS, [[{**EVENT[0], "style": "subtask"}], *[[]] * 6], "style interjection"),
         (ROWS, [[*EVENT, *EVENT], *[[]] * 6], "one question"),
@@ -156,7 +156,7 @@ def test_rows_that_are_wrong(persistent, events, message):
     assert any(message in text for text in texts), texts
 
 
-def test_rows_that_differ_between_frames():
+def test_different_rows_in_frames_are_reported():
     table = pa.table({PERSISTENT: pa.array([ROWS, ROWS[:1]], PERSISTENT_TYPE), EVENTS: pa.array([[], []], EVENTS_TYPE)})
     assert "the same rows in each frame" in str(next(check_language(table, "file", INFO)))
 

@@ -36,7 +36,7 @@ from robocas_ms3.datasets.lerobot.tables import TEXT, Column, read_objects, read
         ("features.frame_index", None),
     ],
 )
-def test_wrong_values_of_the_overview(spoiled, key, value):
+def test_wrong_values_in_info_json(spoiled, key, value):
     def edit(info):
         *way, last = key.split(".", 2)
         for name in way:
@@ -87,7 +87,7 @@ WRONG = {
         (schema.SCENES_FILE, "cameras", "structures"),
     ],
 )
-def test_columns_of_wrong_values(spoiled, file, key, wrong):
+def test_wrong_values_in_columns(spoiled, file, key, wrong):
     table_of(spoiled, file, key, WRONG[wrong])
     assert [violation for violation in check_lerobot(spoiled).violations if "SHA-256" not in violation.expected]
     unused = key == "timestamp"
@@ -125,7 +125,7 @@ def test_irregular_files(spoiled, name, kind):
 
 
 @pytest.mark.parametrize("count", [0, 10**6])
-def test_totals_that_the_tables_contradict(spoiled, count):
+def test_totals_that_differ_from_the_tables(spoiled, count):
     totals = "total_episodes", "total_tasks", "total_frames"
     edit_json(spoiled, schema.INFO_FILE, lambda info: info.update(dict.fromkeys(totals, count)))
     found = [(violation.file, violation.key) for violation in check_lerobot(spoiled).violations]
@@ -169,7 +169,7 @@ def test_rows_are_counted_before_they_are_read(spoiled, file, monkeypatch):
         read[file]()
 
 
-def test_a_consistent_lie_about_rows_is_bounded_by_size(tmp_path):
+def test_wrong_row_counts_are_bounded_by_size(tmp_path):
     path = tmp_path / "file.parquet"
     rows = pa.table({"episode_index": pa.array(np.zeros(4_000_000, np.int64))})
     pq.write_table(pa.table({f"{n}": rows.column(0) for n in range(19)} | {"episode_index": rows.column(0)}), path)
@@ -178,7 +178,7 @@ def test_a_consistent_lie_about_rows_is_bounded_by_size(tmp_path):
         read_rows(path, 0)
 
 
-def test_a_long_text_that_repeats_is_counted_each_time(tmp_path):
+def test_repeated_long_text_counts_each_time(tmp_path):
     path = tmp_path / "file.parquet"
     pq.write_table(pa.table({"text": pa.array(["x" * 2**20]).take(pa.array([0] * 100))}), path)
     assert path.stat().st_size < 2**21

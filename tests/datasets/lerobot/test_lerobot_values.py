@@ -54,7 +54,7 @@ def test_statistics_of_all_episodes_are_exact_and_copy_one_column_at_a_time():
 
 @settings(max_examples=25)
 @given(st.integers(2, 9), st.integers(0, 1000))
-def test_arrays_come_back(steps, seed):
+def test_arrays_round_trip(steps, seed):
     arrays = made_up(steps, seed)
     texts, types = arrays["step_lang_goals"].tolist(), arrays["step_goal_type"].tolist()
     back = robocas_arrays(frame_columns(arrays), "grasp it and drop it", texts, types)
@@ -88,18 +88,18 @@ def test_actions_worked_out_by_hand():
         assert (columns[feature.key].shape, columns[feature.key].dtype) == ((3, feature.width), np.float32)
 
 
-def test_the_documentation_names_every_feature():
+def test_documentation_lists_every_feature():
     text = (Path(__file__).parents[3] / "docs/lerobot.md").read_text()
     for feature in FEATURES:
         assert f"| `{feature.key}` | {feature.width} |" in text
     for variant in VARIANTS.values():
         features = features_json(variant, {})
         assert set(features) <= set(re.findall(r"`([\w.]+)`", text))
-        # LeRobot stacks whatever begins with `observation.` into tensors
+        # LeRobot stacks keys that start with `observation.` into tensors
         assert not [key for key, ft in features.items() if ft["dtype"] == "string" and key.startswith("observation")]
 
 
-def test_levels_of_lerobots_own_datasets():
+def test_depth_levels_of_lerobot_datasets():
     """Logarithmic by default: level 0 is 10 mm, the last one 10 m, and the middle exp of the middle."""
     middle = np.sqrt(3.51 * 13.5) - 3.5
     found = to_depth(np.array([[0, 4095, 2047]], np.uint16), {})
@@ -123,7 +123,7 @@ def test_invalid_ranges_of_depth_are_refused(info):
         to_depth(np.zeros((2, 2), np.uint16), info)
 
 
-def test_images_are_counted_exactly():
+def test_image_statistics_are_exact():
     rng = np.random.default_rng(0)
     images = rng.integers(0, 256, (4, 12, 16, 3), np.uint8)
     images[..., 1] //= 2
@@ -150,7 +150,7 @@ ROWS = {"pairs": [[i, i] for i in range(10)], "episode_index": EPISODES, "index"
 
 @pytest.mark.parametrize("group", [1, 2, 4, 100])
 @pytest.mark.parametrize("statistics", [True, False])
-def test_rows_are_those_of_the_episode(tmp_path, group, statistics):
+def test_read_rows_returns_the_rows_of_the_episode(tmp_path, group, statistics):
     path, rows = tmp_path / "file.parquet", pa.table(ROWS)
     pq.write_table(rows, path, row_group_size=group, write_statistics=statistics)
     for number in range(6):
@@ -163,13 +163,13 @@ def test_rows_are_those_of_the_episode(tmp_path, group, statistics):
 
 
 @pytest.mark.parametrize("other", [{"index": [1, 2]}, {"episode_index": ["one", "two"]}])
-def test_a_file_that_does_not_say_whose_rows_are(tmp_path, other):
+def test_data_file_without_episode_index(tmp_path, other):
     pq.write_table(pa.table(other), tmp_path / "file.parquet")
     with pytest.raises(DatasetError):
         read_rows(tmp_path / "file.parquet", 1)
 
 
-def test_an_encoder_ends_its_stream_where_an_episode_fails(tmp_path, capfd):
+def test_encoder_ends_its_stream_after_an_error(tmp_path, capfd):
     with pytest.raises(KeyError), VideoEncoder(tmp_path / "a.mp4", VIDEO_CODECS["av1"], 5, (64, 48)) as encoder:
         encoder.add(np.zeros((48, 64, 3), np.uint8))
         raise KeyError

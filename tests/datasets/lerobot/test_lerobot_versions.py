@@ -50,13 +50,13 @@ def test_each_version_passes_the_check_and_restores_the_episodes(versions, versi
         assert np.stack(list(episode.frames("base_camera", "depth"))).shape == (7, 48, 64)
 
 
-def test_the_same_input_gives_the_same_bytes(versions, version, trajectory, tmp_path):
+def test_conversion_is_deterministic(versions, version, trajectory, tmp_path):
     jobs = 2 if version == "0.6" else 1
     convert(trajectory, tmp_path / "out", include_failed=True, lerobot_version=version, jobs=jobs)
     assert files_of(tmp_path / "out") == files_of(versions / version)
 
 
-def test_each_version_from_another_version(versions, version, tmp_path):
+def test_conversion_between_versions(versions, version, tmp_path):
     for other in VARIANTS:
         convert(versions / other, tmp_path / other, include_failed=True, lerobot_version=version)
         assert check_lerobot(tmp_path / other).violations == []
@@ -95,7 +95,7 @@ def test_the_folder_of_version_0_6(versions):
     np.testing.assert_allclose(table.column("timestamp").to_pylist()[:7], np.arange(7) / 5, atol=1e-6)
 
 
-def test_statistics_are_those_of_the_data(versions):
+def test_statistics_match_the_data(versions):
     root = versions / "0.6"
     stats, dataset = json.loads((root / "meta/stats.json").read_text()), LeRobotDataset(root)
     rows = pq.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
@@ -136,7 +136,7 @@ def test_language_and_outcome_of_version_0_6(versions):
     assert vqa == [{**row, "timestamp": times[frame]} for frame in range(14, 21) for row in events[frame]]
 
 
-def test_boxes_hold_the_projected_target(versions, trajectory):
+def test_boxes_contain_the_projected_target(versions, trajectory):
     """The centre of the target, projected into a camera that sees all of it, is in its box."""
     episode = LeRobotDataset(versions / "0.6").episode(0)
     with TrajectoryFile(trajectory) as file:
@@ -198,7 +198,7 @@ def test_damaged_lines_of_version_2_1(versions, tmp_path, name, text, file):
             _ = LeRobotDataset(spoiled).rows, LeRobotDataset(spoiled).tasks
 
 
-def test_videos_of_version_2_1_that_are_wrong(versions, tmp_path):
+def test_wrong_videos_of_version_2_1_are_reported(versions, tmp_path):
     spoiled = shutil.copytree(versions / "2.1", tmp_path / "spoiled")
     folder = "videos/chunk-000/observation.images.base_camera"
     shutil.copy(spoiled / folder / "episode_000000.mp4", spoiled / folder / "episode_000003.mp4")

@@ -1,13 +1,13 @@
 import shutil
 
 import pytest
-from managing import as_upstream, make
+from managing import as_v0, make
 
 
 @pytest.fixture(scope="module")
 def four(tmp_path_factory):
-    """Four episodes as RoboCAS-v0 writes them, that nobody may change."""
-    return as_upstream(make(tmp_path_factory.mktemp("four"), "four", range(4)))
+    """Four episodes in the format of RoboCAS-v0, for reading only."""
+    return as_v0(make(tmp_path_factory.mktemp("four"), "four", range(4)))
 
 
 @pytest.fixture

@@ -1,10 +1,10 @@
-"""Datasets in the format of RoboCAS-v0: made of ours by taking away, renaming and retyping."""
+"""Import of datasets in the format of RoboCAS-v0, made from converted ones by removing and renaming keys."""
 
 import json
 
 import numpy as np
 import pytest
-from managing import Bomb, arrays_of, as_upstream, change, files_of, imported, problems, read
+from managing import Bomb, arrays_of, as_v0, change, files_of, imported, problems, read
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.cli.main import run
@@ -21,19 +21,19 @@ NPZ = "episode_info.npz"
 
 
 @pytest.fixture
-def upstream(dataset):
-    return as_upstream(dataset)
+def v0(dataset):
+    return as_v0(dataset)
 
 
-def test_the_output_is_the_input(four, capsys):
+def test_output_equal_to_input_is_refused(four, capsys):
     for out in (four, four / "inside", four.parent):
         assert run(["import-robocas", str(four), "--out", str(out)]) == 1
         assert "--overwrite" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("pose_name", ["cam_pos_wrt", "cam_pose_wrt"])
-def test_what_upstream_writes_becomes_a_valid_dataset(dataset, made, tmp_path, pose_name):
-    root, out = as_upstream(dataset, pose_name), tmp_path / "out"
+def test_v0_dataset_becomes_valid(dataset, made, tmp_path, pose_name):
+    root, out = as_v0(dataset, pose_name), tmp_path / "out"
     before = files_of(root)
     new = imported(root, out)
     assert validate(out).violations == []
@@ -62,8 +62,8 @@ def test_what_upstream_writes_becomes_a_valid_dataset(dataset, made, tmp_path, p
     assert files_of(root) == before
 
 
-def test_other_types_and_axes(upstream, made, tmp_path):
-    episode = upstream / "episode_0000000"
+def test_other_types_and_axes(v0, made, tmp_path):
+    episode = v0 / "episode_0000000"
     arrays = arrays_of(episode)
     change(
         episode,
@@ -79,78 +79,78 @@ def test_other_types_and_axes(upstream, made, tmp_path):
     intrinsic = np.load(episode / "base_camera" / "intrinsic.npy")
     fx, fy, cx, cy = intrinsic
     np.save(episode / "base_camera" / "intrinsic.npy", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
-    np.testing.assert_array_equal(Dataset(upstream).episode(0).intrinsic("base_camera"), intrinsic)
-    assert (0, f"{NPZ}, speed", "an unknown key", "not imported") in problems(upstream, "warning")
-    new = imported(upstream, tmp_path / "out")
+    np.testing.assert_array_equal(Dataset(v0).episode(0).intrinsic("base_camera"), intrinsic)
+    assert (0, f"{NPZ}, speed", "an unknown key", "not imported") in problems(v0, "warning")
+    new = imported(v0, tmp_path / "out")
     assert validate(new.root).violations == []
     old = arrays_of(made / "episode_0000000")
     for key in ("ee_pos", "gripper_width", "gripper_status", "language_goal", "step_goal_type", "episode_length"):
         np.testing.assert_array_equal(new.episode(0).arrays[key], old[key])
 
 
-def test_pickles_are_never_loaded(upstream, tmp_path):
+def test_pickles_are_never_loaded(v0, tmp_path):
     pickles = np.array([Bomb() for _ in range(7)], object)
-    change(upstream / "episode_0000000", robot_joints=pickles)
-    change(upstream / "episode_0000001", step_lang_goals=pickles, speed=pickles)
+    change(v0 / "episode_0000000", robot_joints=pickles)
+    change(v0 / "episode_0000001", step_lang_goals=pickles, speed=pickles)
     pickled = "pickled objects, which are never loaded"
     with pytest.raises(DatasetError, match=f"robot_joints: this array can't be read .found {pickled}"):
-        _ = Dataset(upstream).episode(0).arrays
-    assert (0, f"{NPZ}, robot_joints", pickled, "") in problems(upstream, "skipped")
+        _ = Dataset(v0).episode(0).arrays
+    assert (0, f"{NPZ}, robot_joints", pickled, "") in problems(v0, "skipped")
     # Texts are in data_info.json, too.
-    assert (1, f"{NPZ}, step_lang_goals", pickled, "derived from data_info.json") in problems(upstream, "repaired")
-    new = imported(upstream, tmp_path / "out")
+    assert (1, f"{NPZ}, step_lang_goals", pickled, "derived from data_info.json") in problems(v0, "repaired")
+    new = imported(v0, tmp_path / "out")
     assert new.numbers == [1]
     assert validate(new.root).violations == []
 
 
-def test_relative_motion_as_the_paper_writes_it(upstream, made, tmp_path):
-    episode = upstream / "episode_0000001"
+def test_relative_motion_in_the_convention_of_the_paper(v0, made, tmp_path):
+    episode = v0 / "episode_0000001"
     arrays = arrays_of(episode)
     change(episode, **{key: np.roll(arrays[key], 1, axis=0) for key in ("rel_pos", "rel_orn")})
-    new = imported(upstream, tmp_path / "out")
+    new = imported(v0, tmp_path / "out")
     np.testing.assert_allclose(
         new.episode(1).arrays["rel_pos"], arrays_of(made / "episode_0000001")["rel_pos"], atol=1e-6
     )
     assert any("moved by one step" in text for text in new.episode(1).scene["source"]["repaired"])
 
 
-def test_a_last_motion_becomes_the_identity_and_missing_velocities_are_made(upstream):
-    arrays = arrays_of(upstream / "episode_0000000")
+def test_last_motion_becomes_identity_and_missing_velocities_are_derived(v0):
+    arrays = arrays_of(v0 / "episode_0000000")
     motion = arrays["base_rel_pos"]
     motion[-1] = 1
     joints = np.arange(7, dtype=np.float32)[:, None] * np.full(7, 0.1, np.float32)
-    change(upstream / "episode_0000000", base_rel_pos=motion)
-    change(upstream / "episode_0000001", robot_joints=joints, arm_joint_vel=None)
-    repaired = {(episode, where): repair for episode, where, _, repair in problems(upstream, "repaired")}
+    change(v0 / "episode_0000000", base_rel_pos=motion)
+    change(v0 / "episode_0000001", robot_joints=joints, arm_joint_vel=None)
+    repaired = {(episode, where): repair for episode, where, _, repair in problems(v0, "repaired")}
     assert "identity" in repaired[0, f"{NPZ}, base_rel_pos"]
-    np.testing.assert_allclose(Dataset(upstream).episode(1).arrays["arm_joint_vel"], 0.5, atol=1e-5)  # 0.1 rad at 5 Hz
+    np.testing.assert_allclose(Dataset(v0).episode(1).arrays["arm_joint_vel"], 0.5, atol=1e-5)  # 0.1 rad at 5 Hz
 
 
-def test_quaternions_wxyz(upstream, tmp_path):
-    for episode in upstream.glob("episode_*"):
+def test_quaternions_wxyz(v0, tmp_path):
+    for episode in v0.glob("episode_*"):
         arrays = arrays_of(episode)
         keys = ("ee_orn", "rel_orn", "base_orn", "base_rel_orn")
         change(episode, **{key: np.roll(arrays[key], 1, axis=1) for key in keys})
-    found = problems(upstream, "repaired")
+    found = problems(v0, "repaired")
     assert (None, f"{NPZ}, ee_orn, rel_orn", "quaternions wxyz", "converted from wxyz") in found
-    imported(upstream, tmp_path / "out")
+    imported(v0, tmp_path / "out")
     assert validate(tmp_path / "out").violations == []
 
 
-def test_values_that_are_taken_as_they_are(upstream, tmp_path):
-    widths = arrays_of(upstream / "episode_0000000")["gripper_width"]
-    change(upstream / "episode_0000000", gripper_width=np.full_like(widths, 0.5))
-    assert (0, f"{NPZ}, gripper_width", "0.500 to 0.500", "") in problems(upstream, "warning")
-    assert imported(upstream, tmp_path / "out").numbers == [0, 1]
+def test_values_out_of_range_are_imported_with_a_warning(v0, tmp_path):
+    widths = arrays_of(v0 / "episode_0000000")["gripper_width"]
+    change(v0 / "episode_0000000", gripper_width=np.full_like(widths, 0.5))
+    assert (0, f"{NPZ}, gripper_width", "0.500 to 0.500", "") in problems(v0, "warning")
+    assert imported(v0, tmp_path / "out").numbers == [0, 1]
     (violation,) = validate(tmp_path / "out").violations
     assert (violation.key, violation.found) == ("gripper_width", "0.500 to 0.500")
 
 
-def test_a_turned_eef_frame_is_turned_back(upstream, made, tmp_path):
-    """Upstream's TCP is ManiSkill's turned by -90 deg about z; the gripper camera's place tells."""
+def test_rotated_eef_frame_is_rotated_back(v0, made, tmp_path):
+    """The EEF of RoboCAS-v0 is rotated by -90 deg about z, which the gripper camera reveals."""
     turn = Rotation.from_euler("z", -90, degrees=True)
     for number in (0, 1):
-        episode = upstream / f"episode_{number:07d}"
+        episode = v0 / f"episode_{number:07d}"
         arrays = arrays_of(episode)
         change(
             episode,
@@ -163,7 +163,7 @@ def test_a_turned_eef_frame_is_turned_back(upstream, made, tmp_path):
         pose[:3] = turn.inv().as_matrix() @ pose[:3]
         np.save(path, pose)
     for turned in (False, True):  # also as it is the cameras agree with the arrays
-        new = imported(upstream, tmp_path / f"out {turned}", turn_eef=turned)
+        new = imported(v0, tmp_path / f"out {turned}", turn_eef=turned)
         assert validate(new.root).violations == []
     for number in (0, 1):
         a, b = new.episode(number), Dataset(made).episode(number)
@@ -188,26 +188,26 @@ def test_a_turned_eef_frame_is_turned_back(upstream, made, tmp_path):
         ({"ee_orn": np.array(["x"] * 7)}, "ee_orn", "1 axes, not 2"),
     ],
 )
-def test_bad_arrays_leave_their_episode_out(upstream, tmp_path, new, key, found):
-    change(upstream / "episode_0000001", **new)
+def test_invalid_arrays_skip_their_episode(v0, tmp_path, new, key, found):
+    change(v0 / "episode_0000001", **new)
     assert any(
         (episode, where) == (1, f"{NPZ}, {key}") and text.startswith(found)
-        for episode, where, text, _ in problems(upstream, "skipped")
+        for episode, where, text, _ in problems(v0, "skipped")
     )
-    report = survey(upstream).as_json()
+    report = survey(v0).as_json()
     assert (report["skipped"], report["importable"]) == ([1], 1)
     json.dumps(report)
-    out = imported(upstream, tmp_path / "out")
+    out = imported(v0, tmp_path / "out")
     assert out.numbers == [0]
     assert validate(out.root).violations == []
 
 
-def test_arrays_that_can_not_be_made_are_told(upstream, tmp_path):
-    change(upstream / "episode_0000001", base_pos=None, robot_joints=None, arm_joint_vel=None)
-    new = imported(upstream, tmp_path / "out")
+def test_missing_arrays_are_reported(v0, tmp_path):
+    change(v0 / "episode_0000001", base_pos=None, robot_joints=None, arm_joint_vel=None)
+    new = imported(v0, tmp_path / "out")
     missing = ["robot_joints", "arm_joint_vel", "base_pos", "agv_pose", "rel_agv_pose"]
     assert new.episode(1).scene["source"]["missing"] == missing
-    assert (1, f"{NPZ}, base_pos", "no such key", "can't be derived") in problems(upstream, "warning")
+    assert (1, f"{NPZ}, base_pos", "no such key", "can't be derived") in problems(v0, "warning")
     assert {violation.key for violation in validate(new.root).violations} == set(missing)
 
 
@@ -217,7 +217,7 @@ def embed(texts):
     return vectors
 
 
-def test_embeddings_of_all_or_none_or_made(dataset, made, tmp_path):
+def test_embeddings_are_kept_removed_or_computed(dataset, made, tmp_path):
     (dataset / "conversion.json").unlink()
     assert imported(dataset, tmp_path / "all").settings["embeddings"] is True
     change(dataset / "episode_0000000", language_embedding=np.ones(512, np.float32))
@@ -236,7 +236,7 @@ def test_embeddings_of_all_or_none_or_made(dataset, made, tmp_path):
     assert set(new.episode(0).scene["source"]["derived"]) == {"language_embedding", "step_goal_embs"}
 
 
-def test_ours_with_damage_keeps_what_it_says(dataset, made, tmp_path):
+def test_damaged_dataset_keeps_its_scenes(dataset, made, tmp_path):
     (dataset / "episode_0000000" / "base_camera" / "rgb" / "0000.png").unlink()
     new = imported(dataset, tmp_path / "out")
     assert new.numbers == [1]
@@ -247,7 +247,7 @@ def test_ours_with_damage_keeps_what_it_says(dataset, made, tmp_path):
     assert validate(new.root).violations == []
 
 
-def test_nothing_to_take(copy, tmp_path, capsys):
+def test_no_importable_episode(copy, tmp_path, capsys):
     for path in copy.glob("*/episode_info.npz"):
         path.write_bytes(b"")
     with pytest.raises(DatasetError, match="no episode can be imported"):
@@ -263,7 +263,7 @@ def test_command(copy, tmp_path, capsys):
     assert run(["import-robocas", str(root)]) == 0
     text = capsys.readouterr().out
     assert "4 episodes, 3 can be imported, 1 skipped" in text
-    assert "made of base_pos, base_orn" in " ".join(text.split())
+    assert "derived from base_pos, base_orn" in " ".join(text.split())
     assert run(["import-robocas", str(root), "--out", str(out), "--json", "--link"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["skipped"] == [2]

@@ -17,7 +17,7 @@ from robocas_ms3.datasets.sources.reader import Dataset
 
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory):
-    """Two datasets of two episodes, that nobody may change."""
+    """Two datasets of two episodes, for reading only."""
     folder = tmp_path_factory.mktemp("parts")
     return make(folder, "a", (10, 11)), make(folder, "b", (20, 21))
 
@@ -26,7 +26,7 @@ def spoiled(part, tmp_path):
     return shutil.copytree(part, tmp_path / part.name)
 
 
-def test_episodes_follow_each_other_and_keep_their_side(parts, tmp_path):
+def test_episodes_are_numbered_in_order_and_keep_their_split(parts, tmp_path):
     a, b = parts
     out = tmp_path / "out"
     done = merge([b, a], out)
@@ -47,7 +47,7 @@ def test_episodes_follow_each_other_and_keep_their_side(parts, tmp_path):
     assert validate(out).violations == []
 
 
-def test_files_are_shared_unless_copied(parts, tmp_path):
+def test_files_are_hard_linked_unless_copied(parts, tmp_path):
     pixels = "episode_0000001/base_camera/rgb/0003.png"
     merge([parts[0]], tmp_path / "linked")
     merge([parts[0]], tmp_path / "copied", options=CopyOptions(link=False))
@@ -57,7 +57,7 @@ def test_files_are_shared_unless_copied(parts, tmp_path):
     assert files_of(tmp_path / "linked") == files_of(tmp_path / "copied")
 
 
-def test_links_that_the_file_system_refuses_become_copies(tmp_path, monkeypatch):
+def test_files_are_copied_if_links_are_not_supported(tmp_path, monkeypatch):
     def refuse(*_):
         raise OSError(18, "Invalid cross-device link")
 
@@ -69,7 +69,7 @@ def test_links_that_the_file_system_refuses_become_copies(tmp_path, monkeypatch)
     assert (tmp_path / "b").read_text() == "1"
 
 
-def test_where_a_merged_episode_had_been_before_is_kept(parts, tmp_path):
+def test_origin_of_a_merged_episode_is_kept(parts, tmp_path):
     merge(parts, tmp_path / "once")
     merge([tmp_path / "once"], tmp_path / "twice")
     entry = read(tmp_path / "twice" / "conversion.json")["episodes"]["3"]
@@ -89,7 +89,7 @@ def test_duplicates(parts, tmp_path):
     assert validate(tmp_path / "out").violations == []
 
 
-def test_duplicates_of_unknown_recordings_are_told_by_their_arrays(parts, tmp_path):
+def test_duplicates_of_unknown_recordings_are_found_by_their_arrays(parts, tmp_path):
     first = spoiled(parts[0], tmp_path)
     edit(first / "conversion.json", lambda c: [e.update(recording=None) for e in c["episodes"].values()])
     second = shutil.copytree(first, tmp_path / "again")
@@ -152,7 +152,7 @@ def test_a_split_of_texts_is_read_as_numbers(parts, tmp_path):
     assert resplit(part) == sides
 
 
-def test_what_is_appended_leaves_a_split_of_texts_as_it_is(parts, tmp_path):
+def test_append_keeps_a_split_of_texts(parts, tmp_path):
     part = spoiled(parts[0], tmp_path)
     sides = Dataset(part).splits[::-1]  # not the rule's
     edit(part / "data_info.json", lambda c: c.update(train_eps=[str(*sides[0])], val_eps=[str(*sides[1])]))
@@ -165,7 +165,7 @@ def test_what_is_appended_leaves_a_split_of_texts_as_it_is(parts, tmp_path):
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_episode_stops_it_before_anything_is_written(parts, tmp_path, damage):
+def test_damaged_episode_is_reported_before_writing(parts, tmp_path, damage):
     part = spoiled(parts[0], tmp_path)
     spoil, file = DAMAGES[damage]
     spoil(part / "episode_0000001")
@@ -175,7 +175,7 @@ def test_a_damaged_episode_stops_it_before_anything_is_written(parts, tmp_path, 
     assert not (tmp_path / "out").exists()
 
 
-def test_what_is_overwritten_stays_where_an_input_is_damaged(parts, tmp_path):
+def test_damaged_input_does_not_overwrite_the_output(parts, tmp_path):
     part = spoiled(parts[0], tmp_path)
     merge([parts[1]], tmp_path / "out")
     before = files_of(tmp_path / "out")
@@ -185,7 +185,7 @@ def test_what_is_overwritten_stays_where_an_input_is_damaged(parts, tmp_path):
     assert files_of(tmp_path / "out") == before
 
 
-def test_arrays_that_an_import_could_not_make_may_be_missing(parts, tmp_path):
+def test_arrays_missing_since_the_import_are_accepted(parts, tmp_path):
     part = spoiled(parts[0], tmp_path)
     change(part / "episode_0000001", base_pos=None)
     with pytest.raises(DatasetError, match="episode_0000001/episode_info.npz, base_pos"):
@@ -226,7 +226,7 @@ def test_command(parts, tmp_path, capsys):
     assert "4 episodes, 0 files linked, 212 copied, 2 duplicates skipped" in capsys.readouterr().out
 
 
-def test_the_command_wants_datasets(tmp_path, capsys):
+def test_command_without_datasets(tmp_path, capsys):
     assert run(["merge", "--out", str(tmp_path / "out")]) == 2
     assert "missing dataset folders" in capsys.readouterr().err
 

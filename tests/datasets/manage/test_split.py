@@ -25,7 +25,7 @@ from robocas_ms3.datasets.sources.split import split_by_seed
 
 @pytest.fixture(scope="module")
 def six(tmp_path_factory):
-    """A dataset of six seeds, that nobody may change."""
+    """A dataset of six seeds, for reading only."""
     return make(tmp_path_factory.mktemp("six"), "six", range(6))
 
 
@@ -34,7 +34,7 @@ def six(tmp_path_factory):
     st.lists(st.integers(0, 30), min_size=3, max_size=80),
     st.sampled_from([[0.9, 0.1], [0.5, 0.5], [0.6, 0.3, 0.1]]),
 )
-def test_groups_are_whole_and_no_part_is_empty(values, shares):
+def test_groups_stay_together_and_no_list_is_empty(values, shares):
     groups = {number: str(value) for number, value in enumerate(values)}
     if len(set(values)) < len(shares):
         with pytest.raises(DatasetError, match="too few groups to split"):
@@ -48,13 +48,13 @@ def test_groups_are_whole_and_no_part_is_empty(values, shares):
 
 
 @pytest.mark.parametrize("count", [2, 10, 47, 200])
-def test_a_tenth_by_seed_is_the_writers_split(count):
+def test_tenth_by_seed_equals_the_split_of_convert(count):
     seeds = {number: 1000 + number for number in range(count)}
     assert cut({n: str(seed) for n, seed in seeds.items()}, [0.9, 0.1]) == list(split_by_seed(seeds))
 
 
-def test_parts_have_some_of_both_sides():
-    """Of 800 episodes, as of a dataset of `reproduce_small.sh`."""
+def test_parts_have_training_and_validation_episodes():
+    """With 800 episodes, as in `reproduce_small.sh`."""
     seeds = {number: 510000 + number for number in range(800)}
     dataset = SimpleNamespace(splits=split_by_seed(seeds))
     with pytest.MonkeyPatch.context() as patch:
@@ -64,7 +64,7 @@ def test_parts_have_some_of_both_sides():
                 assert 0.04 < len(val) / (len(train) + len(val)) < 0.2
 
 
-def test_shares():
+def test_fractions():
     groups = {number: str(number) for number in range(100)}
     assert [len(part) for part in cut(groups, [0.7, 0.2, 0.1])] == [70, 20, 10]
     for wrong in ([1.0], [0.5, 0.6], [1.0, 0.0]):
@@ -87,7 +87,7 @@ def test_training_and_validation_as_datasets(six, tmp_path):
         assert validate(out).violations == []
 
 
-def test_parts_and_back(six, tmp_path, capsys):
+def test_split_and_merge_again(six, tmp_path, capsys):
     words = ["split", str(six), "--fractions", "0.5", "0.5", "--out", str(tmp_path / "parts")]
     assert run(words) == 0
     assert capsys.readouterr().out.count("3 episodes") == 2
@@ -118,13 +118,13 @@ def test_by_target_and_task(six, tmp_path):
         "pick": 4,
         "search": 2,
     }
-    anew = tmp_path / "anew"
-    assert run(["split", str(root), "--group-by", "task", "--out", str(anew), "--val-fraction", "0.3"]) == 0
-    assert {path.name: len(read(path / "data_info.json")["val_eps"]) for path in anew.iterdir()} == {
+    again = tmp_path / "again"
+    assert run(["split", str(root), "--group-by", "task", "--out", str(again), "--val-fraction", "0.3"]) == 0
+    assert {path.name: len(read(path / "data_info.json")["val_eps"]) for path in again.iterdir()} == {
         "pick": 1,
         "search": 1,
     }
-    assert "seeds in the order of sha256(seed)" in read(anew / "pick" / "conversion.json")["split"]
+    assert "seeds in the order of sha256(seed)" in read(again / "pick" / "conversion.json")["split"]
     assert run(["split", str(root), "--in-place", "--group-by", "target", "--val-fraction", "0.3"]) == 0
     info, targets = read(root / "data_info.json"), group_episodes(Dataset(root), "target")
     sides = [{targets[n] for n in info[side]} for side in ("train_eps", "val_eps")]
@@ -133,7 +133,7 @@ def test_by_target_and_task(six, tmp_path):
     assert validate(root).violations == []
 
 
-def test_names_of_folders_stay_inside(six, tmp_path):
+def test_folder_names_stay_inside_the_output(six, tmp_path):
     root = shutil.copytree(six, tmp_path / "ds")
     for number in range(6):
         target = {"asset_id": "../../pack/cup"}
@@ -142,7 +142,7 @@ def test_names_of_folders_stay_inside(six, tmp_path):
     assert [path.name for path in (tmp_path / "targets").iterdir()] == ["_.._pack_cup"]
 
 
-def test_two_values_never_share_a_folder():
+def test_folder_names_are_distinct():
     names = folder_names(["a b", "a_b", "c"])
     assert len(set(names.values())) == 3
     assert names["c"] == "c"
@@ -164,7 +164,7 @@ def test_in_place_writes_two_files_only(six, tmp_path):
     assert files_of(root) == after
 
 
-def test_in_place_accepts_what_is_there(six, tmp_path):
+def test_in_place_accepts_the_episodes_on_disk(six, tmp_path):
     root = shutil.copytree(six, tmp_path / "ds")
     info = read(root / "data_info.json")
     gone = info["train_eps"][0]
@@ -210,7 +210,7 @@ def test_invalid_options(six, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("damage", ["pickles", "cut off"])
-def test_a_damaged_episode_stops_it_before_anything_is_written(six, tmp_path, capsys, damage):
+def test_damaged_episode_is_reported_before_writing(six, tmp_path, capsys, damage):
     root = shutil.copytree(six, tmp_path / "ds")
     spoil, file = DAMAGES[damage]
     spoil(root / "episode_0000004")
@@ -220,7 +220,7 @@ def test_a_damaged_episode_stops_it_before_anything_is_written(six, tmp_path, ca
 
 
 @pytest.mark.parametrize("damage", ["infinite ee_pos", "no archive"])
-def test_in_place_leaves_all_as_it_is_where_arrays_are_damaged(six, tmp_path, damage):
+def test_in_place_changes_nothing_if_arrays_are_damaged(six, tmp_path, damage):
     root = shutil.copytree(six, tmp_path / "ds")
     spoil, file = DAMAGES[damage]
     spoil(root / "episode_0000004")

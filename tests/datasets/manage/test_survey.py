@@ -1,4 +1,4 @@
-"""What is wrong with datasets in the format of RoboCAS-v0, and which of their episodes can be imported."""
+"""Survey of datasets in the format of RoboCAS-v0: findings and importable episodes."""
 
 import shutil
 
@@ -15,7 +15,7 @@ NPZ = "episode_info.npz"
 NAMES = ("base", "gripper", "static")
 
 
-def test_what_all_episodes_lack_is_one_finding(copy):
+def test_finding_of_all_episodes_is_reported_once(copy):
     assert [(f.episode, f.violation.file, f.outcome) for f in survey(copy).findings] == [
         (None, "conversion.json", "repaired"),
         (None, NPZ, "repaired"),
@@ -34,11 +34,11 @@ def test_what_all_episodes_lack_is_one_finding(copy):
     ]
 
 
-def test_a_whole_dataset_of_ours_has_no_findings(made):
+def test_valid_dataset_has_no_findings(made):
     assert survey(made).findings == []
 
 
-def test_a_recorded_episode_is_not_turned_wherever_its_camera_is(dataset):
+def test_eef_frame_of_a_recorded_episode_is_not_rotated(dataset):
     def turned():
         return [f.episode for f in survey(dataset).findings if "ee_orn" in f.violation.key]
 
@@ -51,7 +51,7 @@ def test_a_recorded_episode_is_not_turned_wherever_its_camera_is(dataset):
     assert turned() == [1]
 
 
-def test_the_turn_by_hand():
+def test_eef_turn_by_hand():
     def camera_at(x, y):
         pose = np.eye(4)
         pose[:2, 3] = x, y
@@ -62,7 +62,7 @@ def test_the_turn_by_hand():
     assert eef_turn(camera_at(0.04, 0.04)) == 0
 
 
-def test_images_that_are_missing_damaged_or_of_another_kind(copy, tmp_path):
+def test_missing_damaged_and_other_images(copy, tmp_path):
     rgb = copy / "episode_0000001" / "base_camera" / "rgb"
     (rgb / "0002.png").unlink()
     (rgb / "0003.png").write_bytes((rgb / "0003.png").read_bytes()[:99])
@@ -82,7 +82,7 @@ def test_images_that_are_missing_damaged_or_of_another_kind(copy, tmp_path):
     assert validate(new.root).violations == []
 
 
-def test_images_of_another_size_and_episodes_twice(copy, tmp_path):
+def test_other_image_sizes_and_duplicate_episodes(copy, tmp_path):
     shutil.copytree(copy / "episode_0000001", copy / "episode_0000009")
     shutil.copytree(copy / "episode_0000002", copy / "episode_0000008")
     for path in (copy / "episode_0000001").glob("*/*/*.png"):
@@ -106,7 +106,7 @@ def test_cameras(copy, tmp_path):
     assert [text for *_, text, _ in found[1:]] == ["missing pose of a camera", "another matrix"]
 
 
-def test_rgb_alone_and_fewer_cameras(copy, tmp_path):
+def test_rgb_only_and_fewer_cameras(copy, tmp_path):
     for path in [*copy.glob("*/static_camera"), *copy.glob("*/*/depth")]:
         shutil.rmtree(path, ignore_errors=True)
     new = imported(copy, tmp_path / "out")

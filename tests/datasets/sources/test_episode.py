@@ -37,7 +37,7 @@ def compose(first, relative):
 
 @settings(max_examples=50, deadline=None)
 @given(pose_sequences(), pose_sequences())
-def test_the_stored_arrays_compose_to_the_stored_poses(tcp, base):
+def test_relative_motion_composes_to_the_poses(tcp, base):
     count = min(len(tcp), len(base))
     arrays = arrays_of(tcp[:count], base[:count])
     for position, orientation, rel_position, rel_orientation in (
@@ -49,7 +49,7 @@ def test_the_stored_arrays_compose_to_the_stored_poses(tcp, base):
         np.testing.assert_allclose(compose(absolute[0], relative), absolute, atol=1e-4)  # float32
 
 
-def test_orientations_never_flip_their_sign():
+def test_orientations_have_continuous_signs():
     turns = Rotation.from_euler("z", np.linspace(0, 720, 60)[:, None], degrees=True)
     poses = from_xyzw(np.zeros((60, 3)), turns.as_quat())
     quaternions = continuous_xyzw(poses)
@@ -68,7 +68,7 @@ def arrays_of(tcp, base, *, qpos=None, subgoals=None, embed=None):
     return add_embeddings(arrays, embed) if embed else arrays
 
 
-def test_relative_motion_is_in_the_frame_of_the_hand():
+def test_relative_motion_is_in_the_eef_frame():
     # The hand points down (x axis as the world's, y and z turned round) and moves 10 cm down: along its own +z.
     down = Rotation.from_euler("x", 180, degrees=True).as_quat()
     tcp = from_xyzw(np.array([[0.5, 0.2, 0.9], [0.5, 0.2, 0.8]]), np.array([down, down]))
@@ -99,7 +99,7 @@ def test_arrays_have_the_declared_types_and_shapes():
 
 
 def test_base_pose_in_the_world():
-    # The root stands at (0.7, 0.15) turned by 90 deg: 0.2 along its x is 0.2 along the world's y.
+    # The root is at (0.7, 0.15) turned by 90 deg: 0.2 along its x is 0.2 along the world's y.
     root = from_xyzw(np.array([[0.7, 0.15, 0]] * 2), Rotation.from_euler("z", [[90], [90]], degrees=True).as_quat())
     qpos = np.zeros((2, 12))
     qpos[1, :3] = 0.2, 0.0, np.deg2rad(100)
@@ -107,7 +107,7 @@ def test_base_pose_in_the_world():
     np.testing.assert_allclose(planar_base(root, qpos), expected, atol=1e-12)
 
 
-def test_turns_of_the_base_take_the_short_way_round():
+def test_base_yaw_is_continuous():
     poses = np.broadcast_to(np.eye(4), (2, 4, 4))
     qpos = np.zeros((2, 12))
     qpos[:, 2] = np.deg2rad([170, 190])
@@ -118,7 +118,7 @@ def test_turns_of_the_base_take_the_short_way_round():
     ("steps", "stride", "expected"),
     [(8, 4, [0, 4, 8]), (9, 4, [0, 4, 8, 9]), (3, 4, [0, 3]), (4, 1, [0, 1, 2, 3, 4]), (1, 4, [0, 1])],
 )
-def test_the_last_state_is_always_kept(steps, stride, expected):
+def test_last_state_is_always_sampled(steps, stride, expected):
     assert sample_states(steps, stride).tolist() == expected
 
 
@@ -130,7 +130,7 @@ def test_strides():
             sample_stride(20, rate)
 
 
-def test_a_step_belongs_to_the_action_that_leaves_it():
+def test_step_belongs_to_the_action_that_starts_there():
     goals = [SubGoal.of("move and grasp", "a", 0, 4), SubGoal.of("transfer object", "b", 5, 9)]
     # States 0, 4 precede actions 0, 4 of the first goal; 8 and the end belong to the second.
     assert [(g.goal_type, g.first, g.last) for g in sample_subgoals(goals, sample_states(10, 4))] == [
@@ -139,7 +139,7 @@ def test_a_step_belongs_to_the_action_that_leaves_it():
     ]
 
 
-def test_a_sub_goal_between_two_samples_is_left_out():
+def test_sub_goal_between_two_samples_is_omitted():
     goals = [
         SubGoal.of("move and grasp", "a", 0, 4),
         SubGoal.of("lift object", "b", 5, 7),
@@ -169,7 +169,7 @@ def test_sub_goals_with_gaps_are_refused(ranges):
         sample_subgoals(goals, sample_states(10, 4))
 
 
-def test_gripper_status_is_the_command_that_led_there():
+def test_gripper_status_is_the_previous_command():
     # Fingers go to -0.01 + (a + 1) / 2 * 0.05 m each: open (> 0.02 m) above a = 0.2.
     commands = np.array([1, 1, 1, -1, -1, 0.1, 0.3, 1], float)
     samples = np.array([0, 3, 4, 6, 7, 8])

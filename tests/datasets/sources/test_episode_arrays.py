@@ -1,4 +1,4 @@
-"""Arrays as a record: damage is noted in it, and repairs make another one."""
+"""Arrays of an episode: errors are recorded, and repairs do not change their input."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def said(violations):
     return [(violation.key, violation.expected, violation.found) for violation in violations]
 
 
-def test_damage_is_noted_and_refused_by_who_needs_it(dataset):
+def test_unreadable_arrays_are_recorded_and_refused_on_access(dataset):
     episode = dataset / "episode_0000001"
     change(episode, ee_pos=np.array([{}] * 7, object), speed=np.zeros(3))
     stored = read_arrays(episode / "episode_info.npz")
@@ -32,7 +32,7 @@ def test_damage_is_noted_and_refused_by_who_needs_it(dataset):
         some.needed(["rel_pos", "none"])
 
 
-def test_what_is_not_there(tmp_path):
+def test_missing_file(tmp_path):
     stored = read_arrays(tmp_path / "episode_info.npz")
     assert (stored.steps, list(stored.unreadable)) == (0, [""])
     assert said(array_checks.violations_of(stored, array_checks.FORM)) == [("", "this file", "no file")]
@@ -42,7 +42,7 @@ def test_what_is_not_there(tmp_path):
         load_arrays(tmp_path / "episode_info.npz")
 
 
-def test_what_is_absent_breaks_no_law_but_one(tmp_path):
+def test_missing_arrays_violate_one_rule_only(tmp_path):
     empty = EpisodeArrays(tmp_path, {})
     assert (
         said(
@@ -57,7 +57,7 @@ def test_what_is_absent_breaks_no_law_but_one(tmp_path):
     assert absent == [spec.name for spec in schema.EPISODE_INFO if not spec.embedding]
 
 
-def test_repairs_leave_what_they_are_given(made):
+def test_repairs_do_not_change_their_input(made):
     episode = made / "episode_0000001"
     arrays = arrays_of(episode)
     arrays |= {key: np.roll(arrays[key], 1, axis=0) for key in ("rel_pos", "rel_orn")}
@@ -67,7 +67,7 @@ def test_repairs_leave_what_they_are_given(made):
     repaired = ImportedEpisode(1, stored)
     repair_arrays(repaired)
     assert [(finding.violation.key, finding.outcome) for finding in repaired.findings] == [
-        ("language_embedding", "noted"),
+        ("language_embedding", "warning"),
         ("rel_pos", "repaired"),
         ("rel_orn", "repaired"),
         ("rel_agv_pose", "repaired"),

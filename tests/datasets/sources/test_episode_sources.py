@@ -1,4 +1,4 @@
-"""What sources of all formats have, and what damage to one episode leaves of the others."""
+"""Common interface of the sources of all formats, and damaged episodes."""
 
 import json
 import pickle
@@ -31,7 +31,7 @@ def paths(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", ["trajectory", "robocas", "lerobot"])
-def test_an_episode_says_its_instruction_and_length(paths, name):
+def test_instruction_and_length_of_an_episode(paths, name):
     source = open_source(paths[name])
     for number in source.numbers:
         episode = source.episode(number)
@@ -44,14 +44,14 @@ def test_an_episode_says_its_instruction_and_length(paths, name):
         assert episode.steps == said["episode_length"] == source.lengths[number] == 7
 
 
-def test_an_instruction_that_no_overview_has(paths, tmp_path):
+def test_instruction_without_an_overview(paths, tmp_path):
     bare = shutil.copytree(paths["robocas"], tmp_path / "bare")
     info = json.loads((bare / "data_info.json").read_text())
     (bare / "data_info.json").write_text(json.dumps({**info, "language_goal": {"0": 3}}))
     assert open_source(bare).episode(0).instruction.startswith("grasp the cube 1")
 
 
-def test_a_damaged_entry_of_a_trajectory_is_an_error_of_that_episode(paths, tmp_path):
+def test_damaged_entry_of_a_trajectory_is_an_error_of_its_episode(paths, tmp_path):
     path = tmp_path / "trajectory.h5"
     shutil.copy(paths["trajectory"], path)
     content = json.loads(paths["trajectory"].with_suffix(".json").read_text())
@@ -81,8 +81,8 @@ def test_a_pickled_source_reads_what_its_original_reads(paths):
         assert len(episode.layout["object_ids"]) == len(episode.layout["poses"])
 
 
-def test_lerobot_episodes_are_found_by_their_number(paths, tmp_path):
-    """Not by their place: a dataset of another maker may lack some."""
+def test_lerobot_episodes_are_found_by_number(paths, tmp_path):
+    """Not by position: other datasets may lack some numbers."""
     other = shutil.copytree(paths["lerobot"], tmp_path / "other")
     (rows,) = (other / "meta/episodes").rglob("*.parquet")
     pq.write_table(pq.read_table(rows).slice(1), rows)

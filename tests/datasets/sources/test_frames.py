@@ -1,4 +1,4 @@
-"""Images of steps in a run: the same as one by one, and each video closed whatever happens."""
+"""Consecutive images: equal to single reads, and videos are always closed."""
 
 import errno
 import inspect
@@ -23,7 +23,7 @@ STEPS = 7
 
 @pytest.fixture(scope="module")
 def lerobot(made, tmp_path_factory):
-    """A dataset of two episodes that nobody may change."""
+    """A dataset of two episodes, for reading only."""
     out = tmp_path_factory.mktemp("lerobot") / "dataset"
     convert_lerobot(ConversionSettings(made, out, open_renderer=RayCaster))
     return out
@@ -36,7 +36,7 @@ def folders(made, lerobot):
 
 @pytest.fixture
 def runs(monkeypatch):
-    """Every run of frames that is read out of a video; held here, so that none is closed because nobody has it."""
+    """All open frame generators; referenced here, so that none is closed by garbage collection."""
     found, read = [], reader.read_frames
 
     def held(*args):
@@ -53,7 +53,7 @@ def all_closed(runs):
 
 @pytest.mark.parametrize("name", ["robocas", "lerobot"])
 @pytest.mark.parametrize("kind", ["rgb", "depth"])
-def test_a_run_is_what_its_steps_are_one_by_one(folders, name, kind):
+def test_frames_equal_single_images(folders, name, kind):
     episode = open_source(folders[name]).episode(1)
     for camera in episode.cameras:
         alone = [getattr(episode, kind)(camera, step) for step in range(STEPS)]
@@ -64,7 +64,7 @@ def test_a_run_is_what_its_steps_are_one_by_one(folders, name, kind):
                 np.testing.assert_array_equal(image, alone[step])
 
 
-def test_cameras_in_step_are_closed_with_the_run(lerobot, runs):
+def test_all_videos_are_closed_with_the_generator(lerobot, runs):
     episode = open_source(lerobot).episode(0)
     run = iter_images(episode, CAMERAS, "depth")
     seen = [next(run), next(run)]
@@ -78,15 +78,15 @@ def test_cameras_in_step_are_closed_with_the_run(lerobot, runs):
             np.testing.assert_array_equal(image_options[camera], episode.depth(camera, step))
 
 
-def test_a_conversion_that_fails_leaves_no_video_open(lerobot, tmp_path, runs, monkeypatch):
-    add = video.Encoder.add
+def test_failed_conversion_leaves_no_video_open(lerobot, tmp_path, runs, monkeypatch):
+    add = video.VideoEncoder.add
 
     def full(self, image):
         if self.frames == 2:
             raise OSError(errno.ENOSPC, "no space left")
         add(self, image)
 
-    monkeypatch.setattr(video.Encoder, "add", full)
+    monkeypatch.setattr(video.VideoEncoder, "add", full)
     with pytest.raises(OSError, match="No space left"):
         convert_lerobot(ConversionSettings(lerobot, tmp_path / "out"))
     assert runs

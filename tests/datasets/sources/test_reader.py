@@ -1,4 +1,4 @@
-"""What a dataset says of itself, whichever way it is asked."""
+"""Overview files of a dataset."""
 
 import json
 
@@ -16,7 +16,7 @@ def test_a_dataset_without_a_split(tmp_path):
 
 
 @pytest.mark.parametrize("key", ["ep_length", "train_eps", "val_eps"])
-def test_an_overview_that_lacks_a_key_is_damaged_and_not_empty(tmp_path, key):
+def test_missing_key_of_data_info_is_an_error(tmp_path, key):
     (tmp_path / "episode_0000000").mkdir()
     info = {"ep_length": {"0": 7}, "train_eps": [0], "val_eps": []}
     (tmp_path / "data_info.json").write_text(json.dumps({name: info[name] for name in info if name != key}))
@@ -35,7 +35,7 @@ def test_an_overview_that_lacks_a_key_is_damaged_and_not_empty(tmp_path, key):
         ("meta/info.json", ""),
     ],
 )
-def test_what_may_have_been_meant(tmp_path, ask, file, meant):
+def test_error_suggests_a_nearby_dataset(tmp_path, ask, file, meant):
     (tmp_path / "here" / file).parent.mkdir(parents=True)
     (tmp_path / "here" / file).write_text("{}")
     with pytest.raises(DatasetError) as error:

@@ -1,4 +1,4 @@
-"""Statistics of a dataset: counts worked out by hand, images that are there, bad input."""
+"""Statistics of a dataset: counts computed by hand, plots, invalid input."""
 
 import json
 import shutil
@@ -25,8 +25,8 @@ CONFIG = {
 
 
 @pytest.fixture
-def told(dataset):
-    """A dataset whose scenes say where things stood: a cup as target, a jar, and a jar that takes no part."""
+def described(dataset):
+    """A dataset with scenes: a cup as target, a jar, and a jar outside the scene."""
     for number, y in ((0, 0.99), (1, 0.94)):
         path = dataset / f"episode_{number:07d}/scene.json"
         scene = json.loads(path.read_text())
@@ -40,8 +40,8 @@ def told(dataset):
     return dataset
 
 
-def test_counts_of_a_folder(told):
-    found = collect(told).as_json()
+def test_counts_of_a_folder(described):
+    found = collect(described).as_json()
     assert (found["episodes"], found["steps"], found["rate_hz"]) == (2, 14, 5.0)
     assert found["split"] == {"train": 1, "val": 1}
     assert found["success"] == {"true": 2}
@@ -70,7 +70,7 @@ def test_counts_of_a_folder(told):
     assert layout["coverage"] == 3 / 8
 
 
-def test_trajectories_and_their_conversion_agree(made, trajectory):
+def test_statistics_of_trajectory_and_conversion_agree(made, trajectory):
     folder, file = collect(made).as_json(), collect(trajectory).as_json()
     assert (file["episodes"], file["success"]) == (3, {"true": 2, "false": 1})  # failed ones are counted
     assert file["lengths"]["pick"] == {**folder["lengths"]["pick"], "count": 3}
@@ -100,7 +100,7 @@ def test_histogram_and_description():
     assert summarize_values([1, 2, 3, 4])["median"] == 2.5
 
 
-def test_datasets_that_do_not_say_how_they_were_made(dataset, tmp_path):
+def test_datasets_without_scenes(dataset, tmp_path):
     for path in dataset.glob("*/scene.json"):
         path.unlink()
     stats = collect(dataset)
@@ -109,9 +109,9 @@ def test_datasets_that_do_not_say_how_they_were_made(dataset, tmp_path):
     assert names == ["stats.json", "lengths.png", "instructions.png", "actions.png", "subgoals.png"]
 
 
-def test_images_and_json(told, tmp_path, capsys):
+def test_images_and_json(described, tmp_path, capsys):
     out = tmp_path / "out"
-    assert main(Command(told, out=out)) == 0
+    assert main(Command(described, out=out)) == 0
     assert sorted(path.name for path in out.iterdir()) == sorted(["stats.json", *(f"{name}.png" for name in PLOTS)])
     for name in PLOTS:
         pixels = np.asarray(Image.open(out / f"{name}.png").convert("L"))
@@ -119,14 +119,14 @@ def test_images_and_json(told, tmp_path, capsys):
     line = capsys.readouterr().out.strip()
     assert "2 episodes (pick 2), 14 steps" in line
     assert line.endswith(f"{out}: stats.json and 6 images")
-    assert main(Command(told, json=True)) == 0
+    assert main(Command(described, json=True)) == 0
     assert json.loads(capsys.readouterr().out) == json.loads((out / "stats.json").read_text())
-    assert not (told / "preview").exists()
+    assert not (described / "preview").exists()
 
 
-def test_texts_with_dollars_and_control_characters_are_labels(told, tmp_path):
-    """Matplotlib takes what is between two dollars for a formula, and ends with an error where it is none."""
-    stats, text = collect(told), "for $5 and \\frac{ $6\x1b[31m\nmore"
+def test_texts_with_dollars_and_control_characters_are_labels(described, tmp_path):
+    """Matplotlib parses text between two dollars as a formula."""
+    stats, text = collect(described), "for $5 and \\frac{ $6\x1b[31m\nmore"
     stats.names["cup"] = text
     stats.instructions[text] += 1
     stats.lengths[text] = stats.lengths["pick"]
@@ -142,24 +142,24 @@ def test_the_default_folder_is_next_to_a_trajectory(trajectory, tmp_path):
     assert (tmp_path / "T_stats/stats.json").is_file()
 
 
-def test_damaged_scene(told):
-    (told / "episode_0000001/scene.json").write_text('{"layout": {"object_ids": 3}}')
+def test_damaged_scene(described):
+    (described / "episode_0000001/scene.json").write_text('{"layout": {"object_ids": 3}}')
     with pytest.raises(DatasetError, match=r"episode_0000001/scene\.json: invalid description of a scene"):
-        collect(told)
+        collect(described)
 
 
 @pytest.mark.parametrize(("key", "value"), [("rel_pos", np.nan), ("rel_orn", 0.0)])
-def test_actions_that_are_none(told, key, value):
-    managing.spoil_array(told / "episode_0000001", key, value)
+def test_invalid_actions_are_refused(described, key, value):
+    managing.spoil_array(described / "episode_0000001", key, value)
     with pytest.raises(DatasetError, match="episode 1"):
-        collect(told)
+        collect(described)
 
 
-def test_no_episodes(told):
+def test_no_episodes(described):
     info = {"train_eps": [], "val_eps": [], "ep_length": {}}
-    (told / "data_info.json").write_text(json.dumps(info))
+    (described / "data_info.json").write_text(json.dumps(info))
     with pytest.raises(DatasetError, match="this dataset has no episodes"):
-        collect(told)
+        collect(described)
 
 
 def test_without_matplotlib(made, tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""The torch dataset against a naive loader written from the facts of RoboCAS-v0, and against bad input."""
+"""The torch dataset against a simple loader with the rules of RoboCAS-v0, and invalid input."""
 
 import json
 import math
@@ -26,7 +26,7 @@ SMALL = (32, 24)  # half of the synthetic images
 
 
 def naive_euler_xyz(x, y, z, w):
-    """Turn about the fixed x axis, then y, then z: R = Rz Ry Rx, from the quaternion's matrix."""
+    """Rotation about the fixed x axis, then y, then z: R = Rz Ry Rx, from the quaternion's matrix."""
     r20 = 2 * (x * z - w * y)
     roll = math.atan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
     yaw = math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
@@ -39,7 +39,7 @@ def naive_halved(path):
 
 
 def naive_sample(root, number, t, horizon, chunk, padding):
-    """Step by step, as the facts say it; beyond the ends as docs/training.md says."""
+    """Step by step; padding as in docs/training.md."""
     folder = root / f"episode_{number:07d}"
     info = np.load(folder / "episode_info.npz")
     length = int(info["episode_length"])
@@ -68,7 +68,7 @@ def naive_sample(root, number, t, horizon, chunk, padding):
 @pytest.mark.parametrize(
     ("horizon", "chunk", "padding"), [(6, 1, "hold"), (1, 1, "drop"), (2, 5, "zero"), (3, 9, "hold"), (2, 3, "drop")]
 )
-def test_every_element_is_the_naive_loaders(made, horizon, chunk, padding):
+def test_samples_equal_those_of_the_simple_loader(made, horizon, chunk, padding):
     data = RoboCASDataset(
         made,
         SampleOptions(
@@ -102,7 +102,7 @@ def test_actions_by_hand():
     )
     quarter = math.pi / 2
     expected = [
-        [0.01, 0.02, 0.03, 0, 0, quarter, 1],  # the command given between steps 0 and 1 stands at step 1: open
+        [0.01, 0.02, 0.03, 0, 0, quarter, 1],  # the command between steps 0 and 1 is stored at step 1: open
         [0, 0, -0.01, quarter, 0, quarter, 0],  # x -> y -> z -> x: a quarter about x, then about z
         [0, 0, 0, 0, 0, 0, 0],  # nothing follows the last step
     ]
@@ -121,7 +121,7 @@ def test_scale_maps_the_range_to_one_and_clips():
         ActionScale.from_action_space({"relative_position": [[0, 0, 0]], "relative_rotation": [[0, 0, 0]]})
 
 
-def test_normalised_by_the_overviews_ranges(made):
+def test_normalization_uses_the_range_of_data_info(made):
     plain = RoboCASDataset(made, SampleOptions(split="all", cameras=(), observation_horizon=1))
     scaled = RoboCASDataset(made, SampleOptions(split="all", cameras=(), observation_horizon=1, normalize=True))
     scale = ActionScale.from_action_space(json.loads((made / "data_info.json").read_text())["action_space"])
@@ -145,7 +145,7 @@ def test_depth_images_as_they_are_and_floats(made):
     assert 0 < float(small["rgb"].max()) <= 1
 
 
-def test_words_and_subgoals(made):
+def test_texts_and_subgoals(made):
     data = RoboCASDataset(
         made, SampleOptions(split="all", cameras=(), observation_horizon=3, embedding=True, subgoals=True)
     )
@@ -159,7 +159,7 @@ def test_words_and_subgoals(made):
     assert data[data.index(1, 5)]["subgoal_type"].tolist() == [3, 3, 3]  # transfer object
 
 
-def test_index_and_back(made):
+def test_index_and_locate_are_inverse(made):
     data = RoboCASDataset(made, SampleOptions(split="all", cameras=(), observation_horizon=2, padding="drop"))
     places = [data.locate(i) for i in range(len(data))]
     assert places == [(number, step) for number in (0, 1) for step in range(1, 6)]
@@ -172,14 +172,14 @@ def test_index_and_back(made):
             data.index(*place)
 
 
-def test_weights_draw_all_stages_alike(made):
+def test_weights_balance_the_subgoal_types(made):
     data = RoboCASDataset(made, SampleOptions(split="all", cameras=(), observation_horizon=1, subgoals=True))
     weights = data.weights()
     assert data.subgoal_types.tolist() == [2, 2, 2, 3, 3, 3] * 2
     assert weights.tolist() == pytest.approx([1 / 12] * 12)
 
 
-def test_split_is_the_overviews(dataset):
+def test_split_is_that_of_data_info(dataset):
     info = json.loads((dataset / "data_info.json").read_text())
     parts = [
         RoboCASDataset(dataset, SampleOptions(split=side, cameras=())).episodes for side in ("train", "val", "all")
@@ -191,7 +191,7 @@ def test_split_is_the_overviews(dataset):
         RoboCASDataset(dataset, SampleOptions(split="val"))
 
 
-def test_opening_reads_the_overview_only(made, tmp_path):
+def test_opening_reads_only_the_overview(made, tmp_path):
     for name in ("data_info.json", "conversion.json"):
         (tmp_path / name).write_bytes((made / name).read_bytes())
     for number in (0, 1):
@@ -205,7 +205,7 @@ def test_opening_reads_the_overview_only(made, tmp_path):
         data[0]
 
 
-def test_workers_see_what_one_process_sees(made):
+def test_workers_return_the_samples_of_one_process(made):
     data = RoboCASDataset(made, SampleOptions(split="all", size=SMALL, subgoals=True))
     before = len(os.listdir("/proc/self/fd"))
     alone = list(DataLoader(data, batch_size=5))
@@ -292,7 +292,7 @@ def test_arrays_of_another_length(dataset):
         first_item(dataset, cameras=())
 
 
-def test_datasets_made_elsewhere(dataset):
+def test_imported_datasets(dataset):
     options = dict(split="all", cameras=(), state=("agv_pose", "gripper_width"))
     before = list(RoboCASDataset(dataset, SampleOptions(**options)))
     for episode in dataset.glob("episode_*"):
@@ -322,7 +322,7 @@ def test_damaged_overviews(dataset):
             RoboCASDataset(dataset, SampleOptions(cameras=()))
 
 
-def test_the_documentations_code_runs(made, tmp_path, monkeypatch):
+def test_code_of_the_documentation_runs(made, tmp_path, monkeypatch):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "dataset").symlink_to(made)
     monkeypatch.chdir(tmp_path)
@@ -341,6 +341,6 @@ def test_the_documentations_code_runs(made, tmp_path, monkeypatch):
         assert eval(expression, names, {"rgb": batch["rgb"]}).shape == (6, *shape)
 
 
-def test_the_package_alone_brings_no_torch():
+def test_importing_the_package_does_not_load_torch():
     code = "import sys, robocas_ms3.datasets; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -12,7 +12,7 @@ from robocas_ms3.datasets import RoboCASDataset
 from robocas_ms3.datasets.training.options import SampleOptions
 
 
-def test_trajectories_give_what_their_conversion_gives(made, trajectory):
+def test_samples_of_trajectory_and_conversion_are_equal(made, trajectory):
     keys = ("robot_joints", "arm_joint_vel", "gripper_width", "agv_pose", "gripper_status")
     options = dict(cameras=(), observation_horizon=3, action_horizon=4, state=keys, subgoals=True)
     for side in ("train", "val", "all"):
@@ -34,7 +34,7 @@ def test_trajectories_at_another_rate_and_with_failures(trajectory):
     )
     assert len(data) == 3 * 11  # 22 control steps in pairs
     assert float(data[0]["action"][:, :6].abs().max()) <= 1
-    with pytest.raises(DatasetError, match="the rate must divide"):
+    with pytest.raises(DatasetError, match="not a divisor of the control frequency"):
         RoboCASDataset(trajectory, SampleOptions(cameras=(), rate_hz=3))
 
 
@@ -58,6 +58,6 @@ def test_trajectories_of_end_effector_actions(trajectory, tmp_path):
 
 
 @pytest.mark.parametrize("options", [dict(), dict(cameras=(), depth=True), dict(cameras=(), embedding=True)])
-def test_trajectories_hold_no_images(trajectory, options):
+def test_trajectory_files_have_no_images(trajectory, options):
     with pytest.raises(DatasetError):
         RoboCASDataset(trajectory, SampleOptions(**options))
