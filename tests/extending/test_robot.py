@@ -77,8 +77,8 @@ from robocas_ms3.planning.rrt_connect import make_planner
 planner, rest = make_planner({name!r}, twin, dt=0.05), np.array(twin.description.arm_rest)
 motion = planner.plan_to_qpos(rest, [rest + [1.5, 0, 0, 0, 0, 0, 0]], stage="x")
 print(np.abs(np.diff(motion.qpos, axis=0)).max() / 0.05)
-from robocas_ms3.robots.description_file import chain
-tip = chain(twin.files().urdf, twin.description.arm_base_link, twin.description.tcp_link, motion.qpos[-1:])
+from robocas_ms3.robots.description_file import chain_poses
+tip = chain_poses(twin.files().urdf, twin.description.arm_base_link, twin.description.tcp_link, motion.qpos[-1:])
 print(np.abs(planner.tcp(motion.qpos[-1]) - tip).max() < 1e-9, planner.collisions(rest))
 """,
     )
