@@ -14,7 +14,7 @@ SHOWN = (
 
 
 @pytest.fixture(scope="module")
-def render_page():
+def page():
     with open_page() as page:
         yield page
 
