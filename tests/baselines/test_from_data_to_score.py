@@ -9,15 +9,9 @@ from robocas_ms3.baselines.bc_state import BASELINE, BcStateConfig
 from robocas_ms3.cli.main import run
 
 SEED = 510_000
-TINY = ["--set", "views.base_camera={image_size: [64, 48], size: [64, 48]}", "--set", "width=32", "--set", "channels=8"]
-TINY += [
-    "--set",
-    "views.gripper_camera={image_size: [64, 48], size: [64, 48]}",
-    "--set",
-    "heads=2",
-    "--set",
-    "layers=1",
-]
+VIEW = "{image_size: [64, 48], size: [64, 48]}"
+TINY = ["--set", f"views.base_camera={VIEW}", "--set", "width=32", "--set", "channels=8"]
+TINY += ["--set", f"views.gripper_camera={VIEW}", "--set", "heads=2", "--set", "layers=1"]
 
 
 @pytest.fixture(scope="module")

@@ -104,9 +104,9 @@ def train_run(options: RunOptions, progress: Progress | None = None) -> RunRecor
         base = recorded or (initial.record if initial else None)
         values = base.config if base else baseline.Config().model_dump(mode="json")
         config: Any = None
-        for source, changes in (*options.layers, (baseline.name, options.changes)):
+        for origin, changes in (*options.layers, (baseline.name, options.changes)):
             values = merge_configs(values, changes)
-            config = parse(baseline.Config, values, TrainingError, where=source)
+            config = parse(baseline.Config, values, TrainingError, where=origin)
         settings: dict[str, Any] = {"config": config.model_dump(mode="json")}
         output.check_settings(settings | ({"init_from": initial.name} if initial else {}))
         accelerator = make_accelerator(options.device, _precision(config.train.precision, recorded))
