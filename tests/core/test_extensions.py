@@ -79,6 +79,6 @@ def test_the_error_of_an_unknown_name_suggests_the_nearest_one():
 
 def test_load_object_by_import_path():
     assert load_object("robocas_ms3.core.extensions:load_object") is load_object
-    for path in ("robocas_ms3.core.extensions:nothing", "robocas_ms3.nothing:load_object", "robocas_ms3.core.extensions"):
+    for path in ("robocas_ms3.core.extensions:nothing", "robocas_ms3.nothing:load", "robocas_ms3.core.extensions"):
         with pytest.raises(ExtensionError, match=f"{path}: cannot import this object .expected package.module:name"):
             load_object(path)
