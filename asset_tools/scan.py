@@ -22,7 +22,7 @@ PLAUSIBLE = (0.005, 1.5)  # m, longest side of an object that a gripper may pick
 TYPICAL = 0.15  # m, longest side of a household object
 GIANT = 5.0  # times the typical size; a larger scan is more likely in a unit ten times smaller
 FAR = np.log(20)  # log ratio to the typical size; limits the weight of a scan in the guess for a folder
-STANDS = 0.27  # thickness over height; thinner boxes are not placed upright
+MIN_UPRIGHT_RATIO = 0.27  # thickness over height; thinner boxes are not placed upright
 BOX_FILL = 0.93  # outline over bounding rectangle of a box; 0.785 for an ellipse
 
 
@@ -90,7 +90,7 @@ def guess_up(mesh: trimesh.Trimesh) -> Up:
     if long != "x":
         across = sorted(size[axis] for axis in size if axis != long)
         boxy = _fill(hull, "xyz".index(long)) > BOX_FILL
-        if not boxy or across[0] / size[long] >= STANDS:
+        if not boxy or across[0] / size[long] >= MIN_UPRIGHT_RATIO:
             return long  # pyright: ignore[reportReturnType]
     return "y" if y < z else "z"
 

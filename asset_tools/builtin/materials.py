@@ -67,7 +67,7 @@ class Grid:
         Args:
             cell: width and height, m.
             shift: by how many cells each row is pushed against the one before.
-            phase: share of a cell by which all are moved, so that no joint lies on the image's border.
+            phase: offset as a fraction of a cell, so that no joint is on the border of the image.
         """
         columns, rows = (round(self.size[i] / cell[i]) for i in (0, 1))
         wide, high = self.size[0] / columns, self.size[1] / rows

@@ -142,7 +142,7 @@ def weld(vertices: np.ndarray, tolerance: float = WELD) -> tuple[np.ndarray, np.
 
 
 def pack_regions(patches: list[Patch], texture_size: int) -> dict[str, Region]:
-    """Lay the patches' regions out on shelves, at the largest common scale that fits.
+    """Pack the patches' regions in rows at the largest common scale that fits.
 
     Raises:
         ValueError: two patches of one region disagree about its size.

@@ -177,7 +177,7 @@ def _triple(color: Array) -> tuple[float, float, float]:
 
 
 def _repeating(image: Image.Image, values: Array, wrap: int, axis: int) -> tuple[Image.Image, Array]:
-    """Return an image that repeats along an axis (0: across), and coordinates on it, for one that is wrapped otherwise.
+    """Convert an image with another wrap mode along an axis (0: across) to a repeating image and coordinates.
 
     A mirrored image is joined to its mirror image. Edges continue for at most one width of the image.
     """

@@ -75,7 +75,7 @@ def lock_file(file: IO[Any], path: Path, *, wait: bool) -> None:
 
 
 def _open_locked(lock: Path, path: Path) -> IO[bytes]:
-    """Open and lock a lock file; retry if the process that held the lock removed the file meanwhile."""
+    """Open and lock a lock file; retry if the process that held the lock removed the file in between."""
     while True:
         make_folder(lock.parent)
         try:

@@ -1,4 +1,4 @@
-"""What scanners and exporters do to a scan: each is mended and said, or is one error that says what is wrong.
+"""Defects of scanners and exporters are repaired with a note, or are one clear error.
 
 The scan is a bottle of revolution: four quarters in four colours, its neck at the top.
 """
@@ -40,7 +40,7 @@ def bottle(sections=ROUND, rows=1):
     a = row * (sections + 1) + column
     b, c, d = a + 1, a + sections + 2, a + sections + 1
     top = (len(at) - 1) * (sections + 1)
-    tips = len(wall) + np.arange(2 * sections)  # a middle of its own for each cap triangle, for its colour
+    tips = len(wall) + np.arange(2 * sections)  # a separate centre for each cap triangle, for its colour
     k = np.arange(sections)
     faces = [
         np.column_stack([a, b, c]),
@@ -103,7 +103,7 @@ def check_bottle(scan, *, colors=True, volume=0.005):
     assert (np.einsum("ni,ni->n", shading, light.face_normals[faces]) > 0).all()
 
 
-def test_a_good_scan_has_nothing_to_mend(tmp_path):
+def test_a_good_scan_needs_no_repairs(tmp_path):
     scan = prepare_scan(write_scan(tmp_path))
     assert (scan.up, scan.unit, scan.repairs) == ("z", "m", ())
     check_bottle(scan)
@@ -159,7 +159,7 @@ def test_a_large_texture_is_shrunk(tmp_path):
     check_bottle(scan)
 
 
-def test_a_texture_beyond_all_bounds_is_an_error(tmp_path):
+def test_a_texture_over_the_size_limit_is_an_error(tmp_path):
     path = write_scan(tmp_path)
     image = tmp_path / "skin.png"
     head = bytearray(image.read_bytes())
@@ -171,7 +171,7 @@ def test_a_texture_beyond_all_bounds_is_an_error(tmp_path):
 
 
 def test_several_materials(tmp_path):
-    """Each quarter has a texture of its own."""
+    """Each quarter has its texture."""
     vertices, _, faces = bottle()
     path = write_scan(tmp_path)
     lines = [line for line in path.read_text().splitlines() if not line.startswith(("f ", "usemtl"))]

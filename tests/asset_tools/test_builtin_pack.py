@@ -26,13 +26,13 @@ def pack():
     return load_pack("builtin")
 
 
-def test_ships_with_everything(pack):
+def test_the_builtin_pack_is_complete(pack):
     assert set(pack.objects) == set(products())
     assert set(pack.furniture) == set(MAKERS)
     assert sum(path.stat().st_size for path in pack.root.rglob("*")) < 25e6
 
 
-def test_stands_in_for_the_objects_of_upstream(pack):
+def test_the_builtin_pack_replaces_the_objects_of_robocas_v0(pack):
     """Same number, same id, same kind: a configuration runs on either pack."""
     ours = {loaded.asset.graspnet_id: (id_, loaded.asset.category) for id_, loaded in pack.objects.items()}
     assert ours == {number: (entry.id, entry.category) for number, entry in ENTRIES.items()} and len(ours) == 46
@@ -40,13 +40,13 @@ def test_stands_in_for_the_objects_of_upstream(pack):
     assert len(set(names)) == 46
 
 
-def test_is_as_good_as_packs_should_be(pack):
+def test_the_builtin_pack_meets_all_requirements(pack):
     assert check_objects({id_: loaded.asset for id_, loaded in pack.objects.items()}) == []
     assert check_furniture({id_: loaded.asset.quality for id_, loaded in pack.furniture.items()}) == []
 
 
 @each
-def test_shipped_object_is_what_the_table_says(pack, product):
+def test_bundled_objects_match_the_product_table(pack, product):
     loaded = pack.objects[product.id]
     asset = loaded.asset
     np.testing.assert_allclose(asset.extents, product.size, atol=1e-4)
@@ -59,7 +59,7 @@ def test_shipped_object_is_what_the_table_says(pack, product):
 
 
 @each
-def test_can_be_grasped_from_above_as_it_usually_lies(pack, product):
+def test_objects_can_be_grasped_from_above_in_their_usual_pose(pack, product):
     annotations = pack.objects[product.id].annotations
     approach_in_object = annotations.grasps_tcp_in_object[:, :3, 2]
     steep = [
@@ -101,7 +101,7 @@ def test_unknown_ids_are_named():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("id_", ["soap_box", "monkey", "cabinet"])
-def test_same_as_shipped(pack, tmp_path, id_):
+def test_a_new_build_equals_the_bundled_pack(pack, tmp_path, id_):
     """The code makes what is shipped: the pack was built again after the last change.
 
     Byte by byte on a processor like the one it was built on. Others sum up in another order: last bits differ, and
@@ -124,7 +124,7 @@ def facts_of(asset):
 
 
 def assert_close(found, shipped, path=""):
-    """Numbers to 1e-6; shares of trials of grasps, a few of which are at the brink, to 0.1."""
+    """Compare numbers with 1e-6, and fractions of held grasps, some of which are borderline, with 0.1."""
     if isinstance(shipped, dict):
         assert found.keys() == shipped.keys(), path
         for key in shipped:
@@ -149,4 +149,4 @@ def assert_same_surface(found, shipped):
     if found.suffix == ".glb":
         images = (np.asarray(one.visual.material.baseColorTexture.convert("RGB"), float) for one in (ours, theirs))
         colours = [pixels.mean((0, 1)) for pixels in images]
-        np.testing.assert_allclose(*colours, atol=2)  # where each face lies in it is another matter
+        np.testing.assert_allclose(*colours, atol=2)  # positions of the faces may differ

@@ -17,14 +17,14 @@ def studio(needs_renderer):
 
 
 def share(image, channel):
-    """Share of the image in which a colour channel stands out."""
+    """Return the fraction of the image in which a colour channel dominates."""
     values = np.asarray(image).astype(int)
     others = np.delete(values, channel, axis=2).max(axis=2)
     return float((values[..., channel] > others + 40).mean())
 
 
 @pytest.mark.slow
-def test_a_sheet_shows_the_assets_asked_for(tmp_path, studio):
+def test_a_contact_sheet_shows_the_requested_assets(tmp_path, studio):
     pack = load_pack("builtin")
     write_contact_sheet(pack, tmp_path / "new" / "sheet.png", ids=["tomato_soup_can", "cabinet"])
     sheet = Image.open(tmp_path / "new" / "sheet.png").convert("RGB")
@@ -42,8 +42,8 @@ def test_a_sheet_shows_the_assets_asked_for(tmp_path, studio):
 
 
 @pytest.mark.slow
-def test_the_camera_looks_from_where_it_should(studio):
-    # a red and a blue cube, side by side along y: from +x red, which stands at +y, is on the right
+def test_the_camera_renders_from_the_given_direction(studio):
+    # a red and a blue cube, side by side along y: from +x red, which is at +y, is on the right
     cubes = [
         RenderBody(faces.reshape(-1, 3), faces=faces, colour=colour)
         for faces, colour in (

@@ -95,7 +95,7 @@ def test_few_flat_faces_keep_their_vertices():
     assert sorted(reduce_vertices(column).round(9).tolist()) == sorted(column.round(9).tolist())
 
 
-def test_vertices_that_the_engine_would_drop_are_left_out():
+def test_vertices_that_the_engine_would_drop_are_removed():
     cube = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)])
     bumps = [[0.05, 0.05, 0.1006], [0.05, 0.05, -0.0006], [0.1006, 0.05, 0.05]]
     assert len(reduce_vertices(np.concatenate([cube, bumps]))) == 8

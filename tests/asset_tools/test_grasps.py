@@ -86,7 +86,7 @@ def test_wide_cup_is_held_by_its_wall():
     assert towards(grasps, (0, 0, -1), 0.85) >= 100
 
 
-def test_same_chance_same_grasps():
+def test_the_same_random_state_gives_the_same_grasps():
     mesh, first = mesh_and_grasps("box")
     again = sample_grasps(mesh, np.zeros(3), np.random.default_rng(3))
     other = sample_grasps(mesh, np.zeros(3), np.random.default_rng(4), count=50)

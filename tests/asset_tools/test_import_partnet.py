@@ -97,7 +97,7 @@ def test_a_drawer_is_hollow(chest):
         assert not trimesh.convex.convex_hull(piece).contains(inside).any()
 
 
-def test_what_is_too_slender_for_a_gpu_is_halved_or_becomes_a_box():
+def test_a_hull_too_slender_for_a_gpu_is_halved_or_becomes_a_box():
     # a bar whose section is a triangle with sides of 3, 4 and 5 cm: 8 mm from its middle to the nearest face
     section = np.array([[0, 0, 0], [0, 0.03, 0], [0, 0, 0.04]])
     bars = {length: np.concatenate([section, section + [length, 0, 0]]) for length in (1.5, 1.6, 4.0)}
@@ -146,7 +146,7 @@ def test_a_part_that_cuts_into_the_body_is_trimmed(chest):
         ({"mass": 20.0}, ("moving parts", "under `joints`")),
     ],
 )
-def test_what_does_not_fit_the_model_is_named(chest, more, words):
+def test_annotations_that_do_not_fit_the_model_are_named(chest, more, words):
     with pytest.raises(AssetError) as raised:
         read(chest, **more)
     assert all(word in str(raised.value) for word in words), raised.value
@@ -168,7 +168,7 @@ def test_a_model_without_an_annotation(tmp_path):
     assert "--template" in raised.value.fix
 
 
-def test_the_users_annotation_goes_first(tmp_path):
+def test_the_users_annotation_has_priority(tmp_path):
     assert find_annotation("45855", tmp_path).name == "sliding door cabinet"
     (tmp_path / "45855.yaml").write_text("name: mine\ncategory: b\norigin_lift: 0\n")
     assert find_annotation("45855", tmp_path).name == "mine"
@@ -194,7 +194,7 @@ def test_a_model_becomes_a_pack_and_the_same_bytes_again(chest, tmp_path):
     assert job.id == "chest"
 
 
-def test_the_sliding_door_is_where_upstream_has_it(shared_dir):
+def test_the_sliding_door_is_where_robocas_v0_has_it(shared_dir):
     source = real(shared_dir, "45855")
     (door,) = source.links
     assert (door.name, door.joint.name, door.joint.axis) == ("link_0", "joint_0", (0, -1, 0))
@@ -208,7 +208,7 @@ def test_the_sliding_door_is_where_upstream_has_it(shared_dir):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SIX)
-def test_real_models_open_close_and_hold(shared_dir, name):
+def test_real_models_have_working_joints_and_surfaces(shared_dir, name):
     source = real(shared_dir, name)
     report = examine_furniture(source)
     assert {joint for joint, found in report.joints.items() if not found.works} == set()
@@ -225,7 +225,7 @@ def test_real_models_open_close_and_hold(shared_dir, name):
             assert overlap(link, others, share) == 0
 
 
-def test_a_template_names_the_models_own_joints_and_is_an_annotation(shared_dir, tmp_path):
+def test_a_template_has_the_models_joints_and_is_a_valid_annotation(shared_dir, tmp_path):
     text = make_template(shared_dir / "partnet_mobility" / "45949")
     (tmp_path / "45949.yaml").write_text(text)
     note = find_annotation("45949", tmp_path)

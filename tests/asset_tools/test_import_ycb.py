@@ -33,13 +33,13 @@ def root(tmp_path):
     return tmp_path
 
 
-def test_names_become_the_ids_that_graspnets_objects_have():
+def test_names_become_the_ids_of_graspnet_objects():
     assert ycb_id("005_tomato_soup_can") == "tomato_soup_can"
     assert ycb_id("072-a_toy_airplane") == "toy_airplane_a"
     assert ycb_id("065-c_cups") == "cups_c"
 
 
-def test_an_object_that_graspnet_has_too(root):
+def test_an_object_that_is_also_in_graspnet(root):
     source = ycb_source(root, "005_tomato_soup_can")
     assert (source.id, source.graspnet_id, source.mass) == ("tomato_soup_can", 2, 0.349)
     assert (source.source, source.licence) == ("ycb", "CC BY 4.0")
@@ -47,14 +47,14 @@ def test_an_object_that_graspnet_has_too(root):
     assert not source.hollow
 
 
-def test_objects_that_graspnet_has_not(root):
+def test_objects_that_are_not_in_graspnet(root):
     box = ycb_source(root, "003_cracker_box")
     assert (box.id, box.name, box.graspnet_id, box.mass) == ("cracker_box", "cracker box", None, 0.411)
     block = ycb_source(root, "070-a_colored_wood_blocks")  # not listed: 600 kg/m3 would be 0.0105 kg, which is raised
     assert block.mass == pytest.approx(0.03)
 
 
-def test_the_scale_counts(root):
+def test_the_scale_is_applied(root):
     info = json.loads((root / "info_pick_v0.json").read_text())
     before = ycb_jobs(root, ["003_cracker_box"])[0].content
     info["003_cracker_box"]["scales"] = [0.5]
@@ -65,7 +65,7 @@ def test_the_scale_counts(root):
     assert ycb_jobs(root, ["003_cracker_box"])[0].content != before
 
 
-def test_what_is_not_there_is_one_error(root, tmp_path, monkeypatch):
+def test_missing_models_are_one_error(root, tmp_path, monkeypatch):
     with pytest.raises(AssetError) as caught:
         ycb_jobs(tmp_path / "nowhere")
     assert "mani_skill.utils.download_asset ycb" in caught.value.fix
@@ -83,7 +83,7 @@ def test_what_is_not_there_is_one_error(root, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("scales", ["[]", '["x"]', "[0]", "[-1]", "null"])
-def test_an_invalid_scale_fails_that_object_alone(root, scales):
+def test_an_invalid_scale_affects_only_its_object(root, scales):
     (root / "info_pick_v0.json").write_text(f'{{"003_cracker_box": {{"scales": {scales}}}}}')
     (job,) = ycb_jobs(root)
     with pytest.raises(AssetError):

@@ -92,7 +92,7 @@ def test_parts_that_touch_become_one_solid(name, change):
     np.testing.assert_allclose(solid.bounds, mesh.bounds, atol=1e-6)
 
 
-def test_a_single_wall_between_parts_is_dropped_from_the_looks_as_well():
+def test_a_single_wall_between_parts_is_also_dropped_from_the_visual_mesh():
     boxes = TOUCHING["boxes"].copy()
     boxes.merge_vertices()
     boxes.update_faces(boxes.unique_faces())

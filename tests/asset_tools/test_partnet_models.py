@@ -109,7 +109,7 @@ def test_paths_inside_the_model_are_found(folder, name):
         "<visual/>",
     ],
 )
-def test_a_shape_that_cannot_be_used_is_left_out_and_reported(folder, extra):
+def test_an_unusable_shape_is_skipped_and_reported(folder, extra):
     (folder / "empty.obj").write_text("v 0 0 0\n")
     (folder / "line.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
     source = read(folder, urdf(tray=mesh("cube.obj") + extra))
@@ -126,7 +126,7 @@ def test_collision_shapes_are_shown_where_there_are_no_others(folder):
     assert len(source.repairs) == 1
 
 
-def test_a_moving_link_without_a_mesh_can_be_held(folder):
+def test_a_moving_link_without_a_mesh_can_be_fixed(folder):
     empty = f"""<link name="ghost"/><joint name="spin" type="revolute"><parent link="tray"/><child link="ghost"/>
     {RANGE}</joint>"""
     with pytest.raises(AssetError) as raised:
@@ -142,7 +142,7 @@ ENDLESS = [("prismatic", "-inf", "inf"), ("revolute", 0, "inf"), ("revolute", 0,
 
 
 @pytest.mark.parametrize(("kind", "limits"), [(kind, limits) for kind, *limits in ENDLESS])
-def test_a_joint_without_a_finite_range_is_held_and_reported(folder, kind, limits):
+def test_a_joint_without_a_finite_range_is_fixed_and_reported(folder, kind, limits):
     text = urdf(kind=kind, joint='<limit lower="{}" upper="{}"/>'.format(*limits) if limits else "")
     source = read(folder, text)
     assert source.links == () and "slide" in source.repairs[0]
@@ -158,7 +158,7 @@ UNUSABLE = [
 
 
 @pytest.mark.parametrize("joint", UNUSABLE)
-def test_a_joint_that_cannot_be_used_is_an_error_unless_it_is_held(folder, joint):
+def test_an_invalid_joint_is_an_error_unless_it_is_fixed(folder, joint):
     text = urdf(**joint)
     with pytest.raises(AssetError) as raised:
         read(folder, text)
@@ -168,7 +168,7 @@ def test_a_joint_that_cannot_be_used_is_an_error_unless_it_is_held(folder, joint
 
 @pytest.mark.parametrize("name", ["../../evil", "/tmp/evil", "a\\b", "..", "", "x" * 300, "a\nb"])
 @pytest.mark.parametrize("element", ["link", "name"])
-def test_names_that_lead_elsewhere_are_refused_before_anything_is_written(folder, tmp_path, name, element):
+def test_names_with_paths_are_refused_before_writing(folder, tmp_path, name, element):
     (folder / "mobility.urdf").write_text(urdf(**{element: name}).replace("\n", "&#10;"), encoding="utf-8")
     (tmp_path / "model.yaml").write_text("name: chest\ncategory: cabinet\norigin_lift: 0\n")
     before = sorted(tmp_path.rglob("*"))
@@ -229,7 +229,7 @@ JOINT = '<joint name="fixed" type="fixed"><parent link="{}"/><child link="{}"/><
         f"<robot>{' ' * (17 * 2**20)}</robot>",
     ],
 )
-def test_what_is_no_model_is_one_error(folder, text):
+def test_an_invalid_model_is_one_error(folder, text):
     for name in ("cube.stl", "cube.glb"):
         (folder / name).write_bytes(b"solid\n")
     with pytest.raises(AssetError):
@@ -318,13 +318,13 @@ def test_stl_meshes_have_the_colour_of_the_urdf(folder):
     assert link.mesh.extents == pytest.approx([0.1, 0.1, 0.1]) and colors_of(link.mesh) == {(0, 255, 0)}
 
 
-def test_mimic_joints_move_on_their_own(folder):
+def test_mimic_joints_move_independently(folder):
     source = read(folder, urdf(joint=RANGE + '<mimic joint="other"/>'))
     assert len(source.links) == len(source.repairs) == 1
 
 
 @pytest.mark.parametrize("name", ["../x", "A", "", "a\n"])
-def test_names_that_are_no_folder_of_a_pack_are_refused(folder, name):
+def test_invalid_folder_names_are_refused(folder, name):
     source = read(folder, urdf())
     for change in (
         lambda: replace(source, id=name),
@@ -335,7 +335,7 @@ def test_names_that_are_no_folder_of_a_pack_are_refused(folder, name):
             change()
 
 
-def test_a_linked_folder_is_the_model_itself(folder, tmp_path):
+def test_a_linked_folder_is_read_as_the_model(folder, tmp_path):
     (folder / "mobility.urdf").write_text(urdf(tray=mesh("cube.obj")))
     (tmp_path / "alias").symlink_to(folder)
     assert read_partnet(tmp_path / "alias", ModelAnnotation.model_validate(NOTE)).id == "model"

@@ -43,7 +43,7 @@ def made_in(log):
     return log.read_text().split() if log.exists() else []
 
 
-def test_what_was_made_is_not_made_again(tmp_path):
+def test_a_finished_asset_is_not_built_again(tmp_path):
     log, kept = tmp_path / "log", tmp_path / "kept"
     write_pack(jobs(log, a="1" * 64, b="2" * 64), tmp_path / "first", kept)
     results = write_pack(jobs(log, a="1" * 64, b="3" * 64), tmp_path / "second", kept)
@@ -55,7 +55,7 @@ def test_what_was_made_is_not_made_again(tmp_path):
     assert not (tmp_path / "second" / "a" / "asset.json").exists()
 
 
-def test_a_kept_asset_that_was_damaged_is_made_again(tmp_path):
+def test_a_damaged_cached_asset_is_built_again(tmp_path):
     log, kept = tmp_path / "log", tmp_path / "kept"
     write_pack(jobs(log, a="1" * 64), tmp_path / "pack", kept)
     (hulls,) = kept.glob(f"*/{HULLS}")
@@ -65,7 +65,7 @@ def test_a_kept_asset_that_was_damaged_is_made_again(tmp_path):
     load_pack(tmp_path / "pack")
 
 
-def test_hulls_that_the_engine_would_shrink_make_no_pack(tmp_path):
+def test_hulls_that_the_engine_shrinks_stop_the_build(tmp_path):
     log = tmp_path / "log"
     todo = [*jobs(log, cube="1" * 64), AssetJob("ball", partial(make, "ball", log=log, hull=BALL), "2" * 64)]
     with pytest.raises(AssetError, match=r"ball: hull 0 shrinks by \d+\.\d mm on a GPU"):
@@ -79,7 +79,7 @@ def test_hulls_that_the_engine_would_shrink_make_no_pack(tmp_path):
     assert load_pack(tmp_path / "pack").furniture.keys() == {"cube"}
 
 
-def test_a_failure_names_the_asset_leaves_no_pack_and_loses_nothing(tmp_path):
+def test_a_failure_names_the_asset_and_keeps_finished_assets(tmp_path):
     log, kept = tmp_path / "log", tmp_path / "kept"
     bad = AssetJob("bad", partial(make, "bad", log=log, fail="it has no faces"), "9" * 64)
     todo = [*jobs(log, a="1" * 64), bad]
@@ -95,7 +95,7 @@ def test_a_failure_names_the_asset_leaves_no_pack_and_loses_nothing(tmp_path):
         write_pack([bad], tmp_path / "none", kept, skip_errors=True)
 
 
-def test_content_counts_files_settings_and_code(tmp_path):
+def test_content_hash_depends_on_files_settings_and_code(tmp_path):
     path = tmp_path / "mesh.obj"
     path.write_text("v 0 0 0")
     first = content_hash("m", files=[path])
@@ -114,7 +114,7 @@ def die(folder):
     os._exit(9)
 
 
-def test_whatever_goes_wrong_is_said_of_the_asset_and_costs_no_other(tmp_path):
+def test_any_error_names_its_asset_and_affects_no_other(tmp_path):
     log = tmp_path / "log"
     todo = [AssetJob("odd", trip, "7" * 64), AssetJob("deadly", die, "8" * 64), *jobs(log, a="1" * 64, b="2" * 64)]
     results = write_pack(todo, tmp_path / "pack", tmp_path / "kept", skip_errors=True, processes=2)
@@ -124,7 +124,7 @@ def test_whatever_goes_wrong_is_said_of_the_asset_and_costs_no_other(tmp_path):
     assert load_pack(tmp_path / "pack").furniture.keys() == {"a", "b"}
 
 
-def test_what_is_no_pack_is_not_replaced(tmp_path):
+def test_a_folder_that_is_not_a_pack_is_not_replaced(tmp_path):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter").write_text("1")
     todo = jobs(tmp_path / "log", a="1" * 64)
@@ -152,7 +152,7 @@ if __name__ == "__main__":
 
 
 def workers_of(script):
-    """Processes of the session that the script began, by /proc."""
+    """Return the processes of the script's session from /proc."""
     found = []
     for path in Path("/proc").glob("[0-9]*/environ"):
         with contextlib.suppress(OSError):
@@ -160,7 +160,7 @@ def workers_of(script):
     return found
 
 
-def test_a_killed_run_goes_on_where_it_stopped(tmp_path):
+def test_a_killed_run_continues_where_it_stopped(tmp_path):
     script = tmp_path / "run.py"
     script.write_text(SCRIPT.format(tests=[os.path.dirname(__file__), str(SUPPORT)], root=str(tmp_path)))
     quick = {**os.environ, "ROBOCAS_TEST_RUN": str(script)}
@@ -168,7 +168,7 @@ def test_a_killed_run_goes_on_where_it_stopped(tmp_path):
     while len(list((tmp_path / "kept").glob("asset_*/asset.json"))) < 3:
         time.sleep(0.02)
         assert run.poll() is None
-    run.kill()  # the parent alone: its workers must not go on without it
+    run.kill()  # the parent alone: its workers must end too
     run.wait()
     deadline = time.monotonic() + 5
     while workers_of(script) and time.monotonic() < deadline:
@@ -183,7 +183,7 @@ def test_a_killed_run_goes_on_where_it_stopped(tmp_path):
     assert len(json.loads((tmp_path / "pack" / "made_from.json").read_text())["content"]) == 8
 
 
-def test_content_counts_code_and_yaml(tmp_path, monkeypatch):
+def test_content_hash_depends_on_code_and_yaml(tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "__file__", str(tmp_path / "pipeline.py"))
     for folder in ("quality", "readers", "products"):
         (tmp_path / folder).mkdir()
@@ -196,7 +196,7 @@ def test_content_counts_code_and_yaml(tmp_path, monkeypatch):
     assert len(set(found)) == 3 and found[2] == found[3]
 
 
-def test_assets_not_asked_for_in_months_are_forgotten(tmp_path):
+def test_unused_cached_assets_are_deleted_after_months(tmp_path):
     log, kept = tmp_path / "log", tmp_path / "kept"
     (tmp_path / "one").mkdir()
     list(make_assets(jobs(log, a="1" * 64), tmp_path / "one", kept))

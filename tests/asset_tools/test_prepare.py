@@ -60,7 +60,7 @@ def test_axis_and_unit_can_be_given(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["alphabet_soup", "ketchup", "orange_juice", "salad_dressing"])
-def test_what_stands_in_life_stands_here(shared_dir, name):
+def test_objects_that_stand_in_reality_stand_in_the_simulation(shared_dir, name):
     scan = prepare_scan(shared_dir / "scans" / "hope" / name, unit="cm")
     found = decompose(scan.closed)
     assert found.volume_iou >= 0.9
@@ -75,14 +75,14 @@ QUARTER = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
     "body",
     [
         carton(0.0),
-        carton(-0.003),  # hollowed: it stands on its edges
+        carton(-0.003),  # hollowed: supported by its edges
         trimesh.creation.icosphere(4, 0.04),
         trimesh.creation.capsule(0.1, 0.02),
         trimesh.creation.cylinder(0.03, 0.1, sections=64, transform=QUARTER),
     ],
     ids=["flat", "hollow", "ball", "capsule", "lying"],
 )
-def test_other_bases_stay(body):
+def test_other_bases_are_not_flattened(body):
     repairs: list[str] = []
     mesh, closed = level_base(body.copy(), body, repairs)
     assert repairs == []

@@ -46,13 +46,13 @@ def test_a_shell_becomes_solid(can):
 
 
 @pytest.mark.slow
-def test_a_sieve_is_meshed_anew(can):
+def test_a_sieve_is_remeshed(can):
     volume = can.volume
     can.update_faces(np.random.default_rng(0).random(len(can.faces)) > 0.08)
     assert closed_volume(can, "remeshed") == pytest.approx(volume, rel=0.02)
 
 
-def test_what_encloses_nothing_is_an_error():
+def test_a_mesh_without_volume_is_an_error():
     confetti = np.random.default_rng(0).random((300, 3))
     cap = trimesh.creation.icosphere(3)
     cap.update_faces(cap.triangles_center[:, 2] > 0.7)
@@ -87,7 +87,7 @@ def test_boxes_that_share_parts_of_faces_and_edges_keep_both_volumes(upright, sc
 
 
 def test_bodies_that_overlap_count_once(can):
-    box = trimesh.creation.box([0.02, 0.02, 0.02])  # lies with half of itself on the lid
+    box = trimesh.creation.box([0.02, 0.02, 0.02])  # half of it is on the lid
     box.apply_translation([0, 0, HEIGHT / 2])
     assert closed_volume(trimesh.util.concatenate([can, box]), "") == pytest.approx(can.volume + 4e-6, rel=1e-4)
 

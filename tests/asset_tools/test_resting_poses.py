@@ -92,7 +92,7 @@ def test_cylinder_stands_both_ways_and_lies() -> None:
     assert up[result.display_pose] > 0.999
 
 
-def test_the_same_answer_twice_and_the_engine_as_before() -> None:
+def test_resting_poses_are_deterministic_and_restore_the_engine_settings() -> None:
     physx.set_shape_config(contact_offset=0.0123, rest_offset=0.0)
     mesh = trimesh.creation.icosphere(subdivisions=1, radius=0.03)
     one, two = solid(mesh), solid(mesh)
@@ -148,7 +148,7 @@ def test_box_with_its_weight_at_one_end_never_stands_on_a_slanted_far_end() -> N
     assert downs[0] @ [-1, 0, 0] == pytest.approx(1, abs=1e-4)
 
 
-def test_weight_far_from_the_middle_is_felt() -> None:
+def test_an_eccentric_centre_of_mass_changes_the_poses() -> None:
     points = box_points(0.05, 0.05, 0.05)
     low = resting_poses(body(points, mass=0.1, center=(0, 0, -0.02)))
     assert low.display_pose == 0
@@ -164,7 +164,7 @@ def test_ball_gets_a_pose_that_stays() -> None:
     np.testing.assert_allclose(result.poses[:, 2, 3], 0.035, atol=1.5e-3)
 
 
-def test_two_pieces_stand_on_both() -> None:
+def test_an_object_of_two_pieces_stands_on_both() -> None:
     # A table of two legs: the convex hull bridges the gap, the pieces carry the weight
     legs = [box_points(0.02, 0.06, 0.05) + [side * 0.05, 0, 0] for side in (-1, 1)]
     result = resting_poses(body(*legs, mass=0.2, inertia=(1e-4, 6e-4, 6e-4)))

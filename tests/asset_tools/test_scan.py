@@ -17,7 +17,7 @@ def test_units_are_guessed_from_sizes(longest, unit):
     assert guess_unit(longest) == unit
 
 
-def test_sizes_of_no_unit():
+def test_sizes_that_fit_no_unit_are_an_error():
     with pytest.raises(AssetError, match=r"found 1e\+06 units\)\. Pass --units"):
         guess_unit([1e6])
 
@@ -62,7 +62,7 @@ def test_any_axis_can_be_turned_up(up):
 
 
 def test_a_bottle_in_millimetres_among_boxes_in_centimetres():
-    """149 mm would be 1.49 m, which a hand could still pick up, but no such thing lies among boxes of 10 cm."""
+    """149 mm would be 1.49 m: plausible alone, but not next to boxes of 10 cm."""
     sides = {"butter": 10.3, "cheese": 10.4, "dressing": 14.7, "ketchup": 148.6}
     assert guess_units(sides) == {"butter": "cm", "cheese": "cm", "dressing": "cm", "ketchup": "mm"}
     assert guess_units({**sides, "ketchup": 60.0})["ketchup"] == "cm"  # a long thing of 60 cm

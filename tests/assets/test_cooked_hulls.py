@@ -13,7 +13,7 @@ def box(*size):
 
 
 def prism(sides, radius=0.05, length=0.1):
-    """A regular one along z: two rings of corners, and one face a side besides the two ends."""
+    """A regular prism along z: two rings of corners, one face per side and two ends."""
     angles = np.arange(sides) * 2 * np.pi / sides
     ring = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return np.concatenate([np.column_stack([ring, np.full(sides, z)]) for z in (0, length)])
@@ -24,7 +24,7 @@ def written(folder, hulls):
     write_hulls(folder / "hulls.obj", hulls)
 
 
-def test_hulls_that_a_gpu_would_cut_down_or_leave_out_are_named(tmp_path):
+def test_hulls_that_a_gpu_shrinks_or_rejects_are_reported(tmp_path):
     # a ball of 42 corners has 80 triangles; a prism of 56 has 28 + 2 faces
     ball = 0.05 * np.asarray(trimesh.creation.icosphere(subdivisions=1).vertices)
     written(tmp_path / "ball", [box(0.1, 0.1, 0.1), ball])
@@ -42,11 +42,11 @@ def test_hulls_that_a_gpu_would_cut_down_or_leave_out_are_named(tmp_path):
     ]
 
 
-def test_what_the_engine_refuses_is_named():
+def test_a_hull_that_the_engine_rejects_is_reported():
     (cooked,) = cook_hulls([np.eye(3)])  # no body of three points
     assert cooked.shrinkage == np.inf
     assert str(HullViolation("dot", 2, "CPU", cooked)) == "dot: hull 2 cannot be built on a CPU"
 
 
-def test_hulls_of_the_builtin_pack_are_cooked_as_they_are():
+def test_hulls_of_the_builtin_pack_do_not_shrink():
     assert find_hull_violations(builtin_packs_dir() / "builtin") == []

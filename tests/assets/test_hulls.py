@@ -28,7 +28,7 @@ def test_hulls_survive_writing_and_reading(tmp_path):
     assert volume == pytest.approx(0.001)  # positive: the faces look outwards
 
 
-def test_points_in_a_plane_are_no_hull():
+def test_coplanar_points_are_an_error():
     with pytest.raises(AssetError, match="are coplanar"):
         convex_faces(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], dtype=float))
 
@@ -46,11 +46,11 @@ def test_grid_of_a_triangle():
     assert np.all(points >= -1e-12) and np.all(points[:, 0] + points[:, 1] <= 0.01 + 1e-12)
     for corner in ([0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]):
         assert np.linalg.norm(points - corner, axis=1).min() < 1e-9
-    # The middle of the long edge lies at most half a step from a point
+    # The middle of the long edge is at most half a step from a point
     assert np.linalg.norm(points - [0.005, 0.005, 0], axis=1).min() <= 0.0025
 
 
-def test_surface_of_a_union_leaves_out_what_is_inside(tmp_path):
+def test_surface_of_a_union_has_no_inner_points(tmp_path):
     # Two cubes that overlap by half: the union is a 0.15 x 0.1 x 0.1 box
     write_hulls(tmp_path / "hulls.obj", [CUBE, CUBE + [0.05, 0, 0]])
     points = sample_surface(read_hulls(tmp_path / "hulls.obj"), 0.005)
@@ -71,7 +71,7 @@ def test_a_box_along_the_axes_is_not_turned():
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_box_is_known_however_it_is_turned_and_its_corners_ordered(seed):
+def test_find_box_for_any_orientation_and_order_of_corners(seed):
     rng = np.random.default_rng(seed)
     size, turn = rng.uniform(0.002, 1.0, 3), Rotation.random(random_state=seed).as_matrix()
     corners = np.round((CUBE / 0.1 - 0.5) * size @ turn.T + [0.3, -0.2, 0.7], 7)[rng.permutation(8)]
@@ -83,7 +83,7 @@ def test_a_box_is_known_however_it_is_turned_and_its_corners_ordered(seed):
     assert cKDTree(found).query(corners)[0].max() < 2e-6
 
 
-def test_what_is_no_box_is_none():
+def test_find_box_returns_none_for_other_shapes():
     assert find_box(CUBE[:7]) is None
     moved = CUBE.copy()
     moved[3] += [0, 0, 5e-5]  # a corner that is off by a twentieth of a millimetre

@@ -122,7 +122,7 @@ VERSION = '"schema_version":2,'
         ),
     ],
 )
-def test_damage_is_found_even_after_a_good_load(box_pack, damage, where):
+def test_damaged_files_are_found_after_a_successful_load(box_pack, damage, where):
     (box_pack / "box" / ".DS_Store").write_text("hidden ones don't count")
     load_pack(box_pack)
     damage(box_pack)
@@ -160,7 +160,7 @@ def link(name="door", parent="", inertia=(1, 1, 1), **joint):
     ],
     ids=str,
 )
-def test_furniture_that_makes_no_sense(changes):
+def test_invalid_furniture_is_refused(changes):
     furniture_asset(surfaces={"top": SURFACE}, links=(link(inertia=(0.5, 0.497, 1)),))  # moments may be rounded
     with pytest.raises(ValidationError):
         furniture_asset(**changes)
@@ -174,7 +174,7 @@ def test_furniture_that_makes_no_sense(changes):
         ({"surface_points": np.full((8, 3), np.nan)}, "surface_points"),
     ],
 )
-def test_annotations_of_wrong_shapes(changes, where):
+def test_annotations_with_invalid_shapes_are_refused(changes, where):
     with pytest.raises(AssetError) as caught:
         notes(**changes)
     assert caught.value.where == where

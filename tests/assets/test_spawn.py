@@ -71,7 +71,7 @@ def test_furniture_without_moving_parts_is_a_static_actor(scene, cabinet):
     assert isinstance(built, Actor) and built.px_body_type == "static"
 
 
-def test_hulls_are_built_as_boxes_where_they_are_boxes_and_each_in_its_place(scene, tmp_path):
+def test_box_hulls_become_boxes_at_their_poses(scene, tmp_path):
     wedge = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
     write_hulls(tmp_path / "hulls.obj", [wedge, box((0.2, 0, 0), (0.3, 0.4, 0.6)), wedge + [0.5, 0, 0]])
     first, second, third = load_shapes(BodyFiles(tmp_path), PhysxMaterial(0.5, 0.5, 0.0))

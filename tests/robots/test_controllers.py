@@ -1,4 +1,4 @@
-"""The control modes, in an empty environment; the robot stands turned by 90 deg."""
+"""The control modes, in an empty environment; the robot is rotated by 90 deg."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_a_pose_beyond_the_joint_limits_leaves_the_arm_where_it_is(make_env, mod
 
 
 @pytest.mark.parametrize("mode", ["pd_ee_pose", "pd_ee_delta_pose"])
-def test_other_joints_make_up_for_one_at_its_limit(make_env, mode):
+def test_other_joints_compensate_for_a_joint_at_its_limit(make_env, mode):
     env, agent = make_env(mode)
     now, goal = near_a_limit(agent, 7)
     action = ee_action(mode, now, goal)
@@ -183,7 +183,7 @@ def test_reset_sets_the_drive_targets_too(make_env):
     assert agent.robot.qpos[0].numpy() == pytest.approx(qpos, abs=1e-4)
 
 
-def test_held_base_stays_where_a_state_put_it(make_env):
+def test_held_base_stays_where_a_state_was_set(make_env):
     env, agent = make_env()
     action = np.array([*MOBILE_PANDA.arm_evaluation_start, 1], np.float32)
     env.step(action)

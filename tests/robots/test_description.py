@@ -13,7 +13,7 @@ from robocas_ms3.robots.quantities import Quantity
 from robocas_ms3.robots.registry import DEFAULT_ROBOT, PANDA, ROBOTS, find_robot
 
 
-def test_positions_are_where_the_slices_say():
+def test_slices_select_the_joints_of_each_part():
     joints = np.array(MOBILE_PANDA.joints)
     assert joints[MOBILE_PANDA.base_slice].tolist() == list(MOBILE_PANDA.base_joints)
     assert joints[MOBILE_PANDA.arm_slice].tolist() == list(MOBILE_PANDA.arm_joints)
@@ -22,7 +22,7 @@ def test_positions_are_where_the_slices_say():
     assert len(limits) == len(joints) == 12
 
 
-def test_grasps_are_annotated_for_a_gripper_as_wide():
+def test_grasp_annotations_fit_the_gripper_width():
     assert GRIPPER_BOXES[0, 0, 1] * 2 == MOBILE_PANDA.open_width == 0.08
 
 
@@ -30,13 +30,13 @@ def test_grasps_are_annotated_for_a_gripper_as_wide():
     ("part", "what"),
     [("arm_joints", 7), ("arm_limits", 7), ("base_joints", 3), ("finger_links", 2), ("arm_rest", 7)],
 )
-def test_another_number_of_joints_does_not_fit(part, what):
+def test_another_number_of_joints_is_an_error(part, what):
     fewer = getattr(MOBILE_PANDA, part)[:-1]
     with pytest.raises(RobocasError, match=rf"six, {part}: .* RoboCAS' format \(expected {what}, found {what - 1}\)"):
         replace(MOBILE_PANDA, uid="six", **{part: fewer})
 
 
-def test_robots_are_known_by_their_uids():
+def test_robots_are_registered_by_their_uids():
     assert DEFAULT_ROBOT == "robocas_mobile_panda"
     assert find_robot(None) is find_robot(DEFAULT_ROBOT) is PANDA
     assert {name: spec.description.uid for name, spec in ROBOTS.items()} == {name: name for name in ROBOTS}
@@ -44,14 +44,14 @@ def test_robots_are_known_by_their_uids():
         find_robot("robocas_mobile_pandas", where="here")
 
 
-def test_a_row_by_another_name_is_refused(monkeypatch):
+def test_an_entry_point_with_another_name_than_its_uid_is_refused(monkeypatch):
     monkeypatch.setitem(ROBOTS.builtin, "other", PANDA)
     with pytest.raises(ExtensionError, match="a robot by another name .expected robocas_mobile_panda, found other"):
         find_robot("other")
 
 
 @pytest.mark.parametrize("name", ["top", "Side_camera", "../side_camera", ""])
-def test_a_camera_whose_name_datasets_would_not_know(name):
+def test_an_invalid_camera_name_is_refused(name):
     with pytest.raises(ExtensionError):
         CameraSpec(name)
 

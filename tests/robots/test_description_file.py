@@ -45,7 +45,7 @@ def test_joints_between_two_links_are_in_order_from_the_root(write):
 
 
 @pytest.mark.parametrize(("root", "tip"), [("base", "none"), ("lower", "base"), ("pad", "lower")])
-def test_links_that_no_joints_connect_are_an_error(write, root, tip):
+def test_unconnected_links_are_an_error(write, root, tip):
     path = write(ARM)
     with pytest.raises(RobotDescriptionError) as caught:
         RobotXml(path).joints_between(root, tip)

@@ -25,7 +25,7 @@ def test_delta_is_applied_in_the_end_effectors_frame():
     assert q[1, 0] * q[1, 1] < 0  # 270 deg, not 90
 
 
-def test_action_of_a_motion_leads_to_that_motion():
+def test_the_action_of_a_motion_reproduces_the_motion():
     rng = np.random.default_rng(0)
     translation, rotvec = rng.uniform(-0.1, 0.1, (20, 3)), rng.uniform(-0.25, 0.25, (20, 3))
     action = to_ee_delta_action(translation, rotvec)
@@ -40,7 +40,7 @@ def test_action_of_a_motion_leads_to_that_motion():
     assert p.numpy() == pytest.approx(start.apply(translation), abs=1e-6)
 
 
-def test_euler_conventions_are_told_apart():
+def test_euler_conventions_give_different_actions():
     angles = np.array([0.3, 0.2, 0.1])
     assert to_ee_delta_action(np.zeros(3), angles, euler="XYZ")[3:] == pytest.approx(angles / 0.5)
     extrinsic = Rotation.from_euler("xyz", angles)
@@ -54,7 +54,7 @@ def test_euler_conventions_are_told_apart():
 
 
 @pytest.mark.parametrize("axis", range(6))
-def test_ee_delta_moves_along_and_turns_about_the_tcps_own_axes(make_env, axis):
+def test_ee_delta_moves_along_and_rotates_about_the_tcp_axes(make_env, axis):
     env, agent = make_env("pd_ee_delta_pose", control_freq=5)
     start = matrix(agent.tcp.pose)
     action = np.zeros(7, np.float32)
@@ -66,7 +66,7 @@ def test_ee_delta_moves_along_and_turns_about_the_tcps_own_axes(make_env, axis):
     assert np.abs(np.delete(motion, axis)).max() < 0.06
 
 
-def test_ee_deltas_add_up_without_the_arms_lag(make_env):
+def test_ee_deltas_add_up_without_tracking_errors(make_env):
     env, agent = make_env("pd_ee_delta_pose", control_freq=5)
     start = matrix(agent.tcp.pose)
     for _ in range(10):
@@ -78,7 +78,7 @@ def test_ee_deltas_add_up_without_the_arms_lag(make_env):
     assert rotation == pytest.approx([0, 0, 0.5], abs=2e-3)
 
 
-def test_ee_deltas_start_where_the_arm_is_after_it_was_held_back(make_env):
+def test_ee_deltas_start_at_the_current_pose_after_the_arm_was_blocked(make_env):
     env, agent = make_env("pd_ee_delta_pose", control_freq=5)
     elsewhere = agent.robot.qpos.clone()
     elsewhere[0, 3] += 0.3  # 0.3 rad about the first joint moves the TCP by more than 10 cm
@@ -93,7 +93,7 @@ def velocities(agent) -> np.ndarray:
     return agent.robot.drive_velocities[0].numpy()
 
 
-def test_ee_deltas_tell_the_drives_their_velocity_and_resets_and_other_modes_take_it_back(make_env):
+def test_ee_deltas_set_velocity_targets_which_resets_and_other_modes_clear(make_env):
     env, agent = make_env("pd_ee_delta_pose", control_freq=5)
     assert agent.controller.sets_target_qvel  # else a GPU would not hear of it
     env.step(np.array([0, 0, -0.3, 0, 0, 0, 1], np.float32))
@@ -106,7 +106,7 @@ def test_ee_deltas_tell_the_drives_their_velocity_and_resets_and_other_modes_tak
         assert not velocities(agent).any()
 
 
-def test_ee_deltas_start_where_the_arm_is_after_its_state_was_set(make_env):
+def test_ee_deltas_start_at_the_current_pose_after_the_state_was_set(make_env):
     env, agent = make_env("pd_ee_delta_pose", control_freq=5)
     before, start = agent.robot.qpos.clone(), matrix(agent.tcp.pose)
     for _ in range(2):

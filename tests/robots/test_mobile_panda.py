@@ -59,7 +59,7 @@ CAMERAS = {
 }
 
 
-def test_cameras_are_the_references(make_env):
+def test_cameras_match_robocas_v0(make_env):
     _, agent = make_env()
     configs = {config.uid: config for config in agent._sensor_configs}
     assert list(configs) == list(CAMERAS)
@@ -159,7 +159,7 @@ def test_gripper_holds_a_box(make_env):
     assert box.pose.p[0, 2] < 0.5  # it fell
 
 
-def test_is_static_looks_at_base_and_arm_not_at_fingers(make_env):
+def test_is_static_ignores_the_fingers(make_env):
     _, agent = make_env()
     qvel = np.zeros(12)
     qvel[10] = 1.0

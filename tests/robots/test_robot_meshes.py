@@ -36,7 +36,7 @@ def test_whole_robot_has_under_10_k_triangles():
     assert sum(triangles(trimesh.load(path, force="scene")) for path in meshes) < 10_000
 
 
-def test_boxes_are_where_they_are_told(tmp_path):
+def test_boxes_have_their_positions_and_colours(tmp_path):
     write_boxes_glb(
         tmp_path / "boxes.glb", [((0.2, 0.4, 0.6), (1, 0, 0), (1, 0, 0)), ((0.1, 0.1, 0.1), (0, 0, 2), (0, 1, 0))]
     )

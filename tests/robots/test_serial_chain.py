@@ -114,7 +114,7 @@ def test_a_target_turned_by_180_degrees_is_not_solved(kind, tmp_path):
     assert abs(float(qpos[0, 0])) > 1  # on its way
 
 
-def test_a_batch_of_tensors_is_solved_as_single_arrays_are():
+def test_a_batch_of_tensors_gives_the_solutions_of_single_arrays():
     """What a GPU computes and what a CPU does: the same configurations, and the same targets given up."""
     single, batched = SerialChain(*ARM), SerialChain(*ARM, device=torch.device("cpu"))
     goals = [nearby_goals(arrays, count=150, away=away, seed=8) for away in (0.02, 0.1, 0.2)]
@@ -144,7 +144,7 @@ class Operations(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def test_no_operation_waits_for_a_gpu():
+def test_no_operation_synchronizes_with_a_gpu():
     """Neither values are read, nor errors of linear algebra checked, nor rows counted that a mask selects."""
     arm = SerialChain(*ARM, device=torch.device("cpu"))
     goals = nearby_goals(tensors, count=5, away=0.1, seed=9)

@@ -38,7 +38,7 @@ def test_heights_above_the_floor():
     poses = link_poses(make_robot_files().urdf, REST)
     assert poses["base_link"][2, 3] == pytest.approx(0.26)
     assert poses["panda_link0"][:3, 3] == pytest.approx([0, 0, 0.49])
-    # The evaluation start holds the TCP 0.29 m above the 0.61 m table, which is why the base link stands 0.26 m high.
+    # The evaluation start has the TCP 0.29 m above the 0.61 m table, which determines the base link's height of 0.26 m.
     assert link_poses(make_robot_files().urdf, EVALUATION)["panda_hand_tcp"][2, 3] - 0.61 == pytest.approx(
         0.287, abs=2e-3
     )
@@ -125,7 +125,7 @@ def test_files_are_made_once_and_again_when_damaged(tmp_path, monkeypatch):
         assert (files.folder / path.get("filename")).is_file()
 
 
-def test_two_processes_at_once(tmp_path):
+def test_two_processes_generate_the_files_once(tmp_path):
     code = "from robocas_ms3.robots.urdf import robot_files; print(robot_files().urdf)"
     both = [python(code, ROBOCAS_CACHE=str(tmp_path)) for _ in range(2)]
     first, second = (output(process) for process in both)
@@ -134,7 +134,7 @@ def test_two_processes_at_once(tmp_path):
     assert len(list((tmp_path / "robots").iterdir())) == 1
 
 
-def test_a_cache_that_cannot_be_written(tmp_path, monkeypatch):
+def test_an_unwritable_cache_is_an_error(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "file"))
     with pytest.raises(RobocasError) as caught:
@@ -143,7 +143,7 @@ def test_a_cache_that_cannot_be_written(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("urdf", [None, "<robot/>", '<robot><joint name="panda_hand_tcp_joint"/></robot>'])
-def test_a_mani_skill_without_the_panda_that_is_expected(tmp_path, monkeypatch, urdf):
+def test_mani_skill_without_the_panda_is_an_error(tmp_path, monkeypatch, urdf):
     monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "cache"))
     spec = ModuleSpec("mani_skill", None, is_package=True)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: spec if urdf else None)
@@ -167,6 +167,6 @@ def test_imports_write_nothing_and_the_urdf_needs_no_sapien(tmp_path):
     assert not cache.exists()
 
 
-def test_the_package_holds_no_meshes():
+def test_the_package_contains_no_meshes():
     folder = Path(robocas_ms3.robots.__file__).parent
     assert {path.suffix for path in folder.rglob("*") if path.is_file()} <= {".py", ".pyc"}

@@ -41,7 +41,7 @@ def test_whole_numbers_lists_and_defaults(tmp_path):
         (CARTON, "box: ["),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path, right, wrong):
+def test_invalid_values_are_named(tmp_path, right, wrong):
     (tmp_path / "boxes.yaml").write_text(CARTON.replace(right, wrong))
     with pytest.raises(AssetError) as error:
         load_products(tmp_path)

@@ -104,7 +104,7 @@ def test_pieces_fill_the_shape(spec):
     closed, pieces = shape.closed(), list(shape.pieces)
     assert 1 <= len(pieces) <= (24 if toy else 13 if spec.hollow else 8)
     assert max(map(len, pieces)) <= 48 and max(map(count_flat_faces, pieces)) <= GPU_LIMIT
-    if not (toy and spec.hollow):  # of thin walls a tenth of a millimetre is a share of its own
+    if not (toy and spec.hollow):  # for thin walls 0.1 mm is a large fraction
         assert volume_iou(closed, pieces) >= (0.75 if spec.hollow else 0.88 if toy else 0.9)
     if toy:
         points = trimesh.sample.sample_surface(closed, 4000, seed=0)[0]
@@ -114,7 +114,7 @@ def test_pieces_fill_the_shape(spec):
 
 @each_toy
 def test_stands(spec):
-    """What touches level ground lies around the centre of mass; a ball and what lies along its length may roll."""
+    """Ground contacts surround the centre of mass, except for balls and objects that lie along their length."""
     closed = shape_of(spec.id).closed()
     low = closed.vertices[closed.vertices[:, 2] < closed.bounds[0, 2] + 1.5e-3]
     foot = MultiPoint(low[:, :2]).convex_hull.buffer(2e-3)

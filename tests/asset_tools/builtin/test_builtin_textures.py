@@ -85,7 +85,7 @@ def differences(first, second):
     return colours, np.abs(first[1] - second[1]).sum() / max(first[1].sum(), second[1].sum())
 
 
-def test_no_two_look_alike():
+def test_all_objects_look_different():
     """Any two differ by far more than one apple does from the next, which of all things here vary the most."""
     same_kind = differences(look("apple"), look("apple", seed=1))[0]
     assert 0.05 < same_kind < 0.2

@@ -9,7 +9,7 @@ UPSTREAM = [1, 2, 3, 4, 5, 7, 8, 9, 10, 12, 13, 14, 15, 16, 17, 20, 21, 24, 25, 
 UPSTREAM += [42, 44, 47, 51, 52, 53, 54, 57, 58, 59, 61, 62, 63, 64, 65, 66, 71]
 
 
-def test_the_46_are_there_with_ids_of_their_own():
+def test_the_46_objects_have_unique_ids():
     assert list(ENTRIES) == UPSTREAM
     assert len({entry.id for entry in ENTRIES.values()}) == 46
     for number, entry in ENTRIES.items():
@@ -18,7 +18,7 @@ def test_the_46_are_there_with_ids_of_their_own():
         assert 0.02 <= entry.mass <= 0.9
 
 
-def test_others_are_called_by_their_number():
+def test_other_objects_are_named_by_their_number():
     assert catalogue_entry(2).id == "tomato_soup_can"
     assert catalogue_entry(2).folder == "002"
     assert catalogue_entry(6).id == "graspnet_006"

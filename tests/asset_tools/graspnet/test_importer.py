@@ -58,7 +58,7 @@ def test_a_model_without_labels(tmp_path):
     assert "GraspNet" in source.attribution
 
 
-def test_what_is_missing_is_named_at_once(tmp_path):
+def test_missing_models_are_named_before_the_import(tmp_path):
     write_models(tmp_path, [1, 3])
     with pytest.raises(AssetError, match="numbers 2, 4"):
         graspnet_jobs(tmp_path, [4, 1, 2])
@@ -104,7 +104,7 @@ def test_a_banana_with_labels(labelled_banana):
     assert source.grasps.qualities[:fit] == pytest.approx(np.full(fit, 0.2), abs=1e-6)
 
 
-def test_enough_labels_are_all_there_is(tmp_path):
+def test_enough_labels_need_no_sampled_grasps(tmp_path):
     write_models(tmp_path, [1])
     plain = graspnet_source(tmp_path, 1)
     grasps = sample_grasps(plain.closed, plain.closed.center_mass, np.random.default_rng(0), count=90)

@@ -14,7 +14,7 @@ RNG = np.random.default_rng(0)
 
 
 def arrays(points=1, dtype=np.float32):
-    """Labels of which none is of any use."""
+    """Labels without a usable grasp."""
     shape = (points, 300, 12, 4)
     return {
         "points": np.zeros((points, 3), dtype),
@@ -45,7 +45,7 @@ def test_views_are_the_fibonacci_lattice():
 
 
 @pytest.mark.parametrize("quarters", [0, 1])
-def test_a_grasp_worked_out_by_hand(tmp_path, quarters):
+def test_a_grasp_with_known_pose(tmp_path, quarters):
     # View 150 has z = 301 / 300 - 1 = 1 / 300 and goes 150 * 0.618033989 = 92.7050983 turns around: 253.8354 deg.
     # So the view is (-0.278396, -0.960460, 0.003333) and the approach (0.278396, 0.960460, -0.003333).
     # At angle 0 the closing axis is level: (-ay, ax, 0) / 0.999994 = (-0.960465, 0.278398, 0).
@@ -53,7 +53,7 @@ def test_a_grasp_worked_out_by_hand(tmp_path, quarters):
     approach = [0.278396, 0.960460, -0.003333]
     closing = [[-0.960465, 0.278398, 0.0], [0.000928, 0.003202, 0.999994]][quarters]
     label = (quarters * np.pi / 2, 0.02, 0.05, 0.2, False)
-    # on the side of the box that looks to -y
+    # on the side of the box at -y
     path = write(tmp_path / "000_labels.npz", [((0, 150, 3 * quarters, 1), label)], at=(0.01, -0.05, 0.02))
 
     pose = tcp_poses(read_labels(path, RNG))[0]
@@ -66,7 +66,7 @@ def test_a_grasp_worked_out_by_hand(tmp_path, quarters):
 
 def test_the_closing_axis_crosses_the_box_from_side_to_side(tmp_path):
     # From above at the middle of the top. At angle 0 the closing axis is (-ay, ax, 0) = (vy, -vx, 0); seen from above a
-    # positive angle about an approach that looks down turns it clockwise, so its azimuth itself brings it to +x.
+    # positive angle about a downward approach is clockwise, so its azimuth itself rotates it to +x.
     view = view_directions()[TOP_VIEW]
     azimuth = np.arctan2(-view[0], view[1])
     labels = [((0, TOP_VIEW, i, 2), (azimuth + i * np.pi / 2, 0.03, 0.06, 0.1, False)) for i in (0, 1)]
@@ -107,7 +107,7 @@ def test_only_good_labels_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("dtype", "save"), [(np.float16, np.savez_compressed), (np.float32, np.savez), (np.float64, np.savez_compressed)]
 )
-def test_slices_leave_nothing_out(tmp_path, monkeypatch, dtype, save):
+def test_slices_contain_all_labels(tmp_path, monkeypatch, dtype, save):
     monkeypatch.setattr("asset_tools.graspnet.labels.SLICE_BYTES", 1)  # one point at a time
     rng = np.random.default_rng(1)
     data = arrays(points=3, dtype=dtype)
@@ -167,7 +167,7 @@ def test_a_damaged_file_is_one_error_that_names_it(tmp_path, damage, words):
     assert "000_labels.npz" in str(error.value)
 
 
-def test_checksums_tell_label_files_apart(tmp_path):
+def test_checksums_differ_for_different_label_files(tmp_path):
     one = label_checksums(write(tmp_path / "one.npz"))
     assert label_checksums(write(tmp_path / "same.npz")) == one
     other = label_checksums(write(tmp_path / "other.npz", [((0, 0, 0, 0), (0, 0.01, 0.05, 0.3, False))]))

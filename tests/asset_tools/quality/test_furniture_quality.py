@@ -74,7 +74,7 @@ def cabinet(**changes):
     return replace(source, **changes)
 
 
-def test_a_sound_cabinet_opens_and_holds():
+def test_a_good_cabinet_has_working_joints_and_surfaces():
     quality = measure_furniture(cabinet())
     assert (quality.joints_open, quality.surfaces_hold) == (1.0, 1.0)
     assert (quality.hull_count, quality.hull_vertices) == (10, 8)
@@ -106,7 +106,7 @@ def test_a_drawer_buried_in_solid_wood_is_found_to_be_jammed():
 
 @pytest.mark.parametrize(("reach", "works"), [(0.0015, True), (0.003, False)])
 def test_a_part_may_reach_two_millimetres_into_another(reach, works):
-    # a stop beside the drawer's way that it meets halfway
+    # a stop next to the drawer's path that it hits halfway
     stop = box((0.2, 0.1 - reach, 0.1), (0.22, 0.14, 0.2))
     found = examine_furniture(cabinet(pieces=[*cabinet().pieces, stop], links=(drawer("drawer", 0.0),), handles={}))
     assert found.joints["drawer_joint"].overlap == pytest.approx(reach)
@@ -121,7 +121,7 @@ def test_a_part_may_reach_two_millimetres_into_another(reach, works):
         ((0.17, 0.15, 0.45), np.inf),  # within the door, which is wider than the hand
     ],
 )
-def test_a_handle_that_holds_nothing_does_not_work(position, distance):
+def test_a_handle_without_a_part_does_not_work(position, distance):
     found = examine_furniture(cabinet(handles=grip(position))).joints["hinge"]
     assert found.grip == pytest.approx(distance)
     assert not found.works

@@ -45,7 +45,7 @@ def annotate(mesh, solid, count=60):
     )
 
 
-def test_a_block_passes_all(block):
+def test_a_block_meets_all_requirements(block):
     mesh, solid = trimesh.creation.box((0.05, 0.08, 0.12)), block(0.05, 0.08, 0.12)
     notes = annotate(mesh, solid)
     quality = measure_object(mesh, solid, notes)
@@ -105,7 +105,7 @@ def test_medians_of_the_pack():
     assert check_objects({}) == []
 
 
-def test_what_the_manifest_says_is_compared():
+def test_the_manifest_is_compared_with_measurements():
     def loaded(grasps):
         notes = SimpleNamespace(grasp_widths=np.zeros(grasps))
         return cast(LoadedObject, SimpleNamespace(asset=object_asset(), annotations=notes))
@@ -119,8 +119,8 @@ def test_what_the_manifest_says_is_compared():
     ]
 
 
-def test_a_drop_that_moves_on_is_jitter_unless_it_rolls(block):
-    """Only a drop that rolls evenly may move after two seconds: one that isn't at rest counts as well."""
+def test_a_moving_drop_counts_as_jitter_unless_it_rolls(block):
+    """Only a uniformly rolling drop may move after 2 s; a drop that is not at rest counts too."""
     mesh, solid = trimesh.creation.box((0.05, 0.08, 0.12)), block(0.05, 0.08, 0.12)
     notes = annotate(mesh, solid, count=2)
     with pytest.MonkeyPatch.context() as patch:

@@ -60,10 +60,10 @@ def test_a_can_may_roll_but_not_rock():
     assert report.good.mean() >= 0.9
     assert report.rolling.any()
     assert not report.rolling[report.matches == 0].any()
-    assert drop_test(solid, standing(0.05)[None]).good.mean() < 0.6  # what lies is in no listed pose then
+    assert drop_test(solid, standing(0.05)[None]).good.mean() < 0.6  # lying is not a listed pose
 
 
-def test_what_trembles_is_never_at_rest(block, monkeypatch):
+def test_a_trembling_object_is_never_at_rest(block, monkeypatch):
     solid = block(0.05, 0.08, 0.12)
     energy = drops._energy
     calls = iter(range(10**6))
@@ -74,7 +74,7 @@ def test_what_trembles_is_never_at_rest(block, monkeypatch):
     assert report.jitters.min() >= 1e-3
 
 
-def test_the_same_again_and_the_engine_left_as_it_was(block):
+def test_drops_are_deterministic_and_restore_the_engine_settings(block):
     solid = block(0.05, 0.08, 0.12)
     physx.set_shape_config(contact_offset=0.0123)
     try:

@@ -13,7 +13,7 @@ def grasps(*places):
 CENTRE = (0, 0, 0)
 
 
-def test_a_grasp_beside_the_object_holds_nothing(block):
+def test_a_grasp_next_to_the_object_does_not_hold(block):
     # 5 cm beyond its edge, and 5 cm above it, in front of the tips
     found = hold_test(block(0.05, 0.05, 0.05), grasps((0.075, 0, 0), (0, 0, -0.075), CENTRE))
     assert found.tolist() == [False, False, True]
@@ -32,7 +32,7 @@ def test_a_long_bar_held_by_its_end_turns(block):
     assert hold_test(bar, grasps(CENTRE, (0.12, 0, 0))).tolist() == [True, False]
 
 
-def test_each_grasp_is_for_itself(block):
+def test_grasps_are_tested_independently(block):
     solid, both = block(0.06, 0.05, 0.05), grasps(CENTRE, (0.02, 0, 0.01), (0.09, 0, 0), (-0.02, 0, 0))
     together = hold_test(solid, both)
     assert together.tolist() == [hold_test(solid, grasp[None])[0] for grasp in both]

@@ -31,13 +31,13 @@ def test_distance_to_a_hull_that_is_larger_all_round():
 
 
 def test_distance_is_taken_both_ways():
-    # All of the body lies on the hulls, but a fifth of their surface is a lump 3 cm off that the body doesn't have.
+    # The body is covered by the hulls, but a fifth of their surface is a lump at 3 cm that the body does not have.
     body = box((0.1, 0.1, 0.1))
     lump = box((0.05, 0.05, 0.05), at=(0, 0, 0.11))
     assert hull_quality(body, [vertices(body), vertices(lump)]).surface_p95 == pytest.approx(0.08, abs=0.012)
 
 
-def test_what_is_thin():
+def test_thin_objects_are_not_compact():
     assert mean_thickness(box((0.1, 0.1, 0.1))) == pytest.approx(0.1 / 3)  # 2 a^3 / 6 a^2
     assert mean_thickness(box((10, 10, 0.006))) == pytest.approx(0.006, rel=1e-2)
     plate = box((0.1, 0.1, 0.006))

@@ -48,7 +48,7 @@ def test_the_textured_version_is_taken_and_others_are_reported(tmp_path, used, o
     assert all(f"ignored {name}" in notes_of(model) for name in others)
 
 
-def test_a_version_that_cannot_be_read_is_left_out(tmp_path):
+def test_an_unreadable_version_is_ignored(tmp_path):
     write_obj(tmp_path, "mug", mug())
     (tmp_path / "mug.ply").write_bytes(b"ply\nnonsense")
     model = read_model(tmp_path)
@@ -75,7 +75,7 @@ def test_a_part_inside_the_box_of_another_is_joined(tmp_path):
     assert read_model(tmp_path).mesh.volume == pytest.approx(cabinet.volume + np.pi * 0.045**2 * 0.02, rel=0.02)
 
 
-def test_what_another_file_shows_is_left_out(tmp_path):
+def test_a_part_contained_in_another_file_is_ignored(tmp_path):
     both = trimesh.util.concatenate([mug(), box((0.03, 0.01, 0.06), (0.056, 0, 0))])
     both.export(tmp_path / "whole.ply")
     mug().export(tmp_path / "body.ply")

@@ -107,7 +107,7 @@ def test_second_set_of_texture_coordinates(tmp_path):
     check(gltf, tmp_path, (255, 255, 255), warns=1)
 
 
-def test_what_is_left_out_is_a_warning_each(tmp_path):
+def test_ignored_features_give_one_warning_each(tmp_path):
     gltf, texture = with_uvs(0.625)
     gltf.tree["materials"][0] |= {
         "normalTexture": texture,

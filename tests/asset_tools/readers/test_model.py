@@ -76,7 +76,7 @@ def test_values_that_are_not_finite(tmp_path):
     assert (shown_colors(model.mesh) == 255).all() and any(note.startswith("warning:") for note in model.notes)
 
 
-def test_the_axis_that_a_format_says_is_up(tmp_path):
+def test_the_up_axis_of_a_format(tmp_path):
     assert read_model(Gltf().write(tmp_path / "a.glb")).up == "y"
     assert read_model(write_obj(tmp_path)).up is None
 
@@ -117,7 +117,7 @@ def test_textures_of_all_modes_and_depths(tmp_path, image, color):
     assert (shown_colors(read_model(path).mesh) == color).all()
 
 
-def test_several_textures_of_the_name_that_is_searched_are_a_warning(tmp_path):
+def test_several_textures_with_the_searched_name_give_a_warning(tmp_path):
     for name in ("a", "b"):
         image_file(tmp_path / name / "skin.png")
     write_obj(tmp_path, color=None)

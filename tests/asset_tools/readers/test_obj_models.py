@@ -77,7 +77,7 @@ def test_the_only_material_file_is_not_taken_if_it_lacks_a_material(tmp_path):
         ("newmtl skin\nmap_Kd skin.png\n", {"uvs": False}, True),
     ],
 )
-def test_what_has_no_texture_is_white(tmp_path, mtl, text, warns):
+def test_faces_without_a_texture_are_white(tmp_path, mtl, text, warns):
     path = write_obj(tmp_path, mtl=mtl, **text)
     image_file(tmp_path / "other.png", GREEN)
     model = read_model(path)
