@@ -32,7 +32,9 @@ def test_grasp_annotations_fit_the_gripper_width():
 )
 def test_another_number_of_joints_is_an_error(part, what):
     fewer = getattr(MOBILE_PANDA, part)[:-1]
-    with pytest.raises(RobocasError, match=rf"six, {part}: .* RoboCAS' format \(expected {what}, found {what - 1}\)"):
+    with pytest.raises(
+        RobocasError, match=rf"six, {part}: unsupported number of joints \(expected {what}, found {what - 1}\)"
+    ):
         replace(MOBILE_PANDA, uid="six", **{part: fewer})
 
 
@@ -46,7 +48,8 @@ def test_robots_are_registered_by_their_uids():
 
 def test_an_entry_point_with_another_name_than_its_uid_is_refused(monkeypatch):
     monkeypatch.setitem(ROBOTS.builtin, "other", PANDA)
-    with pytest.raises(ExtensionError, match="a robot by another name .expected robocas_mobile_panda, found other"):
+    message = "name differs from the robot's uid .expected robocas_mobile_panda, found other"
+    with pytest.raises(ExtensionError, match=message):
         find_robot("other")
 
 
@@ -58,4 +61,4 @@ def test_an_invalid_camera_name_is_refused(name):
 
 def test_an_optional_quantity_has_no_lerobot_feature():
     with pytest.raises(ValueError):
-        Quantity("gap", "float32", ("T", 1), "m", "between the pads", feature="observation.gap", optional=True)
+        Quantity("gap", "float32", ("T", 1), "m", "between the pads", lerobot_feature="observation.gap", optional=True)

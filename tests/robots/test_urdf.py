@@ -126,7 +126,7 @@ def test_files_are_made_once_and_again_when_damaged(tmp_path, monkeypatch):
 
 
 def test_two_processes_generate_the_files_once(tmp_path):
-    code = "from robocas_ms3.robots.urdf import robot_files; print(robot_files().urdf)"
+    code = "from robocas_ms3.robots.urdf import make_robot_files; print(make_robot_files().urdf)"
     both = [python(code, ROBOCAS_CACHE=str(tmp_path)) for _ in range(2)]
     first, second = (output(process) for process in both)
     assert first == second
