@@ -28,7 +28,7 @@ from typing import Annotated, Any
 
 import torch
 import tyro
-from convert_memory import repeated
+from convert_memory import repeat_recordings
 
 from robocas_ms3.datasets import ConversionSettings, ImageOptions, convert, convert_lerobot
 from robocas_ms3.datasets.conversion.env_renderer import EnvRenderer
@@ -50,7 +50,7 @@ class Benchmark:
     trajectory: Annotated[Path | None, tyro.conf.Positional] = None
     """File F.h5, next to F.json. Default: pick demonstrations, which are generated first."""
     episodes: int = 2
-    """Number of successful recordings; a file with fewer is repeated."""
+    """Number of successful recordings; a file with fewer is repeat_recordings."""
     turns: int = 3
     """Number of rounds of the bare loop and of each case."""
     cases: tuple[str, ...] = tuple(CASES)
@@ -70,11 +70,11 @@ def main(cfg: Benchmark) -> None:
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         source = cfg.trajectory or generated(work / "demos", cfg.episodes)
-        trajectory = repeated(source, cfg.episodes, work / "trajectory.h5")
+        trajectory = repeat_recordings(source, cfg.episodes, work / "trajectory.h5")
         report: dict[str, Any] = {"cores": os.cpu_count(), "load": os.getloadavg()[1], "size": cfg.size}
         report |= measure_cases(cfg, trajectory, work)
         if cfg.jobs > 1:
-            more = repeated(source, cfg.jobs_episodes, work / "more.h5")
+            more = repeat_recordings(source, cfg.jobs_episodes, work / "more.h5")
             walls: dict[int, list[float]] = {1: [], cfg.jobs: []}
             for _ in range(cfg.turns):
                 for jobs, spent in walls.items():
