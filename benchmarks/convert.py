@@ -50,7 +50,7 @@ class Benchmark:
     trajectory: Annotated[Path | None, tyro.conf.Positional] = None
     """File F.h5, next to F.json. Default: pick demonstrations, which are generated first."""
     episodes: int = 2
-    """Number of successful recordings; a file with fewer is repeat_recordings."""
+    """Number of successful recordings; a file with fewer is repeated."""
     turns: int = 3
     """Number of rounds of the bare loop and of each case."""
     cases: tuple[str, ...] = tuple(CASES)
