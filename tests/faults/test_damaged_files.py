@@ -125,7 +125,7 @@ def test_facts_and_checkpoints_of_a_run(tmp_path):
     root = shutil.copytree(BUNDLED / "small", tmp_path / "run")
     whole = json.loads((root / "run.json").read_text())
     facts = whole["facts"]
-    for changes in ({"chunk": {**facts["chunk"], "mean": "x"}}, {"heights": []}, {"images": {"base_camera": [1]}}):
+    for changes in ({"chunk": {**facts["chunk"], "mean": "x"}}, {"heights": []}, {"image_sizes": {"base_camera": [1]}}):
         (root / "run.json").write_text(json.dumps({**whole, "facts": {**facts, **changes}}))
         with pytest.raises(TrainingError):
             RunPolicy(root, "cpu")
