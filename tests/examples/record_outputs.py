@@ -12,6 +12,7 @@ from pathlib import Path
 from robocas_ms3 import __version__
 
 OUTPUTS = {
+    "generate": "robocas generate pick -n 12 --jobs 2",
     "plan_run_tiny": "robocas plan run tiny --out runs/tiny --jobs 2",
 }
 
