@@ -104,7 +104,7 @@ def test_a_damaged_trajectory(run_folder, tmp_path):
     said = whole["episodes"][1]["robocas"]
     write({**said, "target": "cube"})
     (_, row, *_) = shown(open_content(folder), [0, 1])[0]["episodes"]
-    assert row["damage"] == 'its entry of the JSON, target: expected an object, found "cube"'
+    assert row["damage"] == 'JSON entry, target: expected an object, found "cube"'
     assert row["instruction"].startswith("grasp the cube 4")
     write({"instruction": 3, "target": said["target"]})
     (_, row, *_) = shown(open_content(folder), [0, 1])[0]["episodes"]

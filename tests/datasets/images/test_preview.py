@@ -89,7 +89,7 @@ def test_previews_of_many_episodes_with_all_videos(stub_images, tmp_path, monkey
     assert shown(tmp_path / "two") == ["contact_sheet.png", *videos[:2]]
 
 
-def test_no_previews_with_no_video(trajectory, stub_images, tmp_path, capsys):
+def test_previews_can_be_switched_off(trajectory, stub_images, tmp_path, capsys):
     assert converted(trajectory, tmp_path / "out", "--no-video") == 0
     assert shown(tmp_path / "out") == []
     assert "video" not in capsys.readouterr().out
