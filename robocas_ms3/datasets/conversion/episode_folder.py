@@ -47,13 +47,18 @@ class FolderWriter(EpisodeWriter):
     def write_files(
         self, folder: Path, wanted: InputEpisode, frames: Generator[StepImages, None, None]
     ) -> NDArray[np.uint8] | None:
-        episode, image_options, arrays, preview = wanted.episode, wanted.given.image_options, wanted.arrays, None
+        episode, image_options, arrays, preview = (
+            wanted.episode,
+            wanted.conversion_input.image_options,
+            wanted.arrays,
+            None,
+        )
         for camera in image_options.cameras:
             for kind in image_options.kinds:
                 (folder / camera / kind).mkdir(parents=True)
         with ExitStack() as stack:
             if self.sheet is not None:
-                drawing = EpisodeDrawer(wanted.number, arrays, wanted.given.source.rate_hz)
+                drawing = EpisodeDrawer(wanted.number, arrays, wanted.conversion_input.source.rate_hz)
                 preview = stack.enter_context(open_preview(self.out, drawing, row=wanted.number in self.sheet))
             encode = stack.enter_context(_encoder())
             in_order = stack.enter_context(_encoder(1))  # frames of a video

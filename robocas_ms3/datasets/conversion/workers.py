@@ -41,7 +41,7 @@ class InputEpisode:
     number: int
     episode: SourceEpisode
     arrays: dict[str, NDArray]
-    given: ConversionInput
+    conversion_input: ConversionInput
 
 
 class EpisodeWriter(ABC):
@@ -57,12 +57,12 @@ class EpisodeWriter(ABC):
     ) -> NDArray[np.uint8] | None:
         """Write an episode into a folder; return its row of the contact sheet, if any."""
 
-    def write(self, number: int, given: ConversionInput, source: int) -> WrittenEpisode:
+    def write(self, number: int, conversion_input: ConversionInput, source: int) -> WrittenEpisode:
         """Write episode ``source`` of the input as episode ``number`` of the dataset."""
         with atomic_folder(self.folder(number), sync=True) as folder:
-            episode = given.source.episode(source)
-            wanted = InputEpisode(number, episode, require_complete_arrays(episode), given)
-            with closing(given.frames(episode)) as frames:
+            episode = conversion_input.source.episode(source)
+            wanted = InputEpisode(number, episode, require_complete_arrays(episode), conversion_input)
+            with closing(conversion_input.frames(episode)) as frames:
                 row = self.write_files(folder, wanted, frames)
             size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
         return WrittenEpisode(number, int(wanted.arrays["episode_length"]), size, row)
@@ -157,13 +157,13 @@ class _EpisodeWorker:
                 os.environ.setdefault("LP_NUM_THREADS", "1")
             use_one_torch_thread()
         self._job = job
-        self._given: ConversionInput | None = open_input(job.settings)
+        self._input: ConversionInput | None = open_input(job.settings)
 
     def run(self, task: Task) -> WrittenEpisode | _Failure:
         number, source = task
         try:
-            self._given = self._given or open_input(self._job.settings)
-            return self._job.writer.write(number, self._given, source)
+            self._input = self._input or open_input(self._job.settings)
+            return self._job.writer.write(number, self._input, source)
         except Exception as error:
             if _concerns_all(error):
                 raise
@@ -171,9 +171,9 @@ class _EpisodeWorker:
             return _Failure(episode_folder(number), RemoteError.of(error, "a worker"))
 
     def close(self) -> None:
-        given, self._given = self._given, None
-        if given is not None:
-            given.close()
+        conversion_input, self._input = self._input, None
+        if conversion_input is not None:
+            conversion_input.close()
 
 
 def _concerns_all(error: Exception) -> bool:

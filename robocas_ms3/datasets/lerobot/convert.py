@@ -76,8 +76,8 @@ def convert_lerobot(
     start, variant, out = time.perf_counter(), find_variant(settings.lerobot_version), settings.out
     settings = replace(settings, boxes=variant.language)
     written: list[WrittenEpisode] = []
-    with closing(open_input(settings)) as given:
-        plan = _plan(given, settings.codec, variant)
+    with closing(open_input(settings)) as conversion_input:
+        plan = _plan(conversion_input, settings.codec, variant)
         recorded_settings = {key: plan[key] for key in ("settings", "made_with")}
         with OutputFolder(out, _OUTPUT, recorded_settings, overwrite=settings.overwrite) as output:
             _check_episodes(output, plan)  # everything that may fail runs before the output changes
@@ -103,11 +103,11 @@ def convert_lerobot(
     return Conversion(written, len(plan["episodes"]) - len(written), time.perf_counter() - start)
 
 
-def _plan(given: ConversionInput, codec: str, variant: Variant) -> dict[str, Any]:
-    entries, image_options = given.entries(), given.image_options
+def _plan(conversion_input: ConversionInput, codec: str, variant: Variant) -> dict[str, Any]:
+    entries, image_options = conversion_input.entries(), conversion_input.image_options
     place = {entry["source"]: i for i, entry in enumerate(entries)}
     # a dataset keeps its split, a trajectory file has none
-    previous = [given.source.split(name) if given.sizes else [] for name in ("train", "val")]
+    previous = [conversion_input.source.split(name) if conversion_input.sizes else [] for name in ("train", "val")]
     previous_train, previous_val = ([place[n] for n in numbers if n in place] for numbers in previous)
     train, val = split_by_seed({i: entry["seed"] for i, entry in enumerate(entries)}, (previous_train, previous_val))
     plan = {
@@ -115,7 +115,7 @@ def _plan(given: ConversionInput, codec: str, variant: Variant) -> dict[str, Any
         "made_with": versions(),
         "settings": {
             "lerobot_version": variant.version,
-            "rate_hz": whole_rate(given.source.rate_hz),
+            "rate_hz": whole_rate(conversion_input.source.rate_hz),
             "cameras": list(image_options.cameras),
             "depth": image_options.depth,
             "codec": codec,

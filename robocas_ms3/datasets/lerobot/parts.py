@@ -78,8 +78,8 @@ class PartWriter(EpisodeWriter):
         return self.parts / episode_folder(number)
 
     def write_files(self, folder: Path, wanted: InputEpisode, frames: Generator[StepImages, None, None]) -> None:
-        episode, arrays, image_options = wanted.episode, wanted.arrays, wanted.given.image_options
-        fps, steps = schema.whole_rate(wanted.given.source.rate_hz), int(arrays["episode_length"])
+        episode, arrays, image_options = wanted.episode, wanted.arrays, wanted.conversion_input.image_options
+        fps, steps = schema.whole_rate(wanted.conversion_input.source.rate_hz), int(arrays["episode_length"])
         encoders: dict[str, VideoEncoder] = {}  # opened at the first frame
         levels: dict[str, LevelHistogram] = {}
         boxes: list[dict[str, Box]] = []

@@ -21,7 +21,7 @@ class Writer:
 
     errors: dict[int, Exception] = field(default_factory=dict)
 
-    def write(self, number, given, source):
+    def write(self, number, conversion_input, source):
         if number in self.errors:
             raise self.errors[number]
         about = os.getpid(), torch.get_num_threads(), os.environ.get("LP_NUM_THREADS")
@@ -29,8 +29,8 @@ class Writer:
 
 
 class Deadly(Writer):
-    def write(self, number, given, source):
-        return os._exit(9) if number == 2 else super().write(number, given, source)
+    def write(self, number, conversion_input, source):
+        return os._exit(9) if number == 2 else super().write(number, conversion_input, source)
 
 
 @pytest.fixture(scope="module")
@@ -112,9 +112,9 @@ def test_error_of_the_first_episodes_is_raised(job, numbers, tried):
     attempts = []
 
     class Counting(Writer):
-        def write(self, number, given, source):
+        def write(self, number, conversion_input, source):
             attempts.append(number)
-            return super().write(number, given, source)
+            return super().write(number, conversion_input, source)
 
     make = partial(job, Counting(odd(numbers)), numbers)
     with pytest.raises(LookupError, match="1 is odd"):
