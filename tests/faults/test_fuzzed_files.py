@@ -122,7 +122,7 @@ def write_plan(root):
         for seed in unit.seeds(folder.plan):
             with folder.files(unit, seed).temporary_files() as files:
                 files.write(Outcome(seed, True, 10, ["a: b"], ["c: d"], 1.0, 1.0, 5, 1e9))
-    folder.complete(COMPLETE)
+    folder.write_outcomes(COMPLETE)
     (root / PLAN).write_text(json.dumps(folder.record()))
     shutil.copy(folder.unit_folder(COMPLETE) / OUTCOMES, root)  # where the table below finds them
     shutil.copy(first_seed(folder) / OUTCOME, root)
