@@ -109,5 +109,5 @@ def test_unexpected_packed_state_is_an_error(env, monkeypatch):
         pack=lambda: packed + b"more",
     )
     monkeypatch.setattr(scene, "px", system)
-    with pytest.raises(RobocasError, match="packs states otherwise"):
+    with pytest.raises(RobocasError, match="SAPIEN.s packed state"):
         Bodies(scene, env.unwrapped.agent.robot)

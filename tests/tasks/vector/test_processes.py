@@ -191,7 +191,7 @@ def test_errors_of_making_environments_keep_their_type():
 
 def test_env_registered_in_the_main_program_is_an_error(monkeypatch):
     monkeypatch.setattr(RoboCASPickEnv, "__module__", "__main__")
-    with pytest.raises(VectorEnvError, match=r"RoboCASPick-v1.*the_module:"):
+    with pytest.raises(VectorEnvError, match=r"RoboCASPick-v1.*my_module:"):
         make(1, 1)
 
 
