@@ -18,7 +18,7 @@ from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 from robocas_ms3.tasks import terms
 
 Stepping = Literal["timed", "upstream"]
-UPSTREAM_HZ = 5
+V0_CONTROL_HZ = 5
 # A policy step of RoboCAS-v0 (evaluation_v0.md): the gripper moves until it stops, at most 5 control steps; then the
 # arm moves, at most 2.
 _GRIPPER_STEPS, _MOTION_STEPS = 5, 2
@@ -104,16 +104,16 @@ class PolicyActionWrapper(gym.Wrapper):
             self._open = actions[:, 7] > 0
             return self._control(actions)
         motion = self._convention.decode(actions)
-        return self._timed(motion) if self._stepping == "timed" else self._upstream(motion)
+        return self._timed_step(motion) if self._stepping == "timed" else self._v0_step(motion)
 
     def _measures(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
         return {**self._metrics.read(), **(self._weld.read(info) if self._weld else {})}
 
-    def _timed(self, motion: TcpMotion) -> tuple:
+    def _timed_step(self, motion: TcpMotion) -> tuple:
         start = self._tcp() if self._reference == "tcp" else self._target()
         return self._move_to(*_apply_motion(start, motion), motion.open)
 
-    def _upstream(self, motion: TcpMotion) -> tuple:
+    def _v0_step(self, motion: TcpMotion) -> tuple:
         """Move the grippers, then the arms; an env that has finished either phase waits for the others."""
         result, here = None, self._target()
         turned = motion.open != self._open

@@ -20,7 +20,7 @@ from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.demos.failures import Intervention
 from robocas_ms3.demos.settings import EpisodeSettings
-from robocas_ms3.evaluation.action_wrapper import UPSTREAM_HZ, PolicyActionWrapper, env_kwargs
+from robocas_ms3.evaluation.action_wrapper import V0_CONTROL_HZ, PolicyActionWrapper, env_kwargs
 from robocas_ms3.evaluation.policies import open_policy
 from robocas_ms3.evaluation.policy import EpisodeSpec, Policy
 from robocas_ms3.evaluation.protocol import load_protocol
@@ -62,7 +62,7 @@ class PolicyRollIn:
             pack=settings.pack,
             robot_uids=settings.robot,
             sim_backend="physx_cpu",
-            **env_kwargs(spec, UPSTREAM_HZ),
+            **env_kwargs(spec, V0_CONTROL_HZ),
         )
         self._env = PolicyActionWrapper(env, spec, "upstream")
         self._base: Any = env.unwrapped
@@ -76,7 +76,7 @@ class PolicyRollIn:
     def run(self, seed: int) -> Intervention:
         """Run the policy in the scene of a seed and return the state in which it leaves the scene."""
         settings, steps = self._settings, roll_in_steps(seed, self._settings.after_steps)
-        batch = EpisodeBatch(self._vector, self._policy.spec, EndConditions(steps), 1 / UPSTREAM_HZ, refill=False)
+        batch = EpisodeBatch(self._vector, self._policy.spec, EndConditions(steps), 1 / V0_CONTROL_HZ, refill=False)
         try:
             self._vector.reset(seed=[seed])
             (played,) = rollout(batch, self._policy, [self._episode(seed)])

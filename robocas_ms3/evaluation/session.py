@@ -20,7 +20,7 @@ from robocas_ms3.core.errors import EvaluationError, VectorEnvCrashError
 from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.action_wrapper import UPSTREAM_HZ, PolicyActionWrapper, check_weld, env_kwargs
+from robocas_ms3.evaluation.action_wrapper import V0_CONTROL_HZ, PolicyActionWrapper, check_weld, env_kwargs
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import (
     EpisodeSpec,
@@ -75,7 +75,7 @@ class EvaluationSession:
         self.protocol, self.spec = load_protocol(settings.protocol), policy.spec
         rules = self.protocol.rules
         rules.check_policy(self.spec)
-        self.rate = UPSTREAM_HZ if rules.stepping == "upstream" else rules.action_rate(self.spec)
+        self.rate = V0_CONTROL_HZ if rules.stepping == "upstream" else rules.action_rate(self.spec)
         backend = choose_backend(settings.backend)
         if settings.weld:
             check_weld(rules.stepping, backend)

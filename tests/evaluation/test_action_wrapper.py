@@ -87,7 +87,7 @@ def test_joint_targets_are_executed_unchanged():
     np.testing.assert_allclose(base.agent.robot.get_qpos()[0, 3:10].numpy(), wanted, atol=0.01)
 
 
-def test_upstream_step_waits_for_gripper_and_motion():
+def test_v0_step_waits_for_gripper_and_motion():
     env = made(stepping="upstream")
     base: Any = env.unwrapped
 

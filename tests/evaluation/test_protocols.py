@@ -146,8 +146,8 @@ def test_step_limits_and_valid_action_rates():
     assert rules.step_limit("pick", 20) == 800
     assert rules.model_copy(update={"max_steps": 30}).step_limit("pick", 5) == 30
     assert rules.model_copy(update={"max_steps": 300}).step_limit("pick", 5) == 200
-    upstream = load_protocol("paper-v1").rules
-    assert upstream.step_limit("pick", 5) == upstream.step_limit("search", 5) == 150
+    paper = load_protocol("paper-v1").rules
+    assert paper.step_limit("pick", 5) == paper.step_limit("search", 5) == 150
     assert [rules.action_rate(PolicySpec()), rules.action_rate(PolicySpec(rate_hz=10))] == [20, 10]
     with pytest.raises(EvaluationError, match="divisor of 100"):
         rules.action_rate(PolicySpec(rate_hz=30))
