@@ -206,10 +206,10 @@ def test_a_quarter_of_a_million_faces_take_less_than_a_gigabyte(tmp_path):
     path = write_scan(tmp_path, model, scale=100)
     code = f"""
 import re
-from asset_tools.prepare import prepare
+from asset_tools.prepare import prepare_scan
 from asset_tools.visual import to_display
 from pathlib import Path
-scan = prepare(Path({str(path)!r}))
+scan = prepare_scan(Path({str(path)!r}))
 light = to_display(scan.mesh, triangles=12000, texture_size=1024)
 peak = re.search(r"VmHWM:\\s*(\\d+) kB", Path("/proc/self/status").read_text())[1]  # rusage has the parent's in it
 print(int(peak) / 1024**2, abs(light.volume / scan.mesh.volume - 1))

@@ -142,11 +142,11 @@ from functools import partial
 from pathlib import Path
 sys.path[:0] = {tests!r}
 from test_pipeline import make
-from asset_tools.pipeline import Job, write_pack
+from asset_tools.pipeline import AssetJob, write_pack
 if __name__ == "__main__":
     root = Path({root!r})
     make_one = partial(make, log=root / "log", seconds=0.3)
-    todo = [Job(f"asset_{{i}}", partial(make_one, f"asset_{{i}}"), str(i) * 64) for i in range(8)]
+    todo = [AssetJob(f"asset_{{i}}", partial(make_one, f"asset_{{i}}"), str(i) * 64) for i in range(8)]
     write_pack(todo, root / "pack", root / "kept", processes=2)
 """
 
