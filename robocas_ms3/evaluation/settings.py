@@ -27,10 +27,9 @@ class EvaluationSettings:
     """Tasks to evaluate, such as pick. Default: all tasks of the protocol. In paper-v1, select runs in the episodes of
     pick, as in RoboCAS-v0."""
     policy: Annotated[str, tyro.conf.arg(metavar="POLICY")] = "scripted"
-    """Policy to evaluate. One of: scripted (joint targets), scripted-ee-delta (RoboCAS' 7-D actions),
-    scripted-perturbed (7-D actions with an offset of 1 to 5 cm), random, noop, another name from `robocas list`,
-    replay:TRAJECTORY.h5, a run folder of `robocas train`, module:Class of your own code, or ws://HOST:PORT of a policy
-    server (`robocas serve-policy`)."""
+    """Policy to evaluate: scripted (joint targets), scripted-ee-delta (7-D actions), scripted-perturbed (7-D actions
+    with an offset of 1 to 5 cm), random, noop, another name from `robocas list`, replay:TRAJECTORY.h5, a run folder
+    of `robocas train`, module:Class of your own code, or the address ws://HOST:PORT of `robocas serve-policy`."""
     protocol: Annotated[str, tyro.conf.arg(metavar="PROTOCOL")] = "ms3-v1"
     """Name of a bundled protocol (`robocas eval protocols`), or a protocol folder."""
     out: Annotated[Path | None, _NO_HINT] = None
@@ -44,9 +43,9 @@ class EvaluationSettings:
     workers: Annotated[int | None, _NO_HINT] = None
     """Number of worker processes. Default: one per environment, at most one per CPU core."""
     step_seconds: float = 300.0
-    """Time limit in seconds for a step or reset of the environments in a worker process. If a worker exceeds a limit or
-    crashes, the episode is retried once; after the second time it counts as failed, with an error. The time of the
-    policy is not limited."""
+    """Time limit in seconds for a step or reset of the environments in a worker process. If a worker exceeds a limit
+    or crashes, the episode is retried once; after the second time it counts as failed, with an error. The time of
+    the policy is not limited."""
     memory_gb: float = 8.0
     """Memory limit per worker process in GB."""
     backend: Literal["auto", "processes", "gpu"] = "auto"
