@@ -24,9 +24,8 @@ def main(settings: ConversionSettings) -> int:
     with ProgressBar("episodes written") as bar:
         done = write(settings, on_start=bar.start, on_episode=bar.advance)
     count = len(done.episodes)
-    words = [f"{settings.out}: {format_count(count, 'episode')}"] + (
-        [f"{done.existing} already there"] if done.existing else []
-    )
+    words = [f"{settings.out}: {format_count(count, 'episode')}"]
+    words += [f"{done.existing} already there"] if done.existing else []
     if count:
         megabytes = sum(episode.size for episode in done.episodes) / 1e6
         steps = format_count(sum(episode.steps for episode in done.episodes), "step")
@@ -44,12 +43,8 @@ def _find_format(settings: ConversionSettings) -> Format:
 
     writable = [name for name, known in FORMATS.items() if known.writer]
     if settings.to not in writable:
-        what, expected, fix = (
-            "unknown dataset format",
-            f"one of {writable}",
-            did_you_mean(settings.to, writable),
-        )
-        raise DatasetError(what, where="--to", expected=expected, found=settings.to, fix=fix)
+        expected, fix = f"one of {', '.join(writable)}", did_you_mean(settings.to, writable)
+        raise DatasetError("unknown dataset format", where="--to", expected=expected, found=settings.to, fix=fix)
     chosen = FORMATS[settings.to]
     of_others = {option for known in FORMATS.values() for option in known.options if option not in chosen.options}
     for field in fields(settings):

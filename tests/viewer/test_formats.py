@@ -18,7 +18,7 @@ SOURCE = ("rate_hz", "numbers", "lengths", "cameras", "has_depth", "has_embeddin
 EPISODE = ("where", "steps", "instruction", "arrays", "read", "goals", "scene", "layout", "cameras", "rgb", "depth")
 
 
-class Only:
+class PartialCopy:
     """Copies some attributes of an object and damages others."""
 
     def __init__(self, other, names, broken=(), **own):
@@ -37,12 +37,12 @@ def open_toy(folder, monkeypatch, broken=()):
 
     def read(path, *, rate_hz=None, include_failed=False):
         dataset = Dataset(path)
-        episode = lambda number: Only(dataset.episode(number), EPISODE)  # noqa: E731
-        return Only(dataset, SOURCE, broken, root=path, episode=episode)
+        episode = lambda number: PartialCopy(dataset.episode(number), EPISODE)  # noqa: E731
+        return PartialCopy(dataset, SOURCE, broken, root=path, episode=episode)
 
     toy = formats.Format("toy", "toy dataset", lambda path: path == folder, "toys:read")
     with monkeypatch.context() as patch:
-        patch.setattr(formats.Format, "part", lambda self, name: read)
+        patch.setattr(formats.Format, "load", lambda self, name: read)
         patch.setattr(formats, "FORMATS", {"toy": toy})
         return open_content(folder)
 
