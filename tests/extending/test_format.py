@@ -96,7 +96,7 @@ def test_validate_reports_a_violation(datasets, capsys):
 def test_unknown_format_and_option(toy_package, tmp_path, capsys):
     file = write_trajectory(tmp_path / "F.h5")
     assert run(["convert", str(file), "--to", "rlds", "--out", str(tmp_path / "out")]) == 2
-    assert "expected one of ['lerobot', 'robocas', 'toy']" in capsys.readouterr().err
+    assert "expected one of lerobot, robocas, toy" in capsys.readouterr().err
     assert run(["convert", str(file), "--to", "toy", "--append", "--out", str(tmp_path / "out")]) == 2
     assert "--append: this option does not apply to a toy dataset" in capsys.readouterr().err
 
