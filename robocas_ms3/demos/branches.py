@@ -1,4 +1,4 @@
-"""Backtracking with forked processes: each candidate of a decision runs in a process of its own.
+"""Backtracking with forked processes: each candidate runs in a separate process.
 
 A decision (`planning.decisions`) forks a child process per candidate. The child plays the candidate, sends its score
 and waits. The child with the best score then continues the episode, while the parent waits for the result. If the

@@ -66,7 +66,7 @@ class EpisodeGenerator:
         assert isinstance(base_env, RoboCASEnv)
         self.planner: Planner = make_planner(settings.planner, robot, dt=base_env.control_timestep)
         self.reachability = Reachability(ArmChain(robot.files().arm_urdf, robot.description))
-        # a scripted policy tries once, from wherever the episode stands, and raises PlanningError
+        # runs one attempt from the current state; raises PlanningError if it fails
         self.policy: Callable[[Arm], None] = load_object(TASKS[settings.task].solver)
         self.open_loop_envs: list[OpenLoopEnv] = []
         self.open_loop_checks: OpenLoopChecks | None = None

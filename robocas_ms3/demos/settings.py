@@ -40,13 +40,14 @@ class EpisodeSettings:
     keep_recoveries: bool = False
     """Keep failed attempts in the episode, as one continuous motion, instead of undoing them."""
     check_rate: Annotated[int | None, _NO_HINT] = None
-    """Rate in Hz of the open-loop check, which replays the 7-D actions of each attempt; an attempt that fails the
-    check is undone. 0: no check. Default: 5 Hz, or the control rate if 5 is not a divisor of it."""
+    """Rate in Hz of the open-loop check, which replays the 7-D actions of each attempt.
+    An attempt that fails the check is undone. 0: no check.
+    Default: 5 Hz, or the control rate if 5 is not a divisor of it."""
     check_trials: int = 1
     """Number of additional open-loop checks with actuation noise, see --check-noise. 0: none."""
     check_failures: int = 1
-    """Maximum number of attempts per seed that fail only with noise; later attempts are checked without noise, and the
-    recording says so (`check_trials: 0`)."""
+    """Maximum number of attempts per seed that fail only with noise.
+    Later attempts are checked without noise, and their recording has `check_trials: 0`."""
     check_noise_mm: Annotated[float, tyro.conf.Suppress] = 0.5
     check_noise_deg: Annotated[float, tyro.conf.Suppress] = 0.2
     layouts: Annotated[str, tyro.conf.Suppress] = "auto"
@@ -56,8 +57,9 @@ class EpisodeSettings:
     robot: Annotated[str, tyro.conf.arg(metavar="ROBOT")] = DEFAULT_ROBOT
     """Robot: a robot of this package or of another one (see docs/extending.md)."""
     after_policy: Annotated[str, tyro.conf.arg(metavar="POLICY"), _NO_HINT] = ""
-    """Policy that acts first, as --policy of `robocas eval` (DAgger). The scripted policy then completes the task, and
-    only its part is recorded. Seeds in which the policy has succeeded or failed already are skipped."""
+    """Policy that acts first, as --policy of `robocas eval` (DAgger).
+    The scripted policy then completes the task, and only its part is recorded.
+    Seeds in which the policy has succeeded or failed already are skipped."""
     after_steps: tuple[int, int] = (5, 60)
     """Minimum and maximum number of policy steps before the scripted policy continues; drawn uniformly per seed."""
 
@@ -129,18 +131,18 @@ class GenerateSettings:
     jobs: int = 1
     """Number of worker processes; the episodes do not depend on it. 0: record in this process, without limits."""
     episode_seconds: float = 1800.0
-    """Time limit per episode in seconds. An episode whose process exceeds a limit or crashes is retried once in a new
-    process; then its seed is skipped."""
+    """Time limit per episode in seconds.
+    An episode whose process exceeds a limit or crashes is retried once; then its seed is skipped."""
     memory_gb: float = 8.0
     """Memory limit per process in GB."""
     check_noise: Annotated[tuple[float, float] | None, _NO_HINT] = None
-    """Noise of the open-loop checks with noise: standard deviations in mm and degrees of each component of each action.
+    """Noise of the additional open-loop checks: standard deviations in mm and degrees of each action component.
     Default: 0.5 0.2."""
     fork: bool = True
     """Undo failed attempts by forking the process if that is safe. --no-fork gives the same episodes, but is slower."""
     overwrite: bool = False
-    """Delete the output and start again. Default: resume a run with the same settings, or add episodes to a finished
-    run."""
+    """Delete the output and start again.
+    Default: resume a run with the same settings, or add episodes to a finished run."""
 
     def resolve(self) -> GenerateSettings:
         """Return settings with output folder and noise filled in, and YAML files and ``set`` resolved.
@@ -181,8 +183,7 @@ class ReplaySettings:
     trajectory: Annotated[Path, tyro.conf.Positional]
     """Trajectory file F.h5 with F.json next to it, or the output folder of `robocas generate`."""
     control_mode: Annotated[str | None, tyro.conf.arg(aliases=["-c"], help_behavior_hint="")] = None
-    """Control mode to convert the actions to: pd_joint_delta_pos, pd_ee_delta_pose or pd_ee_pose. Default: as
-    recorded."""
+    """Control mode to convert to: pd_joint_delta_pos, pd_ee_delta_pose or pd_ee_pose. Default: as recorded."""
     obs_mode: Annotated[str, tyro.conf.arg(aliases=["-o"])] = "none"
     """Observation mode for --save, e.g. rgb+depth or state."""
     use_env_states: bool = False

@@ -49,7 +49,7 @@ def test_crashed_candidate_is_played_once_more_and_then_skipped(signal_, tmp_pat
 
     ended, notes = forked(decide)
     assert ended
-    assert notes.texts == []  # it was never gone on from
+    assert notes.texts == []  # the episode never continued from it
     assert (tmp_path / "played").read_text() == "aab"
 
 
@@ -63,7 +63,7 @@ def test_crash_after_the_decision_is_a_failed_attempt():
     assert notes.texts == ["branch: crashed"]
 
 
-@pytest.mark.parametrize("moment", ["it plays", "it goes on", "it waits"])
+@pytest.mark.parametrize("moment", ["it plays", "it continues", "it waits"])
 def test_child_killed_once_does_not_change_the_episode(tmp_path, moment):
     """Three candidates are compared, b is the best. Its process or that of a later decision is killed once."""
 
@@ -88,7 +88,7 @@ def test_child_killed_once_does_not_change_the_episode(tmp_path, moment):
         first = runner.choose("abc", play, SearchLimits(compared=3))
         second = runner.choose("abc", lambda letter: 0.0)
         if second == "b":
-            kill_once("it goes on")
+            kill_once("it continues")
         if (first, second) != ("b", "c"):
             raise PlanningError("end", first + second)
         (tmp_path / "outcome").write_text(first + second)

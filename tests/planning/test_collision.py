@@ -31,7 +31,7 @@ def test_cloud_with_5_mm_spacing_has_no_holes(world):
     plane = np.stack([*(axis.ravel() for axis in np.meshgrid(grid, grid)), np.zeros(len(grid) ** 2)], axis=1)
     for _ in range(40):
         shift = np.append(rng.uniform(0, 0.005, 2), 0.0)
-        # The plane lies across the approach, so that both pads meet it flat.
+        # The plane is perpendicular to the approach, so that both pads touch it flat.
         world.set_scene((plane + shift + [0, 0, -0.004]) @ tcp[:3, :3].T + lowest)
         assert world.collisions(REST, 0.08) == ["cloud", "panda_leftfinger", "panda_rightfinger"]
         world.set_scene((plane + shift + [0, 0, 0.010]) @ tcp[:3, :3].T + lowest)

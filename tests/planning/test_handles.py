@@ -75,9 +75,7 @@ def test_route_keeps_the_held_object_collision_free(planner):
     arm = SimpleNamespace(env=env, robot=MOBILE_PANDA, planner=planner, qpos=np.array(REST))
     start, goal = np.zeros(3), np.array([0.24, 0.0, 0.0])
     planner.finger_width = 0.04
-    beyond = planner.tcp(arm.qpos) @ np.array(
-        [0, 0, 0.10, 1]
-    )  # 0.10 m beyond the tips, where the base stands at the goal
+    beyond = planner.tcp(arm.qpos) @ np.array([0, 0, 0.10, 1])  # 0.10 m beyond the tips, at the goal of the base
     spot, there = np.random.default_rng(0).uniform(-0.01, 0.01, (600, 3)), np.eye(4)
     there[:3, 3] = beyond[:3] + [0.24, 0, 0.49]
     spot = Surroundings([Obstacle("spot", Shape(points=spot), there)], spot + there[:3, 3])

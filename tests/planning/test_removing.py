@@ -77,7 +77,7 @@ def test_removed_object_is_upright_at_a_free_position_of_the_table(generator, mo
     assert leant < 3  # as it was put down it stays
     after = surface(arm, moved)
     table = min(points[:, 2].min() for points in before.values())
-    assert after[:, 2].min() == pytest.approx(table, abs=0.005)  # it stands on the table
+    assert after[:, 2].min() == pytest.approx(table, abs=0.005)  # it is on the table
     assert np.linalg.norm((after - before[moved]).mean(axis=0)[:2]) > 0.05
     others = np.concatenate([surface(arm, slot) for slot in before if slot != moved])
     gaps = np.linalg.norm(after[:, None, :2] - others[None, ::10, :2], axis=2)

@@ -61,12 +61,12 @@ class Way(Arm):
 @pytest.mark.parametrize(
     ("tcp", "approach", "blocking", "moved", "checked", "excluded"),
     [
-        # above a table it rises through what it touches
+        # above a table the arm rises, ignoring contacts
         (top_down(0.6, 0.1, 0.05), "top", (None, TARGET), (0, 0, 0.1), False, None),
-        # where it reached in level it steps straight back on a free way; from the top too, with a handle in the fingers
+        # after a horizontal approach it moves straight back on a free line; also with a handle in the fingers
         (LEVEL, "front", (), (-0.25, 0, 0), True, None),
         (LEVEL, "top", (), (-0.25, 0, 0), True, None),
-        (LEVEL, "front", (None,), (-0.25, 0, 0), True, TARGET),  # from the target that it stands against too
+        (LEVEL, "front", (None,), (-0.25, 0, 0), True, TARGET),  # in contact with the target too
     ],
 )
 def test_retreat_after_a_failure(tcp, approach, blocking, moved, checked, excluded):
