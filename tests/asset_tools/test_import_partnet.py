@@ -199,7 +199,7 @@ def test_the_sliding_door_is_where_robocas_v0_has_it(shared_dir):
     (door,) = source.links
     assert (door.name, door.joint.name, door.joint.axis) == ("link_0", "joint_0", (0, -1, 0))
     handle = next(iter(source.handles.values()))
-    assert handle.position == pytest.approx((0.378, 0.672, 0.0), abs=0.002)  # upstream's (0.672, 0, 0.378), turned
+    assert handle.position == pytest.approx((0.378, 0.672, 0.0), abs=0.002)  # RoboCAS-v0's (0.672, 0, 0.378), rotated
     bar = next(piece for piece in door.pieces if piece[:, 0].min() > 0.36)
     assert (np.abs(np.array(handle.position) - (bar.min(axis=0) + bar.max(axis=0)) / 2)[:2] < 0.002).all()
     corners = np.concatenate([*source.pieces, *door.pieces])

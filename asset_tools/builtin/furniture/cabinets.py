@@ -126,7 +126,7 @@ def _corners(low: tuple[float, float, float], high: tuple[float, float, float]) 
 
 
 def container() -> FurnitureSource:
-    """A cupboard whose door slides to the left, two layers behind it; origin on the floor, frame as upstream has it."""
+    """A cupboard whose door slides to the left, two layers behind it; origin on the floor, frame as in RoboCAS-v0."""
     back, front, low, high, height = -0.30, 0.335, -0.80, 0.74, 1.13
     board, layers = 0.024, (0.055, 0.60)
     divider = 0.13  # right of it are the layers, left of it is a closed bay

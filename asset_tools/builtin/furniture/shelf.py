@@ -6,9 +6,9 @@ from asset_tools.builtin.furniture.base import Body, surface
 from asset_tools.builtin.materials import BLACK_STEEL, OAK, WHITE, coat, wooden
 from asset_tools.sources import FurnitureSource
 
-LAYERS = (0.085, 0.514, 0.942, 1.371)  # m, upstream's
+LAYERS = (0.085, 0.514, 0.942, 1.371)  # m, as in RoboCAS-v0
 TOP = 1.80
-DEPTH, HALF_WIDTH = 0.42, 0.58  # m; the front is at x = 0, as upstream's numbers have it
+DEPTH, HALF_WIDTH = 0.42, 0.58  # m; the front is at x = 0, as in RoboCAS-v0's numbers
 POST = 0.04
 BOARD = 0.022
 

@@ -8,7 +8,7 @@ from asset_tools.builtin.furniture.base import Body, disc, surface
 from asset_tools.builtin.materials import BLACK_STEEL, OAK, WALNUT, WHITE, Material, marble, wooden
 from asset_tools.sources import FurnitureSource
 
-TABLE_HEIGHT = 0.61  # m, upstream's
+TABLE_HEIGHT = 0.61  # m, as in RoboCAS-v0
 TABLE_HALF = (0.38, 0.68)
 DINING_HEIGHT = 0.75
 DINING_HALF = (0.42, 0.80)

@@ -16,7 +16,7 @@ from asset_tools.sources import FurnitureSource
 from robocas_ms3.assets.manifest import InnerBox, Surface
 
 BASKET_HEIGHT = 0.19
-BASKET_ORIGIN = 0.096  # of the frame above the bottom, upstream's
+BASKET_ORIGIN = 0.096  # m, height of the frame above the bottom, as in RoboCAS-v0
 PLATE_HEIGHT = 0.10
 ROUNDING_STEPS = 3
 
@@ -47,7 +47,7 @@ def basket() -> FurnitureSource:
 
 
 def plate() -> FurnitureSource:
-    """A deep square plate of white enamel with a blue rim, of upstream's size; its origin is its bottom's middle."""
+    """A deep square plate of white enamel with a blue rim, sized as in RoboCAS-v0; origin at its bottom centre."""
     white = Material((0.3, 0.3), partial(painted, colour=(240, 240, 236)))
     paints = {"rim": Material((1.2, 0.02), partial(painted, colour=(38, 62, 122)))}
     paints |= dict.fromkeys(("side", "inside", "floor", "bottom"), white)
