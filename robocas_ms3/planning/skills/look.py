@@ -57,7 +57,7 @@ def load_object_meshes(arm: Arm) -> None:
 def hidden_fraction(arm: Arm, slot: int) -> float:
     """Return the fraction of an object hidden from the gripper camera by other objects.
 
-    The fraction is 1 for an object out of view. It is computed by ray casting without the robot, which needs no renderer.
+    It is 1 for an object out of view. Ray casting without the robot computes it, so that no renderer is needed.
     """
     env = arm.env
     config = _camera_config(arm)
