@@ -163,7 +163,7 @@ class _Comparison:
         self._trees = [KDTree(profile) for profile in self._listed]
 
     def find(self, pose: Array) -> int:
-        """Return the index of the listed pose equal to a pose (4, 4), or -1."""
+        """Return the index of the listed resting pose that matches `pose` (4, 4) within the tolerance, or -1."""
         apart = [self._apart(pose, index) for index in range(len(self._listed))]
         return int(np.argmin(apart)) if min(apart) <= self._limit else -1
 

@@ -25,8 +25,8 @@ class Build:
 
     A single environment takes the objects and their poses from one seed. A vector environment is built with the objects
     of seeds 0, 1, ... and keeps them; only the poses change. For num_envs=4, `--objects 0:4 --seeds 0:100` covers all
-    resets without a seed. These layouts are also written to one file, the layout table. For a GPU, each layout of the
-    table is simulated for 1 s: if an object moves more than 3 mm, the layout is marked and resets skip it.
+    resets without a seed. These layouts are also written to one file, the layout table. With --engine gpu, each
+    layout is simulated for 1 s. Resets skip a layout in which an object moves more than 3 mm.
 
     Example: robocas layouts build pick_table_scattered --seeds 0:100 --set objects.count=12
     """
@@ -42,7 +42,8 @@ class Build:
     seeds: Annotated[str, tyro.conf.arg(metavar="FIRST:END")] = "0:100"
     """Range of seeds, without END. With --objects, the layout of each object seed itself is added."""
     objects: Annotated[Maybe[str], tyro.conf.arg(metavar="SEEDS")] = None
-    """Object seeds of a vector environment, 0:4 or 3,7. Default: layouts of a single environment."""
+    """Objects seeds of a vector environment with fixed objects: a range such as 0:4 (0, 1, 2, 3) or a list such as
+    3,7. Default: build layouts for a single environment, whose objects change with the seed."""
     engine: Literal["auto", "cpu", "gpu"] = "auto"
     """With --objects: physics engine of the vector environment; auto takes a GPU if there is one."""
     jobs: Jobs = CORES

@@ -40,7 +40,7 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
         "merge": "Merge datasets into one",
         "split": "Split a dataset into several",
         "import-robocas": "Import a dataset in the format of RoboCAS-v0",
-        "plan": "Generate a large dataset on this machine, Slurm or Ray",
+        "plan": "Generate a large dataset on this machine, with Slurm or with Ray",
     },
     "training and evaluation": {
         "train": "Train a baseline",

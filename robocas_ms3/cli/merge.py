@@ -12,13 +12,14 @@ from robocas_ms3.cli.options import Folders
 class Merge:
     """Merge several datasets into one.
 
-    Episodes are numbered in the given order and stay in training or validation.
+    Episodes are numbered from 0 in the order of the folders and keep their split.
 
     Example: robocas merge datasets/pick datasets/search --out datasets/both
     """
 
     datasets: Folders
-    """Folders of the datasets; their settings must be equal."""
+    """Folders of the datasets.
+    Rate, cameras, image size and format, depth, embeddings and schema version must be equal."""
     out: Path
     """Folder of the new dataset."""
     skip_duplicates: bool = False

@@ -30,11 +30,13 @@ class Run:
     executor: Literal["local", "slurm", "ray"] = "local"
     """Where work units run: processes of this machine, jobs of Slurm, or tasks of Ray."""
     jobs: Jobs = CORES
-    """Number of work units that run at the same time. Default: one per CPU core of this machine."""
+    """Maximum number of work units in progress at the same time: processes (local), jobs (Slurm) or tasks (Ray).
+    Default: the number of CPU cores of this machine."""
     executor_option: Overrides = ()
     """Option of the executor, such as `--executor-option partition=cpu`; repeatable (docs/scale.md)."""
     shard: Annotated[Maybe[str], tyro.conf.arg(metavar="K/N")] = None
-    """Run only the work units whose number is K modulo N, such as 0/4, and do not join. Default: run all and join."""
+    """Run shard K of N (work units whose number is K modulo N) on this machine and do not join.
+    Join at the end with `robocas plan join`. Default: run all work units and join."""
     overwrite: bool = False
     """Replace the output folder if it exists."""
 

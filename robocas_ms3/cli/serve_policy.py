@@ -31,8 +31,9 @@ class ServePolicy:
     port: int = 8000
     """Port to listen on; 0: a free port. The address is printed."""
     protocol: Several[Path] = ()
-    """Folders of your own protocols, for policies that read task configurations, such as scripted. Clients can use the
-    configurations of these and of the bundled protocols."""
+    """Folders of your own protocols.
+    Needed only if the policy reads task configurations (such as scripted) and clients evaluate on these protocols;
+    bundled protocols always work."""
     max_batch: int = 64
     """Maximum number of environments per call of the policy; less if the images exceed the message limit (64 MiB)."""
 

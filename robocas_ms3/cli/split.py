@@ -37,9 +37,10 @@ class Split:
     in_place: bool = False
     """Rewrite data_info.json of the dataset instead of writing new datasets."""
     val_fraction: Maybe[float] = None
-    """Fraction of the episodes for validation, chosen again. Default: each episode stays in training or validation."""
+    """Draw a new validation split with this fraction of the episodes. Default: keep the split of each episode."""
     group_by: Maybe[Literal["seed", "target", "task"]] = None
-    """Keep episodes with the same seed (default), target object or task together."""
+    """Never separate episodes with the same seed (default), target object or task.
+    With --out and without --fractions: write one dataset per task or target."""
     copy: bool = False
     """Copy files instead of hard-linking them."""
     overwrite: bool = False

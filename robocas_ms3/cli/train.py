@@ -34,8 +34,9 @@ class Training:
     seed: Maybe[int] = None
     """Random seed; short for --set train.seed=N."""
     init_from: Maybe[str] = None
-    """Run with the initial weights: a folder, or `small` for the bundled weights (for a folder of that name: ./small).
-    Its configuration replaces the defaults. Default: random weights."""
+    """Start from the weights of this run: a run folder, or `small` for the bundled weights (write ./small for a
+    folder named small). The configuration of that run replaces the defaults of this baseline. Default: random
+    weights."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device of the network. auto: a GPU if there is one."""
     overwrite: bool = False
@@ -66,7 +67,7 @@ class BCState(Training):
     """
 
     data: Path
-    """Trajectory file, made by `robocas generate`: trajectory.h5."""
+    """A trajectory.h5 written by `robocas generate`."""
 
 
 @dataclass(kw_only=True)

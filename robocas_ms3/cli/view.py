@@ -26,7 +26,7 @@ class View:
     open: bool = True
     """Open the page in the default browser."""
     static: Maybe[Path] = None
-    """Write the page into this folder instead of serving it; OUT/index.html opens from disk."""
+    """Output folder of a static page, instead of a server. Open PATH/index.html in a browser."""
     episodes: Several[int] = ()
     """With --static: episode numbers. Default: all."""
     width: int = 480

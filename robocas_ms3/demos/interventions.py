@@ -69,7 +69,10 @@ def _retreat(arm: Arm) -> None:
 
 
 def _plan_shortest_retreat(arm: Arm, tcp_in_base: Array) -> Trajectory:
-    """Plan the shortest collision-ignoring straight line to a free pose: back, up, or towards the robot."""
+    """Plan the shortest straight retreat (back, up or towards the robot) that ends in a collision-free pose.
+
+    The path itself may collide.
+    """
     arm.planner.set_scene(arm.scene.obstacles())
     for distance in RETREAT_DISTANCES[::-1]:
         inward = tcp_in_base.copy()

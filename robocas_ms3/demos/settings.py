@@ -38,16 +38,18 @@ class EpisodeSettings:
     max_attempts: int = 20
     """Maximum number of attempts of the scripted policy per seed; then the seed is skipped."""
     keep_recoveries: bool = False
-    """Keep failed attempts in the episode, as one continuous motion, instead of undoing them."""
+    """Record failed attempts and the recovery from them in the episode.
+    Default: undo a failed attempt, so the episode contains only the successful one."""
     check_rate: Annotated[int | None, _NO_HINT] = None
     """Rate in Hz of the open-loop check, which replays the 7-D actions of each attempt.
     An attempt that fails the check is undone. 0: no check.
     Default: 5 Hz, or the control rate if 5 is not a divisor of it."""
     check_trials: int = 1
-    """Number of additional open-loop checks with actuation noise, see --check-noise. 0: none."""
+    """Number of noise checks: open-loop checks with actuation noise (--check-noise), after the check without noise.
+    0: none."""
     check_failures: int = 1
-    """Maximum number of attempts per seed that fail only with noise.
-    Later attempts are checked without noise, and their recording has `check_trials: 0`."""
+    """Number of failed noise checks per seed after which the noise check is switched off for that seed.
+    Such a recording has `check_trials: 0`."""
     check_noise_mm: Annotated[float, tyro.conf.Suppress] = 0.5
     check_noise_deg: Annotated[float, tyro.conf.Suppress] = 0.2
     layouts: Annotated[str, tyro.conf.Suppress] = "auto"
@@ -55,10 +57,10 @@ class EpisodeSettings:
     planner: Annotated[str, tyro.conf.arg(metavar="PLANNER")] = "rrt_connect"
     """Motion planner: rrt_connect, or a planner of another package (see docs/extending.md)."""
     robot: Annotated[str, tyro.conf.arg(metavar="ROBOT")] = DEFAULT_ROBOT
-    """Robot: a robot of this package or of another one (see docs/extending.md)."""
+    """Name of the robot (`robocas list`); docs/extending.md shows how to add one."""
     after_policy: Annotated[str, tyro.conf.arg(metavar="POLICY"), _NO_HINT] = ""
-    """Policy that acts first, as --policy of `robocas eval` (DAgger).
-    The scripted policy then completes the task, and only its part is recorded.
+    """Record expert interventions (DAgger): this policy acts first, the scripted policy completes the task, and
+    only the scripted part is recorded. Values as `robocas eval --policy`.
     Seeds in which the policy has succeeded or failed already are skipped."""
     after_steps: tuple[int, int] = (5, 60)
     """Minimum and maximum number of policy steps before the scripted policy continues; drawn uniformly per seed."""
@@ -114,7 +116,7 @@ class EpisodeSettings:
 class GenerateSettings:
     """Record demonstrations of a task with its scripted policy, as a ManiSkill trajectory file.
 
-    States and actions are recorded, which needs no renderer; `robocas convert` renders the images.
+    Record states and actions only, without a renderer. Render the images afterwards with `robocas convert`.
 
     Example: robocas generate pick -n 20 --config pick_shelf_scattered --set objects.count=12
     """
@@ -139,7 +141,9 @@ class GenerateSettings:
     """Noise of the additional open-loop checks: standard deviations in mm and degrees of each action component.
     Default: 0.5 0.2."""
     fork: bool = True
-    """Undo failed attempts by forking the process if that is safe. --no-fork gives the same episodes, but is slower."""
+    """Undo a failed attempt with a forked copy of the process.
+    --no-fork records the same episodes by simulating them again, which is slower; this is automatic where a fork is
+    unsafe (not Linux, CUDA in use, renderer open)."""
     overwrite: bool = False
     """Delete the output and start again.
     Default: resume a run with the same settings, or add episodes to a finished run."""

@@ -24,7 +24,8 @@ class EvaluationSettings:
     """
 
     tasks: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[TASK ...]"), _NO_HINT] = ()
-    """Tasks to evaluate, such as pick. Default: all tasks of the protocol. In paper-v1, select runs in the episodes of
+    """Tasks to evaluate, such as pick.
+    Default: all tasks of the protocol. In paper-v1, select runs in the episodes of
     pick, as in RoboCAS-v0."""
     policy: Annotated[str, tyro.conf.arg(metavar="POLICY")] = "scripted"
     """Policy to evaluate: scripted (joint targets), scripted-ee-delta (7-D actions), scripted-perturbed (7-D actions
@@ -43,15 +44,16 @@ class EvaluationSettings:
     workers: Annotated[int | None, _NO_HINT] = None
     """Number of worker processes. Default: one per environment, at most one per CPU core."""
     step_seconds: float = 300.0
-    """Time limit in seconds for a step or reset of the environments in a worker process. If a worker exceeds a limit
-    or crashes, the episode is retried once; after the second time it counts as failed, with an error. The time of
-    the policy is not limited."""
+    """Time limit in seconds per environment step or reset of a worker process; the policy has no limit.
+    An episode whose worker exceeds it or crashes is repeated once. After a second failure it counts as failed, with
+    an error."""
     memory_gb: float = 8.0
     """Memory limit per worker process in GB."""
     backend: Literal["auto", "processes", "gpu"] = "auto"
     """Where the simulation runs. auto: on a GPU if there is one, else in worker processes."""
     shard: Annotated[str, tyro.conf.arg(metavar="K/N")] = "0/1"
-    """K/N: run only every N-th episode, from episode K on (0 <= K < N). `robocas eval merge` joins the results."""
+    """Run shard K of N: the episodes whose number is K modulo N, 0 <= K < N.
+    `robocas eval merge` joins the results."""
     split: Annotated[str, _NO_HINT] = ""
     """Run only the episodes of this split, such as `seen`. Default: all splits."""
     episodes: Annotated[int | None, _NO_HINT] = None

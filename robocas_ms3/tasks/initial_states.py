@@ -35,7 +35,7 @@ class InitialStates:
     present: torch.Tensor
 
     @classmethod
-    def of(cls, layouts: Sequence[Layout], device: torch.device | str) -> InitialStates:
+    def from_layouts(cls, layouts: Sequence[Layout], device: torch.device | str) -> InitialStates:
         """Convert layouts to tensors on a device."""
 
         def poses(matrices: list[NDArray[np.float64]]) -> torch.Tensor:

@@ -175,7 +175,7 @@ class EpisodeSeeds:
         """Return the initial states of some envs' episodes; gathered on the device if the table has them all."""
         self.forget_layouts(envs)
         if self.initial_state_table is None:
-            return InitialStates.of([self.layout(env) for env in envs.tolist()], device)
+            return InitialStates.from_layouts([self.layout(env) for env in envs.tolist()], device)
         for env in envs[~self.initial_state_table.is_usable(envs, self.layout_seeds[envs])].tolist():
             self.layout(env)  # may draw another seed that is in the table
         tabled = self.initial_state_table.is_usable(envs, self.layout_seeds[envs])
@@ -183,7 +183,7 @@ class EpisodeSeeds:
         if tabled.all():
             return found
         others = [self.layout(env) for env in envs[~tabled].tolist()]
-        return found.with_rows(tabled, InitialStates.of(others, device))
+        return found.with_rows(tabled, InitialStates.from_layouts(others, device))
 
     def forget_layouts(self, envs: NDArray[np.int64]) -> None:
         for env in envs.tolist():

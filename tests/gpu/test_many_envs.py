@@ -136,7 +136,7 @@ def test_heaps_are_checked_by_this_engine_and_resets_use_stable_ones(tmp_path):
         made.reset()
         assert env.object_poses.is_cuda
         for i in (0, ENVS - 1):
-            wanted = InitialStates.of([env.layout(i)], env.device).object_poses[0]
+            wanted = InitialStates.from_layouts([env.layout(i)], env.device).object_poses[0]
             torch.testing.assert_close(env.object_poses[i], wanted, atol=1e-4, rtol=0)
     made.close()
 

@@ -49,7 +49,7 @@ def assert_same(one: InitialStates, two: InitialStates) -> None:
 def test_several_envs_reset_from_a_table_built_for_them(tabled, monkeypatch):
     env, asked = several(tabled, monkeypatch, seeds=(0, 1))
     everyone = np.arange(4)
-    one_by_one = InitialStates.of([env.layout(i) for i in range(4)], "cpu")
+    one_by_one = InitialStates.from_layouts([env.layout(i) for i in range(4)], "cpu")
     assert_same(env.seeds.find_initial_states(everyone, env.device), one_by_one)
     assert asked == [[(0, 0), (1, 1), (0, 0), (1, 1)]]
     for _ in range(20):
@@ -58,7 +58,9 @@ def test_several_envs_reset_from_a_table_built_for_them(tabled, monkeypatch):
     assert all([objects for objects, _ in one] == [0, 1, 0, 1] for one in asked)
     env.reset(options={"env_idx": torch.tensor([2])})
     assert [objects for objects, _ in asked[-1]] == [0]
-    assert_same(env.seeds.find_initial_states(np.array([2]), env.device), InitialStates.of([env.layout(2)], "cpu"))
+    assert_same(
+        env.seeds.find_initial_states(np.array([2]), env.device), InitialStates.from_layouts([env.layout(2)], "cpu")
+    )
     assert env.layouts[0].object_ids == env.seeds.object_ids[2] == env.seeds.object_ids[0] != env.seeds.object_ids[1]
 
 
@@ -118,7 +120,7 @@ def test_layouts_missing_in_the_table_come_from_the_cache(built, tmp_path, monke
     assert env.seeds.table is not None
     assert env.seeds.table.status((1, 7)) == LayoutStatus.MISSING
     found = env.seeds.find_initial_states(np.array([0, 1]), env.device)
-    assert_same(found, InitialStates.of([env.seeds.layouts(0, 1), env.seeds.layouts(1, 7)], "cpu"))
+    assert_same(found, InitialStates.from_layouts([env.seeds.layouts(0, 1), env.seeds.layouts(1, 7)], "cpu"))
 
 
 def test_one_env_that_keeps_its_objects_resets_from_a_table(built, monkeypatch):
@@ -129,6 +131,8 @@ def test_one_env_that_keeps_its_objects_resets_from_a_table(built, monkeypatch):
     for seed in (2, 0):
         made.reset(seed=seed)
         wanted = read_layout(env.seeds.layouts.path(env.seeds.objects_seeds[0], seed))
-        torch.testing.assert_close(env.object_poses, InitialStates.of([wanted], "cpu").object_poses, atol=1e-6, rtol=0)
+        torch.testing.assert_close(
+            env.object_poses, InitialStates.from_layouts([wanted], "cpu").object_poses, atol=1e-6, rtol=0
+        )
         assert int(env.target_slot) == wanted.target
     made.close()

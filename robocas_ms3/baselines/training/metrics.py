@@ -25,7 +25,10 @@ def mean_of_sum(sum_and_count: torch.Tensor) -> torch.Tensor:
 
 
 def batch_sum(metric: torch.Tensor, samples: int) -> torch.Tensor:
-    """Return sum and count (2,) float64 of a batch metric: a mean () or sum and count (2,)."""
+    """Convert a batch metric to (sum, count), float64 of shape (2,).
+
+    ``metric`` is a mean of shape (), or already (sum, count).
+    """
     metric = metric.detach().double()
     return metric if metric.ndim else torch.stack([metric * samples, torch.full_like(metric, samples)])
 

@@ -30,7 +30,13 @@ Keys = tuple[str, str, str, str]
 
 @dataclass(frozen=True)
 class Finding:
-    """Violation in an episode, or in the dataset, with the outcome of the import and the repair."""
+    """Violation found by an import.
+
+    Attributes:
+        episode: number of the episode; None for a violation of the whole dataset.
+        outcome: skipped, repaired or warning.
+        repair: description of the change, or empty.
+    """
 
     episode: int | None
     violation: Violation

@@ -34,7 +34,7 @@ _SPLIT = "Run robocas split --in-place --val-fraction 0.1 to split again."
 def _number(value: Any) -> int:
     if type(value) is int or (isinstance(value, str) and value.isdecimal()):
         return int(value)
-    raise ValueError("an episode number")
+    raise ValueError("an episode number: a whole number, at least 0")
 
 
 EpisodeIndex = Annotated[int, BeforeValidator(_number)]
@@ -175,7 +175,7 @@ class Dataset(EpisodeSource):
             return form.validate_python(content[key]) if key in content else default
         except ValidationError as error:
             where, found = f"{self.root / file}, {key}", str(content[key])[:80]
-            expected = error.errors()[0]["msg"]
+            expected = error.errors()[0]["msg"].removeprefix("Value error, ")
             raise DatasetError("invalid value", where=where, expected=expected, found=found, fix=fix) from error
 
     @cached_property
