@@ -235,8 +235,8 @@ def check_errors(folder: Path) -> None:
     episodes = aggregate["tasks"][0]["episodes"]
     assert aggregate["num_errors"] == EPISODES_PER_TASK + 1
     assert [episode["failure_reason"] for episode in episodes] == ["env_step"] * EPISODES_PER_TASK + ["env_start"]
-    assert "Leave max_steps out" in episodes[0]["failure_detail"]
-    assert "the protocol has no more episodes of this task" in episodes[-1]["failure_detail"]
+    assert "max_steps" in episodes[0]["failure_detail"]
+    assert "the protocol has fewer episodes of this task" in episodes[-1]["failure_detail"]
     say(f"refused: {episodes[0]['failure_detail'].splitlines()[-1]}")
 
 
