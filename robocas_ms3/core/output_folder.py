@@ -214,9 +214,12 @@ def _is_hidden(path: Path) -> bool:
 
 def is_empty(path: Path) -> bool:
     """Return whether a path is missing, or a folder with at most a lock file and leftovers of killed runs."""
-    if not path.is_dir():
-        return not path.exists()
-    return all(map(_is_hidden, path.iterdir()))
+    try:
+        return all(map(_is_hidden, path.iterdir()))
+    except FileNotFoundError:
+        return True
+    except NotADirectoryError:
+        return False
 
 
 def check_replaceable(path: Path | str, *, overwrite: bool | None = None, markers: Sequence[str] = ()) -> None:

@@ -141,7 +141,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "float32",
         ("T", 3),
         "m",
-        "EEF from step t to t+1, in the EEF frame at t; last row 0",
+        "translation of the EEF from step t to t+1, in the EEF frame at t; the last row is 0",
         record=lambda motion: motion.tcp_motion[0],
     ),
     Quantity(
@@ -220,7 +220,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "float32",
         ("T", 3),
         "m",
-        "as rel_pos, of the arm base",
+        "motion of the arm base from t to t+1, in the arm base frame at t",
         record=lambda motion: motion.base_motion[0],
     ),
     Quantity(
@@ -259,7 +259,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "float32",
         ("T", 3),
         "m, m, rad",
-        "mobile base in the world: x, y, yaw (yaw is continuous)",
+        "mobile base in the world: x, y, yaw (yaw is unwrapped: no jumps of 2 pi)",
         record=lambda motion: motion.agv_pose,
         lerobot_feature=STATE,
         components=("agv_x", "agv_y", "agv_yaw"),

@@ -3,7 +3,10 @@
 import errno
 import json
 import os
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Barrier
 
 import pytest
 
@@ -233,3 +236,27 @@ def test_mounted_folder_is_replaced_by_moving_entries(mounted):
     with atomic_folder(mounted) as folder:
         (folder / "new").mkdir()
     assert names(mounted) == ["new"]
+
+
+def test_shared_folder_that_another_run_creates_at_the_same_time_is_accepted(tmp_path):
+    """Shards of a plan start together; the test of an empty folder asked twice whether the folder exists."""
+    barrier, interval = Barrier(2), sys.getswitchinterval()
+
+    def create(path):
+        barrier.wait()
+        path.mkdir()
+
+    def enter(path):
+        barrier.wait()
+        with OutputFolder(path, KIND, SETTINGS, shared=True):
+            pass
+
+    sys.setswitchinterval(1e-6)  # makes the race likely: about 1 of 100 folders
+    try:
+        with ThreadPoolExecutor(2) as threads:
+            for number in range(3000):
+                path = tmp_path / str(number)
+                for future in [threads.submit(create, path), threads.submit(enter, path)]:
+                    future.result()
+    finally:
+        sys.setswitchinterval(interval)

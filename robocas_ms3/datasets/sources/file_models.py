@@ -190,7 +190,8 @@ class SceneRecord(_Part):
         description="{trajectory, episode_id, recording: SHA-256 of seed, control mode, instruction and actions}"
     )
     recorded: RecordedDetails | None = Field(
-        description="reported by the generator: template, relation, facts, attempts, seconds"
+        description="extra information of `robocas generate`: instruction template, relation, number of attempts, "
+        "planning and simulation seconds, task-specific counts (`facts`, such as pushes)"
     )
     versions: dict[str, Any] | None = Field(description="{package: version} at the time of the recording")
 
