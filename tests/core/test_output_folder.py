@@ -13,7 +13,7 @@ import pytest
 from robocas_ms3.core.errors import OutputExistsError, RobocasError
 from robocas_ms3.core.files import atomic_folder
 from robocas_ms3.core.locks import locked_folder
-from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, remove_leftovers
+from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, is_empty, remove_leftovers
 
 KIND = FolderKind("robocas test", ("run.json",), "rate", markers=("old_format",))
 SETTINGS = {"rate": 5, "camera": {"size": [640, 480], "depth": True}}
@@ -238,25 +238,25 @@ def test_mounted_folder_is_replaced_by_moving_entries(mounted):
     assert names(mounted) == ["new"]
 
 
-def test_shared_folder_that_another_run_creates_at_the_same_time_is_accepted(tmp_path):
-    """Shards of a plan start together; the test of an empty folder asked twice whether the folder exists."""
+def test_folder_that_another_process_creates_during_the_check_is_empty(tmp_path):
+    """Shards of a plan start together; one of them was refused, as the check asked twice whether the folder exists."""
     barrier, interval = Barrier(2), sys.getswitchinterval()
 
     def create(path):
         barrier.wait()
         path.mkdir()
 
-    def enter(path):
+    def check(path):
         barrier.wait()
-        with OutputFolder(path, KIND, SETTINGS, shared=True):
-            pass
+        return is_empty(path)
 
-    sys.setswitchinterval(1e-6)  # makes the race likely: about 1 of 100 folders
+    sys.setswitchinterval(1e-6)  # the check failed for about 30 of 3000 folders
     try:
         with ThreadPoolExecutor(2) as threads:
             for number in range(3000):
                 path = tmp_path / str(number)
-                for future in [threads.submit(create, path), threads.submit(enter, path)]:
-                    future.result()
+                created, empty = threads.submit(create, path), threads.submit(check, path)
+                created.result()
+                assert empty.result()
     finally:
         sys.setswitchinterval(interval)
