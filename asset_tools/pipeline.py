@@ -104,7 +104,7 @@ def _fail(error: AssetError, folder: Path) -> ObjectAsset:
 
 
 def check_jobs(jobs: Iterable[AssetJob]) -> None:
-    """Raise AssetError for the first job with a known error."""
+    """Raise AssetError for the first job whose `error` was found before the build."""
     for job in jobs:
         if job.error is not None:
             raise AssetError(_failed_result(job, str(job.error)).error.rstrip("."), fix=SKIP_FIX)

@@ -243,7 +243,7 @@ def _opened(path: Path) -> Iterator[dict[str, _Member]]:
                 raise _damaged(path, "the same number of points in each array", ", ".join(map(str, sorted(counts))))
             yield members
     except FileNotFoundError as error:
-        raise AssetError("no such label file", where=path) from error
+        raise AssetError("no such label file of GraspNet grasps", where=path) from error
     except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, OSError, NotImplementedError) as error:
         raise _damaged(path, "an npz archive", str(error) or type(error).__name__) from error
 

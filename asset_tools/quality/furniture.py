@@ -101,7 +101,7 @@ class FurnitureReport:
 
 
 def measure_furniture(furniture: FurnitureSource | LoadedFurniture) -> FurnitureQuality:
-    """Return the fractions of working joints and surfaces, with hull counts; deterministic.
+    """Measure hull counts and the fractions of working joints and stable surfaces; deterministic.
 
     Raises:
         AssetError: the physics engine rejects a hull.

@@ -165,7 +165,7 @@ def _ply_checked(data: bytes, path: Path, textures: _Textures) -> tuple[bytes, i
             kind, count = [*words[1:], b"", b""][:2]
             limit = MOST_FACES if kind == b"face" else MOST_VERTICES
             if not (count.isdigit() and len(count) < 12 and int(count) <= limit):
-                what = f"the mesh has too many elements {decode_text(kind)[:20]!r}"
+                what = f"the mesh has too many elements of type {decode_text(kind)[:20]!r}"
                 found = decode_text(count)[:20]
                 raise AssetError(what, where=path, expected=f"at most {limit:,}", found=found, fix="Reduce it.")
             faces = int(count) if kind == b"face" else faces

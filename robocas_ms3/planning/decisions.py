@@ -40,7 +40,7 @@ FIRST_FEASIBLE = SearchLimits()
 
 
 class Decisions(Protocol):
-    """Interface of the search: plays candidates and continues from one of them."""
+    """Interface for decisions of a scripted policy: run candidate motions, continue from the best one."""
 
     def choose(self, candidates: Iterable[T], play: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE) -> T:
         """Play candidates from the current state and continue from the one with the greatest score.

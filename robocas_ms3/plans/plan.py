@@ -64,7 +64,7 @@ class ImagesConfig(StrictModel):
     cameras: list[str] | None = Field(default=None, description="default: all cameras of the configurations")
 
     def image_options(self) -> ImageOptions:
-        """Return the settings in the form of dataset writers."""
+        """Return the settings as `ImageOptions` for dataset writers."""
         cameras = (
             STANDARD_CAMERA_NAMES if self.cameras is None else tuple(self.cameras)
         )  # None: a plan.json of an older version

@@ -62,7 +62,9 @@ class Layout:
             raise ValueError("objects that the pack does not have, or numbers of poses and objects that differ")
         fixtures = [self.robot_pose] if self.basket_pose is None else [self.robot_pose, self.basket_pose]
         if any(pose.shape != (4, 4) for pose in fixtures) or not 0 <= self.target < count:
-            raise ValueError("a pose that is not 4x4, or a target that is not one of the objects")
+            raise ValueError(
+                f"a robot or basket pose that is not 4 x 4, or target index {self.target} of {count} objects"
+            )
         poses = np.concatenate([self.object_poses, fixtures])
         turns = poses[:, :3, :3]
         if not np.isfinite(poses).all() or np.abs(turns @ turns.swapaxes(1, 2) - np.eye(3)).max() > _ROTATION_ERROR:

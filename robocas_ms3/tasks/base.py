@@ -276,7 +276,7 @@ class RoboCASEnv(BaseEnv):
         return pose
 
     def tcp_in_world(self) -> Array:
-        """Return the pose (N, 7) of the TCP in the world, native (`arrays`)."""
+        """Return the TCP pose (N, 7) in the world frame as a native array (`core.arrays`)."""
         return link_poses(self.scene, [self.agent.tcp])[:, 0]
 
     def target_center(self, objects: Array) -> Array:

@@ -245,5 +245,5 @@ def _bounds(bodies: list[Any]) -> _Boxes:
 def contact_forces(
     scene: ManiSkillScene, bodies: Sequence[Actor | Link], objects: Sequence[Actor | Link]
 ) -> torch.Tensor:
-    """Return `Contacts.forces` for a single query."""
+    """Return the force (N, B, K, 3) of each object on each body in the last physics step, N, world frame."""
     return as_tensor(Contacts(scene, bodies, objects).forces())

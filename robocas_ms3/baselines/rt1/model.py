@@ -154,7 +154,11 @@ class RT1Model(nn.Module):
     def forward(self, batch: Batch) -> dict[str, torch.Tensor]:
         """Return the cross entropy, and the accuracies of the action, gripper and terminate tokens."""
         if self.training and self.config.image_weights is not None and not self.from_imagenet:
-            raise TrainingError("no such file", where=f"image_weights {self.config.image_weights}")
+            raise TrainingError(
+                "missing file of ImageNet weights",
+                where=f"image_weights {self.config.image_weights}",
+                fix="Set image_weights to a file of EfficientNet's weights, or leave it out.",
+            )
         logits, mask = self.logits(batch), batch["mask"]
         end = torch.where(batch["terminate"], TERMINATE, CONTINUE)
         labels = torch.cat([self.bins.encode(batch["action"]), end[..., None]], dim=-1)

@@ -48,7 +48,7 @@ class Block(nn.Module):
         self.shortcut = nn.Identity() if stride == 1 and inputs == outputs else nn.Conv2d(inputs, outputs, 1, stride)
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """Return (B, C, h, w) for (B, c, H, W)."""
+        """Return features (B, outputs, H / stride, W / stride) of features (B, inputs, H, W)."""
         inner = F.relu(self.norms[0](self.first(features)))
         return F.relu(self.norms[1](self.second(inner)) + self.shortcut(features))
 

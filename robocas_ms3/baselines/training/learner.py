@@ -42,7 +42,7 @@ class Learner:
     def update(self, batch: Batch, learning_rate: float) -> None:
         """Take an optimiser step.
 
-        On a GPU, a NaN raises in the next `take_means` only, to avoid synchronisation.
+        A NaN or infinite gradient is an error: at once on a CPU, in the next `take_means` on a GPU.
         """
         for group in self._optimizer.param_groups:
             group["lr"] = learning_rate

@@ -113,7 +113,7 @@ class RunFolder:
 
 
 def _hardware_changes(record: RunRecord, accelerator: Accelerator) -> str:
-    """Return the differences of this hardware from the record, which change rounding; empty: none."""
+    """Return how this hardware differs from the recorded one, which changes rounding; empty if equal."""
     now = describe_hardware(accelerator) | ({} if record.threads else {"threads": 0})
     return ", ".join(f"{name} {value}" for name, value in now.items() if getattr(record, name) != value)
 

@@ -176,4 +176,4 @@ class EpisodePart:
 
 
 def _damaged(path: Path) -> DatasetError:
-    return DatasetError("damaged part of a conversion", where=path, fix="Pass --overwrite to start again.")
+    return DatasetError("damaged temporary file of a conversion", where=path, fix="Pass --overwrite to start again.")

@@ -206,7 +206,7 @@ def fill_unknown_keys(scene: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_scene(scene: Mapping[str, Any], where: object) -> SceneRecord:
-    """Return ``scene.json`` as a model, keys may be missing; raise DatasetError if it is invalid."""
+    """Validate ``scene.json`` as a `SceneRecord`, None for missing keys; raise DatasetError if invalid."""
     try:
         return SceneRecord.model_validate(fill_unknown_keys(scene))
     except ValidationError as problem:

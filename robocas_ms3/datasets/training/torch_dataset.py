@@ -133,7 +133,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
     def weights(self) -> torch.Tensor:
         """Return weights (N,) for ``WeightedRandomSampler`` that balance the sub-goal types."""
         if (self.subgoal_types < 0).all():
-            raise DatasetError("this dataset has no sub-goals", where=self.source.root, expected="step_goals")
+            raise DatasetError("this dataset has no sub-goals", where=self.source.root, expected="the array step_goals")
         _, types, counts = np.unique(self.subgoal_types, return_inverse=True, return_counts=True)
         return torch.from_numpy(1.0 / (len(counts) * counts[types]))
 

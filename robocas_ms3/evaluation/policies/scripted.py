@@ -47,7 +47,7 @@ class ScriptedPolicy(TrackPolicy):
         self._generators: dict[EpisodeSettings, EpisodeGenerator] = {}  # most recently used last
 
     def track(self, episode: EpisodeSpec) -> JointTrack | PoseTrack:
-        """Plan an episode; this takes seconds."""
+        """Plan an episode with the scripted policy and return its track; takes several seconds."""
         actions, states = np.zeros((0, 8)), np.zeros((1, 37))
         generator = self._generator_of(episode)
         with tempfile.TemporaryDirectory() as folder:

@@ -184,7 +184,7 @@ class RemotePolicy:
                 if envs[row] in known | starting:
                     groups.setdefault(key, []).append(row)
                 else:
-                    answers[row] = _ConnectionLost("lost connection")
+                    answers[row] = _ConnectionLost("lost connection to the policy server")
             # A plain openpi server accepts no connection during inference, so open all connections first.
             missing = groups.keys() - self._connections.keys()
             await asyncio.gather(*(self._connect(key) for key in missing))
@@ -200,7 +200,7 @@ class RemotePolicy:
         connection = self._connections.get(key)
         try:
             if connection is None:  # another request has closed it
-                raise _ConnectionLost("lost connection")
+                raise _ConnectionLost("lost connection to the policy server")
             if self._metadata.max_batch is None:
                 answers = [await self._answer(connection.socket, messages[rows[0]])]
             else:
@@ -239,7 +239,7 @@ class RemotePolicy:
             self._last_answer = time.monotonic()
             return read_message(answer.result())
         except CONNECTION_ERRORS as error:
-            raise _ConnectionLost(f"lost connection: {one_line(error, 300)}") from error
+            raise _ConnectionLost(f"lost connection to the policy server: {one_line(error, 300)}") from error
         finally:
             answer.cancel()
 

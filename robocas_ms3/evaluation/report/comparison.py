@@ -45,7 +45,11 @@ def compare_results(results: Sequence[Result]) -> str:
             raise EvaluationError(what, where=other.folder, expected=expected, found=found)
         if first.run.weld != other.run.weld:
             welded = (first if first.run.weld else other).folder
-            raise EvaluationError("cannot compare results with and without RoboCAS-v0's weld", where=welded)
+            raise EvaluationError(
+                "cannot compare results with and without RoboCAS-v0's weld",
+                where=welded,
+                fix="Evaluate all policies with the same weld setting.",
+            )
     shared = sorted(set.intersection(*(set(result.outcomes) for result in results)))
     if not shared:
         raise EvaluationError("the results have no common episodes", where=results[-1].folder)

@@ -83,7 +83,7 @@ def _funnels(result: Result) -> str:
                     f'<div class="row"><span>{escape(name)}</span>{shown}<b>{100 * rate.rate:.0f} %</b></div>\n'
                 )
         cards.append(f"<figure><figcaption>{escape(config)}, n {len(outcomes)}</figcaption>{''.join(rows)}</figure>\n")
-    note = "SuccessRate of the episodes that reached each stage, with its interval. An episode may skip a stage."
+    note = "Fraction of the episodes that reached each stage, with its interval. An episode may skip a stage."
     return _section("Stages", note, f'<div class="cards">\n{"".join(cards)}</div>\n')
 
 

@@ -137,7 +137,7 @@ class Arm:
         return first_plan(
             goals,
             lambda goal: self.planner.plan_straight(start, goal, stage=stage, check_collisions=check_collisions),
-            PlanningError(stage, "no_goal"),
+            PlanningError(stage, "no_goals"),
         )
 
     def plan_home(self, start: Array) -> Trajectory:

@@ -105,7 +105,7 @@ def drive_to_object(arm: Arm, slot: int, *, relocate: bool = False) -> None:
 
 
 def drive_to_handle(arm: Arm, *, relocate: bool = False) -> None:
-    """Drive with a folded arm to where the handle can be pulled; stay if it can, unless ``relocate``."""
+    """Drive with a folded arm to a base pose for the pull, if needed or if ``relocate`` is set."""
     if not arm.executor.drives_base:
         return
     part = MovingPart.of(arm)

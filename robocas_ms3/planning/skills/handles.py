@@ -155,7 +155,7 @@ def pull_handle(arm: Arm, part: MovingPart) -> None:
         back = first_plan(
             check_collisions,
             lambda check: arm.plan_first_line(arm.qpos, goals, stage="retreat", check_collisions=check),
-            PlanningError("retreat", "no_goal"),
+            PlanningError("retreat", "no_goals"),
         )
     arm.follow(back)
 

@@ -80,7 +80,7 @@ def plan_carry(arm: Arm, slot: int) -> Trajectory:
 def _rank_drops(arm: Arm, slot: int, drops: Array, qpos: Array) -> NDArray[np.int_]:
     """Rank drop poses (N, 4, 4) with configurations (N, 7): objects that fit through the opening first.
 
-    Then near and steep poses are preferred, since objects slide off a tilted gripper, and stretched arms are avoided.
+    Next come poses near the current configuration, with a bent arm and a steep gripper, off which objects do not slide.
     """
     inside = _inside_basket(arm, arm.scene.arm_base_in_world)
     overhang = compute_overhang(drops, inside, transform_points(*held_object(arm, slot)), DROP_MARGIN)

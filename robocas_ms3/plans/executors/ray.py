@@ -94,7 +94,7 @@ class RayExecutor(ThreadExecutor):
         except ray.exceptions.RayTaskError as error:
             if isinstance(error.cause, RobocasError | OSError):
                 raise error.cause from error
-            fix = "Install the same versions of robocas-ms3 and Python on all nodes."
+            fix = "Check that all nodes have the same versions of robocas-ms3 and Python."
             found = one_line(error)[-300:]
             raise PlanError("a task of Ray failed", where="Ray", found=found, fix=fix) from error
         except ray.exceptions.RayError as error:

@@ -93,7 +93,7 @@ class SurfaceConfig(StrictModel):
         if (self.min_xy is None) != (self.max_xy is None):
             raise ValueError("expected both min_xy and max_xy, or neither")
         if self.min_xy and self.max_xy and not all(a < b for a, b in zip(self.min_xy, self.max_xy, strict=True)):
-            raise ValueError(f"min_xy {self.min_xy} must be below max_xy {self.max_xy}")
+            raise ValueError(f"min_xy {self.min_xy}: expected both components less than those of max_xy {self.max_xy}")
         return self
 
 

@@ -73,7 +73,7 @@ class ProcessEnv(gym.Env):
         registered = REGISTERED_ENVS.get(self.spec.id)
         module = registered.cls.__module__ if registered else "robocas_ms3"
         if module == "__main__":
-            fix = f'Register it in a module, and pass "my_module:{self.spec.id}".'
+            fix = f'Register it in a module, and pass the id "my_module:{self.spec.id}".'
             what = "worker processes can't import an environment that is registered in the main program"
             raise VectorEnvError(what, where=env_id, fix=fix)
         cuts = [num_envs * worker // workers for worker in range(workers + 1)]
