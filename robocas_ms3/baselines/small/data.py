@@ -72,9 +72,11 @@ class SmallSamples:
         self._episode = torch.from_numpy(np.repeat(np.arange(len(numbers)), lengths))
         starts = (np.cumsum(lengths) - lengths).tolist()
         scenes: list[SceneObjects] = []
+        # threads decode images only: NumPy reads arrays with `ast`, which is not thread-safe in Python 3.11 (gh-106905)
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-            for objects in pool.map(self._read, range(len(numbers)), numbers, starts):
-                scenes.append(objects)
+            image_sizes = pool.map(self._read_images, numbers, starts)
+            for number, start, stored in zip(numbers, starts, image_sizes, strict=True):
+                scenes.append(self._read_arrays(len(scenes), number, start, stored))
                 on_read(len(scenes), len(numbers))
         self._choose_object_texts(scenes if config.language else [replace(objects, target="") for objects in scenes])
         if config.language and split == "train" and not (self._classes >= 0).any():
@@ -125,8 +127,18 @@ class SmallSamples:
             "key": self._keys[rows],
         }
 
-    def _read(self, index: int, number: int, start: int) -> SceneObjects:
-        """Read an episode into the rows from ``start`` on; return its objects."""
+    def _read_images(self, number: int, start: int) -> dict[str, tuple[int, int]]:
+        """Read the images of an episode into the rows from ``start`` on; return their stored sizes by camera."""
+        episode, stored = self._source.episode(number), {}
+        for camera, view in self._config.views.items():
+            with closing(episode.frames(camera, "rgb", 0, self._source.lengths[number])) as images:
+                for row, image in enumerate(images, start=start):
+                    self._images[camera][row] = torch.from_numpy(crop_image(image, view, self._source.root))
+                    stored[camera] = image.shape[1], image.shape[0]
+        return stored
+
+    def _read_arrays(self, index: int, number: int, start: int, stored: dict[str, tuple[int, int]]) -> SceneObjects:
+        """Read the arrays of an episode into the rows from ``start`` on; return its objects."""
         config, episode = self._config, self._source.episode(number)
         arrays = episode.read([*_KEYS, *(["language_embedding"] if config.language else [])])
         length = self._source.lengths[number]
@@ -145,17 +157,13 @@ class SmallSamples:
             self._texts[index] = torch.from_numpy(arrays["language_embedding"])
         projections: dict[str, Callable[[Array], NDArray[np.float32]]] = {}
         for camera, view in config.views.items():
-            stored = (0, 0)
-            with closing(episode.frames(camera, "rgb", 0, length)) as images:
-                for row, image in enumerate(images, start=start):
-                    self._images[camera][row] = torch.from_numpy(crop_image(image, view, self._source.root))
-                    stored = image.shape[1], image.shape[0]
-            self._check_calibration(camera, calibration(episode, camera, arrays, stored, view), episode.where)
+            found = calibration(episode, camera, arrays, stored[camera], view)
+            self._check_calibration(camera, found, episode.where)
             projections[camera] = partial(
                 project_points,
                 camera=episode.camera_in_parent(camera),
                 intrinsic=episode.intrinsic(camera),
-                stored=stored,
+                stored=stored[camera],
                 view=view,
             )
             points = in_camera_parent(episode.camera_parent(camera), key_points[:, None], poses, arrays)[:, 0]

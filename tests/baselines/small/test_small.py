@@ -1,6 +1,7 @@
 """`small`: samples of a dataset, training, policy, and refused datasets."""
 
 import shutil
+import threading
 from types import SimpleNamespace
 
 import numpy as np
@@ -93,6 +94,14 @@ def test_samples_are_those_of_the_dataset(samples, folder):
     assert np.allclose(ahead[0, :3, 3], arrays["ee_pos"][5], atol=1e-5)
     wxyz = to_wxyz(ahead[:1])[0, 3:]
     assert abs(wxyz @ np.roll(arrays["ee_orn"][5], 1)) == pytest.approx(1, abs=1e-5)
+
+
+def test_arrays_are_read_by_one_thread(folder, monkeypatch):
+    """NumPy reads headers with `ast`, which raised SystemError in threads of Python 3.11 (gh-106905)."""
+    threads, load = set(), np.load
+    monkeypatch.setattr("numpy.load", lambda *args, **kwargs: threads.add(threading.get_ident()) or load(*args, **kwargs))
+    read(folder)
+    assert threads == {threading.get_ident()}
 
 
 def test_objects_get_instructions_that_name_them(folder, monkeypatch, caplog):
