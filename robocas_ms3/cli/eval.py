@@ -21,7 +21,7 @@ DESCRIPTION = """Evaluate a policy on a protocol, and report, compare and verify
 
 @dataclass
 class Protocols:
-    """List the bundled protocols and their training configurations.
+    """List the bundled protocols with their splits, hashes and training configurations.
 
     Example: robocas eval protocols
     """
@@ -29,17 +29,18 @@ class Protocols:
 
 @dataclass
 class Freeze:
-    """Create a protocol from a plan: sample its scenes and write them to files.
+    """Create a protocol from a protocol source: sample its scenes and write them to files.
 
     Example: robocas eval freeze scripts/protocols/smoke.yaml --out protocols/mine --set objects.count=12
     """
 
-    plan: Annotated[Path, tyro.conf.Positional]
-    """YAML file of the plan; scripts/protocols contains the plans of the bundled protocols."""
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE.yaml")]
+    """Protocol source: a YAML file with rules and groups of episodes. scripts/protocols has the sources of the
+    bundled protocols."""
     out: Path
     """Folder of the protocol."""
     set: Overrides = ()
-    """Set a key in all configurations of the plan, such as `--set objects.count=12`; repeatable
+    """Set a key in all configurations of the protocol, such as `--set objects.count=12`; repeatable
     (docs/configuration.md)."""
 
 
@@ -87,15 +88,20 @@ def run(settings: EvaluationSettings) -> int:
 
 
 def list_protocols(cfg: Protocols) -> int:
-    from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
+    from robocas_ms3.cli.terminal import print_line, print_table
+    from robocas_ms3.core.paths import protocols_dir
+    from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
+    from robocas_ms3.evaluation.protocol import TRAIN, load_protocol
 
-    for name in shipped_protocols():
-        protocol = load_protocol(name)
-        count = format_count(len(protocol.episodes), "episode")
-        print_line(f"{name}: {count}, {protocol.hash[:12]}: {protocol.rules.description}")
-        if files := protocol.training_configs():
-            print_line(f"    training configurations: {', '.join(map(str, files))}")
+    protocols = [load_protocol(name) for name in bundled_protocols()]
+    rows = [(one.rules.name, len(one.episodes), ", ".join(one.splits), one.description) for one in protocols]
+    print_table(("name", "episodes", "splits", "description"), rows)
+    print_line(f"Folder of a protocol: {protocols_dir()}/NAME")
+    files = [
+        (one.rules.name, one.hash[:16], ", ".join(path.name for path in one.training_configs()) or "none")
+        for one in protocols
+    ]
+    print_table(("name", "hash (first 16 digits)", f"training configurations (in NAME/{TRAIN})"), files)
     return 0
 
 
@@ -103,14 +109,13 @@ def freeze(cfg: Freeze) -> int:
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.output_folder import check_replaceable
-    from robocas_ms3.evaluation.freeze import freeze as make
-    from robocas_ms3.evaluation.freeze import read_plan
+    from robocas_ms3.evaluation.freeze import freeze_protocol, read_protocol_source
     from robocas_ms3.evaluation.protocol import load_protocol
 
-    plan = read_plan(cfg.plan)
+    source = read_protocol_source(cfg.source)
     check_replaceable(cfg.out)
     with ProgressBar("scenes frozen") as bar:
-        for done, total in make(plan, cfg.out, overrides=cfg.set):
+        for done, total in freeze_protocol(source, cfg.out, overrides=cfg.set):
             bar.update(done, total)
     protocol = load_protocol(cfg.out)
     print_line(f"{cfg.out}: {format_count(len(protocol.episodes), 'episode')}, hash {protocol.hash}")

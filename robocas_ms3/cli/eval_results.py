@@ -201,10 +201,11 @@ def _read(folders: tuple[Path, ...]) -> Result:
 def _protocol_of(result: Result, given: str | None) -> LoadedProtocol:
     """Load the given protocol, or the bundled protocol of a result; a result names no folder."""
     from robocas_ms3.core.errors import EvaluationError
-    from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
+    from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
+    from robocas_ms3.evaluation.protocol import load_protocol
 
-    name, shipped = result.run.protocol, shipped_protocols()
-    if given is None and name not in shipped:
+    name, bundled = result.run.protocol, bundled_protocols()
+    if given is None and name not in bundled:
         what, fix = "the protocol of the result is not bundled", "Pass --protocol FOLDER."
-        raise EvaluationError(what, where=result.folder, expected=f"one of {', '.join(shipped)}", found=name, fix=fix)
-    return load_protocol(shipped[name] if given is None else given)
+        raise EvaluationError(what, where=result.folder, expected=f"one of {', '.join(bundled)}", found=name, fix=fix)
+    return load_protocol(bundled[name] if given is None else given)

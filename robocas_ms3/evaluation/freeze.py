@@ -1,4 +1,4 @@
-"""Freeze a protocol from a plan: sample its scenes and write them to files."""
+"""Freeze a protocol from a protocol source: sample its scenes and write them to files."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ from robocas_ms3.scenes.layout_table import write_frozen_layouts
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.base import RoboCASEnv
 
-INVALID_PLAN = "invalid protocol plan"
+INVALID_SOURCE = "invalid protocol source"
 _WRONG = 300  # random stream that draws the object of a wrong instruction
 
 
 class ConfigVariant(StrictModel):
-    """A task configuration with changed keys."""
+    """A task configuration with changed keys: an element of ``train`` in a protocol source."""
 
-    config: str = Field(description="name of a bundled configuration, or a YAML file relative to the plan")
+    config: str = Field(description="name of a bundled configuration, or a YAML file relative to the source")
     name: str = Field(
         default="",
         pattern=r"^[A-Za-z0-9_-]*$",
@@ -51,18 +51,18 @@ class ConfigVariant(StrictModel):
     )
     change: dict[str, Any] = Field(default={}, description="changed keys, in the format of the configuration")
 
-    def resolve(self, overrides: Sequence[str] = ()) -> TaskConfig:
-        """Return the configuration of the file with ``change`` and then ``overrides`` applied."""
+    def load(self, overrides: Sequence[str] = ()) -> TaskConfig:
+        """Load the configuration, and apply ``change`` and then ``overrides`` (``KEY=VALUE`` texts)."""
         return load_task_config(self.config, self.change, overrides)
 
     @property
-    def file(self) -> str:
-        """Return the name of the written file, without suffix."""
+    def file_stem(self) -> str:
+        """Return the name of the configuration file in the protocol, without suffix."""
         return self.name or Path(self.config).stem
 
 
 class ProtocolPart(ConfigVariant):
-    """Episodes of one configuration in a protocol plan."""
+    """Episodes of one configuration and split: an element of ``parts`` in a protocol source."""
 
     count: int = Field(ge=1, description="number of episodes")
     first_seed: int = Field(ge=0, description="first scene seed; seeds without a layout are skipped")
@@ -73,12 +73,12 @@ class ProtocolPart(ConfigVariant):
     )
 
     @property
-    def file(self) -> str:
-        return self.name or super().file + ("" if self.split == "test" else f"-{self.split}")
+    def file_stem(self) -> str:
+        return self.name or super().file_stem + ("" if self.split == "test" else f"-{self.split}")
 
 
-class ProtocolPlan(StrictModel):
-    """Plan of a protocol: rules, episodes, and configurations for training."""
+class ProtocolSource(StrictModel):
+    """Source of a protocol, a YAML file: rules, groups of episodes, and configurations for training."""
 
     rules: dict[str, object] = Field(description="fields of `Protocol` without pack_hash")
     parts: list[ProtocolPart]
@@ -86,42 +86,43 @@ class ProtocolPlan(StrictModel):
     lists: dict[str, Any] = Field(default={}, description="YAML anchors that `change` refers to")
 
 
-def read_plan(path: Path) -> ProtocolPlan:
-    """Read a plan; paths of configurations are relative to the plan or to the working directory."""
+def read_protocol_source(path: Path) -> ProtocolSource:
+    """Read a protocol source; resolve paths of configurations relative to the source or the working directory."""
     try:
         data = load_yaml(path)
     except (OSError, DocumentError) as error:
-        raise EvaluationError(INVALID_PLAN, where=path, found=error) from error
-    plan = parse(ProtocolPlan, data, EvaluationError, where=path, about=INVALID_PLAN)
+        raise EvaluationError(INVALID_SOURCE, where=path, found=error) from error
+    source = parse(ProtocolSource, data, EvaluationError, where=path, about=INVALID_SOURCE)
 
-    def resolve_file(scene: ConfigVariant) -> ConfigVariant:
-        file = path.parent / scene.config
-        own = file.is_file() and scene.config not in bundled_configs()
-        return scene.model_copy(update={"config": str(file)}) if own else scene
+    def add_folder(variant: ConfigVariant) -> ConfigVariant:
+        file = path.parent / variant.config
+        is_own = file.is_file() and variant.config not in bundled_configs()
+        return variant.model_copy(update={"config": str(file)}) if is_own else variant
 
-    return plan.model_copy(update={name: list(map(resolve_file, getattr(plan, name))) for name in ("parts", "train")})
+    return source.model_copy(update={name: list(map(add_folder, getattr(source, name))) for name in ("parts", "train")})
 
 
-def freeze(plan: ProtocolPlan, folder: Path, overrides: Sequence[str] = ()) -> Iterator[tuple[int, int]]:
-    """Write a protocol into a folder atomically; yield the number of sampled episodes and of all episodes.
+def freeze_protocol(source: ProtocolSource, folder: Path, overrides: Sequence[str] = ()) -> Iterator[tuple[int, int]]:
+    """Sample the scenes of a protocol and write its folder atomically.
 
-    ``overrides``: keys to set in all configurations, see `load_task_config`.
+    Yields the number of sampled episodes and the number of all episodes, after each episode. ``overrides``:
+    ``KEY=VALUE`` texts, set in all configurations (`load_task_config`).
     """
-    pack = load_pack(str(plan.rules.get("pack", "builtin")))
-    values = {**plan.rules, "pack_hash": sha256(pack.root / MANIFEST)}
+    pack = load_pack(str(source.rules.get("pack", "builtin")))
+    values = {**source.rules, "pack_hash": sha256(pack.root / MANIFEST)}
     rules = parse(Protocol, values, EvaluationError, where="rules", about=INVALID_RULES)
-    configs, train = _configs(plan.parts, overrides), _configs(plan.train, overrides)
-    total, episodes = sum(part.count for part in plan.parts), []
+    configs, train = _load_configs(source.parts, overrides), _load_configs(source.train, overrides)
+    total, episodes = sum(part.count for part in source.parts), []
     with atomic_folder(folder) as tmp:
         make_folder(tmp / LAYOUTS)
         for inside, named in ((CONFIGS, configs), (TRAIN, train)):
             for name, config in named.items():
                 _write_yaml(config.model_dump(mode="json"), make_folder(tmp / inside) / f"{name}.yaml")
         scenes: dict[str, dict[int, Layout]] = {}
-        for part in plan.parts:
-            for seed, layout, env in _scenes(part, configs[part.file], str(rules.pack)):
-                scenes.setdefault(part.file, {})[seed] = layout
-                episodes.append(_episode(len(episodes), part, seed, layout, env))
+        for part in source.parts:
+            for seed, layout, env in _sample_scenes(part, configs[part.file_stem], str(rules.pack)):
+                scenes.setdefault(part.file_stem, {})[seed] = layout
+                episodes.append(_make_episode(len(episodes), part, seed, layout, env))
                 yield len(episodes), total
         for name, found in scenes.items():
             write_frozen_layouts(tmp / LAYOUTS / f"{name}.npy", pack.objects, found)
@@ -133,16 +134,17 @@ def freeze(plan: ProtocolPlan, folder: Path, overrides: Sequence[str] = ()) -> I
         )
 
 
-def _configs(parts: Sequence[ConfigVariant], overrides: Sequence[str]) -> dict[str, TaskConfig]:
+def _load_configs(variants: Sequence[ConfigVariant], overrides: Sequence[str]) -> dict[str, TaskConfig]:
     found: dict[str, TaskConfig] = {}
-    for part in parts:
-        config = part.resolve(overrides)
-        if not re.fullmatch(CONFIG_NAME, part.file) or len(part.file) > MAX_NAME_BYTES:
-            what, fix = "invalid name of a configuration", "Set `name`, and use a `split` of letters and digits."
-            expected = f"letters, digits, _ and -, at most {MAX_NAME_BYTES}"
-            raise EvaluationError(what, where=part.config, expected=expected, found=repr(part.file)[:80], fix=fix)
-        if found.setdefault(part.file, config) != config:
-            raise EvaluationError("two configurations have the same name", where=part.file, fix="Set `name` of one.")
+    for variant in variants:
+        config, name = variant.load(overrides), variant.file_stem
+        if not re.fullmatch(CONFIG_NAME, name) or len(name) > MAX_NAME_BYTES:
+            what, fix = "invalid file name of a configuration", "Set `name`, and use a `split` of letters and digits."
+            expected = f"at most {MAX_NAME_BYTES} letters, digits, _ and -"
+            raise EvaluationError(what, where=variant.config, expected=expected, found=repr(name)[:80], fix=fix)
+        if found.setdefault(name, config) != config:
+            what, fix = "two different configurations have the same file name", "Set the key `name` of one of them."
+            raise EvaluationError(what, where=name, fix=fix)
     return found
 
 
@@ -150,7 +152,7 @@ def _write_yaml(values: dict[str, Any], path: Path) -> None:
     path.write_text(yaml.safe_dump(values, sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
-def _scenes(part: ProtocolPart, config: TaskConfig, pack: str) -> Iterator[tuple[int, Layout, RoboCASEnv]]:
+def _sample_scenes(part: ProtocolPart, config: TaskConfig, pack: str) -> Iterator[tuple[int, Layout, RoboCASEnv]]:
     env = gym.make(TASKS[config.task].env_id, config=config, pack=pack, obs_mode="none", render_backend="none")
     base: Any = env.unwrapped
     try:
@@ -168,28 +170,28 @@ def _scenes(part: ProtocolPart, config: TaskConfig, pack: str) -> Iterator[tuple
         env.close()
 
 
-def _episode(number: int, part: ProtocolPart, seed: int, layout: Layout, env: RoboCASEnv) -> ProtocolEpisode:
+def _make_episode(number: int, part: ProtocolPart, seed: int, layout: Layout, env: RoboCASEnv) -> ProtocolEpisode:
     p_vis = float(layout.visible_fractions[layout.target])
     return ProtocolEpisode(
         episode=number,
         task=env.SPEC.name,
-        config=part.file,
+        config=part.file_stem,
         seed=seed,
         split=part.split,
-        instruction=_instruction(part, env, seed),
+        instruction=_make_instruction(part, env, seed),
         target=layout.object_ids[layout.target],
         p_vis=None if np.isnan(p_vis) else round(p_vis, 4),
     )
 
 
-def _instruction(part: ProtocolPart, env: RoboCASEnv, seed: int) -> str:
+def _make_instruction(part: ProtocolPart, env: RoboCASEnv, seed: int) -> str:
     if part.instruction == "empty":
         return ""
     if part.instruction == "correct":
         return env.instruction().text
     others = sorted(env.object_names() - {env.target_asset().asset.name})
     if not others:
-        what, fix = "instruction: wrong needs a second kind of object", "Increase objects.count."
-        raise EvaluationError(what, where=f"{part.file}, seed {seed}", fix=fix)
+        what, fix = "no other object for the instruction `wrong`", "Increase objects.count."
+        raise EvaluationError(what, where=f"{part.file_stem}, seed {seed}", fix=fix)
     rng = np.random.default_rng([seed, _WRONG])
     return env.instruction(0, others[int(rng.integers(len(others)))]).text

@@ -26,8 +26,8 @@ from pydantic import Field, model_validator
 from robocas_ms3.core.checks import MAX_SEED, parse_shard
 from robocas_ms3.core.documents import ARRAYS_LIMIT, JSON_LIMIT, DocumentError, load_yaml, read_bytes, read_text
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.core.paths import protocols_dir
 from robocas_ms3.core.strict_model import MAX_NAME_BYTES, FileName, StrictModel, did_you_mean, parse, parse_json
+from robocas_ms3.evaluation.bundled_protocols import DESCRIPTIONS, RULES, bundled_protocols
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
@@ -39,7 +39,7 @@ DEFAULT_HZ = 20  # actions per second if neither protocol nor policy has a rate
 PLAYED_AS = {"select": "pick"}
 """RoboCAS-v0's evaluator runs the first task in the episodes of the second task."""
 CONFIG_NAME = r"^[A-Za-z0-9_-]+$"
-RULES, EPISODES, CONFIGS, LAYOUTS, TRAIN = "protocol.yaml", "episodes.jsonl", "configs", "layouts", "train"
+EPISODES, CONFIGS, LAYOUTS, TRAIN = "episodes.jsonl", "configs", "layouts", "train"
 
 
 class Protocol(StrictModel):
@@ -141,6 +141,18 @@ class LoadedProtocol:
     rules: Protocol
     episodes: tuple[ProtocolEpisode, ...]
 
+    @property
+    def description(self) -> str:
+        """Return what the protocol measures; for a bundled protocol, the text of `DESCRIPTIONS`."""
+        name = self.rules.name
+        is_bundled = self.folder == bundled_protocols().get(name)
+        return DESCRIPTIONS[name] if is_bundled else self.rules.description
+
+    @property
+    def splits(self) -> list[str]:
+        """Return the names of the splits, in the order of the episodes."""
+        return list(dict.fromkeys(episode.split for episode in self.episodes))
+
     @cached_property
     def hash(self) -> str:
         """Return the sha256 of the names and contents of all files, in hex."""
@@ -233,11 +245,6 @@ def protocol_files(folder: Path) -> list[Path]:
     return sorted([folder / RULES, folder / EPISODES, *(path for name in patterns for path in folder.glob(name))])
 
 
-def shipped_protocols() -> dict[str, Path]:
-    """Return the folders of the bundled protocols by name."""
-    return {path.parent.name: path.parent for path in sorted(protocols_dir().glob(f"*/{RULES}"))}
-
-
 def load_protocol(name: str | Path) -> LoadedProtocol:
     """Load a bundled protocol by name, or the protocol in a folder.
 
@@ -245,13 +252,11 @@ def load_protocol(name: str | Path) -> LoadedProtocol:
         EvaluationError: the protocol does not exist, or a file is missing or invalid.
         ConfigError: a configuration extends another file or cannot be read.
     """
-    shipped = shipped_protocols()
-    folder = shipped.get(str(name), Path(name)).absolute()
+    bundled = bundled_protocols()
+    folder = bundled.get(str(name), Path(name)).absolute()
     if not (folder / RULES).is_file():
-        expected, fix = (
-            f"a folder with {RULES}, or one of {', '.join(sorted(shipped))}",
-            did_you_mean(str(name), shipped),
-        )
+        expected = f"a folder with {RULES}, or one of {', '.join(bundled)}"
+        fix = did_you_mean(str(name), bundled)
         raise EvaluationError("unknown protocol", where=name, expected=expected, fix=fix)
     try:
         data = load_yaml(folder / RULES)

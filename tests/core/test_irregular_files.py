@@ -14,7 +14,8 @@ from robocas_ms3.core.errors import AssetError, ConfigError, EvaluationError, Pl
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.paths import builtin_packs_dir
 from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
+from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.plans.folder import OUTCOME, PLAN, Outcome, SeedFiles, read_plan
 
 
@@ -23,7 +24,7 @@ def copy_pack(root):
 
 
 def copy_protocol(root):
-    shutil.copytree(Path(shipped_protocols()["ms3-v1"]), root)
+    shutil.copytree(Path(bundled_protocols()["ms3-v1"]), root)
 
 
 def write_result(root):

@@ -1,4 +1,4 @@
-"""Protocols are frozen from plans."""
+"""Protocols are frozen from protocol sources."""
 
 import pytest
 import yaml
@@ -6,12 +6,12 @@ import yaml
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.cli import eval as command
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError, RobocasError
-from robocas_ms3.evaluation.freeze import ProtocolPlan, freeze, read_plan
+from robocas_ms3.evaluation.freeze import ProtocolSource, freeze_protocol, read_protocol_source
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.layout_table import FrozenLayouts
 
-PLAN = {
+SOURCE = {
     "rules": {"name": "tiny", "description": "One episode.", "max_seconds": {"pick": 5}},
     "parts": [{"config": "pick_table_scattered", "count": 1, "first_seed": 110000, "split": "mine"}],
 }
@@ -20,14 +20,14 @@ PLAN = {
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("frozen") / "tiny"
-    steps = freeze(ProtocolPlan.model_validate(PLAN), folder)
+    steps = freeze_protocol(ProtocolSource.model_validate(SOURCE), folder)
     assert next(steps) == (1, 1)
     assert not folder.exists()  # the folder is written atomically
     assert list(steps) == []
     return folder
 
 
-def test_its_episode_is_that_of_the_shipped_protocol_of_the_same_seed(made):
+def test_episode_equals_the_episode_of_the_bundled_protocol_with_the_same_seed(made):
     protocol = load_protocol(made)
     assert (protocol.rules.name, protocol.rules.max_seconds) == ("tiny", {"pick": 5.0})
     assert [path.name for path in made.parent.iterdir()] == ["tiny"]
@@ -36,18 +36,18 @@ def test_its_episode_is_that_of_the_shipped_protocol_of_the_same_seed(made):
     assert mine.model_copy(update={"split": shipped.split, "config": shipped.config}) == shipped
 
 
-def test_a_folder_that_is_there_is_refused_before_anything_is_drawn(made, tmp_path):
-    (tmp_path / "plan.yaml").write_text(yaml.safe_dump(PLAN))
+def test_existing_folder_is_refused_before_scenes_are_sampled(made, tmp_path):
+    (tmp_path / "source.yaml").write_text(yaml.safe_dump(SOURCE))
     with pytest.raises(OutputExistsError):
-        command.freeze(command.Freeze(tmp_path / "plan.yaml", made))
+        command.freeze(command.Freeze(tmp_path / "source.yaml", made))
 
 
-def test_scenes_may_be_changed_and_misnamed(tmp_path):
+def test_configurations_may_be_changed_and_instructions_wrong_or_empty(tmp_path):
     fewer = {"objects": {"count": 2}, "layout": {"kind": "orderly", "copies": 1, "rows": 1}}
     scene = {"config": "pick_table_scattered", "count": 1, "first_seed": 110010, "change": fewer}
     parts = [{**scene, "split": words, "instruction": words, "name": "two"} for words in ("correct", "wrong", "empty")]
     train = [{"config": "pick_table_scattered", "change": {"objects": {"count": 1}}, "name": "one"}] * 2
-    list(freeze(ProtocolPlan.model_validate({**PLAN, "parts": parts, "train": train}), tmp_path / "out"))
+    list(freeze_protocol(ProtocolSource.model_validate({**SOURCE, "parts": parts, "train": train}), tmp_path / "out"))
     protocol = load_protocol(tmp_path / "out")
     asked, wrong, empty = protocol.episodes
     config = load_task_config(protocol.config_file("two"))
@@ -65,29 +65,29 @@ def test_scenes_may_be_changed_and_misnamed(tmp_path):
     assert load_protocol(tmp_path / "out").hash != before
 
 
-def test_a_configuration_is_found_beside_the_plan(tmp_path, monkeypatch):
+def test_a_configuration_is_found_next_to_the_source(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "plans").mkdir()
+    (tmp_path / "sources").mkdir()
     config = load_task_config("pick_table_scattered").model_dump(mode="json")
-    (tmp_path / "plans" / "mine.yaml").write_text(yaml.safe_dump(config))
+    (tmp_path / "sources" / "mine.yaml").write_text(yaml.safe_dump(config))
     scenes = [{"config": name} for name in ("mine.yaml", "pick_table_scattered")]
-    plan = {**PLAN, "parts": [{**PLAN["parts"][0], **scene} for scene in scenes], "train": scenes}
-    (tmp_path / "plans" / "plan.yaml").write_text(yaml.safe_dump(plan))
-    read = read_plan(tmp_path / "plans" / "plan.yaml")
-    assert [part.file for part in read.parts] == ["mine-mine", "pick_table_scattered-mine"]
-    assert [scene.resolve().task for scene in (*read.parts, *read.train)] == ["pick"] * 4
+    source = {**SOURCE, "parts": [{**SOURCE["parts"][0], **scene} for scene in scenes], "train": scenes}
+    (tmp_path / "sources" / "source.yaml").write_text(yaml.safe_dump(source))
+    read = read_protocol_source(tmp_path / "sources" / "source.yaml")
+    assert [part.file_stem for part in read.parts] == ["mine-mine", "pick_table_scattered-mine"]
+    assert [scene.load().task for scene in (*read.parts, *read.train)] == ["pick"] * 4
 
 
 @pytest.mark.parametrize("text", ["parts: []", "rules: [", "rules: {}\nparts: [{config: x}]"])
-def test_no_plan(tmp_path, text):
-    (tmp_path / "plan.yaml").write_text(text)
-    with pytest.raises(EvaluationError, match=r"plan.yaml: invalid protocol plan") as caught:
-        command.freeze(command.Freeze(tmp_path / "plan.yaml", tmp_path / "out"))
+def test_invalid_sources_are_errors(tmp_path, text):
+    (tmp_path / "source.yaml").write_text(text)
+    with pytest.raises(EvaluationError, match=r"source.yaml: invalid protocol source") as caught:
+        command.freeze(command.Freeze(tmp_path / "source.yaml", tmp_path / "out"))
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
 
 
-FIRST = PLAN["parts"][0]
+FIRST = SOURCE["parts"][0]
 
 
 @pytest.mark.parametrize(
@@ -98,12 +98,12 @@ FIRST = PLAN["parts"][0]
         {"parts": [{**FIRST, "config": "nothing"}]},
         {"parts": [{**FIRST, "instruction": "wrong", "change": {"objects": {"count": 1}}}]},  # no second object
         *({"parts": [{**FIRST, "split": split}]} for split in ("../../evil", "x" * 300)),
-        {"parts": [FIRST], "rules": PLAN["rules"] | {"name": "../../evil"}},
+        {"parts": [FIRST], "rules": SOURCE["rules"] | {"name": "../../evil"}},
         {"train": [{"config": FIRST["config"], "change": {"objects": {"count": n}}} for n in (3, 4)]},
     ],
 )
-def test_plans_that_can_not_be_followed_leave_nothing(tmp_path, changed):
-    plan = ProtocolPlan.model_validate({**PLAN, **changed})
+def test_sources_that_cannot_be_frozen_leave_no_files(tmp_path, changed):
+    source = ProtocolSource.model_validate({**SOURCE, **changed})
     with pytest.raises(RobocasError):
-        list(freeze(plan, tmp_path / "inside" / "out"))
+        list(freeze_protocol(source, tmp_path / "inside" / "out"))
     assert not [path for path in tmp_path.rglob("*") if path != tmp_path / "inside"]

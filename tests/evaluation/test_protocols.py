@@ -8,9 +8,11 @@ from dataclasses import replace
 import pytest
 import yaml
 
+from robocas_ms3.cli.eval import Protocols, list_protocols
 from robocas_ms3.core.errors import ConfigError, EvaluationError
+from robocas_ms3.evaluation.bundled_protocols import DESCRIPTIONS, bundled_protocols
 from robocas_ms3.evaluation.policy import PolicySpec
-from robocas_ms3.evaluation.protocol import EPISODES, RULES, load_protocol, protocol_files, shipped_protocols
+from robocas_ms3.evaluation.protocol import EPISODES, RULES, load_protocol, protocol_files
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 
@@ -32,7 +34,7 @@ HASHES = {  # results are comparable only with unchanged hashes
 @pytest.fixture
 def folder(tmp_path):
     """A copy of a protocol, to be damaged."""
-    return shutil.copytree(shipped_protocols()["smoke"], tmp_path / "mine")
+    return shutil.copytree(bundled_protocols()["smoke"], tmp_path / "mine")
 
 
 def change_rules(folder, **values):
@@ -46,7 +48,7 @@ def change_episode(folder, line, **values):
     (folder / EPISODES).write_text("\n".join(lines) + "\n")
 
 
-@pytest.mark.parametrize("name", shipped_protocols())
+@pytest.mark.parametrize("name", bundled_protocols())
 def test_bundled_protocols_load_have_each_scene_once_and_the_hash_of_their_files(name):
     protocol = load_protocol(name)
     assert protocol.rules.name == name
@@ -151,3 +153,22 @@ def test_step_limits_and_valid_action_rates():
     assert [rules.action_rate(PolicySpec()), rules.action_rate(PolicySpec(rate_hz=10))] == [20, 10]
     with pytest.raises(EvaluationError, match="divisor of 100"):
         rules.action_rate(PolicySpec(rate_hz=30))
+
+
+def test_bundled_protocols_have_descriptions_for_readers(folder):
+    assert list(DESCRIPTIONS) == list(bundled_protocols())
+    for name, text in DESCRIPTIONS.items():
+        assert load_protocol(name).description == text
+    copy = load_protocol(folder)  # a protocol of the user that has the name of a bundled protocol
+    assert copy.description == copy.rules.description != DESCRIPTIONS["smoke"]
+
+
+def test_protocols_are_printed_as_tables(capsys):
+    list_protocols(Protocols())
+    printed = capsys.readouterr().out
+    for name in bundled_protocols():
+        protocol = load_protocol(name)
+        assert protocol.hash[:16] in printed
+        assert ", ".join(protocol.splits) in printed
+        for path in protocol.training_configs():
+            assert path.name in printed

@@ -39,7 +39,8 @@ from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.demos.trajectory_replay import RecordedEpisode
 from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.protocol import load_protocol, shipped_protocols
+from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.report.comparison import compare_results
 from robocas_ms3.evaluation.report.page import render_page
 from robocas_ms3.evaluation.report.tables import render_markdown
@@ -97,7 +98,7 @@ def write_pack(root):
 
 
 def write_protocol(root):
-    shutil.copytree(Path(next(iter(shipped_protocols().values()))), root)
+    shutil.copytree(Path(next(iter(bundled_protocols().values()))), root)
 
 
 def write_result(root):

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import yaml
 
-from robocas_ms3.evaluation.protocol import EPISODES, RULES, shipped_protocols
+from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.protocol import EPISODES, RULES
 
 
 def shorten(name: str, folder: Path, max_steps: int, episodes: int | None = None) -> Path:
-    shutil.copytree(shipped_protocols()[name], folder)
+    shutil.copytree(bundled_protocols()[name], folder)
     rules = yaml.safe_load((folder / RULES).read_text())
     (folder / RULES).write_text(yaml.safe_dump(rules | {"max_steps": max_steps}))
     lines = (folder / EPISODES).read_text().splitlines(keepends=True)

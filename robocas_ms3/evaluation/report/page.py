@@ -137,7 +137,7 @@ def _record(result: Result, protocol: LoadedProtocol | None) -> str:
     if protocol is not None:
         names = {"rate_hz", "stepping", "max_steps", "max_seconds", "ends_on", "max_v0_steps"}
         rules = protocol.rules.model_dump(mode="json", include=names, exclude_none=True)
-        pairs += [("description", protocol.rules.description), ("rules", _plain(rules))]
+        pairs += [("description", protocol.description), ("rules", _plain(rules))]
     entries = policy.model_dump(exclude_unset=True, exclude={"name"})
     pairs += [("policy", policy.name), *((f"policy, {name}", _plain(value)) for name, value in entries.items())]
     pairs += [("RoboCAS-v0's weld", "yes" if run.weld else "no")]

@@ -6,7 +6,8 @@ import pytest
 from synthetic_results import outcome, write
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.protocol import EPISODES, load_protocol, shipped_protocols
+from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.protocol import EPISODES, load_protocol
 from robocas_ms3.evaluation.report.comparison import compare_results, compare_splits
 from robocas_ms3.evaluation.statistics import holm, mcnemar
 
@@ -108,7 +109,7 @@ def test_splits_with_the_same_scenes_are_compared(tmp_path):
 
 def test_a_split_may_have_several_configurations(tmp_path):
     """Configurations with the same scenes are compared."""
-    folder = shutil.copytree(shipped_protocols()["cameras-v1"], tmp_path / "mine")
+    folder = shutil.copytree(bundled_protocols()["cameras-v1"], tmp_path / "mine")
     lines = (folder / EPISODES).read_text()
     (folder / EPISODES).write_text(lines.replace('"task":"select"', '"task":"pick"'))
     protocol = load_protocol(folder)

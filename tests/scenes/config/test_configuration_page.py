@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from robocas_ms3.core.errors import ConfigError
-from robocas_ms3.evaluation.freeze import read_plan
+from robocas_ms3.evaluation.freeze import read_protocol_source
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.scenes.config import load_task_config
 
@@ -59,8 +59,8 @@ def test_commands_of_the_page_set_existing_keys():
         overrides = [words[number + 1] for number, word in enumerate(words) if word == "--set"]
         assert overrides
         if words[0] == "eval":
-            plan = read_plan(ROOT / words[2])
-            assert {scene.resolve(overrides).language.split for scene in plan.parts} == {"held_out"}
+            source = read_protocol_source(ROOT / words[2])
+            assert {part.load(overrides).language.split for part in source.parts} == {"held_out"}
         else:
             name = words[words.index("--config") + 1] if "--config" in words else words[words.index("--set") - 1]
             name = words[2] if words[0] == "layouts" else name

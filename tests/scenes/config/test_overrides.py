@@ -7,7 +7,7 @@ import yaml
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import ConfigError
-from robocas_ms3.evaluation.freeze import ProtocolPlan
+from robocas_ms3.evaluation.freeze import ProtocolSource
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.config.compose import parse_override
 
@@ -49,10 +49,10 @@ def test_overrides_are_merged_over_a_file_in_order(tmp_path):
     loaded = load_task_config(NAME)
     assert load_task_config(loaded, overrides=["objects.count=3"]).objects.count == 3
     assert load_task_config(NAME, overrides=["objects.count=3", "objects.count=null"]) == loaded
-    plan = ProtocolPlan.model_validate(
+    source = ProtocolSource.model_validate(
         {"rules": {}, "parts": [{"config": NAME, "count": 1, "first_seed": 0, "change": {"objects": {"count": 3}}}]}
     )
-    assert plan.parts[0].resolve(["objects.count=4"]).objects.count == 4
+    assert source.parts[0].load(["objects.count=4"]).objects.count == 4
 
 
 @pytest.mark.parametrize(
