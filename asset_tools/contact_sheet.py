@@ -47,7 +47,7 @@ def write_contact_sheet(pack: Pack, path: Path, ids: Sequence[str] | None = None
     assets: dict[str, LoadedObject | LoadedFurniture] = {**pack.objects, **pack.furniture}
     unknown = [id_ for id_ in ids or () if id_ not in assets]
     if unknown:
-        raise AssetError("unknown assets of the pack", where=pack.name, found=", ".join(unknown))
+        raise AssetError("unknown assets of the pack", where=pack.name, found=", ".join(unknown), usage=True)
     chosen = [assets[id_] for id_ in ids or assets]
     size, columns = (LARGE, 2) if len(chosen) <= FEW else (SMALL, 3)
     columns = min(columns, len(chosen))

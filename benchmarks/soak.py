@@ -95,7 +95,7 @@ def watch(process: subprocess.Popen[bytes], until: float) -> dict[int, Memory]:
     runner = psutil.Process(process.pid)
     while time.monotonic() < until:
         if process.poll() is not None:
-            raise SystemExit(f"the run ended before Ctrl-C: exit code {process.returncode}")
+            raise SystemExit(f"the run ended before Ctrl-C: exit status {process.returncode}")
         for child in runner.children():
             try:
                 memory[child.pid].megabytes.append(child.memory_info().rss / 2**20)

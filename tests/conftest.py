@@ -114,4 +114,4 @@ def _render_device() -> tuple[str | None, str]:
     done = subprocess.run([sys.executable, PROBES, "render"], capture_output=True, text=True, check=False)
     if done.returncode == 0:
         return done.stdout.strip(), ""
-    return None, (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
+    return None, (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]

@@ -150,6 +150,7 @@ def load_pack(name_or_path: str | Path) -> Pack:
             expected=f"one of {', '.join(known)}, or a folder with a {MANIFEST}",
             fix="See `robocas assets list`, or make one: `robocas assets import-scans` for objects, "
             "`robocas assets import-partnet` for furniture.",
+            usage=True,
         )
     path = folder / MANIFEST
     status = path.stat()

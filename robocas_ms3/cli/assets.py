@@ -12,7 +12,7 @@ import tyro
 
 from robocas_ms3.cli import assets_show
 from robocas_ms3.cli.assets_show import require_mesh_tools
-from robocas_ms3.cli.options import CORES, Jobs, Maybe, Several
+from robocas_ms3.cli.options import CORES, Folders, Jobs, Maybe, Several
 from robocas_ms3.core.checks import check_number
 from robocas_ms3.core.text import format_count
 
@@ -101,7 +101,7 @@ class ImportPartNet(_ImportOptions):
     Example: robocas assets import-partnet downloads/7179 --annotations annotations
     """
 
-    models: Annotated[Several[Path], tyro.conf.Positional]
+    models: Folders
     """Folders of models, each with a mobility.urdf."""
     template: bool = False
     """Print a template of the annotation of the first model, with its joints, and import nothing."""
@@ -167,7 +167,7 @@ def import_partnet(command: ImportPartNet) -> int:
 
     if not command.models:
         expected, fix = "folders with a mobility.urdf", "Pass at least one folder."
-        raise AssetError("missing model folder", where="--models", expected=expected, fix=fix)
+        raise AssetError("missing model folder", where="DIR", expected=expected, fix=fix, usage=True)
     if command.template:
         from robocas_ms3.cli.terminal import print_text
 
@@ -315,15 +315,13 @@ def _masses(path: Path | None) -> dict[str, float]:
     if path is None:
         return {}
     try:
-        data = load_yaml(path)
-        masses = {str(key): float(value) for key, value in data.items()}
-        if not all(0 < mass < 1000 for mass in masses.values()):
-            raise ValueError("a mass that is not positive, or not below 1000 kg")
-        return masses
+        masses = {str(key): float(value) for key, value in load_yaml(path).items()}
+        if wrong := {key: mass for key, mass in masses.items() if not 0 < mass < 1000}:
+            raise ValueError(f"a mass out of range: {wrong}")
     except (OSError, AttributeError, TypeError, ValueError) as error:
-        raise AssetError(
-            "invalid file of masses", where=path, expected="a YAML mapping of object ids to kg", found=error
-        ) from error
+        what, expected = f"invalid file {path}", "a YAML mapping of object ids to masses, > 0 and < 1000 kg"
+        raise AssetError(what, where="--masses", expected=expected, found=error) from error
+    return masses
 
 
 DESCRIPTION = "List, check and import asset packs. Without a command: list."

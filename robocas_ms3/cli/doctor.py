@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Doctor:
-    """Check versions, render device, physics, planner, asset packs and disk; exit code 1 if a required check fails.
+    """Check versions, render device, physics, planner, asset packs and disk; exit status 1 if a required check fails.
 
     Example: robocas doctor
     """

@@ -55,9 +55,8 @@ def run(settings: EvaluationSettings) -> int:
         if word not in TASKS:
             expected = f"one of {', '.join(TASKS)}; or {', '.join(COMMANDS)}"
             fix = did_you_mean(word, [*TASKS, *COMMANDS])
-            raise EvaluationError(
-                "unknown task or command", where="--tasks", expected=expected, found=repr(word), fix=fix
-            )
+            what = "unknown task or command"
+            raise EvaluationError(what, where="TASK", expected=expected, found=repr(word), fix=fix, usage=True)
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line, print_text
     from robocas_ms3.core.workers import use_one_torch_thread

@@ -186,9 +186,8 @@ def _check_folders(folders: tuple[Path, ...]) -> None:
     from robocas_ms3.core.errors import EvaluationError
 
     if not folders:
-        raise EvaluationError(
-            "missing result folder", where="DIR", expected="the folder of a result, or of partial results"
-        )
+        expected, fix = "the folder of a result, or of partial results", "Pass the --out folder of robocas eval."
+        raise EvaluationError("missing result folder", where="DIR", expected=expected, fix=fix, usage=True)
 
 
 def _read(folders: tuple[Path, ...]) -> Result:

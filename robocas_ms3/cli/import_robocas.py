@@ -22,7 +22,7 @@ class ImportRobocas:
     Without --out the dataset is only checked.
 
     Repairs: types, missing arrays that follow from others, names of camera pose files, a rotated EEF frame. Episodes
-    that can't be repaired are skipped and listed. Exit code 1 if no episode can be imported.
+    that can't be repaired are skipped and listed. Exit status 1 if no episode can be imported.
 
     Example: robocas import-robocas downloads/robocas --out datasets/robocas
     """

@@ -1,4 +1,4 @@
-"""The ``robocas`` command: parse the arguments, run the command, print an error as one line, return an exit code."""
+"""The ``robocas`` command: parse the arguments, run the command, print an error as one line, return an exit status."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import platformdirs
 import tyro
 
 from robocas_ms3 import __version__
-from robocas_ms3.cli.options import METAVARS, with_absolute_paths
+from robocas_ms3.cli.options import METAVARS, check_inputs, with_absolute_paths
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.files import DISK_FULL_ERRNOS
 from robocas_ms3.core.paths import ensure_home, is_writable, temporary_cache, variable_of
@@ -82,16 +82,16 @@ _ENVIRONMENT = {
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run ``robocas`` and end the process with its exit code; the default of ``argv`` is ``sys.argv[1:]``."""
+    """Run ``robocas`` and end the process with its exit status; the default of ``argv`` is ``sys.argv[1:]``."""
     escape_tracebacks()
     handle_interrupts()
     exit_command(run(sys.argv[1:] if argv is None else argv))
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run ``robocas`` and return its exit code: 0, 1 (failure, one line on stderr) or 2 (invalid argument).
+    """Run ``robocas`` and return its exit status: 0, 1 (failure), 2 (invalid argument) or 130 (Ctrl-C).
 
-    With ``--debug`` among the arguments an error shows its traceback.
+    An error is one line on stderr; with ``--debug`` among the arguments, or ``ROBOCAS_DEBUG=1``, it is a traceback.
     """
     arguments = [word for word in argv if word != "--debug"]
     debug = len(arguments) < len(argv) or os.environ.get("ROBOCAS_DEBUG", "0") not in {"", "0"}
@@ -106,7 +106,9 @@ def run(argv: Sequence[str]) -> int:
         command, settings = parse(arguments)
         _set_library_folders()
         with forbid_exit(f"robocas {arguments[0]}"):
-            return command(with_absolute_paths(settings))
+            settings = with_absolute_paths(settings)
+            check_inputs(settings, fix=f"See robocas {arguments[0]} --help.")
+            return command(settings)
     except KeyboardInterrupt as interrupt:  # its argument: how to continue
         return _write_line("; ".join(["interrupted", *map(str, interrupt.args)]), sys.stderr, INTERRUPTED)
     except BrokenPipeError:
@@ -116,7 +118,7 @@ def run(argv: Sequence[str]) -> int:
     except RobocasError as error:
         if debug:
             raise
-        is_usage = str(error.where).startswith("--") or error.where == "DIR"  # an option, or the positional folders
+        is_usage = error.usage or str(error.where).startswith("--")
         return _write_line(f"error: {' '.join(str(error).split())}", sys.stderr, 2 if is_usage else 1)
     except ValueError as error:
         from robocas_ms3.core.documents import DocumentError  # imports yaml, which other errors do not need

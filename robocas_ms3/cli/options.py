@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, ParamSpec, TypeVar
+from typing import Annotated, Any, ParamSpec, TypeVar, get_type_hints
 
 import tyro
 
@@ -78,6 +78,19 @@ def with_absolute_paths(settings: _T) -> _T:
         if path := os.environ.get(variable):
             os.environ[variable] = str(Path(path).absolute())
     return _absolute(settings)
+
+
+def check_inputs(settings: Any, fix: str) -> None:
+    """Raise RobocasError with this ``fix`` if a path that is a positional argument does not exist.
+
+    All positional paths of the commands are inputs; output paths are options.
+    """
+    for name, hint in get_type_hints(type(settings), include_extras=True).items():
+        if tyro.conf.Positional in getattr(hint, "__metadata__", ()):
+            value = getattr(settings, name)
+            for path in value if isinstance(value, tuple) else (value,):
+                if isinstance(path, Path) and not path.exists():
+                    raise RobocasError("no such file or folder", where=path, fix=fix, usage=True)
 
 
 def _absolute(value: Any) -> Any:

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 @dataclass
 class Validate:
-    """Check a dataset against its format and list every violation; exit code 1 if there is one.
+    """Check a dataset against its format and list every violation; exit status 1 if there is one.
 
     With --replay, each episode is also replayed open loop from its 7-D actions in its rebuilt scene. The report gives
-    the success rate and the tracking error of the gripper. The exit code depends on them only with --min-success.
+    the success rate and the tracking error of the gripper. The exit status depends on them only with --min-success.
 
     Example: robocas validate datasets/pick --replay
     """
@@ -35,7 +35,7 @@ class Validate:
     replay: bool = False
     """Replay the 7-D actions of each episode in simulation, without rendering (RoboCAS folders only)."""
     min_success: Maybe[float] = None
-    """With --replay: lowest accepted success rate per task, 0 to 1. Exit code 1 if a task is below it or if none of
+    """With --replay: lowest accepted success rate per task, 0 to 1. Exit status 1 if a task is below it or if none of
     its episodes could be replayed."""
     pack: Annotated[Maybe[str], tyro.conf.arg(metavar="PACK")] = None
     """With --replay: name or folder of the object pack to use instead of the recorded one."""

@@ -16,12 +16,21 @@ class RobocasError(Exception):
         expected: which values are valid.
         found: the value that was found.
         fix: a sentence that says how to correct it.
+        usage: whether the caller passed an unknown name or path; `robocas` then exits with status 2 instead of 1.
     """
 
     def __init__(
-        self, what: str, *, where: object = "", expected: object = "", found: object = "", fix: str = ""
+        self,
+        what: str,
+        *,
+        where: object = "",
+        expected: object = "",
+        found: object = "",
+        fix: str = "",
+        usage: bool = False,
     ) -> None:
         self.what, self.where, self.expected, self.found, self.fix = what, where, expected, found, fix
+        self.usage = usage
         head = f"{where}: {what}" if str(where) else what
         if isinstance(found, OSError) and found.strerror:  # without the number
             found = f"{found.strerror}: {found.filename}" if found.filename else found.strerror

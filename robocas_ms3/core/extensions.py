@@ -62,7 +62,7 @@ class Registry(Mapping[str, T]):
             return self[name]
         known = list(self)
         what, expected, fix = f"no such {self.kind}", f"one of {known}", did_you_mean(name, known)
-        raise ExtensionError(what, where=where, expected=expected, found=repr(name), fix=fix)
+        raise ExtensionError(what, where=where, expected=expected, found=repr(name), fix=fix, usage=True)
 
     @cached_property
     def entry_points(self) -> dict[str, list[EntryPoint]]:

@@ -17,8 +17,8 @@ from typing import Any, NoReturn
 from robocas_ms3.core.errors import ExtensionError
 
 INTERRUPTED = 130
-"""Exit code of a program ended by Ctrl-C (128 + SIGINT)."""
-_TERMINATED = 143  # exit code after SIGTERM, which `timeout`, `kill` and batch systems send
+"""Exit status of a program ended by Ctrl-C (128 + SIGINT)."""
+_TERMINATED = 143  # exit status after SIGTERM, which `timeout`, `kill` and batch systems send
 _GRACE = 2.2  # s for clean-up: worker processes, files, policies
 _SECOND = 0.5  # s; a SIGINT sooner after the first belongs to the same key press
 _PR_SET_PDEATHSIG = 1
@@ -94,7 +94,7 @@ def handle_interrupts() -> None:
 
 
 def exit_command(code: int) -> NoReturn:
-    """Exit the process with an exit code; skip the teardown of libraries if it was interrupted."""
+    """Exit the process with an exit status; skip the teardown of libraries if it was interrupted."""
     if code == INTERRUPTED:
         exit_immediately(_command.code)
     sys.exit(code)

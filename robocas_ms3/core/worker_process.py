@@ -183,7 +183,7 @@ class WorkerProcess(Generic[Task, Result]):
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(5)
             code = self._process.returncode
-            reason = signal.Signals(-code).name if code is not None and code < 0 else f"exit code {code}"
+            reason = signal.Signals(-code).name if code is not None and code < 0 else f"exit status {code}"
             if code in (-signal.SIGTERM, -signal.SIGKILL):
                 wait([self._stop], _JOB_KILL_SECONDS)  # otherwise the task would be blamed for the end of the job
         error = ProcessCrashError("the worker process crashed", found=reason)

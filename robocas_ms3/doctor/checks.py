@@ -180,7 +180,7 @@ def run_probe(name: str, probe: str, *, fix: str, required: bool = True) -> Find
         return Finding(name, "ok", f"not used: {error_lines[-1] if error_lines else 'absent'}")
     if done.returncode < 0:
         return Finding(name, bad, f"crashed ({signal.strsignal(-done.returncode) or -done.returncode})", fix)
-    return Finding(name, bad, error_lines[-1] if error_lines else f"exit code {done.returncode}", fix)
+    return Finding(name, bad, error_lines[-1] if error_lines else f"exit status {done.returncode}", fix)
 
 
 def requirements(distribution: str, extra: str = "") -> Iterator[Requirement]:

@@ -1,7 +1,7 @@
 """Probes of libraries that may crash; this file runs as a program in its own process.
 
 ``python probes.py NAME`` prints one line (a device or version) and exits with 0. If the probe fails, the last line on
-stderr is the error and the exit code is 1. If the machine has no such device, the exit code is 3.
+stderr is the error and the exit status is 1. If the machine has no such device, the exit status is 3.
 """
 
 from __future__ import annotations

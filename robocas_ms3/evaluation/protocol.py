@@ -169,15 +169,14 @@ class LoadedProtocol:
         """Return the episodes that the settings select, at least one."""
         tasks = {self.played_as(settings.tasks).get(task, task) for task in settings.tasks}
         splits = (settings.split,) if settings.split else ()
-        for kind, names in (("task", sorted(tasks)), ("split", splits)):
+        for kind, where, names in (("task", "TASK", sorted(tasks)), ("split", "--split", splits)):
             known = dict.fromkeys(str(getattr(episode, kind)) for episode in self.episodes)
             for name in names:
                 if name not in known:
                     other = "Choose another protocol (robocas eval protocols), or make one: robocas eval freeze."
                     expected, fix = ", ".join(known), did_you_mean(name, known) or other
-                    raise EvaluationError(
-                        f"the protocol has no episodes of this {kind}", expected=expected, found=name, fix=fix
-                    )
+                    what = f"the protocol has no episodes of this {kind}"
+                    raise EvaluationError(what, where=where, expected=expected, found=name, fix=fix, usage=True)
         (index, count), of_config, chosen = parse_shard(settings.shard, EvaluationError), Counter[str](), []
         for episode in self.episodes:
             if (tasks and episode.task not in tasks) or settings.split not in ("", episode.split):
@@ -257,7 +256,7 @@ def load_protocol(name: str | Path) -> LoadedProtocol:
     if not (folder / RULES).is_file():
         expected = f"a folder with {RULES}, or one of {', '.join(bundled)}"
         fix = did_you_mean(str(name), bundled)
-        raise EvaluationError("unknown protocol", where=name, expected=expected, fix=fix)
+        raise EvaluationError("unknown protocol", where=name, expected=expected, fix=fix, usage=True)
     try:
         data = load_yaml(folder / RULES)
     except (OSError, DocumentError) as error:

@@ -45,7 +45,7 @@ def load_plan(plan: str | Path) -> Plan:
         path = bundled[str(plan)]
     elif path.suffix not in {".yaml", ".yml"} or not path.is_file():
         expected, fix = f"a YAML file, or one of {', '.join(bundled)}", did_you_mean(str(plan), bundled)
-        raise PlanError("no such plan", where=plan, expected=expected, fix=fix)
+        raise PlanError("no such plan", where=plan, expected=expected, fix=fix, usage=True)
     try:
         data = load_yaml(path)
     except (OSError, DocumentError) as error:

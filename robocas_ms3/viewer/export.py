@@ -9,6 +9,7 @@ from typing import Any
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import atomic_folder, make_folder
+from robocas_ms3.core.text import format_ranges
 from robocas_ms3.viewer.content import PageContent
 from robocas_ms3.viewer.damage import as_dataset_error, join_reasons, reason
 from robocas_ms3.viewer.images import EncodedImage, depth_image, shrink_image
@@ -33,7 +34,8 @@ def export(
     known = [entry["n"] for entry in index["episodes"] if entry["n"] is not None]
     missing = sorted(set(episodes) - set(known))
     if missing:
-        raise DatasetError("no such episode", where=source.root, expected=f"{known[:1]} to {known[-1:]}", found=missing)
+        expected, found = f"numbers in {format_ranges(known)}", format_ranges(missing)
+        raise DatasetError("no such episode", where=source.root, expected=expected, found=found, usage=True)
     chosen = [number for number in known if not episodes or number in set(episodes)]
     rows = [e for e in index["episodes"] if e["n"] in set(chosen) or (e["n"] is None and not episodes)]
     index = {**index, "depth": index["depth"] and depth}

@@ -120,7 +120,7 @@ def test_any_error_names_its_asset_and_affects_no_other(tmp_path):
     results = write_pack(todo, tmp_path / "pack", tmp_path / "kept", skip_errors=True, processes=2)
     errors = {made.id: made.error for made in results}
     assert errors["odd"] == "odd: IndexError: list index out of range"
-    assert errors["deadly"].startswith("deadly: the worker process crashed (exit code 9)")
+    assert errors["deadly"].startswith("deadly: the worker process crashed (exit status 9)")
     assert load_pack(tmp_path / "pack").furniture.keys() == {"a", "b"}
 
 

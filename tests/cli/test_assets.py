@@ -23,7 +23,7 @@ def scans(tmp_path, monkeypatch):
 
 
 def run(capsys, *words):
-    """Return the exit code and the text of both streams."""
+    """Return the exit status and the text of both streams."""
     code = cli.run(["assets", *map(str, words)])
     shown = capsys.readouterr()
     return code, shown.out + shown.err

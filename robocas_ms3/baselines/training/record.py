@@ -91,7 +91,7 @@ def read_run(folder: Path) -> RunRecord:
     path = folder / RUN
     if not path.is_file():
         fix = "Pass the --out folder of `robocas train`."
-        raise TrainingError("not a training run", where=folder, expected=RUN, fix=fix)
+        raise TrainingError("not a training run", where=folder, expected=RUN, fix=fix, usage=True)
     try:
         record = load_json(path)
     except ValueError as error:
@@ -126,7 +126,7 @@ def hash_dataset(data: Path) -> str:
             if path.suffix in {".json", ".npz", ".npy", ".parquet"}:
                 _hash_file(digest, path)
     else:
-        raise TrainingError("no such dataset", where=data, expected="a dataset folder or a trajectory.h5")
+        raise TrainingError("no such dataset", where=data, expected="a dataset folder or a trajectory.h5", usage=True)
     return digest.hexdigest()
 
 

@@ -61,7 +61,7 @@ class ImageOptions:
         unknown = sorted(set(self.cameras) - set(cameras))
         if unknown:
             expected, found = f"some of {', '.join(cameras)}", ", ".join(unknown)
-            raise DatasetError("no such camera", where=where, expected=expected, found=found)
+            raise DatasetError("no such camera", where=where, expected=expected, found=found, usage=True)
         return replace(self, cameras=tuple(name for name in cameras if name in (self.cameras or cameras)))
 
     @property

@@ -71,7 +71,8 @@ class LeRobotDataset(Metadata, EpisodeSource):
 
     def episode(self, number: int) -> LeRobotEpisode:
         if number not in self.row_of:
-            raise DatasetError("no such episode", where=self.root, expected=f"0 to {len(self.rows) - 1}", found=number)
+            expected = f"0 to {len(self.rows) - 1}"
+            raise DatasetError("no such episode", where=self.root, expected=expected, found=number, usage=True)
         return LeRobotEpisode(self, number)
 
 

@@ -32,7 +32,7 @@ def merge(
     """
     if not roots:
         what, fix = "missing dataset folders", "Run robocas merge A B --out C."
-        raise DatasetError(what, where="DIR", expected="folders of datasets", fix=fix)
+        raise DatasetError(what, where="DIR", expected="folders of datasets", fix=fix, usage=True)
     sources = [open_finished_dataset(root, name) for root, name in zip(roots, _distinct_names(roots), strict=True)]
     _check_settings(sources)
     members: dict[str, CopiedEpisode] = {}

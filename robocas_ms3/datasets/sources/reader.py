@@ -232,7 +232,7 @@ class Dataset(EpisodeSource):
     def episode(self, number: int) -> Episode:
         if number not in self._known:
             known = f"{self.numbers[0]} to {self.numbers[-1]}"
-            raise DatasetError("no such episode", where=self.root, expected=known, found=number)
+            raise DatasetError("no such episode", where=self.root, expected=known, found=number, usage=True)
         return Episode(self.root / schema.episode_folder(number), self)
 
 

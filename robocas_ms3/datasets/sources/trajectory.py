@@ -86,7 +86,8 @@ class TrajectorySource(EpisodeSource):
 
     def episode(self, number: int) -> RecordedEpisode:
         if not 0 <= number < len(self.index):
-            raise DatasetError("no such episode", where=self.root, expected=f"0 to {len(self.index) - 1}", found=number)
+            expected = f"0 to {len(self.index) - 1}"
+            raise DatasetError("no such episode", where=self.root, expected=expected, found=number, usage=True)
         return RecordedEpisode(self, number)
 
 

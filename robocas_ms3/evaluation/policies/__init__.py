@@ -46,7 +46,10 @@ def _remote(address: str) -> Policy:
 def _replay(trajectory: str) -> Policy:
     from robocas_ms3.evaluation.policies.replay import ReplayPolicy
 
-    return ReplayPolicy(Path(trajectory))
+    if not (path := Path(trajectory)).exists():
+        fix = "Pass replay:F.h5 with a file of `robocas generate`."
+        raise EvaluationError("no such trajectory file", where=path, fix=fix, usage=True)
+    return ReplayPolicy(path)
 
 
 POLICIES: Registry[Callable[[], Policy]] = Registry(
@@ -84,7 +87,7 @@ def find_policy(name: str) -> Callable[[], Policy]:
     if re.fullmatch(r"\w+(\.\w+)*", kind) and rest.isidentifier():
         return partial(_make_own, name, kind, rest)
     expected = f"{', '.join(known)}, a folder of robocas train, replay:TRAJECTORY.h5, module:Class or ws://host:port"
-    raise EvaluationError("unknown policy", where=name, expected=expected, fix=did_you_mean(name, known))
+    raise EvaluationError("unknown policy", where=name, expected=expected, fix=did_you_mean(name, known), usage=True)
 
 
 def make_policy(name: str) -> Policy:
@@ -124,13 +127,13 @@ def _make_own(name: str, module: str, attribute: str) -> Policy:
     try:
         make: Any = getattr(importlib.import_module(module), attribute)
     except AttributeError as error:
-        raise EvaluationError("unknown policy", where=name, found=error) from error
+        raise EvaluationError("unknown policy", where=name, found=error, usage=True) from error
     except Exception as error:  # user code may raise any exception
         is_file = module.endswith(".py")
         if isinstance(error, ModuleNotFoundError) and (is_file or error.name == module.partition(".")[0]):
             fix = "Run in the folder of the module, install the module, or add its folder to PYTHONPATH."
             fix = f"Omit the suffix .py: {module[:-3]}:{attribute}" if is_file else fix
-            raise EvaluationError("unknown policy", where=name, found=error, fix=fix) from error
+            raise EvaluationError("unknown policy", where=name, found=error, fix=fix, usage=True) from error
         what, found = "cannot import the module of the policy", f"{type(error).__name__}: {error}"
         raise EvaluationError(what, where=module, found=found) from error
     return _call(name, make)

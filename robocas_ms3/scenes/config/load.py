@@ -173,11 +173,14 @@ def _find(config: str | Path, folder: Path | None = None, where: str = "") -> Pa
         what = "no such base configuration"
         likely = did_you_mean(name, [*shipped, *files]) or did_you_mean(f"{name}.yaml", files) or likely
     if is_yaml and not likely:
-        raise ConfigError("no such file", where=where or name, expected=expected, found=str(path.absolute()))
+        raise ConfigError(
+            "no such file", where=where or name, expected=expected, found=path.absolute(), usage=not where
+        )
     raise ConfigError(
         what,
         where=where or name,
         expected=expected + ("" if likely else f": {', '.join(sorted(shipped))}"),
         found=repr(name) if where else "",
         fix=f"{likely} All names: `robocas list`." if likely else "",
+        usage=not where,
     )

@@ -125,7 +125,7 @@ def test_unreadable_texts_skip_their_episode(many, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("to", ["robocas", "lerobot"])
 def test_the_command(many, tmp_path, monkeypatch, capsys, to):
-    """Exit code, one line with the fix, and --skip-errors."""
+    """Exit status, one line with the fix, and --skip-errors."""
     if to == "lerobot":
         pytest.importorskip("av", reason="needs the extra 'lerobot'")
         from robocas_ms3.datasets.lerobot import convert as lerobot

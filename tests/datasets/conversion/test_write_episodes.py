@@ -91,7 +91,7 @@ def test_failures_and_crashes_in_workers_are_one_error_at_the_end(job):
     written, incomplete = write(job(writer, [1, 2, 3, 4, 5], jobs=2, episode_seconds=60, memory_gb=8))
     assert [one.number for one in written] == [1, 3, 4]
     assert incomplete.reasons == {
-        "episode_0000002": "episode_0000002: its worker process crashed twice: exit code 9",
+        "episode_0000002": "episode_0000002: its worker process crashed twice: exit status 9",
         "episode_0000005": "LookupError: 5 is odd",
     }
     assert os.getpid() not in {one.row[0] for one in written}

@@ -180,7 +180,7 @@ def test_in_place_accepts_the_episodes_on_disk(six, tmp_path):
 def test_invalid_options(six, tmp_path, capsys):
     out = str(tmp_path / "out")
     for words, code, text in [
-        ([], 2, "--out: choose one way to split"),
+        ([], 2, "--out: wrong number of output options"),
         (["--out-train", out], 2, "--out-train: missing second output folder"),
         (["--in-place", "--out", out, "--group-by", "task"], 2, "found --in-place, --out)"),
         (["--fractions", "0.5", "0.5", "--in-place"], 2, "--fractions: missing output folder"),
