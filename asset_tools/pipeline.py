@@ -288,7 +288,7 @@ def check_pack_folder(folder: Path) -> None:
     """
     if not re.fullmatch(PACK_NAME, folder.name):
         expected = "lower-case letters, digits, _ and -"
-        raise AssetError("invalid name of a pack", where=folder, expected=expected, found=folder.name)
+        raise AssetError("invalid name of a pack", where=folder, expected=expected, found=folder.name, usage=True)
     check_replaceable(folder, overwrite=True, markers=(MANIFEST,))
 
 

@@ -159,7 +159,7 @@ def sheet(command: Sheet) -> int:
     out = command.out or Path(f"{pack.name}.png")
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         found = out.suffix or "no suffix"
-        raise AssetError("unknown image format of a contact sheet", where=out, expected=".png or .jpg", found=found)
+        raise AssetError("unknown image format", where="--out", expected="a file name with .png or .jpg", found=found)
     with spinner(f"rendering {format_count(len(command.ids) or len(pack.manifest.assets), 'asset')}"):
         write_contact_sheet(pack, out, ids=command.ids or None)
     print_line(f"wrote {out}")

@@ -168,7 +168,7 @@ def config_layers(cfg: Training) -> list[tuple[str, dict[str, Any]]]:
         try:
             read = load_yaml(cfg.config)
         except FileNotFoundError:
-            raise TrainingError("no such file", where="--config", found=cfg.config) from None
+            raise TrainingError("no such file", where=cfg.config, usage=True) from None
         except (OSError, ValueError) as error:
             raise TrainingError("unreadable file", where=cfg.config, found=error) from error
         if not isinstance(read, dict):

@@ -34,7 +34,7 @@ def export(
     known = [entry["n"] for entry in index["episodes"] if entry["n"] is not None]
     missing = sorted(set(episodes) - set(known))
     if missing:
-        expected, found = f"numbers in {format_ranges(known)}", format_ranges(missing)
+        expected, found = format_ranges(known), format_ranges(missing)
         raise DatasetError("no such episode", where=source.root, expected=expected, found=found, usage=True)
     chosen = [number for number in known if not episodes or number in set(episodes)]
     rows = [e for e in index["episodes"] if e["n"] in set(chosen) or (e["n"] is None and not episodes)]

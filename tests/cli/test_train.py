@@ -44,7 +44,7 @@ def test_invalid_configuration_files(stub, tmp_path, capsys, content, expected):
     if content is not None:
         file.write_text(content)
     words = ["train", "stub", "--data", str(data), "--out", str(tmp_path / "run"), "--config", str(file)]
-    assert run(words) == 1
+    assert run(words) == (2 if content is None else 1)
     (line,) = capsys.readouterr().err.splitlines()
     assert re.search(f"^error: .*{expected}", line)
     assert not (tmp_path / "run").exists()

@@ -60,7 +60,7 @@ def test_overwrite_replaces_only_static_pages(trajectory, tmp_path, capsys):
 
 
 def test_unknown_episode_is_one_line(trajectory, tmp_path, capsys):
-    assert run(["view", str(trajectory), "--static", str(tmp_path / "x"), "--episodes", "7"]) == 1
+    assert run(["view", str(trajectory), "--static", str(tmp_path / "x"), "--episodes", "7"]) == 2
     (error,) = capsys.readouterr().err.splitlines()
     assert "no such episode" in error
     assert not (tmp_path / "x").exists()

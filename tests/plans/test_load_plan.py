@@ -170,7 +170,7 @@ def test_configuration_of_another_task_is_an_error(written):
 
 
 def test_unknown_plan_suggests_the_nearest(capsys):
-    assert run(["plan", "run", "tinny", "--out", "x"]) == 1
+    assert run(["plan", "run", "tinny", "--out", "x"]) == 2
     assert "tinny: no such plan (expected a YAML file, or one of paper, tiny). Did you mean tiny?" in (
         capsys.readouterr().err
     )

@@ -89,5 +89,5 @@ def test_errors(made, tmp_path):
     for number, speed in ((9, 1.0), (0, 0), (0, -1.0), (0, float("nan")), (0, float("inf"))):
         with pytest.raises(DatasetError):
             write_video(Dataset(made), number, tmp_path / "e.mp4", speed=speed)
-    assert run(["video", str(made), "--out", str(tmp_path / "out"), "--episodes", "0", "9"]) == 1
+    assert run(["video", str(made), "--out", str(tmp_path / "out"), "--episodes", "0", "9"]) == 2
     assert list(tmp_path.iterdir()) == []
