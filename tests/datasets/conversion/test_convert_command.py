@@ -90,7 +90,8 @@ def test_interrupted_conversion_prints_how_to_continue(monkeypatch, tmp_path, ca
         raise KeyboardInterrupt
 
     monkeypatch.setattr(conversion, "convert", interrupted)
-    command = ["convert", "F.h5", "--out", str(tmp_path / "out"), *flags]
+    (tmp_path / "F.h5").touch()
+    command = ["convert", str(tmp_path / "F.h5"), "--out", str(tmp_path / "out"), *flags]
     assert run(command) == 130
     assert capsys.readouterr().err == f"interrupted{said}\n"
 
