@@ -31,7 +31,7 @@ from robocas_ms3.evaluation import (
     load_protocol,
 )
 from robocas_ms3.evaluation.protocol import ProtocolEpisode
-from robocas_ms3.evaluation.rollout import rollout
+from robocas_ms3.evaluation.rollout import run_rollouts
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.scenes.task_specs import TASKS
 
@@ -132,7 +132,7 @@ def evaluated(session: EvaluationSession, episodes: list[ProtocolEpisode], steps
     """Return the CPU seconds of the evaluation loop from the first step on."""
     batch = session.open_batch(episodes[0], len(episodes), steps)
     policy = TimedPolicy(batch.env)
-    ended = list(rollout(batch, policy, [session.episode_spec(one) for one in episodes]))
+    ended = list(run_rollouts(batch, policy, [session.make_episode_spec(one) for one in episodes]))
     assert [one.steps for one in ended] == [steps] * len(episodes)
     return cpu(batch.env) - policy.before
 

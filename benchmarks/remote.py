@@ -23,7 +23,7 @@ import tyro
 from websockets.asyncio.server import ServerConnection, serve
 
 from robocas_ms3.evaluation import EpisodeSpec, Observations, PolicyServer, PolicySpec, RemotePolicy
-from robocas_ms3.evaluation.remote.wire import pack
+from robocas_ms3.evaluation.remote.wire import encode_message
 
 SERVERS = ("serial", "parallel", "batched")
 CAMERAS = ("base_camera", "gripper_camera")
@@ -125,10 +125,10 @@ def serve_slowly(server: str, args: Args, spec: PolicySpec, pipe: Connection) ->
 
 async def serve_openpi(seconds: float, pipe: Connection, *, parallel: bool) -> None:
     """Serve zeros by openpi's protocol."""
-    answer = pack({"actions": np.zeros(CHUNK)})
+    answer = encode_message({"actions": np.zeros(CHUNK)})
 
     async def talk(client: ServerConnection) -> None:
-        await client.send(pack({}))
+        await client.send(encode_message({}))
         async for _ in client:
             if parallel:
                 await asyncio.sleep(seconds)

@@ -45,7 +45,7 @@ from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.recordings.motion import sample_states, sample_stride
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
-from robocas_ms3.evaluation.policy import Observations, PolicySpec, privileged_state
+from robocas_ms3.evaluation.policy import Observations, PolicySpec, concatenate_privileged_state
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 
@@ -209,7 +209,7 @@ def read_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArra
 
 def _privileged_state(env: Any, state: dict[str, dict[str, NDArray[np.float32]]]) -> NDArray[np.float32]:
     env.set_state_dict({kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()})
-    return privileged_state(env.get_obs({})["extra"])[0]
+    return concatenate_privileged_state(env.get_obs({})["extra"])[0]
 
 
 class BcStateModel(nn.Module):

@@ -19,28 +19,29 @@ from robocas_ms3.tasks import terms
 
 Stepping = Literal["timed", "upstream"]
 V0_CONTROL_HZ = 5
-# A policy step of RoboCAS-v0 (evaluation_v0.md): the gripper moves until it stops, at most 5 control steps; then the
+# A policy step of RoboCAS-v0: the gripper moves until it stops, at most 5 control steps; then the
 # arm moves, at most 2.
 _GRIPPER_STEPS, _MOTION_STEPS = 5, 2
 _STOPPED = 0.0005  # largest change in gripper width per control step, m; velocities jitter while the fingers press
 _UNUSED_SIZE = 8  # pixels per side of cameras that the policy does not use; they are rendered all the same
 # RoboCAS-v0's motion ends early within this distance (m) and angle (rad) of its goal, below this speed (rad/s).
 _ARRIVED_DISTANCE, _ARRIVED_ANGLE, _ARRIVED_SPIN = 0.02, np.deg2rad(5), np.deg2rad(3)
-RAISED_HEIGHT = 0.03  # m above the initial height (evaluation_v0.md)
+RAISED_HEIGHT = 0.03  # m above the initial height
 # The drive that holds the rotation, in acceleration units (1/s^2, 1/s): equally stiff for light and heavy objects.
 # Limits of zero width lock the translation; SAPIEN 3.0.3 does not enforce angular limits.
 _STIFFNESS, _DAMPING = 1e8, 1e5
 
 
 class PolicyActionWrapper(gym.Wrapper):
-    """Wrapper that executes the actions of a policy and adds metrics to ``info``, for one env or a batch.
+    """Environment wrapper whose step is a policy step; it adds metrics to ``info``. For one env or a batch.
 
     Args:
-        env: a RoboCAS environment made with `env_kwargs`.
-        spec: action convention, and the number of steps between images; images of other steps are black.
-        stepping: ``timed``: a policy step is one control step. ``upstream``: a policy step moves the gripper until it
-            stops, then the TCP along a straight line until it arrives, at most 0.4 s. Envs of a batch that have
-            finished wait for the others.
+        env: a RoboCAS environment made with `make_env_kwargs`.
+        spec: specification of the policy. Its ``observe_every`` is the number of steps between images; the images of
+            other steps are black.
+        stepping: ``timed``: a policy step is one control step. ``upstream``: the policy step of RoboCAS-v0. It moves
+            the gripper until its width is constant, at most 1 s, then the TCP until it arrives, at most 0.4 s. In a
+            batch, each env waits until all envs have finished.
         weld: whether lifted objects are fixed to the hand (`Weld`); only for one env on the CPU.
     """
 
@@ -68,98 +69,98 @@ class PolicyActionWrapper(gym.Wrapper):
         self._metrics.reset(envs)
         rows = envs if isinstance(envs, slice) else np.asarray(torch.as_tensor(envs).cpu())
         self._open[rows], self._width_change[rows], self._steps[rows] = True, 0.0, 0
-        return obs, {**info, **self._measures(info)}
+        return obs, {**info, **self._compute_metrics(info)}
 
     @property
-    def gripper_open(self) -> bool:
-        """Return whether the last command to the gripper of the first env was to open."""
+    def is_gripper_commanded_open(self) -> bool:
+        """Return whether the last gripper command of the first env was to open."""
         return bool(self._open[0])
 
     def get_info(self) -> dict[str, Any]:
-        """Return the ``info`` of the present state."""
+        """Return ``info`` with the metrics of the present state; nothing is simulated."""
         info = self._base.get_info()
-        return {**info, **self._measures(info)}
+        return {**info, **self._compute_metrics(info)}
 
     def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Execute one policy step with actions (A,) or (N, A) of the convention."""
+        """Execute one policy step: actions (A,) of one env, or (N, A) of a batch, in the convention of the policy."""
         actions = np.asarray(action.cpu() if isinstance(action, torch.Tensor) else action, np.float64)
         actions = actions.reshape(self._base.num_envs, self._convention.size)
         if not np.isfinite(actions).all():
             raise EvaluationError("NaN or infinite action", where="action", found=actions.tolist())
         self._base.renders_images = False  # cameras render only at the end of the policy step
         try:
-            obs, *others, info = self._act(actions)
+            obs, *others, info = self._execute(actions)
         finally:
             self._base.renders_images = True
         self._steps += 1
         if (self._steps % self._image_period == 0).any() and isinstance(obs, dict) and "sensor_data" in obs:
             obs = self._base.get_obs(info)
         if self._weld and not self._open[0]:
-            self._weld.update()
+            self._weld.weld_touched_object()
         self._metrics.end_step()
-        return (obs, *others, {**info, **self._measures(info)})
+        return (obs, *others, {**info, **self._compute_metrics(info)})
 
-    def _act(self, actions: np.ndarray) -> tuple:
+    def _execute(self, actions: np.ndarray) -> tuple:
         if self._convention.decode is None:
             self._open = actions[:, 7] > 0
-            return self._control(actions)
+            return self._step_control(actions)
         motion = self._convention.decode(actions)
         return self._timed_step(motion) if self._stepping == "timed" else self._v0_step(motion)
 
-    def _measures(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
-        return {**self._metrics.read(), **(self._weld.read(info) if self._weld else {})}
+    def _compute_metrics(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+        return {**self._metrics.compute_info(), **(self._weld.compute_info(info) if self._weld else {})}
 
     def _timed_step(self, motion: TcpMotion) -> tuple:
-        start = self._tcp() if self._reference == "tcp" else self._target()
+        start = self._tcp_pose() if self._reference == "tcp" else self._commanded_pose()
         return self._move_to(*_apply_motion(start, motion), motion.open)
 
     def _v0_step(self, motion: TcpMotion) -> tuple:
-        """Move the grippers, then the arms; an env that has finished either phase waits for the others."""
-        result, here = None, self._target()
+        """Execute a policy step of RoboCAS-v0: move all grippers, then all arms."""
+        result, held = None, self._commanded_pose()
         turned = motion.open != self._open
         for _ in range(_GRIPPER_STEPS):
             if not (turned | (self._width_change > _STOPPED)).any():
                 break
-            result, turned = self._move_to(*here, motion.open), np.zeros_like(turned)
-        wanted = _apply_motion(self._tcp() if self._reference == "tcp" else self._target(), motion)
+            result, turned = self._move_to(*held, motion.open), np.zeros_like(turned)
+        goal = _apply_motion(self._tcp_pose() if self._reference == "tcp" else self._commanded_pose(), motion)
         for _ in range(_MOTION_STEPS):
-            result = self._move_to(*wanted, motion.open)
-            if self._has_arrived(*wanted).all():
+            result = self._move_to(*goal, motion.open)
+            if self._has_arrived(*goal).all():
                 break
         assert result is not None
         return result
 
-    def _move_to(self, position: np.ndarray, rotation: Rotation, opened: np.ndarray) -> tuple:
-        """Move TCPs toward poses in the arm's base frame, in one control step."""
-        self._open = opened
-        at, turn = self._target()
+    def _move_to(self, position: np.ndarray, rotation: Rotation, open_commands: np.ndarray) -> tuple:
+        """Command one control step toward TCP poses in the frame of the arm's base: (N, 3) m and N rotations."""
+        self._open = open_commands
+        at, turn = self._commanded_pose()
         delta = to_ee_delta_action(turn.inv().apply(position - at), turn.inv() * rotation)
         size = np.linalg.norm(delta[:, 3:], axis=1, keepdims=True)
         delta = np.concatenate([np.clip(delta[:, :3], -1, 1), delta[:, 3:] / np.maximum(size, 1)], axis=1)
-        return self._control(np.concatenate([delta, np.where(opened, 1.0, -1.0)[:, None]], axis=1))
+        return self._step_control(np.concatenate([delta, np.where(open_commands, 1.0, -1.0)[:, None]], axis=1))
 
-    def _control(self, actions: np.ndarray) -> tuple:
+    def _step_control(self, actions: np.ndarray) -> tuple:
         if self._weld and self._open[0]:
-            self._weld.open()
-        width = self._width() if self._stepping == "upstream" else 0.0
+            self._weld.release()
+        width = self._gripper_width() if self._stepping == "upstream" else 0.0
         result = self.env.step(torch.as_tensor(actions, dtype=torch.float32, device=self._base.device))
         if self._stepping == "upstream":
-            self._width_change = np.abs(self._width() - width)
+            self._width_change = np.abs(self._gripper_width() - width)
         self._metrics.update(self._open)
         return result
 
-    def _tcp(self) -> tuple[np.ndarray, Rotation]:
-        return _pose(self._base.agent.tcp_in_arm_base)
+    def _tcp_pose(self) -> tuple[np.ndarray, Rotation]:
+        return _to_numpy(self._base.agent.tcp_in_arm_base)
 
-    def _target(self) -> tuple[np.ndarray, Rotation]:
-        """Return the target poses of the last action."""
-        return _pose(self._base.agent.controller.controllers["arm"].reference_pose())
+    def _commanded_pose(self) -> tuple[np.ndarray, Rotation]:
+        """Return the last commanded TCP poses in the frame of the arm's base: (N, 3) m and N rotations."""
+        return _to_numpy(self._base.agent.controller.controllers["arm"].reference_pose())
 
-    def _width(self) -> np.ndarray:
+    def _gripper_width(self) -> np.ndarray:
         return self._base.agent.gripper_width.cpu().numpy()
 
     def _has_arrived(self, position: np.ndarray, rotation: Rotation) -> np.ndarray:
-        at, turn = self._tcp()
+        at, turn = self._tcp_pose()
         spin = torch.linalg.vector_norm(self._base.agent.tcp.angular_velocity, dim=-1).cpu().numpy()
         near = np.linalg.norm(position - at, axis=1) < _ARRIVED_DISTANCE
         return near & ((turn.inv() * rotation).magnitude() < _ARRIVED_ANGLE) & (spin < _ARRIVED_SPIN)
@@ -168,8 +169,8 @@ class PolicyActionWrapper(gym.Wrapper):
 class Weld:
     """RoboCAS-v0's weld: a drive that fixes at most one lifted object to the hand, for one env on the CPU.
 
-    The evaluator of the paper uses the weld; it helps policies that drop lifted objects. RoboCAS-v0 releases the object
-    at the end of the step that opens the gripper; this class releases it when the gripper starts to open.
+    The evaluator of the paper uses the weld. The weld helps policies that drop lifted objects. This class releases the
+    object when the gripper starts to open; RoboCAS-v0 releases it at the end of the step that opens the gripper.
     """
 
     def __init__(self, env: Any) -> None:
@@ -177,10 +178,10 @@ class Weld:
         self._welded: tuple[Any, Any] | None = None  # body and drive
         self._count = 0
 
-    def update(self) -> None:
-        """Weld a raised object that both fingers touch, unless an object is welded already.
+    def weld_touched_object(self) -> None:
+        """Weld an object that both fingers touch and that is raised by 3 cm; do nothing if an object is welded.
 
-        Call it after each policy step that commands the gripper to close, as RoboCAS-v0 does.
+        Must be called after each policy step that commands the gripper to close, as RoboCAS-v0 does.
         """
         if self._welded is not None:
             return
@@ -192,8 +193,8 @@ class Weld:
         if len(found):
             self._fix(env.objects[int(found[0])]._bodies[0])
 
-    def open(self) -> None:
-        """Release the welded object."""
+    def release(self) -> None:
+        """Release the welded object, if there is one."""
         if self._welded is None:
             return
         body, drive = self._welded
@@ -203,11 +204,15 @@ class Weld:
 
     def reset(self) -> None:
         """Release the welded object and set the number of welds to 0."""
-        self.open()
+        self.release()
         self._count = 0
 
-    def read(self, info: dict[str, Any]) -> dict[str, Any]:
-        """Return entries of ``info``: number of ``welds`` (1,); ``success``, False while an object is welded."""
+    def compute_info(self, info: dict[str, Any]) -> dict[str, Any]:
+        """Return the entries ``welds`` and ``success`` for ``info``.
+
+        ``welds`` (1,) float32: number of welds since the reset. ``success`` (1,) bool: the value in ``info``, but
+        False while an object is welded.
+        """
         welded = torch.tensor([self._welded is not None])
         return {"welds": torch.tensor([float(self._count)]), "success": info["success"] & ~welded}
 
@@ -225,30 +230,31 @@ class Weld:
 
 
 def check_weld(stepping: str, backend: str) -> None:
-    """Check that the weld is available for a protocol's stepping and a backend."""
+    """Raise `EvaluationError` if the weld is not available with this stepping of a protocol and this backend."""
     if stepping != "upstream":
-        what, fix = "the weld needs RoboCAS-v0's steps", "Omit --weld, or pass --protocol paper-v1."
-        raise EvaluationError(what, where="--weld", expected="stepping upstream", found=stepping, fix=fix)
+        what, fix = "the weld needs a protocol with RoboCAS-v0's steps", "Omit --weld, or pass --protocol paper-v1."
+        found = f"stepping: {stepping}"
+        raise EvaluationError(what, where="--weld", expected="stepping: upstream", found=found, fix=fix)
     if backend == "gpu":  # a running GPU batch accepts no new components
         what, fix = "the weld is not available on a GPU", "Pass --backend processes."
-        raise EvaluationError(what, where="--weld", found=backend, fix=fix)
+        raise EvaluationError(what, where="--weld", expected="backend processes", found=backend, fix=fix)
 
 
-def control_mode(convention: str) -> str:
-    """Return the control mode that executes an action convention."""
+def choose_control_mode(convention: str) -> str:
+    """Return the ManiSkill control mode for an action convention: ``pd_joint_pos`` or ``pd_ee_delta_pose``."""
     return "pd_joint_pos" if CONVENTIONS[convention].decode is None else "pd_ee_delta_pose"
 
 
-def env_kwargs(spec: PolicySpec, rate: int, *, renders: bool = False) -> dict[str, Any]:
-    """Return keyword arguments for the environment of a policy.
+def make_env_kwargs(spec: PolicySpec, rate: int, *, renders: bool = False) -> dict[str, Any]:
+    """Return the keyword arguments of ``gym.make`` for the environment of a policy.
 
     Args:
         spec: specification of the policy.
         rate: control steps per second.
-        renders: whether ``env.render`` is used.
+        renders: whether the caller uses ``env.render``.
     """
     common = {
-        "control_mode": control_mode(spec.convention),
+        "control_mode": choose_control_mode(spec.convention),
         "reward_mode": "none",
         "sim_config": {"control_freq": rate},
         "max_episode_steps": 10**9,  # `rollout.EndConditions` ends episodes
@@ -261,7 +267,7 @@ def env_kwargs(spec: PolicySpec, rate: int, *, renders: bool = False) -> dict[st
     return {**common, "obs_mode": "+".join(modes), "sensor_configs": {**others, **cameras}}
 
 
-def _pose(pose: Pose) -> tuple[np.ndarray, Rotation]:
+def _to_numpy(pose: Pose) -> tuple[np.ndarray, Rotation]:
     raw = pose.raw_pose.cpu().numpy().astype(np.float64)
     return raw[:, :3], Rotation.from_quat(raw[:, [4, 5, 6, 3]])
 

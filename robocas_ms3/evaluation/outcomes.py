@@ -1,4 +1,4 @@
-"""Outcome of an episode, as recorded in results."""
+"""Outcome of an episode: a line of ``episodes.jsonl`` in a result."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydantic import Field
 
 from robocas_ms3.scenes.task_specs import STAGES as DEFAULT_STAGES
 
-# Abbreviations of the paper's table (evaluation_v0.md): reach, pick, recognise, clear.
+# Abbreviations in the result table of the paper (docs/evaluation.md)
 PAPER_STAGES = {"RA": "reached_any", "PA": "picked_any", "RR": "reached_target", "CO": "obstacles_cleared"}
 
 Measure = Annotated[int | float, Field(ge=0, le=1e12)]  # int stays int, so that a value is written as it was read
@@ -22,13 +22,13 @@ Count = Annotated[int, Field(ge=0, le=10**12)]
 
 @dataclass(frozen=True)
 class MovedObject:
-    """An object that was moved before the target.
+    """An object of the heap that was moved before the target was first held.
 
     Attributes:
         object: id of the object.
         step: policy step after which the object was first moved.
-        needed: whether the object had to be moved.
-        in_order: whether it was needed and moved after the objects on top of it.
+        needed: whether the object had to be moved to reach the target (`metrics.RetrievalTracker`).
+        in_order: whether the object was needed, and moved after the objects on top of it.
     """
 
     object: str
@@ -39,14 +39,13 @@ class MovedObject:
 
 @dataclass(frozen=True)
 class Retrieval:
-    """Order in which objects were moved before the target of a heap.
+    """Retrieval order: the objects of a heap that were moved before the target was first held.
 
     Attributes:
-        moved: moved objects, sorted by step.
-        needed: ids of the objects that had to be moved (`metrics.RetrievalOrder`).
-        left: number of needed objects that were not moved before the target was grasped; 0 if the heap was cleared.
-        score: fraction of the moved and left objects that were needed and moved in order; 1 without such objects;
-            None if the target was never held.
+        moved: objects that were moved before the target was first held, in the order in which they were moved.
+        needed: ids of the objects that had to be moved (`metrics.RetrievalTracker`).
+        left: number of needed objects that were not moved; 0 if the target was cleared, or never held.
+        score: order score, 0..1 (`compute_order_score`); None if the target was never held.
     """
 
     moved: list[MovedObject]
@@ -58,10 +57,10 @@ class Retrieval:
     def from_record(
         cls, record: NDArray[np.integer], objects: Sequence[str], held_at: int | None, *, cleared: bool
     ) -> Retrieval:
-        """Return the order from a record of `metrics.RetrievalOrder.read`.
+        """Return the retrieval order from a record of `metrics.RetrievalTracker.read`.
 
         Args:
-            record: (K, 3) values of each object.
+            record: (K, 3) values of the K objects by slot.
             objects: ids of the objects by slot.
             held_at: policy step after which the target was first held; None: never.
             cleared: whether the obstacles were cleared in the episode.
@@ -72,11 +71,16 @@ class Retrieval:
         ]
         left = 0 if cleared or held_at is None else int(((record[:, 0] == 0) & (record[:, 1] == 1)).sum())
         needed = [name for name, is_needed in zip(objects, record[:, 1], strict=False) if is_needed]
-        return cls(moved, needed, left, retrieval_score(moved, left, held_at))
+        return cls(moved, needed, left, compute_order_score(moved, left, held_at))
 
 
-def retrieval_score(moved: Sequence[MovedObject], left: int, held_at: int | None) -> float | None:
-    """Return the score of a retrieval order, 0..1; None if the target was never held (`Retrieval`)."""
+def compute_order_score(moved: Sequence[MovedObject], left: int, held_at: int | None) -> float | None:
+    """Return the order score, 0..1; 1 if no object was moved or left; None if the target was never held.
+
+    The score is the number of needed objects that were moved in order, divided by the number of moved objects plus
+    ``left``, the number of needed objects that were not moved. ``held_at``: policy step after which the target was
+    first held.
+    """
     if held_at is None:
         return None
     right, total = sum(move.needed and move.in_order for move in moved), len(moved) + left
@@ -94,18 +98,19 @@ class Outcome:
         seed: seed of the scene.
         split: split of the protocol.
         success: whether the task succeeded at some step.
-        success_at_end: whether the task succeeded at the last step.
-        success_v0: whether RoboCAS-v0's rule held at the last step; False without a basket.
+        success_at_end: whether the task succeeded after the last step.
+        success_v0: whether RoboCAS-v0's success rule held after the last step; False without a basket.
         steps: number of policy steps.
-        seconds: simulated time.
-        failure_stage: first stage not reached (`failure_stage`); empty: success.
+        seconds: simulated duration of the episode, s.
+        failure_stage: stage after the last reached stage (`find_failure_stage`); empty if the task succeeded.
         error: error that ended the episode; empty: no error.
-        flags: policy step after which each stage or rule first held; None: never.
-        flag_seconds: simulated time after which each stage or rule first held; None: never.
-        measures: ``path_length`` m, ``contact_impulse`` N s, ``disturbed_most``, ``fallen``; ``welds`` with the weld.
-        inference_ms: clock time of the policy per step.
-        p_vis: visible fraction of the target from above.
-        retrieval: order in which objects were moved, only in tasks with obstacles to clear.
+        flags: by stage or success rule, the policy step after which it first held; None: never.
+        flag_seconds: by stage or success rule, the simulated time in s after which it first held; None: never.
+        measures: ``path_length``, path length of the TCP in m; ``contact_impulse`` in N s; ``disturbed_most`` and
+            ``fallen``, maximum numbers of disturbed and of fallen objects; with the weld also ``welds``, their number.
+        inference_ms: wall-clock time of the policy per policy step, ms.
+        p_vis: visible fraction of the target at the reset, seen from above, 0..1; None if it was not measured.
+        retrieval: retrieval order; None except in search.
     """
 
     episode: Count
@@ -128,16 +133,21 @@ class Outcome:
     retrieval: Retrieval | None = None
 
     def reproducible_values(self) -> dict[str, Any]:
-        """Return the values that are equal for equal seed and policy: all but clock times."""
+        """Return all values but wall-clock times: these values are equal for equal seed and policy."""
         return {name: value for name, value in asdict(self).items() if name != "inference_ms"}
 
 
-def failure_stage(flags: dict[str, int | None], error: str = "", order: Sequence[str] = DEFAULT_STAGES) -> str:
-    """Return the first stage not reached: the stage after the furthest reached stage.
+def find_failure_stage(flags: dict[str, int | None], error: str = "", order: Sequence[str] = DEFAULT_STAGES) -> str:
+    """Return the stage at which an episode failed: the stage after the last reached stage, in the order of the task.
 
-    Skipped stages do not count: a target can be pulled out of a heap that was never cleared. Stages that are missing
-    in ``flags`` do not exist in the environment. ``placed``: the episode reached all stages, but did not succeed;
-    ``error``: an error ended the episode; empty: success.
+    A stage that was skipped does not count as failed: a target can be pulled out of a heap that was never cleared.
+    Special values: ``placed`` if all stages were reached without success; ``error`` if an error ended the episode;
+    empty if the task succeeded.
+
+    Args:
+        flags: by stage, the policy step after which the stage first held, or None. Other stages are ignored.
+        error: error that ended the episode; empty: no error.
+        order: names of the stages in the order of the task.
     """
     if error:
         return "error"

@@ -47,7 +47,7 @@ class TcpMotion:
 
 
 @dataclass(frozen=True)
-class Convention:
+class ActionConvention:
     """An action convention.
 
     Attributes:
@@ -75,12 +75,12 @@ def _quaternions(wxyz: Array) -> Rotation:
 _euler = partial(Rotation.from_euler, "xyz")
 # Translation in m, then rotation (Euler angles about fixed axes x, y, z in rad, a rotation vector in rad, or a
 # quaternion wxyz), both in the TCP's frame. The last number commands the gripper: open above 0, in `robocas` above 0.5.
-CONVENTIONS: dict[str, Convention] = {
-    "robocas": Convention(7, _motions(_euler, 0.5)),
-    "delta_euler": Convention(7, _motions(_euler)),
-    "delta_axis_angle": Convention(7, _motions(Rotation.from_rotvec)),
-    "delta_quaternion": Convention(8, _motions(_quaternions)),
-    "joint_positions": Convention(8, None),  # seven joint targets, rad; gripper, -1 closed to 1 open
+CONVENTIONS: dict[str, ActionConvention] = {
+    "robocas": ActionConvention(7, _motions(_euler, 0.5)),
+    "delta_euler": ActionConvention(7, _motions(_euler)),
+    "delta_axis_angle": ActionConvention(7, _motions(Rotation.from_rotvec)),
+    "delta_quaternion": ActionConvention(8, _motions(_quaternions)),
+    "joint_positions": ActionConvention(8, None),  # seven joint targets, rad; gripper, -1 closed to 1 open
 }
 """Action conventions by name."""
 
@@ -183,7 +183,7 @@ class Observations:
         return self.robot[name]
 
 
-def privileged_state(extra: Mapping[str, Any]) -> NDArray[np.float32]:
+def concatenate_privileged_state(extra: Mapping[str, Any]) -> NDArray[np.float32]:
     """Return the privileged state (N, D) from ``obs["extra"]`` of an environment, arrays (N, ...)."""
     return np.concatenate([np.asarray(value) for name, value in extra.items() if name != "tcp_pose"], axis=1)
 
@@ -240,24 +240,24 @@ class ExternalPolicy:
         raise EvaluationError("ExternalPolicy returns no actions", fix="Call EvaluationSession.reset and step.")
 
 
-def policy_spec_values(spec: PolicySpec) -> dict[str, Any]:
+def policy_spec_to_dict(spec: PolicySpec) -> dict[str, Any]:
     """Return a specification as JSON values; ``observe_every`` is left out if it is 1."""
     values = {**vars(spec), "cameras": {name: list(size) for name, size in spec.cameras.items()}}
     return {key: value for key, value in values.items() if key != "observe_every" or value != 1}
 
 
-def describe(policy: Policy) -> dict[str, Any]:
+def describe_policy(policy: Policy) -> dict[str, Any]:
     """Return the description of a policy for results: class, specification and ``describe()``."""
     where = f"policy {_class_name(policy)}, describe()"
-    with policy_exit_guard(policy):
-        spec, added = policy_spec_values(policy.spec), getattr(policy, "describe", dict)()
+    with forbid_policy_exit(policy):
+        spec, added = policy_spec_to_dict(policy.spec), getattr(policy, "describe", dict)()
     if not isinstance(added, dict):
         raise EvaluationError("invalid policy description", where=where, expected="a dict", found=type(added).__name__)
     description = {"class": _class_name(policy), "spec": spec, **added}
     return json.loads(json_text(description, where, error=EvaluationError))
 
 
-def policy_exit_guard(policy: Policy) -> AbstractContextManager[None]:
+def forbid_policy_exit(policy: Policy) -> AbstractContextManager[None]:
     """Return a context in which a policy that tries to end the process raises an error (`forbid_exit`)."""
     return forbid_exit(f"policy {_class_name(policy)}")
 

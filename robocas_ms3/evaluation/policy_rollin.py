@@ -20,11 +20,11 @@ from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.demos.failures import Intervention
 from robocas_ms3.demos.settings import EpisodeSettings
-from robocas_ms3.evaluation.action_wrapper import V0_CONTROL_HZ, PolicyActionWrapper, env_kwargs
+from robocas_ms3.evaluation.action_wrapper import V0_CONTROL_HZ, PolicyActionWrapper, make_env_kwargs
 from robocas_ms3.evaluation.policies import open_policy
 from robocas_ms3.evaluation.policy import EpisodeSpec, Policy
 from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, rollout
+from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, run_rollouts
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.vector import RoboCASVectorEnv
@@ -34,12 +34,12 @@ _STEPS = 410  # random stream of the number of steps
 _log = logging.getLogger(__name__)
 
 
-def roll_in_steps(seed: int, after_steps: tuple[int, int]) -> int:
+def sample_roll_in_steps(seed: int, after_steps: tuple[int, int]) -> int:
     """Draw the number of policy steps for a seed, uniform in ``after_steps`` (both ends included)."""
     return int(np.random.default_rng([seed, _STEPS]).integers(after_steps[0], after_steps[1] + 1))
 
 
-def check_roll_in(settings: EpisodeSettings) -> str:
+def check_roll_in_policy(settings: EpisodeSettings) -> str:
     """Check the policy of ``after_policy``; return the hash of its weights (empty without weights)."""
     with open_policy(settings.after_policy) as policy:
         load_protocol(PROTOCOL).rules.check_policy(policy.spec)
@@ -62,7 +62,7 @@ class PolicyRollIn:
             pack=settings.pack,
             robot_uids=settings.robot,
             sim_backend="physx_cpu",
-            **env_kwargs(spec, V0_CONTROL_HZ),
+            **make_env_kwargs(spec, V0_CONTROL_HZ),
         )
         self._env = PolicyActionWrapper(env, spec, "upstream")
         self._base: Any = env.unwrapped
@@ -75,11 +75,11 @@ class PolicyRollIn:
 
     def run(self, seed: int) -> Intervention:
         """Run the policy in the scene of a seed and return the state in which it leaves the scene."""
-        settings, steps = self._settings, roll_in_steps(seed, self._settings.after_steps)
+        settings, steps = self._settings, sample_roll_in_steps(seed, self._settings.after_steps)
         batch = EpisodeBatch(self._vector, self._policy.spec, EndConditions(steps), 1 / V0_CONTROL_HZ, refill=False)
         try:
             self._vector.reset(seed=[seed])
-            (played,) = rollout(batch, self._policy, [self._episode(seed)])
+            (played,) = run_rollouts(batch, self._policy, [self._episode(seed)])
         except LayoutError:
             return Intervention(seed, settings.after_policy, 0, {}, 1.0, "no_layout")
         if played.error:
@@ -92,7 +92,7 @@ class PolicyRollIn:
         skip_reason = next((reason for reason, applies in reasons.items() if applies), "")
         state: dict[str, Any] = self._base.get_state_dict()
         state = {kind: to_numpy(values) for kind, values in state.items() if kind != "controller"}
-        gripper = 1.0 if self._env.gripper_open else -1.0
+        gripper = 1.0 if self._env.is_gripper_commanded_open else -1.0
         return Intervention(seed, settings.after_policy, played.steps, state, gripper, skip_reason)
 
     def close(self) -> None:

@@ -36,7 +36,7 @@ from robocas_ms3.scenes.task_specs import TASKS
 
 INVALID_RULES = "invalid protocol rules"
 DEFAULT_HZ = 20  # actions per second if neither protocol nor policy has a rate
-PLAYED_AS = {"select": "pick"}
+TASK_ALIASES = {"select": "pick"}
 """RoboCAS-v0's evaluator runs the first task in the episodes of the second task."""
 CONFIG_NAME = r"^[A-Za-z0-9_-]+$"
 EPISODES, CONFIGS, LAYOUTS, TRAIN = "episodes.jsonl", "configs", "layouts", "train"
@@ -157,7 +157,7 @@ class LoadedProtocol:
     def hash(self) -> str:
         """Return the sha256 of the names and contents of all files, in hex."""
         digest = hashlib.sha256()
-        for path in protocol_files(self.folder):
+        for path in list_protocol_files(self.folder):
             try:
                 content = hashlib.sha256(read_bytes(path, ARRAYS_LIMIT)).hexdigest()
             except (OSError, DocumentError) as error:
@@ -198,7 +198,7 @@ class LoadedProtocol:
             EvaluationError: both tasks are in ``tasks``; their episodes would be the same.
         """
         known = {episode.task for episode in self.episodes}
-        found = {task: PLAYED_AS[task] for task in tasks if task in PLAYED_AS and task not in known}
+        found = {task: TASK_ALIASES[task] for task in tasks if task in TASK_ALIASES and task not in known}
         if self.rules.stepping != "upstream" or not known.issuperset(found.values()):
             return {}
         for task, other in found.items():
@@ -238,7 +238,7 @@ class LoadedProtocol:
         return sorted(self.folder.glob(f"{TRAIN}/*.yaml"))
 
 
-def protocol_files(folder: Path) -> list[Path]:
+def list_protocol_files(folder: Path) -> list[Path]:
     """Return all files of a protocol, sorted."""
     patterns = (f"{CONFIGS}/*.yaml", f"{LAYOUTS}/*.npy", f"{TRAIN}/*.yaml")
     return sorted([folder / RULES, folder / EPISODES, *(path for name in patterns for path in folder.glob(name))])

@@ -34,7 +34,7 @@ _NO_RESULT = "invalid evaluation result"
 
 
 class PolicyRecord(BaseModel):
-    """The policy of a result. The policy may add entries (`policy.describe`).
+    """The policy of a result. The policy may add entries (`policy.describe_policy`).
 
     Attributes:
         name: name of the policy as given by the user.

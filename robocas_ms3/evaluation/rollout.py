@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError, PolicyError
 from robocas_ms3.core.text import escape_controls
-from robocas_ms3.evaluation.metrics import MEASURES, read_sum
-from robocas_ms3.evaluation.outcomes import Outcome, Retrieval, failure_stage
+from robocas_ms3.evaluation.metrics import MEASURES, read_metric
+from robocas_ms3.evaluation.outcomes import Outcome, Retrieval, find_failure_stage
 from robocas_ms3.evaluation.policy import (
     CONVENTIONS,
     ROBOT_QUANTITIES,
@@ -22,8 +22,8 @@ from robocas_ms3.evaluation.policy import (
     Policy,
     PolicySpec,
     as_action_chunks,
-    policy_exit_guard,
-    privileged_state,
+    concatenate_privileged_state,
+    forbid_policy_exit,
 )
 from robocas_ms3.evaluation.protocol import ProtocolEpisode
 from robocas_ms3.scenes.language.embed import TextEmbedder
@@ -40,7 +40,7 @@ class Rollout:
     Attributes:
         spec: specification of the episode.
         at_end: value of each flag after the last step.
-        retrieval: (K, 3) array of `metrics.RetrievalOrder.read`, only in search.
+        retrieval: (K, 3) array of `metrics.RetrievalTracker.read`, only in search.
         inference_seconds: clock time of the policy; the time of a batch is divided by its number of envs.
     """
 
@@ -72,7 +72,7 @@ class Rollout:
             success_v0=self.at_end.get("success_v0", False),
             steps=self.steps,
             seconds=round(self.seconds, 4),
-            failure_stage=failure_stage(flags, self.error, TASKS[episode.task].stages),
+            failure_stage=find_failure_stage(flags, self.error, TASKS[episode.task].stages),
             error=escape_controls(self.error),  # may come from the code of the policy
             flags=flags,
             flag_seconds=self.flag_seconds,
@@ -156,7 +156,7 @@ class EpisodeBatch:
             images={name: cameras[name]["rgb"][index] for name in spec.cameras},
             depths={name: cameras[name]["depth"][index] for name in spec.cameras} if spec.depth else {},
             robot={name: agent[quantity.name][index] for name, quantity in ROBOT_QUANTITIES.items()},
-            state=privileged_state(obs["extra"])[index] if spec.state else None,
+            state=concatenate_privileged_state(obs["extra"])[index] if spec.state else None,
         )
 
     def step(self, actions: NDArray[np.float32]) -> Iterator[Rollout]:
@@ -172,7 +172,7 @@ class EpisodeBatch:
         for env in [env for env, episode in self.running.items() if self._is_over(episode)]:
             yield self._end(env)
 
-    def fail_lost(self, envs: Sequence[int], why: str) -> Iterator[Rollout]:
+    def fail_crashed(self, envs: Sequence[int], why: str) -> Iterator[Rollout]:
         """Yield the running episodes of envs whose worker crashed, as failures without metrics."""
         for env in envs:
             if env in self.running:
@@ -188,7 +188,7 @@ class EpisodeBatch:
             episode.at_end[name] = bool(info[name][env])
             episode.flags.setdefault(name, None)
             episode.flag_seconds.setdefault(name, None)
-        episode.measures = {name: round(float(read_sum(info, name)[env]), 4) for name in MEASURES}
+        episode.measures = {name: round(float(read_metric(info, name)[env]), 4) for name in MEASURES}
         if _WELDS in info:
             episode.measures[_WELDS] = float(info[_WELDS][env])
         if "retrieval" in info:
@@ -210,11 +210,11 @@ class EpisodeBatch:
 
     def _is_over(self, episode: Rollout) -> bool:
         ends, info, env = self._ends, self._info, episode.spec.env
-        v0 = ends.max_v0_steps is not None and read_sum(info, "v0_steps")[env] >= ends.max_v0_steps
+        v0 = ends.max_v0_steps is not None and read_metric(info, "v0_steps")[env] >= ends.max_v0_steps
         return v0 or episode.steps >= ends.max_steps or any(info[name][env] for name in ends.ends_on if name in info)
 
 
-def rollout(batch: EpisodeBatch, policy: Policy, episodes: Sequence[EpisodeSpec]) -> Iterator[Rollout]:
+def run_rollouts(batch: EpisodeBatch, policy: Policy, episodes: Sequence[EpisodeSpec]) -> Iterator[Rollout]:
     """Run episodes with a policy in idle envs; yield each episode as it ends, in any order.
 
     In worker processes an env starts the next episode at once. In a GPU batch, where the objects of all envs are built
@@ -226,7 +226,7 @@ def rollout(batch: EpisodeBatch, policy: Policy, episodes: Sequence[EpisodeSpec]
         if waiting and free and (batch.refill or not batch.running):
             starts = batch.start([(env, waiting.pop()) for env in free[: len(waiting)]])
             chunks.update({start.env: [] for start in starts})
-            with policy_exit_guard(policy):
+            with forbid_policy_exit(policy):
                 policy.reset(starts)
         _request_actions(batch, policy, chunks)
         actions = np.zeros((batch.num_envs, batch.action_size), np.float32)
@@ -245,7 +245,7 @@ def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list
     observations = batch.observe(envs)
     started = time.perf_counter()
     try:
-        with policy_exit_guard(policy):
+        with forbid_policy_exit(policy):
             actions: Any = np.asarray(policy.act(observations))
     except PolicyError as failed:
         for env in envs if failed.actions is None else failed.reasons:

@@ -20,18 +20,18 @@ from robocas_ms3.core.errors import EvaluationError, VectorEnvCrashError
 from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.action_wrapper import V0_CONTROL_HZ, PolicyActionWrapper, check_weld, env_kwargs
+from robocas_ms3.evaluation.action_wrapper import V0_CONTROL_HZ, PolicyActionWrapper, check_weld, make_env_kwargs
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import (
     EpisodeSpec,
     Observations,
     Policy,
     as_action_chunks,
-    describe,
-    policy_exit_guard,
+    describe_policy,
+    forbid_policy_exit,
 )
 from robocas_ms3.evaluation.protocol import ProtocolEpisode, load_protocol
-from robocas_ms3.evaluation.rollout import NOT_FINITE, EndConditions, EpisodeBatch, Rollout, rollout
+from robocas_ms3.evaluation.rollout import NOT_FINITE, EndConditions, EpisodeBatch, Rollout, run_rollouts
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.scenes.config import TaskConfig, load_task_config
 from robocas_ms3.scenes.layout_table import FrozenLayouts
@@ -123,7 +123,7 @@ class EvaluationSession:
         assert steps is not None  # `load_protocol` checks it
         return steps
 
-    def episode_spec(self, episode: ProtocolEpisode) -> EpisodeSpec:
+    def make_episode_spec(self, episode: ProtocolEpisode) -> EpisodeSpec:
         """Return the specification of an episode for policies; ``env`` is -1 until an env runs it."""
         return EpisodeSpec(
             env=-1,
@@ -171,7 +171,7 @@ class EvaluationSession:
         self._current, self.outcomes = episodes, {}
         batch = self.open_batch(episodes[0], count)
         try:
-            batch.start([(env, self.episode_spec(episode)) for env, episode in enumerate(episodes)])
+            batch.start([(env, self.make_episode_spec(episode)) for env, episode in enumerate(episodes)])
         except Exception:
             self.close()
             raise
@@ -242,14 +242,16 @@ class EvaluationSession:
             batch = None
             try:
                 batch = self.open_batch(episodes[0], min(self.settings.envs, len(left)), max_steps)
-                for ended in rollout(batch, self.policy, [self.episode_spec(episode) for episode in left.values()]):
+                for ended in run_rollouts(
+                    batch, self.policy, [self.make_episode_spec(episode) for episode in left.values()]
+                ):
                     yield self._outcome(ended, left.pop(ended.spec.episode))
             except VectorEnvCrashError as error:
                 self.close()
                 lost = (
                     []
                     if batch is None
-                    else list(batch.fail_lost(error.envs, f"the worker process of the env crashed: {error.found}"))
+                    else list(batch.fail_crashed(error.envs, f"the worker process of the env crashed: {error.found}"))
                 )
                 deaths.update([ended.spec.episode for ended in lost] or [_NO_EPISODE])
                 if deaths[_NO_EPISODE] == MAX_STARTS:
@@ -270,7 +272,7 @@ class EvaluationSession:
             return
         names = dict.fromkeys(episode.config for episode in self.episodes)
         configs = {name: load_task_config(self.protocol.config_file(name)) for name in names}
-        with policy_exit_guard(self.policy):
+        with forbid_policy_exit(self.policy):
             for warning in warn(configs):
                 _log.warning("%s", warning)
 
@@ -307,7 +309,7 @@ class EvaluationSession:
             layouts=str(self.protocol.layouts_file(episode.config)),
             pack=rules.pack,
             robot_uids=rules.robot,
-            **env_kwargs(self.spec, self.rate, renders=bool(render)),
+            **make_env_kwargs(self.spec, self.rate, renders=bool(render)),
             **render,
         )
 
@@ -320,7 +322,7 @@ class EvaluationSession:
         values = {
             "protocol": rules.name,
             "protocol_hash": self.protocol.hash,
-            "policy": {"name": name} | describe(self.policy) | {"name": name},  # a description may not rename it
+            "policy": {"name": name} | describe_policy(self.policy) | {"name": name},  # a description may not rename it
             "weld": self.settings.weld,
             **({"played_as": self.played_as} if self.played_as else {}),
             "backend": backend,

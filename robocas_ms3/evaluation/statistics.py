@@ -35,7 +35,7 @@ class Comparison:
 
     Attributes:
         both, only_a, only_b, neither: numbers of scenes in which both runs, only A, only B or neither succeeded.
-        p_value: two-sided p-value of the hypothesis that A and B have equal success rates (`mcnemar`).
+        p_value: two-sided p-value of the hypothesis that A and B have equal success rates (`mcnemar_p_value`).
         low, high: 95 % interval of the difference of the rates, A - B, -1..1 (`paired_interval`).
     """
 
@@ -51,7 +51,7 @@ class Comparison:
     def from_counts(cls, both: int, only_a: int, only_b: int, neither: int) -> Comparison:
         """Return the comparison with these numbers of scenes."""
         limits = paired_interval(only_a, only_b, both + only_a + only_b + neither)
-        return cls(both, only_a, only_b, neither, mcnemar(only_a, only_b), *limits)
+        return cls(both, only_a, only_b, neither, mcnemar_p_value(only_a, only_b), *limits)
 
     @property
     def n(self) -> int:
@@ -86,7 +86,7 @@ def success_rate(k: int, n: int) -> SuccessRate:
     return SuccessRate(k, n, low, high)
 
 
-def mcnemar(only_a: int, only_b: int) -> float:
+def mcnemar_p_value(only_a: int, only_b: int) -> float:
     """Return McNemar's exact two-sided p-value of two runs over the same scenes.
 
     McNemar, Psychometrika 12 (1947) 153-157, exact form: with equal rates, a scene that only one run solves is solved
@@ -127,13 +127,13 @@ def paired_interval(only_a: int, only_b: int, n: int) -> tuple[float, float]:
     return low, high
 
 
-def compare(a: ArrayLike, b: ArrayLike) -> Comparison:
+def compare_successes(a: ArrayLike, b: ArrayLike) -> Comparison:
     """Compare two runs by their successes (n,) bool, in the same order of scenes."""
     a, b = np.asarray(a, dtype=bool), np.asarray(b, dtype=bool)
     return Comparison.from_counts(*(int(cases.sum()) for cases in (a & b, a & ~b, ~a & b, ~a & ~b)))
 
 
-def holm(p_values: Sequence[float]) -> list[float]:
+def adjust_p_values(p_values: Sequence[float]) -> list[float]:
     """Return p-values of several comparisons adjusted by Holm's method, in their order.
 
     If a difference is claimed where the adjusted p-value is at most alpha, the probability of any false claim is at

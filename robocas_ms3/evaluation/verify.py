@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from robocas_ms3.core.text import format_count
-from robocas_ms3.evaluation.outcomes import Outcome, failure_stage, retrieval_score
+from robocas_ms3.evaluation.outcomes import Outcome, compute_order_score, find_failure_stage
 from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol, ProtocolEpisode
 from robocas_ms3.evaluation.results import Result, RunRecord
 from robocas_ms3.scenes.task_specs import TASKS
@@ -21,7 +21,7 @@ def find_violations(result: Result, protocol: LoadedProtocol) -> list[str]:
     if pack != rules.pack_hash:
         found.append(f"hash of pack {rules.pack}: {pack}, expected {rules.pack_hash}")
     if run.weld and rules.stepping != "upstream":
-        found.append("weld: true, but the weld needs RoboCAS-v0's steps")
+        found.append("weld: true, but the weld needs a protocol with RoboCAS-v0's steps")
     if run.played_as != protocol.played_as(list(run.played_as)):
         found.append(f"played_as is {run.played_as}, but the protocol has no such rule")
     for number, outcome in result.outcomes.items():
@@ -59,7 +59,7 @@ def _find_outcome_violations(
         yield "success_at_end without success"
     if outcome.success_v0 and flags.get("success_v0") is None:
         yield "success_v0 contradicts the flags"
-    stage = failure_stage(flags, outcome.error, TASKS[episode.task].stages)
+    stage = find_failure_stage(flags, outcome.error, TASKS[episode.task].stages)
     if outcome.failure_stage != stage:
         yield f"failure_stage is {outcome.failure_stage or 'empty'}, expected {stage or 'empty'} from the flags"
     late = [name for name, step in flags.items() if step is not None and step > outcome.steps]
@@ -87,6 +87,6 @@ def _find_retrieval_violations(outcome: Outcome) -> Iterator[str]:
     if order is None:
         return
     late = [move for move in order.moved if not 0 < move.step <= outcome.steps]
-    score = retrieval_score(order.moved, order.left, outcome.flags.get("target_grasped"))
+    score = compute_order_score(order.moved, order.left, outcome.flags.get("target_grasped"))
     if "obstacles_cleared" not in outcome.flags or late or order.score != score:
         yield "the retrieval order contradicts its score or the flags"

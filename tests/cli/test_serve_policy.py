@@ -42,13 +42,13 @@ def serving(policy, folder, *options):
 
 
 def test_own_policy_is_served_until_ctrl_c(tmp_path):
-    from robocas_ms3.evaluation.policy import policy_spec_values
+    from robocas_ms3.evaluation.policy import policy_spec_to_dict
     from robocas_ms3.evaluation.remote.client import RemotePolicy
 
     (tmp_path / "mine.py").write_text(POLICY)
     with serving("mine:Up", tmp_path) as (served, url):
         remote = RemotePolicy(url)
-        assert policy_spec_values(remote.spec)["convention"] == "delta_quaternion"
+        assert policy_spec_to_dict(remote.spec)["convention"] == "delta_quaternion"
         remote.close()
         served.send_signal(signal.SIGINT)
         out, err = served.communicate(timeout=20)
@@ -72,11 +72,11 @@ class Slow:
 def test_ctrl_c_ends_a_busy_policy(tmp_path):
     from websockets.sync.client import connect
 
-    from robocas_ms3.evaluation.remote.wire import pack
+    from robocas_ms3.evaluation.remote.wire import encode_message
 
     (tmp_path / "mine.py").write_text(SLOW)
     with serving("mine:Slow", tmp_path) as (served, url), connect(url, proxy=None) as client:
-        client.send(pack(observation()))
+        client.send(encode_message(observation()))
         assert served.stdout.readline() == "acts\n"
         served.send_signal(signal.SIGINT)
         out, err = served.communicate(timeout=60)
@@ -91,10 +91,10 @@ def observation():
 def test_batch_size_is_sent_to_clients(tmp_path):
     from websockets.sync.client import connect
 
-    from robocas_ms3.evaluation.remote.wire import unpack
+    from robocas_ms3.evaluation.remote.wire import decode_message
 
     with serving("noop", tmp_path, "--max-batch", "3") as (_, url), connect(url, proxy=None) as client:
-        assert unpack(client.recv())["robocas_max_batch"] == 3
+        assert decode_message(client.recv())["robocas_max_batch"] == 3
 
 
 @pytest.mark.parametrize(("option", "value"), [("--port", "99999"), ("--max-batch", "0"), ("--max-batch", "257")])

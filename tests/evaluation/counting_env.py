@@ -9,7 +9,7 @@ import numpy as np
 from robocas_ms3.core.errors import VectorEnvCrashError
 from robocas_ms3.evaluation.metrics import SUMS
 from robocas_ms3.evaluation.policy import EpisodeSpec, Policy
-from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, Rollout, rollout
+from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, Rollout, run_rollouts
 
 BREAKS = 13.0  # an action with this number raises
 _POSE = [1, 2, 3, 0.4, 0.1, 0.2, 0.3]  # m; quaternion wxyz
@@ -92,4 +92,4 @@ def play(
 ) -> list[Rollout]:
     """Run episodes with a policy, 0.05 s per step."""
     batch = EpisodeBatch(env, policy.spec, EndConditions(max_steps), 0.05, refill=refill)
-    return list(rollout(batch, policy, episodes))
+    return list(run_rollouts(batch, policy, episodes))

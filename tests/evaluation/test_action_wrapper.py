@@ -13,8 +13,8 @@ from mani_skill.utils.structs import Pose
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.action_wrapper import PolicyActionWrapper, env_kwargs
-from robocas_ms3.evaluation.metrics import read_sum
+from robocas_ms3.evaluation.action_wrapper import PolicyActionWrapper, make_env_kwargs
+from robocas_ms3.evaluation.metrics import read_metric
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.tasks.vector import make_vec
 
@@ -33,7 +33,7 @@ IMAGES = {
 
 @cache
 def pick(convention: str, rate: int) -> gym.Env:
-    return gym.make("RoboCASPick-v1", **env_kwargs(PolicySpec(convention), rate))
+    return gym.make("RoboCASPick-v1", **make_env_kwargs(PolicySpec(convention), rate))
 
 
 def made(convention="robocas", reference="tcp", stepping="timed", rate=5) -> PolicyActionWrapper:
@@ -58,7 +58,7 @@ def test_slow_motion_reaches_its_goal(reference):
     for _ in range(5):
         *_, info = env.step(along(0.02))
     assert np.linalg.norm(tcp(env) - before) == pytest.approx(0.1, abs=0.004)
-    assert read_sum(info, "path_length") == pytest.approx(0.1, abs=0.004)
+    assert read_metric(info, "path_length") == pytest.approx(0.1, abs=0.004)
 
 
 def test_motions_start_from_the_tcp_or_from_the_last_target():
@@ -119,23 +119,23 @@ def test_metrics_count_from_the_reset():
     base.objects[slot].set_pose(Pose.create_from_pq(above, pose[:, 3:]))
     *_, info = env.step(along(0.0))
     assert bool(info["success_v0"])  # near the basket in xy, gripper open: RoboCAS-v0's rule has no other condition
-    assert read_sum(info, "v0_steps") == 1
+    assert read_metric(info, "v0_steps") == 1
     assert not bool(info["success"])
     other = next(i for i in range(len(base.objects)) if i != slot)
     pose = base.objects[other].pose.raw_pose.clone()
     base.objects[other].set_pose(Pose.create_from_pq(torch.tensor([[3.0, 3.0, 0.05]]), pose[:, 3:]))
     *_, info = env.step(along(0.0, gripper=0.0))
     assert not bool(info["success_v0"])
-    assert read_sum(info, "fallen") == 1
-    assert read_sum(info, "disturbed_most") >= 1
+    assert read_metric(info, "fallen") == 1
+    assert read_metric(info, "disturbed_most") >= 1
     base.objects[slot].set_pose(Pose.create_from_pq(torch.tensor([[3.0, 2.0, 0.05]]), pose[:, 3:]))
     *_, info = env.step(along(0.0))
     assert bool(info["fail"])
-    assert read_sum(info, "fallen") == 1  # the target does not count
+    assert read_metric(info, "fallen") == 1  # the target does not count
     env.reset(seed=3)
     *_, info = env.step(along(0.0))
-    assert [read_sum(info, name) for name in ("fallen", "disturbed_most", "v0_steps")] == [0, 0, 0]
-    assert read_sum(info, "path_length") < 0.002
+    assert [read_metric(info, name) for name in ("fallen", "disturbed_most", "v0_steps")] == [0, 0, 0]
+    assert read_metric(info, "path_length") < 0.002
 
 
 def test_images_are_rendered_only_when_the_policy_observes_them(monkeypatch):

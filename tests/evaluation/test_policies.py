@@ -9,8 +9,8 @@ from counting_env import CountingEnv, play
 from robocas_ms3.core.errors import EvaluationError, ExtensionError
 from robocas_ms3.evaluation.policies import make_policy, open_policy
 from robocas_ms3.evaluation.policies.plain import NoopPolicy
-from robocas_ms3.evaluation.policies.scripted import OFFSETS, offset
-from robocas_ms3.evaluation.policy import CONVENTIONS, EpisodeSpec, PolicySpec, describe, policy_spec_values
+from robocas_ms3.evaluation.policies.scripted import OFFSETS, sample_offset
+from robocas_ms3.evaluation.policy import CONVENTIONS, EpisodeSpec, PolicySpec, describe_policy, policy_spec_to_dict
 
 GOOD = """
 import numpy as np
@@ -59,8 +59,8 @@ def here(tmp_path, monkeypatch):
 
 
 def test_invalid_specifications_name_the_field():
-    assert "observe_every" not in policy_spec_values(PolicySpec())  # the default is left out
-    assert policy_spec_values(PolicySpec(observe_every=7))["observe_every"] == 7
+    assert "observe_every" not in policy_spec_to_dict(PolicySpec())  # the default is left out
+    assert policy_spec_to_dict(PolicySpec(observe_every=7))["observe_every"] == 7
     for wrong in ({"convention": "words"}, {"language": "loud"}, {"reference": "me"}, {"observe_every": 0}):
         with pytest.raises(EvaluationError) as error:
             PolicySpec(**wrong)
@@ -110,19 +110,19 @@ def test_an_error_inside_the_policy_is_not_changed(here):
 )
 def test_a_policy_cannot_end_the_process(here, name):
     with pytest.raises(ExtensionError) as caught, open_policy(name) as policy:
-        describe(policy)
+        describe_policy(policy)
         play(CountingEnv(1, None), policy, [EpisodeSpec(-1, 0, "pick", "", "", "", 2, "")], 3)
     assert str(caught.value.where).startswith("policy own_")
     assert str(here) in str(caught.value.found)
 
 
 def test_offsets_depend_only_on_the_seed():
-    drawn = np.array([offset(seed) for seed in range(200)])
+    drawn = np.array([sample_offset(seed) for seed in range(200)])
     lengths = np.linalg.norm(drawn, axis=1)
     assert lengths.min() >= OFFSETS[0] and lengths.max() <= OFFSETS[1]
     assert np.ptp(lengths) > 0.9 * (OFFSETS[1] - OFFSETS[0])
     assert set(zip(*np.sign(drawn).T, strict=True)) == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
-    assert np.array_equal(offset(7), drawn[7])
+    assert np.array_equal(sample_offset(7), drawn[7])
 
 
 QUARTER = np.pi / 2

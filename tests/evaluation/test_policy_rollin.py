@@ -21,7 +21,7 @@ from robocas_ms3.demos.recordings.trajectory_json import read_json
 from robocas_ms3.demos.settings import EpisodeSettings, ReplaySettings
 from robocas_ms3.demos.trajectory_replay import replay
 from robocas_ms3.evaluation.policies.replay import ReplayPolicy
-from robocas_ms3.evaluation.policy_rollin import PolicyRollIn, check_roll_in, roll_in_steps
+from robocas_ms3.evaluation.policy_rollin import PolicyRollIn, check_roll_in_policy, sample_roll_in_steps
 
 CONFIG = "pick_upstream_eval"
 
@@ -62,17 +62,17 @@ def numbers(node, name=""):
 
 
 def test_number_of_steps_is_drawn_from_the_seed_with_both_ends():
-    assert roll_in_steps(5, (7, 7)) == 7
-    drawn = [roll_in_steps(seed, (5, 8)) for seed in range(60)]
+    assert sample_roll_in_steps(5, (7, 7)) == 7
+    drawn = [sample_roll_in_steps(seed, (5, 8)) for seed in range(60)]
     assert set(drawn) == {5, 6, 7, 8}
-    assert drawn == [roll_in_steps(seed, (5, 8)) for seed in range(60)]
+    assert drawn == [sample_roll_in_steps(seed, (5, 8)) for seed in range(60)]
 
 
 def test_weights_have_a_hash_and_unsupported_actions_are_an_error():
     with pytest.raises(EvaluationError, match="joint_positions"):
-        check_roll_in(settings("scripted", (5, 60)))
-    assert check_roll_in(settings("random", (5, 60))) == ""
-    assert check_roll_in(settings("small", (5, 60))) == hash_weights(BUNDLED / "small")
+        check_roll_in_policy(settings("scripted", (5, 60)))
+    assert check_roll_in_policy(settings("random", (5, 60))) == ""
+    assert check_roll_in_policy(settings("small", (5, 60))) == hash_weights(BUNDLED / "small")
 
 
 @pytest.mark.parametrize("roll_in", [("random", (12, 12))], indirect=True)

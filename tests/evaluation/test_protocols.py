@@ -12,7 +12,7 @@ from robocas_ms3.cli.eval import Protocols, list_protocols
 from robocas_ms3.core.errors import ConfigError, EvaluationError
 from robocas_ms3.evaluation.bundled_protocols import DESCRIPTIONS, bundled_protocols
 from robocas_ms3.evaluation.policy import PolicySpec
-from robocas_ms3.evaluation.protocol import EPISODES, RULES, load_protocol, protocol_files
+from robocas_ms3.evaluation.protocol import EPISODES, RULES, list_protocol_files, load_protocol
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 
@@ -87,7 +87,7 @@ def test_hash_depends_only_on_the_files(folder):
     mine = load_protocol(folder)
     before = load_protocol("smoke").hash
     assert mine.hash == before
-    for path in protocol_files(folder):
+    for path in list_protocol_files(folder):
         content = path.read_bytes()
         path.write_bytes(content + b"\n")
         assert replace(mine).hash != before, path

@@ -6,7 +6,7 @@ import pytest
 from synthetic_results import RUN_OF, outcome, write
 
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
-from robocas_ms3.evaluation.outcomes import failure_stage
+from robocas_ms3.evaluation.outcomes import find_failure_stage
 from robocas_ms3.evaluation.results import (
     OUTCOMES,
     RUN,
@@ -150,11 +150,11 @@ def test_folders_with_common_episodes_are_separate_results(tmp_path):
     ],
 )
 def test_failure_stage(reached, stage):
-    assert failure_stage(SEARCH | dict.fromkeys(reached, 5)) == stage
-    assert failure_stage({"reached_any": None, "furniture_opened": 7 if reached else None}) == (
+    assert find_failure_stage(SEARCH | dict.fromkeys(reached, 5)) == stage
+    assert find_failure_stage({"reached_any": None, "furniture_opened": 7 if reached else None}) == (
         "reached_any" if reached else "furniture_opened"
     )
-    assert failure_stage({"reached_any": 5}, "policy died") == "error"
+    assert find_failure_stage({"reached_any": 5}, "policy died") == "error"
 
 
 SERVED = {"server": {"name": "mine", "class": "m:Mine"}, "n_action_steps": None, "spec": {}}

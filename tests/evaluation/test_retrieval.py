@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from robocas_ms3.evaluation.metrics import RetrievalOrder, objects_to_move
+from robocas_ms3.evaluation.metrics import RetrievalTracker, find_objects_to_move
 from robocas_ms3.evaluation.outcomes import Retrieval
 
 TARGET, LID, CUP, PEAR = range(4)
@@ -17,7 +17,7 @@ OVER[0, LID, TARGET], OVER[0, CUP, LID], OVER[0, PEAR, CUP] = 0.5, 0.3, 0.05
 
 
 class Heaps:
-    """Fake search environment for `RetrievalOrder`: equal heaps at 20 Hz."""
+    """Fake search environment for `RetrievalTracker`: equal heaps at 20 Hz."""
 
     device, control_timestep = torch.device("cpu"), 0.05
 
@@ -26,7 +26,7 @@ class Heaps:
         self.disturbed = torch.zeros(count, 4, dtype=torch.bool)
         self.elapsed_steps = torch.zeros(count, dtype=torch.int32)
 
-    def moment(self, *, held: bool = False):
+    def make_state(self, *, held: bool = False):
         return SimpleNamespace(disturbed=self.disturbed.numpy(), held=np.array([held] * len(self.disturbed)))
 
     def pairwise_occlusion(self, envs):
@@ -39,22 +39,22 @@ class Heaps:
 def record_of(moves: dict[int, int], held_at: int = 1000, steps: int = 200) -> np.ndarray:
     """Return the record if objects move at these control steps; two control steps per policy step."""
     heap: Any = Heaps()
-    retrieval = RetrievalOrder(heap)
+    retrieval = RetrievalTracker(heap)
     retrieval.reset(torch.tensor([0]))
     for step in range(1, steps + 1):
         heap.elapsed_steps += 1
         for slot, at in moves.items():
             heap.disturbed[0, slot] |= step == at
-        retrieval.update(heap.moment(held=step == held_at))
+        retrieval.update(heap.make_state(held=step == held_at))
         if step % 2 == 0:
             retrieval.end_step()
-    return retrieval.read()[0].numpy()
+    return retrieval.compute_record()[0].numpy()
 
 
 def test_objects_on_top_of_needed_objects_are_needed():
-    assert objects_to_move(OVER[:, :, TARGET] >= 0.1, OVER >= 0.1).tolist() == [[False, True, True, False]]
+    assert find_objects_to_move(OVER[:, :, TARGET] >= 0.1, OVER >= 0.1).tolist() == [[False, True, True, False]]
     hemmed_in = torch.tensor([[False, False, False, True]])
-    assert objects_to_move(hemmed_in, OVER >= 0.1).tolist() == [[False, False, False, True]]
+    assert find_objects_to_move(hemmed_in, OVER >= 0.1).tolist() == [[False, False, False, True]]
 
 
 def test_order_from_the_top_down_has_full_score():
@@ -93,10 +93,10 @@ def test_no_score_if_the_target_was_never_held():
 
 def test_envs_are_reset_independently():
     heap: Any = Heaps(2)
-    retrieval = RetrievalOrder(heap)
+    retrieval = RetrievalTracker(heap)
     retrieval.reset(torch.tensor([0, 1]))
     heap.disturbed[:, CUP], heap.elapsed_steps[:] = True, 1
-    retrieval.update(heap.moment())
+    retrieval.update(heap.make_state())
     retrieval.end_step()
     retrieval.reset(torch.tensor([1]))
-    assert retrieval.read()[:, CUP].tolist() == [[1, 1, 1], [0, 1, 0]]
+    assert retrieval.compute_record()[:, CUP].tolist() == [[1, 1, 1], [0, 1, 0]]

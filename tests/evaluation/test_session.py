@@ -124,7 +124,7 @@ def no_renderer() -> None:
         ({}, PolicySpec(cameras={"side_camera": (8, 8)}), "unknown camera"),
         ({}, PolicySpec(cameras={"base_camera": (8, 8)}), "no render device"),
         ({"backend": "threads"}, AT_5_HZ, "no such backend"),
-        ({"weld": True}, AT_5_HZ, "the weld needs RoboCAS-v0's steps"),
+        ({"weld": True}, AT_5_HZ, "the weld needs a protocol with RoboCAS-v0's steps"),
         (
             {"protocol": "paper-v1", "weld": True, "backend": "gpu"},
             PolicySpec(reference="tcp", rate_hz=5),
@@ -155,7 +155,7 @@ def test_select_runs_in_the_episodes_of_pick_in_paper_v1_and_the_result_records_
     settings = EvaluationSettings(("select",), "noop", "paper-v1", episodes=2, backend="processes")
     evaluation = EvaluationSession(make_policy("noop"), settings)
     assert {(episode.task, episode.config) for episode in evaluation.episodes} == {("pick", "pick_upstream_eval")}
-    assert evaluation.episode_spec(evaluation.episodes[0]).task == "pick"
+    assert evaluation.make_episode_spec(evaluation.episodes[0]).task == "pick"
     assert evaluation.folder == tmp_path / "eval" / "paper-v1" / "noop_select"
     assert {outcome.task for outcome in evaluation.run()} == {"select"}
     result = results.read_result(evaluation.folder)

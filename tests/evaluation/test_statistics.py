@@ -10,9 +10,9 @@ from scipy.stats import binom, multinomial, norm
 
 from robocas_ms3.evaluation.statistics import (
     Comparison,
-    compare,
-    holm,
-    mcnemar,
+    adjust_p_values,
+    compare_successes,
+    mcnemar_p_value,
     mcnemar_power,
     paired_interval,
     power_warning,
@@ -72,8 +72,8 @@ def test_exact_interval_leaves_half_the_error_at_each_end(counts):
     ],
 )
 def test_mcnemar_equals_published_values(only_a, only_b, p_value):
-    assert mcnemar(only_a, only_b) == pytest.approx(p_value, abs=5e-7)
-    assert mcnemar(only_b, only_a) == mcnemar(only_a, only_b)
+    assert mcnemar_p_value(only_a, only_b) == pytest.approx(p_value, abs=5e-7)
+    assert mcnemar_p_value(only_b, only_a) == mcnemar_p_value(only_a, only_b)
 
 
 def test_paired_interval_equals_published_values():
@@ -120,19 +120,19 @@ def test_swapping_the_runs_swaps_the_signs(counts):
 def test_runs_are_compared_per_scene():
     a = np.array([1, 1, 1, 1, 1, 0, 0, 0], dtype=bool)
     b = np.array([1, 1, 0, 0, 0, 1, 0, 0], dtype=bool)
-    found = compare(a, b)
+    found = compare_successes(a, b)
     assert (found.both, found.only_a, found.only_b, found.neither) == (2, 3, 1, 2)
     assert (found.successes_a, found.successes_b, found.n, found.difference) == (5, 3, 8, 0.25)
     assert found == Comparison.from_counts(2, 3, 1, 2)
     assert found.p_value == pytest.approx(2 * (1 + 4) / 2**4)
-    assert compare(a.tolist(), a.tolist()).p_value == 1
+    assert compare_successes(a.tolist(), a.tolist()).p_value == 1
 
 
 def test_holm_equals_values_computed_by_hand():
-    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
-    assert holm([0.7, 0.6]) == [1, 1]
-    assert holm([0.2]) == [0.2]
-    assert holm([]) == []
+    assert adjust_p_values([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert adjust_p_values([0.7, 0.6]) == [1, 1]
+    assert adjust_p_values([0.2]) == [0.2]
+    assert adjust_p_values([]) == []
 
 
 def test_bins_contain_their_lower_edge_and_the_last_bin_both_edges():
@@ -149,7 +149,7 @@ def test_power_equals_the_sum_over_all_outcomes(difference, discordant):
     for a in range(n + 1):
         for b in range(n + 1 - a):
             ways = factorial(n) // (factorial(a) * factorial(b) * factorial(n - a - b))
-            if mcnemar(a, b) <= 0.05:
+            if mcnemar_p_value(a, b) <= 0.05:
                 power += ways * p**a * q**b * (1 - p - q) ** (n - a - b)
     assert mcnemar_power(n, difference, discordant) == pytest.approx(power, abs=1e-12)
 
@@ -191,4 +191,4 @@ def test_statistics_equal_those_of_robostats():
         assert (ours.low, ours.high) == pytest.approx((theirs.interval.lower, theirs.interval.upper), abs=1e-10)
     kmodel = pytest.importorskip("robostats.kmodel")
     for p_values in ([0.01, 0.04, 0.03, 0.005], [0.2, 0.2, 0.9], [0.001]):
-        assert holm(p_values) == pytest.approx(kmodel.adjust(p_values, "holm"), abs=1e-15)
+        assert adjust_p_values(p_values) == pytest.approx(kmodel.adjust(p_values, "holm"), abs=1e-15)

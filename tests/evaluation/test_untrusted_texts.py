@@ -10,7 +10,7 @@ from synthetic_results import outcome, write
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec, describe
+from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec, describe_policy
 from robocas_ms3.evaluation.remote.server import PolicyServer
 from robocas_ms3.evaluation.report import write_report
 from robocas_ms3.evaluation.report.comparison import compare_results
@@ -43,14 +43,14 @@ class Policy:
     ],
 )
 def test_descriptions_that_cannot_be_recorded_are_refused(description, key):
-    for use in (describe, PolicyServer):
+    for use in (describe_policy, PolicyServer):
         with pytest.raises(EvaluationError) as error:
             use(Policy(description))
         assert error.value.where == f"policy {__name__}:Policy, describe(){key}"
     policy = Policy({})
     policy.spec = PolicySpec(rate_hz=float("nan"))
     with pytest.raises(EvaluationError, match=r"spec\.rate_hz"):
-        describe(policy)
+        describe_policy(policy)
 
 
 def test_description_round_trips_and_does_not_rename_the_policy(tmp_path):

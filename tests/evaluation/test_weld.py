@@ -12,8 +12,8 @@ import torch
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.action_wrapper import PolicyActionWrapper, env_kwargs
-from robocas_ms3.evaluation.metrics import read_sum
+from robocas_ms3.evaluation.action_wrapper import PolicyActionWrapper, make_env_kwargs
+from robocas_ms3.evaluation.metrics import read_metric
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
@@ -34,7 +34,7 @@ class ClaimsSuccess(gym.Wrapper):
 
 
 def make(**kwargs: Any) -> gym.Env:
-    return gym.make("RoboCASPick-v1", **env_kwargs(PolicySpec(), 5), **kwargs)
+    return gym.make("RoboCASPick-v1", **make_env_kwargs(PolicySpec(), 5), **kwargs)
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_welded_object_keeps_its_pose_in_the_hand_while_arm_and_fingers_move(pic
     assert np.isfinite(target(env).linear_velocity).all()
     assert max(shifts) < 0.001  # m
     assert max(turns) < np.deg2rad(0.5)
-    assert read_sum(info, "path_length") > 1  # the arm moved
+    assert read_metric(info, "path_length") > 1  # the arm moved
     assert float(info["welds"]) == 1
 
 
@@ -155,7 +155,7 @@ def test_reset_removes_the_weld(reconfiguration_freq):
     for _ in range(4):
         *_, info = env.step(np.array([0, 0, -0.08, 0, 0, 0, CLOSE]))
     assert float(info["welds"]) == 0
-    assert read_sum(info, "path_length") > 0.2
+    assert read_metric(info, "path_length") > 0.2
     shift = (base.object_poses - base.start_poses)[0, :, :3].norm(dim=-1)
     assert float(shift[base.present[0]].max()) < 0.005
     env.step(stay(OPEN))

@@ -49,7 +49,7 @@ parts: [{config: CONFIG, count: 1, first_seed: 110000}]
 POLICY = """
 import numpy as np
 from robocas_ms3.evaluation.policy import PolicySpec
-from robocas_ms3.evaluation.remote.messages import observation_message, read_observations
+from robocas_ms3.evaluation.remote.messages import make_observation_message, parse_observations
 
 class Sees:
     spec = PolicySpec(rate_hz=5, cameras={"side_camera": (32, 24)}, language="none")
@@ -60,7 +60,7 @@ class Sees:
     def act(self, seen):
         assert seen.images["side_camera"].shape == (1, 24, 32, 3) and seen.images["side_camera"].std() > 10
         assert np.allclose(seen.fingers, seen.qpos[:, 10:])
-        again = read_observations([observation_message(seen, 0, None, reset=False)], [0], self.spec)
+        again = parse_observations([make_observation_message(seen, 0, None, reset=False)], [0], self.spec)
         assert np.array_equal(again.fingers, seen.fingers)
         return np.zeros((1, 7))
 """

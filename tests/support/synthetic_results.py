@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.evaluation.outcomes import Outcome, failure_stage
+from robocas_ms3.evaluation.outcomes import Outcome, find_failure_stage
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.results import OUTCOMES, RUN, Result, read_result
 
@@ -42,7 +42,7 @@ def outcome(episode: int, came_to: int = 7, **others: Any) -> Outcome:
         success_v0=success,
         steps=70 if success else 800,
         seconds=3.5 if success else 40.0,
-        failure_stage=failure_stage(flags),
+        failure_stage=find_failure_stage(flags),
         flags=flags,
         flag_seconds={name: None if step is None else step / 20 for name, step in flags.items()},
         measures={"path_length": 1.5, "contact_impulse": 2.0, "disturbed_most": 1.0, "fallen": 0.0},

@@ -1,4 +1,4 @@
-"""Benchmark for vla-eval 0.8: ``robocas_ms3.evaluation.harness.vla_eval:RoboCAS`` (docs/vla_eval.md).
+"""Benchmark for vla-eval 0.8: ``robocas_ms3.evaluation.harness.vla_eval:RoboCASBenchmark`` (docs/vla_eval.md).
 
 The class does not derive from vla-eval's base class, so that this package does not depend on vla-eval. A task of
 vla-eval is a configuration of the protocol, with its episodes in the order of the protocol.
@@ -21,7 +21,7 @@ from robocas_ms3.evaluation.metrics import MEASURES
 from robocas_ms3.evaluation.outcomes import PAPER_STAGES
 from robocas_ms3.evaluation.policy import ExternalPolicy, Observations
 from robocas_ms3.evaluation.protocol import ProtocolEpisode
-from robocas_ms3.evaluation.remote.messages import parse_actions, read_policy_spec
+from robocas_ms3.evaluation.remote.messages import parse_actions, parse_policy_spec
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
@@ -34,7 +34,7 @@ _ROTATIONS = {
 }
 
 
-class RoboCAS:
+class RoboCASBenchmark:
     """Benchmark with the episodes of a protocol, for vla-eval's runners in mode ``sync``.
 
     Args:
@@ -54,7 +54,7 @@ class RoboCAS:
         rate_hz: float | None = None,
     ) -> None:
         values = {"cameras": dict(cameras or {}), "convention": convention, "reference": reference, "rate_hz": rate_hz}
-        self._spec = read_policy_spec(values, "params")
+        self._spec = parse_policy_spec(values, "params")
         settings = EvaluationSettings(protocol=protocol, envs=1, backend="processes")
         self._session = EvaluationSession(ExternalPolicy(self._spec), settings)
         self._episodes_by_config: dict[str, list[ProtocolEpisode]] = {}
@@ -190,4 +190,4 @@ def _gripper(spec: Any) -> Any:
 if "vla_eval" in sys.modules:  # `vla-eval test` checks that benchmarks derive from its base class
     from vla_eval.benchmarks.base import Benchmark  # pyright: ignore[reportMissingImports]
 
-    Benchmark.register(RoboCAS)
+    Benchmark.register(RoboCASBenchmark)

@@ -30,7 +30,7 @@ class JointTrack:
     actions: Array
     step: int = 0
 
-    def next(self, observations: Observations, row: int) -> Array:
+    def next_action(self, observations: Observations, row: int) -> Array:
         """Return the next action (8,) for the env of a row."""
         if not len(self.actions):
             self.actions = np.append(observations.qpos[row, RobotDescription.arm_slice], 1.0)[None]
@@ -67,7 +67,7 @@ class PoseTrack:
         motion = Motion.of(robot, robot_states, gripper, sample_states(len(gripper), stride))
         return cls(motion.tcp_in_base[1:], motion.gripper_open[1:])
 
-    def next(self, observations: Observations, row: int) -> Array:
+    def next_action(self, observations: Observations, row: int) -> Array:
         """Return the next action (7,) for the env of a row, in the convention ``robocas``."""
         place = min(self.step, len(self.poses) - 1)
         self.step += 1
@@ -87,16 +87,16 @@ class TrackPolicy(ABC):
         self._tracks: dict[int, JointTrack | PoseTrack] = {}  # by env
 
     @abstractmethod
-    def track(self, episode: EpisodeSpec) -> JointTrack | PoseTrack:
+    def make_track(self, episode: EpisodeSpec) -> JointTrack | PoseTrack:
         """Return the track of an episode."""
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
-        self._tracks |= {episode.env: self.track(episode) for episode in episodes}
+        self._tracks |= {episode.env: self.make_track(episode) for episode in episodes}
 
     def act(self, observations: Observations) -> Array:
         """Return (E, A) actions."""
         envs = observations.envs.tolist()
-        return np.stack([self._tracks[env].next(observations, row) for row, env in enumerate(envs)])
+        return np.stack([self._tracks[env].next_action(observations, row) for row, env in enumerate(envs)])
 
 
 class ReplayPolicy(TrackPolicy):
@@ -129,7 +129,7 @@ class ReplayPolicy(TrackPolicy):
     def describe(self) -> dict[str, Any]:
         return {"trajectory": self._trajectory.name, "episodes": len(self._episodes)}
 
-    def track(self, episode: EpisodeSpec) -> JointTrack:
+    def make_track(self, episode: EpisodeSpec) -> JointTrack:
         if episode.seed not in self._episodes:
             return JointTrack(np.zeros((0, 8)))
         number = self._episodes[episode.seed]

@@ -34,7 +34,7 @@ class ScriptedPolicy(TrackPolicy):
     Args:
         convention: ``joint_positions``: planned joint targets at 20 Hz; ``robocas``: 7-D actions relative to the TCP
             at 5 Hz.
-        perturbed: shift the motions horizontally (`offset`), like a policy that misjudges positions.
+        perturbed: shift the motions horizontally (`sample_offset`), like a policy that misjudges positions.
     """
 
     def __init__(
@@ -46,10 +46,10 @@ class ScriptedPolicy(TrackPolicy):
         self.spec = PolicySpec(convention, reference="tcp", rate_hz=rate, language="none")
         self._generators: dict[EpisodeSettings, EpisodeGenerator] = {}  # most recently used last
 
-    def track(self, episode: EpisodeSpec) -> JointTrack | PoseTrack:
+    def make_track(self, episode: EpisodeSpec) -> JointTrack | PoseTrack:
         """Plan an episode with the scripted policy and return its track; takes several seconds."""
         actions, states = np.zeros((0, 8)), np.zeros((1, 37))
-        generator = self._generator_of(episode)
+        generator = self._open_generator(episode)
         with tempfile.TemporaryDirectory() as folder:
             if generator.generate(episode.seed, Path(folder), "episode").success:
                 with open_trajectory(Path(folder) / "episode.h5") as file:
@@ -59,7 +59,7 @@ class ScriptedPolicy(TrackPolicy):
             return JointTrack(actions)
         track = PoseTrack.from_recording(find_robot(episode.robot), states, actions[:, 7], sample_stride(_FREQ, 5))
         if self._perturbed:
-            track.poses[:, :2, 3] += offset(episode.seed)
+            track.poses[:, :2, 3] += sample_offset(episode.seed)
         return track
 
     def close(self) -> None:
@@ -67,7 +67,7 @@ class ScriptedPolicy(TrackPolicy):
         for generator in self._generators.values():
             generator.close()
 
-    def _generator_of(self, episode: EpisodeSpec) -> EpisodeGenerator:
+    def _open_generator(self, episode: EpisodeSpec) -> EpisodeGenerator:
         """Return the generator for an episode; close the least recently used generator if too many are open."""
         for name in ("config_file", "layouts_file", "pack"):
             if not getattr(episode, name):
@@ -92,7 +92,7 @@ class ScriptedPolicy(TrackPolicy):
         return generator
 
 
-def offset(seed: int) -> NDArray[np.floating]:
+def sample_offset(seed: int) -> NDArray[np.floating]:
     """Return the horizontal offset (2,) of an episode, m in the frame of the arm's base (`OFFSETS`)."""
     generator = np.random.default_rng([seed, _OFFSET_STREAM])
     angle, distance = generator.uniform(0, 2 * np.pi), generator.uniform(*OFFSETS)

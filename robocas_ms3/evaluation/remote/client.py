@@ -20,10 +20,10 @@ from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.remote.connection import (
     CONNECTION_ERRORS,
     close_connection,
+    decode_server_message,
+    make_server_error,
     open_connection,
-    read_address,
-    read_message,
-    server_error,
+    parse_address,
 )
 from robocas_ms3.evaluation.remote.messages import (
     BATCH,
@@ -31,12 +31,12 @@ from robocas_ms3.evaluation.remote.messages import (
     LARGEST_BATCH,
     PREFIX,
     ServerMetadata,
-    observation_message,
+    make_observation_message,
     parse_actions,
     parse_batch,
-    read_policy_spec,
+    parse_policy_spec,
 )
-from robocas_ms3.evaluation.remote.wire import pack
+from robocas_ms3.evaluation.remote.wire import encode_message
 
 _log = logging.getLogger(__name__)
 _SHARED = -1  # key of the connection for batched requests; other keys are indices of envs
@@ -68,11 +68,11 @@ class RemotePolicy:
     A forked process cannot use the policy of its parent; it makes its own.
 
     Args:
-        address: ``ws://host:port``, with options (`read_address`).
+        address: ``ws://host:port``, with options (`parse_address`).
     """
 
     def __init__(self, address: str) -> None:
-        self._address = read_address(address)
+        self._address = parse_address(address)
         self._loop = asyncio.new_event_loop()  # answers pings while the caller simulates
         self._thread = threading.Thread(target=self._loop.run_forever, name="robocas-remote", daemon=True)
         self._thread.start()
@@ -82,7 +82,7 @@ class RemotePolicy:
         self._last_answer = 0.0  # clock time, s
         self._metadata = ServerMetadata()
         try:
-            self._metadata = self._run(self._read_metadata())
+            self._metadata = self._run(self._fetch_metadata())
             spec = self._spec_of(self._metadata)
         except BaseException:
             self.close()
@@ -145,7 +145,7 @@ class RemotePolicy:
 
     def _message(self, observations: Observations, row: int, start: EpisodeSpec | None) -> dict[str, Any]:
         known = start if self._metadata.spec is not None else None  # a plain openpi server does not expect the key
-        message = observation_message(observations, row, known, reset=start is not None)
+        message = make_observation_message(observations, row, known, reset=start is not None)
         rename = self._address.rename
         return {rename.get(key.removeprefix(PREFIX), key): value for key, value in message.items()}
 
@@ -223,7 +223,7 @@ class RemotePolicy:
         """
 
         async def exchange() -> str | bytes:
-            await socket.send(pack(message))
+            await socket.send(encode_message(message))
             return await socket.recv()
 
         sent, timeout_s, answer = time.monotonic(), self._address.timeout_s, asyncio.ensure_future(exchange())
@@ -237,13 +237,13 @@ class RemotePolicy:
                     )
                 await asyncio.wait({answer}, timeout=left)
             self._last_answer = time.monotonic()
-            return read_message(answer.result())
+            return decode_server_message(answer.result())
         except CONNECTION_ERRORS as error:
             raise _ConnectionLost(f"lost connection to the policy server: {one_line(error, 300)}") from error
         finally:
             answer.cancel()
 
-    async def _read_metadata(self) -> ServerMetadata:
+    async def _fetch_metadata(self) -> ServerMetadata:
         socket, metadata = await self._open()
         await close_connection(socket)
         return metadata
@@ -271,10 +271,10 @@ class RemotePolicy:
         if given is not None:
             fix = "Remove the fields of PolicySpec from the address."
             raise EvaluationError("the server announces its policy specification", where=url, fix=fix)
-        return read_policy_spec(metadata.spec, url)
+        return parse_policy_spec(metadata.spec, url)
 
 
 def _without_error(answer: dict[str, Any]) -> Any:
     """Return an answer of a batch, or the error in it."""
     text = answer.get(ERROR)
-    return server_error(text) if isinstance(text, str) else answer
+    return make_server_error(text) if isinstance(text, str) else answer

@@ -21,8 +21,8 @@ from robocas_ms3.core.errors import EvaluationError, WireError
 from robocas_ms3.core.strict_model import error_from_validation
 from robocas_ms3.core.text import one_line
 from robocas_ms3.evaluation.policy import PolicySpec
-from robocas_ms3.evaluation.remote.messages import ServerMetadata, read_metadata
-from robocas_ms3.evaluation.remote.wire import unpack
+from robocas_ms3.evaluation.remote.messages import ServerMetadata, parse_metadata
+from robocas_ms3.evaluation.remote.wire import decode_message
 
 PING_INTERVAL = 10.0  # s
 PING_TIMEOUT = 60.0  # s without an answer to a ping
@@ -38,7 +38,7 @@ _Text = Annotated[str, Field(min_length=1)]
 
 
 @dataclass(frozen=True)
-class Address:
+class PolicyAddress:
     """Address of a remote policy with its options.
 
     Attributes:
@@ -62,11 +62,11 @@ class Address:
     connect_s: _Seconds = 30.0
 
 
-_FORM = TypeAdapter(Address)
+_ADDRESS_ADAPTER = TypeAdapter(PolicyAddress)
 
 
-def read_address(text: str) -> Address:
-    """Parse an address; its options are the fields of `PolicySpec` and `Address`.
+def parse_address(text: str) -> PolicyAddress:
+    """Parse an address; its options are the fields of `PolicySpec` and `PolicyAddress`.
 
     ``cameras=base_camera:224x224,gripper_camera:224x224`` (width x height) and
     ``rename=base_camera:observation/image,qpos:observation/state`` are lists of pairs.
@@ -89,10 +89,10 @@ def read_address(text: str) -> Address:
     spec = {name: options.pop(name) for name in options.keys() & {one.name for one in fields(PolicySpec)}}
     url = urlunsplit((parts.scheme, parts.netloc, parts.path, "", ""))
     try:
-        return _FORM.validate_python({**options, "url": url, "spec": spec or None})
+        return _ADDRESS_ADAPTER.validate_python({**options, "url": url, "spec": spec or None})
     except ValidationError as problem:
         raise error_from_validation(
-            problem, _FORM, EvaluationError, where=text, about="invalid policy address"
+            problem, _ADDRESS_ADAPTER, EvaluationError, where=text, about="invalid policy address"
         ) from problem
 
 
@@ -129,7 +129,7 @@ async def open_connection(url: str, connect_s: float, *, pings: bool) -> tuple[C
                 warned = True
             await asyncio.sleep(_RETRY_S)
     try:
-        return connection, read_metadata(read_message(first), url)
+        return connection, parse_metadata(decode_server_message(first), url)
     except EvaluationError:
         await close_connection(connection)
         raise
@@ -143,21 +143,21 @@ async def close_connection(connection: ClientConnection) -> None:
         connection.transport.abort()
 
 
-def read_message(message: str | bytes) -> Any:
+def decode_server_message(message: str | bytes) -> Any:
     """Decode a message of a server.
 
     Raises:
         EvaluationError: the message is invalid, or it is a text: an error of the server.
     """
     if isinstance(message, str):
-        raise server_error(message)
+        raise make_server_error(message)
     try:
-        return unpack(message, MAX_ANSWER)
+        return decode_message(message, MAX_ANSWER)
     except WireError as error:
         raise EvaluationError(f"the server sent an invalid message: {error}") from error
 
 
-def server_error(text: str) -> EvaluationError:
+def make_server_error(text: str) -> EvaluationError:
     """Return the error in a text of a server, such as a traceback; its last line names the error."""
     lines = [line for line in text.splitlines() if line.strip()] or ["no message"]
     return EvaluationError(f"the server failed: {one_line(lines[-1], 300)}")

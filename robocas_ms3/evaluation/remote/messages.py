@@ -77,7 +77,7 @@ class _Start(BaseModel):
 
 
 class Request(BaseModel):
-    """Keys of a request without the observation (`read_observations`)."""
+    """Keys of a request without the observation (`parse_observations`)."""
 
     model_config = ConfigDict(strict=True)
 
@@ -86,13 +86,13 @@ class Request(BaseModel):
     prompt: _Text = ""
     start: _Start = _Start()
 
-    def episode_spec(self, env: int) -> EpisodeSpec:
+    def make_episode_spec(self, env: int) -> EpisodeSpec:
         """Return the specification of the episode that starts in an env of the policy."""
         values: dict[str, Any] = {"instruction": self.prompt, **self.start.model_dump(exclude_none=True)}
         return EpisodeSpec(env=env, **values)
 
 
-def read_request(message: Mapping[str, Any]) -> Request:
+def parse_request(message: Mapping[str, Any]) -> Request:
     """Parse the keys of a request; unknown keys are ignored."""
     try:
         return Request.model_validate(message)
@@ -100,7 +100,7 @@ def read_request(message: Mapping[str, Any]) -> Request:
         raise error_from_validation(problem, Request, WireError, where="", about="invalid request") from problem
 
 
-def read_metadata(message: Any, url: str) -> ServerMetadata:
+def parse_metadata(message: Any, url: str) -> ServerMetadata:
     """Parse the metadata of a server; unknown keys are ignored."""
     try:
         return ServerMetadata.model_validate(message if isinstance(message, dict) else {})
@@ -110,7 +110,7 @@ def read_metadata(message: Any, url: str) -> ServerMetadata:
         ) from problem
 
 
-def read_policy_spec(message: Any, where: object) -> PolicySpec:
+def parse_policy_spec(message: Any, where: object) -> PolicySpec:
     """Parse a policy specification; missing fields have the defaults of `PolicySpec`."""
     what = "invalid policy specification"
     try:
@@ -121,7 +121,7 @@ def read_policy_spec(message: Any, where: object) -> PolicySpec:
         raise EvaluationError(what, where=where, found=one_line(error, 200)) from error
 
 
-def observation_message(
+def make_observation_message(
     observations: Observations, row: int, start: EpisodeSpec | None, *, reset: bool
 ) -> dict[str, Any]:
     """Return the message for a row of observations.
@@ -149,7 +149,7 @@ def observation_message(
     return message
 
 
-def read_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int], spec: PolicySpec) -> Observations:
+def parse_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int], spec: PolicySpec) -> Observations:
     """Parse requests of one env each into the observations of a policy; ``envs``: indices of the envs."""
 
     def stack(name: str, dtype: str, *shape: int | None) -> NDArray[Any]:

@@ -29,9 +29,9 @@ from robocas_ms3.evaluation.policy import (
     Observations,
     Policy,
     as_action_chunks,
-    describe,
-    policy_exit_guard,
-    policy_spec_values,
+    describe_policy,
+    forbid_policy_exit,
+    policy_spec_to_dict,
 )
 from robocas_ms3.evaluation.remote import connection
 from robocas_ms3.evaluation.remote.messages import (
@@ -45,11 +45,11 @@ from robocas_ms3.evaluation.remote.messages import (
     ServerMetadata,
     batch_limit,
     parse_batch,
-    read_observations,
-    read_request,
+    parse_observations,
+    parse_request,
     request_size_limit,
 )
-from robocas_ms3.evaluation.remote.wire import pack, unpack
+from robocas_ms3.evaluation.remote.wire import decode_message, encode_message
 
 HEALTH = "/healthz"
 MAX_CONNECTIONS = 256
@@ -119,17 +119,17 @@ class PolicyServer:
         max_batch: int = DEFAULT_BATCH,
     ) -> None:
         self._host, self._port = strip_brackets(host), port
-        with policy_exit_guard(policy):
+        with forbid_policy_exit(policy):
             spec = policy.spec
         max_batch = batch_limit(spec, max_batch)
         self._max_bytes = request_size_limit(spec, max_batch)
         metadata = ServerMetadata(
-            robocas_spec=policy_spec_values(spec),
-            robocas_policy={**describe(policy), "robocas_ms3": __version__},
+            robocas_spec=policy_spec_to_dict(spec),
+            robocas_policy={**describe_policy(policy), "robocas_ms3": __version__},
             robocas_max_batch=max_batch,
             robocas_answers_pings=True,
         )
-        self._metadata = pack(metadata.model_dump(by_alias=True))
+        self._metadata = encode_message(metadata.model_dump(by_alias=True))
         self._handler = _RequestHandler(policy, files or ServedFiles.collect(), max_batch)
         self._calls: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
         self._connections = 0
@@ -224,8 +224,8 @@ class PolicyServer:
     def _reply(self, message: str | bytes, envs: dict[int, int]) -> tuple[str | bytes, int]:
         """Return an answer and the close code of the connection; 0: the connection stays open."""
         try:
-            value = unpack(message, self._max_bytes) if isinstance(message, bytes) else None
-            return pack(self._handler.answer(value, envs)), 0
+            value = decode_message(message, self._max_bytes) if isinstance(message, bytes) else None
+            return encode_message(self._handler.answer(value, envs)), 0
         except WireError as error:
             _log.warning("a client sent an invalid message: %s", error)
             return format_error(error, 300), _INVALID
@@ -244,7 +244,7 @@ class _RequestHandler:
 
     def __init__(self, policy: Policy, files: ServedFiles, max_batch: int) -> None:
         self._policy, self._files, self._max_batch = policy, files, max_batch
-        with policy_exit_guard(policy):
+        with forbid_policy_exit(policy):
             self._spec = policy.spec
         self._used: set[int] = set()  # envs of the policy in use
 
@@ -269,14 +269,14 @@ class _RequestHandler:
     def _read(self, messages: Sequence[dict[str, Any]], envs: dict[int, int]) -> tuple[Observations, list[EpisodeSpec]]:
         numbers, starts = [], []
         for message in messages:
-            request = read_request(message)
+            request = parse_request(message)
             number, is_new = self._env(request.env_id, request.reset, envs)
             numbers.append(number)
             if is_new or request.reset:
-                starts.append(self._files.resolve(request.episode_spec(number)))
+                starts.append(self._files.resolve(request.make_episode_spec(number)))
         if len(set(numbers)) < len(numbers):
             raise WireError("invalid batch", where=ENV, expected="each env at most once", found=sorted(numbers))
-        return read_observations(messages, numbers, self._spec), starts
+        return parse_observations(messages, numbers, self._spec), starts
 
     def _env(self, env: int, reset: bool | None, envs: dict[int, int]) -> tuple[int, bool]:
         """Return the env of the policy for an env of a client, and whether it is new."""
@@ -295,7 +295,7 @@ class _RequestHandler:
 
     def _act(self, observations: Observations, starts: list[EpisodeSpec]) -> NDArray[Any]:
         """Return the actions (E, H, A) of the policy."""
-        with policy_exit_guard(self._policy):
+        with forbid_policy_exit(self._policy):
             if starts:
                 self._policy.reset(starts)
             return as_action_chunks(self._policy.act(observations), len(observations.envs), None)

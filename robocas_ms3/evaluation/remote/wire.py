@@ -24,7 +24,7 @@ _DTYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248])")  # np.dtype accepts more t
 _ARRAY, _SCALAR = b"__ndarray__", b"__npgeneric__"
 
 
-def pack(value: Any) -> bytes:
+def encode_message(value: Any) -> bytes:
     """Encode a value made of maps, lists, texts, bytes, numbers, None and numeric NumPy arrays.
 
     Raises:
@@ -36,7 +36,7 @@ def pack(value: Any) -> bytes:
         raise WireError("cannot encode the message", found=error) from error
 
 
-def unpack(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
+def decode_message(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
     """Decode a message.
 
     Arrays are writable copies in native byte order. NumPy scalars become Python numbers.

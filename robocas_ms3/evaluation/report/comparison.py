@@ -10,7 +10,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.text import escape_markdown, format_count
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.statistics import Comparison, compare, holm, power_warning
+from robocas_ms3.evaluation.statistics import Comparison, adjust_p_values, compare_successes, power_warning
 
 _ALPHA = 0.05
 ALL = "all"
@@ -72,7 +72,7 @@ def compare_results(results: Sequence[Result]) -> str:
         numbers = [number for number in shared if config in (ALL, first.outcomes[number].config)]
         successes = [[result.outcomes[number].success for number in numbers] for result in results]
         for one, other in combinations(range(len(results)), 2):
-            found = compare(successes[other], successes[one])
+            found = compare_successes(successes[other], successes[one])
             rows.append(Row(config, (names[one], names[other]), found))
     return _table(head, "configuration", rows)
 
@@ -95,7 +95,7 @@ def compare_splits(result: Result, protocol: LoadedProtocol) -> str:
             ]
             seeds = sorted(sides[0].keys() & sides[1].keys())
             if seeds:
-                found = compare([sides[1][seed] for seed in seeds], [sides[0][seed] for seed in seeds])
+                found = compare_successes([sides[1][seed] for seed in seeds], [sides[0][seed] for seed in seeds])
                 rows.append(Row(task, (first[0], other[0]), found))
     if not rows:
         fix = "Pass a second result."
@@ -109,7 +109,7 @@ def _table(head: str, where: str, rows: list[Row]) -> str:
     adjusted: dict[int, tuple[float, int]] = {}
     for pooled in (False, True):
         family = [number for number, row in enumerate(rows) if (row.where == ALL) == pooled]
-        for number, p in zip(family, holm([rows[number].found.p_value for number in family]), strict=True):
+        for number, p in zip(family, adjust_p_values([rows[number].found.p_value for number in family]), strict=True):
             adjusted[number] = p, len(family)
     lines = [
         f"{head} McNemar's exact test, Tango's 95 % interval. Decide by Holm's p, adjusted for all rows except "

@@ -21,10 +21,10 @@ from robocas_ms3.evaluation.report.tables import (
     Cell,
     FailureCount,
     Table,
-    failure_name,
+    get_failure_name,
+    get_stage_names,
     mean,
     notes,
-    stage_names,
     tables,
 )
 from robocas_ms3.evaluation.report.tables import title as title_of
@@ -34,7 +34,7 @@ from robocas_ms3.evaluation.statistics import SuccessRate, success_rate
 VIDEOS = "videos"
 
 
-def video_name(episode: int) -> str:
+def video_file_name(episode: int) -> str:
     """Return the file name of the video of an episode."""
     return f"episode_{episode:05d}.mp4"
 
@@ -75,7 +75,7 @@ def _funnels(result: Result) -> str:
     cards = []
     for config, outcomes in result.group_by("config").items():
         rows = []
-        for stage, name in stage_names(outcomes[0].task).items():
+        for stage, name in get_stage_names(outcomes[0].task).items():
             if any(stage in outcome.flags for outcome in outcomes):
                 rate = result.rate(stage, outcomes)
                 shown = _bar(rate, "good" if stage == "success" else "")
@@ -169,7 +169,7 @@ def _failed_episodes(result: Result, folder: Path | None) -> str:
     for label, column, values in (
         ("configuration", 1, {outcome.config for outcome in failed}),
         ("split", 3, {outcome.split for outcome in failed}),
-        ("first stage not reached", 4, {failure_name(outcome.failure_stage) for outcome in failed}),
+        ("first stage not reached", 4, {get_failure_name(outcome.failure_stage) for outcome in failed}),
     ):
         options = "".join(f"<option>{escape(value)}</option>" for value in sorted(values))
         choices = f'<option value="">all</option>{options}'
@@ -191,14 +191,14 @@ def _failed_episodes(result: Result, folder: Path | None) -> str:
 
 
 def _failed_row(outcome: Outcome, folder: Path | None) -> list[str]:
-    video = f"{VIDEOS}/{video_name(outcome.episode)}"
+    video = f"{VIDEOS}/{video_file_name(outcome.episode)}"
     linked = folder is not None and (folder / video).is_file()
     return [
         f'<a href="{video}">{outcome.episode}</a>' if linked else str(outcome.episode),
         escape(outcome.config),
         str(outcome.seed),
         escape(outcome.split),
-        escape(failure_name(outcome.failure_stage)),
+        escape(get_failure_name(outcome.failure_stage)),
         "error" if outcome.error else "failure" if outcome.flags.get("fail") is not None else "time",
         str(outcome.steps),
         f"{outcome.seconds:.1f}",

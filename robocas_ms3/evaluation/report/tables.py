@@ -40,7 +40,7 @@ FAILURE_NAMES = {
     "placed": "placed, at rest",
     "error": "ended by an error",
 }
-"""Names of the values of `outcomes.failure_stage`."""
+"""Names of the values of `outcomes.find_failure_stage`."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def tables(result: Result) -> Iterator[Table]:
     if len(result.group_by("split")) > 1:
         yield _splits(result)
     yield _failures(result)
-    hidden = [one for one in outcomes_of_first_split(result) if one.p_vis is not None]
+    hidden = [one for one in select_first_split(result) if one.p_vis is not None]
     if hidden:
         yield _occlusion(hidden)
     yield from _retrieval(result)
@@ -121,7 +121,7 @@ def notes(result: Result) -> list[str]:
     return [*([WELD_NOTE] if result.run.weld else []), *played_as, *paper]
 
 
-def stage_names(task: str) -> dict[str, str]:
+def get_stage_names(task: str) -> dict[str, str]:
     """Return the display names of the stages of a task, in order."""
     row = TASKS.get(task)
     if row is None or row.stages == DEFAULT_STAGES:
@@ -129,12 +129,12 @@ def stage_names(task: str) -> dict[str, str]:
     return {stage: STAGE_NAMES.get(stage, stage.replace("_", " ")) for stage in (*row.stages, "success")}
 
 
-def failure_name(stage: str) -> str:
+def get_failure_name(stage: str) -> str:
     """Return the display name of a failure stage."""
     return FAILURE_NAMES.get(stage, stage.replace("_", " "))
 
 
-def outcomes_of_first_split(result: Result) -> list[Outcome]:
+def select_first_split(result: Result) -> list[Outcome]:
     """Return the outcomes; if scenes occur in several splits, only those of the first split of each task."""
     if not result.repeats_scenes():
         return list(result.outcomes.values())
@@ -193,7 +193,7 @@ def _failures(result: Result) -> Table:
         n = count.total()
         cells = (FailureCount(count[stage], n) for stage in stages)
         rows.append((config, str(n), str(n - count[""]), *cells))
-    heads = ("configuration", "n#", "failed#", *(f"{failure_name(stage)}#" for stage in stages))
+    heads = ("configuration", "n#", "failed#", *(f"{get_failure_name(stage)}#" for stage in stages))
     note = "Number of episodes by the first stage not reached, counted from the furthest reached stage."
     return Table("Where episodes failed", note, heads, rows)
 

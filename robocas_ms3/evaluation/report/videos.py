@@ -16,7 +16,7 @@ from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.datasets.images.video import open_video
 from robocas_ms3.evaluation.policy import Policy
 from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.report.page import VIDEOS, video_name
+from robocas_ms3.evaluation.report.page import VIDEOS, video_file_name
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
@@ -65,7 +65,7 @@ def record_videos(
     make_folder(result.folder / VIDEOS)
     with closing(session):
         for number in sorted(episodes, key=lambda one: protocol.episodes[one].config):
-            before, path = result.outcomes[number], result.folder / VIDEOS / video_name(number)
+            before, path = result.outcomes[number], result.folder / VIDEOS / video_file_name(number)
             # As many steps as recorded, whatever ended the episode.
             fps = session.rate / recorder.period * _SPEED
             with atomic_file(path) as tmp, open_video(tmp, fps, quality=6) as recorder.writer:

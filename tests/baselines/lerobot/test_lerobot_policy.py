@@ -10,7 +10,7 @@ from synthetic_observations import observe, start
 from robocas_ms3.baselines.lerobot.policy import EMBEDDING, LeRobotPolicy, make_state, scale_embeddings
 from robocas_ms3.baselines.lerobot.serve import load_policy, main, read_rate
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.policy import describe
+from robocas_ms3.evaluation.policy import describe_policy
 from robocas_ms3.robots.quantities import STATE
 
 INPUTS = {STATE: (17,), "observation.images.base_camera": (3, 2, 4), EMBEDDING: (384,)}
@@ -76,7 +76,7 @@ def test_the_spec_follows_from_the_checkpoint():
     assert spec.cameras == {"base_camera": (4, 2)}
     assert made(inputs={STATE: (17,)}).spec.language == "text"
     policy = LeRobotPolicy(Chunks(), preprocess, preprocess, INPUTS, 5.0, {"weights": "abc"})
-    assert describe(policy)["weights"] == "abc"
+    assert describe_policy(policy)["weights"] == "abc"
 
 
 @pytest.mark.parametrize("key, shape", [(STATE, (18,)), (EMBEDDING, (7,)), ("observation.images.wrist", (3, 2, 4))])

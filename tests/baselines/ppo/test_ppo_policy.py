@@ -11,7 +11,7 @@ from robocas_ms3.baselines.ppo.agent import Agent
 from robocas_ms3.baselines.ppo.config import PpoConfig
 from robocas_ms3.baselines.ppo.environments import expand_action
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.action_wrapper import control_mode
+from robocas_ms3.evaluation.action_wrapper import choose_control_mode
 from robocas_ms3.evaluation.policy import CONVENTIONS
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 
@@ -39,7 +39,7 @@ def test_5d_actions_expand_to_7d_actions():
 
 def test_actions_are_equal_in_evaluation_and_training():
     policy = policy_with([0.5, -1.0, 0.3, 0.4, -0.2])
-    assert control_mode(policy.spec.convention) == "pd_ee_delta_pose"
+    assert choose_control_mode(policy.spec.convention) == "pd_ee_delta_pose"
     motion = CONVENTIONS[policy.spec.convention].decode(policy.act(see(1)))
     assert isinstance(motion.rotation, Rotation)
     assert motion.open.tolist() == [False]

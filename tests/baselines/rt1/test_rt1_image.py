@@ -10,7 +10,7 @@ from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.rt1.image import FiLM, ImageEncoder, StochasticDepth, TokenLearner, efficientnet
 from robocas_ms3.baselines.rt1.model import crop_rows
 from robocas_ms3.core.errors import TrainingError
-from robocas_ms3.evaluation.policy import describe
+from robocas_ms3.evaluation.policy import describe_policy
 
 
 def rows_of(images):
@@ -123,7 +123,7 @@ def test_both_encoders_start_from_the_weights_of_a_file(weights, prefix, kind, f
     for encoder in model.encoders:
         for name, value in encoder.net.state_dict().items():
             assert torch.equal(value, weights[f"efficientnet.{name}"]), name
-    assert describe(BASELINE.policy(config, facts, model))["image_weights"] == path.name
+    assert describe_policy(BASELINE.policy(config, facts, model))["image_weights"] == path.name
     model.train()(batch)["loss"].backward()
 
 
@@ -131,7 +131,8 @@ def test_images_are_normalised_as_for_the_weights(tmp_path, config, facts):
     assert RT1Config().std == (0.229, 0.224, 0.225)
     assert RT1Config(image_weights=tmp_path).std == pytest.approx([0.229**0.5, 0.224**0.5, 0.225**0.5], abs=1e-5)
     assert RT1Config(image_weights=tmp_path, image_std=(0.5, 0.5, 0.5)).std == (0.5, 0.5, 0.5)
-    assert describe(BASELINE.policy(config, facts, BASELINE.model(config, facts)))["image_weights"] == "from scratch"
+    policy = BASELINE.policy(config, facts, BASELINE.model(config, facts))
+    assert describe_policy(policy)["image_weights"] == "from scratch"
 
 
 def test_a_trained_network_does_not_need_the_file(weights, facts, tmp_path, batch):
@@ -145,7 +146,7 @@ def test_a_trained_network_does_not_need_the_file(weights, facts, tmp_path, batc
     with pytest.raises(TrainingError, match="image_weights .*b3.safetensors"):
         model.train()(batch)
     model.load_state_dict(trained.state_dict())
-    assert describe(BASELINE.policy(config, facts, model))["image_weights"] == "b3.safetensors"
+    assert describe_policy(BASELINE.policy(config, facts, model))["image_weights"] == "b3.safetensors"
     model.train()(batch)  # an interrupted training continues without the file
 
 

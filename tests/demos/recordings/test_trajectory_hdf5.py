@@ -150,7 +150,7 @@ def by_replay(path):
 
 
 def by_policy(path):
-    return ReplayPolicy(path).track(EpisodeSpec(0, 0, "", "", "", "", 3, "")).actions
+    return ReplayPolicy(path).make_track(EpisodeSpec(0, 0, "", "", "", "", 3, "")).actions
 
 
 def check_refused(read, path, *words):

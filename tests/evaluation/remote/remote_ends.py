@@ -94,10 +94,10 @@ def serve_connections(talk: Callable[[Any], None]) -> Iterator[str]:
 
 def serve_answer(answer: Any, metadata: dict[str, Any] | None = None) -> Any:
     """Run a server with a fixed answer, or with a function of the connection and the message."""
-    from robocas_ms3.evaluation.remote.wire import pack
+    from robocas_ms3.evaluation.remote.wire import encode_message
 
     def talk(socket: Any) -> None:
-        socket.send(pack(metadata or {}))
+        socket.send(encode_message(metadata or {}))
         for data in socket:
             reply = answer(socket, data) if callable(answer) else answer
             if reply is not None:

@@ -17,9 +17,9 @@ from websockets.sync.client import connect
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
 from robocas_ms3.evaluation.policy import PolicySpec
-from robocas_ms3.evaluation.remote.messages import file_name, observation_message
+from robocas_ms3.evaluation.remote.messages import file_name, make_observation_message
 from robocas_ms3.evaluation.remote.server import ServedFiles
-from robocas_ms3.evaluation.remote.wire import pack
+from robocas_ms3.evaluation.remote.wire import encode_message
 
 GARBAGE, TOO_LARGE = 1008, 1009
 
@@ -44,7 +44,7 @@ class Reading(RecordingPolicy):
 
 
 def message(env=0, start=None, **more):
-    made = observation_message(make_observations(env), 0, make_episode(env), reset=True)
+    made = make_observation_message(make_observations(env), 0, make_episode(env), reset=True)
     return made | {"start": made["start"] | (start or {})} | more
 
 
@@ -53,7 +53,7 @@ def ask(url, request):
     with connect(url, proxy=None, compression=None) as client:
         client.recv()
         try:
-            client.send(pack(request))
+            client.send(encode_message(request))
             answer = client.recv(20)
         except ConnectionClosed:
             return None, client.close_code

@@ -24,7 +24,7 @@ from remote_ends import (
 from robocas_ms3.core.errors import EvaluationError, PolicyError
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.connection import MAX_ANSWER
-from robocas_ms3.evaluation.remote.wire import pack
+from robocas_ms3.evaluation.remote.wire import encode_message
 
 
 @pytest.mark.parametrize(
@@ -33,15 +33,15 @@ from robocas_ms3.evaluation.remote.wire import pack
         ("Traceback (most recent call last):\n  ...\nValueError: no cuda\n", "server failed: ValueError: no cuda"),
         (b"\xc1garbage", "invalid message"),
         (b"", "invalid message"),
-        (pack(7), "invalid actions"),
-        (pack({"actions": "up"}), "invalid actions"),
-        (pack({"actions": [[1.0], [1.0, 2.0]]}), "invalid actions"),
-        (pack({"actions": np.zeros((1, 8))}), r"expected \(chunk, 7\) numbers, found \(1, 8\)"),
-        (pack({"actions": np.zeros((0, 7))}), "invalid actions"),
-        (pack({"actions": np.zeros((1, 2, 7))}), "invalid actions"),
-        (pack({"actions": np.full((1, 7), np.nan)}), "out of range"),
-        (pack({"actions": np.full((1, 7), 1e30)}), "out of range"),
-        (pack({"x": bytes(MAX_ANSWER)}), "lost connection"),
+        (encode_message(7), "invalid actions"),
+        (encode_message({"actions": "up"}), "invalid actions"),
+        (encode_message({"actions": [[1.0], [1.0, 2.0]]}), "invalid actions"),
+        (encode_message({"actions": np.zeros((1, 8))}), r"expected \(chunk, 7\) numbers, found \(1, 8\)"),
+        (encode_message({"actions": np.zeros((0, 7))}), "invalid actions"),
+        (encode_message({"actions": np.zeros((1, 2, 7))}), "invalid actions"),
+        (encode_message({"actions": np.full((1, 7), np.nan)}), "out of range"),
+        (encode_message({"actions": np.full((1, 7), 1e30)}), "out of range"),
+        (encode_message({"x": bytes(MAX_ANSWER)}), "lost connection"),
         (lambda socket, _: time.sleep(1), "no answer from the policy server within 0.5 s"),
         (lambda socket, _: socket.close(), "lost connection"),
         (lambda socket, _: socket.socket.shutdown(sockets.SHUT_RDWR), "lost connection"),
@@ -74,7 +74,7 @@ GOOD = {"actions": [[0.0] * 7]}  # actions may be lists
     ids=range(14),
 )
 def test_invalid_batch_answer_ends_its_episodes(answer, failed):
-    with serve_answer(pack(answer), {"robocas_max_batch": 8}) as url:
+    with serve_answer(encode_message(answer), {"robocas_max_batch": 8}) as url:
         remote = RemotePolicy(f"{url}?{SHORT_TIMEOUTS}")
         remote.reset([make_episode(0), make_episode(1)])
         with pytest.raises(PolicyError) as raised:
@@ -96,10 +96,10 @@ SPECS = (
         "Traceback: no",
         b"\xc1",
         None,
-        *(pack({"robocas_spec": spec}) for spec in SPECS),
-        *(pack({"robocas_max_batch": value}) for value in (0, -1, True, 1.5, "8", [])),
-        pack({"robocas_answers_pings": 1}),
-        *(pack({"robocas_policy": {"weights": weights}}) for weights in (b"no text", "x" * 2**21)),
+        *(encode_message({"robocas_spec": spec}) for spec in SPECS),
+        *(encode_message({"robocas_max_batch": value}) for value in (0, -1, True, 1.5, "8", [])),
+        encode_message({"robocas_answers_pings": 1}),
+        *(encode_message({"robocas_policy": {"weights": weights}}) for weights in (b"no text", "x" * 2**21)),
     ],
     ids=range(18),
 )
@@ -132,7 +132,7 @@ def test_other_programs_on_the_port_are_an_error(said):
 
 def test_timeout_if_the_server_does_not_read():
     def talk(socket):
-        socket.send(pack({}))
+        socket.send(encode_message({}))
         time.sleep(2)
 
     with serve_connections(talk) as url:

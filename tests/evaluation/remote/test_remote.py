@@ -21,8 +21,13 @@ from robocas_ms3.core.errors import EvaluationError, PolicyError
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.remote.client import RemotePolicy
-from robocas_ms3.evaluation.remote.connection import Address, read_address
-from robocas_ms3.evaluation.remote.messages import batch_limit, observation_message, read_request, request_size_limit
+from robocas_ms3.evaluation.remote.connection import PolicyAddress, parse_address
+from robocas_ms3.evaluation.remote.messages import (
+    batch_limit,
+    make_observation_message,
+    parse_request,
+    request_size_limit,
+)
 from robocas_ms3.evaluation.remote.server import PolicyServer, ServedFiles
 from robocas_ms3.evaluation.remote.wire import MAX_BYTES
 
@@ -221,9 +226,9 @@ def test_message_names_the_robot_only_if_it_is_not_the_default():
     """Older servers do not know the key."""
     for robot, keys in (("robocas_mobile_panda", set()), ("twin", {"robot"})):
         start = replace(make_episode(), robot=robot)
-        message = observation_message(make_observations(0), 0, start, reset=True)
+        message = make_observation_message(make_observations(0), 0, start, reset=True)
         assert message["start"].keys() & {"robot"} == keys
-        assert ServedFiles.collect().resolve(read_request(message).episode_spec(0)) == start
+        assert ServedFiles.collect().resolve(parse_request(message).make_episode_spec(0)) == start
 
 
 def test_openpi_client_with_our_server():
@@ -232,7 +237,7 @@ def test_openpi_client_with_our_server():
     with serving(policy) as url:
         client = openpi.WebsocketClientPolicy(host=url)
         assert client.get_server_metadata()["robocas_spec"]["convention"] == "robocas"
-        message = observation_message(make_observations(0), 0, None, reset=False)
+        message = make_observation_message(make_observations(0), 0, None, reset=False)
         for key in ("env_id", "reset"):
             del message[key]
         for _ in range(2):
@@ -287,10 +292,10 @@ def test_server_of_the_docs():
 
 
 def test_options_of_an_address():
-    assert read_address("ws://127.0.0.1:8000") == Address("ws://127.0.0.1:8000")
-    assert read_address("wss://[::1]/policy").url == "wss://[::1]/policy"
+    assert parse_address("ws://127.0.0.1:8000") == PolicyAddress("ws://127.0.0.1:8000")
+    assert parse_address("wss://[::1]/policy").url == "wss://[::1]/policy"
     text = "ws://host:1?cameras=base_camera:320x240,gripper_camera:64x64&depth=1&rate_hz=5&rename=qpos:state&n_action_steps=5"
-    assert read_address(f"{text}&max_in_flight=2&timeout_s=9") == Address(
+    assert parse_address(f"{text}&max_in_flight=2&timeout_s=9") == PolicyAddress(
         "ws://host:1",
         spec=PolicySpec(cameras={"base_camera": (320, 240), "gripper_camera": (64, 64)}, depth=True, rate_hz=5.0),
         rename={"qpos": "state"},

@@ -25,8 +25,8 @@ from websockets.sync.client import connect
 from robocas_ms3.core.errors import PolicyError
 from robocas_ms3.evaluation.remote import connection
 from robocas_ms3.evaluation.remote.client import RemotePolicy
-from robocas_ms3.evaluation.remote.messages import observation_message
-from robocas_ms3.evaluation.remote.wire import pack, unpack
+from robocas_ms3.evaluation.remote.messages import make_observation_message
+from robocas_ms3.evaluation.remote.wire import decode_message, encode_message
 
 ENVS = 5
 
@@ -53,7 +53,9 @@ def fast_pings(monkeypatch):
 
 def with_numbers(answer):
     """Run a server that answers with a function of the env, with one thread per connection."""
-    return serve_answer(lambda _, data: pack({"actions": np.full((1, 7), answer(unpack(data)["env_id"]))}))
+    return serve_answer(
+        lambda _, data: encode_message({"actions": np.full((1, 7), answer(decode_message(data)["env_id"]))})
+    )
 
 
 def started(url):
@@ -87,10 +89,10 @@ def blocking_server(pipe):
     """Run a server like openpi's: no pings and no new connections during inference."""
 
     async def talk(client):
-        await client.send(pack({}))
+        await client.send(encode_message({}))
         async for data in client:
             time.sleep(0.8)
-            await client.send(pack({"actions": np.full((1, 7), unpack(data)["env_id"])}))
+            await client.send(encode_message({"actions": np.full((1, 7), decode_message(data)["env_id"])}))
 
     async def run():
         async with serve(talk, "127.0.0.1", 0, compression=None, max_size=None) as server:
@@ -204,7 +206,7 @@ def test_requests_of_disconnected_clients_are_skipped():
     def ask(url):
         client = connect(url, proxy=None, compression=None)
         client.recv()
-        client.send(pack(observation_message(make_observations(0), 0, make_episode(), reset=True)))
+        client.send(encode_message(make_observation_message(make_observations(0), 0, make_episode(), reset=True)))
         return client
 
     with serving(policy) as url:
@@ -212,7 +214,7 @@ def test_requests_of_disconnected_clients_are_skipped():
         assert policy.entered.wait(20)
         ask(url).close()
         last = ask(url)
-        assert unpack(first.recv(20)).keys() == unpack(last.recv(20)).keys() == {"actions"}
+        assert decode_message(first.recv(20)).keys() == decode_message(last.recv(20)).keys() == {"actions"}
         assert len(policy.seen) == 2
         first.close()
         last.close()

@@ -10,7 +10,7 @@ msgpack = pytest.importorskip("msgpack")
 
 from robocas_ms3.core.errors import WireError
 from robocas_ms3.evaluation.remote import wire
-from robocas_ms3.evaluation.remote.wire import pack, unpack
+from robocas_ms3.evaluation.remote.wire import decode_message, encode_message
 
 SCALARS = (
     st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats(allow_nan=False) | st.text() | st.binary()
@@ -29,12 +29,12 @@ VALUES = st.recursive(
 
 @given(VALUES)
 def test_values_round_trip(value):
-    assert unpack(pack(value)) == value
+    assert decode_message(encode_message(value)) == value
 
 
 @given(ARRAYS)
 def test_arrays_round_trip(array):
-    back = unpack(pack({"a": [array]}))["a"][0]
+    back = decode_message(encode_message({"a": [array]}))["a"][0]
     assert back.dtype == array.dtype.newbyteorder("=")
     assert back.flags.writeable
     np.testing.assert_array_equal(back, array)
@@ -43,11 +43,13 @@ def test_arrays_round_trip(array):
 @given(ARRAYS)
 def test_messages_are_compatible_with_openpi(array):
     openpi = pytest.importorskip("openpi_client.msgpack_numpy")
-    np.testing.assert_array_equal(openpi.unpackb(pack(array)), array)
-    assert pack(array) == openpi.packb(array)
+    np.testing.assert_array_equal(openpi.unpackb(encode_message(array)), array)
+    assert encode_message(array) == openpi.packb(array)
     if array.size:
         scalar = array.reshape(-1)[0]
-        np.testing.assert_array_equal(unpack(openpi.packb(scalar)), unpack(pack(scalar)))  # NaN is NaN
+        np.testing.assert_array_equal(
+            decode_message(openpi.packb(scalar)), decode_message(encode_message(scalar))
+        )  # NaN is NaN
 
 
 @pytest.mark.parametrize(
@@ -67,7 +69,7 @@ def test_messages_are_compatible_with_openpi(array):
 )
 def test_values_that_cannot_be_encoded(value):
     with pytest.raises(WireError, match="cannot encode"):
-        pack(value)
+        encode_message(value)
 
 
 def array(data=bytes(8), dtype="<f4", shape=(2,), **more):
@@ -115,30 +117,30 @@ def array(data=bytes(8), dtype="<f4", shape=(2,), **more):
 )
 def test_invalid_messages_are_refused(data):
     with pytest.raises(WireError):
-        unpack(data)
+        decode_message(data)
 
 
 def test_depth_and_size_are_bounded():
     value = 1
     for _ in range(wire.MAX_DEPTH):
         value = [value]
-    assert unpack(pack(value)) == value
+    assert decode_message(encode_message(value)) == value
     with pytest.raises(WireError, match="nested too deeply"):
-        unpack(pack([value]))
+        decode_message(encode_message([value]))
     with pytest.raises(WireError, match="too large"):
-        unpack(bytes(11), max_bytes=10)
+        decode_message(bytes(11), max_bytes=10)
 
 
 def test_decoded_bools_are_zero_or_one():
-    back = unpack(array(data=b"\x02\x00", dtype="|b1"))
+    back = decode_message(array(data=b"\x02\x00", dtype="|b1"))
     assert back.tolist() == [True, False]
     assert back.view(np.uint8).tolist() == [1, 0]
 
 
 @given(VALUES | ARRAYS, st.data())
 def test_damaged_message_gives_a_value_or_an_error(value, draw):
-    data = bytearray(pack({"a": value, "b": np.zeros((2, 2), np.float32)}))
+    data = bytearray(encode_message({"a": value, "b": np.zeros((2, 2), np.float32)}))
     for place in draw.draw(st.lists(st.integers(0, len(data) - 1), min_size=1, max_size=4)):
         data[place] = draw.draw(st.integers(0, 255))
     with contextlib.suppress(WireError):
-        unpack(bytes(data))
+        decode_message(bytes(data))

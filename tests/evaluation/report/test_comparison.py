@@ -9,7 +9,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
 from robocas_ms3.evaluation.protocol import EPISODES, load_protocol
 from robocas_ms3.evaluation.report.comparison import compare_results, compare_splits
-from robocas_ms3.evaluation.statistics import holm, mcnemar
+from robocas_ms3.evaluation.statistics import adjust_p_values, mcnemar_p_value
 
 
 def rows(said: str) -> list[list[str]]:
@@ -41,9 +41,9 @@ def test_several_claims_are_adjusted_by_holm(tmp_path):
     assert [row[:2] for row in found] == [
         [where, pair] for where in ("left", "right", "all") for pair in ("A, B", "A, C", "B, C")
     ]
-    of_one = [mcnemar(7, 0), mcnemar(16, 0), mcnemar(9, 0)]
-    of_all = [mcnemar(14, 0), mcnemar(32, 0), mcnemar(18, 0)]
-    adjusted = [*holm([*of_one, *of_one]), *holm(of_all)]
+    of_one = [mcnemar_p_value(7, 0), mcnemar_p_value(16, 0), mcnemar_p_value(9, 0)]
+    of_all = [mcnemar_p_value(14, 0), mcnemar_p_value(32, 0), mcnemar_p_value(18, 0)]
+    adjusted = [*adjust_p_values([*of_one, *of_one]), *adjust_p_values(of_all)]
     for row, p, by_holm in zip(found, [*of_one, *of_one, *of_all], adjusted, strict=True):
         assert float(row[-2]) == pytest.approx(p, rel=0.01)
         assert float(row[-1]) == pytest.approx(by_holm, rel=0.01)

@@ -14,7 +14,7 @@ from robocas_ms3.cli.eval_results import Compare, Merge, Report, Verify, compare
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.report import PARQUET, write_report
-from robocas_ms3.evaluation.report.page import render_page, video_name
+from robocas_ms3.evaluation.report.page import render_page, video_file_name
 
 VOID = {"meta", "rect", "path"}  # elements without an end tag
 
@@ -89,7 +89,7 @@ def test_page_links_only_its_own_videos(result):
     assert "robocas eval videos" in text
     assert not re.search(r"https?:|//[a-z]|@import|url\(", text)
     (result.folder / "videos").mkdir()
-    (result.folder / "videos" / video_name(3)).touch()
+    (result.folder / "videos" / video_file_name(3)).touch()
     assert Reader(render_page(result, result.folder)).links == ["videos/episode_00003.mp4"]
 
 
