@@ -96,7 +96,7 @@ def test_another_protocol_or_pack_or_an_impossible_weld_is_found(folder, protoco
     ]
     tamper_run(folder, weld=True)
     found = find_violations(read_result(folder), protocol)
-    assert "weld: true, but the weld needs RoboCAS-v0's steps" in found
+    assert "weld: true, but the weld needs a protocol with RoboCAS-v0's steps" in found
     assert "episode 1: missing value measures.welds: the run has weld: True" in found
     assert len(found) == 8
     tamper_run(folder, protocol_hash="ef" * 32, pack_hashes={"builtin": "00"})

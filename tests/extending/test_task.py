@@ -133,8 +133,8 @@ for _ in range(3):
     env.step(hold)
     metrics.update(np.array([True]))
     metrics.end_step()
-read = metrics.read()
-print(tuple(read["sums"].shape), bool(read["sums"][0, 4]), sorted(read))
+info = metrics.compute_info()
+print(tuple(info["sums"].shape), bool(info["sums"][0, 4]), sorted(info))
 """,
     )
     assert output.strip() == "(1, 5) False ['sums']"
