@@ -73,7 +73,7 @@ def build(command: Build) -> int:
     check_number("--jobs", command.jobs, 1)
     objects = None if command.objects is None else parse_seeds(command.objects, "--objects", listed=True)
     seeds = parse_seeds(command.seeds, "--seeds")
-    config = load_task_config(command.config, overrides=command.set)
+    config = load_task_config(command.config, set_options=command.set)
     packs = load_pack(command.pack), load_pack(command.furniture_pack)  # before the slow imports
     from robocas_ms3.scenes.cache import LayoutCache, seed_pairs
     from robocas_ms3.scenes.model import SceneModel

@@ -44,7 +44,7 @@ def main(cfg: Show) -> int:
     from robocas_ms3.scenes.config import load_task_config
 
     check_number("--seed", cfg.seed, 0, MAX_SEED)
-    config = load_task_config(cfg.config, overrides=cfg.set)  # before the slow imports
+    config = load_task_config(cfg.config, set_options=cfg.set)  # before the slow imports
     if cfg.print_config:
         return print_config(config)
     load_pack(cfg.pack)

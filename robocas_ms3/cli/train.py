@@ -161,7 +161,7 @@ def config_layers(cfg: Training) -> list[tuple[str, dict[str, Any]]]:
     from robocas_ms3.core.checks import check_number
     from robocas_ms3.core.documents import load_yaml
     from robocas_ms3.core.errors import TrainingError
-    from robocas_ms3.scenes.config.compose import parse_override
+    from robocas_ms3.scenes.config.compose import parse_set_option
 
     layers: list[tuple[str, dict[str, Any]]] = []
     if cfg.config is not None:
@@ -178,7 +178,7 @@ def config_layers(cfg: Training) -> list[tuple[str, dict[str, Any]]]:
         layers.append((str(cfg.config), read))
     found: dict[str, Any] = {}
     for text in cfg.set:
-        found = merge_configs(found, parse_override(text, TrainingError, "train.seed=1"))
+        found = merge_configs(found, parse_set_option(text, TrainingError, "train.seed=1"))
     for key, least in {"steps": 1, "batch_size": 1, "seed": 0}.items():
         if (value := getattr(cfg, key)) is not None:
             check_number(f"--{key.replace('_', '-')}", value, least)

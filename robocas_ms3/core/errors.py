@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import importlib.metadata
 import importlib.util
 from collections.abc import Mapping
 from typing import Any
@@ -82,14 +84,34 @@ class PlanError(RobocasError):
 
 
 class MissingExtraError(RobocasError):
-    """Missing optional dependency; the message names the extra that installs it."""
+    """Missing or broken optional dependency; the message has the command that installs it."""
 
 
-def require_extra(extra: str, purpose: str, *modules: str, fix: str = "") -> None:
-    """Raise MissingExtraError if modules of an extra are not installed; ``fix`` is an alternative to installing."""
+def require_extra(extra: str, purpose: str, *modules: str, fix: str = "", load: bool = True) -> None:
+    """Check that the modules of an extra are installed, and import them.
+
+    Args:
+        extra: name of the extra.
+        purpose: what needs the modules, for the message.
+        modules: names of the modules.
+        fix: an alternative to installing the extra, for the message.
+        load: whether to import the modules; without the import, a broken package is not found.
+
+    Raises:
+        MissingExtraError: a module is not installed, or its import fails.
+    """
     if missing := [module for module in modules if importlib.util.find_spec(module) is None]:
         what, install = f"missing for {purpose}: {', '.join(missing)}", f'In the clone: pip install -e ".[{extra}]".'
         raise MissingExtraError(what, fix=f"{install} {fix}".rstrip())
+    for module in modules if load else ():
+        try:
+            importlib.import_module(module)
+        except Exception as error:
+            name = importlib.metadata.packages_distributions().get(module, [module])[0]
+            what, found = f"cannot import {module}, required for {purpose}", f"{type(error).__name__}: {error}"
+            install = f"Install the package again: pip install --force-reinstall {name}."
+            found = " ".join(found.split())[:300]
+            raise MissingExtraError(what, found=found, fix=f"{install} {fix}".rstrip()) from error
 
 
 class WorkerCrashError(RobocasError):

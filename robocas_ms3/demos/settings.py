@@ -157,7 +157,7 @@ class GenerateSettings:
         from robocas_ms3.scenes.config import bundled_configs, load_task_config
 
         episode, name = self.episode, self.episode.config
-        config = load_task_config(name, overrides=self.set)
+        config = load_task_config(name, set_options=self.set)
         if self.set or not isinstance(name, str) or name not in bundled_configs():
             episode = replace(episode, config=config.model_dump(mode="json"))
         if self.check_noise is not None:

@@ -116,6 +116,8 @@ class RobotXml:
     def _joint(self, element: Element) -> Joint:
         found = element.find("axis")
         axis = np.array([1.0, 0.0, 0.0] if found is None else self.numbers(found, "xyz", 3))
+        if not axis.any():
+            raise self.error("invalid joint axis", "a vector that is not zero", repr(self.attribute(found, "xyz")))
         return Joint(
             name=self.attribute(element, "name"),
             kind=self.attribute(element, "type"),

@@ -57,7 +57,7 @@ def test_parts_with_the_same_scenes_need_separate_seeds(written):
 def test_configurations_and_packs_in_folders(written, tmp_path, monkeypatch):
     (tmp_path / "mine.yaml").write_text("extends: pick_shelf_scattered\nobjects: {count: 4}\n")
     plan = load_plan(written("parts:\n  - {task: pick, config: mine.yaml, episodes: 3}\n"))
-    resolved = load_task_config("pick_shelf_scattered", overrides=["objects.count=4"])
+    resolved = load_task_config("pick_shelf_scattered", set_options=["objects.count=4"])
     assert plan.parts[0].config == resolved.model_dump(mode="json")
     assert plan.parts[0].name == "00-mine"
     (tmp_path / "here" / "packs" / "mine").mkdir(parents=True)

@@ -68,6 +68,7 @@ def test_a_loop_of_joints_is_an_error(write):
         ('xyz="1 2 3"', 'xyz="1 2 3m"'),
         ('xyz="1 2 3"', 'xyz="1 2 inf"'),
         ('upper="0.5"', 'upper="abc"'),
+        ('<axis xyz="0 -1 0"/>', '<axis xyz="0 0 0"/>'),
         ('name="wrist" ', ""),
     ],
 )

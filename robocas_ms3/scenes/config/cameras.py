@@ -44,7 +44,7 @@ class CameraConfig(StrictModel):
     @model_validator(mode="after")
     def _one_direction(self) -> CameraConfig:
         if self.rotation_deg is not None and self.look_at is not None:
-            raise ValueError("expected rotation_deg or look_at, found both")
+            raise ValueError("expected only one of the keys rotation_deg and look_at, found both")
         return self
 
     def apply_to(self, camera: CameraSpec) -> CameraSpec:
@@ -62,7 +62,7 @@ class CameraConfig(StrictModel):
 def _check_names(cameras: dict[str, CameraConfig]) -> dict[str, CameraConfig]:
     for name in cameras:
         if not re.fullmatch(CAMERA_NAME, name):
-            raise ValueError(f"expected names like side_camera, found {name!r}")
+            raise ValueError(f"expected a camera name that ends in _camera, such as side_camera, found {name!r}")
     return cameras
 
 
@@ -72,7 +72,14 @@ CamerasConfig = Annotated[dict[str, CameraConfig], AfterValidator(_check_names)]
 def apply_camera_changes(
     cameras: tuple[CameraSpec, ...], changes: list[tuple[str, CameraConfig]]
 ) -> tuple[CameraSpec, ...]:
-    """Return the changed cameras, followed by the additional ones.
+    """Change cameras by name, and add the cameras with new names.
+
+    Args:
+        cameras: cameras of the robot.
+        changes: name and changed values of each camera; a name may occur several times.
+
+    Returns:
+        The cameras of the robot with their changes, followed by the additional cameras.
 
     Raises:
         ConfigError: an additional camera has neither `position` nor `overview`.
@@ -81,9 +88,9 @@ def apply_camera_changes(
     for name, change in changes:
         if name not in specs and change.position is None and not change.overview:
             raise ConfigError(
-                "unknown camera, and an additional camera needs a position",
+                "unknown camera",
                 where=f"cameras.{name}",
-                expected=f"one of {list(specs)}, or `position` or `overview`",
+                expected=f"one of {list(specs)}, or for an additional camera the key `position` or `overview`",
                 fix=did_you_mean(name, specs),
             )
         specs[name] = change.apply_to(specs.get(name, CameraSpec(name)))

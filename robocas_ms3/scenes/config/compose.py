@@ -26,20 +26,20 @@ _NULL = ("~", "null", "Null", "NULL")
 
 
 class _Loader(yaml.SafeLoader):
-    """A YAML loader that reads numbers such as ``3e-4`` as floats; in YAML 1.1 they are strings."""
+    """YAML loader that reads numbers such as ``3e-4`` as floats; in YAML 1.1 they are strings."""
 
 
 _EXPONENT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$")
 _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _EXPONENT, list("-+.0123456789"))
 
 
-def parse_override(text: str, error: type[RobocasError], example: str) -> dict[str, Any]:
-    """Parse ``a.b=VALUE`` of a command line into ``{"a": {"b": VALUE}}``; the value is YAML.
+def parse_set_option(text: str, error: type[RobocasError], example: str) -> dict[str, Any]:
+    """Parse the value ``a.b=VALUE`` of an option ``--set`` into ``{"a": {"b": VALUE}}``; VALUE is YAML.
 
     Args:
-        text: the override.
+        text: the value of the option.
         error: error type to raise.
-        example: a valid override, for the message.
+        example: a valid value of the option, for the message.
 
     Raises:
         RobocasError: ``error``, if the key or ``=`` is missing, or the value is empty or not YAML.
@@ -47,14 +47,15 @@ def parse_override(text: str, error: type[RobocasError], example: str) -> dict[s
     key, sign, word = text.partition("=")
     names = key.split(".")
     if not sign or not all(names) or key != key.strip():
-        raise error("invalid override", where="--set", expected=f"KEY=VALUE, such as {example}", found=text)
+        raise error("invalid option", where="--set", expected=f"KEY=VALUE, such as {example}", found=text)
     try:
         value: Any = yaml.load(word, Loader=_Loader)  # noqa: S506  (a SafeLoader)
     except (yaml.YAMLError, ValueError) as problem:
-        raise error("invalid override: the value is not YAML", where="--set", found=text) from problem
+        fix = "Put the value into quotes."
+        raise error("invalid option: VALUE is not YAML", where="--set", found=text, fix=fix) from problem
     if value is None and word.strip() not in _NULL:
         fix = f"Write {key}=null to remove the key or to set it to null."
-        raise error("invalid override: the value is empty", where="--set", expected="a value", found=text, fix=fix)
+        raise error("invalid option: VALUE is empty", where="--set", expected="KEY=VALUE", found=text, fix=fix)
     nested = {names[-1]: value}
     for name in reversed(names[:-1]):
         nested = {name: nested}
@@ -62,11 +63,11 @@ def parse_override(text: str, error: type[RobocasError], example: str) -> dict[s
 
 
 class Composition:
-    """A configuration that is being composed.
+    """A configuration that is merged from several mappings.
 
     Attributes:
-        values: the merged mapping, as read from YAML.
-        sources: dotted key -> file or command line option that set the key last.
+        values: the result of all mappings that are merged so far.
+        sources: dotted key -> file or command line option from which the value of the key comes.
     """
 
     def __init__(self) -> None:
@@ -74,12 +75,12 @@ class Composition:
         self.sources: dict[str, str] = {}
 
     def merge(self, changes: Mapping[Any, Any], source: str, *, removes: bool = True) -> None:
-        """Merge a mapping, which may be incomplete, over the current values.
+        """Merge a mapping over the current values. The mapping need not have all keys.
 
         Args:
             changes: the mapping.
-            source: its file or command line option, for messages.
-            removes: whether ``null`` removes a key, see above.
+            source: file or command line option of the mapping, for messages.
+            removes: whether ``null`` removes a key that cannot be null (see the rules above).
 
         Raises:
             ConfigError: the mapping removes a name that does not exist, or has the key ``extends``.
@@ -90,12 +91,12 @@ class Composition:
                 where=source,
                 expected="the keys of the configuration",
                 found=repr(changes[EXTENDS])[:80],
-                fix="Load the base by its name or path, and change its keys.",
+                fix="Load the base configuration by its name or path, and pass the changed keys.",
             )
         self._merge(self.values, changes, (), source, removes)
 
     def source_of(self, key: str, default: str) -> str:
-        """Return the source of a dotted key or of its block; ``default`` if several or no sources set it."""
+        """Return the source of a dotted key, else of its block; ``default`` if no source or several sources set it."""
         names = key.split(".") if key else []
         for end in range(len(names), 0, -1):
             place = ".".join(names[:end])
@@ -118,8 +119,8 @@ class Composition:
             if new is None and removes and (declared := _declaration(place)) in {"key", "name"}:
                 if declared == "name" and key not in values:
                     expected, fix = f"one of {sorted(map(str, values))}", did_you_mean(str(key), map(str, values))
-                    what = f"can't remove {'.'.join(place)!r}: it does not exist"
-                    raise ConfigError(what, where=source, expected=expected, found=repr(str(key)), fix=fix)
+                    what = f"null cannot remove {'.'.join(place)!r}, which does not exist"
+                    raise ConfigError(what, where=source, expected=expected, fix=fix)
                 values.pop(key, None)
                 replaced = replaced or declared == "name"
                 self._set_source(place, source, old)
@@ -148,7 +149,12 @@ class Composition:
 
 
 def _declaration(place: Sequence[str]) -> Literal["nullable", "key", "name", "unknown"]:
-    """Return how the configuration declares a key: nullable, not nullable, as a free name, or not at all."""
+    """Return how the schema declares a key.
+
+    Returns:
+        ``nullable``: a key that may be null; ``key``: another key; ``name``: a name that the file chooses, such as that
+        of a camera; ``unknown``: not declared.
+    """
     nodes, found = [_schema()], "unknown"
     for name in place:
         found, inner = "unknown", []

@@ -13,7 +13,7 @@ from robocas_ms3.core.documents import YAML_LIMIT, DocumentError, load_yaml, rea
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.paths import task_configs_dir
 from robocas_ms3.core.strict_model import did_you_mean, parse
-from robocas_ms3.scenes.config.compose import EXTENDS, Composition, parse_override
+from robocas_ms3.scenes.config.compose import EXTENDS, Composition, parse_set_option
 from robocas_ms3.scenes.config.task import TaskConfig
 from robocas_ms3.scenes.language.texts import synonym_texts
 from robocas_ms3.scenes.task_specs import TaskSpec
@@ -25,16 +25,16 @@ _log = logging.getLogger(__name__)
 
 
 def bundled_configs() -> dict[str, Path]:
-    """Return the files of the bundled configurations by name."""
+    """Return the path of each bundled configuration by its name."""
     return {path.stem: path for path in sorted(task_configs_dir().glob("*.yaml"))}
 
 
 def load_config_for(spec: TaskSpec, config: str | Path | dict | TaskConfig | None = None) -> TaskConfig:
-    """Load a configuration for a task; see `load_task_config`.
+    """Load a task configuration, and check that it belongs to a task.
 
     Args:
         spec: the task.
-        config: the configuration; default: the task's default configuration.
+        config: as in `load_task_config`; default: the default configuration of the task.
 
     Raises:
         ConfigError: the configuration is invalid, or belongs to another task.
@@ -48,21 +48,23 @@ def load_config_for(spec: TaskSpec, config: str | Path | dict | TaskConfig | Non
 
 
 def load_task_config(
-    config: str | Path | dict | TaskConfig, changes: Mapping[str, Any] | None = None, overrides: Sequence[str] = ()
+    config: str | Path | dict | TaskConfig, changes: Mapping[str, Any] | None = None, set_options: Sequence[str] = ()
 ) -> TaskConfig:
     """Load a task configuration; warn about a ``support`` that is not in ``synonyms.yaml``.
 
     Args:
         config: name of a bundled configuration (``pick_table_scattered``), path of a YAML file, a mapping of the same
             form, or a loaded configuration. Only files may have the key ``extends``.
-        changes: mapping that is merged over the configuration.
-        overrides: ``KEY=VALUE`` strings such as ``objects.count=12``; they are merged last.
+        changes: mapping of changed keys, nested as in the YAML file: ``{"objects": {"count": 12}}``.
+        set_options: the same in the form of the command line option ``--set``: strings ``objects.count=12``; they
+            have priority over ``changes``.
 
     Raises:
-        ConfigError: the file does not exist or is not YAML, its bases form a cycle, or a key or value is invalid.
+        ConfigError: the file does not exist or is not YAML, files extend each other in a cycle, or a key or value is
+            invalid.
     """
     if isinstance(config, TaskConfig):
-        if not changes and not overrides:
+        if not changes and not set_options:
             return config
         config = config.model_dump(mode="json")
     composition = Composition()
@@ -72,7 +74,7 @@ def load_task_config(
     else:
         label = _merge_file(composition, config)
     sources = {"changes": changes} if changes else {}
-    sources |= {f"--set {text}": parse_override(text, ConfigError, "objects.count=12") for text in overrides}
+    sources |= {f"--set {text}": parse_set_option(text, ConfigError, "objects.count=12") for text in set_options}
     for source, values in sources.items():
         composition.merge(values, source)
     label = f"{label} with {', '.join(sources)}" if sources else label
@@ -80,17 +82,17 @@ def load_task_config(
     parsed = parse(TaskConfig, composition.values, ConfigError, where=where)
     supports = synonym_texts().supports
     if parsed.support not in supports and not isinstance(config, dict):
-        message = "%s: unknown support %r: instructions say 'on the %s' and use no synonyms; known supports: %s"
+        message = "%s: no synonyms for the support %r; instructions contain 'on the %s' (supports with synonyms: %s)"
         _log.warning(message, where("support"), parsed.support, parsed.support, ", ".join(sorted(supports)))
     return parsed
 
 
 def check_no_extends(path: Path) -> None:
-    """Check that a file of a frozen protocol does not depend on a base configuration."""
+    """Raise ConfigError if a configuration file of a frozen protocol has the key ``extends``, or is not readable."""
     try:
         text = read_text(path, YAML_LIMIT)
     except (OSError, DocumentError) as error:
-        raise ConfigError("can't read this file", where=path, found=error) from error
+        raise ConfigError("can't read the configuration", where=path, found=error) from error
     if EXTENDS not in text and "\\" not in text:  # parsing is slow; the key may be written with escapes
         return
     data = _read(path)
@@ -101,7 +103,7 @@ def check_no_extends(path: Path) -> None:
 
 
 def _merge_file(composition: Composition, config: str | Path) -> str:
-    """Merge a file over its bases; return the description of the file for messages."""
+    """Merge a file over the files that it extends; return the name of the file for messages."""
     chain = _chain(_find(config))
     first = str(chain[0][0])
     for number, (path, data) in reversed(list(enumerate(chain))):
@@ -112,7 +114,7 @@ def _merge_file(composition: Composition, config: str | Path) -> str:
 
 
 def _chain(path: Path) -> list[tuple[Path, dict[Any, Any]]]:
-    """Read a file and its bases, the file first; their keys ``extends`` are removed."""
+    """Read a file, the file that it extends, and so on, in this order; keys ``extends`` are removed."""
     chain: list[tuple[Path, dict[Any, Any]]] = []
     found: Path | None = path
     while found is not None:
@@ -122,11 +124,20 @@ def _chain(path: Path) -> list[tuple[Path, dict[Any, Any]]]:
         if any(before.resolve() == path.resolve() for before, _ in chain):
             where = f"{chain[-1][0]}, {EXTENDS}"
             raise ConfigError(
-                "these configurations extend each other", where=where, expected="no cycle", found=" -> ".join(files)
+                "configurations extend each other in a cycle",
+                where=where,
+                found=" -> ".join(files),
+                fix="Remove one of these keys.",
             )
         if len(chain) == CHAIN_LIMIT:
             expected = f"at most {CHAIN_LIMIT} files"
-            raise ConfigError("too many base configurations", where=where, expected=expected, found=files[0])
+            fix = "Copy the keys of some base configurations into the files that extend them."
+            raise ConfigError(
+                f"too many configurations extend each other, from {files[0]} on",
+                where=where,
+                expected=expected,
+                fix=fix,
+            )
         found = None
         if EXTENDS in data:
             named = data.pop(EXTENDS)
@@ -142,21 +153,21 @@ def _read(path: Path) -> dict[Any, Any]:
     try:
         data = load_yaml(path)
     except DocumentError as error:
-        raise ConfigError("invalid YAML", where=path, found=error) from error
+        raise ConfigError("the configuration is not valid YAML", where=path, found=error) from error
     except OSError as error:
-        raise ConfigError("can't read this file", where=path, found=error.strerror) from error
+        raise ConfigError("can't read the configuration", where=path, found=error.strerror) from error
     if not isinstance(data, dict):
-        what = "invalid task configuration"
-        raise ConfigError(what, where=path, expected="a mapping", found=type(data).__name__)
+        what = "the file is not a task configuration"
+        raise ConfigError(what, where=path, expected="a mapping of keys to values", found=type(data).__name__)
     for key in data:
         if key != EXTENDS and key not in TaskConfig.model_fields and (likely := did_you_mean(str(key), [EXTENDS])):
             expected = f"one of {[EXTENDS, *sorted(TaskConfig.model_fields)]}"
-            raise ConfigError(f"unknown key {key!r}", where=path, expected=expected, found=repr(key), fix=likely)
+            raise ConfigError(f"unknown key {key!r}", where=path, expected=expected, fix=likely)
     return data
 
 
 def _find(config: str | Path, folder: Path | None = None, where: str = "") -> Path:
-    """Return the file of a configuration name or path; a path is relative to ``folder`` if given."""
+    """Return the file of a bundled configuration or of a path, which is relative to ``folder`` if given."""
     shipped, name = bundled_configs(), str(config)
     if name in shipped:
         return shipped[name]
@@ -174,7 +185,7 @@ def _find(config: str | Path, folder: Path | None = None, where: str = "") -> Pa
         likely = did_you_mean(name, [*shipped, *files]) or did_you_mean(f"{name}.yaml", files) or likely
     if is_yaml and not likely:
         raise ConfigError(
-            "no such file", where=where or name, expected=expected, found=path.absolute(), usage=not where
+            "no such configuration file", where=where or name, expected=expected, found=path.absolute(), usage=not where
         )
     raise ConfigError(
         what,

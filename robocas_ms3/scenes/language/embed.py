@@ -44,7 +44,7 @@ class TextEmbedder:
 
     def __init__(self) -> None:
         fix = "robocas convert --no-embeddings does not need it."
-        require_extra("language", "sentence embeddings", "sentence_transformers", fix=fix)
+        require_extra("language", "sentence embeddings", "sentence_transformers", fix=fix, load=False)  # takes seconds
         self._model = None
         self._cache: dict[str, NDArray[np.float32]] = {}
 
@@ -69,6 +69,7 @@ class TextEmbedder:
 
 
 def _load(source: str):
+    require_extra("language", "sentence embeddings", "sentence_transformers", fix="Or pass --no-embeddings.")
     from sentence_transformers import SentenceTransformer
     from transformers.utils import logging
 

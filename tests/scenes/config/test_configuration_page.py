@@ -49,7 +49,7 @@ def test_cameras_of_the_page(tmp_path):
 )
 def test_invalid_cameras_are_errors(change):
     with pytest.raises(ConfigError):
-        load_task_config("pick_table_scattered", overrides=[f"cameras.{change}"]).cameras_of(MOBILE_PANDA)
+        load_task_config("pick_table_scattered", set_options=[f"cameras.{change}"]).cameras_of(MOBILE_PANDA)
 
 
 def test_commands_of_the_page_set_existing_keys():
@@ -64,7 +64,7 @@ def test_commands_of_the_page_set_existing_keys():
         else:
             name = words[words.index("--config") + 1] if "--config" in words else words[words.index("--set") - 1]
             name = words[2] if words[0] == "layouts" else name
-            assert load_task_config(name, overrides=overrides) != load_task_config(name)
+            assert load_task_config(name, set_options=overrides) != load_task_config(name)
 
 
 def test_reference_equals_the_models():

@@ -81,7 +81,7 @@ def test_missing_file_gets_the_nearest_names(tmp_path):
     assert "select_table_rows" not in str(error.value)
     with pytest.raises(ConfigError, match="select_table_rows"):  # no similar name: all names are listed
         load_task_config("xyz")
-    with pytest.raises(ConfigError, match="no such file") as error:
+    with pytest.raises(ConfigError, match="no such configuration file") as error:
         load_task_config(tmp_path / "mine_of_the_lab.yaml")
     assert "pick_table_scattered" not in str(error.value)
 

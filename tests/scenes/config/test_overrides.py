@@ -9,7 +9,7 @@ from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.evaluation.freeze import ProtocolSource
 from robocas_ms3.scenes.config import load_task_config
-from robocas_ms3.scenes.config.compose import parse_override
+from robocas_ms3.scenes.config.compose import parse_set_option
 
 NAME = "pick_table_scattered"
 FILE_CHANGED = {"extends": NAME, "objects": {"count": 5, "repeats": True}}
@@ -31,24 +31,24 @@ FILE_CHANGED = {"extends": NAME, "objects": {"count": 5, "repeats": True}}
     ],
 )
 def test_values_are_yaml_and_dots_separate_keys(text, nested):
-    assert parse_override(text, ConfigError, "a=1") == nested
+    assert parse_set_option(text, ConfigError, "a=1") == nested
 
 
 @pytest.mark.parametrize("text", ["objects.count", "=3", "objects.=3", ".count=3", "a=[1", " a=1", "", "a=", "a=#3"])
 def test_an_invalid_override_is_an_error(text):
     with pytest.raises(ConfigError) as caught:
-        parse_override(text, ConfigError, "a=1")
+        parse_set_option(text, ConfigError, "a=1")
     assert (caught.value.where, caught.value.found) == ("--set", text)
 
 
 def test_overrides_are_merged_over_a_file_in_order(tmp_path):
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(FILE_CHANGED))
     overrides = ("objects.count=6", "objects.count=7", "layout.kind=stacked")
-    config = load_task_config(tmp_path / "mine.yaml", overrides=overrides)
+    config = load_task_config(tmp_path / "mine.yaml", set_options=overrides)
     assert (config.objects.count, config.objects.repeats, config.layout.kind) == (7, True, "stacked")
     loaded = load_task_config(NAME)
-    assert load_task_config(loaded, overrides=["objects.count=3"]).objects.count == 3
-    assert load_task_config(NAME, overrides=["objects.count=3", "objects.count=null"]) == loaded
+    assert load_task_config(loaded, set_options=["objects.count=3"]).objects.count == 3
+    assert load_task_config(NAME, set_options=["objects.count=3", "objects.count=null"]) == loaded
     source = ProtocolSource.model_validate(
         {"rules": {}, "parts": [{"config": NAME, "count": 1, "first_seed": 0, "change": {"objects": {"count": 3}}}]}
     )
@@ -66,11 +66,11 @@ def test_overrides_are_merged_over_a_file_in_order(tmp_path):
 )
 def test_errors_name_the_option(text, words):
     with pytest.raises(ConfigError) as caught:
-        load_task_config(NAME, overrides=["objects.repeats=true", text])
+        load_task_config(NAME, set_options=["objects.repeats=true", text])
     assert caught.value.where == f"--set {text}"
     assert [word for word in words if word not in str(caught.value)] == []
     with pytest.raises(ConfigError) as caught:  # a rule between keys is violated
-        load_task_config(NAME, overrides=["surface.furniture=desk"])
+        load_task_config(NAME, set_options=["surface.furniture=desk"])
     assert str(caught.value.where).endswith(f"{NAME}.yaml with --set surface.furniture=desk")
 
 
@@ -79,7 +79,9 @@ def test_show_prints_a_resolved_configuration_that_loads_again(tmp_path, capsys)
     assert run([*words, "--out", str(tmp_path / "out")]) == 0
     (tmp_path / "printed.yaml").write_text(capsys.readouterr().out)
     overrides = ("objects.count=12", "layout.copies=4")
-    assert load_task_config(tmp_path / "printed.yaml") == load_task_config("select_shelf_orderly", overrides=overrides)
+    assert load_task_config(tmp_path / "printed.yaml") == load_task_config(
+        "select_shelf_orderly", set_options=overrides
+    )
     assert "extends" not in yaml.safe_load((tmp_path / "printed.yaml").read_text())
     assert not (tmp_path / "out").exists()
 
@@ -107,7 +109,7 @@ def test_recording_stores_the_resolved_configuration_and_rejects_another(tmp_pat
     out = tmp_path / "out"
     words = ["generate", "pick", "-n", "1", "--out", str(out), "--check-rate", "0", "--set"]
     assert run([*words, "objects.count=3"]) == 0
-    expected = load_task_config(NAME, overrides=["objects.count=3"]).model_dump(mode="json")
+    expected = load_task_config(NAME, set_options=["objects.count=3"]).model_dump(mode="json")
     assert json.loads((out / "run.json").read_text())["settings"]["config"] == expected
     recorded = json.loads((out / "trajectory.json").read_text())["env_info"]["env_kwargs"]["config"]
     assert recorded == expected
