@@ -103,7 +103,7 @@ def _furniture_line(furniture: LoadedFurniture) -> str:
 def _object_images(renderer: Renderer, asset: LoadedObject) -> list[LabelledImage]:
     notes = asset.annotations
     points, tried = np.concatenate(asset.hulls), top_grasps(notes)
-    fast = RenderBody(points, file=asset.visual("fast"))
+    fast = RenderBody(points, file=asset.visual_path("fast"))
     grippers = [
         _solid(gripper_faces(float(width)), _tone(float(quality)), pose)
         for pose, width, quality in zip(
@@ -115,7 +115,7 @@ def _object_images(renderer: Renderer, asset: LoadedObject) -> list[LabelledImag
     chances = " ".join(f"{notes.resting_probabilities[i]:.0%}" for i in best)
     return [
         ("fast", renderer.image([fast], -60, 25)),
-        ("full, from behind", renderer.image([RenderBody(points, file=asset.visual("full"))], 120, 25)),
+        ("full, from behind", renderer.image([RenderBody(points, file=asset.visual_path("full"))], 120, 25)),
         ("hulls", renderer.image(hull_bodies(asset.hull_meshes), -60, 25)),
         (f"rests {chances}", renderer.image(place_in_row(fast, notes.resting_poses[best]), -60, 30)),
         (f"best {len(grippers)} of {len(notes.grasp_widths)} grasps", renderer.image([fast, *grippers], -60, 30)),
@@ -138,10 +138,10 @@ def _furniture_images(renderer: Renderer, furniture: LoadedFurniture) -> list[La
 
     def render_bodies(poses: dict[str, Array]) -> list[RenderBody]:
         bodies = [
-            RenderBody(np.concatenate(part.hulls), file=part.visual("fast"), pose=poses[name])
+            RenderBody(np.concatenate(part.hulls), file=part.visual_path("fast"), pose=poses[name])
             for name, part in parts.items()
         ]
-        finishes = [furniture.finish(part, names[0]) for part, names in asset.finishes.items()]
+        finishes = [furniture.finish_path(part, names[0]) for part, names in asset.finishes.items()]
         return bodies + [RenderBody(np.empty((0, 3)), file=path) for path in finishes]
 
     hulls = [

@@ -15,7 +15,7 @@ from asset_tools.quality.hulls import hull_quality, volume_iou
 from asset_tools.solids import to_mesh, to_solid
 from robocas_ms3.assets.cooked_hulls import MAX_SHRINKAGE, MAX_SLENDERNESS, cook_hulls
 from robocas_ms3.assets.hulls import center_of_mass, find_box, slenderness
-from robocas_ms3.assets.physics import cook
+from robocas_ms3.assets.physics import make_convex_shape
 from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
@@ -148,7 +148,7 @@ def limit_for_engine(points: Array) -> Array:
         points = center + local @ axes
     try:
         if cook_hulls([points])[0].shrinkage > MAX_SHRINKAGE:
-            points = np.array(cook(points, physx.PhysxMaterial(1, 1, 0)).vertices, dtype=float)
+            points = np.array(make_convex_shape(points, physx.PhysxMaterial(1, 1, 0)).vertices, dtype=float)
     except RuntimeError:
         to_box, extents = trimesh.bounds.oriented_bounds(points)
         points = trimesh.creation.box(extents, transform=np.linalg.inv(to_box)).vertices

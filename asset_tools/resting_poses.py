@@ -23,9 +23,9 @@ from robocas_ms3.assets.physics import (
     RigidBody,
     add_body,
     add_ground,
-    cook,
     engine_settings,
     grid_origins,
+    make_convex_shape,
     make_scene,
     pose_matrix,
 )
@@ -117,7 +117,7 @@ def resting_poses(solid: RigidBody) -> RestingPoses:
 
 def _cooked(piece: Array) -> Array:
     """Return the corners (V, 3) of the engine's shape for a convex hull; boxes are exact."""
-    return piece if find_box(piece) is not None else cook(piece, physx.PhysxMaterial(1, 1, 0)).vertices
+    return piece if find_box(piece) is not None else make_convex_shape(piece, physx.PhysxMaterial(1, 1, 0)).vertices
 
 
 def _turn_up(up: Array) -> Array:

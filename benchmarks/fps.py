@@ -32,7 +32,7 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.assets.physics import CONTACT_OFFSET
 from robocas_ms3.core.text import format_error
 from robocas_ms3.scenes import build
-from robocas_ms3.scenes.cache import layout_source
+from robocas_ms3.scenes.cache import make_layout_source
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.task_specs import TASKS
@@ -75,7 +75,7 @@ class BareEnv(BaseEnv):
         ]
 
     def _load_scene(self, options: dict) -> None:
-        self.layout = layout_source(self.model)(0, 0)
+        self.layout = make_layout_source(self.model)(0, 0)
         build.build_fixtures(self.scene, self.model, "fast", [0] * self.num_envs)
         assets = [self.model.object_pack.objects[i] for i in self.layout.object_ids]
         self.things = [build.build_object_slot(self.scene, k, [a] * self.num_envs) for k, a in enumerate(assets)]

@@ -21,7 +21,7 @@ from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array
 from robocas_ms3.scenes.sample import sample_layout
-from robocas_ms3.scenes.visibility import MeshScene, object_mesh, top_down_camera
+from robocas_ms3.scenes.visibility import MeshScene, load_visual_mesh, top_down_camera
 
 SIZES = (512, 256, 128, 64)
 
@@ -60,7 +60,7 @@ def main(args: Args) -> None:
         shares: dict[int, list[Array]] = {size: [] for size in SIZES}
         triangles = []
         for layout in layouts:
-            meshes = [object_mesh(model.object_pack.objects[i], level).copy() for i in layout.object_ids]
+            meshes = [load_visual_mesh(model.object_pack.objects[i], level).copy() for i in layout.object_ids]
             triangles.append(sum(len(mesh.faces) for mesh in meshes))
             scenery = MeshScene(meshes, layout.object_poses)
             for size in SIZES:

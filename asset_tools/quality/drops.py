@@ -10,7 +10,7 @@ from sapien import physx
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.assets.hulls import Hull, convex_faces, sample_surface
+from robocas_ms3.assets.hulls import Hull, make_convex_mesh, sample_surface
 from robocas_ms3.assets.physics import (
     TIME_STEP,
     RigidBody,
@@ -154,7 +154,7 @@ class _Comparison:
     """Comparison of poses with the listed poses (S, 4, 4); see `drop_test`."""
 
     def __init__(self, solid: RigidBody, listed: Array) -> None:
-        points = sample_surface([Hull(*convex_faces(np.asarray(hull, float))) for hull in solid.hulls], SPACING)
+        points = sample_surface([Hull(*make_convex_mesh(np.asarray(hull, float))) for hull in solid.hulls], SPACING)
         self._points = points[:: len(points) // MAX_POINTS + 1]
         self._center = solid.center_of_mass
         reach = np.linalg.norm(self._points - self._center, axis=1).max()

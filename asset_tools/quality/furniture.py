@@ -13,7 +13,7 @@ from asset_tools.quality.furniture_scene import FurnitureModel, FurnitureScene, 
 from asset_tools.quality.overlap import distances, make_convex_body, max_overlap
 from asset_tools.quality.surfaces import BLOCKED, Probe, clearances, make_probes
 from asset_tools.sources import FurnitureSource
-from robocas_ms3.assets.hulls import convex_faces
+from robocas_ms3.assets.hulls import make_convex_mesh
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.manifest import FurnitureQuality, Handle, Link, Surface
 from robocas_ms3.assets.pack import LoadedFurniture
@@ -110,7 +110,7 @@ def measure_furniture(furniture: FurnitureSource | LoadedFurniture) -> Furniture
     hulls = [piece for pieces in make_model(furniture).pieces.values() for piece in pieces]
     return FurnitureQuality(
         hull_count=len(hulls),
-        hull_vertices=max(len(convex_faces(hull)[0]) for hull in hulls),
+        hull_vertices=max(len(make_convex_mesh(hull)[0]) for hull in hulls),
         joints_open=_true_fraction(joint.works for joint in report.joints.values()),
         surfaces_hold=_true_fraction(surface.holds for surface in report.surfaces.values()),
     )

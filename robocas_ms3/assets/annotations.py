@@ -29,17 +29,17 @@ GRIPPER_RADIUS = 0.22  # m, radius of a sphere around the TCP that contains all 
 
 @dataclass(frozen=True)
 class Annotations:
-    """Annotations of an object: S resting poses, G grasps, P surface points; metres, asset frame.
+    """Annotations of an object with S resting poses, G grasps and P surface points; metres, asset frame.
 
     Attributes:
-        resting_poses: (S, 4, 4) ``T_plane_object``: pose of the object in a frame whose plane z = 0 supports it, with
-            its centre of mass at x = y = 0.
-        footprints: (S, K, 2) convex polygon of the covered plane in each pose, counter-clockwise, relative to the
-            centre of mass; the last corner is repeated up to K corners.
+        resting_poses: (S, 4, 4) ``T_plane_object``: pose of the object on a horizontal plane, in a frame with z = 0 on
+            the plane and x = y = 0 below the centre of mass.
+        footprints: (S, K, 2) convex hull of the object's vertical projection in each resting pose, m: corners counter-
+            clockwise, relative to the centre of mass. A polygon with fewer than K corners repeats the last corner.
         resting_probabilities: (S,) fraction of random drops that end in each pose; the sum is 1.
-        display_pose: index of the upright pose, or -1.
+        display_pose: index of the resting pose in which the object is upright, or -1 if there is none.
         grasps_tcp_in_object: (G, 4, 4) TCP poses: z approach, y closing, origin between the finger tips.
-        grasp_widths: (G,) required finger opening, m.
+        grasp_widths: (G,) distance of the fingers at the grasp, m.
         grasp_qualities: (G,) smallest friction coefficient for force closure; smaller is better.
         surface_points: (P, 3) points on the visual mesh.
         surface_normals: (P, 3) outward unit normals of the points.
@@ -70,12 +70,13 @@ class Annotations:
         for name, shape in shapes.items():
             found = getattr(self, name)
             if found.shape != shape or not np.isfinite(found).all():
-                raise AssetError("wrong shape or non-finite numbers", where=name, expected=shape, found=found.shape)
+                found = "NaN or infinite values" if found.shape == shape else f"shape {found.shape}"
+                raise AssetError("invalid array", where=name, expected=f"finite numbers of shape {shape}", found=found)
         if poses == 0 or not -1 <= self.display_pose < poses:
             raise AssetError(
-                "index of a resting pose out of range",
+                "no resting pose with this index",
                 where="display_pose",
-                expected=f"-1 to {poses - 1}",
+                expected=f"-1 to {poses - 1}" if poses else "at least one resting pose",
                 found=self.display_pose,
             )
 
@@ -92,20 +93,25 @@ class Annotations:
             for name, array in arrays.items():
                 array.setflags(write=False)
                 if array.dtype.kind not in "fiu" or (array.ndim == 0) is not (name == "display_pose"):
-                    raise ValueError(f"{name} is {array.dtype} of shape {array.shape}")
+                    raise ValueError(f"{name}: expected numbers, found {array.dtype} of shape {array.shape}")
             return cls(**{**arrays, "display_pose": int(arrays["display_pose"])})
         except (*DAMAGED_FILE_ERRORS, AssetError, KeyError) as error:
             fix = "Make the pack again."
             raise AssetError("cannot read the annotations", where=path, found=error, fix=fix) from error
 
     def footprint(self, pose_index: int) -> Array:
-        """Return the footprint polygon (K, 2) of a resting pose in m, without repeated corners."""
+        """Return the corners (K, 2) of the footprint in one resting pose in m, without repeated corners."""
         corners = self.footprints[pose_index]
         return corners[~np.all(corners == np.roll(corners, 1, axis=0), axis=1)]
 
 
 def compute_footprints(hulls: list[Array], poses: Array) -> Array:
-    """Return the footprints of convex hulls (V, 3) in resting poses (S, 4, 4); see `Annotations`."""
+    """Return the vertical projections (S, K, 2) of an object in its resting poses, as `Annotations.footprints`.
+
+    Args:
+        hulls: vertices (V, 3) of each convex hull of the object, m, asset frame.
+        poses: (S, 4, 4) resting poses.
+    """
     points = np.concatenate(hulls)
     polygons = []
     for pose in poses:

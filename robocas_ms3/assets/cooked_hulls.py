@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull
 
 from robocas_ms3.assets.hulls import Array, find_box, read_hulls, slenderness
 from robocas_ms3.assets.pack import HULLS
-from robocas_ms3.assets.physics import cook
+from robocas_ms3.assets.physics import make_convex_shape
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 
@@ -27,10 +27,10 @@ MAX_SLENDERNESS = 100  # PhysX builds no hull for a GPU at or above this value
 
 @dataclass(frozen=True)
 class CookedHull:
-    """Result of cooking a hull.
+    """Comparison of a convex hull with the hull that PhysX builds from its vertices.
 
     Attributes:
-        shrinkage: m, distance of the farthest vertex from the cooked hull; infinite: the engine built no hull.
+        shrinkage: greatest distance of a vertex outside of PhysX's hull, m; infinite if PhysX built no hull.
         too_slender: whether the hull is too slender for a GPU.
     """
 
@@ -46,7 +46,7 @@ class HullViolation:
         asset: folder of the asset in the pack; ``<furniture>/links/<link>`` for a moving part.
         hull: index of the hull in the file.
         device: ``CPU`` or ``GPU``.
-        cooked: result of cooking the hull.
+        cooked: comparison with PhysX's hull.
     """
 
     asset: str
@@ -65,7 +65,13 @@ class HullViolation:
 
 
 def find_hull_violations(folder: Path) -> list[HullViolation]:
-    """Cook all hulls of a pack's folder except boxes; return hulls that shrink or cannot be built on CPU or GPU."""
+    """Build each hull of a pack with PhysX for CPU and GPU; return those that shrink or cannot be built.
+
+    Boxes are not built, because PhysX has an exact shape for them.
+
+    Args:
+        folder: the pack.
+    """
     named: list[tuple[str, int, Array]] = []
     for path in sorted(folder.rglob(HULLS)):
         name = path.parent.relative_to(folder).as_posix()
@@ -77,7 +83,7 @@ def find_hull_violations(folder: Path) -> list[HullViolation]:
 
     def raise_crash(task: object, reason: str) -> NoReturn:
         raise AssetError(
-            "the process that cooked the hulls crashed",
+            "the process that checked the convex hulls crashed",
             where=folder,
             found=reason,
             fix="Free some memory and try again.",
@@ -95,12 +101,12 @@ def find_hull_violations(folder: Path) -> list[HullViolation]:
 
 
 def cook_hulls(hulls: Sequence[Array]) -> list[CookedHull]:
-    """Cook convex hulls of points (V, 3) with the engine settings of this process."""
+    """Build convex hulls of vertices (V, 3) with PhysX, with the engine settings of this process."""
     material = physx.PhysxMaterial(0.5, 0.5, 0.0)
     results = []
     for vertices in hulls:
         try:
-            shape = cook(vertices, material)
+            shape = make_convex_shape(vertices, material)
         except RuntimeError:
             results.append(CookedHull(np.inf, too_slender=False))
             continue

@@ -32,14 +32,14 @@ class Hull:
 
 @dataclass(frozen=True)
 class Box:
-    """A box: half sizes (3,) in m, and the pose (4, 4) of its centre and axes in the hull's frame."""
+    """A box: half of its size (3,) in m, and the pose (4, 4) of its centre in the frame of the hull."""
 
     half_size: Array
     pose: Array
 
 
 def read_hulls(path: Path) -> list[Hull]:
-    """Read ``hulls.obj``, which has one ``o`` group of triangles per hull."""
+    """Read the convex hulls of ``hulls.obj``, in which each hull is an ``o`` group of triangles."""
     vertices: list[list[float]] = []
     groups: list[list[list[int]]] = []
     try:
@@ -56,15 +56,16 @@ def read_hulls(path: Path) -> list[Hull]:
             faces = np.array(group, dtype=np.int64).reshape(-1, 3)
             used, local = np.unique(faces, return_inverse=True)
             if len(used) and used[0] < 0:
-                raise IndexError(f"no vertex {used[0] + 1}")
+                raise IndexError(f"a triangle with vertex number {used[0] + 1}; the first vertex has number 1")
             hulls.append(Hull(_frozen(points[used]), _frozen(local.reshape(-1, 3))))
         if not np.isfinite(points).all():
-            raise ValueError("NaN or infinity")
+            raise ValueError("a vertex with NaN or infinite coordinates")
     except (OSError, ValueError, IndexError, OverflowError) as error:
         fix = "Make the pack again."
         raise AssetError("cannot read the convex hulls", where=path, found=str(error), fix=fix) from error
     if not hulls or any(len(hull.faces) < 4 for hull in hulls):
-        raise AssetError("no convex hull in the file", where=path, fix="Make the pack again.")
+        expected, found = "at least one hull, each with at least 4 triangles", format_count(len(hulls), "hull")
+        raise AssetError("invalid convex hulls", where=path, expected=expected, found=found, fix="Make the pack again.")
     return hulls
 
 
@@ -72,7 +73,7 @@ def write_hulls(path: Path, hulls: Sequence[Array]) -> None:
     """Write convex hulls of points (V, 3) to ``hulls.obj``, one ``o`` group per hull, with outward faces."""
     lines, offset = [], 1
     for number, points in enumerate(hulls):
-        vertices, faces = convex_faces(points)
+        vertices, faces = make_convex_mesh(points)
         lines.append(f"o hull_{number}")
         lines += [f"v {x:.7f} {y:.7f} {z:.7f}" for x, y, z in vertices]
         lines += [f"f {a} {b} {c}" for a, b, c in faces + offset]
@@ -80,14 +81,13 @@ def write_hulls(path: Path, hulls: Sequence[Array]) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
-def convex_faces(points: Array) -> tuple[Array, NDArray[np.int64]]:
+def make_convex_mesh(points: Array) -> tuple[Array, NDArray[np.int64]]:
     """Return vertices (V, 3) and outward triangles (F, 3) of the convex hull of points (P, 3)."""
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError) as error:
-        raise AssetError(
-            "the points of a convex hull are coplanar", found=format_count(len(points), "point")
-        ) from error
+        expected, found = "at least 4 points that are not in one plane", format_count(len(points), "point")
+        raise AssetError("no convex hull of these points", expected=expected, found=found) from error
     used, local = np.unique(hull.simplices, return_inverse=True)
     vertices, faces = np.asarray(points, dtype=np.float64)[used], local.reshape(-1, 3)
     corners = vertices[faces]
@@ -98,9 +98,9 @@ def convex_faces(points: Array) -> tuple[Array, NDArray[np.int64]]:
 
 
 def find_box(vertices: Array) -> Box | None:
-    """Return the box with these corners (8, 3) in any orientation, or None if they do not form a box.
+    """Return the box with the corners ``vertices`` (8, 3), which may be rotated; None if they do not form a box.
 
-    Order and signs of the axes are chosen for the smallest rotation: an axis-aligned box has no rotation.
+    The axes are ordered so that the rotation is as small as possible. An axis-aligned box has no rotation.
     """
     if len(vertices) != 8:
         return None
@@ -133,7 +133,7 @@ def _box_of(corners: bytes) -> Box | None:
 
 
 def _edges(vectors: Array) -> Array | None:
-    """Return the three edges (3, 3) of a box at a corner from the vectors (7, 3) to the other corners, or None."""
+    """Return the three edges (3, 3) of a box at one corner, from the vectors (7, 3) to its other corners, or None."""
     found: list[Array] = []
     for way in vectors[np.argsort(np.linalg.norm(vectors, axis=1), kind="stable")]:
         if all(abs(way @ edge) <= _BOX_TOLERANCE * np.linalg.norm(way) for edge in found):
@@ -142,7 +142,11 @@ def _edges(vectors: Array) -> Array | None:
 
 
 def slenderness(points: Array) -> float:
-    """Return reach over least depth of the convex hull of points (V, 3), from its centre of mass; a cube has 1."""
+    """Return the slenderness of the convex hull of points (V, 3); a cube has 1.
+
+    It is the greatest coordinate distance of a point from the centre of mass, divided by the least distance of the
+    centre of mass from a face.
+    """
     center = center_of_mass(points)
     depth = -(ConvexHull(points).equations @ np.append(center, 1.0)).max()
     return float(np.abs(points - center).max() / depth)
@@ -157,7 +161,10 @@ def center_of_mass(points: Array) -> Array:
 
 
 def sample_surface(hulls: Sequence[Hull], spacing: float) -> Array:
-    """Return points (P, 3) on the surface of the union of hulls, about ``spacing`` m apart; deterministic."""
+    """Return points (P, 3) on the surface of the union of convex hulls, about ``spacing`` m apart.
+
+    Points of one hull inside another hull are left out. The result is deterministic.
+    """
     equations = [ConvexHull(hull.vertices).equations for hull in hulls]
     kept = []
     for index, hull in enumerate(hulls):
@@ -171,7 +178,7 @@ def sample_surface(hulls: Sequence[Hull], spacing: float) -> Array:
                 depth = np.max(points[close] @ planes[:, :3].T + planes[:, 3], axis=1)
                 points = np.delete(points, close[depth <= -_HIDDEN_DEPTH], axis=0)
         kept.append(points)
-    return thin_points(np.concatenate(kept), spacing)
+    return downsample_points(np.concatenate(kept), spacing)
 
 
 def sample_triangles(corners: Array, spacing: float) -> Array:
@@ -192,8 +199,8 @@ def sample_triangles(corners: Array, spacing: float) -> Array:
     return np.concatenate(points)
 
 
-def thin_points(points: Array, spacing: float) -> Array:
-    """Keep the first of the points (P, 3) in each cube with edges of ``spacing / 2``."""
+def downsample_points(points: Array, spacing: float) -> Array:
+    """Return the first of the points (P, 3) in each cell of a grid with the cell size ``spacing / 2``."""
     cells = np.floor(points / (spacing / 2) + 0.25).astype(np.int64)
     low, high = cells.min(axis=0), cells.max(axis=0)
     key = np.ravel_multi_index(tuple((cells - low).T), tuple(high - low + 1))  # one number per cell sorts faster

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 def joint_motion(joint: Joint, position: float) -> Array:
-    """Return the motion (4, 4) of a link from joint position 0 to ``position`` (m or rad) in the furniture's frame."""
+    """Return the motion (4, 4) of a link, furniture frame, from joint position 0 to ``position`` in m or rad."""
     motion = np.eye(4)
     if joint.kind == "prismatic":
         motion[:3, 3] = np.multiply(joint.axis, position)
@@ -25,7 +25,12 @@ def joint_motion(joint: Joint, position: float) -> Array:
 
 
 def link_poses(links: Sequence[Link], positions: Mapping[str, float]) -> dict[str, Array]:
-    """Return the poses (4, 4) of links, listed parents first, in the furniture's frame; missing joints are at 0."""
+    """Return the pose (4, 4) of each link by name, in the frame of the furniture.
+
+    Args:
+        links: moving parts; a parent is listed before its children.
+        positions: joint name -> position, m or rad; joints that are not listed are at 0.
+    """
     poses: dict[str, Array] = {}
     for link in links:
         above = poses[link.parent] if link.parent else np.eye(4)
@@ -34,7 +39,7 @@ def link_poses(links: Sequence[Link], positions: Mapping[str, float]) -> dict[st
 
 
 def joint_frame(joint: Joint) -> Array:
-    """Return the pose (4, 4) of a frame at the joint's origin with x along its axis, in the furniture's frame."""
+    """Return the pose (4, 4) of a joint in the furniture's frame: origin of the joint, x along its axis."""
     x = np.asarray(joint.axis, dtype=float)
     x = x / np.linalg.norm(x)
     y = np.cross(x, np.eye(3)[np.argmin(np.abs(x))])

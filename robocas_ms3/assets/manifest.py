@@ -41,7 +41,7 @@ def _check_unit_norm(wxyz: tuple[float, float, float, float]) -> tuple[float, fl
 def _check_moments(moments: tuple[float, float, float]) -> tuple[float, float, float]:
     a, b, c = sorted(moments)
     if a + b < 0.99 * c:  # tolerance for flat bodies, where a + b = c
-        raise ValueError(f"invalid moments of inertia {moments}: the largest exceeds the sum of the others")
+        raise ValueError(f"invalid moments of inertia {moments}: expected the largest at most the sum of the others")
     return moments
 
 
@@ -70,14 +70,19 @@ Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 def check_asset_name(name: str, where: object) -> None:
-    """Raise AssetError if a name of an asset, link or finish cannot be used as a file name in a pack."""
+    """Raise AssetError if the name of an asset, link or finish is no valid file name of a pack.
+
+    Args:
+        name: the name.
+        where: file or option with the name, for the message.
+    """
     if re.fullmatch("[a-z0-9_]+", name) is None or len(name) > MAX_NAME_BYTES:
         expected = f"1 to {MAX_NAME_BYTES} lower-case letters, digits and underscores"
         raise AssetError("invalid name in an asset pack", where=where, expected=expected, found=repr(name)[:80])
 
 
 class Surface(StrictModel):
-    """A horizontal rectangle of furniture for objects, in the furniture's frame (metres)."""
+    """Horizontal rectangle of a piece of furniture on which objects can stand; furniture frame, m."""
 
     link: str = Field(default="", description="moving part with this surface; empty: the fixed body")
     min_xy: tuple[float, float]
@@ -88,19 +93,19 @@ class Surface(StrictModel):
     @model_validator(mode="after")
     def _check(self) -> Surface:
         if not all(low < high for low, high in zip(self.min_xy, self.max_xy, strict=True)):
-            raise ValueError(f"min_xy {self.min_xy} must be less than max_xy {self.max_xy}")
+            raise ValueError(f"min_xy {self.min_xy}: expected both components less than those of max_xy {self.max_xy}")
         return self
 
 
 class InnerBox(StrictModel):
-    """The inside of a container: an axis-aligned box in the container's frame (metres)."""
+    """Inner volume of a container: an axis-aligned box in the frame of the container, m."""
 
     min: Vec3
     max: Vec3
 
 
 class Joint(StrictModel):
-    """Joint of a moving part, in the furniture's frame with all joints at 0."""
+    """Joint of a moving part; furniture frame, when all joints are at 0."""
 
     name: Name
     kind: Literal["prismatic", "revolute"]
@@ -115,7 +120,7 @@ class Joint(StrictModel):
         if abs(sum(x * x for x in self.axis) - 1) > 1e-6:
             raise ValueError(f"expected a unit vector as axis, found {self.axis}")
         if not self.limits[0] <= 0 <= self.limits[1] or self.limits[0] == self.limits[1]:
-            raise ValueError(f"limits must include 0 (closed), found {self.limits}")
+            raise ValueError(f"expected limits [least, greatest] that include 0 (closed), found {self.limits}")
         return self
 
 
@@ -132,7 +137,10 @@ class Link(StrictModel):
 
 
 class Handle(StrictModel):
-    """Grasp of a moving part: TCP pose (z approach, y closing) in the furniture's frame with all joints at 0."""
+    """Handle of a moving part: the TCP pose that grasps it (z approach, y closing).
+
+    The pose is in the furniture's frame, when all joints are at 0.
+    """
 
     link: Name
     position: Vec3
@@ -225,11 +233,11 @@ class FurnitureAsset(AssetBase):
     @model_validator(mode="after")
     def _check(self) -> FurnitureAsset:
         if self.mass is not None and self.inertia is None:
-            raise ValueError("expected an inertia in addition to the mass")
+            raise ValueError("furniture with a mass needs the key inertia")
         known, joints = {""}, {BODY}
         for link in self.links:
             if link.parent not in known:
-                raise ValueError(f"parent {link.parent!r} of link {link.name!r} must be listed before the link")
+                raise ValueError(f"expected the parent {link.parent!r} of link {link.name!r} before this link")
             if link.name in {BODY, *known}:
                 raise ValueError(f"duplicate link name {link.name!r} ({BODY!r} is reserved for the fixed body)")
             if link.joint.name in joints:
@@ -239,7 +247,7 @@ class FurnitureAsset(AssetBase):
         named = {name: part.link for name, part in [*self.surfaces.items(), *self.handles.items()]}
         for name, link_name in named.items():
             if link_name not in known:
-                raise ValueError(f"unknown link {link_name!r} of {name!r}")
+                raise ValueError(f"unknown link {link_name!r} of {name!r}, expected one of {sorted(known - {''})}")
         return self
 
 

@@ -40,12 +40,12 @@ _packs: dict[
 
 @dataclass(frozen=True)
 class BodyFiles:
-    """Files of one body: visual meshes and convex hulls in a folder."""
+    """Folder with the files of one body: visual meshes and convex hulls."""
 
     folder: Path
     _points: dict[float, Array] = field(default_factory=dict, repr=False, compare=False)
 
-    def visual(self, level: VisualLevel = "fast") -> Path:
+    def visual_path(self, level: VisualLevel = "fast") -> Path:
         """Return the path of the textured mesh (GLB) at a level of detail."""
         return self.folder / VISUALS[level]
 
@@ -65,7 +65,7 @@ class BodyFiles:
         return [hull.vertices for hull in self.hull_meshes]
 
     def surface_points(self, spacing: float = 0.005) -> Array:
-        """Return points (P, 3) on the surface of the hulls' union, about ``spacing`` m apart, in the asset's frame."""
+        """Return points (P, 3) on the surface of all convex hulls, about ``spacing`` m apart, in the asset's frame."""
         if spacing not in self._points:
             points = sample_surface(self.hull_meshes, spacing)
             points.setflags(write=False)
@@ -86,28 +86,32 @@ class LoadedObject(BodyFiles):
 
 @dataclass(frozen=True)
 class LoadedFurniture(BodyFiles):
-    """Furniture, a basket or a room, with its manifest entry; its own files are those of the fixed body.
+    """Furniture, a basket or a room, with its manifest entry. The files in its folder are those of the fixed body.
 
     Attributes:
-        links: moving parts by name, in the furniture's frame with all joints at 0.
+        links: files of each moving part by name; the meshes are in the furniture's frame when all joints are at 0.
     """
 
     asset: FurnitureAsset = field(kw_only=True)
     links: dict[str, BodyFiles] = field(default_factory=dict, kw_only=True)
 
-    def all_surface_points(self, positions: Mapping[str, float]) -> Array:
-        """Return points (P, 3) on body and links in the furniture's frame, m; joints not in ``positions`` are at 0."""
-        poses = link_poses(self.asset.links, positions)
+    def all_surface_points(self, joint_positions: Mapping[str, float]) -> Array:
+        """Return points (P, 3) on the fixed body and all moving parts, in the furniture's frame, m.
+
+        Args:
+            joint_positions: joint name -> position, m or rad; joints that are not listed are at 0.
+        """
+        poses = link_poses(self.asset.links, joint_positions)
         links = [transform_points(pose, self.links[name].surface_points()) for name, pose in poses.items()]
         return np.concatenate([self.surface_points(), *links])
 
-    def finish(self, part: str, name: str) -> Path:
-        """Return the path of the textured mesh (GLB) of a part with a finish."""
-        found = self.asset.finishes.get(part, ())
-        if name not in found:
+    def finish_path(self, part: str, finish: str) -> Path:
+        """Return the path of the textured mesh (GLB) of a part of a room, such as the floor, with a finish."""
+        known = self.asset.finishes.get(part, ())
+        if finish not in known:
             what = f"{self.asset.id}: no such finish of {part!r}"
-            raise AssetError(what, expected=f"one of {', '.join(found) or '(none)'}", found=name)
-        return self.folder / FINISHES / f"{part}_{name}.glb"
+            raise AssetError(what, expected=f"one of {', '.join(known) or '(none)'}", found=finish)
+        return self.folder / FINISHES / f"{part}_{finish}.glb"
 
 
 @dataclass(frozen=True)
@@ -122,7 +126,10 @@ class Pack:
 
 
 def find_packs() -> dict[str, Path]:
-    """Return name -> folder of all packs; bundled packs come first and cannot be replaced by a user's pack."""
+    """Return the folder of each installed pack by name, bundled packs first.
+
+    A pack of the user with the name of a bundled pack is left out.
+    """
     found: dict[str, Path] = {}
     for parent in (builtin_packs_dir(), data_dir() / "packs"):
         if parent.is_dir():
@@ -162,13 +169,16 @@ def load_pack(name_or_path: str | Path) -> Pack:
 
 
 def verify_pack(pack: Pack) -> None:
-    """Check all files of a pack against its manifest; an unchanged file is read once per process."""
+    """Compare the sha256 of each file of a pack with the manifest; raise AssetError for the first difference.
+
+    Each process reads a file only once, unless its size or modification time changes.
+    """
     for asset in pack.manifest.assets:
         folder = pack.root / asset.id
         for name in _iter_files(str(folder)):
             if name not in asset.files:
-                what = "file is not in the manifest of the asset pack"
-                raise AssetError(what, where=folder / name, fix="Remove it, or make the pack again.")
+                what = "file without an entry in the manifest of the asset pack"
+                raise AssetError(what, where=folder / name, fix="Remove the file, or make the pack again.")
         fix = f"Restore the file, or make the pack {pack.name!r} again."
         for name, wanted in asset.files.items():
             path = folder / name
@@ -184,7 +194,7 @@ def verify_pack(pack: Pack) -> None:
 
 
 def sha256(path: Path) -> str:
-    """Return the sha256 of a file; cached by size and modification time."""
+    """Return the sha256 of a file as 64 hex digits. The result is cached by size and modification time."""
     check_regular(path, _FILE_LIMIT)
     status = path.stat()
     key = (str(path), status.st_size, status.st_mtime_ns)
@@ -226,7 +236,7 @@ def _read(folder: Path, path: Path) -> Pack:
             raise AssetError(what, where=path, expected=expected, found=found, fix=fix)
         manifest = validate_json(PackManifest, data)
     except (OSError, DocumentError) as error:
-        raise AssetError("cannot read the manifest of the asset pack", where=path, found=error) from error
+        raise AssetError("cannot read the manifest of the asset pack", where=path, found=error, fix=fix) from error
     except ValidationError as error:
         raise error_from_validation(
             error, PackManifest, AssetError, where=path, about="the manifest is damaged", fix=fix
@@ -235,10 +245,11 @@ def _read(folder: Path, path: Path) -> Pack:
     furniture: dict[str, LoadedFurniture] = {}
     for asset in manifest.assets:
         if asset.id in objects or asset.id in furniture:
-            raise AssetError("duplicate asset id in the pack", where=path, found=asset.id)
+            raise AssetError("two assets of the pack have the same id", where=path, found=asset.id, fix=fix)
         for name in _required_files(asset):
             if name not in asset.files:
-                raise AssetError("required file is missing in the manifest", where=path, expected=f"{asset.id}/{name}")
+                what, expected = "the manifest has no entry for a required file", f"{asset.id}/{name}"
+                raise AssetError(what, where=path, expected=expected, fix=fix)
         home = folder / asset.id
         if isinstance(asset, ObjectAsset):
             objects[asset.id] = LoadedObject(home, asset=asset)

@@ -29,7 +29,16 @@ SPACING = 10.0  # m between objects that are simulated together
 
 @dataclass(frozen=True)
 class RigidBody:
-    """A free rigid body: hulls (V, 3) in m, mass in kg, principal moments (3,) in kg m2 and their axes."""
+    """A free rigid body.
+
+    Attributes:
+        hulls: vertices (V, 3) of each convex hull, m, body frame.
+        mass: kg.
+        center_of_mass: (3,) m, body frame.
+        inertia: (3,) principal moments, kg m2.
+        inertia_wxyz: (4,) orientation of the principal axes, body frame.
+        friction: static and dynamic friction coefficient.
+    """
 
     hulls: Sequence[Array]
     mass: float
@@ -41,7 +50,7 @@ class RigidBody:
 
 @contextmanager
 def engine_settings() -> Iterator[None]:
-    """Use the physics settings of the environments in this process; restore the old settings at the end."""
+    """Within a ``with`` block, give this process the physics settings of the environments."""
     scene, body, shape = physx.get_scene_config(), physx.get_body_config(), physx.get_shape_config()
     gravity: Any = np.array([0, 0, -9.81])  # the type in SAPIEN's stubs fits no NumPy array
     physx.set_scene_config(gravity=gravity)
@@ -56,37 +65,44 @@ def engine_settings() -> Iterator[None]:
 
 
 def make_scene(time_step: float = TIME_STEP) -> sapien.Scene:
-    """Create an empty scene without a renderer; call it within `engine_settings`."""
+    """Create an empty scene without a renderer, within a ``with engine_settings()`` block."""
     scene = sapien.Scene([physx.PhysxCpuSystem()])
     scene.set_timestep(time_step)
     return scene
 
 
-def add_body(scene: sapien.Scene, solid: RigidBody, pose: Array) -> physx.PhysxRigidDynamicComponent:
-    """Add a free body at a pose (4, 4) of its frame in the world."""
-    material = physx.PhysxMaterial(solid.friction, solid.friction, 0.0)
+def add_body(scene: sapien.Scene, rigid_body: RigidBody, pose: Array) -> physx.PhysxRigidDynamicComponent:
+    """Add a free body to a scene; ``pose`` (4, 4) is the pose of the body frame in the world."""
+    material = physx.PhysxMaterial(rigid_body.friction, rigid_body.friction, 0.0)
     free = physx.PhysxRigidDynamicComponent()
     try:
-        for piece in solid.hulls:
+        for piece in rigid_body.hulls:
             free.attach(make_shape(piece, material))
     except RuntimeError as error:
         raise AssetError("the physics engine rejected a convex hull", found=error) from error
-    free.mass = solid.mass
-    free.cmass_local_pose = sapien.Pose(solid.center_of_mass, solid.inertia_wxyz)
-    free.set_inertia(np.asarray(solid.inertia, np.float64).tolist())
+    free.mass = rigid_body.mass
+    free.cmass_local_pose = sapien.Pose(rigid_body.center_of_mass, rigid_body.inertia_wxyz)
+    free.set_inertia(np.asarray(rigid_body.inertia, np.float64).tolist())
     free.linear_damping = free.angular_damping = DAMPING
     add_component(scene, free, sapien.Pose(pose))
     return free
 
 
-def make_solid(asset: LoadedObject) -> RigidBody:
+def make_rigid_body(asset: LoadedObject) -> RigidBody:
     facts = asset.asset
     moments, center, axes = (np.array(v) for v in (facts.inertia, facts.center_of_mass, facts.inertia_wxyz))
     return RigidBody(asset.hulls, facts.mass, center, moments, axes, facts.friction)
 
 
 def add_static_body(scene: sapien.Scene, hulls: Sequence[Array], pose: Array, friction: float) -> None:
-    """Add a static body of convex hulls (V, 3) at a pose (4, 4) in the world."""
+    """Add a static body to a scene.
+
+    Args:
+        scene: the scene.
+        hulls: vertices (V, 3) of each convex hull, m, body frame.
+        pose: (4, 4) pose of the body frame in the world.
+        friction: static and dynamic friction coefficient.
+    """
     material = physx.PhysxMaterial(friction, friction, 0.0)
     body = physx.PhysxRigidStaticComponent()
     for piece in hulls:
@@ -95,7 +111,7 @@ def add_static_body(scene: sapien.Scene, hulls: Sequence[Array], pose: Array, fr
 
 
 def add_ground(scene: sapien.Scene, origin: Array) -> None:
-    """Add a table of 2 x 2 m with the centre of its top at a point (3,)."""
+    """Add a static square of 2 x 2 m to a scene; ``origin`` (3,) is the centre of its upper side in the world, m."""
     material = physx.PhysxMaterial(TABLE_FRICTION, TABLE_FRICTION, 0.0)
     ground = physx.PhysxRigidStaticComponent()
     ground.attach(physx.PhysxCollisionShapeBox([1.0, 1.0, 0.05], material))
@@ -103,34 +119,34 @@ def add_ground(scene: sapien.Scene, origin: Array) -> None:
 
 
 def grid_origins(count: int) -> Array:
-    """Return grid positions (N, 3) of objects that are simulated together, four per row."""
+    """Return positions (count, 3) in m for objects that are simulated together: a grid with four per row."""
     origins = np.zeros((count, 3))
     origins[:, 0], origins[:, 1] = np.arange(count) % 4 * SPACING, np.arange(count) // 4 * SPACING
     return origins
 
 
 def make_shape(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShape:
-    """Create the shape of a convex hull (V, 3); corners of a box give a box, which is exact and fast."""
+    """Create the collision shape of a convex hull with vertices (V, 3); a box shape if the hull is a box."""
     box = find_box(vertices)
-    return cook(vertices, material) if box is None else _box_shape(box, material)
+    return make_convex_shape(vertices, material) if box is None else _box_shape(box, material)
 
 
-def cook(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShapeConvexMesh:
-    """Create the engine's convex mesh of points (V, 3), which may be smaller than their hull (`cooked_hulls`)."""
+def make_convex_shape(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShapeConvexMesh:
+    """Create PhysX's convex mesh of points (V, 3). It may be smaller than their convex hull (`cooked_hulls`)."""
     return physx.PhysxCollisionShapeConvexMesh(
         vertices=np.asarray(vertices, np.float32), scale=[1, 1, 1], material=material
     )
 
 
-def load_shapes(part: BodyFiles, material: physx.PhysxMaterial) -> list[physx.PhysxCollisionShape]:
-    """Return the shapes of all hulls of a body; bodies of the same file share the engine's meshes."""
-    boxes = [find_box(hull) for hull in part.hulls]
+def load_shapes(files: BodyFiles, material: physx.PhysxMaterial) -> list[physx.PhysxCollisionShape]:
+    """Return the collision shape of each convex hull of a body. Bodies of one file share PhysX's meshes."""
+    boxes = [find_box(hull) for hull in files.hulls]
     # boxes are not cooked: the engine rejects slender ones on a GPU
-    loaded = [] if all(boxes) else _load(part.hulls_path, material)
+    loaded = [] if all(boxes) else _load_meshes(files.hulls_path, material)
     if loaded and len(loaded) != len(boxes):
         raise AssetError(
             "the physics engine rejected a convex hull",
-            where=part.hulls_path,
+            where=files.hulls_path,
             expected=f"{len(boxes)} hulls",
             found=len(loaded),
             fix="Import the asset again.",
@@ -138,11 +154,12 @@ def load_shapes(part: BodyFiles, material: physx.PhysxMaterial) -> list[physx.Ph
     return [_box_shape(box, material) if box is not None else loaded[i] for i, box in enumerate(boxes)]
 
 
-def _load(path: Path, material: physx.PhysxMaterial) -> list[physx.PhysxCollisionShapeConvexMesh]:
+def _load_meshes(path: Path, material: physx.PhysxMaterial) -> list[physx.PhysxCollisionShapeConvexMesh]:
     try:
         return physx.PhysxCollisionShapeConvexMesh.load_multiple(str(path), [1, 1, 1], material)
     except RuntimeError as error:
-        raise AssetError("the physics engine rejected a convex hull", where=path, found=error) from error
+        fix = "Import the asset again."
+        raise AssetError("the physics engine rejected a convex hull", where=path, found=error, fix=fix) from error
 
 
 def _box_shape(box: Box, material: physx.PhysxMaterial) -> physx.PhysxCollisionShapeBox:

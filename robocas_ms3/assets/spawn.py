@@ -27,16 +27,16 @@ def spawn(
     finishes: Mapping[str, str] | None = None,
     scene_idxs: Sequence[int] | None = None,
 ) -> Actor:
-    """Build an asset without moving parts as an actor: dynamic if it has a mass, static otherwise.
+    """Build an asset without moving parts as an actor. The actor is dynamic if the asset has a mass, otherwise static.
 
     Args:
         scene: the ManiSkill scene.
-        asset: the asset.
+        asset: object, furniture, basket or room.
         name: unique name of the actor.
         pose: initial pose of the asset's frame in the world.
         level: level of detail of the visual mesh.
-        finishes: part -> finish, for rooms; other parts have their default finish.
-        scene_idxs: indices of the sub-scenes; default: all.
+        finishes: part of a room -> finish; parts that are not listed have their default finish.
+        scene_idxs: indices of the sub-scenes that get the actor; default: all.
 
     Raises:
         AssetError: the physics engine rejected a hull, or a finish is unknown.
@@ -46,7 +46,7 @@ def spawn(
     _add_shapes(builder, asset, facts.friction, level, render=scene.can_render())
     if scene.can_render() and isinstance(asset, LoadedFurniture):
         for part, known in asset.asset.finishes.items():
-            builder.add_visual_from_file(str(asset.finish(part, (finishes or {}).get(part, known[0]))))
+            builder.add_visual_from_file(str(asset.finish_path(part, (finishes or {}).get(part, known[0]))))
     builder.initial_pose = pose
     if scene_idxs is not None:
         builder.set_scene_idxs(list(scene_idxs))
@@ -67,7 +67,15 @@ def spawn_articulation(
     pose: sapien.Pose,
     level: VisualLevel = "fast",
 ) -> Articulation:
-    """Build furniture with moving parts, with a fixed body and all joints at 0; arguments as in `spawn`."""
+    """Build furniture with moving parts as an articulation with a fixed root; all joints are at 0.
+
+    Args:
+        scene: the ManiSkill scene.
+        asset: the furniture.
+        name: unique name of the articulation.
+        pose: pose of the furniture's frame in the world.
+        level: level of detail of the visual meshes.
+    """
     builder: Any = scene.create_articulation_builder()
     facts = asset.asset
     root = builder.create_link_builder()
@@ -106,11 +114,11 @@ def _add_shapes(builder: Any, part: BodyFiles, friction: float, level: VisualLev
 
     builder.build_physx_component = build
     if render:
-        builder.add_visual_from_file(str(part.visual(level)))
+        builder.add_visual_from_file(str(part.visual_path(level)))
 
 
 def _set_mass(builder: Any, facts: ObjectAsset | FurnitureAsset | Link) -> None:
     if facts.inertia is None:
-        raise AssetError("expected an inertia in addition to the mass", where=getattr(facts, "id", ""))
+        raise AssetError("an asset with a mass needs the key inertia", where=getattr(facts, "id", ""))
     frame = sapien.Pose(list(facts.center_of_mass), list(facts.inertia_wxyz))
     builder.set_mass_and_inertia(facts.mass, frame, np.array(facts.inertia))

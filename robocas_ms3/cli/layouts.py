@@ -81,7 +81,7 @@ def build(command: Build) -> int:
     pairs = seed_pairs(seeds, objects)
     cache = LayoutCache(SceneModel.load(config, *packs), command.out or "auto")
     engine = choose_engine(command.engine) if objects is not None else None
-    present = len(pairs) - len(cache.missing(pairs))
+    present = len(pairs) - len(cache.missing_pairs(pairs))
     failures = 0
     with ProgressBar("layouts sampled") as bar:
         bar.start(len(pairs), present)
@@ -100,7 +100,7 @@ def build(command: Build) -> int:
     sampled = len(pairs) - present - failures
     counts = f"{format_count(sampled, 'layout')} sampled, {present} already present"
     print_line(f"{counts}, {format_count(failures, 'seed')} without a layout")
-    if engine is not None and (table := cache.table(engine)) is not None:
+    if engine is not None and (table := cache.load_table(engine)) is not None:
         sets, arrangements = table.rows.shape
         size = f"{format_count(sets, 'object seed')} x {format_count(arrangements, 'seed')}"
         print_line(f"layout table: {cache.table_path(engine)}, {size}")
@@ -139,16 +139,16 @@ def check_stability(cache: LayoutCache, engine: Engine, **packs: str) -> int:
                     bar.advance()
         finally:  # keeps the results if interrupted
             cache.write_statuses(engine, found)
-    table = cache.table(engine)
-    return len(table.pairs(LayoutStatus.UNSTABLE)) if table else 0
+    table = cache.load_table(engine)
+    return len(table.find_pairs(LayoutStatus.UNSTABLE)) if table else 0
 
 
 def info(command: Info) -> int:
     from robocas_ms3.cli.terminal import print_line, print_table
     from robocas_ms3.core.documents import load_json
-    from robocas_ms3.scenes.cache import ABOUT, caches_folder, count_layouts
+    from robocas_ms3.scenes.cache import ABOUT, count_layouts, layout_caches_folder
 
-    root = caches_folder(command.folder or "auto")
+    root = layout_caches_folder(command.folder or "auto")
     rows = []
     for path in sorted(root.glob(f"*/{ABOUT}")):
         try:

@@ -48,7 +48,7 @@ class EpisodeGenerator:
         self.settings = settings
         config, robot = load_task_config(settings.config), find_robot(settings.robot)
         chosen: dict[str, Any] = {} if settings.robot == DEFAULT_ROBOT else {"robot_uids": settings.robot}
-        self.horizon = TASKS[settings.task].steps(settings.control_freq)
+        self.horizon = TASKS[settings.task].horizon_steps(settings.control_freq)
         self.env = gym.make(
             TASKS[settings.task].env_id,
             max_episode_steps=self.horizon,

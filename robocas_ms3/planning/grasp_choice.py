@@ -13,7 +13,7 @@ from robocas_ms3.scenes.grasp_checks import (
     MAX_WIDTH,
     TESTED_AT_ONCE,
     Approach,
-    check_directions,
+    grasp_direction_tests,
     to_tcp_frames,
 )
 
@@ -56,7 +56,7 @@ def filter_grasps(
     poses = object_in_world @ annotations.grasps_tcp_in_object
     base_to_object = object_in_world[:3, 3] - arm_base_in_world[:3, 3]
     passed = annotations.grasp_widths <= MAX_WIDTH
-    for test in check_directions(poses, base_to_object, approach).values():
+    for test in grasp_direction_tests(poses, base_to_object, approach).values():
         passed = passed & test
     index = np.flatnonzero(passed)
     both = np.concatenate([index, index])

@@ -85,12 +85,12 @@ class Recorder:
     def _open(self, part: int) -> None:
         settings = recording_settings(self._plan, part)
         if "layouts" in self._plan.stages:
-            from robocas_ms3.scenes.cache import layout_source
+            from robocas_ms3.scenes.cache import make_layout_source
 
             config, robot = load_config_for(TASKS[settings.task], settings.config), find_robot(settings.robot)
             pack = load_pack(settings.pack)
             self._model = SceneModel.load(config, pack, load_pack("builtin"), robot=robot.description)
-            self._layouts = layout_source(self._model, settings.layouts)
+            self._layouts = make_layout_source(self._model, settings.layouts)
         if "demonstrations" in self._plan.stages:
             from robocas_ms3.demos.generator import EpisodeGenerator  # imports the simulator
 

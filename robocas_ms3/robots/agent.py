@@ -23,7 +23,7 @@ from robocas_ms3.robots.joint_controllers import (
     BASE_SCALE,
     JOINT_SCALE,
     FingersControllerConfig,
-    HeldJointsControllerConfig,
+    HoldJointsControllerConfig,
     JointDeltaControllerConfig,
     RobotController,
     SmoothJointPosControllerConfig,
@@ -114,7 +114,7 @@ class MobileManipulator(BaseAgent):
         low, high = robot.finger_targets
         mimic: dict[str, Any] = {fingers[1]: {"joint": fingers[0]}}
         hand = FingersControllerConfig(fingers, lower=low, upper=high, mimic=mimic, **self.gripper_drive)
-        held = HeldJointsControllerConfig(base_joints, **base)
+        held = HoldJointsControllerConfig(base_joints, **base)
         moving: dict[str, Any] = {**base, "max_speed": self.base_max_speed}
         base_targets = SmoothJointPosControllerConfig(base_joints, None, None, **moving)
         low_base, high_base = [-scale for scale in BASE_SCALE], list(BASE_SCALE)

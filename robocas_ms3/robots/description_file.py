@@ -141,7 +141,7 @@ class RobotXml:
         return self.numbers(limit, "lower", 1)[0], self.numbers(limit, "upper", 1)[0]
 
 
-def tcp_and_base_poses(spec: RobotSpec, root_in_world: Array, qpos: Array) -> tuple[Array, Array]:
+def tcp_and_arm_base_poses(spec: RobotSpec, root_in_world: Array, qpos: Array) -> tuple[Array, Array]:
     """Return the poses of the TCP and of the arm's base in the world frame, (T, 4, 4) each.
 
     Dataset actions are computed from recorded states with this function, since equal states give bitwise equal poses.

@@ -93,7 +93,7 @@ class SmoothJointPosControllerConfig(PDJointPosControllerConfig):
     controller_cls = SmoothJointPosController
 
 
-class HeldJointsController(DirectDrives):
+class HoldJointsController(DirectDrives):
     """Controller that holds joints at their positions after a reset; its action has 0 dimensions."""
 
     def _initialize_action_space(self) -> None:
@@ -117,15 +117,15 @@ class HeldJointsController(DirectDrives):
 
 
 @dataclass
-class HeldJointsControllerConfig(PDJointPosControllerConfig):
-    """Configuration of a ``HeldJointsController`` without bounds."""
+class HoldJointsControllerConfig(PDJointPosControllerConfig):
+    """Configuration of a ``HoldJointsController`` without bounds."""
 
     lower: None = None
     upper: None = None
     stiffness: Any = None
     damping: Any = None
     normalize_action: bool = False
-    controller_cls = HeldJointsController
+    controller_cls = HoldJointsController
 
 
 State = Mapping[str, Mapping[str, Any]]

@@ -30,7 +30,7 @@ class SerialChain:
     """Chain of revolute joints between two links of a robot, read from its URDF.
 
     Controllers use this class with tensors or NumPy arrays. The planner uses `planning.kinematics.ArmChain`, datasets
-    use `description_file.tcp_and_base_poses`. All arrays are float64: float32 and TF32 errors exceed the tolerance.
+    use `description_file.tcp_and_arm_base_poses`. All arrays are float64: float32 and TF32 errors exceed the tolerance.
 
     Args:
         urdf: the robot.

@@ -92,7 +92,7 @@ class Quantity(ArraySpec):
         return self.components or numbered
 
 
-def continuous_xyzw(poses: Array) -> Array:
+def to_continuous_xyzw(poses: Array) -> Array:
     """Return the orientations of poses (T, 4, 4) as quaternions xyzw (T, 4), without sign flips; w >= 0 in row 0."""
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
     flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
@@ -170,7 +170,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "xyzw",
         _EE,
         quaternion=True,
-        record=lambda motion: continuous_xyzw(motion.tcp_in_base),
+        record=lambda motion: to_continuous_xyzw(motion.tcp_in_base),
         lerobot_feature=STATE,
         components=_XYZW,
     ),
@@ -211,7 +211,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "xyzw",
         _BASE,
         quaternion=True,
-        record=lambda motion: continuous_xyzw(motion.arm_base_in_world),
+        record=lambda motion: to_continuous_xyzw(motion.arm_base_in_world),
         lerobot_feature=ARM_BASE,
         components=_XYZW,
     ),

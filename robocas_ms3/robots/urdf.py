@@ -76,7 +76,7 @@ def make_robot_files(finger_extension: float = c.finger_extension) -> RobotFiles
         arm_srdf=folder / "panda_arm.srdf",
         folder=folder,
     )
-    make_once(folder, lambda tmp: _generate(tmp, source, finger_extension))
+    make_folder_once(folder, lambda tmp: _generate(tmp, source, finger_extension))
     return files
 
 
@@ -263,7 +263,7 @@ def _write(root: Element, path: Path) -> None:
     ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
 
 
-def make_once(folder: Path, make: Callable[[Path], None]) -> None:
+def make_folder_once(folder: Path, make: Callable[[Path], None]) -> None:
     """Make a folder if it is not complete, while other processes wait; its name must be a hash of its inputs."""
     if _is_complete(folder):
         return

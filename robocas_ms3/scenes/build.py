@@ -100,7 +100,7 @@ def build_objects(
     columns = zip(*assets, strict=True)
     actors = [build_object_slot(scene, slot, column, level) for slot, column in enumerate(columns)]
     if config.has_unused_slots:
-        build_parking(scene, len(actors))
+        build_parking_plane(scene, len(actors))
     return actors
 
 
@@ -129,7 +129,7 @@ def build_object_slot(
     return merged
 
 
-def build_parking(scene: ManiSkillScene, slots: int) -> Actor:
+def build_parking_plane(scene: ManiSkillScene, slots: int) -> Actor:
     """Build the plane far below the floor on which the objects of unused slots are placed."""
     builder: Any = scene.create_actor_builder()
     half_size = [(slots + 1) / 2, 1.0, 0.1]

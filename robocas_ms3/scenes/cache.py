@@ -54,7 +54,7 @@ _APPEARANCE_KEYS = {"room", "finishes", "lights", "cameras"}
 _log = logging.getLogger(__name__)
 
 
-def layout_source(model: SceneModel, layouts: str | Path | LayoutSource | None = "auto") -> LayoutSource:
+def make_layout_source(model: SceneModel, layouts: str | Path | LayoutSource | None = "auto") -> LayoutSource:
     """Return the source of an environment's layouts.
 
     Args:
@@ -69,7 +69,7 @@ def layout_source(model: SceneModel, layouts: str | Path | LayoutSource | None =
     return LayoutSampler(model) if layouts is None else LayoutCache(model, layouts)
 
 
-def caches_folder(root: str | Path = "auto") -> Path:
+def layout_caches_folder(root: str | Path = "auto") -> Path:
     """Return the folder of all layout caches; ``auto``: the user's cache folder."""
     return cache_dir() / "layouts" if root == "auto" else Path(root)
 
@@ -133,7 +133,7 @@ class LayoutCache:
 
     Args:
         model: the scene's assets.
-        root: folder of all caches; see `caches_folder`.
+        root: folder of all caches; see `layout_caches_folder`.
 
     Attributes:
         folder: folder of this cache.
@@ -145,9 +145,9 @@ class LayoutCache:
         self._names = sorted(model.object_pack.objects)
         self._about = _about(model)
         key = hashlib.sha256(json.dumps(self._about, sort_keys=True).encode()).hexdigest()[:16]
-        self.folder = caches_folder(root) / f"{model.config.task}-{key}"
+        self.folder = layout_caches_folder(root) / f"{model.config.task}-{key}"
 
-    def table(self, engine: Engine) -> LayoutTable | None:
+    def load_table(self, engine: Engine) -> LayoutTable | None:
         """Return the layout table of an engine, mapped into memory; None if it is missing or damaged."""
         path = self.table_path(engine)
         if not path.is_file():
@@ -167,17 +167,17 @@ class LayoutCache:
         Layouts of an earlier table are kept. No table is written, and None returned, if no pair has a layout.
         """
         with self._locked():
-            before = self.table(engine)
-            statuses = {pair: before.status(pair) for pair in before.pairs()} if before else {}
+            before = self.load_table(engine)
+            statuses = {pair: before.status(pair) for pair in before.find_pairs()} if before else {}
             layouts: dict[SeedPair, Layout] = {}
             for pair in dict.fromkeys([*statuses, *pairs]):
-                if self.path(*pair).is_file():
+                if self.layout_path(*pair).is_file():
                     layouts[pair] = self.get(*pair)
                 elif before is not None and (tabled := before.layout(pair)) is not None:
                     layouts[pair] = tabled
             if layouts:
                 write_table(self.table_path(engine), self._names, layouts, statuses)
-            return self.table(engine)
+            return self.load_table(engine)
 
     def write_statuses(self, engine: Engine, statuses: Mapping[SeedPair, LayoutStatus]) -> None:
         with self._locked():
@@ -189,7 +189,7 @@ class LayoutCache:
             lock_file(file, self.folder, wait=True)
             yield
 
-    def path(self, objects_seed: int, seed: int) -> Path:
+    def layout_path(self, objects_seed: int, seed: int) -> Path:
         name = f"{seed:010d}" if seed == objects_seed else f"{seed:010d}-of-{objects_seed:010d}"
         return self.folder / f"{seed // _FOLDER_SIZE:07d}" / f"{name}.npz"
 
@@ -199,7 +199,7 @@ class LayoutCache:
         Raises:
             LayoutError: the seeds have no layout. The failure is not stored.
         """
-        path = self.path(objects_seed, seed)
+        path = self.layout_path(objects_seed, seed)
         if path.is_file():
             try:
                 layout = read_layout(path)
@@ -218,8 +218,8 @@ class LayoutCache:
 
     __call__ = get
 
-    def missing(self, pairs: Iterable[SeedPair]) -> list[SeedPair]:
-        return [pair for pair in pairs if not self.path(*pair).is_file()]
+    def missing_pairs(self, pairs: Iterable[SeedPair]) -> list[SeedPair]:
+        return [pair for pair in pairs if not self.layout_path(*pair).is_file()]
 
     def fill(self, pairs: Iterable[SeedPair], jobs: int = 1) -> Generator[tuple[SeedPair, str], None, None]:
         """Sample and store the missing layouts.
@@ -233,7 +233,7 @@ class LayoutCache:
         Yields:
             Each seed pair when it is done, in any order, and the reason why it has no layout (empty if it has one).
         """
-        missing = self.missing(pairs)
+        missing = self.missing_pairs(pairs)
         without: dict[int, str] = {}  # objects seeds without objects, and why
         workers = jobs if min(jobs, len(missing)) > 1 else 0
         with WorkerPool(partial(FunctionWorker, partial(_make, self)), workers, on_crash=_crashed) as pool:

@@ -69,7 +69,7 @@ def check_clearance(
     if envelope is not None and config.randomisation.robot is None:
         pairs += [(_body(envelope, robot_pose), other) for other in fixed]
     for one, other in pairs:
-        deep = max((overlap(a, b) for a, b in _near(one, other)), default=0.0)
+        deep = max((overlap_depth(a, b) for a, b in _near(one, other)), default=0.0)
         if deep > _TOUCHING:
             fix = f"Move one of them by more than {deep:.2f} m" + ("." if other is room else ", or leave one out.")
             what, found = f"{one.key} and {other.key} overlap", f"an overlap of {deep:.3f} m"
@@ -81,7 +81,7 @@ def check_clearance(
         _check_reach(config, placed.get("basket"), region, _shoulders(config, robot_pose, robot, envelope), envelope)
 
 
-def overlap(one: Hull, other: Hull) -> float:
+def overlap_depth(one: Hull, other: Hull) -> float:
     """Return the least distance, m, that separates two hulls; 0 if they don't overlap.
 
     The result is exact (separating axis theorem).

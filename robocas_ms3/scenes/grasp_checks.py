@@ -30,7 +30,7 @@ TESTED_AT_ONCE = 1 << 16  # pairs of grasp and point
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # half a turn about the approach axis gives an equivalent grasp
 
 
-def check_directions(
+def grasp_direction_tests(
     tcp_in_world: Array, base_to_object: Array, approach: Approach = "top"
 ) -> dict[str, NDArray[np.bool_]]:
     """Test the approach and closing directions of grasps relative to gravity and the robot.
@@ -137,7 +137,7 @@ def has_free_grasps(
     notes, center = asset.annotations, object_in_world[:3, 3]
     grasps = object_in_world @ notes.grasps_tcp_in_object
     good = notes.grasp_widths <= MAX_WIDTH
-    for passed in check_directions(grasps, center[:2] - robot_xy, approach).values():
+    for passed in grasp_direction_tests(grasps, center[:2] - robot_xy, approach).values():
         good &= passed
     grasps = grasps[good]
     if min_count == 0 or len(grasps) < min_count:

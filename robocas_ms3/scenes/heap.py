@@ -18,8 +18,8 @@ from robocas_ms3.assets.physics import (
     add_component,
     add_ground,
     engine_settings,
+    make_rigid_body,
     make_scene,
-    make_solid,
     pose_matrix,
 )
 from robocas_ms3.core.errors import LayoutError
@@ -99,7 +99,7 @@ def _fill_bucket(
     add_ground(scene, np.array([*middle, region.z]))
     _add_walls(scene, middle, half, region.z)
     bodies: dict[int, physx.PhysxRigidDynamicComponent] = {}
-    outlines = [outline(asset) for asset in assets]
+    outlines = [outline_points(asset) for asset in assets]
     for index in draw_drop_order(rng, assets, layout.order_noise).tolist():
         asset = assets[index]
         pose = _falling_pose(rng, asset, layout.tumble_probability)
@@ -110,7 +110,7 @@ def _fill_bucket(
             (transform_points(pose_matrix(b), outlines[i])[:, 2].max() for i, b in bodies.items()), default=region.z
         )
         pose = from_xyz_yaw(x, y, top + layout.drop_height - points[:, 2].min(), 0) @ pose
-        bodies[index] = add_body(scene, replace(make_solid(asset), hulls=[outlines[index]]), pose)
+        bodies[index] = add_body(scene, replace(make_rigid_body(asset), hulls=[outlines[index]]), pose)
         _run(scene, layout.fall_seconds, list(bodies.values()))
     _run(scene, BUCKET_SECONDS, list(bodies.values()))
     return np.stack([pose_matrix(bodies[i]) for i in range(len(assets))])
@@ -122,7 +122,7 @@ def _spread(assets: Sequence[LoadedObject], poses: Array, region: Region) -> Arr
     scene = make_scene()
     add_ground(scene, np.array([*middle, region.z]))
     fence = _add_walls(scene, middle, np.subtract(region.max_xy, region.min_xy) / 2, region.z)
-    bodies = [add_body(scene, make_solid(asset), pose) for asset, pose in zip(assets, poses, strict=True)]
+    bodies = [add_body(scene, make_rigid_body(asset), pose) for asset, pose in zip(assets, poses, strict=True)]
     _run(scene, SPREAD_SECONDS, bodies)
     for wall in fence:
         wall.remove_from_scene()
@@ -132,7 +132,7 @@ def _spread(assets: Sequence[LoadedObject], poses: Array, region: Region) -> Arr
     return np.stack([pose_matrix(body) for body in bodies])
 
 
-def outline(asset: LoadedObject) -> Array:
+def outline_points(asset: LoadedObject) -> Array:
     """Return at most 64 points (V, 3), m, asset frame, whose convex hull approximates the object's."""
     points = np.concatenate(asset.hulls)
     return points[np.unique(np.argmax(points @ _DIRECTIONS.T, axis=0))]

@@ -77,7 +77,7 @@ class LayoutTable:
     def status(self, pair: SeedPair) -> LayoutStatus:
         return LayoutStatus(int(self.find_records(np.array([pair[0]]), np.array([pair[1]]))[0][0]))
 
-    def pairs(self, *statuses: LayoutStatus) -> list[SeedPair]:
+    def find_pairs(self, *statuses: LayoutStatus) -> list[SeedPair]:
         """Return the seed pairs of the layouts with these statuses; default: of all layouts in the table."""
         rows, columns = np.nonzero(np.isin(self._statuses, statuses) if statuses else self._statuses)
         return [*zip(self._sets[rows].tolist(), self._seeds[columns].tolist(), strict=True)]
@@ -150,7 +150,7 @@ class FrozenLayouts:
         self._places = {int(seed): i for i, seed in enumerate(self._records["seed"])}
 
     @property
-    def seeds(self) -> tuple[int, int]:
+    def seed_range(self) -> tuple[int, int]:
         """First and last of the consecutive seeds that start with the least seed."""
         first = last = min(self._places)
         while last + 1 in self._places:

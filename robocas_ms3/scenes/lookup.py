@@ -170,7 +170,7 @@ def check_joints(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> N
     if opening is None:
         return
     _check_known("opening.handle: no such handle", opening.handle, furniture[opening.furniture].asset.handles)
-    joint = find_opened_joint(config, furniture)
+    joint = find_joint_to_open(config, furniture)
     limit = MAX_OPENED_FRACTION[joint.kind]
     if opening.opened_at >= limit:
         raise ConfigError(
@@ -190,7 +190,7 @@ def check_joints(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> N
         )
 
 
-def find_opened_joint(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> Joint:
+def find_joint_to_open(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> Joint:
     opening = config.opening
     assert opening is not None
     asset = furniture[opening.furniture].asset

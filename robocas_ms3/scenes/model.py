@@ -18,8 +18,8 @@ from robocas_ms3.scenes.lookup import (
     check_joints,
     find_container,
     find_furniture,
+    find_joint_to_open,
     find_objects,
-    find_opened_joint,
     find_region,
     find_room,
     fixture_pose,
@@ -114,13 +114,13 @@ class SceneModel:
         return self.furniture[surface.furniture].asset.surfaces[surface.name].link
 
     @property
-    def opened_joint(self) -> Joint | None:
-        return find_opened_joint(self.config, self.furniture) if self.config.opening else None
+    def joint_to_open(self) -> Joint | None:
+        return find_joint_to_open(self.config, self.furniture) if self.config.opening else None
 
     @property
-    def opened_position(self) -> float:
+    def open_threshold(self) -> float:
         """Joint position, m or rad, from which the joint to open counts as open; signed."""
-        joint, opening = self.opened_joint, self.config.opening
+        joint, opening = self.joint_to_open, self.config.opening
         assert joint is not None
         assert opening is not None
         return opening.opened_at * max(joint.limits, key=abs)
@@ -128,9 +128,9 @@ class SceneModel:
     def joint_positions(self, name: str, *, opened: bool) -> dict[str, float]:
         """Return joint positions of a piece of furniture by name, at the start or opened; others are 0."""
         positions = dict(self.config.furniture[name].joints)
-        joint, opening = self.opened_joint, self.config.opening
+        joint, opening = self.joint_to_open, self.config.opening
         if opened and joint is not None and opening is not None and opening.furniture == name:
-            positions[joint.name] = self.opened_position
+            positions[joint.name] = self.open_threshold
         return positions
 
     def support_motion(self, *, opened: bool) -> Array:

@@ -211,7 +211,7 @@ def _does_not_fit(what: str, needed: float, room: float) -> LayoutError:
     )
 
 
-def choose_objects(rng: np.random.Generator, ids: list[str], count: int, *, repeats: bool = False) -> list[str]:
+def draw_object_ids(rng: np.random.Generator, ids: list[str], count: int, *, repeats: bool = False) -> list[str]:
     """Draw ``count`` ids without repetition or, if there are fewer ids, as evenly as possible.
 
     With ``repeats``, each id is drawn independently from all of them.

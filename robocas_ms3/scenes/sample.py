@@ -16,10 +16,10 @@ from robocas_ms3.scenes.heap import drop_heap
 from robocas_ms3.scenes.layout import PARKING_HEIGHT, Layout, ObjectIds
 from robocas_ms3.scenes.lookup import resolve_ids
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.scenes.placement import Array, PlaceableObject, choose_objects, sample_orderly, sample_scattered
+from robocas_ms3.scenes.placement import Array, PlaceableObject, draw_object_ids, sample_orderly, sample_scattered
 from robocas_ms3.scenes.robot_placement import place_basket, place_robot
 from robocas_ms3.scenes.settle import settle
-from robocas_ms3.scenes.targets import SettledScene, choose_target, target_rule
+from robocas_ms3.scenes.targets import SettledScene, choose_target, find_target_rule
 from robocas_ms3.scenes.task_specs import TASKS
 
 # Each random decision of a scene has its own stream, so that a new decision does not change the others.
@@ -45,11 +45,11 @@ def draw_object_set(model: SceneModel, objects_seed: int, number: int = 0) -> Ob
     if isinstance(config.layout, OrderlyLayout):
         chosen = _kinds_that_fit(rng, model, _usable(model, ids, columns=True), config.layout.copies)
     else:
-        chosen = choose_objects(rng, _usable(model, ids), config.objects.count, repeats=config.objects.repeats)
+        chosen = draw_object_ids(rng, _usable(model, ids), config.objects.count, repeats=config.objects.repeats)
     distractors = config.randomisation.distractors
     if distractors is not None:
         others = _usable(model, resolve_ids(model.object_pack, distractors.ids, key="randomisation.distractors.ids"))
-        chosen += choose_objects(rng, [i for i in others if i not in chosen] or others, distractors.count[1])
+        chosen += draw_object_ids(rng, [i for i in others if i not in chosen] or others, distractors.count[1])
     return tuple(chosen)
 
 
@@ -151,7 +151,7 @@ def _failure(model: SceneModel, unarranged: list[LayoutError], unsettled: int, u
             "Lower objects.count, enlarge the surface, use more stable objects, or lower randomisation.basket.position."
         )
         return LayoutError("the objects don't come to rest", where="layout", found=found, fix=fix)
-    lower = ", ".join(target_rule(model.config.task).keys)
+    lower = ", ".join(find_target_rule(model.config.task).keys)
     fix = f"Raise target.max_distance, lower target.{lower} or min_free_grasps, or use other objects."
     relations = ", ".join(model.config.target.relations)
     if relations and "relation" in TASKS[model.config.task].slots:
@@ -163,7 +163,7 @@ def _kinds_that_fit(rng: np.random.Generator, model: SceneModel, ids: list[str],
     objects, count = model.object_pack.objects, model.config.objects.count
     failure = LayoutError("no kinds fit", where="objects.ids")
     for attempt in range(_KINDS):
-        kinds = choose_objects(rng, ids, -(-count // copies), repeats=model.config.objects.repeats)
+        kinds = draw_object_ids(rng, ids, -(-count // copies), repeats=model.config.objects.repeats)
         chosen = [kind for kind in kinds for _ in range(copies)][:count]
         try:
             _arrange(np.random.default_rng(attempt), model, [objects[i] for i in chosen])

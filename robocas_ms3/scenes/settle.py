@@ -14,8 +14,8 @@ from robocas_ms3.assets.physics import (
     add_body,
     add_static_body,
     engine_settings,
+    make_rigid_body,
     make_scene,
-    make_solid,
     pose_matrix,
 )
 from robocas_ms3.scenes.model import SceneModel
@@ -96,7 +96,7 @@ def _simulate(
         add_static_body(scene, model.basket.hulls, basket_pose, model.basket.asset.friction)
     order = -1 if backwards else 1
     placed = list(zip(assets, poses, strict=True))[::order]
-    bodies = [add_body(scene, make_solid(asset), pose) for asset, pose in placed][::order]
+    bodies = [add_body(scene, make_rigid_body(asset), pose) for asset, pose in placed][::order]
     at_rest = True
     for _ in range(2):
         for _ in range(round(seconds / TIME_STEP / 2)):

@@ -18,7 +18,7 @@ from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.placement import Array
 from robocas_ms3.scenes.relations import select_by_relation
 from robocas_ms3.scenes.task_specs import TASKS
-from robocas_ms3.scenes.visibility import MeshScene, PinholeCamera, object_mesh, top_down_camera
+from robocas_ms3.scenes.visibility import MeshScene, PinholeCamera, load_visual_mesh, top_down_camera
 
 
 @dataclass(frozen=True)
@@ -133,12 +133,12 @@ class TargetRule:
     keys: tuple[str, ...] = ("min_grasps",)
 
 
-def target_rule(task: str) -> TargetRule:
+def find_target_rule(task: str) -> TargetRule:
     return load_object(TASKS[task].target)
 
 
 def choose_target(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
-    return target_rule(scene.model.config.task).choose(rng, scene)
+    return find_target_rule(scene.model.config.task).choose(rng, scene)
 
 
 def _by_name(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
@@ -182,7 +182,7 @@ def _by_visibility(rng: np.random.Generator, scene: SettledScene) -> TargetChoic
     rules = scene.model.config.target
     slots = np.flatnonzero(scene.present)
     fractions = np.full(len(scene.assets), np.nan)
-    scenery = MeshScene([object_mesh(scene.assets[s]) for s in slots], scene.poses[slots])
+    scenery = MeshScene([load_visual_mesh(scene.assets[s]) for s in slots], scene.poses[slots])
     fractions[slots] = scenery.visible_fractions(selection_camera(scene.model))
     unique = np.array([scene.names.count(name) == 1 for name in scene.names])
     fits = scene.eligible & unique

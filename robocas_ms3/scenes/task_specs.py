@@ -46,14 +46,14 @@ class TaskSpec:
     instructions: Mapping[str, Sequence[str]] = field(default_factory=dict, hash=False)
     stages: tuple[str, ...] = STAGES
 
-    def steps(self, control_freq: int) -> int:
+    def horizon_steps(self, control_freq: int) -> int:
         """Return the horizon in control steps at a control rate in Hz."""
         return self.seconds * control_freq
 
     @property
     def max_episode_steps(self) -> int:
         """Horizon in control steps at the standard rate, as registered with gymnasium."""
-        return self.steps(STANDARD_FREQ)
+        return self.horizon_steps(STANDARD_FREQ)
 
 
 REQUIRE_BASKET = "robocas_ms3.scenes.config.task:require_basket"

@@ -43,7 +43,7 @@ class PinholeCamera:
     def focal_length(self) -> float:
         return self.height / 2 / np.tan(self.fov_y / 2)
 
-    def rays(self, box: PixelBox) -> Array:
+    def ray_directions(self, box: PixelBox) -> Array:
         """Return ray directions (rows, columns, 3) through pixel centres in the camera's frame, with x = 1."""
         rows, columns = np.mgrid[box]
         left = (self.width / 2 - columns - 0.5) / self.focal_length
@@ -78,9 +78,9 @@ def _mesh_of(path: Path, _changed_ns: int) -> trimesh.Trimesh:
     return mesh
 
 
-def object_mesh(asset: BodyFiles, level: VisualLevel = "fast") -> trimesh.Trimesh:
+def load_visual_mesh(asset: BodyFiles, level: VisualLevel = "fast") -> trimesh.Trimesh:
     """Return the visual mesh in the asset's frame; it is shared between callers, so don't change it."""
-    path = asset.visual(level)
+    path = asset.visual_path(level)
     return _mesh_of(path, path.stat().st_mtime_ns)
 
 
@@ -124,17 +124,17 @@ def _depths(camera: PinholeCamera, mesh: trimesh.Trimesh, pose: Array) -> tuple[
     # rays are cast in the mesh's frame: its search tree is built once, and single precision is sufficient
     to_mesh = pose[:3, :3].T
     position = to_mesh @ (camera.pose[:3, 3] - pose[:3, 3])
-    directions = camera.rays(box) @ (to_mesh @ camera.pose[:3, :3]).T
+    directions = camera.ray_directions(box) @ (to_mesh @ camera.pose[:3, :3]).T
     shape = directions.shape[:2]
     if 0 in shape:
         return box, np.full(shape, np.inf)
     directions = directions.reshape(-1, 3).astype(np.float32)
     origins = np.tile(position.astype(np.float32), (len(directions), 1))
-    depths = ray_scene(mesh).run(origins, directions, query="DISTANCE").astype(float)
+    depths = make_ray_scene(mesh).run(origins, directions, query="DISTANCE").astype(float)
     return box, np.where(depths < _FAR, depths, np.inf).reshape(shape)
 
 
-def ray_scene(mesh: trimesh.Trimesh) -> EmbreeScene:
+def make_ray_scene(mesh: trimesh.Trimesh) -> EmbreeScene:
     """Return the ray casting scene of a mesh; it is built once per process."""
     if mesh not in _scenes:
         scene = EmbreeScene(robust=True)  # no ray passes between two adjacent triangles

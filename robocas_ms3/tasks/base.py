@@ -22,7 +22,7 @@ from robocas_ms3.core.extensions import load_object
 from robocas_ms3.robots.agent import MobileManipulator
 from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
 from robocas_ms3.scenes import build
-from robocas_ms3.scenes.cache import layout_source
+from robocas_ms3.scenes.cache import make_layout_source
 from robocas_ms3.scenes.config import TaskConfig, load_config_for
 from robocas_ms3.scenes.language.instructions import Instruction, episode_instruction
 from robocas_ms3.scenes.layout import Layout, LayoutSource
@@ -52,7 +52,7 @@ class RoboCASEnv(BaseEnv):
         pack: name or folder of the object pack.
         furniture_pack: name or folder of the pack of room, furniture and basket.
         visual_level: level of detail of the rendered meshes, ``fast`` or ``full``.
-        layouts: source of the layouts; see `scenes.cache.layout_source`.
+        layouts: source of the layouts; see `scenes.cache.make_layout_source`.
         seeds: least and greatest seed of unseeded resets; see `EpisodeSeeds`.
         robot_uids: name of the robot in `robots.registry`.
         num_envs: N; more than 1 needs a GPU.
@@ -105,7 +105,7 @@ class RoboCASEnv(BaseEnv):
         self._engine_errors = engine.EngineErrors()
         if kwargs.get("reconfiguration_freq") is None:
             kwargs["reconfiguration_freq"] = 1 if num_envs == 1 else 0
-        cache, stay = layout_source(self.model, layouts), kwargs["reconfiguration_freq"] == 0
+        cache, stay = make_layout_source(self.model, layouts), kwargs["reconfiguration_freq"] == 0
         self.seeds = EpisodeSeeds(num_envs, cache, seed_range=seeds, objects_stay=stay)
         super().__init__(num_envs=num_envs, robot_uids=robot.uid, **kwargs)
 

@@ -19,9 +19,9 @@ _BACKENDS = {"cpu": "physx_cpu", "gpu": "physx_cuda"}
 
 def unchecked_layouts(cache: LayoutCache, engine: Engine) -> dict[int, list[int]]:
     """Return the seeds of unchecked layouts by objects seed."""
-    table = cache.table(engine)
+    table = cache.load_table(engine)
     seeds: dict[int, list[int]] = {}
-    for objects_seed, seed in table.pairs(LayoutStatus.UNCHECKED) if table else ():
+    for objects_seed, seed in table.find_pairs(LayoutStatus.UNCHECKED) if table else ():
         seeds.setdefault(objects_seed, []).append(seed)
     return seeds
 

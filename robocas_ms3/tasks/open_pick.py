@@ -44,7 +44,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
-        opening, joint = self.task_config.opening, self.model.opened_joint
+        opening, joint = self.task_config.opening, self.model.joint_to_open
         assert opening is not None  # checked by the configuration
         assert joint is not None
         furniture = self.fixtures.furniture[opening.furniture]
@@ -67,7 +67,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
 
     def furniture_opened(self) -> torch.Tensor:
         """Return (N,) bool, whether the furniture is currently open."""
-        goal, position = self.model.opened_position, self.opening_position()
+        goal, position = self.model.open_threshold, self.opening_position()
         return position >= goal if goal > 0 else position <= goal
 
     def evaluate(self) -> dict[str, torch.Tensor]:
@@ -87,7 +87,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
         return stage, found
 
     def _opened_fraction(self) -> Array:
-        return rewards.progress_fraction(to_native(self.opening_position()), 0.0, self.model.opened_position)
+        return rewards.progress_fraction(to_native(self.opening_position()), 0.0, self.model.open_threshold)
 
     def privileged_observations(self) -> dict[str, torch.Tensor]:
         """Return those of `RoboCASEnv`, ``opened_fraction`` (N, 1) and ``tcp_to_handle`` (N, 3)."""

@@ -90,7 +90,7 @@ class EpisodeSeeds:
         if seed_range is not None and not 0 <= seed_range[0] <= seed_range[1]:
             raise ConfigError("invalid range of seeds", where="seeds", expected="0 <= first <= last", found=seed_range)
         if seed_range is None and isinstance(layouts, FrozenLayouts):
-            seed_range = layouts.seeds
+            seed_range = layouts.seed_range
         self.range = seed_range or (SEVERAL_ENVS_SEEDS if num_envs > 1 else None)
         self.layouts = layouts
         self.layout_seeds = np.zeros(num_envs, dtype=np.int64)
@@ -165,7 +165,7 @@ class EpisodeSeeds:
         """Choose the objects of each env from its seed (N,); a seed without a layout is replaced in place."""
         self._built_with = {}
         if isinstance(self.layouts, LayoutCache) and (self._objects_stay or on_gpu):
-            self.table = self.layouts.table("gpu" if on_gpu else "cpu")
+            self.table = self.layouts.load_table("gpu" if on_gpu else "cpu")
             self._other_seeds = _OTHER_SEEDS if self.table else self._other_seeds
         self.object_ids = [self._first_possible(self._objects_of, env, seeds) for env in range(self._num_envs)]
         self.objects_seeds = np.array(seeds)

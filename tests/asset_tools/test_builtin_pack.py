@@ -75,7 +75,7 @@ def test_visuals_are_textured_at_both_levels(pack, id_):
     loaded = pack.objects.get(id_) or pack.furniture[id_]
     faces = {}
     for level in ("fast", "full"):
-        (mesh,) = trimesh.load_scene(loaded.visual(level), process=False).geometry.values()
+        (mesh,) = trimesh.load_scene(loaded.visual_path(level), process=False).geometry.values()
         image = mesh.visual.material.baseColorTexture
         assert max(image.size) <= 1024
         assert mesh.visual.uv.min() >= 0 and mesh.visual.uv.max() <= 1

@@ -5,8 +5,8 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.hulls import (
     center_of_mass,
-    convex_faces,
     find_box,
+    make_convex_mesh,
     read_hulls,
     sample_surface,
     sample_triangles,
@@ -29,8 +29,8 @@ def test_hulls_survive_writing_and_reading(tmp_path):
 
 
 def test_coplanar_points_are_an_error():
-    with pytest.raises(AssetError, match="are coplanar"):
-        convex_faces(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], dtype=float))
+    with pytest.raises(AssetError, match="not in one plane"):
+        make_convex_mesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], dtype=float))
 
 
 @pytest.mark.parametrize("content", ["", "o hull_0\nv 0 0 0\nf 1 2 3\n", "v 0 0 0\nf 1 1 1\n", "o a\nv 0 zero 0\n"])

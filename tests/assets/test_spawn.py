@@ -87,8 +87,8 @@ def test_box_hulls_become_boxes_at_their_poses(scene, tmp_path):
 def test_an_unknown_finish_is_named(cabinet):
     asset = cabinet.asset.model_copy(update={"finishes": {"wall": ("plaster", "brick")}})
     room = LoadedFurniture(cabinet.folder, asset=asset)
-    assert room.finish("wall", "brick").name == "wall_brick.glb"
+    assert room.finish_path("wall", "brick").name == "wall_brick.glb"
     with pytest.raises(
         AssetError, match=r"cabinet: no such finish of 'wall' \(expected one of plaster, brick, found gold\)"
     ):
-        room.finish("wall", "gold")
+        room.finish_path("wall", "gold")

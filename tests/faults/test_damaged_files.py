@@ -42,7 +42,7 @@ def cache(tmp_path, monkeypatch):
 
 def test_damaged_layout_of_a_cache_is_sampled_again(cache):
     made = cache.get(0, 0)
-    path = cache.path(0, 0)
+    path = cache.layout_path(0, 0)
     whole = path.read_bytes()
     for seed in range(80):
         path.write_bytes(damage(path.name, whole, seed))

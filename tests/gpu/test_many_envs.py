@@ -128,8 +128,8 @@ def test_heaps_are_checked_by_this_engine_and_resets_use_stable_ones(tmp_path):
     )
     env: Any = made.unwrapped
     assert env.seeds.initial_state_table is not None
-    assert not env.seeds.table.pairs(LayoutStatus.UNCHECKED)
-    tried = {state: len(env.seeds.table.pairs(state)) for state in (LayoutStatus.STABLE, LayoutStatus.UNSTABLE)}
+    assert not env.seeds.table.find_pairs(LayoutStatus.UNCHECKED)
+    tried = {state: len(env.seeds.table.find_pairs(state)) for state in (LayoutStatus.STABLE, LayoutStatus.UNSTABLE)}
     assert sum(tried.values()) == count * count
     assert tried[LayoutStatus.UNSTABLE] <= count, tried
     for _ in range(5):

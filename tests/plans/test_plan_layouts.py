@@ -42,6 +42,6 @@ def test_seed_without_a_layout_fails(files, monkeypatch):
     def nothing(*_):
         raise LayoutError("no room for all objects")
 
-    monkeypatch.setattr("robocas_ms3.scenes.cache.layout_source", lambda *_: nothing)
+    monkeypatch.setattr("robocas_ms3.scenes.cache.make_layout_source", lambda *_: nothing)
     found = Recorder(ALONE).run(files)
     assert (found["success"], found["failures"]) == (False, ["layout: no room for all objects"])

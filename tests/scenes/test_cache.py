@@ -18,7 +18,7 @@ from scene_models import load_scene
 
 from robocas_ms3.core.errors import SimulationError
 from robocas_ms3.scenes import cache as cache_module
-from robocas_ms3.scenes.cache import LayoutCache, LayoutSampler, count_layouts, layout_source, seed_pairs
+from robocas_ms3.scenes.cache import LayoutCache, LayoutSampler, count_layouts, make_layout_source, seed_pairs
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.scenes.layout_table import LayoutStatus
 from robocas_ms3.scenes.sample import sample_layout
@@ -37,11 +37,11 @@ def test_layout_is_sampled_once_and_read_back_unchanged(tmp_path, monkeypatch):
     scene = load_scene()
     made = LayoutCache(scene, tmp_path).get(1, 1)
     assert_same(made, sample_layout(scene, 1, 1))
-    assert_same(layout_source(scene, None)(1, 1), made)
+    assert_same(make_layout_source(scene, None)(1, 1), made)
     monkeypatch.setattr(cache_module, "sample_layout", None)  # sampling again would fail
     cache = LayoutCache(scene, tmp_path)
     assert_same(cache.get(1, 1), made)
-    assert cache.missing(seed_pairs(range(3))) == [(0, 0), (2, 2)]
+    assert cache.missing_pairs(seed_pairs(range(3))) == [(0, 0), (2, 2)]
     assert count_layouts(cache.folder) == 1
 
 
@@ -49,7 +49,7 @@ def test_layouts_of_different_objects_seeds_have_different_files(tmp_path):
     cache = LayoutCache(load_scene(), tmp_path)
     assert not np.allclose(cache.get(1, 1).object_poses, cache.get(1, 2).object_poses)
     assert cache.get(1, 2).object_ids == cache.get(1, 1).object_ids
-    assert cache.missing([(2, 2), (1, 2)]) == [(2, 2)]
+    assert cache.missing_pairs([(2, 2), (1, 2)]) == [(2, 2)]
 
 
 @pytest.mark.parametrize(
@@ -79,21 +79,21 @@ def test_changed_furniture_has_its_own_cache(tmp_path):
 
 def test_table_keeps_layouts_and_statuses_of_an_earlier_table(tmp_path):
     cache = LayoutCache(load_scene(), tmp_path)
-    assert cache.table("cpu") is None
+    assert cache.load_table("cpu") is None
     for pair in ((0, 0), (0, 1), (2, 1)):
         cache.get(*pair)
     cache.write_table("cpu", [(0, 0), (0, 1)])
     cache.write_statuses("cpu", {(0, 1): LayoutStatus.UNSTABLE})
-    cache.path(0, 0).unlink()
+    cache.layout_path(0, 0).unlink()
     table = cache.write_table("cpu", [(2, 1), (2, 9)])  # the last pair has no layout yet
     assert table is not None
-    assert table.pairs() == [(0, 0), (0, 1), (2, 1)]
-    assert table.pairs(LayoutStatus.UNSTABLE) == [(0, 1)]
-    assert table.pairs(LayoutStatus.UNCHECKED) == [(0, 0), (2, 1)]
+    assert table.find_pairs() == [(0, 0), (0, 1), (2, 1)]
+    assert table.find_pairs(LayoutStatus.UNSTABLE) == [(0, 1)]
+    assert table.find_pairs(LayoutStatus.UNCHECKED) == [(0, 0), (2, 1)]
     path = cache.table_path("cpu")
     path.write_bytes(path.read_bytes()[:-9])
-    assert cache.table("cpu") is None  # damaged
-    assert cache.table("gpu") is None
+    assert cache.load_table("cpu") is None  # damaged
+    assert cache.load_table("gpu") is None
 
 
 def test_table_is_written_by_one_process_at_a_time(tmp_path):
@@ -108,7 +108,7 @@ def test_table_is_written_by_one_process_at_a_time(tmp_path):
     writing.join()
     table = cache.write_table("cpu", [(0, 0)])
     assert table is not None
-    assert table.pairs() == [(0, 0), (1, 1)]
+    assert table.find_pairs() == [(0, 0), (1, 1)]
 
 
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
@@ -170,11 +170,11 @@ def test_process_with_physx_on_a_gpu_makes_equal_layouts():
         "import sys\nfrom sapien import physx\n"
         "if sys.argv[1] == 'gpu':\n    physx._enable_gpu()\n"
         "from robocas_ms3.assets.pack import load_pack\nfrom robocas_ms3.scenes.config import load_task_config\n"
-        "from robocas_ms3.scenes.cache import layout_source\nfrom robocas_ms3.scenes.model import SceneModel\n"
+        "from robocas_ms3.scenes.cache import make_layout_source\nfrom robocas_ms3.scenes.model import SceneModel\n"
         "pack = load_pack('builtin')\n"
         "model = SceneModel.load(load_task_config('search_table_small_heap'), pack, pack)\n"
         "for seed in (0, 1):\n"
-        "    found = layout_source(model, None)(seed, seed)\n"
+        "    found = make_layout_source(model, None)(seed, seed)\n"
         "    sys.stdout.buffer.write(found.object_poses.tobytes() + bytes([found.target]))\n"
     )
     said = []

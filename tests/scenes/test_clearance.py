@@ -13,7 +13,7 @@ from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.paths import protocols_dir
 from robocas_ms3.robots.description_file import chain_poses
 from robocas_ms3.robots.registry import PANDA
-from robocas_ms3.scenes.clearance import overlap
+from robocas_ms3.scenes.clearance import overlap_depth
 from robocas_ms3.scenes.config import bundled_configs, load_task_config
 from robocas_ms3.scenes.model import SceneModel
 
@@ -83,15 +83,15 @@ def hull(mesh: trimesh.Trimesh) -> Hull:
 
 def test_overlaps_equal_hand_computed_depths():
     cube = trimesh.creation.box((1, 1, 1))
-    assert overlap(hull(cube), hull(cube.copy().apply_translation((0.7, 0.2, 0)))) == pytest.approx(0.3)
-    assert overlap(hull(cube), hull(cube.copy().apply_translation((1.1, 0, 0)))) == 0
+    assert overlap_depth(hull(cube), hull(cube.copy().apply_translation((0.7, 0.2, 0)))) == pytest.approx(0.3)
+    assert overlap_depth(hull(cube), hull(cube.copy().apply_translation((1.1, 0, 0)))) == 0
     # two crossed edges: the face normals alone do not separate them
     one, other = cube.copy(), cube.copy()
     one.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 4, (0, 1, 0)))
     other.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 4, (1, 0, 0)))
     for gap in (0.05, -0.05):
         moved = other.copy().apply_translation((0, 0, np.sqrt(2) + gap))
-        assert overlap(hull(one), hull(moved)) == pytest.approx(max(-gap, 0))
+        assert overlap_depth(hull(one), hull(moved)) == pytest.approx(max(-gap, 0))
 
 
 def test_reach_is_checked_with_the_envelope_of_the_robot():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from grasp_poses import CENTER, grasp
 
-from robocas_ms3.scenes.grasp_checks import check_directions, is_gripper_clear
+from robocas_ms3.scenes.grasp_checks import grasp_direction_tests, is_gripper_clear
 
 
 @pytest.mark.parametrize(
@@ -31,15 +31,15 @@ from robocas_ms3.scenes.grasp_checks import check_directions, is_gripper_clear
     ],
 )
 def test_approach_directions(approach, lean, heading, from_there, from_the_robots_side):
-    found = check_directions(grasp(lean, heading)[None], CENTER, approach)
+    found = grasp_direction_tests(grasp(lean, heading)[None], CENTER, approach)
     names = {"top": "from_above", "front": "from_the_front"}[approach], "from_the_robots_side"
     assert [bool(found[name][0]) for name in names] == [from_there, from_the_robots_side]
 
 
 def test_the_direction_turns_with_the_object():
     sideways = grasp(30, 90)
-    assert check_directions(sideways[None], np.array([0.0, 0.5, -0.4]))["from_the_robots_side"][0]
-    assert not check_directions(sideways[None], np.array([0.5, 0.0, -0.4]))["from_the_robots_side"][0]
+    assert grasp_direction_tests(sideways[None], np.array([0.0, 0.5, -0.4]))["from_the_robots_side"][0]
+    assert not grasp_direction_tests(sideways[None], np.array([0.5, 0.0, -0.4]))["from_the_robots_side"][0]
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_the_direction_turns_with_the_object():
 )
 def test_the_closing_axis_may_tilt_by_60_degrees(closing, level):
     # An approach along x: turning about it by c tilts the closing axis (y) by c from the horizontal.
-    assert bool(check_directions(grasp(90, 0, closing)[None], CENTER)["closing_is_level"][0]) is level
+    assert bool(grasp_direction_tests(grasp(90, 0, closing)[None], CENTER)["closing_is_level"][0]) is level
 
 
 @pytest.mark.parametrize(

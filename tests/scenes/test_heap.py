@@ -11,7 +11,7 @@ from robocas_ms3.scenes import heap
 from robocas_ms3.scenes.config.task import StackedLayout
 from robocas_ms3.scenes.heap import SPREAD, drop_heap
 from robocas_ms3.scenes.placement import Region
-from robocas_ms3.scenes.visibility import MeshScene, object_mesh, top_down_camera
+from robocas_ms3.scenes.visibility import MeshScene, load_visual_mesh, top_down_camera
 
 REGION = Region((-0.05, -0.25), (0.25, 0.15), 0.61)
 
@@ -47,7 +47,7 @@ def test_objects_rest_on_the_plane_and_on_each_other():
             assert (center >= np.array(REGION.min_xy) - SPREAD).all()
             assert (center <= np.array(REGION.max_xy) + SPREAD).all()
         camera = top_down_camera(np.array([0.1, -0.05]), REGION.z, size=128)
-        shares = MeshScene([object_mesh(a) for a in assets], poses).visible_fractions(camera)
+        shares = MeshScene([load_visual_mesh(a) for a in assets], poses).visible_fractions(camera)
         assert (shares < 0.9).sum() >= 2  # some objects are hidden
     assert sum(on_others) >= len(on_others)
 
@@ -96,7 +96,7 @@ def test_objects_fall_into_the_middle_of_the_bucket_or_all_over_it():
 def test_outline_approximates_the_convex_hull():
     assets = load_pack("builtin").objects
     for name in ("sugar_box", "mug", "apple"):
-        points, outline = np.concatenate(assets[name].hulls), heap.outline(assets[name])
+        points, outline = np.concatenate(assets[name].hulls), heap.outline_points(assets[name])
         assert len(outline) <= 64
         planes = ConvexHull(outline).equations
         depth = (points @ planes[:, :3].T + planes[:, 3]).max(axis=1)

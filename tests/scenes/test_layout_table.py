@@ -66,7 +66,7 @@ def test_layouts_are_read_back(layouts, table):
         assert found is not None
         assert_same(found, wanted)
     assert table.object_ids(5) == layouts[5, 40].object_ids
-    assert table.pairs() == sorted(layouts)
+    assert table.find_pairs() == sorted(layouts)
 
 
 def test_missing_layouts_are_reported_as_missing(layouts, tmp_path):
@@ -92,11 +92,11 @@ def test_statuses_of_layouts_are_stored(layouts, table, tmp_path):
     }
     write_statuses(tmp_path / "table.npy", NAMES, found)  # some of these are not in the table
     marked = LayoutTable(tmp_path / "table.npy", NAMES)
-    assert marked.pairs(LayoutStatus.UNSTABLE) == [(5, 40)]
-    assert marked.pairs(LayoutStatus.STABLE) == [(2, 10)]
-    assert len(marked.pairs(LayoutStatus.UNCHECKED)) == len(layouts) - 2
-    assert not table.pairs(LayoutStatus.UNSTABLE)  # opened before the change
-    assert marked.pairs() == sorted(layouts)
+    assert marked.find_pairs(LayoutStatus.UNSTABLE) == [(5, 40)]
+    assert marked.find_pairs(LayoutStatus.STABLE) == [(2, 10)]
+    assert len(marked.find_pairs(LayoutStatus.UNCHECKED)) == len(layouts) - 2
+    assert not table.find_pairs(LayoutStatus.UNSTABLE)  # opened before the change
+    assert marked.find_pairs() == sorted(layouts)
     known = marked.layout((5, 40))
     assert known is not None
     assert_same(known, layouts[5, 40])
@@ -132,7 +132,7 @@ def test_joined_parts_equal_the_whole_file(tmp_path):
     join_frozen_layouts(tmp_path / "joined.npy", [tmp_path / f"{seed}.npy" for seed in layouts])
     assert (tmp_path / "joined.npy").read_bytes() == (tmp_path / "whole.npy").read_bytes()
     found = FrozenLayouts(tmp_path / "joined.npy", NAMES)
-    assert found.seeds == (3, 4)
+    assert found.seed_range == (3, 4)
     assert_same(found(9, 9), layouts[9])
     for pair in ((3, 4), (5, 5)):
         with pytest.raises(LayoutError):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.scenes import placement
 from robocas_ms3.scenes.config.task import OrderlyLayout, ScatteredLayout
-from robocas_ms3.scenes.placement import PlaceableObject, Region, choose_objects, sample_orderly, sample_scattered
+from robocas_ms3.scenes.placement import PlaceableObject, Region, draw_object_ids, sample_orderly, sample_scattered
 
 REGION = Region((0.0, -0.4), (0.3, 0.4), 0.6)
 
@@ -74,9 +74,9 @@ def test_objects_are_packed_if_space_is_short(monkeypatch):
 
 def test_objects_repeat_only_when_there_are_too_few():
     rng = np.random.default_rng(0)
-    assert sorted(choose_objects(rng, ["a", "b", "c"], 3)) == ["a", "b", "c"]
-    assert sorted(choose_objects(rng, ["a", "b"], 5)).count("a") in (2, 3)
-    counts = {choose_objects(rng, ["a", "b"], 4, repeats=True).count("a") for _ in range(100)}
+    assert sorted(draw_object_ids(rng, ["a", "b", "c"], 3)) == ["a", "b", "c"]
+    assert sorted(draw_object_ids(rng, ["a", "b"], 5)).count("a") in (2, 3)
+    counts = {draw_object_ids(rng, ["a", "b"], 4, repeats=True).count("a") for _ in range(100)}
     assert counts == {0, 1, 2, 3, 4}
 
 

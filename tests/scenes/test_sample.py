@@ -259,7 +259,7 @@ def test_joints_and_openings(name, opening, joints, words):
         with pytest.raises(ConfigError, match=words):
             load_scene(name, **changes)
     else:
-        assert load_scene(name, **changes).opened_position == pytest.approx(0.44)
+        assert load_scene(name, **changes).open_threshold == pytest.approx(0.44)
 
 
 def test_orderly_objects_come_in_kinds():

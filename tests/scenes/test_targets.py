@@ -27,7 +27,7 @@ def make_scene(monkeypatch):
         everything = np.ones(len(names), dtype=bool)
         scenery = SimpleNamespace(visible_fractions=lambda camera: np.broadcast_to(shares, len(names)))
         monkeypatch.setattr(targets, "MeshScene", lambda meshes, poses: scenery)
-        monkeypatch.setattr(targets, "object_mesh", lambda asset: asset)
+        monkeypatch.setattr(targets, "load_visual_mesh", lambda asset: asset)
         monkeypatch.setattr(SettledScene, "has_free_grasps", lambda self, slot: slot not in blocked)
         monkeypatch.setattr(SettledScene, "has_uncovered_grasps", lambda self, slot: slot not in flat)
         assets = [SimpleNamespace(asset=SimpleNamespace(name=name, grasp_count=grasps)) for name in names]

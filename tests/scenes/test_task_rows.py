@@ -28,7 +28,7 @@ def test_import_paths_of_a_task_spec_exist(spec):
     ("name", "standard", "slow"), [("pick", 800, 200), ("search", 2400, 600), ("open_pick", 2000, 500)]
 )
 def test_horizon_in_seconds_is_independent_of_the_rate(name, standard, slow):
-    assert (TASKS[name].max_episode_steps, TASKS[name].steps(5)) == (standard, slow)
+    assert (TASKS[name].max_episode_steps, TASKS[name].horizon_steps(5)) == (standard, slow)
 
 
 def test_configuration_of_another_task_is_an_error():

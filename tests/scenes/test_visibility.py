@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.scenes.visibility import MeshScene, PinholeCamera, object_mesh, top_down_camera
+from robocas_ms3.scenes.visibility import MeshScene, PinholeCamera, load_visual_mesh, top_down_camera
 
 PLATE = trimesh.creation.box((0.1, 0.1, 0.002))
 HIGH = PinholeCamera(top_down_camera(np.zeros(2), 9.5).pose, 256, 256, 0.03)  # nearly parallel rays
@@ -73,7 +73,7 @@ def test_changed_mesh_file_is_loaded_again():
 def test_meshes_are_in_the_assets_frame():
     asset = load_pack("builtin").objects["drink"]
     hulls = np.concatenate(asset.hulls)
-    np.testing.assert_allclose(object_mesh(asset).bounds, [hulls.min(axis=0), hulls.max(axis=0)], atol=0.003)
+    np.testing.assert_allclose(load_visual_mesh(asset).bounds, [hulls.min(axis=0), hulls.max(axis=0)], atol=0.003)
 
 
 @settings(max_examples=20, deadline=None)

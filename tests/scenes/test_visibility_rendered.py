@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.assets.pack import LoadedObject, load_pack
-from robocas_ms3.scenes.visibility import MeshScene, PinholeCamera, object_mesh, top_down_camera
+from robocas_ms3.scenes.visibility import MeshScene, PinholeCamera, load_visual_mesh, top_down_camera
 
 pytestmark = pytest.mark.slow
 
@@ -31,7 +31,7 @@ def rendered(needs_renderer) -> Iterator[tuple[list[LoadedObject], Segmentation]
     actors = []
     for asset in assets:
         builder = scene.create_actor_builder()
-        builder.add_visual_from_file(str(asset.visual("fast")))
+        builder.add_visual_from_file(str(asset.visual_path("fast")))
         builder.initial_pose = sapien.Pose()
         actors.append(builder.build_kinematic())
     eye = scene.add_camera("eye", SIZE, SIZE, np.pi / 2, 0.01, 5)
@@ -73,7 +73,7 @@ def test_visible_fractions_agree_with_the_segmentation(rendered, seed, camera):
     together = segmentation(camera, poses, list(range(COUNT)))
     visible = np.array([(together == i).sum() for i in range(COUNT)])
     full = np.array([(segmentation(camera, poses, [i]) == i).sum() for i in range(COUNT)])
-    scenery = MeshScene([object_mesh(asset) for asset in assets], poses)
+    scenery = MeshScene([load_visual_mesh(asset) for asset in assets], poses)
     large = full >= 200
     shares = scenery.visible_fractions(camera)
     assert large.sum() >= 6

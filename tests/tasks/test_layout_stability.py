@@ -26,7 +26,7 @@ def cache(tmp_path) -> LayoutCache:
     layout = cache.get(1, 0)
     poses = layout.object_poses.copy()
     poses[np.argmax(poses[:, 2, 3]), 2, 3] += 0.03
-    write_layout(type(layout)(**{**vars(layout), "object_poses": poses}), cache.path(1, 0))
+    write_layout(type(layout)(**{**vars(layout), "object_poses": poses}), cache.layout_path(1, 0))
     cache.write_table("cpu", pairs)
     return cache
 
@@ -41,9 +41,9 @@ def test_unstable_heap_is_found(cache):
     assert moved.pop((1, 0)) > 0.02
     assert max(moved.values()) < 0.003
     cache.write_statuses("cpu", {pair: status_of(by) for pair, by in moved.items()})
-    table = cache.table("cpu")
+    table = cache.load_table("cpu")
     assert table is not None
-    assert table.pairs(LayoutStatus.STABLE) == [(0, 0), (0, 1), (1, 1)]
+    assert table.find_pairs(LayoutStatus.STABLE) == [(0, 0), (0, 1), (1, 1)]
     assert unchecked_layouts(cache, "cpu") == {1: [0]}
     assert count_layouts(cache.folder) == 4  # the check added no layouts
 
@@ -59,10 +59,10 @@ def test_statuses_found_before_an_interruption_are_stored(cache, monkeypatch):
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
             check_stability(cache, "cpu")
-    table = cache.table("cpu")
+    table = cache.load_table("cpu")
     assert table is not None
-    assert (table.pairs(LayoutStatus.STABLE), table.pairs(LayoutStatus.UNSTABLE)) == ([(0, 0)], [(0, 1)])
-    assert table.pairs(LayoutStatus.UNCHECKED) == [(1, 0), (1, 1)]
+    assert (table.find_pairs(LayoutStatus.STABLE), table.find_pairs(LayoutStatus.UNSTABLE)) == ([(0, 0)], [(0, 1)])
+    assert table.find_pairs(LayoutStatus.UNCHECKED) == [(1, 0), (1, 1)]
 
 
 def test_three_millimetres_are_allowed():

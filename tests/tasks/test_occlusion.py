@@ -192,7 +192,7 @@ def test_motion_near_the_target_in_the_image_counts():
 @pytest.mark.slow
 def test_hidden_fractions_agree_with_ray_casting():
     from robocas_ms3.assets.pack import load_pack
-    from robocas_ms3.scenes.cache import layout_source
+    from robocas_ms3.scenes.cache import make_layout_source
     from robocas_ms3.scenes.config import load_task_config
     from robocas_ms3.scenes.model import SceneModel
     from robocas_ms3.scenes.targets import selection_camera
@@ -203,7 +203,7 @@ def test_hidden_fractions_agree_with_ray_casting():
     eye = torch.as_tensor(selection_camera(model).pose[:3, 3], dtype=torch.float32)
     differences = []
     for seed in range(3):
-        layout = layout_source(model)(seed, seed)
+        layout = make_layout_source(model)(seed, seed)
         poses = torch.as_tensor(to_wxyz(layout.object_poses), dtype=torch.float32)[None]
         sampled = [_sample(pack.objects[i].annotations.surface_points) for i in layout.object_ids]
         points = torch.as_tensor(np.array(sampled).swapaxes(1, 2), dtype=torch.float32)[None]

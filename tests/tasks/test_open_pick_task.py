@@ -40,12 +40,12 @@ def test_furniture_is_open_from_the_configured_fraction(name):
     base = env.unwrapped
     assert not bool(base.evaluate()["furniture_opened"][0])
     furniture = base.fixtures.furniture[base.task_config.opening.furniture]
-    index = [joint.name for joint in furniture.active_joints].index(base.model.opened_joint.name)
+    index = [joint.name for joint in furniture.active_joints].index(base.model.joint_to_open.name)
     share = base.task_config.opening.opened_at
     assert share >= 0.5
     for factor, opened in ((0.98, False), (1.02, True)):
         qpos = furniture.get_qpos()
-        qpos[:, index] = factor * share * max(base.model.opened_joint.limits, key=abs)
+        qpos[:, index] = factor * share * max(base.model.joint_to_open.limits, key=abs)
         furniture.set_qpos(qpos)
         assert bool(base.furniture_opened()[0]) is opened
     env.close()

@@ -130,7 +130,7 @@ def test_one_env_that_keeps_its_objects_resets_from_a_table(built, monkeypatch):
     assert env.seeds.initial_state_table is not None
     for seed in (2, 0):
         made.reset(seed=seed)
-        wanted = read_layout(env.seeds.layouts.path(env.seeds.objects_seeds[0], seed))
+        wanted = read_layout(env.seeds.layouts.layout_path(env.seeds.objects_seeds[0], seed))
         torch.testing.assert_close(
             env.object_poses, InitialStates.from_layouts([wanted], "cpu").object_poses, atol=1e-6, rtol=0
         )

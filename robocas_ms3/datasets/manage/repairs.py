@@ -16,7 +16,7 @@ from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.arrays import SPECS, EpisodeArrays, motion_arrays
 from robocas_ms3.demos.recordings.motion import planar_motion
-from robocas_ms3.robots.quantities import continuous_xyzw
+from robocas_ms3.robots.quantities import to_continuous_xyzw
 
 EMBEDDINGS = tuple(spec.name for spec in schema.EPISODE_INFO if spec.embedding)
 _ESSENTIAL = ("ee_pos", "ee_orn", "gripper_status", "language_goal", "step_lang_goals", "step_goal_type")
@@ -192,7 +192,7 @@ def turn_eef_frame(episode: ImportedEpisode, degrees: int) -> None:
     """Rotate the EEF frame of an episode about z, and derive the relative motion again."""
     arrays = episode.stored.arrays
     turns = Rotation.from_quat(arrays["ee_orn"]) * Rotation.from_euler("z", degrees, degrees=True)
-    arrays = {**arrays, "ee_orn": SPECS["ee_orn"].cast(continuous_xyzw(turns.as_matrix()))}
+    arrays = {**arrays, "ee_orn": SPECS["ee_orn"].cast(to_continuous_xyzw(turns.as_matrix()))}
     episode.put({**arrays, **motion_arrays(arrays, schema.RELATIVE_PAIRS[0])})
     episode.turn_deg = degrees
     wrong = Violation(episode.stored.file, "ee_orn, rel_pos, rel_orn", "ManiSkill's TCP frame", "another frame")

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.robots.description import RobotDescription
-from robocas_ms3.robots.description_file import tcp_and_base_poses
+from robocas_ms3.robots.description_file import tcp_and_arm_base_poses
 from robocas_ms3.robots.registry import RobotSpec
 
 Array = NDArray[np.float64]
@@ -169,7 +169,7 @@ class Motion:
     def of_joints(
         cls, robot: RobotSpec, root_in_world: Array, qpos: Array, qvel: Array, opened: NDArray[np.bool_]
     ) -> Motion:
-        return cls(qpos, qvel, root_in_world, *tcp_and_base_poses(robot, root_in_world, qpos), opened)
+        return cls(qpos, qvel, root_in_world, *tcp_and_arm_base_poses(robot, root_in_world, qpos), opened)
 
     @cached_property
     def tcp_in_base(self) -> Array:

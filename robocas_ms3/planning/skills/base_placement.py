@@ -33,7 +33,7 @@ from robocas_ms3.scenes.grasp_checks import (
     HALF_TURN,
     NEIGHBOURHOOD,
     PREGRASP_DISTANCE,
-    check_directions,
+    grasp_direction_tests,
     is_gripper_clear,
 )
 
@@ -183,7 +183,7 @@ def find_clear_grasps(arm: Arm, slot: int) -> Array:
     object_in_world = base @ object_in_base
     notes = arm.env.object_assets[0][slot].annotations
     poses = object_in_world @ notes.grasps_tcp_in_object[:: max(1, len(notes.grasp_widths) // GRASPS_TESTED)]
-    tests = check_directions(poses, np.ones(3), arm.approach)
+    tests = grasp_direction_tests(poses, np.ones(3), arm.approach)
     poses = poses[np.all([passed for name, passed in tests.items() if name != SIDE], axis=0)]
     near = arm.scene.points_in_base(exclude=slot, radius=NEIGHBOURHOOD, around=object_in_base[:3, 3])
     return poses[is_gripper_clear(poses, transform_points(base, near))]
@@ -226,4 +226,4 @@ def _sample_grasp_poses(arm: Arm, frame: Array, grasps: Array, count: int) -> Ar
 
 def _graspable_from(arm: Arm, frame: Array, grasps: Array) -> Array:
     center = grasps[:, :3, 3].mean(axis=0) if len(grasps) else np.zeros(3)
-    return grasps[check_directions(grasps, center - frame[:3, 3], arm.approach)[SIDE]]
+    return grasps[grasp_direction_tests(grasps, center - frame[:3, 3], arm.approach)[SIDE]]

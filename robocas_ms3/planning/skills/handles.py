@@ -58,7 +58,7 @@ class MovingPart:
     @classmethod
     def of(cls, arm: Arm) -> MovingPart:
         model = arm.env.model
-        opening, joint = model.config.opening, model.opened_joint
+        opening, joint = model.config.opening, model.joint_to_open
         assert opening is not None  # required by the task
         assert joint is not None
         return cls(opening.furniture, model.furniture[opening.furniture].asset.handles[opening.handle], joint)
@@ -201,7 +201,7 @@ def _plan_pull(arm: Arm, part: MovingPart, depth_offset: float) -> tuple[Traject
 def pull_fraction(arm: Arm, part: MovingPart, arm_base_in_world: Array, others: list[Obstacle]) -> float:
     """Return the fraction of a pull that the arm can make from another base pose; 1: opened with a margin."""
     positions = part.pull_positions(arm)
-    opened = arm.env.model.opened_position
+    opened = arm.env.model.open_threshold
     enough = 1 + int(np.sum(np.abs(positions) < abs(opened + COMFORT_FRACTION * (positions[-1] - opened))))
     frames = inverse(arm_base_in_world) @ part.in_world(arm, positions)
     try:

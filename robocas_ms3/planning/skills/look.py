@@ -12,7 +12,7 @@ from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.scenes.randomise import draw_camera_shift
-from robocas_ms3.scenes.visibility import MeshScene, PinholeCamera, object_mesh, ray_scene
+from robocas_ms3.scenes.visibility import MeshScene, PinholeCamera, load_visual_mesh, make_ray_scene
 
 FAR, NEAR = (0.4, 0.5), (0.2, 0.3)  # m from camera to target: first view, later views (RoboCAS-v0)
 ELEVATION_DEG = (60.0, 90.0)  # elevation of the camera above the target (RoboCAS-v0)
@@ -51,7 +51,7 @@ def load_object_meshes(arm: Arm) -> None:
     """Load the object meshes before the first decision; otherwise each forked process loads them again."""
     for asset, present in zip(arm.env.object_assets[0], arm.env.present[0].tolist(), strict=True):
         if present:
-            ray_scene(object_mesh(asset))
+            make_ray_scene(load_visual_mesh(asset))
 
 
 def hidden_fraction(arm: Arm, slot: int) -> float:
@@ -66,7 +66,7 @@ def hidden_fraction(arm: Arm, slot: int) -> float:
     camera = PinholeCamera(pose, config.width // scale, config.height // scale, float(config.fov or np.pi / 2))
     slots = np.flatnonzero(env.present[0].cpu().numpy()).tolist()
     poses = np.stack([arm.scene.arm_base_in_world @ arm.scene.object_in_base(s) for s in slots])
-    scenery = MeshScene([object_mesh(env.object_assets[0][s]) for s in slots], poses)
+    scenery = MeshScene([load_visual_mesh(env.object_assets[0][s]) for s in slots], poses)
     fraction = float(scenery.visible_fractions(camera)[slots.index(slot)])
     return 1.0 if np.isnan(fraction) else 1.0 - fraction
 

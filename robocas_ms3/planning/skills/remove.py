@@ -17,7 +17,7 @@ from robocas_ms3.planning.skills.arm import Arm, first_plan, plan_retreat, shift
 from robocas_ms3.planning.skills.grasp import grasp
 from robocas_ms3.planning.skills.place import attach_held
 from robocas_ms3.planning.skills.push import surface_in_base
-from robocas_ms3.scenes.grasp_checks import MAX_WIDTH, check_directions, is_gripper_clear
+from robocas_ms3.scenes.grasp_checks import MAX_WIDTH, grasp_direction_tests, is_gripper_clear
 
 GRID = 0.04  # m between candidate positions
 TURNS = 8  # yaw angles of the object
@@ -86,7 +86,7 @@ def find_grasp_blockers(arm: Arm, slot: int) -> list[int]:
 def _grasps_from_above(arm: Arm, slot: int) -> Array:
     notes, frame = arm.env.object_assets[0][slot].annotations, arm.scene.object_in_base(slot)
     grasps = frame @ notes.grasps_tcp_in_object
-    passed = np.logical_and.reduce(list(check_directions(grasps, frame[:3, 3]).values()))
+    passed = np.logical_and.reduce(list(grasp_direction_tests(grasps, frame[:3, 3]).values()))
     grasps = grasps[passed & (notes.grasp_widths <= MAX_WIDTH)]
     # evenly spaced instead of drawn, so that this query does not change the random state
     return grasps[np.linspace(0, len(grasps) - 1, min(len(grasps), GRASPS_TESTED)).astype(int)]

@@ -15,7 +15,7 @@ from robocas_ms3.core.paths import task_configs_dir
 from robocas_ms3.core.strict_model import did_you_mean, parse
 from robocas_ms3.scenes.config.compose import EXTENDS, Composition, parse_set_option
 from robocas_ms3.scenes.config.task import TaskConfig
-from robocas_ms3.scenes.language.texts import synonym_texts
+from robocas_ms3.scenes.language.texts import load_synonym_texts
 from robocas_ms3.scenes.task_specs import TaskSpec
 
 CHAIN_LIMIT = 8
@@ -80,7 +80,7 @@ def load_task_config(
     label = f"{label} with {', '.join(sources)}" if sources else label
     where = partial(composition.source_of, default=label)
     parsed = parse(TaskConfig, composition.values, ConfigError, where=where)
-    supports = synonym_texts().supports
+    supports = load_synonym_texts().supports
     if parsed.support not in supports and not isinstance(config, dict):
         message = "%s: no synonyms for the support %r; instructions contain 'on the %s' (supports with synonyms: %s)"
         _log.warning(message, where("support"), parsed.support, parsed.support, ", ".join(sorted(supports)))

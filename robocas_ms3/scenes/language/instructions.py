@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeVar, cast, get_args
 import numpy as np
 
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.scenes.language.texts import Split, Templates, instruction_texts, synonym_texts
+from robocas_ms3.scenes.language.texts import Split, Templates, load_instruction_texts, load_synonym_texts
 from robocas_ms3.scenes.relations import Relation
 from robocas_ms3.scenes.task_specs import TASKS
 
@@ -88,13 +88,13 @@ def make_instruction(slots: InstructionSlots, template_id: str = "") -> Instruct
     template_id = template_id or f"{slots.task}/upstream/00"
     for split in SPLITS:
         if template_id in (ids := template_ids(slots.task, split)):
-            phrase = instruction_texts().relations[slots.relation].plain if slots.relation else ""
+            phrase = load_instruction_texts().relations[slots.relation].plain if slots.relation else ""
             return _render(slots, split, ids.index(template_id), (slots.object, slots.support, phrase))
     expected = f"{slots.task}/SPLIT/NN with SPLIT one of {list(SPLITS)}, NN below their counts"
     raise RobocasError("no such template", where=template_id, expected=expected)
 
 
-def choose_instruction(
+def draw_instruction(
     rng: np.random.Generator,
     slots: InstructionSlots,
     split: Split,
@@ -117,17 +117,20 @@ def choose_instruction(
         RobocasError: the task has no templates of the split.
     """
     draws = rng.random(4)
-    words, relation = synonym_texts(), instruction_texts().relations[slots.relation] if slots.relation else None
+    words, relation = (
+        load_synonym_texts(),
+        load_instruction_texts().relations[slots.relation] if slots.relation else None,
+    )
     templates = _templates(slots.task, split)
     if not templates:
         raise RobocasError("this task has no templates of this split", where=slots.task, found=split)
     objects, supports, phrases = [slots.object], [slots.support], [relation.plain if relation else ""]
     if synonyms:
-        known = words.objects[slots.object].of(split) if slots.object in words.objects else ()
+        known = words.objects[slots.object].for_split(split) if slots.object in words.objects else ()
         others = [name for name in others if name != slots.object]
-        objects += [word for word in known if not any(could_mean(word, name) for name in others)]
-        supports += words.supports[slots.support].of(split) if slots.support in words.supports else ()
-        phrases += relation.of(split) if relation else ()
+        objects += [word for word in known if not any(fits_name(word, name) for name in others)]
+        supports += words.supports[slots.support].for_split(split) if slots.support in words.supports else ()
+        phrases += relation.for_split(split) if relation else ()
     drawn = _pick(objects, draws[1]), _pick(supports, draws[2]), _pick(phrases, draws[3])
     return _render(slots, split, _pick(range(len(templates)), draws[0]), drawn)
 
@@ -151,7 +154,7 @@ def episode_instruction(config: TaskConfig, layout: Layout, seed: int, name: str
         part=opening.part or part_name(opening.handle) if opening else "",
     )
     rng, others = np.random.default_rng([seed, _LANGUAGE]), sorted(set(names) - {name})
-    return choose_instruction(rng, slots, language.split, others=others, synonyms=language.synonyms)
+    return draw_instruction(rng, slots, language.split, others=others, synonyms=language.synonyms)
 
 
 def template_ids(task: str, split: Split) -> list[str]:
@@ -168,19 +171,19 @@ def part_name(link: str) -> str:
     return " ".join([last, *noun] if sided else [*noun, last])
 
 
-def could_mean(word: str, name: str) -> bool:
+def fits_name(word: str, name: str) -> bool:
     """Return whether a word fits an object's name: 'shampoo bottle' fits 'white shampoo bottle'."""
     return set(word.lower().split()) <= set(name.lower().split())
 
 
 def is_plural(word: str) -> bool:
     """Return whether the pronoun of a word is 'them': 'scissors', but not 'pair of scissors'."""
-    return word.partition(" of ")[0].split()[-1] in synonym_texts().plurals
+    return word.partition(" of ")[0].split()[-1] in load_synonym_texts().plurals
 
 
 def _render(slots: InstructionSlots, split: Split, index: int, words: tuple[str, str, str]) -> Instruction:
     object_word, support_word, phrase = words
-    known = synonym_texts().supports.get(slots.support)
+    known = load_synonym_texts().supports.get(slots.support)
     text = _templates(slots.task, split)[index].format(
         object=phrase.format(object=object_word) if phrase else object_word,
         support=support_word,
@@ -192,7 +195,7 @@ def _render(slots: InstructionSlots, split: Split, index: int, words: tuple[str,
 
 
 def _templates(task: str, split: Split) -> Sequence[str]:
-    return Templates.for_task(TASKS.find(task)).of(split)
+    return Templates.for_task(TASKS.find(task)).for_split(split)
 
 
 def _tasks_with(slot: str) -> str:

@@ -32,7 +32,7 @@ class Synonyms(StrictModel):
     train: Words = ()
     held_out: Words = ()
 
-    def of(self, split: Split) -> Words:
+    def for_split(self, split: Split) -> Words:
         """Return the words of a split; the split ``upstream`` has no synonyms."""
         return getattr(self, split, ())
 
@@ -50,7 +50,7 @@ class Templates(Synonyms):
             ConfigError: a template is invalid.
         """
         if not spec.instructions:
-            return instruction_texts().tasks[spec.name]
+            return load_instruction_texts().tasks[spec.name]
         try:
             templates = cls.model_validate(spec.instructions)
             templates.check(spec)
@@ -105,12 +105,12 @@ class SynonymTexts(StrictModel):
 
 
 @lru_cache
-def instruction_texts() -> InstructionTexts:
+def load_instruction_texts() -> InstructionTexts:
     return read_texts(INSTRUCTIONS_FILE, InstructionTexts)
 
 
 @lru_cache
-def synonym_texts() -> SynonymTexts:
+def load_synonym_texts() -> SynonymTexts:
     return read_texts(SYNONYMS_FILE, SynonymTexts)
 
 

@@ -19,7 +19,7 @@ from robocas_ms3.demos.recordings.motion import (
 )
 from robocas_ms3.demos.recordings.subgoals import SubGoal, sample_subgoals
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.robots.quantities import continuous_xyzw
+from robocas_ms3.robots.quantities import to_continuous_xyzw
 
 
 @st.composite
@@ -52,7 +52,7 @@ def test_relative_motion_composes_to_the_poses(tcp, base):
 def test_orientations_have_continuous_signs():
     turns = Rotation.from_euler("z", np.linspace(0, 720, 60)[:, None], degrees=True)
     poses = from_xyzw(np.zeros((60, 3)), turns.as_quat())
-    quaternions = continuous_xyzw(poses)
+    quaternions = to_continuous_xyzw(poses)
     assert quaternions[0, 3] > 0
     assert np.sum(quaternions[1:] * quaternions[:-1], axis=1).min() > 0.99
     np.testing.assert_allclose(Rotation.from_quat(quaternions).as_matrix(), poses[:, :3, :3], atol=1e-12)

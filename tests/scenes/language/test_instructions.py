@@ -10,14 +10,14 @@ from robocas_ms3.scenes.language.instructions import (
     SPLITS,
     Instruction,
     InstructionSlots,
-    choose_instruction,
-    could_mean,
+    draw_instruction,
+    fits_name,
     is_plural,
     make_instruction,
     part_name,
     template_ids,
 )
-from robocas_ms3.scenes.language.texts import Split, instruction_texts, synonym_texts
+from robocas_ms3.scenes.language.texts import Split, load_instruction_texts, load_synonym_texts
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.task_specs import TASKS
 
@@ -29,7 +29,7 @@ def slots(task: str = "pick", object: str = "apple", support: str = "table", **m
 
 
 def choose(seed: int, about: InstructionSlots | None = None, split: Split = "train", **options: Any) -> Instruction:
-    return choose_instruction(np.random.default_rng(seed), about or slots(), split, **options)
+    return draw_instruction(np.random.default_rng(seed), about or slots(), split, **options)
 
 
 @pytest.mark.parametrize(
@@ -100,10 +100,10 @@ def test_draws_are_repeatable_and_reach_everything():
     found = [choose(seed) for seed in range(400)]
     assert found == [choose(seed) for seed in range(400)]
     assert {item.template_id for item in found} == set(template_ids("pick", "train"))
-    assert {item.object_word for item in found} == {"apple", *synonym_texts().objects["apple"].train}
-    assert {item.support_word for item in found} == {"table", *synonym_texts().supports["table"].train}
+    assert {item.object_word for item in found} == {"apple", *load_synonym_texts().objects["apple"].train}
+    assert {item.support_word for item in found} == {"table", *load_synonym_texts().supports["table"].train}
     phrases = {choose(seed, slots("select"), "held_out").relation_phrase for seed in range(100)}
-    nearest = instruction_texts().relations["nearest"]
+    nearest = load_instruction_texts().relations["nearest"]
     assert phrases == {nearest.plain, *nearest.held_out}
 
 
@@ -113,7 +113,7 @@ def test_every_draw_moves_the_generator_by_the_same_amount():
         for split in SPLITS:
             for synonyms in (True, False):
                 rng = np.random.default_rng(1)
-                choose_instruction(rng, slots(task), split, synonyms=synonyms)
+                draw_instruction(rng, slots(task), split, synonyms=synonyms)
                 states.add(rng.random())
     assert len(states) == 1
 
@@ -140,8 +140,8 @@ def test_synonyms_that_fit_another_object_are_not_used():
 
     assert words("mug", "apple") == {"mug", "cup", "coffee mug"}
     assert words("paper cup") == {"mug", "coffee mug"}
-    assert could_mean("shampoo bottle", "white shampoo bottle")
-    assert not could_mean("white shampoo bottle", "shampoo bottle")
+    assert fits_name("shampoo bottle", "white shampoo bottle")
+    assert not fits_name("white shampoo bottle", "shampoo bottle")
 
 
 @pytest.mark.parametrize(

@@ -10,21 +10,21 @@ from robocas_ms3.core.paths import builtin_packs_dir
 from robocas_ms3.scenes.language.instructions import (
     SPLITS,
     InstructionSlots,
-    could_mean,
+    fits_name,
     make_instruction,
     template_ids,
 )
 from robocas_ms3.scenes.language.texts import (
     INSTRUCTIONS_FILE,
     InstructionTexts,
-    instruction_texts,
+    load_instruction_texts,
+    load_synonym_texts,
     read_texts,
-    synonym_texts,
 )
 from robocas_ms3.scenes.relations import RELATIONS
 from robocas_ms3.scenes.task_specs import TASKS
 
-TEXTS, WORDS = instruction_texts(), synonym_texts()
+TEXTS, WORDS = load_instruction_texts(), load_synonym_texts()
 NAMES = sorted(
     asset["name"]
     for asset in json.loads((builtin_packs_dir() / "builtin" / "manifest.json").read_text())["assets"]
@@ -42,10 +42,12 @@ def test_every_task_has_its_paraphrases():
 
 def test_templates_are_unique_over_both_splits():
     for templates in TEXTS.tasks.values():
-        texts = [normal(t) for split in SPLITS for t in templates.of(split)]
+        texts = [normal(t) for split in SPLITS for t in templates.for_split(split)]
         assert len(set(texts)) == len(texts)
     # held-out templates of one task are in no split of another task
-    train, held_out = ({normal(t) for task in TEXTS.tasks.values() for t in task.of(s)} for s in ("train", "held_out"))
+    train, held_out = (
+        {normal(t) for task in TEXTS.tasks.values() for t in task.for_split(s)} for s in ("train", "held_out")
+    )
     assert not train & held_out
 
 
@@ -97,7 +99,7 @@ def test_no_word_could_mean_another_builtin_object():
     for (a, of_a), (b, of_b) in combinations(WORDS.objects.items(), 2):
         for x in (a, *of_a.train, *of_a.held_out):
             for y in (b, *of_b.train, *of_b.held_out):
-                assert not could_mean(x, y) and not could_mean(y, x), f"{x!r} of {a}, {y!r} of {b}"
+                assert not fits_name(x, y) and not fits_name(y, x), f"{x!r} of {a}, {y!r} of {b}"
 
 
 @pytest.mark.parametrize(

@@ -249,13 +249,13 @@ def test_tasks_add_their_observations(env_id, names):
         handle = base.handle_in_world()[0].copy()
         shut = reward_now(base)
         qpos = furniture.get_qpos().clone()
-        qpos[:, joint] = base.model.opened_position / 2
+        qpos[:, joint] = base.model.open_threshold / 2
         furniture.set_qpos(qpos)
         half = reward_now(base)
         assert (shut[1]["open"], half[1]["open"]) == pytest.approx((0, 0.5), abs=1e-3)
         assert half[0] > shut[0]
         assert np.linalg.norm(base.handle_in_world()[0] - handle) > 0.1  # the handle moves with the door
-        qpos[:, joint] = base.model.opened_position * 1.01
+        qpos[:, joint] = base.model.open_threshold * 1.01
         furniture.set_qpos(qpos)
         assert reward_now(base)[0] > 4 / 14
     env.close()
