@@ -90,9 +90,9 @@ def measure_cases(cfg: Benchmark, trajectory: Path, work: Path) -> dict[str, Any
     cases: dict[str, list[tuple[float, float]]] = {name: [] for name in cfg.cases}
     with TrajectoryFile(trajectory) as file:
         steps = sum(
-            len(sample_states(file.recording(i).control_steps, _stride(cfg, file))) for i in range(cfg.episodes)
+            len(sample_states(file.read_recording(i).control_steps, _stride(cfg, file))) for i in range(cfg.episodes)
         )
-        with closing(EnvRenderer(file.env, file.recording(0).control_mode, ImageOptions(size=cfg.size))) as source:
+        with closing(EnvRenderer(file.env, file.read_recording(0).control_mode, ImageOptions(size=cfg.size))) as source:
             for _ in range(cfg.turns):
                 for depth, spent in bare.items():
                     spent.append(alone(cfg, file, source, TEXTURES[depth]))
@@ -124,7 +124,7 @@ def alone(cfg: Benchmark, file: TrajectoryFile, source: EnvRenderer, textures: t
     total = (0.0, 0.0)
     env: Any = source.env.unwrapped
     for index in range(cfg.episodes):
-        recording = file.recording(index)
+        recording = file.read_recording(index)
         source.load(recording)
         scene = env.scene.sub_scenes[0]
         cameras = [sensor.camera._render_cameras[0] for sensor in env._sensors.values()]

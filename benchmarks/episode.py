@@ -180,7 +180,11 @@ def judge(found: Seed, generator: EpisodeGenerator, path: Path, args: Args) -> N
         return
     world = generator.open_loop_envs[0]
     stride = sample_stride(generator.settings.control_freq, world.rate_hz)
-    own = Motion.of(PANDA, states, actions[:, 7], sample_states(len(actions), stride)).actions[:-1].astype(np.float64)
+    own = (
+        Motion.from_states(PANDA, states, actions[:, 7], sample_states(len(actions), stride))
+        .actions[:-1]
+        .astype(np.float64)
+    )
     for draw in range(-1, args.draws):
         world.reset(found.seed)
         rng = np.random.default_rng([found.seed, FRESH + draw + 1])

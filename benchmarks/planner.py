@@ -17,7 +17,7 @@ from collections.abc import Callable
 import numpy as np
 
 from robocas_ms3 import PlanningError
-from robocas_ms3.planning.kinematics import ArmChain, Reachability
+from robocas_ms3.planning.kinematics import ArmChain, InverseKinematics
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.rrt_connect import RRTConnectPlanner
 from robocas_ms3.robots.description import MOBILE_PANDA
@@ -101,7 +101,7 @@ def main() -> None:
 
     files, watch, points, seconds = make_robot_files(), Stopwatch(), [], []
     planner = RRTConnectPlanner(files.arm_urdf, files.arm_srdf, robot=MOBILE_PANDA, dt=0.05)
-    reachability = Reachability(ArmChain(files.arm_urdf, MOBILE_PANDA))
+    reachability = InverseKinematics(ArmChain(files.arm_urdf, MOBILE_PANDA))
     for scene in range(options.seed, options.seed + options.scenes):
         rng = np.random.default_rng(scene)
         cloud = table(rng)

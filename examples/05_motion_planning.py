@@ -22,7 +22,7 @@ from robocas_ms3.planning.grasp_choice import filter_grasps, grip_margins
 from robocas_ms3.planning.motionplanner import PandaArmMotionPlanningSolver
 from robocas_ms3.planning.protocol import AttachedBody
 from robocas_ms3.planning.scene import SPACING, PlanningScene
-from robocas_ms3.planning.skills.place import ContainerInterior, compute_overhang, sample_drops
+from robocas_ms3.planning.skills.place import ContainerInterior, compute_overhang, sample_poses_above_container
 from robocas_ms3.scenes.grasp_checks import is_gripper_clear
 
 
@@ -115,7 +115,7 @@ def ranked_drops(env, scene, slot, held, rng):
     inside = ContainerInterior(scene.basket_in_base, np.array(inner.min), np.array(inner.max))
     center = np.array([env.object_assets[0][slot].asset.center_of_mass])
     vertices, center = transform_points(held.object_in_tcp, held.vertices), transform_points(held.object_in_tcp, center)
-    drops = sample_drops(rng, 200, inside, vertices, center[0])
+    drops = sample_poses_above_container(rng, 200, inside, vertices, center[0])
     overhang = compute_overhang(drops, inside, vertices, margin=0.03)
     order = np.lexsort((drops[:, 2, 2], np.ceil(overhang / 0.015)))
     return [sapien.Pose(scene.arm_base_in_world @ drops[i]) for i in order]

@@ -174,10 +174,10 @@ def read_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArra
                 on_read(index, len(file.episodes))
                 if not entry.get("success", True):
                     continue
-                recording = file.recording(index)
+                recording = file.read_recording(index)
                 where = f"{path}, episode {recording.episode_id}"
                 samples = sample_states(recording.control_steps, stride)
-                motion = recording.motion(samples)
+                motion = recording.compute_motion(samples)
                 check_base_is_fixed(np.diff(motion.qpos[:, RobotDescription.base_slice], axis=0), where)
                 if env is None:
                     env = file.env.make(obs_mode="state_dict", render_backend="none", reward_mode="none")

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
-from robocas_ms3.demos.recordings.motion import stored_actions
+from robocas_ms3.demos.recordings.motion import to_dataset_actions
 
 ACTION_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
 """Translation in m and Euler xyz angles in rad, both in the EEF frame at the step; gripper command, 1 = open."""
@@ -27,7 +27,7 @@ def episode_actions(arrays: Mapping[str, NDArray]) -> NDArray[np.float32]:
     Translation is ``rel_pos[t]`` in m. Rotation is ``rel_orn[t]`` as Euler angles in rad about the fixed axes x, y, z
     (scipy's "xyz", the convention of ``action_space``). The gripper command is ``gripper_status[t + 1]``.
     """
-    return stored_actions(arrays["rel_pos"], arrays["rel_orn"], arrays["gripper_status"])
+    return to_dataset_actions(arrays["rel_pos"], arrays["rel_orn"], arrays["gripper_status"])
 
 
 def require_actions(arrays: Mapping[str, NDArray], where: str) -> NDArray[np.float32]:

@@ -43,7 +43,7 @@ def order_candidates(
         PlanningError: no candidate could be played; the error of the last one.
     """
     failure, continued, remaining = PlanningError("decision", "no_candidate"), 0, iter(candidates)
-    while continued < limits.max_continued and not result.out_of_attempts:
+    while continued < limits.max_continued_candidates and not result.has_no_attempts_left:
         scored: list[tuple[float, T]] = []
         for candidate in remaining:
             outcome = yield candidate, False
@@ -52,14 +52,14 @@ def order_candidates(
                 continue
             assert outcome is not None
             scored.append((outcome, candidate))
-            if len(scored) == limits.compared or outcome >= limits.sufficient_score:
+            if len(scored) == limits.max_compared_candidates or outcome >= limits.sufficient_score:
                 break
         if not scored:
             break
         for _, candidate in sorted(scored, key=lambda pair: -pair[0]):
             yield candidate, True
             continued += 1
-            if continued == limits.max_continued or result.out_of_attempts:
+            if continued == limits.max_continued_candidates or result.has_no_attempts_left:
                 break
     raise CandidatesExhaustedError if continued else failure
 
@@ -123,7 +123,9 @@ class ResimulatedDecisions:
                 return False
             self._decisions[-1].advance()
 
-    def choose(self, candidates: Iterable[T], play: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE) -> T:
+    def choose(
+        self, candidates: Iterable[T], run_candidate: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE
+    ) -> T:
         items = list(candidates)
         if self._depth == len(self._decisions):
             self._decisions.append(_Decision(order_candidates(range(len(items)), limits, self._result)))
@@ -135,7 +137,7 @@ class ResimulatedDecisions:
             index, continues = decision.next
             if not continues:
                 try:
-                    outcome = play(items[index])
+                    outcome = run_candidate(items[index])
                 except PlanningError as error:
                     outcome = error
                 decision.advance(outcome)
@@ -144,5 +146,5 @@ class ResimulatedDecisions:
                 decision.chosen = index  # the candidate just played is the best one: keep its motions
                 return items[index]
             decision.chosen = index
-        play(items[decision.chosen])
+        run_candidate(items[decision.chosen])
         return items[decision.chosen]

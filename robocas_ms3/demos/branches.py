@@ -127,7 +127,7 @@ def warn_no_fork(reason: str) -> None:
     )
 
 
-class _Success(Exception):  # noqa: N818
+class _EpisodeFinished(Exception):  # noqa: N818
     """Signal that a child process finished the episode."""
 
 
@@ -144,7 +144,7 @@ class ForkedDecisions:
         succeeded = True
         try:
             attempt()
-        except _Success:
+        except _EpisodeFinished:
             pass
         except CandidatesExhaustedError:
             succeeded = False
@@ -159,22 +159,24 @@ class ForkedDecisions:
             self._send_and_exit(succeeded)
         return succeeded
 
-    def choose(self, candidates: Iterable[T], play: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE) -> T:
+    def choose(
+        self, candidates: Iterable[T], run_candidate: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE
+    ) -> T:
         """Choose a candidate, see `Decisions.choose`; return in the child process that continues the episode."""
         order = order_candidates(enumerate(candidates), limits, self._result)
-        played: dict[int, ForkedProcess] = {}
+        children: dict[int, ForkedProcess] = {}
         outcome: float | PlanningError | None = None
         try:
             while True:
                 (number, candidate), continues = order.send(outcome)
                 outcome = None
                 if not continues:
-                    child, outcome = self._play_in_child(play, candidate)
+                    child, outcome = self._run_in_child(run_candidate, candidate)
                     if child is None:
                         return candidate
-                    played[number] = child
-                elif not self._continue_as(played[number]):
-                    again, failure = self._play_in_child(play, candidate)
+                    children[number] = child
+                elif not self._continue_as(children[number]):
+                    again, failure = self._run_in_child(run_candidate, candidate)
                     if again is None:
                         return candidate
                     if isinstance(failure, PlanningError) or not self._continue_as(again):
@@ -182,8 +184,8 @@ class ForkedDecisions:
         finally:
             self._kill_children()
 
-    def _play_in_child(
-        self, play: Callable[[T], float], candidate: T
+    def _run_in_child(
+        self, run_candidate: Callable[[T], float], candidate: T
     ) -> tuple[ForkedProcess | None, float | PlanningError]:
         """Play a candidate in a child process; return the child and its score or error.
 
@@ -192,7 +194,7 @@ class ForkedDecisions:
         for last in (False, True):
             child = self._fork()
             if child is None:
-                self._play(play, candidate)
+                self._run_and_wait(run_candidate, candidate)
                 return None, 0.0
             try:
                 outcome = self._receive(child, CANDIDATE_TIMEOUT)
@@ -238,7 +240,7 @@ class ForkedDecisions:
         finally:
             self._kill(child)
         if succeeded:
-            raise _Success
+            raise _EpisodeFinished
         return True
 
     def _receive(self, child: ForkedProcess, limit: float) -> Any:
@@ -256,9 +258,9 @@ class ForkedDecisions:
         for child in list(self._children):
             self._kill(child)
 
-    def _play(self, play: Callable[[T], float], candidate: T) -> None:
+    def _run_and_wait(self, run_candidate: Callable[[T], float], candidate: T) -> None:
         try:
-            score = float(play(candidate))
+            score = float(run_candidate(candidate))
         except PlanningError as error:
             self._send_and_exit(error)
         except BaseException as error:

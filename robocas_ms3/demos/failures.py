@@ -16,7 +16,7 @@ from pydantic import Field
 
 from robocas_ms3.core.checks import MAX_SEED
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.planning.decisions import Seconds
+from robocas_ms3.planning.decisions import CpuSeconds
 
 FAILURES_FILE = "failures.jsonl"
 WITH_NOISE = "_with_noise"  # suffix of the reasons of attempts that failed only with noise
@@ -62,7 +62,7 @@ class EpisodeResult:
     success: bool
     steps: int = 0
     attempts: int = 0
-    seconds: Seconds = field(default_factory=Seconds)
+    seconds: CpuSeconds = field(default_factory=CpuSeconds)
     failures: list[FailedAttempt] = field(default_factory=list)
     max_attempts: int = 1
     attempt_start: float = field(default_factory=time.perf_counter)
@@ -73,7 +73,7 @@ class EpisodeResult:
         return sum(failure.reason.endswith(WITH_NOISE) for failure in self.failures)
 
     @property
-    def out_of_attempts(self) -> bool:
+    def has_no_attempts_left(self) -> bool:
         return len(self.failures) >= self.max_attempts
 
     def add_failure(self, error: PlanningError) -> None:
@@ -109,7 +109,9 @@ class Intervention:
     skip_reason: str = ""
 
 
-def failed_attempts(seed: int, recorded: Iterable[str], logged: Mapping[int, FailedAttempt]) -> list[FailedAttempt]:
+def restore_failed_attempts(
+    seed: int, recorded: Iterable[str], logged: Mapping[int, FailedAttempt]
+) -> list[FailedAttempt]:
     """Return the failed attempts of a recorded seed.
 
     Args:
@@ -125,6 +127,6 @@ def failed_attempts(seed: int, recorded: Iterable[str], logged: Mapping[int, Fai
     return failures
 
 
-def count_by_stage(failures: Iterable[FailedAttempt]) -> dict[str, int]:
+def count_by_reason(failures: Iterable[FailedAttempt]) -> dict[str, int]:
     """Return ``{"stage: reason": count}``, most frequent first."""
     return dict(Counter(f"{f.stage}: {f.reason}" for f in failures if not f.skipped).most_common())

@@ -26,13 +26,13 @@ from robocas_ms3.demos.failures import (
     EpisodeResult,
     FailedAttempt,
     Intervention,
-    count_by_stage,
-    failed_attempts,
+    count_by_reason,
+    restore_failed_attempts,
 )
 from robocas_ms3.demos.recordings.trajectory_hdf5 import merge, open_trajectory
-from robocas_ms3.demos.recordings.trajectory_json import read_json, versions
+from robocas_ms3.demos.recordings.trajectory_json import package_versions, read_json
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings
-from robocas_ms3.planning.decisions import Seconds
+from robocas_ms3.planning.decisions import CpuSeconds
 
 RUN = "run.json"
 WEIGHTS = "after_policy_weights"
@@ -44,7 +44,7 @@ def _upgrade_run(record: dict[str, Any]) -> dict[str, Any]:
     settings = record["settings"]
     if isinstance(settings, dict):
         settings = {**json.loads(json.dumps(asdict(EpisodeSettings("pick")))), **settings}
-    return {"versions": versions(), **record, "settings": settings}
+    return {"versions": package_versions(), **record, "settings": settings}
 
 
 OUTPUT = FolderKind("robocas generate", (RUN,), "settings", upgrade=_upgrade_run)
@@ -107,34 +107,34 @@ def generate(
     settings.check()
     assert settings.out is not None
     assert bool(settings.episode.after_policy) == (make_roll_in is not None)
-    record = {"settings": asdict(settings.episode), "first_seed": settings.seed, "versions": versions()}
+    record = {"settings": asdict(settings.episode), "first_seed": settings.seed, "versions": package_versions()}
     if weights:
         record[WEIGHTS] = weights
     with OutputFolder(settings.out, OUTPUT, record, overwrite=settings.overwrite) as output:
         output.start(record)
         run = _Run(output.path)
         on_start(min(settings.episodes, sum(result.success for result in run.earlier.values())))
-        results, good = [], 0
+        results, successes = [], 0
         try:
             with closing(_results(settings, run, make_roll_in)) as found:
-                while good < settings.episodes:
+                while successes < settings.episodes:
                     result = next(found)
                     if result.seed not in run.earlier:
                         output.check_exists()
-                        run.failures.append(_lines(result))
+                        run.failures.append(_failure_lines(result))
                         on_result(result)
                     results.append(result)
-                    good += result.success
-                    if len(results) - good > max(20, 3 * good):
+                    successes += result.success
+                    if len(results) - successes > max(20, 3 * successes):
                         raise RobocasError(
                             "too many seeds are skipped",
                             where=output.path,
-                            found=f"{len(results) - good} of {len(results)}",
+                            found=f"{len(results) - successes} of {len(results)}",
                             fix=f"See {FAILURES_FILE} for the reasons; fewer objects (--set objects.count=N) may help.",
                         )
         except BaseException:
             if not (results or run.earlier):
-                shutil.rmtree(run.shards, ignore_errors=True)  # partial files only
+                shutil.rmtree(run.episodes_folder, ignore_errors=True)  # partial files only
             raise
         return run.finish(results)
 
@@ -143,7 +143,7 @@ def _results(
     settings: GenerateSettings, run: _Run, make_roll_in: Callable[[], Worker[int, Intervention]] | None
 ) -> Generator[EpisodeResult, None, None]:
     missing = (seed for seed in count(settings.seed) if seed not in run.earlier)
-    with closing(generate_seeds(settings, missing, run.shards, make_roll_in)) as new:
+    with closing(generate_seeds(settings, missing, run.episodes_folder, make_roll_in)) as new:
         for seed in count(settings.seed):
             yield run.earlier[seed] if seed in run.earlier else next(new)
 
@@ -178,7 +178,7 @@ class _EpisodeWorker:
 
     def run(self, task: int | Intervention) -> EpisodeResult:
         seed, intervention = (task, None) if isinstance(task, int) else (task.seed, task)
-        return self._generator.generate(seed, self._folder, shard_name(seed), intervention)
+        return self._generator.generate(seed, self._folder, seed_file_stem(seed), intervention)
 
     def close(self) -> None:
         self._generator.close()
@@ -199,11 +199,11 @@ def _crashed_episode(task: int | Intervention, reason: str) -> EpisodeResult:
     return EpisodeResult(seed, success=False, attempts=1, failures=[FailedAttempt(seed, 0, "worker", reason, 0.0)])
 
 
-def shard_name(seed: int) -> str:
+def seed_file_stem(seed: int) -> str:
     return f"seed_{seed:09d}"
 
 
-def _lines(result: EpisodeResult) -> list[FailedAttempt]:
+def _failure_lines(result: EpisodeResult) -> list[FailedAttempt]:
     skipped = [] if result.success else [FailedAttempt(result.seed, -1, "episode", "skipped", 0.0)]
     return [*result.failures, *skipped]
 
@@ -219,7 +219,7 @@ class _Run:
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._trajectory = folder, folder / "trajectory.h5"
-        self.shards = make_folder(folder / "episodes")
+        self.episodes_folder = make_folder(folder / "episodes")
         self.failures: JsonLinesFile[FailedAttempt] = JsonLinesFile(folder / FAILURES_FILE, FailedAttempt)
         logged: dict[int, dict[int, FailedAttempt]] = defaultdict(dict)  # by seed and attempt, the first of duplicates
         for failure in self.failures.read():
@@ -230,18 +230,18 @@ class _Run:
             for seed, lines in logged.items()
             if list(lines) == [*range(len(lines) - 1), -1]  # else lines are missing: run the seed again
         }
-        for path in sorted(self.shards.glob("seed_*.h5")):
+        for path in sorted(self.episodes_folder.glob("seed_*.h5")):
             try:
                 open_trajectory(path).close()
                 self.earlier |= self._read(path)
             except RobocasError:
                 path.unlink()
-        self.earlier |= self._merged()
+        self.earlier |= self._read_merged()
         self._rewrite_failures([self.earlier[seed] for seed in sorted(self.earlier)])
 
     def _rewrite_failures(self, results: list[EpisodeResult]) -> None:
         """Rewrite ``failures.jsonl`` if its lines differ from these results, e.g. after a kill."""
-        lines = [line for result in results for line in _lines(result)]
+        lines = [line for result in results for line in _failure_lines(result)]
         if [line.record for line in self.failures.lines()] != lines:
             self.failures.rewrite(lines)
 
@@ -253,7 +253,7 @@ class _Run:
                 if recorded := episode.get("robocas"):
                     seed = int(episode["episode_seed"])
                     result = EpisodeResult(seed, True, int(episode["elapsed_steps"]), int(recorded["attempts"]))
-                    result.failures = failed_attempts(seed, recorded["failed_attempts"], self._logged[seed])
+                    result.failures = restore_failed_attempts(seed, recorded["failed_attempts"], self._logged[seed])
                     for part, value in recorded["seconds"].items():
                         setattr(result.seconds, part, float(value))
                     results[seed] = result
@@ -263,7 +263,7 @@ class _Run:
                 raise DatasetError(what, where=where, found=one_line(error), fix=fix) from error
         return results
 
-    def _merged(self) -> dict[int, EpisodeResult]:
+    def _read_merged(self) -> dict[int, EpisodeResult]:
         path = self._trajectory
         if not path.is_file():
             return {}
@@ -275,24 +275,28 @@ class _Run:
         return self._read(path)
 
     def finish(self, results: list[EpisodeResult]) -> Summary:
-        merged = self._merged()
+        merged = self._read_merged()
         beyond = range(results[-1].seed + 1, max(merged, default=-1) + 1)  # more episodes exist than were requested
         results = [*results, *(self.earlier[seed] for seed in beyond if seed in self.earlier)]
-        good = [result for result in results if result.success]
-        new = [self.shards / f"{shard_name(result.seed)}.h5" for result in good if result.seed not in merged]
+        successes = [result for result in results if result.success]
+        new = [
+            self.episodes_folder / f"{seed_file_stem(result.seed)}.h5"
+            for result in successes
+            if result.seed not in merged
+        ]
         if new:
             merge(([self._trajectory] if merged else []) + new, self._trajectory)
             flush_to_disk(self._folder)  # before its source files are deleted
-        shutil.rmtree(self.shards)
+        shutil.rmtree(self.episodes_folder)
         self._rewrite_failures(results)
-        seconds = {part.name: [getattr(result.seconds, part.name) for result in results] for part in fields(Seconds)}
+        seconds = {part.name: [getattr(result.seconds, part.name) for result in results] for part in fields(CpuSeconds)}
         summary = Summary(
             self._trajectory,
-            len(good),
+            len(successes),
             len(results),
             {name: round(float(np.mean(values)), 3) for name, values in seconds.items()},
-            round(float(np.mean([result.steps for result in good])), 1),
-            count_by_stage(self.failures.read()),
+            round(float(np.mean([result.steps for result in successes])), 1),
+            count_by_reason(self.failures.read()),
             [result.seed for result in results if not result.success],
         )
         rate = {"trajectory": self._trajectory.name, "success_rate": summary.success_rate}

@@ -23,8 +23,8 @@ from robocas_ms3.demos.recordings.episode_recorder import EpisodeRecorder
 from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.planning.decisions import Decisions, IrreversibleDecisions
-from robocas_ms3.planning.executor import Executor
-from robocas_ms3.planning.kinematics import ArmChain, Reachability
+from robocas_ms3.planning.executor import MotionExecutor
+from robocas_ms3.planning.kinematics import ArmChain, InverseKinematics
 from robocas_ms3.planning.protocol import Planner
 from robocas_ms3.planning.rrt_connect import make_planner
 from robocas_ms3.planning.skills.arm import Arm, recover
@@ -65,7 +65,7 @@ class EpisodeGenerator:
         base_env = self.env.unwrapped
         assert isinstance(base_env, RoboCASEnv)
         self.planner: Planner = make_planner(settings.planner, robot, dt=base_env.control_timestep)
-        self.reachability = Reachability(ArmChain(robot.files().arm_urdf, robot.description))
+        self.inverse_kinematics = InverseKinematics(ArmChain(robot.files().arm_urdf, robot.description))
         # runs one attempt from the current state; raises PlanningError if it fails
         self.policy: Callable[[Arm], None] = load_object(TASKS[settings.task].solver)
         self.open_loop_envs: list[OpenLoopEnv] = []
@@ -88,7 +88,7 @@ class EpisodeGenerator:
         the state in which another policy left the scene.
         """
         recorder = EpisodeRecorder(self.env, folder, name)
-        executor = Executor(recorder, seed)
+        executor = MotionExecutor(recorder, seed)
         result = EpisodeResult(seed, success=False, seconds=executor.seconds, max_attempts=self.settings.max_attempts)
         attempts = _Attempts(self, recorder, executor, result, intervention)
         executor.check_open_loop = attempts.check_open_loop
@@ -116,18 +116,18 @@ class EpisodeGenerator:
 class _Attempts:
     generator: EpisodeGenerator
     recorder: EpisodeRecorder
-    executor: Executor
+    executor: MotionExecutor
     result: EpisodeResult
     intervention: Intervention | None
 
     def run_from_resets(self, decisions: ForkedDecisions | ResimulatedDecisions) -> None:
         """Run attempts, each from the reset, with backtracking over the decisions of the policy."""
-        while not self.result.out_of_attempts:
+        while not self.result.has_no_attempts_left:
             number = len(self.result.failures)
 
             def attempt(number: int = number) -> None:
                 self._reset()
-                self._play(self._arm(decisions, number))
+                self._run_policy(self._arm(decisions, number))
                 self._finish([])
 
             if decisions.run(attempt):
@@ -139,14 +139,14 @@ class _Attempts:
         decisions = IrreversibleDecisions(lambda: len(executor.actions))
         recoveries: list[dict[str, Any]] = []
         self._reset()
-        while not result.out_of_attempts:
+        while not result.has_no_attempts_left:
             first = len(executor.actions)
             arm = self._arm(decisions, len(result.failures))
             try:
                 if first:
                     self.generator.policy(arm)
                 else:
-                    self._play(arm)
+                    self._run_policy(arm)
                 self._finish(recoveries)
                 return
             except PlanningError as error:
@@ -163,9 +163,9 @@ class _Attempts:
                 self._reset()
 
     def _arm(self, decisions: Decisions, number: int) -> Arm:
-        return Arm(self.generator.planner, self.generator.reachability, self.executor, decisions, (number,))
+        return Arm(self.generator.planner, self.generator.inverse_kinematics, self.executor, decisions, (number,))
 
-    def _play(self, arm: Arm) -> None:
+    def _run_policy(self, arm: Arm) -> None:
         if self.intervention is None:
             self.generator.policy(arm)
         else:
@@ -223,7 +223,7 @@ class _Attempts:
             "target": {"slot": int(env.target_slot[0]), "asset_id": target.id, "name": target.name},
             "objects": [asset.asset.id for asset in env.object_assets[0]],
             "subgoals": [
-                SubGoal.of(part.goal_type, part.goal_description, part.first, end - 1).model_dump()
+                SubGoal.from_range(part.goal_type, part.goal_description, part.first, end - 1).model_dump()
                 for part, end in zip(executor.segments, bounds[1:], strict=True)
             ],
             "check_rate": settings.check_rate if checked else None,

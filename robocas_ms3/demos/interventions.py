@@ -29,7 +29,7 @@ def intervene(arm: Arm, policy: Callable[[Arm], None]) -> None:
     """
     slot = arm.target
     arm.executor.move_gripper(arm.executor.gripper, arm.qpos, seconds=STOP_SECONDS)
-    if arm.executor.gripper != OPEN and arm.is_holding(slot) and arm.path[0] % 2 == 0:
+    if arm.executor.gripper != OPEN and arm.is_holding(slot) and arm.decision_path[0] % 2 == 0:
         _carry_held_target(arm, slot)
         return
     _retreat(arm)
@@ -58,7 +58,7 @@ def _retreat(arm: Arm) -> None:
         return
     with arm.planning_time():
         arm.planner.set_scene(arm.scene.obstacles())
-        if not arm.planner.collisions(arm.qpos, arm.planner.finger_width):
+        if not arm.planner.find_collisions(arm.qpos, arm.planner.finger_width):
             return
         tcp = arm.planner.tcp(arm.qpos)
         try:

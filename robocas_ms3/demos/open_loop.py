@@ -100,7 +100,7 @@ class OpenLoopEnv:
         self._gripper = gripper
 
     def step(self, action: NDArray[np.floating]) -> None:
-        """Apply one action (7,), see `motion.stored_actions`."""
+        """Apply one action (7,), see `motion.to_dataset_actions`."""
         action = np.asarray(action, dtype=np.float64)
         motion = to_ee_delta_action(action[:3], action[3:6], euler="xyz")
         self.clipped += bool(np.abs(motion[:3]).max() > 1 or np.linalg.norm(motion[3:]) > 1)
@@ -120,7 +120,7 @@ class OpenLoopEnv:
         self.success |= bool(info["success"][0])
 
     def replay(self, dataset_actions: NDArray[np.floating]) -> OpenLoopResult:
-        """Replay actions (S, 7) from the reset: the rows of `motion.stored_actions` without the last one."""
+        """Replay actions (S, 7) from the reset: the rows of `motion.to_dataset_actions` without the last one."""
         positions = [self.tcp_in_base()]
         for action in np.asarray(dataset_actions, dtype=np.float64).reshape(-1, 7):
             self.step(action)
@@ -175,7 +175,7 @@ class OpenLoopChecks:
             samples = samples[samples % self._stride == 0]
         new = samples[self._replayed :]
         recorded = states["articulations"][self._robot.description.uid]
-        actions = Motion.of(self._robot, recorded, gripper, new).actions[:-1].astype(np.float64)
+        actions = Motion.from_states(self._robot, recorded, gripper, new).actions[:-1].astype(np.float64)
         for number, env in enumerate(self._envs if noise else self._envs[:1]):
             for action in self._with_noise(actions, number) if number else actions:
                 env.step(action)

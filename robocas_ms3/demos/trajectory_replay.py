@@ -22,12 +22,12 @@ from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import make_folder
 from robocas_ms3.core.output_folder import check_replaceable
 from robocas_ms3.core.poses import from_wxyz, inverse
-from robocas_ms3.demos.recordings.environment import RecordedEnv, read_env
+from robocas_ms3.demos.recordings.environment import RecordedEnv, read_recorded_env
 from robocas_ms3.demos.recordings.episode_recorder import EpisodeRecorder
 from robocas_ms3.demos.recordings.trajectory_hdf5 import (
     BODIES,
+    iterate_arrays,
     merge,
-    named_arrays,
     open_episode,
     open_trajectory,
     read_steps,
@@ -79,8 +79,8 @@ class RecordedEpisode:
             raise DatasetError(
                 "actions do not fit the robot", where=self.where, expected=f"{width} numbers per action", found=found
             )
-        theirs = {name: np.size(row) for name, row in named_arrays(self.states[0])}
-        ours = {name: np.size(row.cpu().numpy()) for name, row in named_arrays(env.get_state_dict())}
+        theirs = {name: np.size(row) for name, row in iterate_arrays(self.states[0])}
+        ours = {name: np.size(row.cpu().numpy()) for name, row in iterate_arrays(env.get_state_dict())}
         for name in sorted({*theirs, *ours}):
             body = name.startswith(BODIES)
             # states of controllers depend on the control mode and on the version
@@ -123,7 +123,7 @@ def replay(settings: ReplaySettings) -> Iterator[ReplayResult]:
         check_number("--count", settings.count, 1)
     _check_obs_mode(settings.obs_mode)
     data = read_json(trajectory)
-    env = read_env(data["env_info"], trajectory.with_suffix(".json"), pack=settings.pack)
+    env = read_recorded_env(data["env_info"], trajectory.with_suffix(".json"), pack=settings.pack)
     recorded_mode = env.control_mode
     mode = settings.control_mode or recorded_mode
     if mode not in {*CONVERTIBLE, recorded_mode}:

@@ -18,7 +18,7 @@ from robocas_ms3.planning.protocol import Array
 UPRIGHT = 1 - 1e-9  # cosine between upper arm and vertical; above it joints 1 and 3 are collinear (singular)
 
 
-class PandaGeometry:
+class PandaInverseKinematics:
     """Link lengths of the Panda from its chain; RobocasError if the chain has another structure."""
 
     def __init__(self, chain: ArmChain) -> None:

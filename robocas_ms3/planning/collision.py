@@ -86,9 +86,9 @@ class CollisionChecker:
             points = np.asarray(obstacles, dtype=np.float64).reshape(-1, 3)
             points = np.ascontiguousarray(points[self.is_obstacle_point(points)])
             if len(points):
-                bodies = [(CLOUD, self._shapes.cloud(points), np.eye(4))]
+                bodies = [(CLOUD, self._shapes.cloud_pieces(points), np.eye(4))]
         else:  # bodies are not checked against the robot base
-            bodies = [(o.name, self._shapes.obstacle(o.shape, o.clearance), o.pose_in_base) for o in obstacles]
+            bodies = [(o.name, self._shapes.obstacle_pieces(o.shape, o.clearance), o.pose_in_base) for o in obstacles]
         for index, placed in self._obstacles.items():
             pieces, piece, _ = self._pieces[index]
             pieces.unused[piece].append(placed)
@@ -114,7 +114,7 @@ class CollisionChecker:
         self._held = body is not None
         if body is None:
             return
-        pieces = self._shapes.hull(body.vertices)
+        pieces = self._shapes.hull_pieces(body.vertices)
         if not pieces.unused[0]:
             pieces.unused[0].append(fcl.CollisionObject(pieces.geometries[0]))
         self._parts[-1] = pieces.unused[0][0]
@@ -127,7 +127,7 @@ class CollisionChecker:
         width = self._open_width if finger_width is None else finger_width
         return np.array([next(found, None) is None for found in self._pairs_in_contact(qpos, width, True)], dtype=bool)
 
-    def count_free(self, qpos: Array, *, obstacles: bool = True) -> int:
+    def count_leading_free(self, qpos: Array, *, obstacles: bool = True) -> int:
         """Return the number of collision-free configurations of a path (M, 7) before the first collision."""
         for first in range(0, len(qpos), CHUNK):
             chunk = qpos[first : first + CHUNK]
@@ -136,17 +136,17 @@ class CollisionChecker:
                     return first + row
         return len(qpos)
 
-    def all_free(self, qpos: Array, *, obstacles: bool = True) -> bool:
+    def is_path_free(self, qpos: Array, *, obstacles: bool = True) -> bool:
         """Return whether a path (M, 7) is collision-free; every SPARSE-th configuration is checked first."""
         if len(qpos) > 2 * SPARSE:
             qpos = np.concatenate([qpos[i::SPARSE] for i in (SPARSE - 1, *range(SPARSE - 1))])
             first = len(qpos) // SPARSE
-            if self.count_free(qpos[:first], obstacles=obstacles) < first:
+            if self.count_leading_free(qpos[:first], obstacles=obstacles) < first:
                 return False
             qpos = qpos[first:]
-        return self.count_free(qpos, obstacles=obstacles) == len(qpos)
+        return self.count_leading_free(qpos, obstacles=obstacles) == len(qpos)
 
-    def collisions(self, qpos: Array, finger_width: float | None = None) -> list[str]:
+    def find_collisions(self, qpos: Array, finger_width: float | None = None) -> list[str]:
         width = self._open_width if finger_width is None else finger_width
         found = next(self._pairs_in_contact(np.asarray(qpos, dtype=np.float64)[None], width, True))
         return sorted({name for pair in found for name in pair})
@@ -156,7 +156,7 @@ class CollisionChecker:
         assert np.isfinite(qpos).all(), "NaN would compare as collision-free"
         if not len(qpos):
             return
-        rotations, positions = self.chain.frames(qpos)
+        rotations, positions = self.chain.link_frames(qpos)
         links, others = self._broad_phase(rotations, positions, width, obstacles)
         if not len(links) and not len(others):
             yield from (iter(()) for _ in qpos)

@@ -17,7 +17,7 @@ from robocas_ms3.core.errors import RobotDescriptionError
 from robocas_ms3.core.text import format_error
 from robocas_ms3.planning.kinematics import ArmChain
 from robocas_ms3.planning.protocol import Array
-from robocas_ms3.planning.shapes import convex_hull, fcl_convex
+from robocas_ms3.planning.shapes import convex_hull, make_fcl_convex
 from robocas_ms3.robots.description_file import Joint, RobotXml
 
 BASE, TCP = -1, 7  # frames of parts; 0 to 6 are links 1 to 7
@@ -109,7 +109,7 @@ def _geometry(shape: Element, link: str, file: RobotXml) -> tuple[Any, Array]:
         mesh = file.path.parent / file.attribute(shape, "filename")
         hull = mesh.with_name(mesh.name + HULL_SUFFIX)
         corners, faces = _read_hull(hull if hull.is_file() else mesh, scale, link)
-        return fcl_convex(corners, faces), corners
+        return make_fcl_convex(corners, faces), corners
     if shape.tag == "box":
         x, y, z = file.numbers(shape, "size", 3)
         return fcl.Box(x, y, z), _box_corners(x, y, z)

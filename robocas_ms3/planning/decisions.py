@@ -1,8 +1,8 @@
-"""Decisions of a scripted policy (backtracking search), and CPU seconds per part of an episode.
+"""Decisions of a scripted policy (backtracking search), and CPU seconds per phase of an episode.
 
-A decision has candidates, a function that plays a candidate and returns its score, and a `Decisions` object that plays
-candidates and continues from the best one. The classes in `demos.branches` and `demos.backtracking` undo the motions of
-the other candidates; `IrreversibleDecisions` cannot.
+A decision has candidates, for example grasps. The policy passes the candidates and a function that runs one candidate
+to `Decisions.choose`. Three classes implement this interface. The classes in `demos.branches` and `demos.backtracking`
+undo the motions of rejected candidates; `IrreversibleDecisions` cannot undo motions.
 """
 
 from __future__ import annotations
@@ -17,68 +17,74 @@ from typing import Protocol, TypeVar
 from robocas_ms3.core.errors import PlanningError
 
 T = TypeVar("T")
-MAX_CONTINUED = 3  # candidates of a decision to continue from, before the search backtracks to the previous decision
+MAX_CONTINUED_CANDIDATES = 3
 
 
 @dataclass(frozen=True)
 class SearchLimits:
-    """Limits on the number of candidates that are tried for a decision.
+    """Limits on the candidates that a decision tries.
 
     Attributes:
-        compared: feasible candidates that are scored before the episode continues from the best one.
-        max_continued: candidates to continue from, before the search backtracks to the previous decision.
-        sufficient_score: score from which on no further candidate is compared.
+        max_compared_candidates: number of feasible candidates to score before the episode continues from the best.
+        max_continued_candidates: number of candidates that the episode continues from, one after the other, before the
+            search backtracks to the previous decision.
+        sufficient_score: a candidate with at least this score ends the comparison.
     """
 
-    compared: int = 1
-    max_continued: int = MAX_CONTINUED
+    max_compared_candidates: int = 1
+    max_continued_candidates: int = MAX_CONTINUED_CANDIDATES
     sufficient_score: float = math.inf
 
 
 FIRST_FEASIBLE = SearchLimits()
-"""Continue from the first feasible candidate, and after a failure from the next one, without comparing scores."""
+"""Continue from the first feasible candidate; if the episode fails later, continue from the next feasible one."""
 
 
 class Decisions(Protocol):
-    """Interface for decisions of a scripted policy: run candidate motions, continue from the best one."""
+    """Interface for the decisions of a scripted policy."""
 
-    def choose(self, candidates: Iterable[T], play: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE) -> T:
-        """Play candidates from the current state and continue from the one with the greatest score.
+    def choose(
+        self, candidates: Iterable[T], run_candidate: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE
+    ) -> T:
+        """Run candidates from the current state and continue from the candidate with the greatest score.
 
-        If a later step fails, the search returns to this state and continues from the next best candidate.
+        If a later motion fails, the search returns to this state and continues from the next best candidate.
 
         Args:
             candidates: candidates, the most promising first.
-            play: function that runs the motions of a candidate and returns its score; it raises PlanningError if the
-                candidate is not feasible.
+            run_candidate: function that runs the motions of a candidate and returns its score. It raises
+                PlanningError if the candidate is not feasible.
             limits: numbers of candidates to compare and to continue from.
 
         Returns:
-            The chosen candidate; its motions have been run.
+            The chosen candidate. Its motions have been executed.
 
         Raises:
-            PlanningError: no candidate is feasible; the error of the last one. Nothing has moved.
+            PlanningError: no candidate is feasible. The error is that of the last candidate.
         """
         ...
 
 
 @dataclass(frozen=True)
 class IrreversibleDecisions:
-    """Decisions that take the first feasible candidate and never undo motions.
+    """Decisions that continue from the first feasible candidate and never undo motions.
+
+    A candidate that fails after it has executed actions ends the decision with its error.
 
     Attributes:
-        count_actions: function that returns the number of actions so far. After a candidate that fails with actions
-            done, no other candidate is played.
+        count_actions: function that returns the number of actions since the reset.
     """
 
     count_actions: Callable[[], int]
 
-    def choose(self, candidates: Iterable[T], play: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE) -> T:
+    def choose(
+        self, candidates: Iterable[T], run_candidate: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE
+    ) -> T:
         failure = PlanningError("decision", "no_candidate")
         for candidate in candidates:
             before = self.count_actions()
             try:
-                play(candidate)
+                run_candidate(candidate)
                 return candidate
             except PlanningError as error:
                 failure = error
@@ -88,8 +94,15 @@ class IrreversibleDecisions:
 
 
 @dataclass
-class Seconds:
-    """CPU seconds of an episode by part, including child processes of feasible candidates."""
+class CpuSeconds:
+    """CPU seconds of an episode by phase, including the child processes of feasible candidates.
+
+    Attributes:
+        reset: resets of the environments.
+        planning: motion planning.
+        simulation: steps of the recorded environment.
+        check: open-loop checks.
+    """
 
     reset: float = 0.0
     planning: float = 0.0
@@ -97,10 +110,10 @@ class Seconds:
     check: float = 0.0
 
     @contextmanager
-    def measure(self, part: str) -> Iterator[None]:
-        """Add the CPU seconds of a ``with`` block to a part."""
+    def measure(self, phase: str) -> Iterator[None]:
+        """Add the CPU seconds of a ``with`` block to a phase, given by the name of its attribute."""
         start = time.process_time()
         try:
             yield
         finally:
-            setattr(self, part, getattr(self, part) + time.process_time() - start)
+            setattr(self, phase, getattr(self, phase) + time.process_time() - start)

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from robocas_ms3.planning.decisions import Seconds
+from robocas_ms3.planning.decisions import CpuSeconds
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.tasks.base import RoboCASEnv
 
@@ -26,8 +26,8 @@ class Segment:
 
 
 @dataclass
-class Executor:
-    """Executor of motions in one environment with control mode ``pd_joint_pos`` or ``pd_joint_pos_base``.
+class MotionExecutor:
+    """MotionExecutor of motions in one environment with control mode ``pd_joint_pos`` or ``pd_joint_pos_base``.
 
     Attributes:
         env: environment with ``num_envs`` = 1, possibly wrapped by a recorder.
@@ -47,7 +47,7 @@ class Executor:
     info: dict[str, Any] = field(default_factory=dict)
     gripper: float = OPEN
     base: Array = field(default_factory=lambda: np.zeros(3))
-    seconds: Seconds = field(default_factory=Seconds)
+    seconds: CpuSeconds = field(default_factory=CpuSeconds)
     facts: dict[str, Any] = field(default_factory=dict)
     check_open_loop: Callable[[], None] = lambda: None
 

@@ -84,7 +84,7 @@ class ArmChain:
         chain.links = [*self.links[:-1], self.links[-1] @ back]
         return chain
 
-    def frames(self, qpos: Array) -> tuple[Array, Array]:
+    def link_frames(self, qpos: Array) -> tuple[Array, Array]:
         """Compute rotations (8, M, 3, 3) and positions (8, M, 3) of links 1 to 7 and the TCP at (M, 7).
 
         They are in the arm's base frame.
@@ -107,12 +107,12 @@ class ArmChain:
 
     def tcp(self, qpos: Array) -> Array:
         """Compute TCP poses (M, 4, 4) in the base frame at configurations (M, 7)."""
-        rotations, positions = self.frames(qpos)
+        rotations, positions = self.link_frames(qpos)
         return _poses(rotations[7], positions[7])
 
     def jacobian(self, qpos: Array) -> tuple[Array, Array]:
         """Compute TCP poses (M, 4, 4) and Jacobians (M, 6, 7) in the base frame, linear rows first."""
-        rotations, positions = self.frames(qpos)
+        rotations, positions = self.link_frames(qpos)
         axes = rotations[:7, :, :, 2].transpose(1, 2, 0)
         arm = (positions[7] - positions[:7]).transpose(1, 2, 0)
         jacobian = np.empty((len(qpos), 6, 7))
@@ -137,7 +137,7 @@ def _poses(rotation: Array, position: Array) -> Array:
     return pose
 
 
-class Reachability:
+class InverseKinematics:
     """Inverse kinematics of an arm by the closed form in its description, without collision checks."""
 
     def __init__(self, chain: ArmChain) -> None:
@@ -184,7 +184,7 @@ class Reachability:
         return solved.reshape(len(poses), -1, 7)
 
 
-def rotation_vector(rotations: Array) -> Array:
+def to_rotation_vectors(rotations: Array) -> Array:
     """Return rotation vectors (M, 3), rad, of norm at most pi, for rotation matrices (M, 3, 3)."""
     twice_sine_axis = rotations[:, (2, 0, 1), (1, 2, 0)] - rotations[:, (1, 2, 0), (2, 0, 1)]
     sine = np.sqrt(np.einsum("mi,mi->m", twice_sine_axis, twice_sine_axis)) / 2
@@ -197,7 +197,7 @@ def rotation_vector(rotations: Array) -> Array:
     return vectors
 
 
-def newton_step(chain: ArmChain, qpos: Array, goals: Array) -> tuple[Array, Array]:
+def apply_newton_step(chain: ArmChain, qpos: Array, goals: Array) -> tuple[Array, Array]:
     """Apply one damped Newton step towards a TCP pose to each configuration, within the joint limits.
 
     The step has minimum norm. It is computed without BLAS and LAPACK, since the last bits of their results depend on
@@ -213,14 +213,14 @@ def newton_step(chain: ArmChain, qpos: Array, goals: Array) -> tuple[Array, Arra
     poses, jacobian = chain.jacobian(qpos)
     error = np.empty((len(qpos), 6))
     error[:, :3] = goals[:, :3, 3] - poses[:, :3, 3]
-    error[:, 3:] = rotation_vector(np.einsum("mij,mkj->mik", goals[:, :3, :3], poses[:, :3, :3]))
+    error[:, 3:] = to_rotation_vectors(np.einsum("mij,mkj->mik", goals[:, :3, :3], poses[:, :3, :3]))
     square = np.einsum("mij,mkj->mik", jacobian, jacobian)
     square[:, range(6), range(6)] += DAMPING
-    step = np.einsum("mji,mj->mi", jacobian, solve_positive(square, error))
+    step = np.einsum("mji,mj->mi", jacobian, solve_positive_definite(square, error))
     return np.clip(qpos + step, chain.lower, chain.upper), np.sqrt(np.einsum("mi,mi->m", error, error))
 
 
-def solve_positive(matrices: Array, values: Array) -> Array:
+def solve_positive_definite(matrices: Array, values: Array) -> Array:
     """Solve positive definite systems (M, N, N) with right-hand sides (M, N) by Gauss-Jordan elimination."""
     rows = np.concatenate([matrices, values[:, :, None]], axis=2)
     for pivot in range(rows.shape[1]):
@@ -231,7 +231,7 @@ def solve_positive(matrices: Array, values: Array) -> Array:
     return rows[:, :, -1]
 
 
-def follow_line(chain: ArmChain, start: Array, tcp_in_base: Array, *, stage: str) -> Array:
+def solve_straight_line(chain: ArmChain, start: Array, tcp_in_base: Array, *, stage: str) -> Array:
     """Compute configurations along a straight line of the TCP from a configuration (7,) to a pose (4x4).
 
     The position is interpolated linearly, the orientation along the shortest rotation.
@@ -243,7 +243,7 @@ def follow_line(chain: ArmChain, start: Array, tcp_in_base: Array, *, stage: str
         PlanningError: reason ``line_unreachable`` or ``line_joint_jump``.
     """
     start = np.asarray(start, dtype=np.float64)
-    goals = _line_poses(chain.tcp(start[None])[0], tcp_in_base)
+    goals = _interpolate_poses(chain.tcp(start[None])[0], tcp_in_base)
     path = _solve_simultaneously(chain, start, goals)
     if path is None or _largest_jump(path) > MAX_JUMP:
         path = _solve_sequentially(chain, start, goals)
@@ -263,10 +263,10 @@ def _solve_simultaneously(chain: ArmChain, start: Array, goals: Array) -> Array 
     path[0] = start
     for before in range(0, len(goals), ESTIMATE_STRIDE):
         after = min(before + ESTIMATE_STRIDE, len(goals))
-        estimate = newton_step(chain, path[before, None], goals[after - 1, None])[0][0]
+        estimate = apply_newton_step(chain, path[before, None], goals[after - 1, None])[0][0]
         path[before : after + 1] = np.linspace(path[before], estimate, after - before + 1)
     for _ in range(LINE_ITERATIONS):
-        following, error = newton_step(chain, path[1:], goals)
+        following, error = apply_newton_step(chain, path[1:], goals)
         if error.max() <= TOLERANCE:
             return path
         path[1:] = following
@@ -278,7 +278,7 @@ def _solve_sequentially(chain: ArmChain, start: Array, goals: Array) -> Array | 
     for goal in goals:
         qpos = path[-1][None]
         for _ in range(POSE_ITERATIONS):
-            following, error = newton_step(chain, qpos, goal[None])
+            following, error = apply_newton_step(chain, qpos, goal[None])
             if error[0] <= TOLERANCE:
                 break
             qpos = following
@@ -294,8 +294,8 @@ def _largest_jump(path: Array) -> float:
     return float(np.abs(np.diff(path, axis=0)).max())
 
 
-def _line_poses(first: Array, last: Array) -> Array:
-    turn, shift = rotation_vector((first[:3, :3].T @ last[:3, :3])[None])[0], last[:3, 3] - first[:3, 3]
+def _interpolate_poses(first: Array, last: Array) -> Array:
+    turn, shift = to_rotation_vectors((first[:3, :3].T @ last[:3, :3])[None])[0], last[:3, 3] - first[:3, 3]
     count = max(1, int(np.ceil(max(np.linalg.norm(shift) / LINE_STEP, np.linalg.norm(turn) / LINE_TURN))))
     fractions = np.linspace(0, 1, count + 1)[1:, None]
     poses = np.tile(np.eye(4), (count, 1, 1))

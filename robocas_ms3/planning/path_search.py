@@ -42,7 +42,7 @@ class _Tree:
         difference = self.qpos[: len(self.parent)] - qpos
         return int(np.argmin(np.einsum("ij,ij->i", difference, difference)))
 
-    def branch(self, node: int) -> list[Array]:
+    def path_to_root(self, node: int) -> list[Array]:
         chain = []
         while node >= 0:
             chain.append(self.qpos[node].copy())
@@ -54,14 +54,16 @@ class PathSearch:
     """RRT-Connect path search in joint space.
 
     Args:
-        count_free: function that returns the number of free configurations (M, n) before the first collision.
+        count_leading_free: function that returns the number of free configurations (M, n) before the first collision.
         lower, upper: (n,) joint limits, rad.
         step: maximum extension of a tree, rad (norm over joints).
         spacing: distance between checks along an edge, rad (norm over joints).
     """
 
-    def __init__(self, count_free: CountFree, lower: Array, upper: Array, *, step: float, spacing: float) -> None:
-        self._free_until, self._lower, self._upper = count_free, lower, upper
+    def __init__(
+        self, count_leading_free: CountFree, lower: Array, upper: Array, *, step: float, spacing: float
+    ) -> None:
+        self._free_until, self._lower, self._upper = count_leading_free, lower, upper
         self._step, self.spacing = step, spacing
         self._remaining_checks = 0
 
@@ -95,7 +97,7 @@ class PathSearch:
                     last, reached = self._extend(trees[other], target, greedy=True)
                     if reached and last is not None:
                         ends = {grow: node, other: last}
-                        forward, backward = trees[0].branch(ends[0]), trees[1].branch(ends[1])
+                        forward, backward = trees[0].path_to_root(ends[0]), trees[1].path_to_root(ends[1])
                         return forward + backward[::-1][1:]
                 grow, other = other, grow
         except BudgetExceededError:

@@ -94,7 +94,7 @@ class Planner(Protocol):
         """Return the TCP pose (4x4) in the arm's base frame at a configuration (7,)."""
         ...
 
-    def collisions(self, qpos: Array, finger_width: float | None = None) -> list[str]:
+    def find_collisions(self, qpos: Array, finger_width: float | None = None) -> list[str]:
         """Return the names of colliding bodies at a configuration (7,); an empty list means free.
 
         Names are links, obstacles, 'cloud' (points) and 'attached' (the held object). ``finger_width`` is in m;
@@ -113,7 +113,7 @@ class Planner(Protocol):
         """
         ...
 
-    def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str, search: bool = True) -> Trajectory:
+    def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str, straight_only: bool = False) -> Trajectory:
         """Plan a collision-free motion to one of several configurations.
 
         Without ``search``, only straight motions in joint space are tried.

@@ -55,7 +55,7 @@ def track_handle(chain: ArmChain, starts: Array, goals: Array) -> Array:
     return path
 
 
-def count_reached(path: Array) -> NDArray[np.int_]:
+def count_reached_poses(path: Array) -> NDArray[np.int_]:
     """Count the poses (N,) reached by paths (T, N, 7) of `track_handle`."""
     return np.isfinite(path[:, :, 0]).sum(axis=0)
 

@@ -42,7 +42,7 @@ class Push:
         return pose
 
 
-def push_candidates(
+def generate_push_candidates(
     rng: np.random.Generator,
     points: Array,
     target: Array,
@@ -68,7 +68,7 @@ def push_candidates(
     walls = fixed[(fixed[:, 2] > frame[2, 3] + 0.01) & (fixed[:, 2] < points[:, 2].max())][:, :2]
     tree = KDTree(walls) if len(walls) else None
     center = points.mean(axis=0)
-    ahead = push_direction(rng, center, target)
+    ahead = compute_push_direction(rng, center, target)
     ahead = Rotation.from_euler("z", turn_deg, degrees=True).apply(ahead)
     lowest = frame[2, 3] + TIP_CLEARANCE + TIP_BELOW_TCP
     top = points[:, 2].max()
@@ -79,7 +79,7 @@ def push_candidates(
     for turn in TURNS_DEG:
         direction = Rotation.from_euler("z", turn, degrees=True).apply(ahead)
         for height in heights:
-            extent = extent_behind(points, center, direction, height)
+            extent = measure_extent_behind(points, center, direction, height)
             if extent is None:
                 continue
             tool = np.array([*center[:2], height]) - (extent + STAND_OFF + TOOL_RADIUS) * direction
@@ -87,7 +87,7 @@ def push_candidates(
                 continue
             length = STAND_OFF + extent + PUSH_BEYOND_CENTER
             shift = (length - STAND_OFF) * direction
-            if not _ends_on(points + shift, frame, half) or _hits(tree, points, shift):
+            if not _ends_on_surface(points + shift, frame, half) or _hits(tree, points, shift):
                 continue
             yaw = np.arctan2(direction[1], direction[0])
             for k in range(YAWS):
@@ -101,7 +101,7 @@ def push_candidates(
 _DOWN = Rotation.from_euler("x", np.pi)
 
 
-def push_direction(rng: np.random.Generator, center: Array, target: Array) -> Array:
+def compute_push_direction(rng: np.random.Generator, center: Array, target: Array) -> Array:
     """Return v_push of the paper: (3,) horizontal unit vector from the target to the obstacle.
 
     If their centres are less than 1 cm apart, return a random direction within 30 deg of the direction to the robot at
@@ -114,7 +114,7 @@ def push_direction(rng: np.random.Generator, center: Array, target: Array) -> Ar
     return away / np.linalg.norm(away)
 
 
-def extent_behind(points: Array, center: Array, direction: Array, height: float) -> float | None:
+def measure_extent_behind(points: Array, center: Array, direction: Array, height: float) -> float | None:
     """Return d_ext of the paper: extent of an object from its centre against the push, m, or None.
 
     Only points that the tool can touch count: within the tool radius of the line and 1 cm of the height. None: there is
@@ -128,7 +128,7 @@ def extent_behind(points: Array, center: Array, direction: Array, height: float)
     return float(np.max(-relative[slice_, :2] @ direction[:2]))
 
 
-def _ends_on(points: Array, frame: Array, half: Array) -> bool:
+def _ends_on_surface(points: Array, frame: Array, half: Array) -> bool:
     local = (points - frame[:3, 3]) @ frame[:3, :3]
     return bool(np.all(np.abs(local[:, :2]) <= half - EDGE_MARGIN))
 

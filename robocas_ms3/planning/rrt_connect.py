@@ -13,7 +13,7 @@ import numpy as np
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.extensions import Registry
 from robocas_ms3.planning.collision import CollisionChecker
-from robocas_ms3.planning.kinematics import Reachability, follow_line, joint_distance
+from robocas_ms3.planning.kinematics import InverseKinematics, joint_distance, solve_straight_line
 from robocas_ms3.planning.path_search import PathSearch
 from robocas_ms3.planning.protocol import Array, Planner, Trajectory
 from robocas_ms3.planning.time_parameterization import (
@@ -57,11 +57,11 @@ class RRTConnectPlanner(CollisionChecker):
         import toppra  # noqa: F401  (takes 0.2 s; import before this process forks)
 
         super().__init__(urdf, srdf, robot)
-        self._reachability = Reachability(self.chain)
+        self._reachability = InverseKinematics(self.chain)
         self._dt = dt
         self._limits = {"velocity": robot.arm_velocity_limit, "acceleration": robot.arm_acceleration_limit}
         lower, upper = self.chain.lower, self.chain.upper
-        self._search = PathSearch(self.count_free, lower, upper, step=RRT_RANGE, spacing=SPACING)
+        self._search = PathSearch(self.count_leading_free, lower, upper, step=RRT_RANGE, spacing=SPACING)
         self._rng = np.random.default_rng(0)
 
     def seed(self, seed: int) -> None:
@@ -85,33 +85,33 @@ class RRTConnectPlanner(CollisionChecker):
             raise PlanningError(stage, "no_ik")
         return self.plan_to_qpos(start, goals, stage=stage)
 
-    def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str, search: bool = True) -> Trajectory:
+    def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str, straight_only: bool = False) -> Trajectory:
         """Plan a collision-free motion to the nearest reachable configuration of several.
 
         Raises:
             PlanningError: ``start_in_collision``, ``start_outside_limits``, ``no_goals`` (the list is empty),
                 ``goal_outside_limits`` (all goals are), ``goal_in_collision`` (all goals within the limits are),
-                ``not_straight``, ``rrt_timeout``, ``path_blocked``, ``timing_failed``.
+                ``not_straight``, ``rrt_timeout``, ``path_blocked``, ``no_time_parameterization``.
         """
         start = self._checked_start(start, stage)
-        wanted = np.array(goals, dtype=np.float64).reshape(-1, 7)
-        if not len(wanted):
+        candidates = np.array(goals, dtype=np.float64).reshape(-1, 7)
+        if not len(candidates):
             raise PlanningError(stage, "no_goals")
         lower, upper = self.chain.limits.T
-        wanted = wanted[np.all((wanted >= lower) & (wanted <= upper), axis=1)]
-        if not len(wanted):
+        candidates = candidates[np.all((candidates >= lower) & (candidates <= upper), axis=1)]
+        if not len(candidates):
             raise PlanningError(stage, "goal_outside_limits")
-        wanted = wanted[self.is_free(wanted, self.finger_width)]
-        if not len(wanted):
+        candidates = candidates[self.is_free(candidates, self.finger_width)]
+        if not len(candidates):
             raise PlanningError(stage, "goal_in_collision")
-        free = list(wanted[np.argsort(joint_distance(wanted, start), kind="stable")])
+        free = list(candidates[np.argsort(joint_distance(candidates, start), kind="stable")])
         if np.linalg.norm(free[0] - start) < MIN_MOTION:
             return Trajectory(free[0][None].copy(), self._dt)
         enough = DETOUR * joint_distance(free[0], start) + 0.5
         for goal in free:
-            if joint_distance(goal, start) <= enough and self._straight_free(start, goal):
-                return self._timed(partial(time_with_stops, np.array([start, goal])))
-        if not search:
+            if joint_distance(goal, start) <= enough and self._is_straight_free(start, goal):
+                return self._time_motion(partial(time_with_stops, np.array([start, goal])))
+        if straight_only:
             raise PlanningError(stage, "not_straight")
         reason = "rrt_timeout"
         # First the nearest goal with a small budget, then all goals with the full budget. If a path collides between
@@ -128,7 +128,7 @@ class RRTConnectPlanner(CollisionChecker):
             if path is None:
                 continue
             path = self._search.shorten(path, self._rng, tries=SHORTCUTS, max_checks=BUDGET // 4)
-            trajectory = self._finish(path)
+            trajectory = self._smooth_and_time(path)
             if trajectory is not None:
                 return trajectory
             reason = "path_blocked"
@@ -141,18 +141,18 @@ class RRTConnectPlanner(CollisionChecker):
 
         Raises:
             PlanningError: ``start_in_collision``, ``start_outside_limits``, ``line_unreachable``, ``line_joint_jump``,
-                ``straight_line_blocked``, ``timing_failed``.
+                ``straight_line_blocked``, ``no_time_parameterization``.
         """
         start = self._checked_start(start, stage, obstacles=check_collisions)
-        waypoints = follow_line(self.chain, start, np.asarray(tcp_in_base, dtype=np.float64), stage=stage)
+        waypoints = solve_straight_line(self.chain, start, np.asarray(tcp_in_base, dtype=np.float64), stage=stage)
         if np.linalg.norm(waypoints[-1] - start) < MIN_MOTION:
             return Trajectory(waypoints[-1:].copy(), self._dt)
         path = fit_spline(waypoints)
-        if not self._path_free(path, obstacles=check_collisions):
+        if not self._is_spline_free(path, obstacles=check_collisions):
             raise PlanningError(stage, "straight_line_blocked")
-        trajectory = self._timed(partial(time_path, path), speed)
+        trajectory = self._time_motion(partial(time_path, path), speed)
         if trajectory is None:
-            raise PlanningError(stage, "timing_failed")
+            raise PlanningError(stage, "no_time_parameterization")
         return trajectory
 
     def join(self, start: Array, first: Trajectory, second: Trajectory) -> Trajectory:
@@ -164,13 +164,13 @@ class RRTConnectPlanner(CollisionChecker):
                 continue
             points = blend_motions(a, b, rows)
             path = fit_spline(thin_path(points, BLEND_SPACING))
-            driven, end = path.dense(FINE_SPACING), points[min(len(a), len(points) - 1)]
+            samples, end = path.sample(FINE_SPACING), points[min(len(a), len(points) - 1)]
             lower, upper = self.chain.limits.T  # the sum of two motions may exceed the limits
             # check up to the end of the corner; the rest was planned with other obstacles
-            corner = int(np.linalg.norm(driven - end, axis=1).argmin()) + 1
-            if not np.all((lower <= driven) & (driven <= upper)) or not self.all_free(driven[:corner]):
+            corner = int(np.linalg.norm(samples - end, axis=1).argmin()) + 1
+            if not np.all((lower <= samples) & (samples <= upper)) or not self.is_path_free(samples[:corner]):
                 continue
-            trajectory = self._timed(partial(time_path, path))
+            trajectory = self._time_motion(partial(time_path, path))
             if trajectory is not None and len(trajectory.qpos) < len(best.qpos):
                 return trajectory
         return best
@@ -180,33 +180,33 @@ class RRTConnectPlanner(CollisionChecker):
         lower, upper = self.chain.limits.T
         if not np.all((lower - 1e-3 <= start) & (start <= upper + 1e-3)):
             raise PlanningError(stage, "start_outside_limits")
-        if not self.all_free(start[None], obstacles=obstacles):
+        if not self.is_path_free(start[None], obstacles=obstacles):
             raise PlanningError(stage, "start_in_collision")
         return start
 
-    def _straight_free(self, start: Array, goal: Array) -> bool:
-        return self.all_free(start + (goal - start) * _fractions(start, goal)[1:-1, None])
+    def _is_straight_free(self, start: Array, goal: Array) -> bool:
+        return self.is_path_free(start + (goal - start) * _fractions(start, goal)[1:-1, None])
 
-    def _path_free(self, path: JointPath, *, obstacles: bool = True) -> bool:
-        return self.all_free(path.dense(FINE_SPACING), obstacles=obstacles)
+    def _is_spline_free(self, path: JointPath, *, obstacles: bool = True) -> bool:
+        return self.is_path_free(path.sample(FINE_SPACING), obstacles=obstacles)
 
-    def _finish(self, waypoints: list[Array]) -> Trajectory | None:
+    def _smooth_and_time(self, waypoints: list[Array]) -> Trajectory | None:
         """Round the corners of a path, check the rounded path, and time it; None if it collides."""
         points = [waypoints[0]]
         points += [b for a, b in zip(waypoints[:-1], waypoints[1:], strict=True) if np.linalg.norm(b - a) > 1e-4]
         points[-1] = waypoints[-1]
         corners = np.array(points)
-        if len(points) == 2 and self._straight_free(*points):
-            return self._timed(partial(time_with_stops, corners))
+        if len(points) == 2 and self._is_straight_free(*points):
+            return self._time_motion(partial(time_with_stops, corners))
         for radius in CORNER_RADII:
             path = round_corners(corners, radius)
-            if self._path_free(path):
-                trajectory = self._timed(partial(time_path, path))
+            if self._is_spline_free(path):
+                trajectory = self._time_motion(partial(time_path, path))
                 if trajectory is not None:
                     return trajectory
-        return self._timed(partial(time_with_stops, corners)) if self.all_free(_dense(corners)) else None
+        return self._time_motion(partial(time_with_stops, corners)) if self.is_path_free(_densify(corners)) else None
 
-    def _timed(self, time: Callable[..., Timed], speed: float = 1.0) -> Timed:
+    def _time_motion(self, time: Callable[..., Timed], speed: float = 1.0) -> Timed:
         """Time a motion within a fraction of the limits; slow it down if the TCP exceeds its speed limit."""
         limits = {name: value * speed for name, value in self._limits.items()}
         trajectory = time(**limits, dt=self._dt)
@@ -221,7 +221,7 @@ class RRTConnectPlanner(CollisionChecker):
         return trajectory
 
 
-def _dense(points: Array) -> Array:
+def _densify(points: Array) -> Array:
     return np.concatenate([a + (b - a) * _fractions(a, b)[:, None] for a, b in pairwise(points)])
 
 

@@ -27,7 +27,7 @@ BASKET = "basket"  # name of the basket as an obstacle
 _SHAPES: dict[int, tuple[BodyFiles, Shape]] = {}  # by id of the body, which is unique since the body is kept
 
 
-def part_shape(part: BodyFiles) -> Shape:
+def get_body_shape(part: BodyFiles) -> Shape:
     """Return the shape of a body; the same object for each call in a process."""
     if id(part) not in _SHAPES:
         _SHAPES[id(part)] = part, Shape(tuple(part.hulls))
@@ -131,7 +131,9 @@ class PlanningScene:
     ) -> list[Obstacle]:
         """Return the bodies of `obstacles` with poses in the world frame; see `to_arm_base_frame`."""
         excluded = {exclude} if isinstance(exclude, int) else exclude
-        return [Obstacle(name, part_shape(part), pose) for name, part, _, pose in self._bodies(excluded, exclude_link)]
+        return [
+            Obstacle(name, get_body_shape(part), pose) for name, part, _, pose in self._bodies(excluded, exclude_link)
+        ]
 
     def points_in_base(
         self,

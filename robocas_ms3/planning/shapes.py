@@ -47,18 +47,18 @@ class CollisionShapes:
         self._shapes: WeakKeyDictionary[Shape, dict[float, ConvexPieces]] = WeakKeyDictionary()
         self._recent: OrderedDict[bytes, ConvexPieces] = OrderedDict()
 
-    def obstacle(self, shape: Shape, clearance: float) -> ConvexPieces:
+    def obstacle_pieces(self, shape: Shape, clearance: float) -> ConvexPieces:
         """Return the pieces of a shape, with hulls enlarged by ``clearance`` (m) and the margin."""
         sizes = self._shapes.setdefault(shape, {})
         if clearance not in sizes:
             sizes[clearance] = self._pieces(shape, clearance)
         return sizes[clearance]
 
-    def cloud(self, points: Array) -> ConvexPieces:
+    def cloud_pieces(self, points: Array) -> ConvexPieces:
         """Return an octree of points (P, 3); no piece if all points are outside its range."""
         return self._get_cached(points, self._tree)
 
-    def hull(self, vertices: Array) -> ConvexPieces:
+    def hull_pieces(self, vertices: Array) -> ConvexPieces:
         return self._get_cached(np.ascontiguousarray(vertices, dtype=np.float64), self._hull)
 
     def _pieces(self, shape: Shape, clearance: float) -> ConvexPieces:
@@ -66,7 +66,7 @@ class CollisionShapes:
             return self._tree(np.ascontiguousarray(shape.points))
         hulls = [inflate_hull(np.asarray(vertices, dtype=np.float64), MARGIN + clearance) for vertices in shape.hulls]
         first = np.cumsum([0, *(len(vertices) for vertices, _ in hulls[:-1])])
-        geometries = [fcl_convex(vertices, faces) for vertices, faces in hulls]
+        geometries = [make_fcl_convex(vertices, faces) for vertices, faces in hulls]
         return ConvexPieces(geometries, np.concatenate([vertices for vertices, _ in hulls]), first)
 
     def _tree(self, points: Array) -> ConvexPieces:
@@ -79,7 +79,7 @@ class CollisionShapes:
 
     def _hull(self, vertices: Array) -> ConvexPieces:
         corners, faces, _ = convex_hull(vertices)
-        return ConvexPieces([fcl_convex(corners, faces)], corners, np.zeros(1, dtype=int))
+        return ConvexPieces([make_fcl_convex(corners, faces)], corners, np.zeros(1, dtype=int))
 
     def _get_cached(self, points: Array, make: Callable[[Array], ConvexPieces]) -> ConvexPieces:
         key = hashlib.blake2b(points.data).digest() + make.__name__.encode()
@@ -90,7 +90,7 @@ class CollisionShapes:
         return made
 
 
-def fcl_convex(corners: Array, faces: NDArray[np.integer]) -> Any:
+def make_fcl_convex(corners: Array, faces: NDArray[np.integer]) -> Any:
     polygons = np.concatenate([np.full((len(faces), 1), 3), faces], axis=1)  # size, corners
     return fcl.Convex(np.ascontiguousarray(corners, dtype=np.float64), len(faces), polygons.ravel().tolist())
 

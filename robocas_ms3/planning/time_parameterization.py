@@ -50,7 +50,7 @@ class JointPath:
     def length(self) -> float:
         return float(self._curve.x[-1])
 
-    def dense(self, spacing: float) -> Array:
+    def sample(self, spacing: float) -> Array:
         """Sample configurations (m, n) at most ``spacing`` rad apart, both ends included."""
         return self(np.linspace(0, self.length, max(2, int(np.ceil(self.length / spacing)) + 1), dtype=np.float64))
 

@@ -27,7 +27,7 @@ from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
 from robocas_ms3.core.strict_model import parse, validate_json
 from robocas_ms3.datasets.schema import episode_folder
-from robocas_ms3.demos.recordings.trajectory_json import versions
+from robocas_ms3.demos.recordings.trajectory_json import package_versions
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 
@@ -149,7 +149,7 @@ class PlanFolder:
 
     def record(self) -> dict[str, Any]:
         """Return the content of ``plan.json``: the plan and the versions of the packages."""
-        return {"plan": self.plan.model_dump(mode="json"), "versions": versions()}
+        return {"plan": self.plan.model_dump(mode="json"), "versions": package_versions()}
 
     def open(self, *, overwrite: bool = False, shared: bool = False) -> OutputFolder:
         """Return a context manager that checks that the folder belongs to this plan and these versions."""

@@ -99,7 +99,7 @@ class RobotDescription:
     stock_tcp_in_hand: float
     finger_extension: float
     finger_friction: float
-    inverse_kinematics: str = "robocas_ms3.planning.analytic:PandaGeometry"
+    inverse_kinematics: str = "robocas_ms3.planning.analytic:PandaInverseKinematics"
     envelope: Envelope | None = None
     cameras: tuple[CameraSpec, ...] = STANDARD_CAMERAS
 

@@ -16,7 +16,7 @@ from robocas_ms3.core.text import format_object_name
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource, ImageKind
 from robocas_ms3.demos.failures import FailedAttempt
-from robocas_ms3.demos.recordings.trajectory_json import one_seed
+from robocas_ms3.demos.recordings.trajectory_json import parse_seed
 from robocas_ms3.viewer.damage import as_dataset_error, join_reasons, read_or_default, read_scene
 from robocas_ms3.viewer.episode import facts_of, round_values, show_arrays
 from robocas_ms3.viewer.episode_table import Failures, Row, describe, stages
@@ -106,7 +106,7 @@ class PageContent:
             instruction=instruction,
             task=scene.get("task") or "",
             object=format_object_name(target.get("asset_id") or "", target.get("name") or ""),
-            seed=one_seed(scene.get("seed")),
+            seed=parse_seed(scene.get("seed")),
             success=scene.get("success"),
             split=split,
             stages=stages(self._failures(scene), recorded),
@@ -130,7 +130,7 @@ class PageContent:
         return {**dict.fromkeys(train, "train"), **dict.fromkeys(val, "val")}
 
     def _failures(self, scene: Mapping[str, Any]) -> Sequence[FailedAttempt]:
-        return self.failures.of_seed(one_seed(scene.get("seed")), scene.get("env_info"))
+        return self.failures.of_seed(parse_seed(scene.get("seed")), scene.get("env_info"))
 
     def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
         """Return the content of an episode, see `show_arrays`; it may replace ``facts``."""

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.core.text import format_object_name
-from robocas_ms3.demos.recordings.subgoals import subgoal_runs
+from robocas_ms3.demos.recordings.subgoals import group_subgoals
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 
 XYZ = ("x", "y", "z")
@@ -52,7 +52,7 @@ def show_arrays(
             plot("Action: TCP translation per step", "mm", XYZ, a["rel_pos"] * 1000),
             plot("Action: TCP rotation per step", "deg", ROLL_PITCH_YAW, turns),
         ]
-    goals = subgoal_runs([str(v) for v in a["step_goal_type"]], [str(v) for v in a["step_lang_goals"]])
+    goals = group_subgoals([str(v) for v in a["step_goal_type"]], [str(v) for v in a["step_lang_goals"]])
     base = from_xyzw(a["base_pos"].astype(float), a["base_orn"].astype(float))
     tcp = base @ from_xyzw(a["ee_pos"].astype(float), a["ee_orn"].astype(float))
     objects = _objects(scene) if moving is None else moving

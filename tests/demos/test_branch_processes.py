@@ -85,7 +85,7 @@ def test_child_killed_once_does_not_change_the_episode(tmp_path, moment):
         return {"a": 1.0, "b": 3.0, "c": 2.0}[letter]
 
     def decide(runner):
-        first = runner.choose("abc", play, SearchLimits(compared=3))
+        first = runner.choose("abc", play, SearchLimits(max_compared_candidates=3))
         second = runner.choose("abc", lambda letter: 0.0)
         if second == "b":
             kill_once("it continues")
@@ -236,7 +236,7 @@ def test_interrupt_in_a_new_child_ends_the_run(monkeypatch):
         yield "b"
 
     def decide(runner):
-        runner.choose(candidates(), lambda letter: 0.0, SearchLimits(compared=2))
+        runner.choose(candidates(), lambda letter: 0.0, SearchLimits(max_compared_candidates=2))
 
     try:
         with pytest.raises(KeyboardInterrupt) as caught:
@@ -265,12 +265,12 @@ from robocas_ms3.demos.branches import ForkedDecisions
 from robocas_ms3.planning.decisions import SearchLimits
 from robocas_ms3.core.remote_errors import RemoteTraceback
 class Notes:
-    out_of_attempts = False
+    has_no_attempts_left = False
     def add_failure(self, error): pass
     def copy_from(self, other): pass
 def attempt():
     for _ in range(2):
-        runner.choose("ab", lambda letter: 0.0, SearchLimits(compared=2))
+        runner.choose("ab", lambda letter: 0.0, SearchLimits(max_compared_candidates=2))
     print(os.getpid(), flush=True)
     time.sleep(120)
 runner = ForkedDecisions(Notes())

@@ -51,11 +51,11 @@ A_FEW, ALL = {"a": 1.0, "b": 3.0, "c": 2.0}, {"a": 1.0, "b": 2.0, "c": 3.0}  # s
     [
         ("bc", SearchLimits(), None, "bc", "aa ab ac ba bb"),  # what failed leaves no trace
         ("", SearchLimits(), None, "", "aa ab ac ba bb bc ca cb cc"),
-        ("ba", SearchLimits(max_continued=2), None, "ba", "aa ab"),  # backtrack after some candidates
-        ("cb bc", SearchLimits(compared=3), A_FEW, "bc", "bb"),  # from the best of those compared first
+        ("ba", SearchLimits(max_continued_candidates=2), None, "ba", "aa ab"),  # backtrack after some candidates
+        ("cb bc", SearchLimits(max_compared_candidates=3), A_FEW, "bc", "bb"),  # from the best of those compared first
         (
             "cc",
-            SearchLimits(compared=2, max_continued=9),
+            SearchLimits(max_compared_candidates=2, max_continued_candidates=9),
             ALL,
             "cc",
             "bb ba bc ab aa ac cb ca",
@@ -80,7 +80,9 @@ def test_sufficient_score_ends_the_comparison():
 
     def decide(world, runner):
         runner.choose(
-            "abc", lambda letter: (world.act(letter), scores[letter])[1], SearchLimits(compared=3, sufficient_score=4)
+            "abc",
+            lambda letter: (world.act(letter), scores[letter])[1],
+            SearchLimits(max_compared_candidates=3, sufficient_score=4),
         )
 
     assert search(decide, {"b"}) == (True, "b", [])
@@ -94,7 +96,7 @@ def test_infeasible_candidate_is_skipped():
                 raise PlanningError("play", letter)
             return 0.0
 
-        runner.choose("abcd", play, SearchLimits(compared=2))
+        runner.choose("abcd", play, SearchLimits(max_compared_candidates=2))
         world.act("!")
 
     assert search(decide, {"c!"}) == (True, "c!", [])
@@ -137,7 +139,7 @@ def test_candidates_are_evaluated_lazily():
         yield "a"
         raise AssertionError("nobody asked for another")
 
-    order = order_candidates(candidates(), SearchLimits(max_continued=1), Notes())
+    order = order_candidates(candidates(), SearchLimits(max_continued_candidates=1), Notes())
     assert order.send(None) == ("a", False)
     assert order.send(0.0) == ("a", True)
     with pytest.raises(CandidatesExhaustedError):

@@ -21,7 +21,7 @@ from robocas_ms3.demos.open_loop import OpenLoopChecks
 from robocas_ms3.demos.recordings.trajectory_json import read_json
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings, ReplaySettings
 from robocas_ms3.demos.trajectory_replay import replay
-from robocas_ms3.planning.executor import Executor
+from robocas_ms3.planning.executor import MotionExecutor
 from robocas_ms3.planning.protocol import Trajectory
 from robocas_ms3.robots.description import MOBILE_PANDA
 
@@ -134,8 +134,8 @@ def test_action_replay_is_exact_and_ee_deltas_succeed(run):
 
 def accept_all_attempts(monkeypatch):
     """Accept all attempts as successful, to test how attempts are kept or undone."""
-    flag = Executor.flag
-    monkeypatch.setattr(Executor, "flag", lambda self, name: name == "success" or flag(self, name))
+    flag = MotionExecutor.flag
+    monkeypatch.setattr(MotionExecutor, "flag", lambda self, name: name == "success" or flag(self, name))
     monkeypatch.setattr(OpenLoopChecks, "check", lambda *args, **how: None)
 
 

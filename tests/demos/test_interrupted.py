@@ -11,7 +11,7 @@ from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.demos import generation as module
 from robocas_ms3.demos.failures import FAILURES_FILE, EpisodeResult, FailedAttempt
-from robocas_ms3.demos.generation import shard_name
+from robocas_ms3.demos.generation import seed_file_stem
 from robocas_ms3.demos.recordings.trajectory_json import read_json
 from robocas_ms3.demos.settings import EpisodeSettings, GenerateSettings
 
@@ -35,7 +35,7 @@ def lines_of(seed):
 
 def record(folder, seed):
     """Write the file of an episode that a worker has finished."""
-    path = folder / f"{shard_name(seed)}.h5"
+    path = folder / f"{seed_file_stem(seed)}.h5"
     with h5py.File(path, "w") as file:
         file.create_group("traj_0").attrs["seed"] = seed
     seconds = {"reset": 1.0, "planning": 2.0, "simulation": 3.0}
@@ -129,7 +129,7 @@ def test_failures_of_a_resumed_run_are_those_of_an_uninterrupted_run(tmp_path, s
 def test_truncated_episodes_are_recorded_again(tmp_path, made, suffix, left):
     out = tmp_path / "out"
     write_killed_run(out, (0, 1), lines_of(1))
-    path = (out / "episodes" / shard_name(1)).with_suffix(suffix)
+    path = (out / "episodes" / seed_file_stem(1)).with_suffix(suffix)
     path.write_bytes(path.read_bytes()[: int(left * path.stat().st_size)])
     generate(out, episodes=3)
     assert made == [1, 2, 3]

@@ -43,14 +43,14 @@ def recorded(tmp_path_factory):
     for env, (reset, step) in zip(generator.open_loop_envs, plain, strict=True):
         env.reset, env.step = reset, step
     with TrajectoryFile(folder / "one.h5") as file:
-        yield generator.open_loop_envs[0], file.recording(0), [np.array(actions) for actions in played]
+        yield generator.open_loop_envs[0], file.read_recording(0), [np.array(actions) for actions in played]
     generator.close()
 
 
 def own_actions(recording):
     samples = sample_states(recording.control_steps, 4)
     goals = sample_subgoals(recording.subgoals, samples)
-    arrays = episode_arrays(recording.motion(samples), recording.instruction, goals)
+    arrays = episode_arrays(recording.compute_motion(samples), recording.instruction, goals)
     return episode_actions(arrays)[:-1], arrays["ee_pos"]
 
 

@@ -126,7 +126,7 @@ def test_recording_starts_in_the_state_of_the_policy(recorded, generator, tmp_pa
     assert [played.success for played in replay(ReplaySettings(one, use_env_states=True, save=saved))] == [True]
     assert parse_actions(saved) == parse_actions(one)
     with TrajectoryFile(saved) as file:
-        assert file.entry(0).is_intervention
+        assert file.read_entry(0).is_intervention
     with pytest.raises(EvaluationError, match="cannot replay expert interventions"):
         ReplayPolicy(one)
 

@@ -79,7 +79,7 @@ motion = planner.plan_to_qpos(rest, [rest + [1.5, 0, 0, 0, 0, 0, 0]], stage="x")
 print(np.abs(np.diff(motion.qpos, axis=0)).max() / 0.05)
 from robocas_ms3.robots.description_file import chain_poses
 tip = chain_poses(twin.files().urdf, twin.description.arm_base_link, twin.description.tcp_link, motion.qpos[-1:])
-print(np.abs(planner.tcp(motion.qpos[-1]) - tip).max() < 1e-9, planner.collisions(rest))
+print(np.abs(planner.tcp(motion.qpos[-1]) - tip).max() < 1e-9, planner.find_collisions(rest))
 """,
     )
     fastest, rest = output.splitlines()
@@ -125,7 +125,7 @@ from robocas_ms3.datasets.conversion.convert import convert
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.demos.open_loop import OpenLoopEnv
 from robocas_ms3.core.poses import from_wxyz, inverse
-from robocas_ms3.demos.recordings.motion import sample_states, stored_actions
+from robocas_ms3.demos.recordings.motion import sample_states, to_dataset_actions
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 file, out = Path({str(recorded)!r}), Path({str(tmp_path)!r})
 convert(ConversionSettings(file, out / "folder", embeddings=False, video=False, open_renderer=RayCaster))
@@ -149,7 +149,7 @@ for step in (0, 20, len(qpos) - 1):
     tcp = inverse(from_wxyz(agent.arm_base_link.pose.raw_pose[0])) @ from_wxyz(agent.tcp.pose.raw_pose[0])
     off.append(np.abs(arrays["ee_pos"][step] - tcp[:3, 3]).max())
 print(max(off) < 1e-5, len(arrays["ee_pos"]) == len(qpos))
-actions = stored_actions(*(arrays[name] for name in ("rel_pos", "rel_orn", "gripper_status")))
+actions = to_dataset_actions(*(arrays[name] for name in ("rel_pos", "rel_orn", "gripper_status")))
 print(world.replay(actions[:-1]).success)
 """,
     )

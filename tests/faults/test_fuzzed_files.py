@@ -33,7 +33,7 @@ from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_en
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.datasets.statistics.collect import collect
-from robocas_ms3.demos.failures import FailedAttempt, count_by_stage
+from robocas_ms3.demos.failures import FailedAttempt, count_by_reason
 from robocas_ms3.demos.generation import OUTPUT
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.settings import EpisodeSettings
@@ -171,8 +171,8 @@ def read_recording(root):
     path = root / "trajectory.h5"
     with TrajectoryFile(path) as file:
         for index in range(len(file.episodes)):
-            recording = file.recording(index)
-            motion = recording.motion(np.arange(0, recording.control_steps + 1, 4))
+            recording = file.read_recording(index)
+            motion = recording.compute_motion(np.arange(0, recording.control_steps + 1, 4))
             assert np.isfinite(motion.actions).all()
             assert np.isfinite(RecordedEpisode.read(path, file.episodes[index]).actions).all()
             assert recording_entry(file, index)
@@ -224,7 +224,7 @@ def read_plan_folder(root):
 
 def read_generation(root):
     OutputFolder(root, OUTPUT, RUN).read()
-    count_by_stage(JsonLinesFile(root / "failures.jsonl", FailedAttempt).read())
+    count_by_reason(JsonLinesFile(root / "failures.jsonl", FailedAttempt).read())
 
 
 def read_conversion(root):

@@ -33,7 +33,7 @@ def recordings(request, tmp_path_factory) -> tuple[str, list[Recording]]:
     command = [sys.executable, ROOT / "robocas_cli.py", "generate", request.param, "-n", str(emulated_envs())]
     subprocess.run([*command, "--out", folder, "--jobs", "2", "--check-rate", "0"], check=True, cwd=ROOT)
     with TrajectoryFile(folder / "trajectory.h5") as file:
-        return request.param, [file.recording(i) for i in range(len(file.episodes))]
+        return request.param, [file.read_recording(i) for i in range(len(file.episodes))]
 
 
 def test_whole_demonstrations_succeed_in_a_batch(recordings, monkeypatch):

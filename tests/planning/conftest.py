@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from planning_scenes import Checker
 
-from robocas_ms3.planning.kinematics import ArmChain, Reachability
+from robocas_ms3.planning.kinematics import ArmChain, InverseKinematics
 from robocas_ms3.planning.rrt_connect import RRTConnectPlanner
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.urdf import RobotFiles, make_robot_files
@@ -35,5 +35,5 @@ def planner(make_planner) -> RRTConnectPlanner:
 
 
 @pytest.fixture(scope="session")
-def reachability(panda_files) -> Reachability:
-    return Reachability(ArmChain(panda_files.arm_urdf, MOBILE_PANDA))
+def reachability(panda_files) -> InverseKinematics:
+    return InverseKinematics(ArmChain(panda_files.arm_urdf, MOBILE_PANDA))

@@ -33,7 +33,7 @@ def test_cloud_with_5_mm_spacing_has_no_holes(world):
         shift = np.append(rng.uniform(0, 0.005, 2), 0.0)
         # The plane is perpendicular to the approach, so that both pads touch it flat.
         world.set_scene((plane + shift + [0, 0, -0.004]) @ tcp[:3, :3].T + lowest)
-        assert world.collisions(REST, 0.08) == ["cloud", "panda_leftfinger", "panda_rightfinger"]
+        assert world.find_collisions(REST, 0.08) == ["cloud", "panda_leftfinger", "panda_rightfinger"]
         world.set_scene((plane + shift + [0, 0, 0.010]) @ tcp[:3, :3].T + lowest)
         assert world.is_free(REST[None])[0]
 
@@ -56,7 +56,7 @@ def test_points_inside_the_base_and_out_of_reach_are_dropped(world):
     inside_pedestal = inside_pedestal[(np.abs(x) < 0.12) & (np.abs(y) < 0.09)]
     floor = np.stack([x, y, np.full(len(x), -0.49)], axis=1)  # 1 cm below the mobile base
     world.set_scene(np.concatenate([inside_pedestal, floor]))
-    assert world.collisions(REST, 0.08) == []
+    assert world.find_collisions(REST, 0.08) == []
     points = np.array(
         [[0, 0, -0.05], [0.05, 0, 0.1], [0.2, 0, -0.3], [0.3, 0, 0], [0, 0.2, -0.1], [1.51, 0, 0], [1.49, 0, 0]]
     )
@@ -67,20 +67,20 @@ def test_points_outside_the_octree_are_ignored(world):
     """Keys of octomap have 16 bits: 327.68 m away a point has the key of a point at the TCP."""
     at_tcp = Shape(points=world.tcp(REST)[None, :3, 3] + np.array([[0, 0, 0], [0.042, 0, 0], [0, 0.042, 0]]))
     world.set_scene([Obstacle("near", at_tcp, np.eye(4))])
-    assert "near" in world.collisions(REST, 0.0)
+    assert "near" in world.find_collisions(REST, 0.0)
     far = [Shape(points=at_tcp.points + offset) for offset in ([327.68, 0, 0], [0, -327.68, 0], [0, 0, 1e300])]
     mixed = Shape(points=np.concatenate([far[0].points, [[-1, -1, -1], [0, 1, 1]]]))  # a box around all holds the arm
     world.set_scene([Obstacle("far", shape, np.eye(4)) for shape in (*far, mixed)])
-    assert world.collisions(REST, 0.0) == []
+    assert world.find_collisions(REST, 0.0) == []
 
 
 def test_self_collisions_are_checked_without_obstacles(world):
     world.set_scene(cloud([Box(tuple(world.tcp(REST)[:3, 3]), (0.09, 0.09, 0.03))]))
     assert not world.is_free(REST[None])[0]
-    assert world.all_free(REST[None], obstacles=False)
+    assert world.is_path_free(REST[None], obstacles=False)
     folded = np.array([0.0, -1.7, 0.0, -3.0, 0.0, 0.0, 0.0])
-    assert not world.all_free(folded[None], obstacles=False)
-    assert len(world.collisions(folded, 0.08)) >= 2
+    assert not world.is_path_free(folded[None], obstacles=False)
+    assert len(world.find_collisions(folded, 0.08)) >= 2
 
 
 def body(box: Box) -> Obstacle:
@@ -100,12 +100,12 @@ def test_bodies_and_their_clouds_give_the_same_results(world):
     by_bodies = world.is_free(qpos)
     assert 20 < np.sum(~by_bodies) < 380
     assert np.mean(by_points == by_bodies) > 0.98
-    assert [world.all_free(q[None]) for q in qpos] == by_bodies.tolist()
+    assert [world.is_path_free(q[None]) for q in qpos] == by_bodies.tolist()
     first = int(np.argmin(by_bodies))
-    assert world.count_free(qpos) == first
-    assert world.count_free(qpos[by_bodies]) == by_bodies.sum()
-    assert not world.all_free(qpos)
-    assert world.all_free(qpos[by_bodies])
+    assert world.count_leading_free(qpos) == first
+    assert world.count_leading_free(qpos[by_bodies]) == by_bodies.sum()
+    assert not world.is_path_free(qpos)
+    assert world.is_path_free(qpos[by_bodies])
 
 
 def check_configurations(panda_files) -> bytes:
@@ -137,9 +137,9 @@ def test_all_obstacles_with_a_common_shape_are_checked(world):
     near[:3, 3], far[:3, 3] = tcp[:3, 3], (0.6, 0.5, 0.8)
     for _ in range(2):
         world.set_scene([Obstacle("far", cube, far), Obstacle("near", cube, near), Obstacle("also near", cube, near)])
-        assert {"near", "also near"} == {name for name in world.collisions(REST, 0.0) if "panda" not in name}
+        assert {"near", "also near"} == {name for name in world.find_collisions(REST, 0.0) if "panda" not in name}
         world.set_scene([Obstacle("near", cube, far), Obstacle("far", cube, near)])
-        assert {"far"} == {name for name in world.collisions(REST, 0.0) if "panda" not in name}
+        assert {"far"} == {name for name in world.find_collisions(REST, 0.0) if "panda" not in name}
 
 
 def test_broad_phase_misses_no_contact(world, monkeypatch):
@@ -161,7 +161,7 @@ def test_broad_phase_misses_no_contact(world, monkeypatch):
     def contacts(*attached):
         world.attach(AttachedBody(*attached))
         widths = np.resize((0.0, 0.03, 0.08), len(qpos))
-        return [world.collisions(q, width) for q, width in zip(qpos, widths, strict=True)]
+        return [world.find_collisions(q, width) for q, width in zip(qpos, widths, strict=True)]
 
     found = contacts(held, pose)
     assert 20 < sum(map(bool, found)) < 80

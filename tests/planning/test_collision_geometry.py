@@ -54,7 +54,7 @@ def touches_cube(world: CollisionChecker, checker: Checker, position: np.ndarray
     pose = checker.link_pose("panda_hand", REST).copy()
     pose[:3, 3] += pose[:3, :3] @ (AHEAD + position)
     world.set_scene([Obstacle("cube", Shape((corners(*[0.0026 - MARGIN] * 3),)), pose)])
-    return "cube" in world.collisions(REST, 0.0)
+    return "cube" in world.find_collisions(REST, 0.0)
 
 
 @pytest.mark.parametrize(

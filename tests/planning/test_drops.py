@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from robocas_ms3.planning.skills.place import ContainerInterior, compute_overhang, sample_drops
+from robocas_ms3.planning.skills.place import ContainerInterior, compute_overhang, sample_poses_above_container
 
 CONTAINER = np.array([[0, -1, 0, 0.6], [1, 0, 0, 0.2], [0, 0, 1, 0.1], [0, 0, 0, 1.0]])  # turned by 90 degrees
 INSIDE = ContainerInterior(CONTAINER, np.array([-0.2, -0.1, -0.1]), np.array([0.2, 0.1, 0.1]))
@@ -9,7 +9,7 @@ BOX = np.array([[x, y, z] for x in (-0.03, 0.03) for y in (-0.02, 0.02) for z in
 
 
 def drops():
-    return sample_drops(np.random.default_rng(0), 200, INSIDE, BOX, np.array([0, 0, 0.05]))
+    return sample_poses_above_container(np.random.default_rng(0), 200, INSIDE, BOX, np.array([0, 0, 0.05]))
 
 
 def test_held_objects_are_above_the_container_clear_of_its_rim():

@@ -13,7 +13,7 @@ from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.manifest import Handle, Joint
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.planning.protocol import AttachedBody, Obstacle, Shape
-from robocas_ms3.planning.pull_path import MAX_SLIP, count_reached, track_handle
+from robocas_ms3.planning.pull_path import MAX_SLIP, count_reached_poses, track_handle
 from robocas_ms3.planning.skills.drive import Surroundings, find_free_route
 from robocas_ms3.planning.skills.handles import MovingPart
 from robocas_ms3.robots.description import MOBILE_PANDA
@@ -45,7 +45,7 @@ def test_all_poses_of_a_pull_hold_the_bar_at_the_joint_position(reachability, jo
     solved, start = reachability.nearest_solutions(goals[:1], np.array(REST))
     assert solved.all()
     path = track_handle(reachability.chain, start, goals)[:, 0]
-    assert count_reached(path[:, None])[0] == 25
+    assert count_reached_poses(path[:, None])[0] == 25
     assert np.abs(np.diff(path, axis=0)).max() <= 0.2
     assert (path >= reachability.lower).all()
     assert (path <= reachability.upper).all()
@@ -62,7 +62,7 @@ def test_pull_ends_at_the_limit_of_reach(reachability):
     goals = np.array([joint_motion(away, q) @ hold for q in np.arange(0, 1.0, 0.02)])
     _, start = reachability.nearest_solutions(goals[:1], np.array(REST))
     path = track_handle(reachability.chain, start, goals)
-    count = int(count_reached(path)[0])
+    count = int(count_reached_poses(path)[0])
     assert 0.6 + 0.02 * count < 1.2  # the Panda's reach, long fingers included
     assert count > 3
     assert np.isnan(path[count:]).all()
@@ -79,14 +79,14 @@ def test_route_keeps_the_held_object_collision_free(planner):
     spot, there = np.random.default_rng(0).uniform(-0.01, 0.01, (600, 3)), np.eye(4)
     there[:3, 3] = beyond[:3] + [0.24, 0, 0.49]
     spot = Surroundings([Obstacle("spot", Shape(points=spot), there)], spot + there[:3, 3])
-    assert len(find_free_route(arm, start, goal, spot, leaving=False)) == 1
+    assert len(find_free_route(arm, start, goal, spot, back_first=False)) == 1
     corners = np.stack(np.meshgrid((-0.02, 0.02), (-0.02, 0.02), (-0.02, 0.15)), axis=-1).reshape(-1, 3)
     planner.attach(AttachedBody(corners, np.eye(4)))
-    assert find_free_route(arm, start, goal, spot, leaving=False) is None
+    assert find_free_route(arm, start, goal, spot, back_first=False) is None
 
 
 def part_at(position, joint, monkeypatch):
-    monkeypatch.setattr(MovingPart, "position", lambda self, arm: position)
+    monkeypatch.setattr(MovingPart, "joint_position", lambda self, arm: position)
     handle = Handle(link="door", position=(0, 0, 0), wxyz=(1, 0, 0, 0), width=0.02)
     return MovingPart("cabinet", handle, joint)
 

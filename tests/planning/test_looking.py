@@ -7,7 +7,7 @@ import pytest
 import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.planning.scene import PlanningScene
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.look import _shift, camera_in_base
+from robocas_ms3.planning.skills.look import _camera_shift, camera_in_base
 from robocas_ms3.scenes.config import load_task_config
 
 pytestmark = pytest.mark.slow
@@ -29,7 +29,7 @@ def test_camera_pose_includes_the_random_shift():
     made.reset(seed=1)
     arm = Looking(made.unwrapped)
     rendered = arm.env._sensors["gripper_camera"].camera._render_cameras[0].global_pose.to_transformation_matrix()
-    pose, shift = arm.scene.arm_base_in_world @ camera_in_base(arm), _shift(arm)
+    pose, shift = arm.scene.arm_base_in_world @ camera_in_base(arm), _camera_shift(arm)
     made.close()
     assert pose == pytest.approx(rendered, abs=1e-4)
     assert np.linalg.norm(shift[:3, 3]) > 0.02

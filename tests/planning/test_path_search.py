@@ -16,10 +16,10 @@ def off_the_wall(q):
 
 
 def search(valid=off_the_wall, spacing=0.02):
-    def count_free(path):
+    def count_leading_free(path):
         return next((i for i, q in enumerate(path) if not valid(q)), len(path))
 
-    return PathSearch(count_free, LOW, HIGH, step=0.2, spacing=spacing)
+    return PathSearch(count_leading_free, LOW, HIGH, step=0.2, spacing=spacing)
 
 
 def length(path):

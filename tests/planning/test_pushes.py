@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.core.poses import transform_points
 from robocas_ms3.planning import pushes as pushing
 from robocas_ms3.planning.skills.look import sample_views
-from robocas_ms3.planning.skills.remove import find_free_places, upright_rotation
+from robocas_ms3.planning.skills.remove import compute_upright_rotation, find_free_places
 
 SURFACE = 0.1  # height of the table, in the arm's base frame
 TABLE = np.eye(4)
@@ -30,14 +30,16 @@ NOTHING = np.zeros((0, 3))
 
 
 def pushes(target=TARGET, others=NOTHING, points=OBSTACLE, half=HALF, fixed=NOTHING) -> list[pushing.Push]:
-    return list(pushing.push_candidates(np.random.default_rng(0), points, target, others, (TABLE, half), fixed))
+    return list(
+        pushing.generate_push_candidates(np.random.default_rng(0), points, target, others, (TABLE, half), fixed)
+    )
 
 
 def test_push_of_an_object_above_the_target_is_towards_the_robot():
     above = np.array([0.6, 0.005, 0.2])
     angles = []
     for seed in range(40):
-        x, y, z = pushing.push_direction(np.random.default_rng(seed), above, np.array([0.6, 0, 0.1]))
+        x, y, z = pushing.compute_push_direction(np.random.default_rng(seed), above, np.array([0.6, 0, 0.1]))
         assert z == 0
         angles.append(np.rad2deg(np.arctan2(-y, -x)))
     assert -30.5 <= min(angles) < -15
@@ -53,7 +55,7 @@ def test_first_push_has_the_direction_of_the_paper():
     assert push.start[:3, 2] == pytest.approx([0, 0, -1])  # tool down
     assert push.end[:3, 3] - push.start[:3, 3] == pytest.approx(push.length * push.direction)
     for turn in (30.0, -30.0):
-        found = pushing.push_candidates(
+        found = pushing.generate_push_candidates(
             np.random.default_rng(0), OBSTACLE, TARGET, NOTHING, (TABLE, HALF), NOTHING, turn
         )
         first = next(found).direction
@@ -76,7 +78,9 @@ def test_tool_starts_at_free_positions_only():
 def test_all_pushes_end_on_the_surface(x, y, seed):
     points = OBSTACLE - OBSTACLE.mean(axis=0) + [x, y, 0.15]
     rng = np.random.default_rng(seed)
-    for push in pushing.push_candidates(rng, points, np.array([0.6, 0.0, 0.12]), NOTHING, (TABLE, HALF), NOTHING):
+    for push in pushing.generate_push_candidates(
+        rng, points, np.array([0.6, 0.0, 0.12]), NOTHING, (TABLE, HALF), NOTHING
+    ):
         moved = points + (push.length - pushing.STAND_OFF) * push.direction
         assert np.all(np.abs(moved[:, :2] - TABLE[:2, 3]) <= HALF - pushing.EDGE_MARGIN)
         assert push.start[2, 3] - pushing.TIP_BELOW_TCP >= SURFACE + pushing.TIP_CLEARANCE - 1e-9
@@ -133,20 +137,20 @@ def corners(shift):
 def test_tilted_object_is_rotated_upright_about_horizontal_axes(turned_deg):
     leant = Rotation.from_euler("xyz", turned_deg, degrees=True)
     expected = leant.inv().as_matrix() if turned_deg[2] == 0 else np.eye(3)
-    turn = upright_rotation(leant.apply(BRICK), np.zeros(3))
+    turn = compute_upright_rotation(leant.apply(BRICK), np.zeros(3))
     np.testing.assert_allclose(turn[:3, :3], expected, atol=1e-9)
     np.testing.assert_array_equal(turn[:3, 3], 0)
 
 
 def test_object_tilted_beyond_45_degrees_is_rotated_to_the_next_side():
     leant = Rotation.from_euler("x", 50, degrees=True)
-    turn = upright_rotation(leant.apply(BRICK), np.zeros(3))
+    turn = compute_upright_rotation(leant.apply(BRICK), np.zeros(3))
     np.testing.assert_allclose(turn[:3, :3], Rotation.from_euler("x", 40, degrees=True).as_matrix(), atol=1e-9)
 
 
 def test_face_not_below_the_centre_of_mass_is_unstable():
     # its foot reaches to x = 2 cm, its middle is at 1.5 cm, then at 2.5 cm: it falls onto the side (3, 4) cm long
-    np.testing.assert_array_equal(upright_rotation(corners(0.01), corners(0.01).mean(axis=0)), np.eye(4))
-    turn = upright_rotation(corners(0.03), corners(0.03).mean(axis=0))
+    np.testing.assert_array_equal(compute_upright_rotation(corners(0.01), corners(0.01).mean(axis=0)), np.eye(4))
+    turn = compute_upright_rotation(corners(0.03), corners(0.03).mean(axis=0))
     expected = Rotation.from_rotvec([0, np.arccos(0.6), 0]).as_matrix()
     np.testing.assert_allclose(turn[:3, :3], expected, atol=1e-9)

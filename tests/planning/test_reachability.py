@@ -8,8 +8,8 @@ from planning_scenes import REST, pose_error, top_down
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.planning.analytic import PandaGeometry
-from robocas_ms3.planning.kinematics import MIN_SOLUTION_DISTANCE, ArmChain, Reachability, joint_distance
+from robocas_ms3.planning.analytic import PandaInverseKinematics
+from robocas_ms3.planning.kinematics import MIN_SOLUTION_DISTANCE, ArmChain, InverseKinematics, joint_distance
 from robocas_ms3.planning.pull_path import pose_difference
 from robocas_ms3.robots.description import MOBILE_PANDA
 
@@ -44,7 +44,7 @@ def random_configurations(chain: ArmChain, count: int, seed: int) -> np.ndarray:
 def test_solver_finds_configurations_at_their_own_joint_7(reachability):
     chain = reachability.chain
     qpos = random_configurations(chain, 2000, 0)
-    found = PandaGeometry(chain).solve(chain.tcp(qpos), qpos[:, 6])
+    found = PandaInverseKinematics(chain).solve(chain.tcp(qpos), qpos[:, 6])
     away = np.nanmin(np.abs(found - qpos[:, None]).max(axis=2), axis=1)
     assert np.mean(away < 1e-6) > 0.99
     rows, branches = np.nonzero(np.isfinite(found[..., 0]))
@@ -113,4 +113,4 @@ def test_closed_form_for_another_arm_is_an_error(panda_files):
     with pytest.raises(
         RobocasError, match="robocas_mobile_panda: closed-form inverse kinematics do not fit the arm .*inverse_kinem"
     ):
-        Reachability(chain)
+        InverseKinematics(chain)

@@ -13,9 +13,9 @@ from robocas_ms3.core.errors import PlanningError, UnrecoverableError
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.planning.decisions import IrreversibleDecisions
-from robocas_ms3.planning.executor import Executor
+from robocas_ms3.planning.executor import MotionExecutor
 from robocas_ms3.planning.protocol import Obstacle, Shape
-from robocas_ms3.planning.pushes import push_direction
+from robocas_ms3.planning.pushes import compute_push_direction
 from robocas_ms3.planning.skills import heap as heap_skill
 from robocas_ms3.planning.skills import push
 from robocas_ms3.planning.skills.arm import Arm
@@ -36,10 +36,12 @@ def generator():
 
 def start_episode(generator, seed):
     """Return the arm at the start of an episode and the other objects of the heap, the highest first."""
-    executor = Executor(generator.env, seed)
+    executor = MotionExecutor(generator.env, seed)
     executor.reset()
     executor.facts = {"pushes": 0, "removals": 0}
-    arm = Arm(generator.planner, generator.reachability, executor, IrreversibleDecisions(lambda: len(executor.actions)))
+    arm = Arm(
+        generator.planner, generator.inverse_kinematics, executor, IrreversibleDecisions(lambda: len(executor.actions))
+    )
     target = int(arm.env.target_slot[0])
     slots = [s for s in np.flatnonzero(arm.env.present[0].numpy()).tolist() if s != target]
     return arm, target, sorted(slots, key=lambda slot: -surface(arm, slot)[:, 2].max())
@@ -91,7 +93,7 @@ def test_push_moves_an_object_away_from_the_target(generator):
     starts = {slot: surface(arm, slot).mean(axis=0) for slot in [*slots, target]}
     pushed = first_that_works(lambda slot: push_away(arm, slot, target), slots)
     assert pushed is not None
-    ahead = push_direction(np.random.default_rng(0), starts[pushed], starts[target])
+    ahead = compute_push_direction(np.random.default_rng(0), starts[pushed], starts[target])
     shift = surface(arm, pushed).mean(axis=0) - starts[pushed]
     assert shift @ ahead > 0.02
     assert np.abs(arm.env.gripper_forces()).max() == 0  # it has let go of everything

@@ -142,7 +142,7 @@ def test_motions_are_joined_only_without_collisions(planner):
     place = planner.tcp(early)[:3, 3]
     assert np.linalg.norm(place - planner.tcp(reach.qpos[-1])[:3, 3]) > 0.1  # far from the corner
     planner.set_scene(cloud([Box(tuple(place), (0.09, 0.09, 0.03))]))  # wider than the open gripper
-    assert planner.collisions(early) and not planner.collisions(reach.qpos[-1])
+    assert planner.find_collisions(early) and not planner.find_collisions(reach.qpos[-1])
     assert planner.join(REST, reach, down).qpos.tolist() == [*reach.qpos.tolist(), *down.qpos.tolist()]
 
 

@@ -31,7 +31,7 @@ class _Planner:
 def arm(reachability):
     robot = SimpleNamespace(pose=SimpleNamespace(raw_pose=np.array([[0.0, 0, 0, 1, 0, 0, 0]])))
     env = SimpleNamespace(agent=SimpleNamespace(robot=robot))
-    tools = {"robot": MOBILE_PANDA, "reachability": reachability, "planner": _Planner()}
+    tools = {"robot": MOBILE_PANDA, "inverse_kinematics": reachability, "planner": _Planner()}
     return SimpleNamespace(env=env, qpos=REST, approach="top", **tools)
 
 
@@ -50,7 +50,7 @@ def test_thorough_check_finds_free_configurations_other_than_the_nearest(arm):
     assert base_placement.reachable_fraction(arm, here, grasps, []) == 1.0
     assert base_placement.reachable_fraction(arm, here, grasps, [], thorough=True) == 1.0
     poses = base_placement._sample_grasp_poses(arm, arm_base_in_world(arm, here), grasps, len(grasps))
-    solved, nearest = arm.reachability.nearest_solutions(poses, REST)
+    solved, nearest = arm.inverse_kinematics.nearest_solutions(poses, REST)
     assert solved.all()
     arm.planner.blocked = nearest
     assert base_placement.reachable_fraction(arm, here, grasps, []) == 0.0
@@ -61,7 +61,7 @@ def test_a_grasp_counts_only_with_its_pregrasp(arm):
     grasps, here = grasps_in_world(arm), np.zeros(3)
     poses = base_placement._sample_grasp_poses(arm, arm_base_in_world(arm, here), grasps, len(grasps))
     half = len(poses) // 2
-    everything, of_pose = arm.reachability.all_solutions(poses, REST)
+    everything, of_pose = arm.inverse_kinematics.all_solutions(poses, REST)
     arm.planner.blocked = everything[of_pose >= half]  # each way in
     assert base_placement.reachable_fraction(arm, here, grasps, [], thorough=True) == 0.0
     one_and_its_half_turn = np.isin(of_pose, [half, half + len(grasps)])

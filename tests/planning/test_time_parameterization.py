@@ -63,7 +63,7 @@ def test_rounded_corner_is_a_parabola_inside_the_corner():
 
 def test_rounded_corners_do_not_overlap():
     path = round_corners(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.1], [2.0, 0.1]]), 0.3)
-    dense = path.dense(0.001)
+    dense = path.sample(0.001)
     assert np.abs(np.diff(dense, axis=0)).max() <= 0.001 + 1e-9
     np.testing.assert_allclose(dense[[0, -1]], [[0, 0], [2, 0.1]], atol=1e-12)
     assert dense[:, 1].min() >= -1e-12 and dense[:, 1].max() <= 0.1 + 1e-12
@@ -84,7 +84,7 @@ def test_timed_paths_respect_the_limits_and_end_at_rest(seed):
 def test_spline_through_a_smooth_motion_stays_on_it():
     angle = np.linspace(0, 1, 15)
     path = fit_spline(np.stack([np.sin(angle), np.cos(angle)], axis=1))
-    np.testing.assert_allclose(np.linalg.norm(path.dense(0.001), axis=1), 1.0, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(path.sample(0.001), axis=1), 1.0, atol=1e-6)
     trajectory = time_path(path, dt=0.05, **LIMITS)
     assert trajectory is not None
     np.testing.assert_array_equal(trajectory.qpos[-1], [np.sin(1.0), np.cos(1.0)])

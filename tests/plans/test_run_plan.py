@@ -24,7 +24,7 @@ from robocas_ms3.core.errors import OutputExistsError, PlanError, RobocasError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
-from robocas_ms3.demos.recordings.trajectory_json import versions
+from robocas_ms3.demos.recordings.trajectory_json import package_versions
 from robocas_ms3.plans.executors import LocalExecutor
 from robocas_ms3.plans.folder import Outcome, PlanFolder, WorkUnit
 from robocas_ms3.plans.run import join_plan, run_shard
@@ -145,7 +145,7 @@ def test_machine_that_cannot_open_a_part_fails_no_seed(tmp_path):
     plan = PLAN.model_copy(update={"parts": [PLAN.parts[0].model_copy(update={"pack": "mine"})]})
     shard(tmp_path / "out", "4/5")
     (tmp_path / "out" / "plan.json").write_text(
-        json.dumps({"plan": plan.model_dump(mode="json"), "versions": versions()})
+        json.dumps({"plan": plan.model_dump(mode="json"), "versions": package_versions()})
     )
     with stub_stages(Recorder), closing(WorkUnitWorker(PlanFolder(plan, tmp_path / "out"))) as worker:
         with pytest.raises(PlanError) as error:

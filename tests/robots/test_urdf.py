@@ -100,10 +100,10 @@ def test_srdf_reports_true_self_collisions_only():
     reaching = (0, 0.6, 0, -1.5, 0, 2.1, 0.78)
     for qpos in (MOBILE_PANDA.arm_rest, MOBILE_PANDA.arm_evaluation_start, reaching):
         for width in (0.0, 0.08):
-            assert world.collisions(np.array(qpos), width) == []
-    into_base = world.collisions(np.array((0, 1.7, 0, -1.6, 0, 1.5, 0)), 0.08)
+            assert world.find_collisions(np.array(qpos), width) == []
+    into_base = world.find_collisions(np.array((0, 1.7, 0, -1.6, 0, 1.5, 0)), 0.08)
     assert {"base_link", "panda_hand"} <= set(into_base)
-    folded = world.collisions(np.array((0, -1, 0, -3.05, 0, 0, 0)), 0.08)
+    folded = world.find_collisions(np.array((0, -1, 0, -3.05, 0, 0, 0)), 0.08)
     assert "base_link" not in folded
     assert len(folded) >= 2  # the hand on the shoulder
 

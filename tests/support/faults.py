@@ -110,7 +110,7 @@ def count_readable(command, out):
         recorded = sorted((out / "episodes").glob("seed_*.h5"))
         for path in recorded:
             with TrajectoryFile(path) as file:
-                assert len(file.recording(0).actions)
+                assert len(file.read_recording(0).actions)
         return len(recorded)
     if command.name == "eval":
         lines = (out / "episodes.jsonl").read_bytes().splitlines(keepends=True)

@@ -85,7 +85,7 @@ class RayCaster:
         return np.array([height / 2, height / 2, width / 2, height / 2])  # 90 deg vertical field of view
 
     def frames(self, recording, samples):
-        motion = recording.motion(np.asarray(samples))
+        motion = recording.compute_motion(np.asarray(samples))
         for index, base, tcp in zip(samples, motion.arm_base_in_world, motion.tcp_in_world, strict=True):
             state = recording.state(int(index))
             parents = {"base_camera": base, "gripper_camera": tcp, "static_camera": np.eye(4)}

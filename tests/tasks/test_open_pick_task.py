@@ -18,7 +18,7 @@ from robocas_ms3.demos.recordings.subgoals import sample_subgoals
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.settings import EpisodeSettings, ReplaySettings
 from robocas_ms3.demos.trajectory_replay import replay
-from robocas_ms3.planning.executor import Executor
+from robocas_ms3.planning.executor import MotionExecutor
 from robocas_ms3.planning.skills.base_placement import drive_to_handle
 from robocas_ms3.planning.skills.drive import current_base_pose, drive
 from robocas_ms3.planning.skills.grasp import plan_grasp
@@ -54,9 +54,9 @@ def test_furniture_is_open_from_the_configured_fraction(name):
 @contextmanager
 def done_early():
     """Accept episodes without success, since these tests end before it."""
-    flag = Executor.flag
+    flag = MotionExecutor.flag
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Executor, "flag", lambda self, name: name == "success" or flag(self, name))
+        patch.setattr(MotionExecutor, "flag", lambda self, name: name == "success" or flag(self, name))
         patch.setattr(OpenLoopChecks, "check", lambda *_, **how: None)
         yield
 
@@ -85,7 +85,7 @@ def driven(tmp_path_factory):
 def test_drive_is_in_the_actions_and_the_arm_is_still(driven):
     path, seen = driven
     with TrajectoryFile(path) as file:
-        actions = file.recording(0).actions
+        actions = file.read_recording(0).actions
     assert actions.shape[1] == 11
     base = actions[:, 8:]
     assert base[-1] == pytest.approx([0.2, -0.1, 0.3], abs=1e-6)
@@ -100,9 +100,9 @@ def test_drive_is_in_the_actions_and_the_arm_is_still(driven):
 def test_drive_is_in_the_base_motion_of_the_dataset(driven):
     path, seen = driven
     with TrajectoryFile(path) as file:
-        recording = file.recording(0)
+        recording = file.read_recording(0)
     samples = sample_states(recording.control_steps, 4)
-    motion = recording.motion(samples)
+    motion = recording.compute_motion(samples)
     x, y, yaw = motion.agv_pose.T
     base = np.tile(np.eye(4), (len(x), 1, 1))  # as rendering reads it from the arm's base link
     base[:, 0, 0] = base[:, 1, 1] = np.cos(yaw)
@@ -142,18 +142,18 @@ def test_pull_opens_by_contact_and_releases_the_handle(tmp_path):
     generator = EpisodeGenerator(EpisodeSettings("open_pick", "open_pick_container", "builtin", max_attempts=1))
 
     def policy(arm) -> None:
-        part, touched = MovingPart.of(arm), watch(arm)
-        assert part.position(arm) == pytest.approx(0, abs=1e-3)
+        part, touched = MovingPart.from_task(arm), watch(arm)
+        assert part.joint_position(arm) == pytest.approx(0, abs=1e-3)
         open_furniture_part(arm)
         assert set(touched) == {part.handle.link}  # and nothing else in the scene
         assert touched[part.handle.link] < 0.002
-        assert part.position(arm) == pytest.approx(0.95 * part.open_limit, abs=0.01)
+        assert part.joint_position(arm) == pytest.approx(0.95 * part.open_limit, abs=0.01)
         assert bool(arm.env.furniture_opened()[0])
         # the gripper is open and off the handle
-        bar = part.in_world(arm, np.array([part.position(arm)]))[0] @ part.grasp_in_part
+        bar = part.poses_in_world(arm, np.array([part.joint_position(arm)]))[0] @ part.grasp_in_part
         assert (np.linalg.inv(bar) @ arm.scene.arm_base_in_world @ arm.scene.tcp_in_base)[2, 3] < -0.05
         arm.planner.set_scene(arm.scene.obstacles())
-        assert arm.planner.collisions(arm.scene.arm_qpos) == []
+        assert arm.planner.find_collisions(arm.scene.arm_qpos) == []
         assert int(arm.env.evaluate()["disturbed"][0]) == 0
 
     generator.policy = policy
@@ -178,7 +178,7 @@ def test_robot_drives_to_a_handle_out_of_reach(tmp_path):
     generator = EpisodeGenerator(EpisodeSettings("open_pick", config, "builtin", max_attempts=1))
 
     def share(arm) -> float:
-        part = MovingPart.of(arm)
+        part = MovingPart.from_task(arm)
         others = arm.scene.obstacles(exclude_link=(part.furniture, part.handle.link))
         return pull_fraction(arm, part, arm.scene.arm_base_in_world, others)
 
@@ -211,7 +211,7 @@ def test_robot_drives_to_a_target_out_of_reach(tmp_path):
     assert generator.generate(3, tmp_path, "far").success
     generator.close()
     with TrajectoryFile(tmp_path / "far.h5") as file:
-        actions = file.recording(0).actions
+        actions = file.read_recording(0).actions
     base = actions[:, 8:]
     assert base[-1, 0] > 0.1
     driving = np.flatnonzero(np.abs(np.diff(base, axis=0)).max(axis=1) > 0)

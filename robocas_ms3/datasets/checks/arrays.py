@@ -12,7 +12,7 @@ from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.violation import NO_FILE, Violation
 from robocas_ms3.datasets.sources.arrays import SPECS, EpisodeArrays
-from robocas_ms3.demos.recordings.motion import planar_motion, relative_motion
+from robocas_ms3.demos.recordings.motion import compute_agv_motion, compute_relative_motion
 from robocas_ms3.scenes.language.templates import GOAL_TYPES
 
 Check = Callable[[EpisodeArrays], Iterator[Violation]]
@@ -111,7 +111,7 @@ def motion_errors(stored: EpisodeArrays, keys: tuple[str, ...], order: int = 0) 
     """Return the errors (T,) of relative poses in m and in rad; ``order`` -1 reads quaternions as wxyz."""
     arrays = [stored.arrays[key].astype(np.float64) for key in keys]
     absolute, relative = (from_xyzw(arrays[i], np.roll(arrays[i + 1], order, axis=1)) for i in (0, 2))
-    motion = relative_motion(absolute)
+    motion = compute_relative_motion(absolute)
     turn = Rotation.from_matrix(np.swapaxes(motion[:, :3, :3], 1, 2) @ relative[:, :3, :3]).magnitude()
     return np.linalg.norm(motion[:, :3, 3] - relative[:, :3, 3], axis=1), turn
 
@@ -119,7 +119,7 @@ def motion_errors(stored: EpisodeArrays, keys: tuple[str, ...], order: int = 0) 
 def check_base_motion(stored: EpisodeArrays) -> Iterator[Violation]:
     """Check that ``rel_agv_pose`` are the differences of ``agv_pose``."""
     if {"agv_pose", "rel_agv_pose"} <= stored.arrays.keys():
-        error = np.abs(planar_motion(stored.arrays["agv_pose"]) - stored.arrays["rel_agv_pose"]).max()
+        error = np.abs(compute_agv_motion(stored.arrays["agv_pose"]) - stored.arrays["rel_agv_pose"]).max()
         if error > POSITION_TOLERANCE:
             yield Violation(stored.file, "rel_agv_pose", "differences of agv_pose", f"off by {error:.3g}")
 

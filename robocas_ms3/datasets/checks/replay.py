@@ -17,8 +17,8 @@ from robocas_ms3.datasets.actions import episode_actions
 from robocas_ms3.datasets.sources.file_models import EnvInfo, Layout, SceneRecord, read_scene
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.open_loop import OpenLoopEnv
-from robocas_ms3.demos.recordings.environment import read_env
-from robocas_ms3.demos.recordings.trajectory_json import one_seed, read_reset_options
+from robocas_ms3.demos.recordings.environment import read_recorded_env
+from robocas_ms3.demos.recordings.trajectory_json import parse_seed, read_reset_options
 
 _SAME_PLACE = 1e-3  # m
 _BASE_STILL = 1e-3  # m; 7-D actions do not move the base
@@ -105,12 +105,14 @@ class _Replayer:
         self._open_loop: OpenLoopEnv | None = None
 
     def replay(self, number: int, task: str, scene: SceneRecord, arrays: Mapping[str, NDArray]) -> EpisodeReplay:
-        seed, reason = one_seed(scene.seed), _skip_reason(scene, arrays)
+        seed, reason = parse_seed(scene.seed), _skip_reason(scene, arrays)
         if seed is None or reason:
             return EpisodeReplay(number, task, None, skipped=reason)
         if self._open_loop is None or scene.env_info != self._env_info:
             self.close()
-            env = read_env(scene.env_info and scene.env_info.model_dump(), "scene.json, env_info", pack=self._pack)
+            env = read_recorded_env(
+                scene.env_info and scene.env_info.model_dump(), "scene.json, env_info", pack=self._pack
+            )
             self._env_info, self._open_loop = scene.env_info, OpenLoopEnv(env, self._rate_hz)
         self._open_loop.reset(seed, read_reset_options(scene.reset_options, "reset_options"))
         difference = _scene_difference(scene.layout or Layout(), self._open_loop)
@@ -144,7 +146,7 @@ def _scene_difference(recorded: Layout, open_loop: OpenLoopEnv) -> str:
 
 
 def _skip_reason(scene: SceneRecord, arrays: Mapping[str, NDArray]) -> str:
-    if not scene.env_info or one_seed(scene.seed) is None:
+    if not scene.env_info or parse_seed(scene.seed) is None:
         return "scene.json lacks env_info or seed, so the scene can't be built"
     if scene.success is False:
         return "the recording has no success"

@@ -13,7 +13,7 @@ from robocas_ms3.datasets.checks.violation import Violation, check_form, read_ob
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.arrays import EpisodeArrays, arrays_fingerprint
 from robocas_ms3.datasets.sources.file_models import ConversionRecord, SceneRecord, fill_unknown_keys
-from robocas_ms3.demos.recordings.trajectory_json import one_seed
+from robocas_ms3.demos.recordings.trajectory_json import parse_seed
 from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 
 FILE = schema.CONVERSION_FILE
@@ -82,7 +82,7 @@ def check_entries(
         entry, known = (entries or {}).get(str(number), {}), valid_values(scene)[0]
         for key, expected, found in (
             ("source.recording", entry.get("recording"), known.get("source", {}).get("recording")),
-            ("seed", one_seed(entry.get("seed")), one_seed(known.get("seed"))),
+            ("seed", parse_seed(entry.get("seed")), parse_seed(known.get("seed"))),
             ("rate_hz", settings.get("rate_hz"), known.get("rate_hz")),
         ):
             if None not in (expected, found) and expected != found:

@@ -38,7 +38,7 @@ from robocas_ms3.datasets.images.video import MAX_PREVIEWS, finish_previews, she
 from robocas_ms3.datasets.sources.file_models import SettingsRecord
 from robocas_ms3.datasets.sources.files import read_json
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.demos.recordings.trajectory_json import versions
+from robocas_ms3.demos.recordings.trajectory_json import package_versions
 
 _FIX = "The dataset of the other episodes is valid. Run the same command to retry, or pass --skip-errors."
 _log = logging.getLogger(__name__)
@@ -71,7 +71,7 @@ def convert(
         source = stack.enter_context(closing(open_trajectory(settings)))
         image_options = source.image_options
         stored = dataset_settings(source.rate_hz, image_options, settings.embeddings)
-        recorded = {**stored, "made_with": versions()}
+        recorded = {**stored, "made_with": package_versions()}
         output = stack.enter_context(OutputFolder(out, DATASET, recorded, overwrite=settings.overwrite))
         # Everything that may fail runs before the output changes.
         entries = ConversionInput(source, image_options, settings.include_failed).entries()

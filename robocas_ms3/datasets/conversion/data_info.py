@@ -22,7 +22,7 @@ from robocas_ms3.datasets.sources.provenance import environment_id, task_of
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.failures import FAILURES_FILE
-from robocas_ms3.demos.recordings.subgoals import subgoal_runs
+from robocas_ms3.demos.recordings.subgoals import group_subgoals
 
 _NEEDED = ("episode_length", "language_goal", "step_goal_type", "step_lang_goals", "rel_pos", "rel_orn")
 
@@ -48,7 +48,7 @@ def build_info(root: Path, previous: tuple[Iterable[int], Iterable[int]] = ((), 
         seeds[number] = episode.scene.get("seed")
         lengths[str(number)] = int(arrays["episode_length"])
         instructions[str(number)] = str(arrays["language_goal"])
-        runs = subgoal_runs(arrays["step_goal_type"].tolist(), arrays["step_lang_goals"].tolist())
+        runs = group_subgoals(arrays["step_goal_type"].tolist(), arrays["step_lang_goals"].tolist())
         goals[str(number)] = [goal.model_dump() for goal in runs]
         positions.append(arrays["rel_pos"])
         orientations.append(arrays["rel_orn"])

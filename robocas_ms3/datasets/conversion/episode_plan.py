@@ -18,7 +18,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.file_models import ConversionRecord, SettingsRecord
 from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
-from robocas_ms3.demos.recordings.trajectory_json import versions
+from robocas_ms3.demos.recordings.trajectory_json import package_versions
 
 Entries = Sequence[dict[str, Any]]
 """See `conversion_input.ConversionInput.entries`."""
@@ -32,7 +32,7 @@ MARKS = (schema.CONVERSION_FILE, schema.DATA_INFO_FILE)
 
 def add_versions(record: dict[str, Any]) -> dict[str, Any]:
     """Return a record with the current versions if some are missing, as in merged datasets."""
-    now, made_with = versions(), record.get("made_with")
+    now, made_with = package_versions(), record.get("made_with")
     is_complete = isinstance(made_with, dict) and now.keys() <= made_with.keys()
     return record if is_complete else {**record, "made_with": now}
 
@@ -55,7 +55,7 @@ def dataset_settings(rate_hz: float, image_options: ImageOptions, embeddings: bo
 
 def header(settings: Mapping[str, Any], split_rule: str = SPLIT_RULE) -> dict[str, Any]:
     """Return ``conversion.json`` without the episodes."""
-    version = {"format": "robocas", "schema_version": schema.SCHEMA_VERSION, "made_with": versions()}
+    version = {"format": "robocas", "schema_version": schema.SCHEMA_VERSION, "made_with": package_versions()}
     return {**version, **settings, "split": split_rule}
 
 

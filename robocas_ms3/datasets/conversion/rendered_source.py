@@ -58,7 +58,7 @@ class RenderedSource(TrajectorySource):
         super().__init__(path, rate_hz=self.rate_hz, include_failed=True, pack=self._pack)
 
     def entry(self, number: int) -> dict[str, Any]:
-        with self.file.reopened() as file:
+        with self.file.reopen() as file:
             try:
                 return recording_entry(file, number)
             except DatasetError:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets.schema import EPISODE_INFO
-from robocas_ms3.demos.recordings.motion import relative_motion
+from robocas_ms3.demos.recordings.motion import compute_relative_motion
 from robocas_ms3.robots.quantities import feature_columns, lerobot_features
 
 
@@ -48,7 +48,7 @@ def robocas_arrays(
             values[quantity.name] = part > 0.5 if quantity.dtype == "bool" else part
     for pos, orn, rel in (("ee_pos", "ee_orn", "rel"), ("base_pos", "base_orn", "base_rel")):
         poses = from_xyzw(values[pos].astype(np.float64), values[orn].astype(np.float64))
-        motion = relative_motion(poses)
+        motion = compute_relative_motion(poses)
         values.setdefault(f"{rel}_pos", motion[:, :3, 3])
         values[f"{rel}_orn"] = Rotation.from_matrix(motion[:, :3, :3]).as_quat(canonical=True)
     return {spec.name: spec.cast(values[spec.name]) for spec in EPISODE_INFO if spec.name in values}

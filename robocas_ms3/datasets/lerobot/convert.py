@@ -35,7 +35,7 @@ from robocas_ms3.datasets.lerobot.schema import (
 from robocas_ms3.datasets.lerobot.variants import Variant, find_variant
 from robocas_ms3.datasets.schema import episode_folder
 from robocas_ms3.datasets.sources.split import split_by_seed
-from robocas_ms3.demos.recordings.trajectory_json import versions
+from robocas_ms3.demos.recordings.trajectory_json import package_versions
 
 FILE_LIMITS = FileLimits()
 _PARTS, _JOINED = ".parts", ".joined"  # folders of finished episodes, and of the dataset being joined
@@ -112,7 +112,7 @@ def _plan(conversion_input: ConversionInput, codec: str, variant: Variant) -> di
     train, val = split_by_seed({i: entry["seed"] for i, entry in enumerate(entries)}, (previous_train, previous_val))
     plan = {
         "format": "lerobot",
-        "made_with": versions(),
+        "made_with": package_versions(),
         "settings": {
             "lerobot_version": variant.version,
             "rate_hz": whole_rate(conversion_input.source.rate_hz),

@@ -37,7 +37,7 @@ from robocas_ms3.datasets.lerobot.variants import Variant
 from robocas_ms3.datasets.lerobot.video import VideoEncoder, find_codec, to_levels
 from robocas_ms3.datasets.schema import episode_folder
 from robocas_ms3.datasets.sources.episode_source import ImageKind, StepImages
-from robocas_ms3.demos.recordings.subgoals import subgoal_runs
+from robocas_ms3.demos.recordings.subgoals import group_subgoals
 
 FRAMES_FILE, EPISODE_FILE = "frames.parquet", "episode.json"
 SUBGOAL = "subgoal"  # column of texts; they become indices when parts are joined
@@ -172,7 +172,7 @@ class EpisodePart:
     def persistent_rows(self, fps: int) -> list[Row]:
         types, goals = (self.table.column(key).to_pylist() for key in (schema.SUBGOAL_TYPE.key, SUBGOAL))
         texts = paraphrases(self.record.scene, self.record.instruction)
-        return persistent_rows(subgoal_runs(types, goals), texts, fps)
+        return persistent_rows(group_subgoals(types, goals), texts, fps)
 
 
 def _damaged(path: Path) -> DatasetError:

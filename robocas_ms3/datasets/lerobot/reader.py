@@ -27,7 +27,7 @@ from robocas_ms3.datasets.lerobot.video import read_frames, to_depth
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource, ImageKind, SourceEpisode, Split
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.reader import check_rate
-from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
+from robocas_ms3.demos.recordings.subgoals import SubGoal, group_subgoals
 from robocas_ms3.robots.cameras import Parent, standard_camera_parent
 
 _Text = TypeVar("_Text", SceneText, CamerasText)
@@ -140,7 +140,7 @@ class LeRobotEpisode(SourceEpisode):
     @property
     def goals(self) -> list[SubGoal]:
         """Sub-goals and their steps; empty for other LeRobot datasets."""
-        return subgoal_runs(*self._subgoals()) if self.dataset.is_robocas else []
+        return group_subgoals(*self._subgoals()) if self.dataset.is_robocas else []
 
     def _subgoals(self) -> tuple[list[str], list[str]]:
         key, columns = schema.SUBTASK_INDEX.key, declared_columns(self.dataset.info["features"])

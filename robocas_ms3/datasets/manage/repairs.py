@@ -15,7 +15,7 @@ from robocas_ms3.datasets.checks import arrays as array_checks
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.arrays import SPECS, EpisodeArrays, motion_arrays
-from robocas_ms3.demos.recordings.motion import planar_motion
+from robocas_ms3.demos.recordings.motion import compute_agv_motion
 from robocas_ms3.robots.quantities import to_continuous_xyzw
 
 EMBEDDINGS = tuple(spec.name for spec in schema.EPISODE_INFO if spec.embedding)
@@ -130,7 +130,7 @@ def _repair_content(episode: ImportedEpisode) -> None:
     for keys in schema.RELATIVE_PAIRS:
         _repair_motion(episode, keys)
     for wrong in [*array_checks.check_base_motion(episode.stored)]:
-        episode.put({wrong.key: SPECS[wrong.key].cast(planar_motion(episode.stored.arrays["agv_pose"]))})
+        episode.put({wrong.key: SPECS[wrong.key].cast(compute_agv_motion(episode.stored.arrays["agv_pose"]))})
         episode.add_finding(wrong, "repaired", "derived from agv_pose")
     for wrong in array_checks.check_values(episode.stored):
         episode.add_finding(wrong, "skipped" if wrong.key == "language_goal" else "warning")

@@ -18,7 +18,7 @@ from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
-from robocas_ms3.demos.recordings.motion import Motion, planar_motion, stored_motion
+from robocas_ms3.demos.recordings.motion import Motion, compute_agv_motion, to_dataset_motion
 from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.robots.quantities import QUANTITIES
 
@@ -171,7 +171,7 @@ def derive_missing_arrays(loaded: EpisodeArrays, info: Mapping[str, Any], rate_h
         yaw = np.arctan2(base[:, 1, 0], base[:, 0, 0])
         put("agv_pose", np.column_stack([base[:, :2, 3], np.unwrap(yaw)]), "base_pos, base_orn")
     if arrays.get("agv_pose", np.zeros(0)).shape[1:] == (3,):
-        put("rel_agv_pose", planar_motion(arrays["agv_pose"]), "agv_pose")
+        put("rel_agv_pose", compute_agv_motion(arrays["agv_pose"]), "agv_pose")
     joints = arrays.get("robot_joints", np.zeros((0, 7)))
     if len(joints) > 1:
         put("arm_joint_vel", np.gradient(joints.astype(np.float64), axis=0) * rate_hz, "differences of robot_joints")
@@ -182,7 +182,7 @@ def motion_arrays(arrays: Mapping[str, NDArray], keys: tuple[str, str, str, str]
     """Return the relative motion between absolute poses, for one tuple of ``schema.RELATIVE_PAIRS``."""
     poses = _poses(arrays, keys[0], keys[1])
     assert poses is not None
-    return dict(zip(keys[2:], stored_motion(poses), strict=True))
+    return dict(zip(keys[2:], to_dataset_motion(poses), strict=True))
 
 
 def arrays_fingerprint(arrays: Mapping[str, NDArray]) -> str:

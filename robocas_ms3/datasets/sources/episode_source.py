@@ -21,7 +21,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.actions import action_space
 from robocas_ms3.datasets.images.image_files import Box, ImageOptions
 from robocas_ms3.datasets.sources.split import split_by_seed
-from robocas_ms3.demos.recordings.subgoals import SubGoal, subgoal_runs
+from robocas_ms3.demos.recordings.subgoals import SubGoal, group_subgoals
 from robocas_ms3.robots.cameras import Parent, standard_camera_parent
 
 Split = Literal["train", "val", "all"]
@@ -90,7 +90,7 @@ class SourceEpisode(ABC):
     def goals(self) -> list[SubGoal]:
         """Sub-goals and their steps; empty if unknown."""
         arrays = self.read(("step_goal_type", "step_lang_goals"))
-        return subgoal_runs(arrays["step_goal_type"].tolist(), arrays["step_lang_goals"].tolist())
+        return group_subgoals(arrays["step_goal_type"].tolist(), arrays["step_lang_goals"].tolist())
 
     @property
     def scene(self) -> dict[str, Any]:

@@ -22,12 +22,12 @@ from robocas_ms3.core.strict_model import error_from_validation
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.demos.recordings.subgoals import SubGoal
-from robocas_ms3.demos.recordings.trajectory_json import one_seed
+from robocas_ms3.demos.recordings.trajectory_json import parse_seed
 from robocas_ms3.robots.cameras import CAMERA_NAME
 
 
 def _seed(value: Any) -> Any:
-    if value is not None and one_seed(value) is None:
+    if value is not None and parse_seed(value) is None:
         raise ValueError("an integer, or a list of one")
     return value
 

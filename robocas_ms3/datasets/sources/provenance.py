@@ -25,7 +25,10 @@ def fingerprint(recording: Recording) -> str:
 
 def recording_entry(file: TrajectoryFile, index: int) -> dict[str, Any]:
     """Return the recording of an episode, as stored in ``conversion.json``."""
-    return {**entry_without_fingerprint(file, index), "recording": fingerprint(file.recording(index, bodies=False))}
+    return {
+        **entry_without_fingerprint(file, index),
+        "recording": fingerprint(file.read_recording(index, bodies=False)),
+    }
 
 
 def entry_without_fingerprint(file: TrajectoryFile, index: int) -> dict[str, Any]:
@@ -44,7 +47,7 @@ def entry_without_fingerprint(file: TrajectoryFile, index: int) -> dict[str, Any
 
 def recorded_scene(file: TrajectoryFile, index: int) -> dict[str, Any]:
     """Return the content of ``scene.json`` that the JSON of a trajectory file has, by `SCENE_KEYS`."""
-    entry, recorded = file.entry(index), file.episodes[index].get("robocas", {})
+    entry, recorded = file.read_entry(index), file.episodes[index].get("robocas", {})
     known = {"target", "instruction", "subgoals", "objects"}  # stored under other keys
     return {
         "schema_version": schema.SCHEMA_VERSION,

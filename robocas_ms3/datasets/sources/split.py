@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from robocas_ms3.demos.recordings.trajectory_json import one_seed
+from robocas_ms3.demos.recordings.trajectory_json import parse_seed
 
 SPLIT_RULE = (
     "seeds in the order of sha256(seed), the first tenth is for validation; episodes of one seed stay together;"
@@ -23,7 +23,7 @@ def split_by_seed(
     depends on the seeds alone, not on their order. Episodes of the ``previous`` split, and their seeds, keep their
     split; new seeds fill validation up to a tenth of all seeds. At least one of two seeds is for validation.
     """
-    known = {number: one_seed(value) for number, value in seed_of.items()}
+    known = {number: parse_seed(value) for number, value in seed_of.items()}
     seeds = {number: number if seed is None else seed for number, seed in known.items()}
     old = [{seeds[number] for number in numbers if number in seeds} for numbers in previous]
     ranked = sorted(set(seeds.values()), key=lambda seed: hashlib.sha256(str(seed).encode()).hexdigest())

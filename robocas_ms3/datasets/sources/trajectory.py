@@ -76,13 +76,13 @@ class TrajectorySource(EpisodeSource):
         return split_by_seed({number: self.info(number).seed for number in self.numbers})[name == "val"]
 
     def entry(self, number: int) -> Mapping[str, Any]:
-        with self.file.reopened() as file:
+        with self.file.reopen() as file:
             return recording_entry(file, self.index[number])
 
     def recording(self, number: int, *, bodies: bool = True) -> Recording:
         """Return the recording of an episode, with the states of all bodies or of the robot only."""
-        with self.file.reopened() as file:
-            return file.recording(self.index[number], bodies=bodies)
+        with self.file.reopen() as file:
+            return file.read_recording(self.index[number], bodies=bodies)
 
     def episode(self, number: int) -> RecordedEpisode:
         if not 0 <= number < len(self.index):
@@ -119,7 +119,7 @@ class RecordedEpisode(SourceEpisode):
     def arrays(self) -> dict[str, NDArray]:
         recording = self.recording(bodies=False)
         samples = sample_states(recording.control_steps, self._source.stride)
-        return episode_arrays(recording.motion(samples), recording.instruction, self.goals)
+        return episode_arrays(recording.compute_motion(samples), recording.instruction, self.goals)
 
     @property
     def goals(self) -> list[SubGoal]:
@@ -157,7 +157,7 @@ class RecordedEpisode(SourceEpisode):
 def _read_entry(file: TrajectoryFile, index: int) -> EpisodeEntry | DatasetError:
     """Return the JSON entry of an episode, or its error, which is raised when the episode is read."""
     try:
-        entry = file.entry(index)
+        entry = file.read_entry(index)
         recorded_scene(file, index)
         return entry
     except DatasetError as error:

@@ -24,14 +24,14 @@ from robocas_ms3.scenes.config.load import bundled_configs, load_config_for
 from robocas_ms3.scenes.task_specs import TASKS, TaskSpec
 
 _PREFIX = "robocas_ms3:"  # makes gymnasium import this package, which ManiSkill's tools need
-_DEEP = 3  # maximum nesting of settings of simulation and cameras
+_MAX_DEPTH = 3  # maximum nesting of settings of simulation and cameras
 
 _NAME = re.compile(r"\w[\w.+-]*")
 _Name = Annotated[str, Field(pattern=f"^{_NAME.pattern}$")]
 _Settings = dict[str, Any]
 
 
-class _Kwargs(StrictModel):
+class _EnvKwargs(StrictModel):
     """Arguments of ``gym.make`` that a file may set: those of the scene and the control mode."""
 
     model_config = ConfigDict(strict=True)
@@ -47,18 +47,18 @@ class _Kwargs(StrictModel):
 
 
 # arguments in a recording that are ignored, since the reader chooses them
-_READERS = {
+_READER_KWARGS = {
     *("obs_mode", "reward_mode", "render_mode", "num_envs", "seeds", "reconfiguration_freq", "max_episode_steps"),
     *("enable_shadow", "enhanced_determinism", "parallel_in_single_scene", "sim_backend", "render_backend"),
     *("shader_dir", "human_render_camera_configs", "viewer_camera_configs", "layouts"),
 }
 
 
-class _Info(BaseModel):
+class _EnvInfo(BaseModel):
     model_config = ConfigDict(extra="allow", strict=True)
 
     env_id: str
-    env_kwargs: _Kwargs
+    env_kwargs: _EnvKwargs
 
 
 @dataclass(frozen=True)
@@ -120,18 +120,18 @@ class RecordedEnv:
         return gym.make(self.env_id, **{**self.kwargs, **kwargs})
 
 
-def read_env(info: Any, where: object, *, pack: str | Path | None = None) -> RecordedEnv:
+def read_recorded_env(info: Any, where: object, *, pack: str | Path | None = None) -> RecordedEnv:
     """Read ``env_info`` of a file; ``pack`` replaces the recorded pack.
 
     ``env_info`` is ``{"env_id": ..., "env_kwargs": {...}}``.
     """
     if isinstance(info, Mapping) and isinstance(info.get("env_kwargs"), Mapping):
-        kwargs = {name: value for name, value in info["env_kwargs"].items() if name not in _READERS}
+        kwargs = {name: value for name, value in info["env_kwargs"].items() if name not in _READER_KWARGS}
         info = {**info, "env_kwargs": kwargs if pack is None else {**kwargs, "pack": "builtin"}}
     try:
-        found = _Info.model_validate(info)
+        found = _EnvInfo.model_validate(info)
     except ValidationError as error:
-        raise _refusal(error, where) from error
+        raise _to_dataset_error(error, where) from error
     env_id = found.env_id.removeprefix(_PREFIX)
     if not re.fullmatch(r"\w+-v\d+", env_id):
         raise DatasetError(
@@ -139,16 +139,16 @@ def read_env(info: Any, where: object, *, pack: str | Path | None = None) -> Rec
         )
     kwargs = found.env_kwargs.model_dump(exclude_unset=True, exclude={"control_mode"})
     for name in ("sim_config", "sensor_configs"):
-        _check_settings(kwargs.get(name, {}), f"{where}, env_kwargs.{name}", _DEEP)
+        _check_settings(kwargs.get(name, {}), f"{where}, env_kwargs.{name}", _MAX_DEPTH)
     return RecordedEnv(env_id, found.env_kwargs.control_mode, kwargs).with_pack(pack)
 
 
-def recorded_id(env_id: str) -> str:
+def to_recorded_env_id(env_id: str) -> str:
     return f"{_PREFIX}{env_id}"
 
 
-def _refusal(error: ValidationError, where: object) -> DatasetError:
-    first = list_invalid_values(error, _Info)[0]
+def _to_dataset_error(error: ValidationError, where: object) -> DatasetError:
+    first = list_invalid_values(error, _EnvInfo)[0]
     name, fix, expected = first.key.rpartition(".")[2], first.fix, first.expected
     if first.kind == "string_pattern_mismatch":
         expected = "a name without a path"
@@ -159,11 +159,11 @@ def _refusal(error: ValidationError, where: object) -> DatasetError:
     return DatasetError(what, where=where, expected=expected, found=first.found, fix=fix)
 
 
-def _check_settings(settings: Any, where: str, deep: int) -> None:
-    if isinstance(settings, dict) and deep:
+def _check_settings(settings: Any, where: str, depth: int) -> None:
+    if isinstance(settings, dict) and depth:
         for key, value in settings.items():
-            _check_settings(value, f"{where}.{key}", deep - 1)
-    elif isinstance(settings, list) and len(settings) <= 16 and deep:
+            _check_settings(value, f"{where}.{key}", depth - 1)
+    elif isinstance(settings, list) and len(settings) <= 16 and depth:
         for value in settings:
             _check_settings(value, where, 0)
     elif not _is_setting(settings):

@@ -19,9 +19,9 @@ from mani_skill.utils.wrappers.record import parse_env_info
 from numpy.typing import NDArray
 
 from robocas_ms3.core.files import atomic_file, write_json
-from robocas_ms3.demos.recordings.environment import recorded_id
-from robocas_ms3.demos.recordings.trajectory_hdf5 import write_whole
-from robocas_ms3.demos.recordings.trajectory_json import versions
+from robocas_ms3.demos.recordings.environment import to_recorded_env_id
+from robocas_ms3.demos.recordings.trajectory_hdf5 import write_hdf5
+from robocas_ms3.demos.recordings.trajectory_json import package_versions
 from robocas_ms3.tasks.base import RoboCASEnv
 
 # settings of a machine or a run; they are not recorded, since trajectories replay without them
@@ -43,7 +43,7 @@ class EpisodeRecorder(gym.Wrapper):
         self._base_env, self._trajectory = base_env, folder / f"{name}.h5"
         self._steps = _Steps()
         self._reset_kwargs: dict[str, Any] = {}
-        versions()  # cached before the process forks
+        package_versions()  # cached before the process forks
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         observation, info = self.env.reset(seed=seed, options=options)
@@ -68,8 +68,8 @@ class EpisodeRecorder(gym.Wrapper):
     def _store(self, observation: Any) -> None:
         steps = self._steps
         steps.states.append(self._base_env.bodies.read()[0].cpu().numpy())
-        steps.beside_bodies.append(_of_one_env(self._base_env.extra_state()))
-        steps.observations.append(_of_one_env(observation))
+        steps.extra_states.append(_take_only_env(self._base_env.extra_state()))
+        steps.observations.append(_take_only_env(observation))
 
     @property
     def states(self) -> dict[str, dict[str, NDArray[np.float32]]]:
@@ -83,15 +83,15 @@ class EpisodeRecorder(gym.Wrapper):
 
         def fill(file: h5py.File) -> None:
             group = file.create_group("traj_0", track_order=True)
-            _write(group, "obs", _stacked(steps.observations))
+            _write(group, "obs", _stack_steps(steps.observations))
             group.create_dataset("actions", data=np.stack(steps.actions), dtype=np.float32)
             flags = {"terminated": terminated, "truncated": truncated, "success": success, "fail": fail}
             for name, values in flags.items():
                 group.create_dataset(name, data=values, dtype=bool)
-            _write(group, "env_states", {**self.states, **_stacked(steps.beside_bodies)})
+            _write(group, "env_states", {**self.states, **_stack_steps(steps.extra_states)})
 
         with atomic_file(self._trajectory, sync=True) as tmp:
-            write_whole(tmp, fill)
+            write_hdf5(tmp, fill)
             # the JSON first, so that an HDF5 file never lacks its JSON
             write_json(
                 self._trajectory.with_suffix(".json"),
@@ -111,7 +111,11 @@ class EpisodeRecorder(gym.Wrapper):
                     ],
                     "source_type": "motionplanning",
                     "source_desc": "scripted policy of robocas_ms3",
-                    "robocas": {"control_freq": env.control_freq, "sim_freq": env.sim_freq, "versions": versions()},
+                    "robocas": {
+                        "control_freq": env.control_freq,
+                        "sim_freq": env.sim_freq,
+                        "versions": package_versions(),
+                    },
                 },
                 sync=True,
             )
@@ -121,7 +125,7 @@ class EpisodeRecorder(gym.Wrapper):
         assert info is not None, "the environment was not created by gym.make"
         kwargs = {key: value for key, value in info["env_kwargs"].items() if key not in _LOCAL_KWARGS}
         return {
-            "env_id": recorded_id(str(info["env_id"])),
+            "env_id": to_recorded_env_id(str(info["env_id"])),
             "env_kwargs": kwargs,
             "max_episode_steps": find_max_episode_steps_value(self.env),
         }
@@ -135,19 +139,19 @@ class _Steps:
     flags: list[tuple[bool, bool, bool, bool]] = field(default_factory=list)
     """terminated, truncated, success, fail"""
     states: list[NDArray[np.float32]] = field(default_factory=list)
-    beside_bodies: list[Any] = field(default_factory=list)
+    extra_states: list[Any] = field(default_factory=list)
     observations: list[Any] = field(default_factory=list)
 
 
-def _of_one_env(data: Any) -> Any:
+def _take_only_env(data: Any) -> Any:
     if isinstance(data, dict):
-        return {key: _of_one_env(value) for key, value in data.items()}
+        return {key: _take_only_env(value) for key, value in data.items()}
     return common.to_numpy(data)[0].copy()
 
 
-def _stacked(steps: list[Any]) -> Any:
+def _stack_steps(steps: list[Any]) -> Any:
     if isinstance(steps[0], dict):
-        return {key: _stacked([step[key] for step in steps]) for key in steps[0]}
+        return {key: _stack_steps([step[key] for step in steps]) for key in steps[0]}
     return np.stack(steps)
 
 

@@ -46,7 +46,7 @@ def sample_states(control_steps: int, stride: int) -> NDArray[np.int64]:
     return indices if indices[-1] == control_steps else np.append(indices, control_steps)
 
 
-def gripper_open(
+def sample_gripper_commands(
     robot: RobotDescription,
     commands: NDArray[np.floating],
     samples: NDArray[np.int64],
@@ -69,27 +69,27 @@ def gripper_open(
     return widths[samples] > robot.open_width / 2 + 1e-6
 
 
-def relative_motion(poses: Array) -> Array:
+def compute_relative_motion(poses: Array) -> Array:
     """Return the relative motion ``inv(pose[t]) pose[t + 1]`` (T, 4, 4); the last one is the identity."""
     return np.concatenate([inverse(poses[:-1]) @ poses[1:], np.eye(4)[None]])
 
 
-def stored_motion(poses: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def to_dataset_motion(poses: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the relative motion in the format of datasets.
 
     Returns:
         Positions (T, 3), m, and quaternions (T, 4), xyzw with w >= 0.
     """
-    motion = relative_motion(poses)
+    motion = compute_relative_motion(poses)
     turns = Rotation.from_matrix(motion[:, :3, :3]).as_quat(canonical=True)
     return motion[:, :3, 3].astype(np.float32), turns.astype(np.float32)
 
 
-def stored_actions(positions: NDArray, turns: NDArray, gripper_status: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return RoboCAS actions (T, 7) for `stored_motion`; row t is the motion from step t to t + 1.
+def to_dataset_actions(positions: NDArray, turns: NDArray, gripper_status: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return RoboCAS actions (T, 7) for `to_dataset_motion`; row t is the motion from step t to t + 1.
 
     An action has a translation in m, Euler angles about the fixed axes x, y, z in rad ("xyz" in scipy), and the gripper
-    command ``gripper_status[t + 1]`` of `gripper_open`, 1 = open. The last row holds the pose.
+    command ``gripper_status[t + 1]`` of `sample_gripper_commands`, 1 = open. The last row holds the pose.
     """
     status = np.asarray(gripper_status, dtype=np.float64)
     actions = np.zeros((len(status), 7))
@@ -101,7 +101,7 @@ def stored_actions(positions: NDArray, turns: NDArray, gripper_status: NDArray[n
     return actions.astype(np.float32)
 
 
-def planar_base(root: Array, qpos: Array) -> Array:
+def compute_agv_pose(root: Array, qpos: Array) -> Array:
     """Return the pose (T, 3) of the mobile base in the world: x, y in m, yaw in rad.
 
     The first yaw is in [-pi, pi); the others are unwrapped.
@@ -116,7 +116,7 @@ def planar_base(root: Array, qpos: Array) -> Array:
     return np.column_stack([position[:, :2], np.asarray(np.unwrap(_wrap(root_yaw + yaw)), dtype=np.float64)])
 
 
-def planar_motion(agv_pose: NDArray) -> Array:
+def compute_agv_motion(agv_pose: NDArray) -> Array:
     """Return differences (T, 3) of consecutive x, y, yaw; the last row is 0."""
     pose = agv_pose.astype(np.float64)
     motion = np.diff(pose, axis=0, append=pose[-1:])
@@ -135,7 +135,7 @@ class Motion:
     Attributes:
         qpos: (T, 12) base x, y, yaw, 7 arm joints, 2 fingers, m and rad; ``qvel`` likewise.
         root_in_world: (T, 4, 4) poses; ``tcp_in_world`` and ``arm_base_in_world`` are computed from them and ``qpos``.
-        gripper_open: (T,) bool commands, see `gripper_open`.
+        gripper_open: (T,) bool commands, see `sample_gripper_commands`.
     """
 
     qpos: Array
@@ -146,7 +146,7 @@ class Motion:
     gripper_open: NDArray[np.bool_]
 
     @classmethod
-    def of(
+    def from_states(
         cls,
         robot: RobotSpec,
         robot_states: NDArray[np.floating],
@@ -160,13 +160,13 @@ class Motion:
             gripper: (S,) commands in [-1, 1].
             samples: (T,) indices of states from `sample_states`, or a contiguous part of them.
         """
-        root_in_world, qpos, qvel = split_states(robot_states[samples])
-        width = float(split_states(robot_states[:1])[1][0, robot.description.finger_slice].sum())
-        opened = gripper_open(robot.description, gripper, samples, initial_width=width)
-        return cls.of_joints(robot, root_in_world, qpos, qvel, opened)
+        root_in_world, qpos, qvel = split_robot_states(robot_states[samples])
+        width = float(split_robot_states(robot_states[:1])[1][0, robot.description.finger_slice].sum())
+        opened = sample_gripper_commands(robot.description, gripper, samples, initial_width=width)
+        return cls.from_joints(robot, root_in_world, qpos, qvel, opened)
 
     @classmethod
-    def of_joints(
+    def from_joints(
         cls, robot: RobotSpec, root_in_world: Array, qpos: Array, qvel: Array, opened: NDArray[np.bool_]
     ) -> Motion:
         return cls(qpos, qvel, root_in_world, *tcp_and_arm_base_poses(robot, root_in_world, qpos), opened)
@@ -177,35 +177,35 @@ class Motion:
 
     @cached_property
     def tcp_motion(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """`stored_motion` of the TCP in the arm's base."""
-        return stored_motion(self.tcp_in_base)
+        """`to_dataset_motion` of the TCP in the arm's base."""
+        return to_dataset_motion(self.tcp_in_base)
 
     @cached_property
     def base_motion(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """`stored_motion` of the arm's base in the world."""
-        return stored_motion(self.arm_base_in_world)
+        """`to_dataset_motion` of the arm's base in the world."""
+        return to_dataset_motion(self.arm_base_in_world)
 
     @cached_property
     def agv_pose(self) -> Array:
-        """(T, 3), see `planar_base`."""
-        return planar_base(self.root_in_world, self.qpos)
+        """(T, 3), see `compute_agv_pose`."""
+        return compute_agv_pose(self.root_in_world, self.qpos)
 
     @property
     def agv_motion(self) -> Array:
-        return planar_motion(self.agv_pose)
+        return compute_agv_motion(self.agv_pose)
 
     @property
     def actions(self) -> NDArray[np.float32]:
-        """(T, 7), see `stored_actions`."""
-        return stored_actions(*self.tcp_motion, self.gripper_open)
+        """(T, 7), see `to_dataset_actions`."""
+        return to_dataset_actions(*self.tcp_motion, self.gripper_open)
 
 
-def gripper_commands(actions: NDArray[np.floating], control_mode: str) -> NDArray[np.floating]:
+def select_gripper_commands(actions: NDArray[np.floating], control_mode: str) -> NDArray[np.floating]:
     """Return gripper commands (S,) of actions (S, A): column 6 in ``_ee_`` modes, else column 7."""
     return actions[:, 6 if "_ee_" in control_mode else 7]
 
 
-def split_states(states: NDArray[np.floating]) -> tuple[Array, Array, Array]:
+def split_robot_states(states: NDArray[np.floating]) -> tuple[Array, Array, Array]:
     """Split ManiSkill robot states (T, 37) into root pose (T, 4, 4), qpos (T, 12) and qvel (T, 12)."""
     states = np.asarray(states, dtype=np.float64)
     return (

@@ -24,7 +24,7 @@ class SubGoal(BaseModel):
     goal_description: str
 
     @classmethod
-    def of(cls, goal_type: str, goal_description: str, first: int, last: int) -> SubGoal:
+    def from_range(cls, goal_type: str, goal_description: str, first: int, last: int) -> SubGoal:
         return cls(goal_type=goal_type, goal_range=[first, last], goal_description=goal_description)
 
     @property
@@ -78,14 +78,14 @@ def sample_subgoals(subgoals: Sequence[SubGoal], samples: NDArray[np.int64]) -> 
     for index, goal in enumerate(subgoals):
         steps = np.flatnonzero(owner == index)
         if len(steps):
-            result.append(SubGoal.of(goal.goal_type, goal.goal_description, int(steps[0]), int(steps[-1])))
+            result.append(SubGoal.from_range(goal.goal_type, goal.goal_description, int(steps[0]), int(steps[-1])))
     return result
 
 
-def subgoal_runs(types: Sequence[str], texts: Sequence[str]) -> list[SubGoal]:
+def group_subgoals(types: Sequence[str], texts: Sequence[str]) -> list[SubGoal]:
     """Return one sub-goal per run of equal types and texts."""
     goals: list[SubGoal] = []
     for (kind, text), steps in groupby(range(len(types)), key=lambda step: (types[step], texts[step])):
         inside = list(steps)
-        goals.append(SubGoal.of(kind, text, inside[0], inside[-1]))
+        goals.append(SubGoal.from_range(kind, text, inside[0], inside[-1]))
     return goals

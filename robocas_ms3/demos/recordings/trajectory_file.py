@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.demos.recordings.environment import read_env
-from robocas_ms3.demos.recordings.motion import Motion, gripper_commands
+from robocas_ms3.demos.recordings.environment import read_recorded_env
+from robocas_ms3.demos.recordings.motion import Motion, select_gripper_commands
 from robocas_ms3.demos.recordings.trajectory_hdf5 import (
+    convert_read_errors,
     open_episode,
     open_trajectory,
     read_steps,
-    readable,
 )
 from robocas_ms3.demos.recordings.trajectory_json import EpisodeEntry, RunRecord, read_entry, read_json
 from robocas_ms3.robots.description import RobotDescription
@@ -39,9 +39,11 @@ class Recording(EpisodeEntry):
     states: dict[str, dict[str, NDArray[np.float32]]]
     robot: RobotSpec
 
-    def motion(self, samples: NDArray[np.int64]) -> Motion:
-        commands = gripper_commands(self.actions, self.control_mode)
-        return Motion.of(self.robot, self.states["articulations"][self.robot.description.uid], commands, samples)
+    def compute_motion(self, samples: NDArray[np.int64]) -> Motion:
+        commands = select_gripper_commands(self.actions, self.control_mode)
+        return Motion.from_states(
+            self.robot, self.states["articulations"][self.robot.description.uid], commands, samples
+        )
 
     def state(self, index: int) -> dict[str, dict[str, NDArray[np.float32]]]:
         """Return a state as an argument of ``set_state_dict``, each array (1, D)."""
@@ -74,7 +76,7 @@ class TrajectoryFile:
         metadata = read_json(self.path)
         self.env_info: dict[str, Any] = metadata["env_info"]
         self.episodes: list[dict[str, Any]] = metadata["episodes"]
-        self.env = read_env(self.env_info, metadata_path, pack=pack)
+        self.env = read_recorded_env(self.env_info, metadata_path, pack=pack)
         self.robot = self.env.robot(f"{metadata_path}, env_info.env_kwargs.robot_uids")
         run = metadata.get("robocas")
         if run is None:
@@ -88,7 +90,7 @@ class TrajectoryFile:
         self.versions: dict[str, Any] = run.get("versions", {})
         self._file = open_trajectory(self.path)
         listed = {f"traj_{episode['episode_id']}" for episode in self.episodes}
-        with readable(self.path, "damaged file"):
+        with convert_read_errors(self.path, "damaged file"):
             stored = set(self._file)
         if listed != stored:
             self.close()
@@ -108,7 +110,7 @@ class TrajectoryFile:
     def close(self) -> None:
         self._file.close()
 
-    def reopened(self) -> TrajectoryFile:
+    def reopen(self) -> TrajectoryFile:
         """Open the file again without reading its JSON again."""
         file = copy(self)
         file._file = open_trajectory(self.path)
@@ -118,11 +120,11 @@ class TrajectoryFile:
         """Drop the open file, which cannot be pickled or copied."""
         return {**self.__dict__, "_file": None}
 
-    def entry(self, index: int) -> EpisodeEntry:
+    def read_entry(self, index: int) -> EpisodeEntry:
         """Read the JSON entry of an episode by its position in ``episodes``."""
         return read_entry(self.episodes[index], self._where(index))
 
-    def recording(self, index: int, *, bodies: bool = True) -> Recording:
+    def read_recording(self, index: int, *, bodies: bool = True) -> Recording:
         """Read an episode by its position in ``episodes``; without ``bodies`` only the robot's states."""
         where, uid = self._where(index), self.robot.description.uid
         group = open_episode(self._file, self.episodes[index]["episode_id"])
@@ -130,7 +132,7 @@ class TrajectoryFile:
         states = {
             kind: {name: rows.astype(np.float32, copy=False) for name, rows in of.items()} for kind, of in found.items()
         }
-        entry = self.entry(index)
+        entry = self.read_entry(index)
         if entry.control_steps != len(actions):
             expected = f"{entry.control_steps} actions as in the JSON"
             raise DatasetError("damaged episode", where=where, expected=expected, found=len(actions))

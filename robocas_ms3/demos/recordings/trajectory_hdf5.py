@@ -23,19 +23,19 @@ from robocas_ms3.core.documents import DocumentError, check_regular
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import atomic_file, write_json
 from robocas_ms3.core.text import one_line
-from robocas_ms3.demos.recordings.trajectory_json import one_seed, read_json
+from robocas_ms3.demos.recordings.trajectory_json import parse_seed, read_json
 
 BODIES = ("actors", "articulations")
 """Kinds of states whose rows start with a position and a wxyz quaternion."""
 
-_UNIT = 0.05  # tolerance of the length of quaternions
-_HARD: int = getattr(h5py, "h5l").TYPE_HARD  # noqa: B009  (its stubs lack it)
-_LIMIT = 2**30  # bytes of an episode's states: ten thousand steps of forty bodies are 20 MB
-_DEEP = 4  # maximum nesting of groups in states
-_MARGIN = 4096  # bytes per episode that a merged file may need in addition
+_LENGTH_TOLERANCE = 0.05  # tolerance of the length of quaternions
+_HARD_LINK: int = getattr(h5py, "h5l").TYPE_HARD  # noqa: B009  (its stubs lack it)
+_MAX_BYTES = 2**30  # bytes of an episode's states: ten thousand steps of forty bodies are 20 MB
+_MAX_DEPTH = 4  # maximum nesting of groups in states
+_MARGIN_BYTES = 4096  # bytes per episode that a merged file may need in addition
 
 
-def write_whole(path: Path, fill: Callable[[h5py.File], None]) -> None:
+def write_hdf5(path: Path, fill: Callable[[h5py.File], None]) -> None:
     """Create a file in memory and write it at once; raise OSError if it cannot be written."""
     with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
         fill(file)
@@ -45,9 +45,9 @@ def write_whole(path: Path, fill: Callable[[h5py.File], None]) -> None:
 
 
 @contextmanager
-def reserved(path: Path, size: int) -> Iterator[h5py.File]:
+def open_reserved(path: Path, size: int) -> Iterator[h5py.File]:
     """Open a new file with ``size`` bytes reserved on the disk; raise OSError if the disk is full."""
-    write_whole(path, lambda file: None)
+    write_hdf5(path, lambda file: None)
     with path.open("r+b") as file:
         try:
             os.posix_fallocate(file.fileno(), 0, max(size, 1))
@@ -59,7 +59,7 @@ def reserved(path: Path, size: int) -> Iterator[h5py.File]:
 
 
 @contextmanager
-def readable(where: object, what: str = "damaged episode") -> Iterator[None]:
+def convert_read_errors(where: object, what: str = "damaged episode") -> Iterator[None]:
     """Convert errors of h5py during reading to ``DatasetError``."""
     try:
         yield
@@ -89,13 +89,13 @@ def open_episode(file: h5py.File, number: int) -> h5py.Group:
     bad_links: list[bytes] = []
 
     def check_link(place: bytes, link: Any) -> bool | None:
-        return None if link.type == _HARD else bad_links.append(place) or True
+        return None if link.type == _HARD_LINK else bad_links.append(place) or True
 
-    with readable(where):
+    with convert_read_errors(where):
         links: Any = file.id.links
         if not links.exists(name.encode()):
             raise KeyError(name)
-        group: Any = file[name] if links.get_info(name.encode()).type == _HARD else None
+        group: Any = file[name] if links.get_info(name.encode()).type == _HARD_LINK else None
         if group is None:
             raise _external_reference(where, "a link")
         if group.id.links.visit(check_link, info=True):  # visits each group once, even in cycles
@@ -105,15 +105,15 @@ def open_episode(file: h5py.File, number: int) -> h5py.Group:
 
 def copy_episode(source: h5py.File, number: int, target: h5py.File, new_number: int) -> None:
     group = open_episode(source, number)
-    with readable(f"{source.filename}, traj_{number}"):
-        group.visititems(lambda _, item: _check_own(item) if isinstance(item, h5py.Dataset) else None)
+    with convert_read_errors(f"{source.filename}, traj_{number}"):
+        group.visititems(lambda _, item: _check_stored_in_file(item) if isinstance(item, h5py.Dataset) else None)
         source.copy(group, target, name=f"traj_{new_number}")
 
 
 def read_actions(episode: h5py.Group) -> NDArray[np.float32]:
     where = _where(episode)
-    with readable(where):
-        actions = np.asarray(_read(_found(episode["actions"], 0)), np.float32)
+    with convert_read_errors(where):
+        actions = np.asarray(_load_arrays(_collect_arrays(episode["actions"], 0)), np.float32)
     if actions.ndim != 2 or len(actions) == 0:
         raise DatasetError("episode without actions", where=where)
     _check_finite(actions, f"{where}, actions")
@@ -129,15 +129,16 @@ def read_steps(
     e.g. of controllers.
     """
     where, actions = _where(episode), read_actions(episode)
-    with readable(where):
+    with convert_read_errors(where):
         found: Any = episode["env_states"]
         if not extras:
             kinds = {kind: found[kind] for kind in BODIES if kind in found}
             found = {
-                kind: {name: _found(of[name], 0) for name in of if body in (None, name)} for kind, of in kinds.items()
+                kind: {name: _collect_arrays(of[name], 0) for name in of if body in (None, name)}
+                for kind, of in kinds.items()
             }
-        states = _read(_found(found, _DEEP) if extras else found)
-    for name, rows in named_arrays(states):
+        states = _load_arrays(_collect_arrays(found, _MAX_DEPTH) if extras else found)
+    for name, rows in iterate_arrays(states):
         place, kind = f"{where}, {name}", name.split("/")[0]
         if rows.dtype.kind not in "fbiu" or rows.shape[:1] != (len(actions) + 1,):
             expected = f"{len(actions) + 1} rows of numbers, one more than actions"
@@ -149,13 +150,13 @@ def read_steps(
     return actions, states
 
 
-def named_arrays(node: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+def iterate_arrays(node: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the arrays in nested dicts with their paths."""
     if not isinstance(node, dict):
         yield name, node
         return
     for key, inner in node.items():
-        yield from named_arrays(inner, f"{name}/{key}" if name else key)
+        yield from iterate_arrays(inner, f"{name}/{key}" if name else key)
 
 
 def _check_finite(rows: NDArray[Any], where: str) -> None:
@@ -170,35 +171,35 @@ def _check_orientations(rows: NDArray[Any], name: str, where: str) -> None:
     if name.count("/") != 1 or rows.ndim != 2 or rows.shape[1] < 7:
         raise DatasetError("damaged episode", where=where, expected="rows with a pose", found=rows.shape)
     length = np.linalg.norm(rows[:, 3:7].astype(np.float64), axis=1)
-    wrong = np.flatnonzero(abs(length - 1) > _UNIT)
+    wrong = np.flatnonzero(abs(length - 1) > _LENGTH_TOLERANCE)
     if len(wrong):
         place, found = f"{where}, row {wrong[0]}", f"{length[wrong[0]]:g}"
         raise DatasetError("invalid orientation", where=place, expected="a quaternion of length 1", found=found)
 
 
-def _found(node: Any, deep: int) -> Any:
+def _collect_arrays(node: Any, depth: int) -> Any:
     """Return nested groups as dicts of arrays that are not read yet."""
     if isinstance(node, h5py.Dataset):
-        _check_own(node)
+        _check_stored_in_file(node)
         return node
-    if not deep:
+    if not depth:
         raise ValueError("groups nested too deeply")
     # not node.items(), which holds the lock of h5py as long as the traceback of an error exists
-    return {name: _found(node[name], deep - 1) for name in node}
+    return {name: _collect_arrays(node[name], depth - 1) for name in node}
 
 
-def _read(found: Any) -> Any:
-    size = sum(math.prod(array.shape) * array.dtype.itemsize for _, array in named_arrays(found))
-    if size > _LIMIT:  # a small compressed file can declare terabytes
-        raise ValueError(f"{size >> 20} MB of arrays, the limit is {_LIMIT >> 20} MB")
-    return _values(found)
+def _load_arrays(found: Any) -> Any:
+    size = sum(math.prod(array.shape) * array.dtype.itemsize for _, array in iterate_arrays(found))
+    if size > _MAX_BYTES:  # a small compressed file can declare terabytes
+        raise ValueError(f"{size >> 20} MB of arrays, the limit is {_MAX_BYTES >> 20} MB")
+    return _load(found)
 
 
-def _values(found: Any) -> Any:
-    return {name: _values(inner) for name, inner in found.items()} if isinstance(found, dict) else found[()]
+def _load(found: Any) -> Any:
+    return {name: _load(inner) for name, inner in found.items()} if isinstance(found, dict) else found[()]
 
 
-def _check_own(array: h5py.Dataset) -> None:
+def _check_stored_in_file(array: h5py.Dataset) -> None:
     if array.external or array.is_virtual:
         where = f"{array.file.filename}, {str(array.name).strip('/')}"
         raise _external_reference(where, "an array stored in other files")
@@ -213,20 +214,20 @@ def _external_reference(where: str, found: str) -> DatasetError:
     return DatasetError(what, where=where, expected="arrays stored in this file", found=found, fix=fix)
 
 
-def merge(shards: list[Path], out: Path) -> None:
+def merge(sources: list[Path], out: Path) -> None:
     """Merge trajectory files; episodes are numbered in the given order, unknown JSON keys are kept.
 
     The file is synced to disk before it is renamed to ``out``.
     """
     merged: dict[str, Any] = {}
     episodes: list[dict[str, Any]] = []
-    sizes = [shard.stat().st_size for shard in shards]
+    sizes = [source.stat().st_size for source in sources]
     with atomic_file(out, sync=True) as tmp:
-        with reserved(tmp, sum(sizes) + _MARGIN * (1 + len(sizes))) as target:
-            for shard in shards:
-                data = read_json(shard)
+        with open_reserved(tmp, sum(sizes) + _MARGIN_BYTES * (1 + len(sizes))) as target:
+            for path in sources:
+                data = read_json(path)
                 merged = merged or {key: value for key, value in data.items() if key != "episodes"}
-                with open_trajectory(shard) as source:
+                with open_trajectory(path) as source:
                     for episode in data["episodes"]:
                         number = len(episodes)
                         copy_episode(source, episode["episode_id"], target, number)
@@ -243,7 +244,7 @@ def find_violation(path: Path, seeds: Sequence[int]) -> str:
     try:
         with open_trajectory(path) as file:
             entries = read_json(path)["episodes"]
-            found = [one_seed(episode.get("episode_seed")) for episode in entries]
+            found = [parse_seed(episode.get("episode_seed")) for episode in entries]
             if found != list(seeds) or len(file) != len(found):
                 expected = f"{len(seeds)} episodes with the given seeds in order"
                 count = f"{len(found)} in the JSON, {len(file)} in the HDF5 file"
@@ -251,7 +252,7 @@ def find_violation(path: Path, seeds: Sequence[int]) -> str:
             for episode in entries:
                 where = f"traj_{episode['episode_id']}"
                 group: Any = open_episode(file, episode["episode_id"])
-                with readable(where):
+                with convert_read_errors(where):
                     group.visititems(lambda *_: None)
                     steps = len(group["actions"])
                 if steps != episode.get("elapsed_steps", steps):

@@ -25,12 +25,12 @@ _ENTRY = "invalid episode entry"
 
 
 @cache  # reads package metadata from disk
-def versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
     """Return the versions of this package and of its main dependencies."""
     return {name: version(name) for name in ("robocas-ms3", "mani_skill", "sapien", "python-fcl", "torch", "numpy")}
 
 
-def one_seed(value: Any) -> int | None:
+def parse_seed(value: Any) -> int | None:
     """Return a seed as an integer, also from a list of one seed as ManiSkill writes it; None if invalid."""
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
@@ -42,7 +42,7 @@ class _Record(BaseModel):
 
 
 def _single_seed(value: Any) -> Any:
-    return value if one_seed(value) is None else one_seed(value)
+    return value if parse_seed(value) is None else parse_seed(value)
 
 
 Seed = Annotated[int, BeforeValidator(_single_seed), Field(ge=0, le=MAX_SEED)]

@@ -11,7 +11,7 @@ from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import frame_columns
 from robocas_ms3.datasets.sources.arrays import episode_arrays
-from robocas_ms3.demos.recordings.motion import Motion, gripper_open
+from robocas_ms3.demos.recordings.motion import Motion, sample_gripper_commands
 from robocas_ms3.robots.description_file import chain_poses
 from robocas_ms3.robots.quantities import ARM_BASE, STATE, feature_columns, lerobot_features
 from robocas_ms3.robots.registry import find_robot
@@ -56,8 +56,10 @@ class Proprioception:
         """
         qpos, qvel = (obs["agent"][name][env][None].astype(np.float64) for name in ("qpos", "qvel"))
         commands, width = np.array([] if gripper is None else [gripper]), float(self._widths[env])
-        opened = gripper_open(self._spec.description, commands, np.array([len(commands)]), initial_width=width)
-        motion = Motion.of_joints(self._spec, self._roots[env][None], qpos, qvel, opened)
+        opened = sample_gripper_commands(
+            self._spec.description, commands, np.array([len(commands)]), initial_width=width
+        )
+        motion = Motion.from_joints(self._spec, self._roots[env][None], qpos, qvel, opened)
         columns = frame_columns(episode_arrays(motion, "", []))
         found = {name: columns[column][0] for name, column in KEYS.items()}
         self._last[env] = _continued(self._last[env], found) if env in self._last else found

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.demos.recordings.environment import read_env
+from robocas_ms3.demos.recordings.environment import read_recorded_env
 from robocas_ms3.demos.recordings.motion import Motion, sample_states
 from robocas_ms3.demos.recordings.trajectory_hdf5 import open_episode, open_trajectory, read_actions
 from robocas_ms3.demos.recordings.trajectory_json import is_intervention, read_json, read_reset
@@ -64,7 +64,7 @@ class PoseTrack:
         """
         if not len(gripper):
             return cls(np.zeros((0, 4, 4)), np.zeros(0, dtype=bool))
-        motion = Motion.of(robot, robot_states, gripper, sample_states(len(gripper), stride))
+        motion = Motion.from_states(robot, robot_states, gripper, sample_states(len(gripper), stride))
         return cls(motion.tcp_in_base[1:], motion.gripper_open[1:])
 
     def next_action(self, observations: Observations, row: int) -> Array:
@@ -110,7 +110,7 @@ class ReplayPolicy(TrackPolicy):
         super().__init__()
         self._trajectory = trajectory = trajectory.absolute()
         data = read_json(trajectory)
-        env = read_env(data["env_info"], trajectory.with_suffix(".json"))
+        env = read_recorded_env(data["env_info"], trajectory.with_suffix(".json"))
         if env.control_mode != "pd_joint_pos":
             what, found = "cannot replay actions of this control mode", env.control_mode
             raise EvaluationError(what, where=trajectory, expected="pd_joint_pos", found=found)

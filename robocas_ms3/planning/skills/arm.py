@@ -9,9 +9,9 @@ from typing import TypeVar
 import numpy as np
 
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.planning.decisions import FIRST_FEASIBLE, MAX_CONTINUED, Decisions, SearchLimits
-from robocas_ms3.planning.executor import CLOSED, OPEN, Executor
-from robocas_ms3.planning.kinematics import Reachability
+from robocas_ms3.planning.decisions import FIRST_FEASIBLE, MAX_CONTINUED_CANDIDATES, Decisions, SearchLimits
+from robocas_ms3.planning.executor import CLOSED, OPEN, MotionExecutor
+from robocas_ms3.planning.kinematics import InverseKinematics
 from robocas_ms3.planning.protocol import Array, Planner, Trajectory
 from robocas_ms3.planning.scene import PlanningScene
 from robocas_ms3.robots.description import RobotDescription
@@ -43,10 +43,10 @@ class Arm:
     """
 
     planner: Planner
-    reachability: Reachability
-    executor: Executor
+    inverse_kinematics: InverseKinematics
+    executor: MotionExecutor
     decisions: Decisions
-    path: tuple[int, ...] = (0,)
+    decision_path: tuple[int, ...] = (0,)
     rng: np.random.Generator = field(init=False)
     qpos: Array = field(init=False)
 
@@ -61,25 +61,27 @@ class Arm:
                 self.planner.set_scene(self.scene.obstacles(clearance=clearance))
 
     def _seed(self) -> None:
-        entropy = np.random.SeedSequence([self.executor.seed, *self.path])
+        entropy = np.random.SeedSequence([self.executor.seed, *self.decision_path])
         self.planner.seed(int(entropy.generate_state(1)[0]))
         self.rng = np.random.default_rng(entropy)
 
-    def choose(self, candidates: Iterable[T], play: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE) -> T:
+    def choose(
+        self, candidates: Iterable[T], run_candidate: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE
+    ) -> T:
         """Choose a candidate, see `Decisions.choose`; each candidate gets its own random seed."""
-        path = self.path
+        decision_path = self.decision_path
 
-        def play_one(numbered: tuple[int, T]) -> float:
+        def run_numbered(numbered: tuple[int, T]) -> float:
             index, candidate = numbered
-            self.path = (*path, index)
+            self.decision_path = (*decision_path, index)
             self._seed()
-            return play(candidate)
+            return run_candidate(candidate)
 
-        return self.decisions.choose(enumerate(candidates), play_one, limits)[1]
+        return self.decisions.choose(enumerate(candidates), run_numbered, limits)[1]
 
     def add_backtracking_point(self) -> None:
         """Add a decision whose candidates differ in the random seed only; later failures backtrack to it."""
-        self.choose(range(MAX_CONTINUED), lambda _: 0.0)
+        self.choose(range(MAX_CONTINUED_CANDIDATES), lambda _: 0.0)
 
     @property
     def env(self) -> RoboCASEnv:
@@ -108,7 +110,7 @@ class Arm:
         return self.executor.seconds.measure("planning")
 
     def follow(self, *motions: Trajectory, until: str | None = None) -> bool:
-        """Run motions one after the other, see `Executor.follow`."""
+        """Run motions one after the other, see `MotionExecutor.follow`."""
         reached = True
         for motion in motions:
             reached = self.executor.follow(motion, until=until)
@@ -134,7 +136,7 @@ class Arm:
         self, start: Array, goals: Iterable[Array], *, stage: str, check_collisions: bool = True
     ) -> Trajectory:
         """Plan a straight line to the first feasible TCP pose of ``goals``."""
-        return first_plan(
+        return plan_first_feasible(
             goals,
             lambda goal: self.planner.plan_straight(start, goal, stage=stage, check_collisions=check_collisions),
             PlanningError(stage, "no_goals"),
@@ -148,7 +150,7 @@ class Arm:
         for rises in range(MAX_RISES + 1):
             with self.planning_time():
                 self.planner.set_scene(self.scene.obstacles(exclude=exclude))
-                if not self.planner.collisions(self.qpos, self.planner.finger_width):
+                if not self.planner.find_collisions(self.qpos, self.planner.finger_width):
                     return
                 if rises == MAX_RISES:
                     raise PlanningError("rise", "in_contact")
@@ -163,7 +165,7 @@ class Arm:
         return self.plan_first_line(self.qpos, [up, inward], stage=stage, check_collisions=False)
 
 
-def first_plan(candidates: Iterable[T], plan: Callable[[T], Plan], failure: PlanningError) -> Plan:
+def plan_first_feasible(candidates: Iterable[T], plan: Callable[[T], Plan], failure: PlanningError) -> Plan:
     """Return the plan of the first feasible candidate; raise the last error, or ``failure``."""
     for candidate in candidates:
         try:

@@ -13,7 +13,7 @@ from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import inverse, transform_points
 from robocas_ms3.planning.protocol import Array, Obstacle
 from robocas_ms3.planning.scene import to_arm_base_frame
-from robocas_ms3.planning.skills.arm import Arm, first_plan, shift_back
+from robocas_ms3.planning.skills.arm import Arm, plan_first_feasible, shift_back
 from robocas_ms3.planning.skills.drive import (
     THINNED,
     Surroundings,
@@ -28,7 +28,12 @@ from robocas_ms3.planning.skills.drive import (
 )
 from robocas_ms3.planning.skills.grasp import grasp
 from robocas_ms3.planning.skills.handles import MovingPart, open_furniture_part, pull_fraction
-from robocas_ms3.planning.skills.place import attach_held, carry_to_basket, release_into_basket, sample_drop_poses
+from robocas_ms3.planning.skills.place import (
+    attach_held_object,
+    carry_to_basket,
+    release_into_basket,
+    sample_drop_poses,
+)
 from robocas_ms3.scenes.grasp_checks import (
     HALF_TURN,
     NEIGHBOURHOOD,
@@ -49,7 +54,7 @@ MIN_GRASP_FRACTION, MIN_PULL_FRACTION, MIN_DROP_FRACTION = 0.3, 1.0, 0.1
 
 def drive_and_grasp(arm: Arm, slot: int) -> None:
     """Drive within comfortable reach of an object and grasp it; try other base poses if planning fails."""
-    kind = arm.path[-1] % GRASP_KINDS  # skip the kinds of earlier attempts
+    kind = arm.decision_path[-1] % GRASP_KINDS  # skip the kinds of earlier attempts
     _try_base_poses(
         arm,
         lambda relocate: drive_to_object(arm, slot, relocate=relocate),
@@ -83,7 +88,7 @@ def drive_to_object(arm: Arm, slot: int, *, relocate: bool = False) -> None:
         others, grasps = arm.scene.obstacles_in_world(exclude=slot), find_clear_grasps(arm, slot)
         if not relocate and reachable_fraction(arm, current_base_pose(arm), grasps, others) >= MIN_GRASP_FRACTION:
             return
-    around = _fold(arm)
+    around = _fold_arm(arm)
     with arm.planning_time():
         center = (arm.scene.arm_base_in_world @ arm.scene.object_in_base(slot))[:3, 3]
         goals = sample_base_poses(arm, center)
@@ -100,7 +105,7 @@ def drive_to_object(arm: Arm, slot: int, *, relocate: bool = False) -> None:
 
         # if the nearest configurations collide, evaluate all configurations
         modes = (False, 2 * MIN_GRASP_FRACTION), (True, MIN_GRASP_FRACTION)
-        route = first_plan(modes, route_to, PlanningError("drive", "no_base_pose"))
+        route = plan_first_feasible(modes, route_to, PlanningError("drive", "no_base_pose"))
     drive(arm, *route)
 
 
@@ -108,7 +113,7 @@ def drive_to_handle(arm: Arm, *, relocate: bool = False) -> None:
     """Drive with a folded arm to a base pose for the pull, if needed or if ``relocate`` is set."""
     if not arm.executor.drives_base:
         return
-    part = MovingPart.of(arm)
+    part = MovingPart.from_task(arm)
 
     def fraction(goal: Array) -> float:
         frame = arm_base_in_world(arm, goal)
@@ -118,11 +123,13 @@ def drive_to_handle(arm: Arm, *, relocate: bool = False) -> None:
 
     with arm.planning_time():
         others = arm.scene.obstacles_in_world(exclude_link=(part.furniture, part.handle.link))
-        moved = part.in_world(arm, part.pull_positions(arm))
-        swept = np.concatenate([transform_points(frame, part.surface(arm)[::THINNED]) for frame in moved[::THINNED]])
+        moved = part.poses_in_world(arm, part.pull_positions(arm))
+        swept = np.concatenate(
+            [transform_points(frame, part.surface_points(arm)[::THINNED]) for frame in moved[::THINNED]]
+        )
         if not relocate and fraction(current_base_pose(arm)) >= MIN_PULL_FRACTION:
             return
-    around = _fold(arm)
+    around = _fold_arm(arm)
     with arm.planning_time():
         center = (moved @ part.grasp_in_part)[:, :3, 3].mean(axis=0)
         route = find_best_route(arm, sample_base_poses(arm, center), around, fraction, enough=MIN_PULL_FRACTION)
@@ -147,15 +154,15 @@ def drive_to_basket(arm: Arm, slot: int) -> None:
 
     def fraction(goal: Array) -> float:
         poses = sample_drop_poses(arm, slot, arm_base_in_world(arm, goal))
-        return float(arm.reachability.nearest_solutions(poses, arm.qpos)[0].mean())
+        return float(arm.inverse_kinematics.nearest_solutions(poses, arm.qpos)[0].mean())
 
     with arm.planning_time():
-        attach_held(arm, slot)
+        attach_held_object(arm, slot)
         around = read_surroundings(arm, exclude=slot)
         start, here = np.zeros(3), current_base_pose(arm)
         route = None
         if np.any(here) and fraction(start) >= MIN_DROP_FRACTION:
-            route = find_free_route(arm, here, start, around, leaving=True)
+            route = find_free_route(arm, here, start, around, back_first=True)
         if route is None and fraction(here) >= MIN_DROP_FRACTION:
             return
         if route is None:
@@ -168,7 +175,7 @@ def drive_to_basket(arm: Arm, slot: int) -> None:
         raise PlanningError("drive", "dropped")
 
 
-def _fold(arm: Arm) -> Surroundings:
+def _fold_arm(arm: Arm) -> Surroundings:
     with arm.planning_time():
         arm.planner.set_scene(arm.scene.obstacles())
         home = arm.plan_home(arm.qpos)
@@ -206,9 +213,9 @@ def reachable_fraction(
     if not len(poses):
         return 0.0
     if thorough:
-        qpos, of_pose = arm.reachability.all_solutions(poses, arm.qpos)
+        qpos, of_pose = arm.inverse_kinematics.all_solutions(poses, arm.qpos)
     else:
-        solved, nearest = arm.reachability.nearest_solutions(poses, arm.qpos)
+        solved, nearest = arm.inverse_kinematics.nearest_solutions(poses, arm.qpos)
         qpos, of_pose = nearest[solved], np.flatnonzero(solved)
     arm.planner.set_scene(to_arm_base_frame(others, frame))
     possible = np.bincount(of_pose[arm.planner.is_free(qpos)], minlength=len(poses)) > 0

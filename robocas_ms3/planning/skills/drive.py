@@ -105,7 +105,7 @@ def find_best_route(
         if scored > POSES_SCORED:
             break
         score = score_pose(goal)
-        if score > best[0] and (route := find_free_route(arm, current_base_pose(arm), goal, around, leaving=False)):
+        if score > best[0] and (route := find_free_route(arm, current_base_pose(arm), goal, around, back_first=False)):
             best = score, route
             if score >= enough:
                 break
@@ -114,22 +114,25 @@ def find_best_route(
     return best[1]
 
 
-def find_free_route(arm: Arm, start: Array, goal: Array, around: Surroundings, *, leaving: bool) -> list[Array] | None:
-    """Return base poses of a free route, straight or via a pose behind its narrow end, or None.
+def find_free_route(
+    arm: Arm, start: Array, goal: Array, around: Surroundings, *, back_first: bool
+) -> list[Array] | None:
+    """Return base poses (3,) of a collision-free route from ``start`` to ``goal``, or None.
 
-    With ``leaving``, the narrow end is ``start``, and the robot drives back first. Else it is ``goal``, and the robot
-    drives forward last.
+    The route is straight, or goes via a pose 15 or 30 cm straight behind one of its ends. With ``back_first`` this end
+    is ``start``: the robot first drives straight back. Otherwise it is ``goal``: the robot drives straight forward at
+    the end.
     """
-    for route in _routes(start, goal, leaving, arm.robot.base_limits):
+    for route in _routes(start, goal, back_first, arm.robot.base_limits):
         poses = [start, *route]
         if all(_leg_is_free(arm, a, b, around) for a, b in zip(poses[:-1], poses[1:], strict=True)):
             return route
     return None
 
 
-def _routes(start: Array, goal: Array, leaving: bool, limits: Limits) -> Iterator[list[Array]]:
+def _routes(start: Array, goal: Array, back_first: bool, limits: Limits) -> Iterator[list[Array]]:
     yield [goal]
-    narrow = start if leaving else goal
+    narrow = start if back_first else goal
     for distance in BACK_DISTANCES:
         via = narrow - distance * np.array([np.cos(narrow[2]), np.sin(narrow[2]), 0])
         if all(a <= v <= b for v, (a, b) in zip(via, limits, strict=True)):
@@ -144,7 +147,7 @@ def _leg_is_free(arm: Arm, start: Array, goal: Array, around: Surroundings) -> b
         if not is_body_clear(arm.robot, frame, around.cloud):
             return False
         arm.planner.set_scene(to_arm_base_frame(around.obstacles, frame))
-        if arm.planner.collisions(arm.qpos, width):
+        if arm.planner.find_collisions(arm.qpos, width):
             return False
     return True
 

@@ -77,7 +77,7 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, skip_kinds: int = 0) -> 
         for start in starts:
             try:
                 planner.set_scene(with_room)
-                reach = planner.plan_to_qpos(arm.qpos, [start], stage="reach", search=False)
+                reach = planner.plan_to_qpos(arm.qpos, [start], stage="reach", straight_only=True)
             except PlanningError:
                 reach = None
             try:
@@ -106,8 +106,8 @@ def grasp_candidates(arm: Arm, slot: int, skip_kinds: int) -> Iterator[Array]:
     base, object_in_base = arm.scene.arm_base_in_world, arm.scene.object_in_base(slot)
     kept = filter_grasps(notes, base @ object_in_base, base, arm.approach)
     tcp_in_base = inverse(base) @ kept.tcp_in_world
-    solved, qpos = arm.reachability.nearest_solutions(tcp_in_base, arm.qpos)
-    solved_before, qpos_before = arm.reachability.nearest_solutions(
+    solved, qpos = arm.inverse_kinematics.nearest_solutions(tcp_in_base, arm.qpos)
+    solved_before, qpos_before = arm.inverse_kinematics.nearest_solutions(
         shift_back(tcp_in_base, PREGRASP_DISTANCE), arm.qpos
     )
     reachable = np.flatnonzero(solved & solved_before)

@@ -17,9 +17,9 @@ from robocas_ms3.assets.manifest import Handle, Joint
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import inverse, transform_points
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
-from robocas_ms3.planning.pull_path import count_reached, rotate_about_bar, track_handle
-from robocas_ms3.planning.scene import SPACING, part_shape
-from robocas_ms3.planning.skills.arm import Arm, first_plan, plan_retreat, shift_back
+from robocas_ms3.planning.pull_path import count_reached_poses, rotate_about_bar, track_handle
+from robocas_ms3.planning.scene import SPACING, get_body_shape
+from robocas_ms3.planning.skills.arm import Arm, plan_first_feasible, plan_retreat, shift_back
 from robocas_ms3.planning.time_parameterization import fit_spline, time_path
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.scenes.grasp_checks import HALF_TURN
@@ -56,7 +56,7 @@ class MovingPart:
     joint: Joint
 
     @classmethod
-    def of(cls, arm: Arm) -> MovingPart:
+    def from_task(cls, arm: Arm) -> MovingPart:
         model = arm.env.model
         opening, joint = model.config.opening, model.joint_to_open
         assert opening is not None  # required by the task
@@ -68,13 +68,13 @@ class MovingPart:
         """Joint limit in the opening direction, m or rad."""
         return max(self.joint.limits, key=abs)
 
-    def position(self, arm: Arm) -> float:
+    def joint_position(self, arm: Arm) -> float:
         """Return the joint position, m or rad."""
         return arm.scene.joint_positions(self.furniture)[self.joint.name]
 
     def pull_positions(self, arm: Arm) -> Array:
         """Return joint positions (T,) of a pull, from the current position to the maximum of a pull."""
-        start, far = self.position(arm), MAX_OPENED_FRACTION[self.joint.kind] * self.open_limit
+        start, far = self.joint_position(arm), MAX_OPENED_FRACTION[self.joint.kind] * self.open_limit
         left = (far - start) * np.sign(far)
         if left < STEP[self.joint.kind]:
             raise PlanningError("pull", "already_open")
@@ -85,16 +85,16 @@ class MovingPart:
         positions = self.pull_positions(arm)
         return min(MIN_RANGE_FRACTION * abs(self.open_limit), abs(positions[-1] - positions[0]))
 
-    def in_world(self, arm: Arm, positions: Array) -> Array:
+    def poses_in_world(self, arm: Arm, positions: Array) -> Array:
         """Return world poses (T, 4, 4) of the part at joint positions (T,)."""
         frame = arm.env.model.furniture_poses[self.furniture]
         return np.array([frame @ joint_motion(self.joint, float(q)) for q in positions])
 
     def obstacle(self, arm: Arm, pose_in_base: Array) -> Obstacle:
         part = arm.env.model.furniture[self.furniture].links[self.handle.link]
-        return Obstacle(self.handle.link, part_shape(part), pose_in_base)
+        return Obstacle(self.handle.link, get_body_shape(part), pose_in_base)
 
-    def surface(self, arm: Arm) -> Array:
+    def surface_points(self, arm: Arm) -> Array:
         return arm.env.model.furniture[self.furniture].links[self.handle.link].surface_points(SPACING)
 
     @property
@@ -119,7 +119,7 @@ class MovingPart:
 
 def open_furniture_part(arm: Arm) -> None:
     """Open the door or drawer of the task, with up to ``MAX_PULLS`` pulls."""
-    part = MovingPart.of(arm)
+    part = MovingPart.from_task(arm)
     for _ in range(MAX_PULLS):
         pull_handle(arm, part)
         if is_opened(arm):
@@ -138,13 +138,13 @@ def pull_handle(arm: Arm, part: MovingPart) -> None:
     """Grasp the handle, pull as far as the arm reaches, release it and retreat."""
     with arm.planning_time():
         approach, opening = plan_pull(arm, part)
-        before, least = part.position(arm), 0.5 * part.min_pull(arm)
+        before, least = part.joint_position(arm), 0.5 * part.min_pull(arm)
     arm.follow(approach)
     arm.close_gripper()
     if not part.is_grasped(arm):
         raise PlanningError("handle", "missed")
     arm.follow(opening)
-    if abs(part.position(arm) - before) < least:
+    if abs(part.joint_position(arm) - before) < least:
         raise PlanningError("pull", "slipped")
     arm.open_gripper()
     with arm.planning_time():
@@ -152,7 +152,7 @@ def pull_handle(arm: Arm, part: MovingPart) -> None:
         arm.planner.set_scene(arm.scene.obstacles())
         goals = [shift_back(arm.planner.tcp(arm.qpos), distance) for distance in RETREATS]
         check_collisions = (True, False)  # collision-free if possible
-        back = first_plan(
+        back = plan_first_feasible(
             check_collisions,
             lambda check: arm.plan_first_line(arm.qpos, goals, stage="retreat", check_collisions=check),
             PlanningError("retreat", "no_goals"),
@@ -163,13 +163,13 @@ def pull_handle(arm: Arm, part: MovingPart) -> None:
 def plan_pull(arm: Arm, part: MovingPart) -> tuple[Trajectory, Trajectory]:
     """Plan the approach to the handle and the longest pull, with the bar deep in the gripper if possible."""
     failure = PlanningError("pull", "no_plan")
-    return first_plan((DEPTH_OFFSET, 0.0), lambda depth_offset: _plan_pull(arm, part, depth_offset), failure)
+    return plan_first_feasible((DEPTH_OFFSET, 0.0), lambda depth_offset: _plan_pull(arm, part, depth_offset), failure)
 
 
 def _plan_pull(arm: Arm, part: MovingPart, depth_offset: float) -> tuple[Trajectory, Trajectory]:
     positions = part.pull_positions(arm)
-    frames = inverse(arm.scene.arm_base_in_world) @ part.in_world(arm, positions)
-    paths, ends, turned = _paths(arm, part, frames, depth_offset)
+    frames = inverse(arm.scene.arm_base_in_world) @ part.poses_in_world(arm, positions)
+    paths, ends, turned = _compute_paths(arm, part, frames, depth_offset)
     least = part.min_pull(arm) / abs(positions[-1] - positions[0]) * len(positions)
     # the longest pull first, in coarse steps; then the squarest grasp nearest to the current configuration
     cost = np.abs(paths[0] - arm.qpos).max(axis=1) + TURN_WEIGHT * turned + arm.rng.uniform(0, 0.3, len(ends))
@@ -179,23 +179,23 @@ def _plan_pull(arm: Arm, part: MovingPart, depth_offset: float) -> tuple[Traject
         raise PlanningError("pull", "unreachable")
     everything = arm.scene.obstacles()
     others = arm.scene.obstacles(exclude_link=(part.furniture, part.handle.link))
-    order = _filter_holds(arm, part, paths[0], order, frames, others, depth_offset)
+    order = _filter_grasps(arm, part, paths[0], order, frames, others, depth_offset)
     if not order:
         raise PlanningError("handle", "blocked")
 
     def plan(index: int) -> tuple[Trajectory, Trajectory]:
         path = paths[: ends[index], index]
-        free = _free_length(arm, part, path, frames, others)
+        free = _count_free_poses(arm, part, path, frames, others)
         if free < least:
             raise PlanningError("pull", "blocked")
-        free = _retreatable_length(arm, path[:free], int(np.ceil(least)))
+        free = _find_retreatable_length(arm, path[:free], int(np.ceil(least)))
         arm.planner.set_scene(everything)
         away = arm.planner.plan_straight(path[0], shift_back(arm.planner.tcp(path[0]), STANDOFF), stage="approach")
         reach = arm.planner.plan_to_qpos(arm.qpos, [away.qpos[-1]], stage="reach")
         inward = Trajectory(np.concatenate([away.qpos[-2::-1], path[:1]]), away.dt)
-        return arm.planner.join(arm.qpos, reach, inward), _timed(path[:free], arm.robot, away.dt)
+        return arm.planner.join(arm.qpos, reach, inward), _time_pull(path[:free], arm.robot, away.dt)
 
-    return first_plan(order[:PULLS_PLANNED], plan, PlanningError("pull", "no_plan"))
+    return plan_first_feasible(order[:PULLS_PLANNED], plan, PlanningError("pull", "no_plan"))
 
 
 def pull_fraction(arm: Arm, part: MovingPart, arm_base_in_world: Array, others: list[Obstacle]) -> float:
@@ -203,21 +203,21 @@ def pull_fraction(arm: Arm, part: MovingPart, arm_base_in_world: Array, others: 
     positions = part.pull_positions(arm)
     opened = arm.env.model.open_threshold
     enough = 1 + int(np.sum(np.abs(positions) < abs(opened + COMFORT_FRACTION * (positions[-1] - opened))))
-    frames = inverse(arm_base_in_world) @ part.in_world(arm, positions)
+    frames = inverse(arm_base_in_world) @ part.poses_in_world(arm, positions)
     try:
-        paths, ends, _ = _paths(arm, part, frames)
+        paths, ends, _ = _compute_paths(arm, part, frames)
     except PlanningError:
         return 0.0
     fraction = 0.0
     order = [i for i in np.argsort(-ends, kind="stable") if ends[i]]
-    for index in _filter_holds(arm, part, paths[0], order, frames, others)[:HOLDS_CHECKED]:
+    for index in _filter_grasps(arm, part, paths[0], order, frames, others)[:HOLDS_CHECKED]:
         path = paths[: ends[index], index]
         if fraction < 1:
-            fraction = max(fraction, min(1.0, _free_length(arm, part, path, frames, others) / enough))
+            fraction = max(fraction, min(1.0, _count_free_poses(arm, part, path, frames, others) / enough))
     return fraction
 
 
-def _paths(
+def _compute_paths(
     arm: Arm, part: MovingPart, frames: Array, depth_offset: float = 0.0
 ) -> tuple[Array, NDArray[np.int_], Array]:
     """Compute paths of the arm for N grasps of the handle.
@@ -236,15 +236,15 @@ def _paths(
                 goals.append(frames @ hold)
                 starts.append(rotate_about_bar(goals[-1][0], turn) @ beyond)
     held = np.stack(goals, axis=1)
-    solved, qpos = arm.reachability.nearest_solutions(np.array(starts), arm.qpos)
+    solved, qpos = arm.inverse_kinematics.nearest_solutions(np.array(starts), arm.qpos)
     if not solved.any():
         raise PlanningError("handle", "unreachable")
-    path = track_handle(arm.reachability.chain.with_tool_offset(depth_offset), qpos[solved], held[:, solved])
+    path = track_handle(arm.inverse_kinematics.chain.with_tool_offset(depth_offset), qpos[solved], held[:, solved])
     turned = np.tile(np.abs(TURNS), len(goals) // len(TURNS))[solved]
-    return path, count_reached(path), turned
+    return path, count_reached_poses(path), turned
 
 
-def _filter_holds(
+def _filter_grasps(
     arm: Arm,
     part: MovingPart,
     starts: Array,
@@ -254,7 +254,7 @@ def _filter_holds(
     depth_offset: float = 0.0,
 ) -> list[int]:
     """Return the grasps of ``order`` with the handle between the open fingers and without collisions."""
-    surface = transform_points(frames[0], part.surface(arm))
+    surface = transform_points(frames[0], part.surface_points(arm))
     near = surface[np.linalg.norm(surface - (frames[0] @ part.grasp_in_part)[:3, 3], axis=1) < HANDLE_RADIUS]
     arm.planner.set_scene([*others, part.obstacle(arm, frames[0])])
 
@@ -269,7 +269,7 @@ def _filter_holds(
     return [i for i, free in zip(order, arm.planner.is_free(starts[order], width), strict=True) if free]
 
 
-def _free_length(arm: Arm, part: MovingPart, path: Array, frames: Array, others: list[Obstacle]) -> int:
+def _count_free_poses(arm: Arm, part: MovingPart, path: Array, frames: Array, others: list[Obstacle]) -> int:
     """Return the length of the collision-free start of a path (T, 7), with the part at poses (T, 4, 4)."""
     planner, width = arm.planner, part.handle.width
     planner.set_scene(others)
@@ -277,16 +277,16 @@ def _free_length(arm: Arm, part: MovingPart, path: Array, frames: Array, others:
     length = 3 * int(blocked[0]) if len(blocked) else len(path)
     if not length:
         return 0
-    points, held = part.surface(arm), transform_points(inverse(frames[0]), planner.tcp(path[0])[None, :3, 3])
+    points, held = part.surface_points(arm), transform_points(inverse(frames[0]), planner.tcp(path[0])[None, :3, 3])
     rest = Shape(points=points[np.linalg.norm(points - held, axis=1) > HANDLE_CLEARANCE])
     for i in np.linspace(0, length - 1, POSITIONS_CHECKED).round().astype(int):
         planner.set_scene([Obstacle(part.handle.link, rest, frames[i])])
-        if planner.collisions(path[i], width):
+        if planner.find_collisions(path[i], width):
             return int(i * (1 - 1 / POSITIONS_CHECKED))
     return length
 
 
-def _retreatable_length(arm: Arm, path: Array, least: int) -> int:
+def _find_retreatable_length(arm: Arm, path: Array, least: int) -> int:
     """Return the longest start of a pull (T, 7), at least ``least``, after which the gripper can retreat."""
     for length in range(len(path), max(least, 1) - 1, -3):
         tcp = arm.planner.tcp(path[length - 1])
@@ -298,7 +298,7 @@ def _retreatable_length(arm: Arm, path: Array, least: int) -> int:
     raise PlanningError("pull", "no_retreat")
 
 
-def _timed(path: Array, robot: RobotDescription, dt: float) -> Trajectory:
+def _time_pull(path: Array, robot: RobotDescription, dt: float) -> Trajectory:
     motion = time_path(
         fit_spline(path),
         velocity=SPEED * robot.arm_velocity_limit,
@@ -306,5 +306,5 @@ def _timed(path: Array, robot: RobotDescription, dt: float) -> Trajectory:
         dt=dt,
     )
     if motion is None:
-        raise PlanningError("pull", "timing_failed")
+        raise PlanningError("pull", "no_time_parameterization")
     return motion

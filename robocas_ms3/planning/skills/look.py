@@ -32,7 +32,7 @@ def plan_view(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> 
     tcp_in_camera = inverse(inverse(arm.scene.tcp_in_base) @ camera_in_base(arm))
     for least, greatest in (distance, (NEAR[0], FAR[1])):  # any distance, if a high table allows no such view
         views = sample_views(arm.rng, point_in_base, (least, greatest), VIEWS_SAMPLED)
-        solved, qpos = arm.reachability.nearest_solutions(views @ tcp_in_camera, arm.qpos)
+        solved, qpos = arm.inverse_kinematics.nearest_solutions(views @ tcp_in_camera, arm.qpos)
         if solved.any():
             break
     else:
@@ -78,11 +78,11 @@ def camera_in_base(arm: Arm) -> Array:
     """
     config = _camera_config(arm)
     link = arm.env.agent.robot.links_map[str(config.entity_uid)]
-    camera_in_link = from_wxyz(config.pose.raw_pose[0]) @ _shift(arm)
+    camera_in_link = from_wxyz(config.pose.raw_pose[0]) @ _camera_shift(arm)
     return inverse(arm.scene.arm_base_in_world) @ from_wxyz(link.pose.raw_pose[0]) @ camera_in_link
 
 
-def _shift(arm: Arm) -> Array:
+def _camera_shift(arm: Arm) -> Array:
     randomisation = arm.env.task_config.randomisation.cameras
     if randomisation is None:
         return np.eye(4)

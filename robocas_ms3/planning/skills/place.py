@@ -12,7 +12,14 @@ from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import from_wxyz, inverse, transform_points
 from robocas_ms3.planning.kinematics import joint_distance
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
-from robocas_ms3.planning.skills.arm import CARRY_CLEARANCE, Arm, first_plan, plan_retreat, shift_back, shift_up
+from robocas_ms3.planning.skills.arm import (
+    CARRY_CLEARANCE,
+    Arm,
+    plan_first_feasible,
+    plan_retreat,
+    shift_back,
+    shift_up,
+)
 
 DROPS_SAMPLED, DROPS_CHECKED, DROPS_PLANNED = 192, 64, 10
 DROP_MARGIN = 0.045  # m, expected position error of a robot at the drop
@@ -63,18 +70,18 @@ def plan_carry(arm: Arm, slot: int) -> Trajectory:
     If possible, the motion keeps ``CARRY_CLEARANCE`` to basket and furniture.
     """
     drops = sample_drop_poses(arm, slot, arm.scene.arm_base_in_world)
-    solved, qpos = arm.reachability.nearest_solutions(drops, arm.qpos)
+    solved, qpos = arm.inverse_kinematics.nearest_solutions(drops, arm.qpos)
     if not solved.any():
         raise PlanningError("transfer", "unreachable")
     order = _rank_drops(arm, slot, drops[solved], qpos[solved])
     drops, qpos = drops[solved][order], qpos[solved][order]
-    attach_held(arm, slot)
+    attach_held_object(arm, slot)
 
     def plan(clearance: float) -> Trajectory:
         arm.planner.set_scene(arm.scene.obstacles(exclude=slot, clearance=clearance))
-        return _plan_to_one_of(arm, drops, qpos)
+        return _plan_to_first_feasible(arm, drops, qpos)
 
-    return first_plan((CARRY_CLEARANCE, 0.0), plan, PlanningError("transfer", "no_plan"))
+    return plan_first_feasible((CARRY_CLEARANCE, 0.0), plan, PlanningError("transfer", "no_plan"))
 
 
 def _rank_drops(arm: Arm, slot: int, drops: Array, qpos: Array) -> NDArray[np.int_]:
@@ -82,15 +89,15 @@ def _rank_drops(arm: Arm, slot: int, drops: Array, qpos: Array) -> NDArray[np.in
 
     Next come poses near the current configuration, with a bent arm and a steep gripper, off which objects do not slide.
     """
-    inside = _inside_basket(arm, arm.scene.arm_base_in_world)
-    overhang = compute_overhang(drops, inside, transform_points(*held_object(arm, slot)), DROP_MARGIN)
+    inside = _basket_interior(arm, arm.scene.arm_base_in_world)
+    overhang = compute_overhang(drops, inside, transform_points(*read_held_object(arm, slot)), DROP_MARGIN)
     lean = np.arccos(np.clip(-drops[:, 2, 2], -1, 1))
     stretched = np.maximum(qpos[:, ELBOW] - STRETCHED, 0)
     cost = joint_distance(qpos, arm.qpos) + LEAN_WEIGHT * lean + STRETCH_WEIGHT * stretched
     return np.lexsort((cost, np.ceil(overhang / 0.015)))
 
 
-def _plan_to_one_of(arm: Arm, drops: Array, qpos: Array) -> Trajectory:
+def _plan_to_first_feasible(arm: Arm, drops: Array, qpos: Array) -> Trajectory:
     """Plan a motion to the first feasible drop pose (N, 4, 4) with configurations (N, 7)."""
     start = arm.qpos
     chosen = np.flatnonzero(arm.planner.is_free(qpos[:DROPS_CHECKED], arm.planner.finger_width))[:DROPS_PLANNED]
@@ -99,7 +106,7 @@ def _plan_to_one_of(arm: Arm, drops: Array, qpos: Array) -> Trajectory:
     drops, qpos = drops[chosen], qpos[chosen]
     for drop, goal in zip(drops, qpos, strict=True):
         try:
-            carry = arm.planner.plan_to_qpos(start, [goal], stage="transfer", search=False)
+            carry = arm.planner.plan_to_qpos(start, [goal], stage="transfer", straight_only=True)
             plan_retreat(arm, carry.qpos[-1], _retreat_poses(drop))  # a drop pose needs a retreat
             return carry
         except PlanningError:
@@ -116,33 +123,33 @@ def _plan_to_one_of(arm: Arm, drops: Array, qpos: Array) -> Trajectory:
     raise failure
 
 
-def held_object(arm: Arm, slot: int) -> tuple[Array, Array]:
+def read_held_object(arm: Arm, slot: int) -> tuple[Array, Array]:
     """Return the pose (4x4) of a held object in the TCP frame and the vertices (V, 3) of its hulls, m."""
     vertices = np.concatenate(arm.env.object_assets[0][slot].hulls)
     return inverse(arm.scene.tcp_in_base) @ arm.scene.object_in_base(slot), vertices
 
 
-def attach_held(arm: Arm, slot: int) -> None:
+def attach_held_object(arm: Arm, slot: int) -> None:
     """Attach a held object to the arm in the planner, with the current finger width."""
-    object_in_tcp, vertices = held_object(arm, slot)
+    object_in_tcp, vertices = read_held_object(arm, slot)
     arm.planner.attach(AttachedBody(vertices, object_in_tcp))
     arm.planner.finger_width = float(arm.env.agent.gripper_width[0])
 
 
 def sample_drop_poses(arm: Arm, slot: int, arm_base_in_world: Array) -> Array:
     """Sample TCP poses (N, 4, 4) that hold an object above the basket, in the arm's base frame."""
-    object_in_tcp, vertices = held_object(arm, slot)
+    object_in_tcp, vertices = read_held_object(arm, slot)
     center_of_mass = np.array([arm.env.object_assets[0][slot].asset.center_of_mass])
-    return sample_drops(
+    return sample_poses_above_container(
         arm.rng,
         DROPS_SAMPLED,
-        _inside_basket(arm, arm_base_in_world),
+        _basket_interior(arm, arm_base_in_world),
         transform_points(object_in_tcp, vertices),
         transform_points(object_in_tcp, center_of_mass)[0],
     )
 
 
-def _inside_basket(arm: Arm, arm_base_in_world: Array) -> ContainerInterior:
+def _basket_interior(arm: Arm, arm_base_in_world: Array) -> ContainerInterior:
     basket = arm.env.model.basket
     assert basket is not None  # required by the task
     inner = basket.asset.inner
@@ -163,7 +170,7 @@ def _failure_reason(arm: Arm) -> str:
     return "unstable"
 
 
-def sample_drops(
+def sample_poses_above_container(
     rng: np.random.Generator, count: int, inside: ContainerInterior, vertices: Array, center_of_mass: Array
 ) -> Array:
     """Sample TCP poses (count, 4, 4) with a held object above a container, clear of its rim.

@@ -12,7 +12,7 @@ from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import inverse
 from robocas_ms3.planning.executor import CLOSED
 from robocas_ms3.planning.protocol import Array, Obstacle, Trajectory
-from robocas_ms3.planning.pushes import STAND_OFF, YAWS, Push, push_candidates
+from robocas_ms3.planning.pushes import STAND_OFF, YAWS, Push, generate_push_candidates
 from robocas_ms3.planning.skills.arm import Arm, shift_up
 
 APPROACH_HEIGHT = 0.08  # m above the start of the push; the tool moves straight down from there
@@ -91,9 +91,9 @@ def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPl
     try:
         starts = _plan_starts(arm, slot, target, turn_deg)
         try:
-            return _plan_along(arm, starts, movable={slot})
+            return _plan_push_and_lift(arm, starts, movable={slot})
         except PlanningError:
-            return _plan_along(arm, starts, movable=set(range(len(arm.env.objects))) - {target})
+            return _plan_push_and_lift(arm, starts, movable=set(range(len(arm.env.objects))) - {target})
     finally:
         planner.finger_width = width
 
@@ -114,7 +114,7 @@ def _plan_starts(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tupl
     return starts
 
 
-def _plan_along(arm: Arm, starts: list[tuple[Push, Array, Trajectory]], movable: set[int]) -> PushPlan:
+def _plan_push_and_lift(arm: Arm, starts: list[tuple[Push, Array, Trajectory]], movable: set[int]) -> PushPlan:
     """Plan push and lift for the first direction with a feasible push; ``movable`` objects may be touched."""
     planner, failure = arm.planner, PlanningError("push", "no_free_push")
     along_scene, fixed = arm.scene.obstacles(exclude=movable), _fixed_bodies(arm)
@@ -147,13 +147,13 @@ def reachable_pushes(
     """Yield reachable pushes with a configuration (7,) above the start, the paper's direction first."""
     points, middle = arm.scene.object_points(slot), arm.scene.object_points(target).mean(axis=0)
     fixed = arm.scene.points_in_base(exclude=range(len(arm.env.objects)))
-    pushes = list(push_candidates(arm.rng, points, middle, others, surface_in_base(arm), fixed, turn_deg))
+    pushes = list(generate_push_candidates(arm.rng, points, middle, others, surface_in_base(arm), fixed, turn_deg))
     if not pushes:
         return
     starts, ends = np.stack([push.start for push in pushes]), np.stack([push.end for push in pushes])
-    reachable, qpos = arm.reachability.nearest_solutions(shift_up(starts, APPROACH_HEIGHT), arm.qpos)
+    reachable, qpos = arm.inverse_kinematics.nearest_solutions(shift_up(starts, APPROACH_HEIGHT), arm.qpos)
     for poses in (starts, ends):
-        reachable[reachable] = arm.reachability.nearest_solutions(poses[reachable], arm.qpos)[0]
+        reachable[reachable] = arm.inverse_kinematics.nearest_solutions(poses[reachable], arm.qpos)[0]
     turn = np.repeat(np.arange(len(pushes) // YAWS), YAWS)
     order = np.lexsort((np.abs(qpos - arm.qpos).max(axis=1), turn))
     yield from [(pushes[i], qpos[i]) for i in order if reachable[i]][:PUSHES_TRIED]

@@ -13,9 +13,9 @@ from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import transform_points
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.shapes import convex_hull
-from robocas_ms3.planning.skills.arm import Arm, first_plan, plan_retreat, shift_back, shift_up
+from robocas_ms3.planning.skills.arm import Arm, plan_first_feasible, plan_retreat, shift_back, shift_up
 from robocas_ms3.planning.skills.grasp import grasp
-from robocas_ms3.planning.skills.place import attach_held
+from robocas_ms3.planning.skills.place import attach_held_object
 from robocas_ms3.planning.skills.push import surface_in_base
 from robocas_ms3.scenes.grasp_checks import MAX_WIDTH, grasp_direction_tests, is_gripper_clear
 
@@ -35,10 +35,10 @@ PLACES_SOLVED, PLACES_PLANNED = 96, 12
 
 def remove_object(arm: Arm, slot: int) -> None:
     """Grasp an object, place it at a free position on the surface, and retreat."""
-    grasp(arm, slot, lift_height=lift_height(arm, slot))
+    grasp(arm, slot, lift_height=compute_lift_height(arm, slot))
     raise_held_object(arm, slot)
     with arm.planning_time():
-        way = plan_place(arm, slot)
+        way = plan_placement(arm, slot)
     arm.follow(way)
     if not arm.is_holding(slot):
         raise PlanningError("remove", "dropped")
@@ -51,11 +51,11 @@ def remove_object(arm: Arm, slot: int) -> None:
 
 def raise_held_object(arm: Arm, slot: int) -> None:
     """Raise a held object until it is collision-free."""
-    attach_held(arm, slot)
+    attach_held_object(arm, slot)
     arm.rise_until_free(exclude=slot)
 
 
-def lift_height(arm: Arm, slot: int) -> float:
+def compute_lift_height(arm: Arm, slot: int) -> float:
     """Return the lift after which an object is above all bodies around it, m."""
     points = transform_points(arm.scene.object_in_base(slot), np.concatenate(arm.env.object_assets[0][slot].hulls))
     middle = points.mean(axis=0)
@@ -92,7 +92,7 @@ def _grasps_from_above(arm: Arm, slot: int) -> Array:
     return grasps[np.linspace(0, len(grasps) - 1, min(len(grasps), GRASPS_TESTED)).astype(int)]
 
 
-def plan_place(arm: Arm, slot: int) -> Trajectory:
+def plan_placement(arm: Arm, slot: int) -> Trajectory:
     """Plan a motion to above a free position and down to it.
 
     Objects in a heap are tilted and would fall over. The object is rotated to its nearest stable orientation, or placed
@@ -100,10 +100,10 @@ def plan_place(arm: Arm, slot: int) -> Trajectory:
     """
     scene, asset, held = arm.scene, arm.env.object_assets[0][slot], arm.scene.object_in_base(slot)
     vertices = transform_points(held, np.concatenate(asset.hulls))
-    standing = upright_rotation(vertices, transform_points(held, np.array([asset.asset.center_of_mass]))[0])
+    standing = compute_upright_rotation(vertices, transform_points(held, np.array([asset.asset.center_of_mass]))[0])
     others = scene.points_in_base(exclude=slot)
     arm.planner.set_scene(scene.obstacles(exclude=slot))
-    attach_held(arm, slot)
+    attach_held_object(arm, slot)
 
     def free_poses() -> Iterator[Array]:
         for turn, margin in itertools.product((standing, np.eye(4)), EDGE_MARGINS):
@@ -112,18 +112,18 @@ def plan_place(arm: Arm, slot: int) -> Trajectory:
                 yield motions @ scene.tcp_in_base
 
     failure = PlanningError("remove", "no_free_position")
-    return first_plan(free_poses(), lambda places: _plan_to_one_of(arm, places), failure)
+    return plan_first_feasible(free_poses(), lambda places: _plan_to_first_feasible(arm, places), failure)
 
 
-def _plan_to_one_of(arm: Arm, places: Array) -> Trajectory:
+def _plan_to_first_feasible(arm: Arm, places: Array) -> Trajectory:
     """Plan a motion to above one of several TCP poses (N, 4, 4) and down to it."""
     start = arm.qpos
     nearest = np.argsort(np.linalg.norm(places[:, :2, 3] - arm.scene.tcp_in_base[:2, 3], axis=1), kind="stable")
     # near and far poses; inverse kinematics of all poses would take seconds
     places = places[nearest[:: max(1, len(places) // PLACES_SOLVED)]]
     above = shift_up(places, PLACE_APPROACH_HEIGHT)
-    solved, qpos = arm.reachability.nearest_solutions(above, start)
-    solved[solved] = arm.reachability.nearest_solutions(places[solved], start)[0]
+    solved, qpos = arm.inverse_kinematics.nearest_solutions(above, start)
+    solved[solved] = arm.inverse_kinematics.nearest_solutions(places[solved], start)[0]
     places, above, qpos = places[solved], above[solved], qpos[solved]
 
     def plan(index: int) -> Trajectory:
@@ -132,10 +132,10 @@ def _plan_to_one_of(arm: Arm, places: Array) -> Trajectory:
         return arm.planner.join(start, carry, down)
 
     order = np.argsort(np.abs(qpos - start).max(axis=1), kind="stable")[:PLACES_PLANNED]
-    return first_plan(order, plan, PlanningError("remove", "unreachable"))
+    return plan_first_feasible(order, plan, PlanningError("remove", "unreachable"))
 
 
-def upright_rotation(vertices: Array, center_of_mass: Array) -> Array:
+def compute_upright_rotation(vertices: Array, center_of_mass: Array) -> Array:
     """Return the smallest rotation (4x4) to a stable orientation of a body with vertices (V, 3), z up."""
     corners, faces, normals = convex_hull(vertices)
     a, b, c = corners[faces.T]

@@ -37,7 +37,7 @@ def attempt(arm: Arm) -> None:
             arm.start_subgoal("find the object")
         done = len(arm.executor.actions)
         try:
-            limits = SearchLimits(MOVES_COMPARED, max_continued(heap.moves_made), SUFFICIENT_SCORE)
+            limits = SearchLimits(MOVES_COMPARED, max_continued_moves(heap.moves_made), SUFFICIENT_SCORE)
             arm.choose(heap.candidate_moves(), heap.execute, limits)
         except PlanningError:
             if len(arm.executor.actions) > done:
@@ -57,7 +57,7 @@ def attempt(arm: Arm) -> None:
     release_into_basket(arm, slot)
 
 
-def max_continued(moves_made: int) -> int:
+def max_continued_moves(moves_made: int) -> int:
     """Return the number of moves to continue from; fewer later on, when failures have earlier causes."""
     return max(1, 3 - moves_made // 2)
 
@@ -66,14 +66,14 @@ def _grasp(arm: Arm, slot: int) -> bool:
     """Grasp the target and lift it; return False if planning fails before anything moves."""
     done = len(arm.executor.actions)
 
-    def play(kind: int) -> float:
+    def execute_grasp(kind: int) -> float:
         arm.executor.gripper = OPEN  # opens during the approach
         grasp(arm, slot, lift_height=LIFT_HEIGHT, skip_kinds=kind)
         raise_held_object(arm, slot)
         return 0.0
 
     try:
-        arm.choose(range(GRASP_KINDS), play)
+        arm.choose(range(GRASP_KINDS), execute_grasp)
     except PlanningError:
         if len(arm.executor.actions) > done:
             raise

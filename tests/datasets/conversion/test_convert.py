@@ -57,8 +57,11 @@ def test_failed_episodes_are_omitted_and_numbers_have_no_gaps(made, trajectory, 
 def test_arrays_equal_the_sampled_states(made, trajectory):
     samples = [0, 4, 8, 12, 16, 20, 22]
     with TrajectoryFile(trajectory) as file:
-        recording = file.recording(2)
-    robot, motion = recording.states["articulations"]["robocas_mobile_panda"][samples], recording.motion(samples)
+        recording = file.read_recording(2)
+    robot, motion = (
+        recording.states["articulations"]["robocas_mobile_panda"][samples],
+        recording.compute_motion(samples),
+    )
     with np.load(made / "episode_0000001" / "episode_info.npz", allow_pickle=False) as arrays:
         np.testing.assert_array_equal(arrays["robot_joints"], robot[:, 16:23])
         base = from_xyzw(arrays["base_pos"], arrays["base_orn"])
@@ -72,7 +75,7 @@ def test_arrays_equal_the_sampled_states(made, trajectory):
 def test_images_equal_the_rendered_ones(made, trajectory):
     source = RayCaster({}, "pd_joint_pos", None)
     with TrajectoryFile(trajectory) as file:
-        frame = list(source.frames(file.recording(2), np.array([0, 4, 8, 12, 16, 20, 22])))[3]
+        frame = list(source.frames(file.read_recording(2), np.array([0, 4, 8, 12, 16, 20, 22])))[3]
     for camera in frame.rgb:
         folder = made / "episode_0000001" / camera
         rgb = cv2.cvtColor(cv2.imread(str(folder / "rgb" / "0003.png"), cv2.IMREAD_UNCHANGED), cv2.COLOR_BGR2RGB)
@@ -202,7 +205,7 @@ def test_fewer_and_smaller_images(trajectory, tmp_path, image_format):
 
 def recording(trajectory, index):
     with TrajectoryFile(trajectory) as file:
-        return file.recording(index)
+        return file.read_recording(index)
 
 
 def test_append_keeps_numbers_and_split(trajectory, tmp_path):

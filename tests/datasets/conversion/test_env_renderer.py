@@ -72,7 +72,7 @@ def recorded(tmp_path_factory, needs_renderer):
 @pytest.fixture(scope="module")
 def recording(recorded):
     with TrajectoryFile(recorded[0]) as file:
-        yield file.recording(0)
+        yield file.read_recording(0)
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def test_rendered_states_equal_the_recorded_images(source, recording, recorded):
     _, seen, tcp = recorded
     for index in (0, 4, STEPS):
         frame = shown(source, recording, index)
-        by_kinematics = recording.motion(np.array([index])).tcp_in_world[0]
+        by_kinematics = recording.compute_motion(np.array([index])).tcp_in_world[0]
         np.testing.assert_allclose(by_kinematics, tcp[index], atol=1e-5)
         for camera in frame.rgb:
             then = seen[index][camera]
@@ -156,7 +156,7 @@ def test_depth_agrees_with_the_cameras(source, recording):
     steps = []
     for index in (0, 5, STEPS):
         frame = shown(source, recording, index)
-        motion = recording.motion(np.array([index]))
+        motion = recording.compute_motion(np.array([index]))
         parents = {"gripper_camera": motion.tcp_in_world[0], "base_camera": motion.arm_base_in_world[0]}
         steps.append(
             [

@@ -21,7 +21,7 @@ from robocas_ms3.datasets.lerobot.language import (
 from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.scenes.language.instructions import template_ids
 
-GOALS = [SubGoal.of("move and grasp", "grasp it", 0, 2), SubGoal.of("transfer object", "drop it", 3, 6)]
+GOALS = [SubGoal.from_range("move and grasp", "grasp it", 0, 2), SubGoal.from_range("transfer object", "drop it", 3, 6)]
 CAMERA = "observation.images.base_camera"
 INFO = {"fps": 5, "features": {CAMERA: {"dtype": "video", "shape": [48, 64, 3]}}}
 

@@ -34,7 +34,10 @@ def made_up(steps, seed):
     poses = [from_xyzw(rng.uniform(-1, 1, (steps, 3)), Rotation.random(steps, rng).as_quat()) for _ in range(2)]
     root = np.tile(np.eye(4), (steps, 1, 1))
     qpos, qvel = rng.uniform(-2, 2, (steps, 12)), rng.uniform(-1, 1, (steps, 12))
-    goals = [SubGoal.of("move and grasp", "grasp it", 0, 0), SubGoal.of("transfer object", "drop it", 1, steps - 1)]
+    goals = [
+        SubGoal.from_range("move and grasp", "grasp it", 0, 0),
+        SubGoal.from_range("transfer object", "drop it", 1, steps - 1),
+    ]
     return episode_arrays(Motion(qpos, qvel, root, *poses, rng.random(steps) < 0.5), "grasp it and drop it", goals)
 
 

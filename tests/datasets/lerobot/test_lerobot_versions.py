@@ -140,7 +140,7 @@ def test_boxes_contain_the_projected_target(versions, trajectory):
     """The centre of the target, projected into a camera that sees all of it, is in its box."""
     episode = LeRobotDataset(versions / "0.6").episode(0)
     with TrajectoryFile(trajectory) as file:
-        centres = file.recording(0).states["actors"]["object_0"][[0, 4, 8, 12, 16, 20, 22], :3]
+        centres = file.read_recording(0).states["actors"]["object_0"][[0, 4, 8, 12, 16, 20, 22], :3]
     world_in_camera = inverse(episode.camera_in_parent("static_camera"))
     fx, fy, cx, cy = episode.intrinsic("static_camera")
     for centre, boxes in zip(centres, episode.target_boxes, strict=True):

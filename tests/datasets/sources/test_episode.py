@@ -12,8 +12,8 @@ from robocas_ms3.datasets.schema import EPISODE_INFO
 from robocas_ms3.datasets.sources.arrays import add_embeddings, episode_arrays
 from robocas_ms3.demos.recordings.motion import (
     Motion,
-    gripper_open,
-    planar_base,
+    compute_agv_pose,
+    sample_gripper_commands,
     sample_states,
     sample_stride,
 )
@@ -63,7 +63,7 @@ def arrays_of(tcp, base, *, qpos=None, subgoals=None, embed=None):
     qpos = np.zeros((count, 12)) if qpos is None else qpos
     root = np.broadcast_to(np.eye(4), (count, 4, 4))
     motion = Motion(qpos, np.zeros((count, 12)), root, tcp, base, np.ones(count, bool))
-    subgoals = subgoals or [SubGoal.of("move and grasp", "grasp it", 0, count - 1)]
+    subgoals = subgoals or [SubGoal.from_range("move and grasp", "grasp it", 0, count - 1)]
     arrays = episode_arrays(motion, "do it", subgoals)
     return add_embeddings(arrays, embed) if embed else arrays
 
@@ -84,7 +84,10 @@ def test_relative_motion_is_in_the_eef_frame():
 def test_arrays_have_the_declared_types_and_shapes():
     poses = np.broadcast_to(np.eye(4), (5, 4, 4))
     qpos = np.arange(60.0).reshape(5, 12)
-    goals = [SubGoal.of("move and grasp", "grasp it", 0, 1), SubGoal.of("transfer object", "drop it", 2, 4)]
+    goals = [
+        SubGoal.from_range("move and grasp", "grasp it", 0, 1),
+        SubGoal.from_range("transfer object", "drop it", 2, 4),
+    ]
     arrays = arrays_of(poses, poses, qpos=qpos, subgoals=goals, embed=lambda texts: np.ones((len(texts), 384)))
     assert list(arrays) == [spec.name for spec in EPISODE_INFO]
     for spec in EPISODE_INFO:
@@ -104,7 +107,7 @@ def test_base_pose_in_the_world():
     qpos = np.zeros((2, 12))
     qpos[1, :3] = 0.2, 0.0, np.deg2rad(100)
     expected = [[0.7, 0.15, np.pi / 2], [0.7, 0.35, np.deg2rad(190)]]  # on from 90, not to -170
-    np.testing.assert_allclose(planar_base(root, qpos), expected, atol=1e-12)
+    np.testing.assert_allclose(compute_agv_pose(root, qpos), expected, atol=1e-12)
 
 
 def test_base_yaw_is_continuous():
@@ -131,7 +134,7 @@ def test_strides():
 
 
 def test_step_belongs_to_the_action_that_starts_there():
-    goals = [SubGoal.of("move and grasp", "a", 0, 4), SubGoal.of("transfer object", "b", 5, 9)]
+    goals = [SubGoal.from_range("move and grasp", "a", 0, 4), SubGoal.from_range("transfer object", "b", 5, 9)]
     # States 0, 4 precede actions 0, 4 of the first goal; 8 and the end belong to the second.
     assert [(g.goal_type, g.first, g.last) for g in sample_subgoals(goals, sample_states(10, 4))] == [
         ("move and grasp", 0, 1),
@@ -141,9 +144,9 @@ def test_step_belongs_to_the_action_that_starts_there():
 
 def test_sub_goal_between_two_samples_is_omitted():
     goals = [
-        SubGoal.of("move and grasp", "a", 0, 4),
-        SubGoal.of("lift object", "b", 5, 7),
-        SubGoal.of("transfer object", "c", 8, 9),
+        SubGoal.from_range("move and grasp", "a", 0, 4),
+        SubGoal.from_range("lift object", "b", 5, 7),
+        SubGoal.from_range("transfer object", "c", 8, 9),
     ]
     sampled = sample_subgoals(goals, sample_states(10, 4))
     assert [(g.goal_description, g.first, g.last) for g in sampled] == [("a", 0, 1), ("c", 2, 3)]
@@ -154,7 +157,7 @@ def test_sub_goal_between_two_samples_is_omitted():
 def test_sampled_sub_goals_cover_all_steps(lengths, stride):
     firsts = np.concatenate([[0], np.cumsum(lengths)])
     goals = [
-        SubGoal.of("move and grasp", str(i), int(a), int(b) - 1)
+        SubGoal.from_range("move and grasp", str(i), int(a), int(b) - 1)
         for i, (a, b) in enumerate(zip(firsts[:-1], firsts[1:], strict=True))
     ]
     samples = sample_states(sum(lengths), stride)
@@ -164,7 +167,7 @@ def test_sampled_sub_goals_cover_all_steps(lengths, stride):
 
 @pytest.mark.parametrize("ranges", [[(0, 4), (6, 9)], [(1, 9)], [(0, 8)], [(0, 12)], [(0, 5), (4, 9)], []])
 def test_sub_goals_with_gaps_are_refused(ranges):
-    goals = [SubGoal.of("move and grasp", "a", first, last) for first, last in ranges]
+    goals = [SubGoal.from_range("move and grasp", "a", first, last) for first, last in ranges]
     with pytest.raises(DatasetError, match="ranges from 0 to 9"):
         sample_subgoals(goals, sample_states(10, 4))
 
@@ -173,6 +176,6 @@ def test_gripper_status_is_the_previous_command():
     # Fingers go to -0.01 + (a + 1) / 2 * 0.05 m each: open (> 0.02 m) above a = 0.2.
     commands = np.array([1, 1, 1, -1, -1, 0.1, 0.3, 1], float)
     samples = np.array([0, 3, 4, 6, 7, 8])
-    status = gripper_open(MOBILE_PANDA, commands, samples, initial_width=0.08)
+    status = sample_gripper_commands(MOBILE_PANDA, commands, samples, initial_width=0.08)
     assert status.tolist() == [True, True, False, False, True, True]
-    assert not gripper_open(MOBILE_PANDA, commands, samples, initial_width=0.0)[0]
+    assert not sample_gripper_commands(MOBILE_PANDA, commands, samples, initial_width=0.0)[0]

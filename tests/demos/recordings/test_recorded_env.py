@@ -10,7 +10,7 @@ from robocas_ms3.assets.pack import MANIFEST
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import ConfigError, DatasetError
 from robocas_ms3.core.paths import builtin_packs_dir, task_configs_dir
-from robocas_ms3.demos.recordings.environment import RecordedEnv, read_env, recorded_id
+from robocas_ms3.demos.recordings.environment import RecordedEnv, read_recorded_env, to_recorded_env_id
 
 ID = "robocas_ms3:RoboCASPick-v1"
 
@@ -27,12 +27,14 @@ def test_scene_arguments_are_kept_and_reader_arguments_are_dropped():
         "sim_config": {"control_freq": 20, "scene_config": {"contact_offset": 0.01}},
         "sensor_configs": {"width": 64, "base_camera": {"fov": 1.2, "shader_pack": "default"}},
     }
-    env = read_env({"env_id": ID, "env_kwargs": kwargs, "max_episode_steps": 800}, "F.json")
+    env = read_recorded_env({"env_id": ID, "env_kwargs": kwargs, "max_episode_steps": 800}, "F.json")
     assert (env.env_id, env.control_mode) == ("RoboCASPick-v1", "pd_joint_pos")
     kept = ("config", "pack", "sim_config", "sensor_configs")
     assert env.kwargs == {name: kwargs[name] for name in kept}
-    assert read_env({"env_id": "RoboCASPick-v1", "env_kwargs": {}}, "F.json") == RecordedEnv("RoboCASPick-v1", None, {})
-    assert recorded_id("RoboCASPick-v1") == ID
+    assert read_recorded_env({"env_id": "RoboCASPick-v1", "env_kwargs": {}}, "F.json") == RecordedEnv(
+        "RoboCASPick-v1", None, {}
+    )
+    assert to_recorded_env_id("RoboCASPick-v1") == ID
 
 
 @pytest.mark.parametrize(
@@ -56,21 +58,21 @@ def test_scene_arguments_are_kept_and_reader_arguments_are_dropped():
 )
 def test_forbidden_values_of_a_file_are_errors(info, where):
     with pytest.raises(DatasetError) as error:
-        read_env({"env_id": ID, "env_kwargs": {}, **info}, "F.json")
+        read_recorded_env({"env_id": ID, "env_kwargs": {}, **info}, "F.json")
     assert str(error.value.where).startswith(f"F.json, {where}")
 
 
 def test_user_can_set_a_pack(tmp_path):
     info = {"env_id": ID, "env_kwargs": {"pack": "../mine", "config": "pick_table_scattered"}}
-    assert read_env(info, "F.json", pack=tmp_path).kwargs["pack"] == str(tmp_path)
+    assert read_recorded_env(info, "F.json", pack=tmp_path).kwargs["pack"] == str(tmp_path)
 
 
 @pytest.mark.parametrize("use", [RecordedEnv.make, RecordedEnv.cameras])
 def test_only_registered_tasks_are_created(use):
     with pytest.raises(DatasetError, match=r"unknown task .expected one of .*RoboCASPick-v1.*found CartPole-v1"):
-        use(read_env({"env_id": "CartPole-v1", "env_kwargs": {}}, "F.json"))
+        use(read_recorded_env({"env_id": "CartPole-v1", "env_kwargs": {}}, "F.json"))
     with pytest.raises(DatasetError, match="unknown configuration"):
-        use(read_env({"env_id": ID, "env_kwargs": {"config": "mine"}}, "F.json"))
+        use(read_recorded_env({"env_id": ID, "env_kwargs": {"config": "mine"}}, "F.json"))
 
 
 @pytest.mark.parametrize(("key", "name"), [("pack", "mine"), ("furniture_pack", "mine"), ("config", "mine.yaml")])
@@ -79,7 +81,7 @@ def test_names_of_packs_and_configurations_are_not_resolved_in_the_current_folde
     (tmp_path / "mine").mkdir()
     shutil.copyfile(builtin_packs_dir() / "builtin" / MANIFEST, tmp_path / "mine" / MANIFEST)
     shutil.copyfile(task_configs_dir() / "pick_table_scattered.yaml", tmp_path / "mine.yaml")
-    env = read_env({"env_id": ID, "env_kwargs": {key: name}}, "F.json")
+    env = read_recorded_env({"env_id": ID, "env_kwargs": {key: name}}, "F.json")
     with pytest.raises(DatasetError, match=f"{key}: (unknown configuration|pack is not installed) .*found {name}"):
         env.make(obs_mode="none", render_backend="none")
     trusted = env.with_pack("mine").kwargs["pack"]  # by the user
@@ -90,7 +92,7 @@ def test_names_of_packs_and_configurations_are_not_resolved_in_the_current_folde
 def test_recorded_configuration_cannot_extend_a_file(tmp_path):
     (tmp_path / "base.yaml").write_text("extends: pick_table_scattered\n")
     config = {"extends": str(tmp_path / "base.yaml")}
-    env = read_env({"env_id": ID, "env_kwargs": {"config": config}}, "F.json")
+    env = read_recorded_env({"env_id": ID, "env_kwargs": {"config": config}}, "F.json")
     with pytest.raises(ConfigError, match="'extends' is allowed in YAML files only"):
         env.make(obs_mode="none", render_backend="none")
 

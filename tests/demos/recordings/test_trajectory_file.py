@@ -26,13 +26,13 @@ def edit_json(path, change):
 def test_written_episode_is_read(tmp_path):
     with TrajectoryFile(write_trajectory(tmp_path / "F.h5", seeds=(3, 4, 5))) as file:
         assert file.control_freq == 20
-        recording, alone = file.recording(1), file.recording(1, bodies=False)
+        recording, alone = file.read_recording(1), file.read_recording(1, bodies=False)
     assert (recording.seed, recording.control_steps, recording.control_mode) == (4, STEPS, "pd_joint_pos")
     assert recording.instruction == "grasp the cube 4 on the table and move it to the basket"
     assert [(g.first, g.last) for g in recording.subgoals] == [(0, 11), (12, 21)]
     states = make_states(4)
     np.testing.assert_array_equal(recording.state(7)["actors"]["object_1"], states["actors"]["object_1"][7:8])
-    motion = recording.motion(np.array([0, STEPS]))
+    motion = recording.compute_motion(np.array([0, STEPS]))
     robot = states["articulations"][UID]
     np.testing.assert_array_equal(motion.qpos, robot[[0, STEPS], 13:25])
     np.testing.assert_array_equal(motion.qvel, robot[[0, STEPS], 25:])
@@ -40,18 +40,18 @@ def test_written_episode_is_read(tmp_path):
     np.testing.assert_allclose(motion.root_in_world[0, :3, 0], [0, 1, 0], atol=1e-6)
     np.testing.assert_allclose(motion.root_in_world[0, :3, 3], [0.7, 0.15, 0], atol=1e-6)
     assert alone.states["actors"] == {}
-    np.testing.assert_array_equal(motion.actions, alone.motion(np.array([0, STEPS])).actions)
+    np.testing.assert_array_equal(motion.actions, alone.compute_motion(np.array([0, STEPS])).actions)
 
 
 def test_reconfigure_is_a_reset_option(own):
     edit_json(own, lambda data: data["episodes"][0].update(reset_kwargs={"options": {"reconfigure": True}}))
     with TrajectoryFile(own) as file:
-        assert file.entry(0).reset_options == {"reconfigure": True}
+        assert file.read_entry(0).reset_options == {"reconfigure": True}
 
 
 def fails(path, *words):
     with pytest.raises(DatasetError) as caught, TrajectoryFile(path) as file:
-        file.recording(0)
+        file.read_recording(0)
     assert "\n" not in str(caught.value)
     assert all(word in str(caught.value) for word in words)
 

@@ -16,7 +16,7 @@ from synthetic import STEPS, write_trajectory
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import atomic_file
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
-from robocas_ms3.demos.recordings.trajectory_hdf5 import find_violation, merge, reserved, write_whole
+from robocas_ms3.demos.recordings.trajectory_hdf5 import find_violation, merge, open_reserved, write_hdf5
 from robocas_ms3.demos.trajectory_replay import RecordedEpisode
 from robocas_ms3.evaluation.policies.replay import ReplayPolicy
 from robocas_ms3.evaluation.policy import EpisodeSpec
@@ -48,7 +48,7 @@ def test_unused_reserved_space_is_released(tmp_path, monkeypatch, size):
 
     if size is None:  # a file system that reserves nothing
         monkeypatch.setattr("os.posix_fallocate", none)
-    with reserved(tmp_path / "x.h5", size or 10) as file:
+    with open_reserved(tmp_path / "x.h5", size or 10) as file:
         fill(file)
     with h5py.File(tmp_path / "x.h5") as file:
         np.testing.assert_array_equal(file["a/b"], DATA)
@@ -59,9 +59,9 @@ def test_full_disk_is_an_error_without_data_loss(tmp_path):
     """HDF5 does not crash when it closes the file, and no file is left."""
     with files_of_at_most(100_000):
         with pytest.raises(OSError, match="x.h5") as error, atomic_file(tmp_path / "x.h5") as tmp:
-            write_whole(tmp, fill)
+            write_hdf5(tmp, fill)
         assert error.value.errno == errno.EFBIG
-        with pytest.raises(OSError, match="y.h5"), atomic_file(tmp_path / "y.h5") as tmp, reserved(tmp, 500_000):
+        with pytest.raises(OSError, match="y.h5"), atomic_file(tmp_path / "y.h5") as tmp, open_reserved(tmp, 500_000):
             raise AssertionError("it was opened")
     assert list(tmp_path.iterdir()) == []
 
@@ -138,7 +138,7 @@ def virtual(file, name):
 
 def by_file(path):
     with TrajectoryFile(path) as file:
-        return file.recording(0)
+        return file.read_recording(0)
 
 
 def by_merge(path):

@@ -6,7 +6,7 @@ from robocas_ms3.core.poses import from_wxyz
 from robocas_ms3.datasets.lerobot.arrays import frame_columns
 from robocas_ms3.datasets.lerobot.schema import FEATURES
 from robocas_ms3.datasets.sources.arrays import episode_arrays
-from robocas_ms3.demos.recordings.motion import Motion, gripper_open
+from robocas_ms3.demos.recordings.motion import Motion, sample_gripper_commands
 from robocas_ms3.evaluation.harness.proprioception import KEYS, WIDTHS, Proprioception
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.registry import DEFAULT_ROBOT, PANDA
@@ -24,8 +24,8 @@ def moving(seed: int) -> Motion:
     qpos[:, 10:] = 0.04
     qpos = qpos.astype(np.float32).astype(np.float64)
     qvel = rng.normal(size=(STEPS, 12)).astype(np.float32).astype(np.float64)
-    opened = gripper_open(MOBILE_PANDA, COMMANDS, np.arange(STEPS), initial_width=0.08)
-    return Motion.of_joints(PANDA, np.tile(from_wxyz(root), (STEPS, 1, 1)), qpos, qvel, opened)
+    opened = sample_gripper_commands(MOBILE_PANDA, COMMANDS, np.arange(STEPS), initial_width=0.08)
+    return Motion.from_joints(PANDA, np.tile(from_wxyz(root), (STEPS, 1, 1)), qpos, qvel, opened)
 
 
 def observed(robots: list[Motion], step: int) -> dict:
