@@ -54,7 +54,7 @@ def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPar
     Joints other than arm and finger joints are at their zero position.
     """
     robot, file = chain.robot, RobotXml(urdf)
-    links = {file.attribute(link, "name"): link for link in file.root.iterfind("link")}
+    links = {file.read_attribute(link, "name"): link for link in file.root.iterfind("link")}
     joints_below: dict[str, list[Joint]] = {}
     for joint in file.joints():
         joints_below.setdefault(joint.parent, []).append(joint)
@@ -62,7 +62,7 @@ def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPar
 
     def visit(name: str, frame: int, pose: Array, slide: Array) -> Iterator[CollisionPart]:
         if name not in links:
-            raise file.error("missing link", f'<link name="{name}">, the child of a joint', "none")
+            raise file.make_error("missing link", f'<link name="{name}">, the child of a joint', "none")
         for geometry, corners, origin in _collision_geometries(links[name], name, file):
             yield CollisionPart(name, frame, pose @ origin, slide, geometry, corners)
         if frame == 6:  # links that hang from link 7 are rigid with the TCP
@@ -75,7 +75,7 @@ def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPar
             child_slide = slide
             if joint.name in robot.finger_joints:
                 if joint.kind != "prismatic":
-                    raise file.error(f"wrong type of finger joint {joint.name!r}", "type prismatic", joint.kind)
+                    raise file.make_error(f"wrong type of finger joint {joint.name!r}", "type prismatic", joint.kind)
                 child_slide = slide + child_pose[:3, :3] @ joint.axis
             yield from visit(joint.child, frame, child_pose, child_slide)
 
@@ -87,7 +87,7 @@ def read_link_pairs(urdf: Path | str, srdf: Path | str, parts: list[CollisionPar
     ignored = {frozenset((joint.parent, joint.child)) for joint in RobotXml(urdf).joints()}
     file = RobotXml(srdf)
     for pair in file.root.iterfind("disable_collisions"):
-        ignored.add(frozenset((file.attribute(pair, "link1"), file.attribute(pair, "link2"))))
+        ignored.add(frozenset((file.read_attribute(pair, "link1"), file.read_attribute(pair, "link2"))))
     return [
         (i, j)
         for i, j in itertools.combinations(range(len(parts)), 2)
@@ -97,7 +97,7 @@ def read_link_pairs(urdf: Path | str, srdf: Path | str, parts: list[CollisionPar
 
 def _collision_geometries(link: Element, name: str, file: RobotXml) -> Iterator[tuple[Any, Array, Array]]:
     for collision in link.iterfind("collision"):
-        origin = file.origin(collision)
+        origin = file.read_origin(collision)
         for shape in collision.iterfind("geometry/*"):
             geometry, corners = _geometry(shape, name, file)
             yield geometry, corners, origin
@@ -105,21 +105,22 @@ def _collision_geometries(link: Element, name: str, file: RobotXml) -> Iterator[
 
 def _geometry(shape: Element, link: str, file: RobotXml) -> tuple[Any, Array]:
     if shape.tag == "mesh":
-        scale = np.array(file.numbers(shape, "scale", 3, "1 1 1"))
-        mesh = file.path.parent / file.attribute(shape, "filename")
+        scale = np.array(file.read_numbers(shape, "scale", 3, "1 1 1"))
+        mesh = file.path.parent / file.read_attribute(shape, "filename")
         hull = mesh.with_name(mesh.name + HULL_SUFFIX)
         corners, faces = _read_hull(hull if hull.is_file() else mesh, scale, link)
         return make_fcl_convex(corners, faces), corners
     if shape.tag == "box":
-        x, y, z = file.numbers(shape, "size", 3)
+        x, y, z = file.read_numbers(shape, "size", 3)
         return fcl.Box(x, y, z), _box_corners(x, y, z)
     if shape.tag == "cylinder":
-        (radius,), (length,) = file.numbers(shape, "radius", 1), file.numbers(shape, "length", 1)
+        (radius,), (length,) = file.read_numbers(shape, "radius", 1), file.read_numbers(shape, "length", 1)
         return fcl.Cylinder(radius, length), _box_corners(2 * radius, 2 * radius, length)
     if shape.tag == "sphere":
-        (radius,) = file.numbers(shape, "radius", 1)
+        (radius,) = file.read_numbers(shape, "radius", 1)
         return fcl.Sphere(radius), _box_corners(2 * radius, 2 * radius, 2 * radius)
-    raise file.error(f"unsupported collision geometry of link {link!r}", "mesh, box, cylinder or sphere", shape.tag)
+    what, expected = f"unsupported collision geometry of link {link!r}", "mesh, box, cylinder or sphere"
+    raise file.make_error(what, expected, shape.tag)
 
 
 def _box_corners(x: float, y: float, z: float) -> Array:

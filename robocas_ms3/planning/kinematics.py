@@ -58,7 +58,7 @@ class ArmChain:
         names = tuple(joint.name for joint in turning)
         if names != robot.arm_joints or not all(joint.axis.tolist() == [0, 0, 1] for joint in turning):
             expected = f"{', '.join(robot.arm_joints)}, each about z"
-            raise file.error(f"wrong arm joints for {robot.uid}", expected, ", ".join(names))
+            raise file.make_error(f"wrong arm joints for {robot.uid}", expected, ", ".join(names))
         self.links, self.hand_in_tcp = [], np.eye(4)
         pending, after_hand = np.eye(4), False
         for joint in chain:
@@ -73,7 +73,8 @@ class ArmChain:
         self.hand_in_tcp = np.linalg.inv(self.hand_in_tcp)
         without = [joint.name for joint in turning if joint.limits is None]
         if without:
-            raise file.error("arm joints without limits", "a <limit> element in each arm joint", ", ".join(without))
+            expected = "a <limit> element in each arm joint"
+            raise file.make_error("arm joints without limits", expected, ", ".join(without))
         self.limits = np.array([joint.limits for joint in turning])
         self.lower, self.upper = self.limits[:, 0] + LIMIT_MARGIN, self.limits[:, 1] - LIMIT_MARGIN
 

@@ -36,7 +36,7 @@ Drive = dict[str, Any]
 
 
 class _GeneratedUrdf:
-    """Descriptor that returns the path of the URDF; the file is generated at the first access."""
+    """Class attribute with the path of the robot's URDF; the first access generates the file."""
 
     def __get__(self, instance: object, owner: type[MobileManipulator]) -> str:
         return str(owner.spec.files().urdf)
@@ -48,10 +48,11 @@ def _keyframe(robot: RobotDescription, arm: tuple[float, ...]) -> Keyframe:
 
 
 class MobileManipulator(BaseAgent):
-    """Base class of the agents. ``qpos``: base x, y, yaw, 7 arm joints, 2 fingers; the root link is on the floor.
+    """Base class of the agents: an arm on a mobile base.
 
-    Control modes ending in ``_base`` have 3 more action dimensions for base x, y and yaw; all others hold the base.
-    Each robot is a subclass with its `RobotSpec` as class argument ``spec``, which registers it with ManiSkill.
+    ``qpos`` has 12 values: base x, y, yaw, 7 arm joints, 2 fingers. The root link is on the floor. Control modes whose
+    name ends in ``_base`` have 3 additional action dimensions for base x, y and yaw; all other modes hold the base.
+    A subclass ``class MyRobot(MobileManipulator, spec=MY_SPEC)`` is registered with ManiSkill.
     """
 
     spec: ClassVar[RobotSpec]
@@ -83,7 +84,7 @@ class MobileManipulator(BaseAgent):
 
     @property
     def _controller_configs(self) -> dict[str, dict[str, Any]]:
-        """Controllers of arm, gripper and base for each control mode."""
+        """Control mode -> configurations of the controllers ``arm``, ``gripper`` and ``base``."""
         # ManiSkill's replay tool checks for the exact class of its own controller
         joint_deltas = JointDeltaControllerConfig if self.scene.gpu_sim_enabled else PDJointPosControllerConfig
         robot, arm, base = self.description, self.arm_drive, self.base_drive
@@ -133,7 +134,10 @@ class MobileManipulator(BaseAgent):
         return [self.camera_config(camera) for camera in self.cameras]
 
     def camera_config(self, camera: CameraSpec) -> CameraConfig:
-        """Return a ManiSkill configuration with the fastest shader; ``sensor_configs`` of ``gym.make`` has priority."""
+        """Convert a camera specification to a ManiSkill configuration with the fastest shader.
+
+        Values in ``sensor_configs`` of ``gym.make`` have priority over this configuration.
+        """
         links = {"world": None, "base": self.description.base_link, "hand": self.description.hand_link}
         if camera.look_at is None:
             pose = sapien.Pose(camera.position)
@@ -162,7 +166,11 @@ class MobileManipulator(BaseAgent):
         self.base_link: Link = links[robot.base_link]
 
     def reset(self, init_qpos: Any = None) -> None:
-        """Stop the robot; with a configuration (12,) or (N, 12), set joint positions and drive targets to it."""
+        """Set all velocities to 0, and joint positions and drive targets to ``init_qpos``.
+
+        Args:
+            init_qpos: (12,) or (N, 12) joint positions, m and rad; None: keep the present positions.
+        """
         super().reset(init_qpos)
         self._clear_velocity_targets()
         if init_qpos is not None:
@@ -173,7 +181,7 @@ class MobileManipulator(BaseAgent):
 
     def set_action(self, action: Any) -> None:
         if not self.scene.gpu_sim_enabled and torch.isnan(action).any():
-            raise ValueError("Action cannot be NaN. Environment received:", action)
+            raise ValueError(f"action with NaN: {action.tolist()}; expected finite numbers")
         self.controller.set_action(action)
 
     def before_simulation_step(self) -> None:
@@ -204,12 +212,12 @@ class MobileManipulator(BaseAgent):
         return cast("RobotController", super().controller)
 
     def _clear_velocity_targets(self) -> None:
-        """Set the velocity targets of the drives to zero in the envs that are being reset."""
+        """Set the velocity targets of all drives to 0 in the envs that are being reset."""
         joints = self.robot.active_joints
         self.robot.set_joint_drive_velocity_targets(torch.zeros(1, len(joints), device=self.device), joints)
 
     def get_proprioception(self) -> dict[str, Any]:
-        """Return the observed quantities (N, D) by name, and the state of the controller."""
+        """Return ``obs["agent"]``: each observed quantity (N, D) by name, and ``controller`` if it has a state."""
         obs: dict[str, Any] = {quantity.name: quantity.observe(self) for quantity in QUANTITIES if quantity.observe}
         state = self.controller.get_state()
         if state:
@@ -218,7 +226,7 @@ class MobileManipulator(BaseAgent):
 
     @property
     def tcp_pose(self) -> Pose:
-        """Pose of the TCP in the world frame: z approach, y closing direction."""
+        """Pose of the TCP in the world frame. z is the approach direction, y the closing direction."""
         return self.tcp.pose
 
     @property
@@ -227,7 +235,7 @@ class MobileManipulator(BaseAgent):
 
     @property
     def tcp_in_arm_base(self) -> Pose:
-        """Pose of the TCP in the frame of the arm's base."""
+        """Pose of the TCP in the frame of the arm's base link."""
         return relative_pose(self.arm_base_link, self.tcp)
 
     @property
@@ -236,9 +244,12 @@ class MobileManipulator(BaseAgent):
         return self.robot.get_qpos()[:, self.description.finger_slice].sum(dim=1)
 
     def is_grasping(self, object: Actor, min_force: float = 0.5, max_angle: float = 85) -> torch.Tensor:
-        """Return whether both fingers press on an object (N,).
+        """Return for each env (N,) whether both fingers press on an object.
 
-        Each contact force is at least ``min_force`` N, within ``max_angle`` degrees of the finger's opening direction.
+        Args:
+            object: the object.
+            min_force: least contact force of each finger, N.
+            max_angle: greatest angle between contact force and opening direction of a finger, degrees.
         """
         grasping = None
         for link, side in ((self.finger1_link, 1.0), (self.finger2_link, -1.0)):
@@ -251,14 +262,14 @@ class MobileManipulator(BaseAgent):
         return grasping
 
     def is_static(self, threshold: float = 0.2) -> torch.Tensor:
-        """Return whether all joints except the fingers move at most at ``threshold`` m/s or rad/s (N,)."""
+        """Return for each env (N,) whether no joint of base and arm is faster than ``threshold`` m/s or rad/s."""
         qvel = self.robot.get_qvel()[:, : self.description.finger_slice.start]
         return qvel.abs().max(dim=1).values <= threshold
 
 
 class RoboCASMobilePanda(MobileManipulator, spec=PANDA):
-    """A Franka Panda with extended finger tips on a mobile base."""
+    """A Franka Panda on a mobile base, with fingers that are 3 cm longer than ManiSkill's (default robot)."""
 
 
 class RoboCASMobilePandaStockFingers(MobileManipulator, spec=STOCK_FINGERS):
-    """A Franka Panda with ManiSkill's standard fingers on a mobile base, for comparison."""
+    """A Franka Panda on a mobile base, with ManiSkill's standard fingers."""

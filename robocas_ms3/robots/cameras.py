@@ -29,7 +29,7 @@ class CameraSpec:
     """Specification of a camera. Camera frame as in SAPIEN: x forward, y left, z up.
 
     Attributes:
-        name: matches `CAMERA_NAME`.
+        name: name of the camera, which matches `CAMERA_NAME`, such as ``side_camera``.
         mount: body that carries the camera: the world, the base link or the hand link of the robot.
         position: position in the frame of the mount, m.
         rpy: roll, pitch and yaw (fixed axes) in the frame of the mount, rad; used if ``look_at`` is None.
@@ -37,10 +37,10 @@ class CameraSpec:
         overview: whether the task places the camera so that it sees the whole scene.
         fov: vertical field of view, rad.
         width, height: pixels.
-        near, far: limits of the depth, m.
+        near, far: least and greatest depth, m.
 
     Raises:
-        ExtensionError: the name does not match; datasets recognize camera folders by their names.
+        ExtensionError: the name does not match `CAMERA_NAME`, by which datasets recognize the folders of cameras.
     """
 
     name: str
@@ -61,7 +61,7 @@ class CameraSpec:
 
     @property
     def parent(self) -> Parent:
-        """Frame of the camera's pose in datasets."""
+        """Frame in which datasets store the pose of this camera."""
         return PARENTS[self.mount]
 
 
@@ -77,7 +77,7 @@ EE_CAMERA = next(camera.name for camera in STANDARD_CAMERAS if camera.mount == "
 
 
 def standard_camera_parent(camera: str) -> Parent:
-    """Return the parent frame of a standard camera by name; ``world`` for all other names."""
+    """Return the frame in which datasets store the pose of a camera: that of a standard camera, else ``world``."""
     for spec in STANDARD_CAMERAS:
         if spec.name == camera:
             return spec.parent

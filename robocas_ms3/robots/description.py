@@ -19,11 +19,12 @@ _PER_JOINT_FIELDS = ("joints", "limits")
 
 @dataclass(frozen=True)
 class Envelope:
-    """Volume of a robot in its start configurations, and its reach; scenes are checked against it without a simulator.
+    """Space that a robot occupies at the start of an episode, and its reach, for checks of scenes without a simulator.
 
     Attributes:
-        body_boxes: boxes around base and lowest arm link, with margin: half sizes in x and y, height over the floor, m.
-        arm_at_start: start configuration -> points along the arm from its base to the TCP, in the root frame, m.
+        body_boxes: boxes around base and lowest arm link, with a margin: half sizes in x and y, height above the
+            floor, m.
+        arm_at_start: start pose of the arm -> points along the arm from its base to the TCP, in the root frame, m.
         shoulder: height of the shoulder joint above the arm's base, m.
         reach: distance from the shoulder joint to the TCP of the stretched arm, m.
     """
@@ -36,23 +37,25 @@ class Envelope:
 
 @dataclass(frozen=True)
 class RobotDescription:
-    """A mobile base with an arm of seven joints and a gripper of two fingers. ``qpos`` is base, arm, fingers.
+    """Names, limits and dimensions of a mobile base with a seven-joint arm and a two-finger gripper.
 
-    The numbers of joints are fixed: recordings, datasets and policies depend on them.
+    ``qpos`` has the joint positions of base, arm and fingers, in this order. Every robot has the same numbers of
+    joints, because recordings, datasets and policies depend on them.
 
     Attributes:
-        base_slice, arm_slice, finger_slice: indices in ``qpos``, the same for every robot.
+        base_slice, arm_slice, finger_slice: indices in ``qpos``; equal for all robots.
         uid: name of the robot in ManiSkill, in `ROBOTS` and in recordings.
         base_joints, arm_joints, finger_joints: active joints in the order of ``qpos``.
         base_limits, arm_limits, finger_limits: lower and upper limit of each joint.
         root_link: fixed link on the floor.
-        base_link: upright link moved by the base's joints.
+        base_link: link that the joints of the base move.
         arm_base_link: root of the arm; planners plan in its frame.
         arm_links: child links of the arm's joints.
         hand_link, tcp_link, finger_links: links of the gripper. TCP: z approach, y closing direction.
         open_finger: joint position of a finger of the open gripper, m.
-        finger_targets: target of a finger at the gripper actions -1 and +1, m.
-        arm_rest, arm_evaluation_start: configurations of the arm.
+        finger_targets: target position of a finger at the gripper actions -1 and +1, m.
+        arm_rest, arm_evaluation_start: joint positions of the arm at the start of an episode, rad, for ``robot_start``
+            ``rest`` and ``evaluation``.
         arm_velocity_limit, arm_acceleration_limit: limits of every arm joint in planned motions, rad/s and rad/s^2.
         base_link_height: height of the base link above the floor, m.
         arm_base_above_base_link: height of the arm's base above the base link, m.
@@ -61,11 +64,11 @@ class RobotDescription:
         finger_extension: extra length of the fingers, m.
         finger_friction: friction coefficient of the finger tips.
         inverse_kinematics: import path of a closed-form solver for the arm (`planning.analytic`).
-        envelope: occupied volume; None: scenes are not checked.
+        envelope: occupied space and reach; None: scenes are not checked for this robot.
         cameras: default cameras; a task configuration may change them and add others.
 
     Raises:
-        RobocasError: the number of joints is wrong.
+        RobocasError: a field has the wrong number of joints or links.
     """
 
     base_slice: ClassVar[slice] = slice(0, 3)
@@ -112,7 +115,7 @@ class RobotDescription:
         for name, size in sizes.items():
             if len(getattr(self, name)) != size:
                 where, found = f"{self.uid}, {name}", len(getattr(self, name))
-                raise RobocasError("unsupported number of joints", where=where, expected=size, found=found)
+                raise RobocasError("wrong number of entries", where=where, expected=size, found=found)
 
     @property
     def joints(self) -> tuple[str, ...]:

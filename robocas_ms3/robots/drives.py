@@ -15,7 +15,7 @@ ARM_RESET_DISTANCE, BASE_RESET_DISTANCE = 0.3, 0.02
 
 
 class BatchedDrives(PDJointPosController):
-    """Joint position controller that writes drive targets on a GPU without synchronizing with the device."""
+    """Joint position controller that writes drive targets to GPU buffers without waiting for the GPU."""
 
     def set_drive_targets(self, targets: torch.Tensor) -> None:
         """Set the drive targets (N, joints) in rad or m of all joints in all envs."""
@@ -25,14 +25,14 @@ class BatchedDrives(PDJointPosController):
             super().set_drive_targets(targets)
 
     def _write(self, buffer: Any, values: torch.Tensor) -> None:
-        """Write values (N, joints) to a GPU buffer; ManiSkill's index by a mask would synchronize with the device."""
+        """Write values (N, joints) to a GPU buffer. ManiSkill's index by a mask would wait for the GPU."""
         buffer.torch()[self.articulation.get_joint_target_indices(self.joints)] = values
 
 
 class DirectDrives(BatchedDrives):
-    """Controller that works on native arrays (`core.arrays`), and on a CPU without ManiSkill's joint wrappers.
+    """Controller that writes drive targets to SAPIEN joints on a CPU, and works on native arrays (`core.arrays`).
 
-    These wrappers would take longer than the physics.
+    ManiSkill's joint wrappers would take longer than the physics.
     """
 
     action_space_low: Any
@@ -92,7 +92,7 @@ class InterpolatedDrives(DirectDrives):
         self._step = 0
 
     def _interpolate(self, start: Any, end: Any) -> None:
-        """Compute the drive targets of a control step, after ``start`` (N, joints) up to ``end``; native arrays."""
+        """Set the drive targets of the next control step: from ``start`` (N, joints), excluded, to ``end``."""
         targets = torch.lerp(as_tensor(start), as_tensor(end), self._fractions)  # (steps, N, joints)
         self._remaining_targets = list(targets) if self.scene.gpu_sim_enabled else targets[:, 0].tolist()
         self._step = 0

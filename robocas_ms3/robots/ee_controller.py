@@ -29,7 +29,7 @@ from robocas_ms3.core.arrays import (
 )
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.robots.drives import ARM_RESET_DISTANCE, InterpolatedDrives
-from robocas_ms3.robots.ee_deltas import ee_delta_target
+from robocas_ms3.robots.ee_deltas import apply_ee_delta
 from robocas_ms3.robots.kinematics import SerialChain
 
 BODY_FRAME = "body_translation:body_aligned_body_rotation"
@@ -38,12 +38,15 @@ EE_MAX_LAG = (0.1, 0.5)
 
 
 def relative_pose(frame: Link, link: Link) -> Pose:
-    """Return the poses (N,) of a link in the frame of another; SAPIEN is ten times faster than tensors on a CPU."""
-    return Pose(raw_pose=as_tensor(_relative_pose(frame, link)))
+    """Return the poses (N,) of ``link`` in the frame of the link ``frame``."""
+    return Pose(raw_pose=as_tensor(_relative_pose_array(frame, link)))
 
 
-def _relative_pose(frame: Link, link: Link) -> Any:
-    """Return the poses (N, 7) of a link in the frame of another as native arrays."""
+def _relative_pose_array(frame: Link, link: Link) -> Any:
+    """Return the poses (N, 7) of ``link`` in the frame of the link ``frame`` as a native array.
+
+    On a CPU, SAPIEN is ten times faster than tensors.
+    """
     if frame.scene.gpu_sim_enabled:
         base, pose = frame.pose, link.pose  # ManiSkill's pose product synchronizes with the GPU
         inverse = torch.cat([base.q[:, :1], -base.q[:, 1:]], dim=1)
@@ -56,9 +59,9 @@ def _relative_pose(frame: Link, link: Link) -> Any:
 
 
 class _ArmChainController(PDEEPoseController):
-    """ManiSkill's end-effector controller with a `SerialChain` for inverse kinematics.
+    """ManiSkill's end-effector controller with inverse kinematics by `SerialChain`.
 
-    ManiSkill's solver ignores joint limits on a CPU. On a GPU it synchronizes with the device and does one iteration.
+    ManiSkill's solver ignores joint limits on a CPU. On a GPU it waits for the device and does only one iteration.
     """
 
     def _initialize_joints(self) -> None:
@@ -72,22 +75,27 @@ class _ArmChainController(PDEEPoseController):
         self._chain = SerialChain(self.config.urdf_path, self.root_link.name, self.ee_link.name, device)
         names = tuple(joint.name for joint in self.joints)
         if names != self._chain.joint_names:
-            what, expected = "the controlled joints differ from the arm's joints", ", ".join(self._chain.joint_names)
+            expected = ", ".join(self._chain.joint_names)
+            what = "the joints of the controller differ from the joints of the arm's URDF"
             raise RobocasError(what, where=self.config.urdf_path, expected=expected, found=", ".join(names))
         limits = as_double(to_native(self.articulation.get_qlimits()[0, self.active_joint_indices]))
         self._lower, self._upper = limits[:, 0], limits[:, 1]
 
     def _solve(self, target: Any, qpos: Any) -> tuple[Any, Any]:
-        """Return joint positions (N, joints) near ``qpos`` for targets (N, 7), and whether each is reached (N,)."""
+        """Solve inverse kinematics for target poses (N, 7), starting from joint positions ``qpos`` (N, joints).
+
+        Returns:
+            Joint positions (N, joints), and for each env (N,) whether they reach the target.
+        """
         target = as_double(target)
         qpos, solved = self._chain.inverse(target[:, :3], target[:, 3:], as_double(qpos), self._lower, self._upper)
         return as_float(qpos), solved
 
 
 class RoboCASEEPoseController(InterpolatedDrives, _ArmChainController):
-    """End-effector pose control: deltas in the end effector's frame, or absolute poses in the arm's base frame.
+    """End-effector controller: deltas in the end effector's frame, or absolute poses in the arm's base frame.
 
-    Differences to ManiSkill's controller:
+    Differences from ManiSkill's controller:
 
     - A positive angle is a positive rotation.
     - Body-frame deltas also work on a GPU: the target pose in the base frame is computed before inverse kinematics.
@@ -104,18 +112,21 @@ class RoboCASEEPoseController(InterpolatedDrives, _ArmChainController):
     def _target_from_action(self, reference: Any, action: Any) -> Any:
         """Convert actions (N, 6) in m and rad to target poses (N, 7) in the arm's base frame.
 
-        Actions are deltas to the pose ``reference`` (N, 7), or absolute poses if it is None.
+        Actions are deltas that are applied to the poses ``reference`` (N, 7), or absolute poses if it is None.
         """
         if reference is not None:
-            return concatenate([*ee_delta_target(reference[:, :3], reference[:, 3:], action)])
+            return concatenate([*apply_ee_delta(reference[:, :3], reference[:, 3:], action)])
         return concatenate([action[:, :3], rotations.from_euler(action[:, 3:6])])
 
     sets_target_qvel = True
 
     def set_action(self, action: Any) -> None:
-        """Set drive targets for the target pose; hold the current position if inverse kinematics fails."""
+        """Set the drive targets for the target pose of an action (N, size).
+
+        An env whose target pose inverse kinematics does not reach holds its current joint positions.
+        """
         action = self._scale_action(action)
-        reference = self._reference_pose() if self.config.use_delta else None
+        reference = self._reference_pose_array() if self.config.use_delta else None
         last = now = self._current_qpos()
         if self._target_qpos is not None:
             last = to_native(self._target_qpos)
@@ -123,7 +134,7 @@ class RoboCASEEPoseController(InterpolatedDrives, _ArmChainController):
         wanted = self._target_from_action(reference, action)
         target, solved = self._solve(wanted, now)
         if not known_all_true(solved):
-            stay = self._reference_pose() if reference is None else reference
+            stay = self._reference_pose_array() if reference is None else reference
             target, wanted = where(solved[:, None], target, now), where(solved[:, None], wanted, stay)
         self._target_pose, self._target_qpos = Pose(raw_pose=as_tensor(wanted)), as_tensor(target)
         if self.config.use_delta:
@@ -133,16 +144,16 @@ class RoboCASEEPoseController(InterpolatedDrives, _ArmChainController):
             self._set_targets(target, torch.zeros_like(as_tensor(target)))
 
     def _set_targets(self, targets: Any, velocities: Any) -> None:
-        """Set position and velocity targets of the drives; velocity targets avoid a tracking lag."""
+        """Set position and velocity targets (N, joints) of the drives. Velocity targets avoid a tracking lag."""
         self.set_drive_targets(targets)
         self.set_drive_velocities(velocities)
 
     def reference_pose(self) -> Pose:
-        """Return the poses (N,) in the arm's base frame to which the next deltas are added."""
-        return Pose(raw_pose=as_tensor(self._reference_pose()))
+        """Return the poses (N,) in the arm's base frame to which the next action, a delta, is applied."""
+        return Pose(raw_pose=as_tensor(self._reference_pose_array()))
 
-    def _reference_pose(self) -> Any:
-        now = _relative_pose(cast("Link", self.root_link), self.ee_link)
+    def _reference_pose_array(self) -> Any:
+        now = _relative_pose_array(cast("Link", self.root_link), self.ee_link)
         if not self.config.use_target or self._target_pose is None:
             return now
         max_distance, max_angle = EE_MAX_LAG
@@ -157,6 +168,6 @@ class RoboCASEEPoseController(InterpolatedDrives, _ArmChainController):
 
 @dataclass
 class RoboCASEEPoseControllerConfig(PDEEPoseControllerConfig):
-    """Configuration of a ``RoboCASEEPoseController``; rotation bounds must be symmetric."""
+    """Configuration of a ``RoboCASEEPoseController``. The rotation bounds must be symmetric."""
 
     controller_cls = RoboCASEEPoseController

@@ -20,16 +20,17 @@ POSITION_SCALE, ROTATION_SCALE = 0.1, 0.5  # m and rad at |action| = 1
 def to_ee_delta_action(
     translation: np.ndarray, rotation: np.ndarray | Rotation, *, euler: str | None = None
 ) -> np.ndarray:
-    """Convert a TCP motion in the TCP frame to the arm's part of a ``pd_ee_delta_pose`` action.
+    """Convert a motion of the TCP to the first six values of a ``pd_ee_delta_pose`` action.
 
     Args:
-        translation: (..., 3) m.
-        rotation: (..., 3) rotation vectors, rad; or Euler angles with ``euler``; or a scipy ``Rotation``.
-        euler: scipy's name of the Euler convention if ``rotation`` has Euler angles: ``"XYZ"`` intrinsic (ManiSkill),
-            ``"xyz"`` fixed axes (RoboCAS datasets).
+        translation: (..., 3) m, in the present TCP frame.
+        rotation: (..., 3) rotation vectors, rad, in the present TCP frame; or Euler angles, rad, with ``euler``; or a
+            scipy ``Rotation``.
+        euler: convention of the Euler angles in scipy's notation: ``"XYZ"`` intrinsic (ManiSkill), ``"xyz"`` about
+            fixed axes (RoboCAS datasets).
 
     Returns:
-        Actions (..., 6) float32, not clipped; a motion beyond +-1 exceeds one step.
+        Actions (..., 6) float32, not clipped. A value beyond +-1 cannot be executed in one step.
     """
     translation = np.asarray(translation, dtype=np.float64)
     if not isinstance(rotation, Rotation):
@@ -39,16 +40,16 @@ def to_ee_delta_action(
     return np.concatenate([translation / POSITION_SCALE, angles / ROTATION_SCALE], axis=-1).astype(np.float32)
 
 
-def ee_delta_target(position: Array, quaternion: Array, delta: Array) -> tuple[Array, Array]:
-    """Apply a motion in the end-effector frame to a pose of the end effector in a parent frame.
+def apply_ee_delta(position: Array, quaternion: Array, delta: Array) -> tuple[Array, Array]:
+    """Move poses of the end effector by motions in the end effector's frame.
 
     Args:
-        position: (N, 3) m, of the end effector in the parent frame.
-        quaternion: (N, 4) wxyz.
+        position: (N, 3) position of the end effector in a parent frame, m.
+        quaternion: (N, 4) orientation of the end effector in the parent frame, wxyz.
         delta: (N, 6) translation in m and intrinsic XYZ Euler angles in rad, in the end effector's frame.
 
     Returns:
-        Position (N, 3) and quaternion (N, 4) of the target in the parent frame.
+        Position (N, 3) and quaternion wxyz (N, 4) of the moved end effector in the parent frame.
     """
     rotation = rotations.from_euler(delta[:, 3:6])
     return position + rotations.rotate_float64(quaternion, delta[:, :3]), rotations.multiply(quaternion, rotation)

@@ -32,13 +32,13 @@ BASE_SCALE = (0.025, 0.025, 0.025)  # m, m, rad, base joints: 0.5 m/s at 20 Hz
 
 @dataclass
 class JointDeltaControllerConfig(PDJointPosControllerConfig):
-    """Configuration of joint delta control on a GPU; see ``BatchedDrives``."""
+    """Configuration of a joint delta controller on a GPU, `BatchedDrives`."""
 
     controller_cls = BatchedDrives
 
 
 class FingersController(DirectDrives, PDJointPosMimicController):
-    """Faster version of ManiSkill's mimic controller: the same absolute position for all fingers."""
+    """Gripper controller that sends one absolute position to all fingers; faster than ManiSkill's mimic controller."""
 
     def set_action(self, action: Any) -> None:
         """Set the target position (N, 1) of all fingers."""
@@ -49,13 +49,13 @@ class FingersController(DirectDrives, PDJointPosMimicController):
 
 @dataclass
 class FingersControllerConfig(PDJointPosMimicControllerConfig):
-    """Configuration of a ``FingersController``; joints mimic with factor 1."""
+    """Configuration of a ``FingersController``. All fingers have the same position (mimic factor 1)."""
 
     controller_cls = FingersController
 
 
 class SmoothJointPosController(InterpolatedDrives):
-    """Joint position controller with interpolated targets; positions are absolute or relative to the last target.
+    """Joint position controller that interpolates drive targets. Actions are positions, or deltas of the last target.
 
     Without interpolation, targets at 5 Hz would start and stop the arm in every step at twice the planned velocity.
     ManiSkill's ``interpolate`` starts from the current position instead of the last target, which causes more jerk.
@@ -69,7 +69,7 @@ class SmoothJointPosController(InterpolatedDrives):
         self._low, self._high = limits[:, 0], limits[:, 1]
 
     def set_action(self, action: Any) -> None:
-        """Set the target positions (N, joints) in rad or m for the end of the control step."""
+        """Set the positions (N, joints) at the end of the control step, in rad or m, or their deltas."""
         action = self._scale_action(action)
         assert self._target_qpos is not None, "the controller has not been reset"
         now, last = self._current_qpos(), to_native(self._target_qpos)
@@ -94,7 +94,7 @@ class SmoothJointPosControllerConfig(PDJointPosControllerConfig):
 
 
 class HoldJointsController(DirectDrives):
-    """Controller that holds joints at their positions after a reset; its action has 0 dimensions."""
+    """Controller without actions that holds joints at the positions that they have after a reset."""
 
     def _initialize_action_space(self) -> None:
         self.single_action_space = spaces.Box(np.empty(0, np.float32), np.empty(0, np.float32))
@@ -109,7 +109,7 @@ class HoldJointsController(DirectDrives):
             self.set_drive_targets(held)
 
     def set_action(self, action: Any) -> None:
-        """Keep the drive targets; if the simulation state was set since, hold the current positions."""
+        """Keep the drive targets. If the simulation state was set since the last step, hold the current positions."""
         assert self._target_qpos is not None, "the controller has not been reset"
         now, held = self._current_qpos(), to_native(self._target_qpos)
         self._target_qpos = as_tensor(where(abs(held - now) > BASE_RESET_DISTANCE, now, held))
@@ -118,7 +118,7 @@ class HoldJointsController(DirectDrives):
 
 @dataclass
 class HoldJointsControllerConfig(PDJointPosControllerConfig):
-    """Configuration of a ``HoldJointsController`` without bounds."""
+    """Configuration of a ``HoldJointsController``."""
 
     lower: None = None
     upper: None = None
@@ -133,16 +133,16 @@ State = Mapping[str, Mapping[str, Any]]
 
 
 class RobotController(CombinedController):
-    """Combined controller that can reset a subset of the envs.
+    """Controller of arm, gripper and base, which can reset a subset of the envs.
 
-    ManiSkill clears its reset mask before it resets the controllers, which would reset all envs.
+    ManiSkill clears its reset mask before it resets the controllers, which would reset the controllers of all envs.
     """
 
     reset_only: torch.Tensor | None = None
     """Indices of the envs of the next reset; None: all."""
 
     def reset(self) -> None:
-        """Set the targets to the current joint positions in the envs that are being reset."""
+        """Set the targets to the current joint positions in the envs that are being reset (`reset_only`)."""
         mask = self.scene._reset_mask
         if self.reset_only is not None:
             self.scene._reset_mask = torch.zeros_like(mask)
@@ -153,7 +153,7 @@ class RobotController(CombinedController):
             self.scene._reset_mask, self.reset_only = mask, None
 
     def targets(self) -> dict[str, dict[str, torch.Tensor]]:
-        """Return a copy of the targets to which the next actions are relative, as `State`."""
+        """Return a copy of the present targets, to which deltas of the next action are added, as `State`."""
         found: dict[str, dict[str, torch.Tensor]] = {}
         for name, controller in self.controllers.items():
             part, kept = cast("Any", controller), found.setdefault(name, {})
@@ -164,19 +164,24 @@ class RobotController(CombinedController):
         return found
 
     def set_targets(self, state: State | None = None, env_idx: torch.Tensor | None = None) -> None:
-        """Set the targets (`targets`) of envs; missing targets are set to the current positions."""
+        """Set the targets of some envs.
+
+        Args:
+            state: result of `targets`; a target that it does not have is set to the current position.
+            env_idx: indices (E,) of the envs; None: all.
+        """
         envs = slice(None) if env_idx is None else env_idx
         for name, controller in self.controllers.items():
             part, given = cast("Any", controller), (state or {}).get(name, {})
             if part._target_qpos is not None:
                 target = given.get("target_qpos", part.qpos[envs])
-                part._target_qpos = _put(part._target_qpos, envs, target)
+                part._target_qpos = _set_rows(part._target_qpos, envs, target)
             if getattr(part, "_target_pose", None) is not None:
                 target = given["target_pose"] if "target_pose" in given else part.ee_pose_at_base.raw_pose[envs]
-                part._target_pose = Pose(raw_pose=_put(part._target_pose.raw_pose, envs, target))
+                part._target_pose = Pose(raw_pose=_set_rows(part._target_pose.raw_pose, envs, target))
 
 
-def _put(values: torch.Tensor, envs: Any, rows: Any) -> torch.Tensor:
+def _set_rows(values: torch.Tensor, envs: Any, rows: Any) -> torch.Tensor:
     values = values.clone()
     values[envs] = torch.as_tensor(rows, dtype=values.dtype, device=values.device).reshape(-1, values.shape[1])
     return values

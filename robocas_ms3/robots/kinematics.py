@@ -27,15 +27,15 @@ IK_CONVERGED = 1e-5  # error (m and rad combined) at which the iteration stops
 
 
 class SerialChain:
-    """Chain of revolute joints between two links of a robot, read from its URDF.
+    """Inverse kinematics of the revolute joints between two links of a URDF.
 
-    Controllers use this class with tensors or NumPy arrays. The planner uses `planning.kinematics.ArmChain`, datasets
-    use `description_file.tcp_and_arm_base_poses`. All arrays are float64: float32 and TF32 errors exceed the tolerance.
+    Only controllers use this class. The planner uses `planning.kinematics.ArmChain`, and datasets use
+    `description_file.tcp_and_arm_base_poses`. All arrays are float64: float32 and TF32 errors exceed the tolerance.
 
     Args:
-        urdf: the robot.
-        root, tip: names of the links. Poses are of the tip in the root's frame.
-        device: device of the tensors; None: NumPy arrays are used.
+        urdf: the file.
+        root, tip: names of the links. All poses are poses of the tip in the frame of the root.
+        device: device of the tensors; None: the class uses NumPy arrays.
 
     Attributes:
         joint_names: names of the n joints from root to tip.
@@ -52,10 +52,11 @@ class SerialChain:
         for joint in read_joints(Path(urdf), root, tip):
             if joint.kind not in ("fixed", "revolute"):
                 where = f"{urdf}, {joint.name}"
-                raise RobocasError("unsupported joint", where=where, expected="fixed or revolute", found=joint.kind)
+                what, expected = "unsupported type of joint", "fixed or revolute"
+                raise RobocasError(what, where=where, expected=expected, found=joint.kind)
             pending = pending @ joint.origin
             if joint.kind == "revolute":
-                to_axis = _frame_about(joint.axis)
+                to_axis = _rotation_with_z_axis(joint.axis)
                 names.append(joint.name)
                 fixed.append(pending @ to_axis)
                 pending = to_axis.T
@@ -68,10 +69,10 @@ class SerialChain:
     def inverse(
         self, position: Array, quaternion: Array, qpos: Array, lower: Array, upper: Array
     ) -> tuple[Array, Array]:
-        """Solve inverse kinematics within joint limits, near given joint positions.
+        """Solve inverse kinematics within joint limits for N envs, starting from given joint positions.
 
         Levenberg-Marquardt with damping proportional to the squared error (Sugihara, IEEE T-RO 27(5), 2011). A joint at
-        a limit is excluded from steps that would exceed the limit. Rows are independent of each other.
+        a limit does not take part in a step that would exceed the limit. Envs are independent of each other.
 
         Args:
             position: (N, 3) m, target positions of the tip in the root's frame.
@@ -81,7 +82,8 @@ class SerialChain:
             lower, upper: (n,) rad, joint limits.
 
         Returns:
-            Joint positions (N, n) within the limits, and whether each reaches its target within ``IK_TOLERANCE`` (N,).
+            Joint positions (N, n), rad, within the limits. For each env (N,) whether the error is below
+            ``IK_TOLERANCE``.
         """
         to_target = (quaternion @ self._quotient).reshape(-1, 4, 4)
         position, qpos, lower, upper = position[..., None], qpos[..., None], lower[:, None], upper[:, None]
@@ -97,7 +99,7 @@ class SerialChain:
             if iteration == IK_ITERATIONS or known_all_false(moving):
                 return qpos[..., 0], square[:, 0, 0] < IK_TOLERANCE**2
             error = error * moving / clamp(square**0.5 / IK_MAX_ERROR, 1.0, np.inf)
-            twists = _twists(frames)
+            twists = _transposed_jacobian(frames)
             room = where(matmul(twists, error) < 0, qpos - lower, upper - qpos)
             twists = twists * (room > 0)
             damping = (IK_DAMPING * square + IK_MIN_DAMPING) * self._identity
@@ -106,7 +108,7 @@ class SerialChain:
             iteration += 1
 
     def _frames(self, qpos: Array) -> Array:
-        """Return poses of joints and the tip, and left product matrices of their orientations (n + 1, 2, N, 4, 4)."""
+        """Return two matrices for each joint and the tip, (n + 1, 2, N, 4, 4): pose, quaternion's left product matrix."""
         rows, count = len(qpos), qpos.shape[1] + 1
         angles = qpos @ self._angles + self._shift
         sines = torch.sin(angles) if isinstance(angles, Tensor) else np.sin(angles)
@@ -146,8 +148,8 @@ def _joint_constants(fixed: list[NDArray[np.float64]]) -> tuple[NDArray[np.float
     return angles, shift, weights.reshape(4 * count, -1), constant.reshape(-1)
 
 
-def _frame_about(z: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a transform (4, 4) that rotates the z axis onto the unit vector ``z``."""
+def _rotation_with_z_axis(z: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a rotation as transform (4, 4) whose z axis is the unit vector ``z``."""
     x = np.cross([1, 0, 0] if abs(z[1]) > 0.9 else [0, 1, 0], z)
     x /= np.linalg.norm(x)
     pose = np.eye(4)
@@ -159,8 +161,8 @@ _QUOTIENT = (left_product_matrix(np.eye(4)) @ np.diag([1, -1, -1, -1])).reshape(
 """Constant that converts quaternions a (N, 4) to matrices (N, 16) of the map b -> a * conjugate(b)."""
 
 
-def _twists(frames: Array) -> Array:
-    """Return the motions (N, n, 6) of the tip in m and rad per rad of each joint (transposed Jacobian)."""
+def _transposed_jacobian(frames: Array) -> Array:
+    """Return the transposed Jacobian (N, n, 6): translation (m) and rotation (rad) of the tip per rad of each joint."""
     poses = frames[:, 0, :, :3]
     axes, points = poses[:-1, ..., 2], poses[..., 3]
     return concatenate([_cross(axes, points[-1:] - points[:-1]), axes]).swapaxes(0, 1)

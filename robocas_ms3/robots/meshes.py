@@ -19,7 +19,11 @@ Box = tuple[Sequence[float], Sequence[float], Sequence[float]]
 
 
 def decimate_glb(source: Path, target: Path, triangles: int) -> int:
-    """Write a decimated copy of a GLB file with its materials; return the resulting number of triangles."""
+    """Write a copy of a GLB file with about ``triangles`` triangles and the same materials.
+
+    Returns:
+        Number of triangles of the copy.
+    """
     scene = trimesh.load(source, force="scene")
     assert isinstance(scene, trimesh.Scene)
     total = sum(len(g.faces) for g in scene.geometry.values())
@@ -50,8 +54,8 @@ def decimate_glb(source: Path, target: Path, triangles: int) -> int:
 def write_boxes_glb(target: Path, boxes: Sequence[Box]) -> None:
     """Write coloured boxes as one GLB file.
 
-    For a URDF ``<box>`` with a material, SAPIEN's loader creates a render material, which fails without a renderer. A
-    mesh file is only read if a renderer exists.
+    SAPIEN cannot load a URDF ``<box>`` with a material if there is no renderer. It can load a URDF with a mesh file,
+    because it does not read the file then.
     """
     scene = trimesh.Scene()
     for i, (size, centre, colour) in enumerate(boxes):

@@ -25,14 +25,14 @@ class ArraySpec:
 
     Attributes:
         name: key of the array.
-        dtype: data type; ``str`` is numpy's fixed-width unicode.
-        shape: shape; ``"T"`` is the number of steps.
+        dtype: data type; ``str`` is NumPy's fixed-width unicode.
+        shape: shape; ``"T"`` stands for the number of steps of the episode.
         unit: unit of the values.
         meaning: description for users.
         quaternion: whether rows are unit quaternions xyzw.
         embedding: whether rows are sentence embeddings, which a dataset may omit.
         limits: smallest and largest valid value; None: unlimited.
-        optional: whether a dataset may omit the array because of its version or format.
+        optional: whether a dataset of an older version, or of another format, may omit the array.
     """
 
     name: str
@@ -57,7 +57,7 @@ class ArraySpec:
 
 @dataclass(frozen=True)
 class Quantity(ArraySpec):
-    """Specification of a quantity of the robot per step.
+    """Specification of a quantity of the robot that has one value or vector per step.
 
     Attributes:
         observe: returns the quantity (N, ...) of an agent (`agent.MobileManipulator`), for ``obs["agent"]``; None: not
@@ -78,9 +78,8 @@ class Quantity(ArraySpec):
 
     def __post_init__(self) -> None:
         if self.optional and self.lerobot_feature:
-            raise ValueError(
-                f"optional quantity {self.name!r} must not have a LeRobot feature, found {self.lerobot_feature!r}"
-            )
+            what = f"optional quantity {self.name!r} with the LeRobot feature {self.lerobot_feature!r}"
+            raise ValueError(f"{what}: set optional=False or remove lerobot_feature")
 
     @property
     def width(self) -> int:
@@ -93,7 +92,10 @@ class Quantity(ArraySpec):
 
 
 def to_continuous_xyzw(poses: Array) -> Array:
-    """Return the orientations of poses (T, 4, 4) as quaternions xyzw (T, 4), without sign flips; w >= 0 in row 0."""
+    """Convert the rotations of poses (T, 4, 4) to quaternions xyzw (T, 4) without sign flips between rows.
+
+    The first row has w >= 0.
+    """
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
     flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
     quaternions[1:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
@@ -276,7 +278,7 @@ QUANTITIES: tuple[Quantity, ...] = (
 
 
 def lerobot_features() -> dict[str, list[Quantity]]:
-    """Return LeRobot feature -> its quantities in order."""
+    """Return the quantities that each LeRobot feature contains, in the order of its columns."""
     found: dict[str, list[Quantity]] = {}
     for quantity in QUANTITIES:
         if quantity.lerobot_feature:
@@ -285,7 +287,7 @@ def lerobot_features() -> dict[str, list[Quantity]]:
 
 
 def feature_columns(feature: str) -> dict[str, slice]:
-    """Return quantity name -> columns in a LeRobot feature (T, D)."""
+    """Return the columns of each quantity, by name, in a LeRobot feature (T, D)."""
     columns, first = {}, 0
     for quantity in lerobot_features()[feature]:
         columns[quantity.name] = slice(first, first := first + quantity.width)

@@ -14,11 +14,11 @@ from robocas_ms3.robots.urdf import RobotFiles, make_robot_files
 
 @dataclass(frozen=True)
 class RobotSpec:
-    """Registry entry of a robot; importing it does not import a simulator.
+    """Registry entry of a robot. It can be imported without a simulator.
 
     Attributes:
-        description: names, limits and dimensions; its ``uid`` is the name in the registry.
-        files: function that returns the URDF files and generates missing ones.
+        description: names, limits and dimensions; ``description.uid`` is the name of the robot in the registry.
+        files: function without arguments that generates missing URDF files and returns their paths.
         agent: import path of the ManiSkill agent, a subclass of `robots.agent.MobileManipulator`.
     """
 
@@ -43,9 +43,9 @@ def find_robot(name: str | None, *, where: object = "robot") -> RobotSpec:
     """Return the registered robot of this name, or the default robot for None."""
     spec = ROBOTS.find(name or DEFAULT_ROBOT, where=where)
     if spec.description.uid != (name or DEFAULT_ROBOT):
-        fix = "Name the entry point as the uid of its description."
+        fix = "Give the entry point the name uid of the robot's description."
         raise ExtensionError(
-            "the entry point's name differs from the robot's uid",
+            "the name of the entry point differs from the uid of the robot",
             where=where,
             expected=spec.description.uid,
             found=name,

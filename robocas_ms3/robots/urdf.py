@@ -58,9 +58,9 @@ class RobotFiles:
 
 
 def make_robot_files(finger_extension: float = c.finger_extension) -> RobotFiles:
-    """Return the robot's files; generate missing files.
+    """Return the paths of the default robot's files, which are generated if they are missing.
 
-    The name of the folder is a hash of all inputs, including the code of this generator.
+    The folder is in the cache of the user. Its name is a hash of all inputs and of the code of this generator.
 
     Args:
         finger_extension: extra length of the fingers in m; 0: ManiSkill's standard fingers.
@@ -87,7 +87,7 @@ def _panda_folder() -> Path:
         raise RobocasError("mani_skill is not installed", fix=_INSTALL)
     folder = Path(spec.submodule_search_locations[0]) / "assets" / "robots" / "panda"
     if not (folder / "panda_v2.urdf").is_file():
-        raise RobocasError("mani_skill's Panda is missing", where=folder / "panda_v2.urdf", fix=_INSTALL)
+        raise RobocasError("missing file of mani_skill's Panda", where=folder / "panda_v2.urdf", fix=_INSTALL)
     return folder
 
 
@@ -111,7 +111,7 @@ def _generate(folder: Path, source: Path, finger_extension: float) -> None:
     visual.mkdir()
     collision.mkdir()
     panda = _parse(source / "panda_v2.urdf")
-    tips = _adapt_fingers(panda, finger_extension)
+    tips = _adapt_finger_tips(panda, finger_extension)
     for mesh in panda.iterfind(".//collision/geometry/mesh"):
         # the planner reads the convex hull next to each mesh
         path = source / mesh.attrib["filename"]
@@ -137,7 +137,7 @@ def _generate(folder: Path, source: Path, finger_extension: float) -> None:
         shown = (centre[0], centre[1] * 0.95, centre[2])  # 0.1 mm inwards, in front of the rubber in the same plane
         write_boxes_glb(folder / name, [(size, shown, _TIP_COLOUR)])
         _find(panda, "link", link).insert(1, _visual(name))
-    _write(_with_base(panda), folder / f"{c.uid}.urdf")
+    _write(_add_mobile_base(panda), folder / f"{c.uid}.urdf")
 
     srdf = _parse(source / "panda_v2.srdf")
     for pair in srdf.findall("disable_collisions"):
@@ -149,8 +149,12 @@ def _generate(folder: Path, source: Path, finger_extension: float) -> None:
     _write(srdf, folder / f"{c.uid}.srdf")
 
 
-def _adapt_fingers(panda: Element, extension: float) -> dict[str, tuple[tuple[float, ...], tuple[float, ...]]]:
-    """Move the TCP and add the tips' collision boxes; return size and centre of each finger's tip box."""
+def _adapt_finger_tips(panda: Element, extension: float) -> dict[str, tuple[tuple[float, ...], tuple[float, ...]]]:
+    """Move the TCP and add a collision box to the tip of each finger.
+
+    Returns:
+        Finger link -> size (3,) and centre (3,) of the box, m.
+    """
     _origin(panda, "panda_hand_tcp_joint").set("xyz", f"0 0 {c.stock_tcp_in_hand + extension:g}")
     tips = {}
     if extension == 0:
@@ -167,8 +171,8 @@ def _adapt_fingers(panda: Element, extension: float) -> dict[str, tuple[tuple[fl
     return tips
 
 
-def _with_base(panda: Element) -> Element:
-    """Put the arm on the mobile base: root, three virtual joints, base link, fixed arm base."""
+def _add_mobile_base(panda: Element) -> Element:
+    """Add the mobile base below the arm: root link, three base joints, base link, fixed joint to the arm's base."""
     robot = Element("robot", name=c.uid)
     # reduced-coordinate solvers become unstable for mass ratios over a few hundred along a chain
     for link in ("root", "base_x_link", "base_y_link"):
@@ -216,14 +220,14 @@ def _visual(filename: str) -> Element:
 
 def _box_collision(size: tuple[float, ...], centre: tuple[float, ...]) -> Element:
     collision = Element("collision")
-    SubElement(collision, "origin", rpy="0 0 0", xyz=_text(centre))
-    SubElement(SubElement(collision, "geometry"), "box", size=_text(size))
+    SubElement(collision, "origin", rpy="0 0 0", xyz=_format_numbers(centre))
+    SubElement(SubElement(collision, "geometry"), "box", size=_format_numbers(size))
     return collision
 
 
 def _inertial(mass: float, diagonal: tuple[float, ...], centre: tuple[float, ...]) -> Element:
     inertial = Element("inertial")
-    SubElement(inertial, "origin", rpy="0 0 0", xyz=_text(centre))
+    SubElement(inertial, "origin", rpy="0 0 0", xyz=_format_numbers(centre))
     SubElement(inertial, "mass", value=f"{mass:g}")
     xx, yy, zz = (f"{value:.6g}" for value in diagonal)
     SubElement(inertial, "inertia", ixx=xx, ixy="0", ixz="0", iyy=yy, iyz="0", izz=zz)
@@ -236,7 +240,7 @@ def _replace_inertial(link: Element, inertial: Element) -> None:
     link.append(inertial)
 
 
-def _text(numbers: tuple[float, ...]) -> str:
+def _format_numbers(numbers: tuple[float, ...]) -> str:
     return " ".join(f"{number:.6g}" for number in numbers)
 
 
@@ -264,7 +268,12 @@ def _write(root: Element, path: Path) -> None:
 
 
 def make_folder_once(folder: Path, make: Callable[[Path], None]) -> None:
-    """Make a folder if it is not complete, while other processes wait; its name must be a hash of its inputs."""
+    """Make a folder of generated files unless it is complete; other processes that need it wait.
+
+    Args:
+        folder: the folder. Its name must change with everything on which the files depend, such as a hash.
+        make: writes all files into the folder that it gets.
+    """
     if _is_complete(folder):
         return
     make_folder(folder.parent)

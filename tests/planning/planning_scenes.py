@@ -70,7 +70,7 @@ class Checker:
                     mesh = trimesh.creation.box([float(v) for v in box.attrib["size"].split()])
                 else:
                     mesh = trimesh.load(urdf.parent / f"{shape.find('mesh').attrib['filename']}.convex.stl")
-                mesh.apply_transform(self._file.origin(collision))
+                mesh.apply_transform(self._file.read_origin(collision))
                 self.parts.append((link.attrib["name"], np.asarray(mesh.vertices)))
 
     def poses(self, link: str, qpos: np.ndarray, finger: float = 0.04) -> np.ndarray:

@@ -33,7 +33,7 @@ def test_grasp_annotations_fit_the_gripper_width():
 def test_another_number_of_joints_is_an_error(part, what):
     fewer = getattr(MOBILE_PANDA, part)[:-1]
     with pytest.raises(
-        RobocasError, match=rf"six, {part}: unsupported number of joints \(expected {what}, found {what - 1}\)"
+        RobocasError, match=rf"six, {part}: wrong number of entries \(expected {what}, found {what - 1}\)"
     ):
         replace(MOBILE_PANDA, uid="six", **{part: fewer})
 
@@ -48,7 +48,7 @@ def test_robots_are_registered_by_their_uids():
 
 def test_an_entry_point_with_another_name_than_its_uid_is_refused(monkeypatch):
     monkeypatch.setitem(ROBOTS.builtin, "other", PANDA)
-    message = "name differs from the robot's uid .expected robocas_mobile_panda, found other"
+    message = "name of the entry point differs from the uid of the robot .expected robocas_mobile_panda, found other"
     with pytest.raises(ExtensionError, match=message):
         find_robot("other")
 

@@ -44,6 +44,11 @@ def test_joints_between_two_links_are_in_order_from_the_root(write):
     assert elbow.limits == (-1, 0.5)
 
 
+def test_a_fixed_joint_needs_no_axis(write):
+    path = write(ARM.replace('type="fixed">', 'type="fixed"><axis xyz="0 0 0"/>'))
+    assert RobotXml(path).joints()[2].axis.tolist() == [1, 0, 0]
+
+
 @pytest.mark.parametrize(("root", "tip"), [("base", "none"), ("lower", "base"), ("pad", "lower")])
 def test_unconnected_links_are_an_error(write, root, tip):
     path = write(ARM)

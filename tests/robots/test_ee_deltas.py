@@ -8,7 +8,7 @@ import torch
 from robot_checks import matrix, moved
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.robots.ee_deltas import ee_delta_target, to_ee_delta_action
+from robocas_ms3.robots.ee_deltas import apply_ee_delta, to_ee_delta_action
 
 # Maths, without a simulation.
 
@@ -18,7 +18,7 @@ def test_delta_is_applied_in_the_end_effectors_frame():
     position = torch.tensor([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]])
     quaternion = torch.tensor([[half, 0.0, 0.0, half], [0.0, 1.0, 0.0, 0.0]])  # yaw 90 deg; upside down about x
     delta = torch.tensor([[0.1, 0.0, 0.0, 0.0, 0.0, np.pi / 2], [0.0, 0.0, 0.2, np.pi / 2, 0.0, 0.0]]).float()
-    p, q = ee_delta_target(position, quaternion, delta)
+    p, q = apply_ee_delta(position, quaternion, delta)
     assert p.numpy() == pytest.approx(np.array([[1.0, 2.1, 3.0], [0.0, 0.0, -0.2]]), abs=1e-6)
     assert q[0].abs().numpy() == pytest.approx([0, 0, 0, 1], abs=1e-6)  # 90 + 90 deg about z
     assert q[1].abs().numpy() == pytest.approx([half, half, 0, 0], abs=1e-6)  # 180 + 90 deg about x
@@ -34,7 +34,7 @@ def test_the_action_of_a_motion_reproduces_the_motion():
     start = Rotation.random(20, random_state=1)
     quaternion = torch.tensor(start.as_quat()[:, [3, 0, 1, 2]]).float()
     scaled = torch.tensor(action) * torch.tensor([0.1] * 3 + [0.5] * 3)
-    p, q = ee_delta_target(torch.zeros(20, 3), quaternion, scaled)
+    p, q = apply_ee_delta(torch.zeros(20, 3), quaternion, scaled)
     reached = Rotation.from_quat(q.numpy()[:, [1, 2, 3, 0]])
     assert (start.inv() * reached).as_rotvec() == pytest.approx(rotvec, abs=1e-5)
     assert p.numpy() == pytest.approx(start.apply(translation), abs=1e-6)
