@@ -1,4 +1,4 @@
-"""Build the files of an asset from its source: visual meshes, hulls, annotations, mass properties, quality."""
+"""Build the files of an asset from a source: visual meshes, hulls, annotations, mass properties, quality."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import trimesh
 from asset_tools.decompose import Decomposition, decompose, is_hollow
 from asset_tools.glb import write_glb
 from asset_tools.grasps import sample_grasps
-from asset_tools.inertia import piece_inertia, principal_inertia, to_moments, to_tuple
+from asset_tools.inertia import compute_piece_inertia, compute_principal_inertia, round_moments, round_vector
 from asset_tools.quality.furniture import measure_furniture
-from asset_tools.quality.hulls import volume_iou
+from asset_tools.quality.hulls import compute_volume_iou
 from asset_tools.quality.measure import measure_object
-from asset_tools.resting_poses import resting_poses
+from asset_tools.resting_poses import find_resting_poses
 from asset_tools.sources import FurnitureSource, ObjectSource
-from asset_tools.visual import to_display
+from asset_tools.visual import make_display_mesh
 from robocas_ms3.assets.annotations import Annotations, compute_footprints
 from robocas_ms3.assets.hulls import read_hulls, write_hulls
 from robocas_ms3.assets.manifest import FurnitureAsset, FurnitureQuality, ObjectAsset
@@ -45,9 +45,13 @@ FULL, FULL_TEXTURE = 12_000, 1024
 
 
 def build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
-    """Write the files of an object to a folder and return its manifest entry; deterministic.
+    """Write the files of an object to a folder and return the manifest entry of the object; deterministic.
 
-    The origin of the frame is moved to the centre of the mesh's bounding box.
+    The origin of the object's frame is moved to the centre of the mesh's bounding box.
+
+    Args:
+        source: meshes and properties of the object.
+        folder: new or existing folder of the object.
 
     Raises:
         AssetError: the object cannot be built.
@@ -72,17 +76,17 @@ def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
         parts = decompose(closed)
     else:
         pieces = [piece + shift for piece in source.pieces]
-        parts = Decomposition(pieces, volume_iou(closed, pieces))
+        parts = Decomposition(pieces, compute_volume_iou(closed, pieces))
     write_hulls(folder / HULLS, parts.hulls)
     # hulls as the simulator loads them: rounding of the file changes the resting poses of round objects
     hulls = [hull.vertices for hull in read_hulls(folder / HULLS)]
 
     # rounded as in the manifest, so that measuring the pack again gives equal values
-    center = np.array(to_tuple(closed.center_mass))
-    moments, axes = principal_inertia(closed, source.mass)
-    inertia = np.array(to_moments(moments))
+    center = np.array(round_vector(closed.center_mass))
+    moments, axes = compute_principal_inertia(closed, source.mass)
+    inertia = np.array(round_moments(moments))
     solid = RigidBody(hulls, source.mass, center, inertia, np.array(axes), source.friction)
-    rest = resting_poses(solid)
+    rest = find_resting_poses(solid)
     grasps, reason = source.grasps, ""
     if grasps is None:
         grasps = sample_grasps(closed, center, np.random.default_rng(zlib.crc32(source.id.encode())), count=GRASPS)
@@ -113,14 +117,14 @@ def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
         source=source.source,
         licence=source.licence,
         attribution=source.attribution,
-        extents=to_tuple(mesh.extents),
+        extents=round_vector(mesh.extents),
         friction=source.friction,
         repairs=repairs,
         files=_hashes(folder),
         graspnet_id=source.graspnet_id,
         mass=source.mass,
-        center_of_mass=to_tuple(center),
-        inertia=to_moments(inertia),
+        center_of_mass=round_vector(center),
+        inertia=round_moments(inertia),
         inertia_wxyz=axes,
         grasp_count=len(grasps),
         no_grasps_because=reason,
@@ -129,7 +133,12 @@ def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
 
 
 def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
-    """Write the files of furniture to a folder and return its manifest entry."""
+    """Write the files of a piece of furniture to a folder and return the manifest entry of the furniture.
+
+    Args:
+        source: meshes and properties of the furniture.
+        folder: new or existing folder of the furniture.
+    """
     _write_body(source.mesh, source.pieces, folder)
     for link in source.links:
         _write_body(link.mesh, link.pieces, folder / LINKS / link.name)
@@ -139,11 +148,11 @@ def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
             write_glb(mesh, folder / FINISHES / f"{part}_{name}.glb")
     body: dict[str, Any] = {}
     if source.mass is not None:
-        center, inertia, axes = piece_inertia(source.pieces, source.mass)
+        center, inertia, axes = compute_piece_inertia(source.pieces, source.mass)
         body = {
             "mass": source.mass,
-            "center_of_mass": to_tuple(center),
-            "inertia": to_moments(inertia),
+            "center_of_mass": round_vector(center),
+            "inertia": round_moments(inertia),
             "inertia_wxyz": axes,
         }
     asset = FurnitureAsset(
@@ -153,7 +162,7 @@ def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
         source=source.source,
         licence=source.licence,
         attribution=source.attribution,
-        extents=to_tuple(source.mesh.extents),
+        extents=round_vector(source.mesh.extents),
         friction=source.friction,
         repairs=source.repairs,
         files=_hashes(folder),
@@ -172,14 +181,22 @@ def build_furniture(source: FurnitureSource, folder: Path) -> FurnitureAsset:
 
 
 def write_visuals(mesh: trimesh.Trimesh, folder: Path) -> list[str]:
-    """Write a textured mesh at both levels of detail; return a note per level with more faces than the limit."""
+    """Write the visual meshes of an asset at two levels of detail, ``fast`` and ``full``.
+
+    Args:
+        mesh: textured mesh of the asset, metres.
+        folder: existing folder of the asset.
+
+    Returns:
+        A note for each level whose mesh has more faces than the limit.
+    """
     levels: dict[VisualLevel, tuple[int, int]] = {
         "fast": (FAST_ENOUGH if len(mesh.faces) <= FAST_ENOUGH else FAST, 512),
         "full": (FULL, FULL_TEXTURE),
     }
     notes = []
     for level, (triangles, size) in levels.items():
-        shown = to_display(mesh, triangles=triangles, texture_size=size)
+        shown = make_display_mesh(mesh, triangles=triangles, texture_size=size)
         write_glb(shown, folder / VISUALS[level])
         if len(shown.faces) > max(triangles, FAST_ENOUGH):
             notes.append(f"kept {len(shown.faces)} instead of {triangles} faces ({level}): many holes or pieces")
@@ -189,14 +206,14 @@ def write_visuals(mesh: trimesh.Trimesh, folder: Path) -> list[str]:
 def _write_body(mesh: trimesh.Trimesh, pieces: list[np.ndarray], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     # the same mesh for both levels: decimation would drop some of the loose boards and sheets of furniture
-    body = mesh if len(mesh.faces) <= FULL else to_display(mesh, triangles=FULL, texture_size=FULL_TEXTURE)
+    body = mesh if len(mesh.faces) <= FULL else make_display_mesh(mesh, triangles=FULL, texture_size=FULL_TEXTURE)
     for name in VISUALS.values():
         write_glb(body, folder / name)
     write_hulls(folder / HULLS, pieces)
 
 
 def _light(values: Any) -> Any:
-    """Convert to single precision, which halves the file size with errors below 1e-6 m."""
+    """Convert numbers to an array of float32, which halves the file size; lengths change by less than 1e-6 m."""
     return np.asarray(values, dtype=np.float32)
 
 

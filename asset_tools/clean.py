@@ -28,11 +28,11 @@ SAME = 1e-6  # of the diagonal
 
 @dataclass(frozen=True)
 class CleanScan:
-    """A cleaned scan.
+    """A scan after cleaning, as two meshes with equal faces in equal order; all faces are oriented outwards.
 
     Attributes:
-        scan: scan with its colours and outward faces, without the dropped faces.
-        welded: the same faces in the same order with merged vertices, without colours.
+        scan: mesh with the colours and UV seams of the input.
+        welded: mesh without colours, whose vertices are merged by position.
     """
 
     scan: trimesh.Trimesh
@@ -40,11 +40,11 @@ class CleanScan:
 
 
 def clean_scan(scan: trimesh.Trimesh, repairs: list[str]) -> CleanScan:
-    """Drop faces that are not part of the outer surface, and orient the others outwards.
+    """Drop the faces of a scan that are not part of the outer surface, and orient the other faces outwards.
 
     Args:
-        scan: any unit; UV seams are allowed.
-        repairs: list to which a note per repair is added.
+        scan: mesh in any unit; UV seams are allowed.
+        repairs: list to which the function appends one note per repair.
 
     Raises:
         AssetError: all faces are degenerate.
@@ -54,7 +54,10 @@ def clean_scan(scan: trimesh.Trimesh, repairs: list[str]) -> CleanScan:
     kept = np.flatnonzero(welded.unique_faces() & (a != b) & (b != c) & (c != a))
     if len(kept) == 0:
         raise AssetError(
-            "all faces of the mesh are degenerate", expected="triangles", found=f"{len(scan.faces)} slivers"
+            "all faces of the mesh are degenerate",
+            expected="triangles with an area above 0",
+            found=f"{len(scan.faces)} faces without area",
+            fix="Export the mesh again.",
         )
     if len(kept) < len(scan.faces):
         repairs.append(f"dropped {_count(len(scan.faces) - len(kept), 'double or degenerate face')}")
@@ -79,7 +82,7 @@ def clean_scan(scan: trimesh.Trimesh, repairs: list[str]) -> CleanScan:
 
 
 def _welded(scan: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
-    """Return the scan's faces with vertices merged by position."""
+    """Return the faces of a scan in the same order, with vertices merged by position, without colours."""
     scale = 1 / (SAME * float(np.linalg.norm(np.ptp(scan.vertices[np.unique(scan.faces)], axis=0))))
     keys = np.rint(np.asarray(scan.vertices) * scale).astype(np.int64)
     _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
@@ -95,13 +98,14 @@ def _welded(scan: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
 
 
 def _outer_boundary(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, Ints]:
-    """Resolve edges of more than two faces: drop inner walls and fins, and separate parts that share an edge.
+    """Remove edges of more than two faces: drop inner walls and fins, and separate parts that share an edge.
 
-    The faces divide space into cells: facing sides of two neighbouring faces at an edge belong to the same cell. A face
-    of the outer surface has the unbounded cell on exactly one side.
+    The faces divide space into cells. Two faces that are neighbours around an edge enclose a cell between them. A face
+    belongs to the outer surface if exactly one side of the face is in the unbounded cell.
 
     Returns:
-        Mesh of the outer faces, in which edges of closed parts have at most two faces, and the face indices (K,).
+        A mesh of the outer faces, in which the edges of closed parts have at most two faces.
+        The indices (K,) of the outer faces in ``mesh``.
     """
     count = len(mesh.faces)
     edge, face = np.asarray(mesh.edges_unique_inverse), np.asarray(mesh.edges_face)
@@ -137,10 +141,10 @@ def _outer_boundary(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, Ints]:
 
 
 def _around_edges(mesh: trimesh.Trimesh, outside_ahead: NDArray[np.bool_]) -> Ints:
-    """Return the order (3 F,) of half-edges by edge, and around each edge by the angle of their faces.
+    """Return the half-edges (3 F,) sorted by edge, and around each edge by the angle of the half-edge's face.
 
-    If two faces have the same angle, the face with its outside ahead comes first: it ends a part, and the other face
-    starts the next part. If both have the same outside, the face of the larger surface is outermost.
+    If two faces have the same angle, a face with the outside towards larger angles comes first: this face ends a part,
+    and the other face starts the next part. If the outsides are equal, the face of the larger surface is outermost.
 
     Args:
         mesh: mesh with half-edges in the order of ``mesh.edges``.
@@ -159,7 +163,12 @@ def _around_edges(mesh: trimesh.Trimesh, outside_ahead: NDArray[np.bool_]) -> In
 
 
 def _neighbours(order: Ints, edge: Ints) -> tuple[Ints, Ints]:
-    """Return each half-edge and the next half-edge around its edge (3 F,), without edges of a single face."""
+    """Return pairs (H,), (H,) of half-edges that follow each other around an edge; edges of one face have none.
+
+    Args:
+        order: (3 F,) half-edges, sorted by edge and around each edge.
+        edge: (3 F,) edge of each half-edge.
+    """
     first = np.flatnonzero(np.diff(edge[order], prepend=-1))
     following = np.arange(1, len(order) + 1)
     following[np.append(first[1:], len(order)) - 1] = first
@@ -168,7 +177,11 @@ def _neighbours(order: Ints, edge: Ints) -> tuple[Ints, Ints]:
 
 
 def _outermost_side(mesh: trimesh.Trimesh, faces: Ints) -> int:
-    """Return the side (2 f: front, 2 f + 1: back) through which a ray from the largest face leaves all faces."""
+    """Return a side that is on the outside: the side through which a ray from the largest face leaves the mesh.
+
+    Returns:
+        2 f for the front of face f, 2 f + 1 for its back.
+    """
     a, b, c = np.asarray(mesh.vertices)[mesh.faces[faces]].transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)
     areas = np.linalg.norm(normals, axis=1)
@@ -186,27 +199,46 @@ def _outermost_side(mesh: trimesh.Trimesh, faces: Ints) -> int:
 
 
 def _box_change(mesh: trimesh.Trimesh, faces: Ints, kept: Ints) -> float:
-    """Return the relative change of the bounding box of faces if only ``kept`` faces stay."""
+    """Return how much the bounding box of ``faces`` shrinks if only the faces ``kept`` stay.
+
+    Returns:
+        The largest motion of a side of the box, as a fraction of the box's diagonal.
+    """
     corners, left = mesh.vertices[mesh.faces[faces]].reshape(-1, 3), mesh.vertices[mesh.faces[kept]].reshape(-1, 3)
     change = np.maximum(left.min(axis=0) - corners.min(axis=0), corners.max(axis=0) - left.max(axis=0))
     return float(change.max() / np.linalg.norm(np.ptp(corners, axis=0)))
 
 
 def _pieces(mesh: trimesh.Trimesh) -> Ints:
-    """Return the piece number (F,) of each face; edges of more than two faces do not connect faces."""
+    """Return the number (F,) of the connected piece of each face; edges of more than two faces connect no faces."""
     one, other = np.asarray(mesh.face_adjacency).reshape(-1, 2).T
     return _components(one, other, len(mesh.faces))
 
 
 def _components(one: Ints, other: Ints, count: int) -> Ints:
-    """Return the connected component (N,) of each of N nodes from pairs of nodes."""
+    """Return the number (N,) of the connected component of each node of a graph.
+
+    Args:
+        one: (E,) first node of each edge.
+        other: (E,) second node of each edge.
+        count: number of nodes N.
+    """
     graph = coo_matrix((np.ones(len(one), bool), (one, other)), shape=(count, count))
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 @dataclass(frozen=True)
 class _Pieces:
-    """The N connected pieces of a mesh: faces, bounding boxes (N, 3), fractions of the surface, closed, flat."""
+    """The N connected pieces of a mesh.
+
+    Attributes:
+        faces: indices of the faces of each piece.
+        low: (N, 3) lower corner of the bounding box of each piece.
+        high: (N, 3) upper corner of the bounding box of each piece.
+        shares: (N,) fraction of the surface of the mesh.
+        closed: (N,) whether the piece has no open edge.
+        flat: (N,) whether the piece is a flat scrap.
+    """
 
     faces: list[Ints]
     low: Array
@@ -217,7 +249,7 @@ class _Pieces:
 
 
 def _object_faces(mesh: trimesh.Trimesh, repairs: list[str]) -> Ints:
-    """Return the indices of faces that are neither dirt nor a shell inside another piece."""
+    """Return the indices of the object's faces: neither scanner dirt nor a shell inside another piece."""
     piece = _pieces(mesh)
     if piece.max() == 0:
         return np.arange(len(mesh.faces))
@@ -294,7 +326,7 @@ def _are_parts(pieces: _Pieces) -> NDArray[np.bool_]:
 
 
 def _inward_faces(mesh: trimesh.Trimesh) -> NDArray[np.bool_]:
-    """Return which faces (F,) must be flipped so that all faces are oriented outwards."""
+    """Return a mask (F,) of the faces that must be flipped so that all faces are oriented outwards."""
     faces, count = np.asarray(mesh.faces), len(mesh.faces)
     links = np.asarray(mesh.face_adjacency).reshape(-1, 2)
     edges = np.asarray(mesh.face_adjacency_edges).reshape(-1, 2)
@@ -328,7 +360,14 @@ def _runs_along(faces: Ints, edges: Ints) -> NDArray[np.bool_]:
 
 
 def _shown(scan: trimesh.Trimesh, kept: Ints, turned: NDArray[np.bool_], repairs: list[str]) -> trimesh.Trimesh:
-    """Return the scan with the kept faces, flipped where ``turned``; drop normals that do not fit the faces."""
+    """Return the scan with only the faces ``kept``, with its colours and, if they fit the faces, its normals.
+
+    Args:
+        scan: the scan before cleaning.
+        kept: (K,) indices of the faces that stay.
+        turned: (K,) whether to flip the face.
+        repairs: list to which the function appends a note if the normals are dropped.
+    """
     shown, normals = scan.copy(), scan._cache.cache.get("vertex_normals")
     shown.update_faces(kept)
     if turned.any():

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from asset_tools.quality.measure import top_grasps
-from asset_tools.renderer import PAPER, Colour, RenderBody, Renderer, box_faces
+from asset_tools.quality.measure import select_top_grasps
+from asset_tools.renderer import PAPER, Colour, RenderBody, Renderer, make_box_faces
 from robocas_ms3.assets.annotations import Annotations
 from robocas_ms3.assets.hulls import Hull
 from robocas_ms3.assets.kinematics import link_poses
@@ -34,12 +34,12 @@ FINGER = 0.003  # m, thickness of drawn grippers
 
 
 def write_contact_sheet(pack: Pack, path: Path, ids: Sequence[str] | None = None) -> None:
-    """Draw the assets of a pack, objects first.
+    """Draw the assets of a pack and write the contact sheet as PNG.
 
     Args:
         pack: the pack.
-        path: of the PNG.
-        ids: ids of the assets to draw, in order; None: all.
+        path: path of the PNG file.
+        ids: ids of the assets to draw, in this order; None or empty: all objects, then all furniture.
 
     Raises:
         AssetError: an id is unknown, or no render device is available.
@@ -47,7 +47,10 @@ def write_contact_sheet(pack: Pack, path: Path, ids: Sequence[str] | None = None
     assets: dict[str, LoadedObject | LoadedFurniture] = {**pack.objects, **pack.furniture}
     unknown = [id_ for id_ in ids or () if id_ not in assets]
     if unknown:
-        raise AssetError("unknown assets of the pack", where=pack.name, found=", ".join(unknown), usage=True)
+        expected, fix = "ids of assets of the pack", f"Run `robocas assets info {pack.name}` for the ids."
+        raise AssetError(
+            "unknown asset ids", where=pack.name, expected=expected, found=", ".join(unknown), fix=fix, usage=True
+        )
     chosen = [assets[id_] for id_ in ids or assets]
     size, columns = (LARGE, 2) if len(chosen) <= FEW else (SMALL, 3)
     columns = min(columns, len(chosen))
@@ -102,10 +105,10 @@ def _furniture_line(furniture: LoadedFurniture) -> str:
 
 def _object_images(renderer: Renderer, asset: LoadedObject) -> list[LabelledImage]:
     notes = asset.annotations
-    points, tried = np.concatenate(asset.hulls), top_grasps(notes)
+    points, tried = np.concatenate(asset.hulls), select_top_grasps(notes)
     fast = RenderBody(points, file=asset.visual_path("fast"))
     grippers = [
-        _solid(gripper_faces(float(width)), _tone(float(quality)), pose)
+        _solid(make_gripper_faces(float(width)), _tone(float(quality)), pose)
         for pose, width, quality in zip(
             *(values[tried] for values in (notes.grasps_tcp_in_object, notes.grasp_widths, notes.grasp_qualities)),
             strict=True,
@@ -114,16 +117,16 @@ def _object_images(renderer: Renderer, asset: LoadedObject) -> list[LabelledImag
     best = _shown_poses(notes)
     chances = " ".join(f"{notes.resting_probabilities[i]:.0%}" for i in best)
     return [
-        ("fast", renderer.image([fast], -60, 25)),
-        ("full, from behind", renderer.image([RenderBody(points, file=asset.visual_path("full"))], 120, 25)),
-        ("hulls", renderer.image(hull_bodies(asset.hull_meshes), -60, 25)),
-        (f"rests {chances}", renderer.image(place_in_row(fast, notes.resting_poses[best]), -60, 30)),
-        (f"best {len(grippers)} of {len(notes.grasp_widths)} grasps", renderer.image([fast, *grippers], -60, 30)),
+        ("fast", renderer.render([fast], -60, 25)),
+        ("full, from behind", renderer.render([RenderBody(points, file=asset.visual_path("full"))], 120, 25)),
+        ("hulls", renderer.render(make_hull_bodies(asset.hull_meshes), -60, 25)),
+        (f"rests {chances}", renderer.render(place_in_grid(fast, notes.resting_poses[best]), -60, 30)),
+        (f"best {len(grippers)} of {len(notes.grasp_widths)} grasps", renderer.render([fast, *grippers], -60, 30)),
     ]
 
 
 def _shown_poses(notes: Annotations) -> list[int]:
-    """Return indices of the most probable resting poses, with the upright pose first."""
+    """Return the indices of at most four resting poses: the upright pose, then the most probable poses."""
     order = [int(i) for i in np.argsort(-notes.resting_probabilities, kind="stable")]
     if notes.display_pose >= 0:
         order = [notes.display_pose, *(i for i in order if i != notes.display_pose)]
@@ -136,7 +139,7 @@ def _furniture_images(renderer: Renderer, furniture: LoadedFurniture) -> list[La
     wide = {link.joint.name: max(link.joint.limits, key=abs) for link in asset.links}
     shut, open_ = ({"": np.eye(4), **link_poses(asset.links, at)} for at in ({}, wide))
 
-    def render_bodies(poses: dict[str, Array]) -> list[RenderBody]:
+    def make_bodies(poses: dict[str, Array]) -> list[RenderBody]:
         bodies = [
             RenderBody(np.concatenate(part.hulls), file=part.visual_path("fast"), pose=poses[name])
             for name, part in parts.items()
@@ -147,30 +150,36 @@ def _furniture_images(renderer: Renderer, furniture: LoadedFurniture) -> list[La
     hulls = [
         body
         for i, (name, part) in enumerate(parts.items())
-        for body in hull_bodies(part.hull_meshes, pose=open_[name], first_colour=i)
+        for body in make_hull_bodies(part.hull_meshes, pose=open_[name], first_colour=i)
     ]
     thick = 0.004 * max(asset.extents)
     marks = []
     for i, surface in enumerate(asset.surfaces.values()):
-        faces = box_faces((*surface.min_xy, surface.z), (*surface.max_xy, surface.z + thick))
+        faces = make_box_faces((*surface.min_xy, surface.z), (*surface.max_xy, surface.z + thick))
         marks.append(_solid(faces, _hue(i), open_[surface.link]))
     for handle in asset.handles.values():
         grasp = from_wxyz(np.array([*handle.position, *handle.wxyz]))
-        marks.append(_solid(gripper_faces(handle.width, thick), RED, open_[handle.link] @ grasp))
-    points = np.concatenate([body.points for body in render_bodies(shut)])
-    edges = _solid(frame_faces(points.min(axis=0), points.max(axis=0), thick / 2), GREY)
+        marks.append(_solid(make_gripper_faces(handle.width, thick), RED, open_[handle.link] @ grasp))
+    points = np.concatenate([body.points for body in make_bodies(shut)])
+    edges = _solid(make_frame_faces(points.min(axis=0), points.max(axis=0), thick / 2), GREY)
     front, behind = ("closed", "open") if asset.links else ("front", "behind")
     return [
-        (front, renderer.image(render_bodies(shut), 30, 25)),
-        (behind, renderer.image(render_bodies(open_), 30 if asset.links else 210, 25)),
-        ("hulls", renderer.image(hulls, 30, 25)),
-        ("surfaces, handles", renderer.image([edges, *marks], 30, 25)),
-        ("from above", renderer.image([*render_bodies(open_), *marks], 30, 70)),
+        (front, renderer.render(make_bodies(shut), 30, 25)),
+        (behind, renderer.render(make_bodies(open_), 30 if asset.links else 210, 25)),
+        ("hulls", renderer.render(hulls, 30, 25)),
+        ("surfaces, handles", renderer.render([edges, *marks], 30, 25)),
+        ("from above", renderer.render([*make_bodies(open_), *marks], 30, 70)),
     ]
 
 
-def hull_bodies(hulls: Sequence[Hull], *, pose: Array | None = None, first_colour: int = 0) -> list[RenderBody]:
-    """Return hulls in different colours, each slightly shrunk so that all are visible."""
+def make_hull_bodies(hulls: Sequence[Hull], *, pose: Array | None = None, first_colour: int = 0) -> list[RenderBody]:
+    """Return one body per hull in different colours, each shrunk by 3 % so that all hulls are visible.
+
+    Args:
+        hulls: convex hulls in one frame, m.
+        pose: pose (4, 4) of this frame; None: identity.
+        first_colour: number of the colour of the first hull.
+    """
     bodies = []
     for i, hull in enumerate(hulls):
         middle = hull.vertices.mean(axis=0)
@@ -182,8 +191,13 @@ def hull_bodies(hulls: Sequence[Hull], *, pose: Array | None = None, first_colou
     return bodies
 
 
-def place_in_row(body: RenderBody, poses: Array) -> list[RenderBody]:
-    """Return copies of a body in resting poses in a grid on a slab."""
+def place_in_grid(body: RenderBody, poses: Array) -> list[RenderBody]:
+    """Return a slab with copies of a body on it, in a grid of two columns.
+
+    Args:
+        body: the object, whose pose is ignored.
+        poses: (N, 4, 4) resting pose of each copy.
+    """
     turned = [body.points @ pose[:3, :3].T + pose[:3, 3] for pose in poses]
     step = 1.12 * np.max([np.ptp(points[:, :2], axis=0) for points in turned], axis=0) + 0.01
     bodies = []
@@ -192,27 +206,38 @@ def place_in_row(body: RenderBody, poses: Array) -> list[RenderBody]:
         moved[:2, 3] += (i % 2, i // 2) * step - (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
         bodies.append(RenderBody(body.points, file=body.file, pose=moved))
     places = np.array([(i % 2, i // 2) for i in range(len(poses))])
-    slab = box_faces((*(-0.5 * step), -0.004), (*((places.max(axis=0) + 0.5) * step), 0.0))
+    slab = make_box_faces((*(-0.5 * step), -0.004), (*((places.max(axis=0) + 0.5) * step), 0.0))
     return [*bodies, _solid(slab, GROUND)]
 
 
-def gripper_faces(width: float, thick: float = FINGER) -> Array:
-    """Return triangles (F, 3, 3) of a gripper of thin boxes with an opening ``width`` in m, in the TCP frame."""
-    half, t = width / 2, thick / 2
+def make_gripper_faces(width: float, thickness: float = FINGER) -> Array:
+    """Return the triangles (F, 3, 3) of a symbol of the gripper, made of thin boxes, in the TCP frame.
+
+    Args:
+        width: distance of the fingers, m.
+        thickness: thickness of the boxes, m.
+    """
+    half, t = width / 2, thickness / 2
     fingers = [((-t, y - t, -0.04), (t, y + t, 0.0085)) for y in (-half - t, half + t)]
-    palm = ((-t, -half - thick, -0.04 - thick), (t, half + thick, -0.04))
-    stem = ((-t, -t, -0.08), (t, t, -0.04 - thick))
-    return np.concatenate([box_faces(low, high) for low, high in (*fingers, palm, stem)])
+    palm = ((-t, -half - thickness, -0.04 - thickness), (t, half + thickness, -0.04))
+    stem = ((-t, -t, -0.08), (t, t, -0.04 - thickness))
+    return np.concatenate([make_box_faces(low, high) for low, high in (*fingers, palm, stem)])
 
 
-def frame_faces(low: Array, high: Array, half: float) -> Array:
-    """Return triangles (F, 3, 3) of bars along the edges of a box."""
+def make_frame_faces(lower_corner: Array, upper_corner: Array, half_thickness: float) -> Array:
+    """Return the triangles (F, 3, 3) of bars along the edges of a box.
+
+    Args:
+        lower_corner: (3,) lower corner of the box.
+        upper_corner: (3,) upper corner of the box.
+        half_thickness: half of the thickness of the bars.
+    """
     bars = []
     for a, b in ((1, 2), (0, 2), (0, 1)):
         for i, j in np.ndindex(2, 2):
-            start, end = low.copy(), high.copy()
-            start[[a, b]] = end[[a, b]] = (low, high)[i][a], (low, high)[j][b]
-            bars.append(box_faces(start - half, end + half))
+            start, end = lower_corner.copy(), upper_corner.copy()
+            start[[a, b]] = end[[a, b]] = (lower_corner, upper_corner)[i][a], (lower_corner, upper_corner)[j][b]
+            bars.append(make_box_faces(start - half_thickness, end + half_thickness))
     return np.concatenate(bars)
 
 
@@ -225,12 +250,12 @@ def _count(number: int, thing: str) -> str:
 
 
 def _hue(i: int) -> Colour:
-    """Return the i-th of a series of distinct colours."""
+    """Return the i-th colour of a series of distinct colours."""
     return colorsys.hsv_to_rgb(0.07 + i * 0.618034 % 1, 0.62, 0.9 - 0.25 * (i % 3 == 2))
 
 
 def _tone(friction: float) -> Colour:
-    """Return a colour from green (friction 0) to red (friction 0.8)."""
+    """Return the colour of a grasp: green if the required friction is 0, red from 0.8 on."""
     return colorsys.hsv_to_rgb(max(0.0, 0.33 * (1 - friction / 0.8)), 0.9, 0.8)
 
 

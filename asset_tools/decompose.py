@@ -1,4 +1,4 @@
-"""Decompose a closed mesh into convex hulls: one hull if it is close enough, else merged hulls of CoACD."""
+"""Decompose a closed mesh into convex hulls: one hull if it is close to the mesh, otherwise merged hulls of CoACD."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sapien import physx
 from scipy.spatial import ConvexHull, QhullError
 
-from asset_tools.quality.hulls import hull_quality, volume_iou
+from asset_tools.quality.hulls import compute_volume_iou, measure_hull_quality
 from asset_tools.solids import to_mesh, to_solid
 from robocas_ms3.assets.cooked_hulls import MAX_SHRINKAGE, MAX_SLENDERNESS, cook_hulls
 from robocas_ms3.assets.hulls import center_of_mass, find_box, slenderness
@@ -45,7 +45,7 @@ class Decomposition:
 
     Attributes:
         hulls: vertices (V, 3) of each hull, m.
-        volume_iou: IoU of their union and the body.
+        volume_iou: IoU of the body and the union of the hulls.
     """
 
     hulls: list[Array]
@@ -53,29 +53,31 @@ class Decomposition:
 
 
 def decompose(closed: trimesh.Trimesh) -> Decomposition:
-    """Decompose a closed mesh; deterministic.
+    """Decompose a closed mesh into at most 32 convex hulls that PhysX accepts on CPU and GPU; deterministic.
 
     Args:
-        closed: watertight, metres.
+        closed: watertight mesh, metres.
 
     Raises:
         AssetError: the mesh is not closed, or CoACD finds no hulls.
     """
     if not closed.is_watertight or closed.volume <= 0:
-        raise AssetError("cannot decompose an open mesh", expected="watertight, volume > 0")
+        found = f"watertight: {closed.is_watertight}, volume {closed.volume:.3g} m3"
+        expected = "a watertight mesh with a volume above 0"
+        raise AssetError("cannot decompose an open mesh", expected=expected, found=found)
     found = _decompose(closed)
     hulls = [limit_for_engine(hull) for hull in found.hulls]
     if all(hull is old for hull, old in zip(hulls, found.hulls, strict=True)):
         return found
-    return Decomposition(hulls, volume_iou(closed, hulls))
+    return Decomposition(hulls, compute_volume_iou(closed, hulls))
 
 
 def _decompose(closed: trimesh.Trimesh) -> Decomposition:
-    """Return one hull if it is close enough, or else CoACD's hulls, merged."""
+    """Return one convex hull if its IoU with the mesh is large enough, otherwise the merged hulls of CoACD."""
     best: Decomposition | None = None
     if closed.volume / closed.convex_hull.volume >= WANTED_OVERLAP - 0.02:
         hulls = [reduce_vertices(np.asarray(closed.vertices))]
-        best = Decomposition(hulls, volume_iou(closed, hulls))
+        best = Decomposition(hulls, compute_volume_iou(closed, hulls))
         if best.volume_iou >= WANTED_OVERLAP:
             return best
     hollow, smooth = is_hollow(closed), _smoothed(closed)
@@ -83,7 +85,7 @@ def _decompose(closed: trimesh.Trimesh) -> Decomposition:
         hulls = _run_coacd(smooth, threshold)
         if not hulls:
             continue
-        found = Decomposition(hulls, volume_iou(closed, hulls))
+        found = Decomposition(hulls, compute_volume_iou(closed, hulls))
         if _good_enough(closed, found, hollow):
             return _merged(closed, found, hollow)
         if best is None or found.volume_iou > best.volume_iou + 0.01:
@@ -94,16 +96,17 @@ def _decompose(closed: trimesh.Trimesh) -> Decomposition:
 
 
 def reduce_vertices(points: Array, *, bevel: float = BEVEL) -> Array:
-    """Return the vertices of a convex hull, reduced to those that the engine keeps, with the same volume.
+    """Return the few vertices (V, 3) of a simplified convex hull with the same volume.
 
-    Small bevels around broad faces across x, y or z are squared, since the engine would keep a few corners of a bevel,
-    on which a bottle rocks. Starting with a few extreme vertices, the vertex farthest outside of the current hull is
-    added repeatedly until the distance is negligible: at most 34 vertices, or 64 if the hull has at most 64 flat faces.
-    The result is scaled about its centre to the volume of the original hull.
+    PhysX keeps few vertices of a hull. It would keep single corners of a small bevel around a base, on which a bottle
+    rocks. Therefore small bevels around broad faces across x, y or z are first replaced by sharp edges. Then the
+    function starts with a few extreme vertices and repeatedly adds the vertex farthest outside of their hull, until
+    all vertices are within 0.7 mm. It keeps at most 34 vertices, or 64 if the hull has at most 64 flat faces. Finally
+    the vertices are scaled about the centre of mass to the volume of the original hull.
 
     Args:
-        points: (P, 3) m.
-        bevel: largest bevel that is squared, m; 0 for parts that fit each other.
+        points: (P, 3) points, m.
+        bevel: largest bevel that is replaced by a sharp edge, m; 0 for parts that fit each other.
     """
     points = _without_bevels(points, bevel)
     hull = ConvexHull(points)
@@ -131,10 +134,14 @@ def reduce_vertices(points: Array, *, bevel: float = BEVEL) -> Array:
 
 
 def limit_for_engine(points: Array) -> Array:
-    """Return vertices (V, 3) of a convex hull that the physics engine can build on CPU and GPU.
+    """Return the vertices (V, 3) of a convex hull that PhysX can build on CPU and GPU.
 
-    A hull that is too slender is stretched along its thin axes. A hull that shrinks too much is replaced by the
-    engine's own hull. A hull that the engine rejects is replaced by its bounding box. Boxes stay unchanged.
+    A box is returned unchanged. A hull that is too slender is stretched along its thin axes. If PhysX would shrink the
+    hull too much, the vertices of PhysX's own hull are returned. If PhysX rejects the hull, the corners of its oriented
+    bounding box are returned.
+
+    Args:
+        points: (P, 3) vertices of the hull, m.
     """
     if find_box(points) is not None:
         return points
@@ -156,7 +163,12 @@ def limit_for_engine(points: Array) -> Array:
 
 
 def _without_bevels(points: Array, bevel: float) -> Array:
-    """Move points (P, 3) close to a broad face across x, y or z into this face."""
+    """Move points (P, 3) that are close to a broad face across x, y or z into the plane of this face.
+
+    Args:
+        points: (P, 3) points, m.
+        bevel: largest distance that counts as close, m.
+    """
     squared, extents = np.array(points), np.ptp(points, axis=0)
     for axis in range(3):
         for extreme in (points[:, axis].min(), points[:, axis].max()):
@@ -168,9 +180,9 @@ def _without_bevels(points: Array, bevel: float) -> Array:
 
 
 def _outside(points: Array, corners: Array) -> Array:
-    """Return the signed distances of points (P, 3) from the convex hull of corners (V, 3) in m; negative inside.
+    """Return the signed distances (P,) of points (P, 3) from the convex hull of corners (V, 3), m; negative inside.
 
-    If the corners are coplanar, return the distance from their plane plus 1 m.
+    If the corners are coplanar, the result is the distance from the plane of the corners plus 1 m.
     """
     try:
         planes = ConvexHull(corners).equations
@@ -189,18 +201,18 @@ def count_flat_faces(points: Array) -> int:
 
 
 def is_hollow(closed: trimesh.Trimesh) -> bool:
-    """Return whether a body is hollow, or thin and bent: it fills less than half of its convex hull."""
+    """Return whether a body is hollow, or thin and bent: the body fills less than half of its convex hull."""
     return bool(closed.volume < HOLLOW * closed.convex_hull.volume)
 
 
 def _good_enough(closed: trimesh.Trimesh, found: Decomposition, hollow: bool, least: float = 0.0) -> bool:
     if not hollow:
         return found.volume_iou >= WANTED_OVERLAP
-    return found.volume_iou >= least and hull_quality(closed, found.hulls).surface_p95 <= WANTED_DISTANCE
+    return found.volume_iou >= least and measure_hull_quality(closed, found.hulls).surface_p95 <= WANTED_DISTANCE
 
 
 def _merged(closed: trimesh.Trimesh, found: Decomposition, hollow: bool) -> Decomposition:
-    """Merge pairs of hulls, smallest added volume first, as long as the result is good enough."""
+    """Merge pairs of hulls as long as the decomposition stays good enough; pairs that add little volume come first."""
     least = found.volume_iou - LOST_OVERLAP
     hulls, volumes = dict(enumerate(found.hulls)), {i: ConvexHull(hull).volume for i, hull in enumerate(found.hulls)}
 
@@ -214,7 +226,7 @@ def _merged(closed: trimesh.Trimesh, found: Decomposition, hollow: bool) -> Deco
         kept = {k: hull for k, hull in hulls.items() if k not in (i, j)}
         new = max(volumes) + 1
         kept[new] = reduce_vertices(np.concatenate([hulls[i], hulls[j]]))
-        fewer = Decomposition(list(kept.values()), volume_iou(closed, list(kept.values())))
+        fewer = Decomposition(list(kept.values()), compute_volume_iou(closed, list(kept.values())))
         if not _good_enough(closed, fewer, hollow, least):
             tries += 1
             del costs[i, j]

@@ -22,7 +22,11 @@ JPEG_QUALITY = 88
 
 
 def write_glb(mesh: trimesh.Trimesh, path: Path | str) -> None:
-    """Write a mesh of `visual.to_display` as GLB with a JPEG texture; deterministic.
+    """Write a mesh as a GLB file with a JPEG texture; deterministic.
+
+    Args:
+        mesh: result of `visual.make_display_mesh`.
+        path: path of the file.
 
     Raises:
         AssetError: the mesh has no ``PBRMaterial``.
@@ -30,7 +34,7 @@ def write_glb(mesh: trimesh.Trimesh, path: Path | str) -> None:
     material = getattr(mesh.visual, "material", None)
     if not isinstance(material, PBRMaterial):
         raise AssetError(
-            "cannot write this mesh as GLB", where=path, expected="a PBRMaterial", fix="Use to_display first."
+            "cannot write this mesh as GLB", where=path, expected="a PBRMaterial", fix="Use make_display_mesh first."
         )
     vertices = np.asarray(mesh.vertices, dtype="<f4")
     normals = np.asarray(mesh.vertex_normals, dtype="<f4")
@@ -83,7 +87,7 @@ def write_glb(mesh: trimesh.Trimesh, path: Path | str) -> None:
 
 
 def get_roughness(material: Any) -> float:
-    """Return the roughness of a material, or the default."""
+    """Return the roughness of a material in 0..1; 0.6 if the material has none."""
     value = getattr(material, "roughnessFactor", None)
     return DEFAULT_ROUGHNESS if value is None else float(value)
 

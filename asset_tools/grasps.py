@@ -32,11 +32,12 @@ CHUNK = 128
 
 @dataclass(frozen=True)
 class Grasps:
-    """Grasps in the object's frame, ordered greedily by quality and by distance from previous grasps.
+    """Grasps of an object. Each grasp is the best of the remaining grasps by quality and distance from earlier grasps.
 
     Attributes:
-        tcp_in_object: (G, 4, 4) TCP poses: z approach, y closing, origin between the finger tips; m.
-        widths: (G,) required finger opening, m.
+        tcp_in_object: (G, 4, 4) poses of the TCP in the object's frame, m. z is the approach direction, y is the
+            closing direction, and the origin is between the finger tips.
+        widths: (G,) required distance of the fingers, m.
         qualities: (G,) smallest friction coefficient for force closure, at least 0.1; smaller is better.
     """
 
@@ -48,14 +49,21 @@ class Grasps:
         return len(self.widths)
 
     def concatenate(self, more: Grasps) -> Grasps:
-        """Return these grasps followed by others."""
+        """Return the grasps of this set, followed by the grasps of ``more``."""
         pairs = zip(vars(self).values(), vars(more).values(), strict=True)
         return Grasps(*(np.concatenate(pair) for pair in pairs))
 
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Contacts: midpoints (N, 3), unit closing axes (N, 3), widths (N,) m, friction coefficients (N,)."""
+    """N pairs of opposite contacts.
+
+    Attributes:
+        middles: (N, 3) midpoints between the two contacts, m.
+        axes: (N, 3) unit vectors from one contact to the other.
+        widths: (N,) distances of the two contacts, m.
+        frictions: (N,) smallest friction coefficients for force closure.
+    """
 
     middles: Array
     axes: Array
@@ -66,12 +74,12 @@ class _Pairs:
 def sample_grasps(
     closed: trimesh.Trimesh, center_of_mass: Array, rng: np.random.Generator, *, count: int = 400
 ) -> Grasps:
-    """Sample grasps that the open gripper reaches along a straight approach, spread over directions and positions.
+    """Sample grasps that the open gripper reaches on a straight path, spread over directions and positions.
 
     Args:
         closed: watertight mesh, m; may be concave.
-        center_of_mass: (3,) in the mesh's frame, m.
-        rng: random generator; the same state gives the same grasps.
+        center_of_mass: (3,) centre of mass in the mesh's frame, m.
+        rng: random generator; equal states give equal grasps.
         count: maximum number of grasps.
 
     Returns:
@@ -82,9 +90,11 @@ def sample_grasps(
     """
     if len(closed.faces) == 0 or not closed.is_watertight:
         raise AssetError(
-            "cannot sample grasps on an open mesh", expected="watertight", found=f"{len(closed.faces)} faces"
+            "cannot sample grasps on an open or empty mesh",
+            expected="a watertight mesh with faces",
+            found=f"{len(closed.faces)} faces, watertight: {closed.is_watertight}",
         )
-    points = surface_samples(closed, POINTS, rng)[0]
+    points = sample_surface_points(closed, POINTS, rng)[0]
     pairs = _contact_pairs(closed, rng)
     pair, rotations, depths = _reachable(pairs, points, rng)
     limit = 30 * count  # limits the time; the remaining candidates are still dense
@@ -103,12 +113,14 @@ def sample_grasps(
     scores = 0.5 * shares - 2.0 * (frictions - MIN_FRICTION) - lever / 0.15 - distance / 0.3
     left = np.flatnonzero(shares >= MIN_PAD_SHARE)
     left = left[_not_dominated(poses[left], frictions[left])]
-    chosen = left[select_spread(poses[left], scores[left], count)]
+    chosen = left[select_diverse_grasps(poses[left], scores[left], count)]
     return Grasps(poses[chosen], widths[chosen], frictions[chosen])
 
 
-def surface_samples(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.int_]]:
-    """Sample points (P, 3) evenly over the area; return them and their faces (P,)."""
+def sample_surface_points(
+    mesh: trimesh.Trimesh, count: int, rng: np.random.Generator
+) -> tuple[Array, NDArray[np.int_]]:
+    """Sample points on a mesh, evenly over the area; return points (P, 3) and the face (P,) of each point."""
     area = np.cumsum(mesh.area_faces)
     faces = np.searchsorted(area, (np.arange(count) + rng.random(count)) / count * area[-1])
     faces = np.minimum(faces, len(area) - 1)
@@ -119,8 +131,12 @@ def surface_samples(mesh: trimesh.Trimesh, count: int, rng: np.random.Generator)
 
 
 def _contact_pairs(mesh: trimesh.Trimesh, rng: np.random.Generator) -> _Pairs:
-    """Cast rays into the body; the second contact is the exit from the first wall or from the object."""
-    points, faces = surface_samples(mesh, RAYS, rng)
+    """Sample pairs of opposite contacts with rays into the body.
+
+    A ray starts at a random point, the first contact. The second contact is the exit of the ray from the first wall or
+    from the whole object.
+    """
+    points, faces = sample_surface_points(mesh, RAYS, rng)
     normals = np.asarray(mesh.face_normals)
     u, v = _across(normals[faces])
     radius = JITTER * np.sqrt(rng.random(RAYS)) * (rng.random(RAYS) < 0.5)
@@ -152,10 +168,16 @@ def _contact_pairs(mesh: trimesh.Trimesh, rng: np.random.Generator) -> _Pairs:
 
 
 def _reachable(pairs: _Pairs, points: Array, rng: np.random.Generator) -> tuple[NDArray[np.int_], Array, Array]:
-    """Rotate the gripper about each closing axis; keep poses whose straight approach with an open gripper is free.
+    """Rotate the gripper about each closing axis, and keep poses that the open gripper reaches on a straight path.
+
+    Args:
+        pairs: pairs of contacts.
+        points: (P, 3) points on the object.
+        rng: random generator.
 
     Returns:
-        Index of the pair (K,), rotation (K, 3, 3) and depth (K,) of each grasp.
+        For each of K grasps the index (K,) of its pair, the rotation (K, 3, 3) of the TCP, and the distance (K,) of
+        the TCP beyond the contacts in m.
     """
     count = len(pairs.widths)
     u, v = _across(pairs.axes)
@@ -167,7 +189,7 @@ def _reachable(pairs: _Pairs, points: Array, rng: np.random.Generator) -> tuple[
     clear = np.zeros((len(pair), len(DEPTHS)), dtype=bool)
     for start in range(0, len(pair), CHUNK):
         chunk = slice(start, start + CHUNK)
-        x, y, z = local_points(points, rotations[chunk], pairs.middles[pair[chunk]])
+        x, y, z = to_local_frames(points, rotations[chunk], pairs.middles[pair[chunk]])
         x, y = np.abs(x), np.abs(y)
         free = np.ones((len(x), len(DEPTHS)), dtype=bool)
         for low, high in GRIPPER_BOXES:
@@ -183,15 +205,16 @@ def _reachable(pairs: _Pairs, points: Array, rng: np.random.Generator) -> tuple[
 def _touched(
     pairs: _Pairs, pair: NDArray[np.int_], rotations: Array, depths: Array, points: Array, area: float
 ) -> tuple[Array, Array]:
-    """Return the required opening (K,) in m and the fraction (K,) of the pads in contact with the object.
+    """Return the required distance (K,) of the fingers in m, and the fraction (K,) of the pads that touches the object.
 
-    The fraction is that of the pad with less contact, and 0 if a finger would touch another point before the contacts.
+    The fraction is that of the pad with less contact. It is 0 if a finger would touch the object elsewhere before it
+    reaches the contacts.
     """
     widths, shares = np.zeros(len(pair)), np.zeros(len(pair))
     expected = max(len(points) / area * 4 * PAD_HALF_SIZE[0] * PAD_HALF_SIZE[1], 2.0)
     for start in range(0, len(pair), CHUNK):
         chunk = slice(start, start + CHUNK)
-        x, y, z = local_points(points, rotations[chunk], pairs.middles[pair[chunk]])
+        x, y, z = to_local_frames(points, rotations[chunk], pairs.middles[pair[chunk]])
         half = 0.5 * pairs.widths[pair[chunk]].astype(np.float32)
         depth = depths[chunk, None].astype(np.float32)
         x = np.abs(x)
@@ -209,7 +232,12 @@ def _touched(
 
 
 def _not_dominated(poses: Array, frictions: Array) -> NDArray[np.int_]:
-    """Return indices of grasps without a better grasp nearby (about 30 deg and 2 cm)."""
+    """Return the indices of grasps that have no better grasp within about 30 deg and 2 cm.
+
+    Args:
+        poses: (N, 4, 4) poses of the TCP in the object's frame.
+        frictions: (N,) required friction; a grasp is better if it is below a limit that the other grasp exceeds.
+    """
     keep = np.ones(len(poses), dtype=bool)
     places = np.concatenate([poses[:, :3, 2] / 0.5, poses[:, :3, 3] / 0.02], axis=1)
     for limit in GOOD_FRICTIONS:
@@ -219,8 +247,19 @@ def _not_dominated(poses: Array, frictions: Array) -> NDArray[np.int_]:
     return np.flatnonzero(keep)
 
 
-def select_spread(poses: Array, scores: Array, count: int) -> NDArray[np.int_]:
-    """Select grasps greedily by score plus distance (approach, closing axis, position) from selected grasps."""
+def select_diverse_grasps(poses: Array, scores: Array, count: int) -> NDArray[np.int_]:
+    """Select grasps with high scores that differ in approach direction, closing axis and position.
+
+    Each step selects the grasp with the largest sum of its score and its distance from the grasps selected before.
+
+    Args:
+        poses: (N, 4, 4) poses of the TCP in the object's frame.
+        scores: (N,) scores; higher is better.
+        count: maximum number of grasps.
+
+    Returns:
+        Indices (K,) in the order of selection.
+    """
     closing = poses[:, :3, 1]
     both_ways = np.einsum("ni,nj->nij", closing, closing).reshape(-1, 9)  # independent of the axis' sign
     if len(poses) == 0:
@@ -236,8 +275,17 @@ def select_spread(poses: Array, scores: Array, count: int) -> NDArray[np.int_]:
     return np.array(picked, dtype=int)
 
 
-def local_points(points: Array, rotations: Array, origins: Array) -> tuple[NDArray[np.float32], ...]:
-    """Coordinates x, y, z, each (C, P), of points (P, 3) in frames (C, 3, 3) at (C, 3); single precision, for speed."""
+def to_local_frames(points: Array, rotations: Array, origins: Array) -> tuple[NDArray[np.float32], ...]:
+    """Transform points to C frames.
+
+    Args:
+        points: (P, 3) points.
+        rotations: (C, 3, 3) rotation of each frame.
+        origins: (C, 3) origin of each frame.
+
+    Returns:
+        Coordinates x, y and z, each (C, P), in float32 for speed.
+    """
     axes = rotations.transpose(2, 0, 1).astype(np.float32)  # (3, C, 3)
     offset = np.einsum("aci,ci->ac", axes, origins.astype(np.float32))
     local = axes @ points.T.astype(np.float32) - offset[..., None]
@@ -245,7 +293,11 @@ def local_points(points: Array, rotations: Array, origins: Array) -> tuple[NDArr
 
 
 def _across(directions: Array) -> tuple[Array, Array]:
-    """Two unit vectors (N, 3) square to unit vectors (N, 3) and to each other."""
+    """Return two arrays (N, 3) of unit vectors that are perpendicular to ``directions`` and to each other.
+
+    Args:
+        directions: (N, 3) unit vectors.
+    """
     least = np.eye(3)[np.argmin(np.abs(directions), axis=1)]
     u = np.cross(directions, least)
     u /= np.linalg.norm(u, axis=1, keepdims=True)

@@ -15,7 +15,7 @@ from typing import Any
 
 from asset_tools.build import build_object
 from asset_tools.graspnet.catalogue import ENTRIES, NUMBERS
-from asset_tools.import_scans import estimate_mass, object_id
+from asset_tools.import_scans import estimate_mass, make_object_id
 from asset_tools.inspection import Inspect, Inspection, ModelSource, inspect_models
 from asset_tools.pipeline import AssetJob, content_hash, make_failing_job
 from asset_tools.prepare import prepare_scan
@@ -69,32 +69,35 @@ MASSES = {
 HOLLOW = re.compile(r"bowl|cups|pitcher|plate|skillet|fork|spoon|knife|spatula|clamp|chain|wrench|toy_airplane")
 
 
-def default_root() -> Path:
-    """Return the folder of ManiSkill's YCB download."""
+def default_ycb_folder() -> Path:
+    """Return the folder to which ManiSkill downloads the YCB objects."""
     data = Path(os.environ.get("MS_ASSET_DIR") or Path.home() / ".maniskill") / "data"
     return data / "assets" / "mani_skill2_ycb"
 
 
-def ycb_jobs(root: Path | None = None, ids: Sequence[str] = (), inspect: Inspect = inspect_models) -> list[AssetJob]:
-    """Return the jobs that import ManiSkill's YCB folder; an unreadable model gives a failing job.
+def make_ycb_jobs(
+    root: Path | None = None, ids: Sequence[str] = (), inspect: Inspect = inspect_models
+) -> list[AssetJob]:
+    """Return one job per YCB object; the job of an unreadable model raises an error when it runs.
 
     Args:
-        root: the folder; None: ManiSkill's default.
-        ids: names such as ``005_tomato_soup_can``; empty: all.
-        inspect: inspects the models; `inspect_models` with its options.
+        root: ManiSkill's YCB folder; None: the default folder of the download.
+        ids: names of YCB models, such as ``005_tomato_soup_can``; empty: all.
+        inspect: function that inspects all models: `inspect_models` with chosen options.
 
     Raises:
-        AssetError: the folder or some models are missing.
+        AssetError: the folder or a model is missing, or a name is unknown.
     """
-    root = root or default_root()
+    root = root or default_ycb_folder()
     info = _info(root)
     unknown = sorted(set(ids) - set(info))
     if unknown:
         raise AssetError(
-            "no such YCB objects",
+            "unknown names of YCB objects",
             where=root / INFO,
-            expected=f"names of the {len(info)} objects",
+            expected=f"names such as {min(info)}",
             found=_listed(unknown),
+            fix="The names are the keys of this file.",
         )
     models = sorted(set(ids) or info)
     missing = [model for model in models if not _mesh(root, model).is_file()]
@@ -104,8 +107,8 @@ def ycb_jobs(root: Path | None = None, ids: Sequence[str] = (), inspect: Inspect
     return [_job(root, model, info[model], inspected[model]) for model in models]
 
 
-def ycb_source(root: Path, model: str) -> ObjectSource:
-    """Return the source of a YCB object; models have z up.
+def load_ycb_source(root: Path, model: str) -> ObjectSource:
+    """Load a YCB object as the source of an asset, in metres with z up.
 
     Args:
         root: ManiSkill's YCB folder.
@@ -116,13 +119,14 @@ def ycb_source(root: Path, model: str) -> ObjectSource:
     """
     info = _info(root)
     if model not in info:
-        raise AssetError("no such YCB object", where=root / INFO, expected=f"one of the {len(info)} names", found=model)
+        expected = f"a name such as {min(info)}"
+        raise AssetError("unknown name of a YCB object", where=root / INFO, expected=expected, found=model)
     scan = prepare_scan(_mesh(root, model), root=root, up="z", unit="m")
     scale = _scale(root, model, info[model])
     if scale != 1:
         scan.mesh.apply_scale(scale)
         scan.closed.apply_scale(scale)
-    id_ = ycb_id(model)
+    id_ = make_ycb_object_id(model)
     entry = ENTRIES[NUMBERS[id_]] if id_ in NUMBERS else None
     return ObjectSource(
         id=id_,
@@ -140,24 +144,27 @@ def ycb_source(root: Path, model: str) -> ObjectSource:
     )
 
 
-def ycb_id(model: str) -> str:
-    """Convert a model's name to the id of the GraspNet-1Billion object, e.g. 072-a_toy_airplane -> toy_airplane_a."""
+def make_ycb_object_id(model: str) -> str:
+    """Convert the name of a YCB model to an object id: 072-a_toy_airplane -> toy_airplane_a.
+
+    If the object is also in GraspNet-1Billion, the result is its id there.
+    """
     found = re.fullmatch(r"\d+(?:-([a-z]))?_(\w+)", model)
     if found is None:
-        return object_id(model)
+        return make_object_id(model)
     letter, name = found.groups()
-    return object_id(f"{name}_{letter}" if letter else name)
+    return make_object_id(f"{name}_{letter}" if letter else name)
 
 
 def _job(root: Path, model: str, info: dict[str, Any], inspected: Inspection) -> AssetJob:
     if inspected.error is not None:
-        return make_failing_job(ycb_id(model), inspected.error)
+        return make_failing_job(make_ycb_object_id(model), inspected.error)
     try:
         scale = _scale(root, model, info)
     except AssetError as error:
-        return make_failing_job(ycb_id(model), error)
+        return make_failing_job(make_ycb_object_id(model), error)
     content = content_hash("ycb", model, scale, files=inspected.files, packages=["graspnet"])
-    return AssetJob(ycb_id(model), partial(_make, root, model), content)
+    return AssetJob(make_ycb_object_id(model), partial(_make, root, model), content)
 
 
 def _mesh(root: Path, model: str) -> Path:
@@ -165,7 +172,7 @@ def _mesh(root: Path, model: str) -> Path:
 
 
 def _make(root: Path, model: str, folder: Path) -> ObjectAsset:
-    return build_object(ycb_source(root, model), folder)
+    return build_object(load_ycb_source(root, model), folder)
 
 
 def _info(root: Path) -> dict[str, dict[str, Any]]:
@@ -177,7 +184,8 @@ def _info(root: Path) -> dict[str, dict[str, Any]]:
     except ValueError as error:
         raise AssetError("cannot read the list of YCB objects", where=path, found=error, fix=DOWNLOAD) from error
     if not isinstance(info, dict) or not info or not all(isinstance(entry, dict) for entry in info.values()):
-        raise AssetError("cannot read the list of YCB objects", where=path, expected="a mapping of names", fix=DOWNLOAD)
+        expected, found = "a mapping of names to properties", type(info).__name__
+        raise AssetError("invalid list of YCB objects", where=path, expected=expected, found=found, fix=DOWNLOAD)
     for name in info:
         check_name(name, AssetError, where=path, fix=DOWNLOAD)
     return info
@@ -188,9 +196,11 @@ def _scale(root: Path, model: str, info: dict[str, Any]) -> float:
     try:
         scale = float(scales[0])
     except (TypeError, ValueError, LookupError) as error:
-        raise AssetError("invalid scale of a YCB object", where=root / INFO, found=f"{model}: {scales}") from error
+        found, expected = f"scales {scales} of {model}", "a list that starts with a positive number"
+        raise AssetError("invalid scale of a YCB object", where=root / INFO, expected=expected, found=found) from error
     if not 0 < scale < float("inf"):
-        raise AssetError("invalid scale of a YCB object", where=root / INFO, found=f"{model}: {scale}")
+        found = f"scale {scale} of {model}"
+        raise AssetError("invalid scale of a YCB object", where=root / INFO, expected="a positive number", found=found)
     return scale
 
 

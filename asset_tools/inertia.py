@@ -1,4 +1,4 @@
-"""Mass properties of solids."""
+"""Compute mass properties of solids, and round them as in manifests."""
 
 from __future__ import annotations
 
@@ -7,18 +7,34 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 
-def principal_inertia(closed: trimesh.Trimesh, mass: float) -> tuple[np.ndarray, tuple[float, float, float, float]]:
-    """Moments (3,) in kg m2 about the centre of mass and their axes (wxyz) of a solid of even density."""
+def compute_principal_inertia(
+    closed: trimesh.Trimesh, mass: float
+) -> tuple[np.ndarray, tuple[float, float, float, float]]:
+    """Compute the principal moments of inertia of a solid of uniform density.
+
+    Args:
+        closed: watertight mesh, m.
+        mass: mass of the solid, kg.
+
+    Returns:
+        The moments (3,) about the centre of mass in kg m2, and the rotation wxyz of the principal axes in the mesh's
+        frame.
+    """
     return _principal(np.asarray(closed.moment_inertia) * (mass / closed.volume))
 
 
-def piece_inertia(
+def compute_piece_inertia(
     pieces: list[np.ndarray], mass: float
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, float, float, float]]:
-    """Mass properties of convex pieces of even density; what two pieces share counts twice.
+    """Compute the mass properties of a body of convex pieces of uniform density; overlaps count twice.
+
+    Args:
+        pieces: points (V, 3) of each piece, m.
+        mass: mass of the body, kg.
 
     Returns:
-        Centre of mass (3,) m, principal moments (3,) kg m2 about it, their axes (wxyz).
+        The centre of mass (3,) in m, the principal moments (3,) about the centre of mass in kg m2, and the rotation
+        wxyz of the principal axes in the frame of the pieces.
     """
     hulls = [trimesh.convex.convex_hull(piece) for piece in pieces]
     volumes = np.array([hull.volume for hull in hulls])
@@ -42,13 +58,13 @@ def _principal(tensor: np.ndarray) -> tuple[np.ndarray, tuple[float, float, floa
     return moments, (w, x, y, z)
 
 
-def to_tuple(values: np.ndarray) -> tuple[float, float, float]:
-    """Round to 9 decimals, as in manifests."""
+def round_vector(values: np.ndarray) -> tuple[float, float, float]:
+    """Round the three numbers of a vector to 9 decimals, the precision of manifests."""
     x, y, z = (round(float(value), 9) for value in values)
     return x, y, z
 
 
-def to_moments(values: np.ndarray) -> tuple[float, float, float]:
-    """Round moments of inertia to 9 significant digits; they can be as small as 4e-10 kg m2."""
+def round_moments(values: np.ndarray) -> tuple[float, float, float]:
+    """Round three moments of inertia to 9 significant digits, since they can be as small as 4e-10 kg m2."""
     x, y, z = (float(f"{value:.9g}") for value in values)
     return x, y, z

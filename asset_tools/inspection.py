@@ -20,6 +20,7 @@ log = logging.getLogger(__name__)
 
 GRACE = 5.0  # s after the time limit until a process that hangs in native code is killed
 MEMORY_GB = 4.0  # of the whole process, including imported libraries
+EXPORT = "Export the mesh again, or skip the model."
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,8 @@ class ModelSource:
     """Paths of a model.
 
     Attributes:
-        paths: the folder, the file, or several files that are versions of one model.
-        root: the imported folder.
+        paths: one folder, one file, or several files that are versions of one model.
+        root: the imported folder, which contains all paths.
     """
 
     paths: tuple[Path, ...]
@@ -37,10 +38,10 @@ class ModelSource:
 
 @dataclass(frozen=True)
 class Inspection:
-    """Result of an inspection.
+    """Result of the inspection of a model.
 
     Attributes:
-        longest: longest side in the unit of the file; 0 after an error.
+        longest: longest side of the bounding box in the unit of the file; 0 after an error.
         files: files that were read.
         error: error of reading the model, or None.
     """
@@ -53,15 +54,15 @@ class Inspection:
 def inspect_models(
     models: Mapping[str, ModelSource], processes: int = 0, on_inspected: Callable[[], None] = lambda: None
 ) -> dict[str, Inspection]:
-    """Inspect models, with limits of 30 s and 2 GB of memory per model.
+    """Read models and measure their size, with limits of 30 s and 2 GB of memory per model.
 
     Args:
-        models: models by id.
-        processes: number of worker processes; 0: this process, which a crash of native code would end.
+        models: object id -> paths of the model.
+        processes: number of worker processes; 0: read in this process, which a crash of native code would end.
         on_inspected: called after each model.
 
     Returns:
-        Inspections by id; unreadable models have an error.
+        Object id -> result; the result of an unreadable model has an error.
     """
     limits, found = Limits(MAX_SECONDS + GRACE, MEMORY_GB), {}
     with WorkerPool(partial(FunctionWorker, _inspect), processes, limits=limits, on_crash=_crashed) as pool:
@@ -88,5 +89,5 @@ def _inspect(task: tuple[str, ModelSource]) -> tuple[str, Inspection]:
 def _crashed(task: tuple[str, ModelSource], reason: str) -> tuple[str, Inspection]:
     id_, source = task
     return id_, Inspection(
-        error=AssetError("the process that read the model crashed", where=source.paths[0], found=reason)
+        error=AssetError("the process that read the model crashed", where=source.paths[0], found=reason, fix=EXPORT)
     )

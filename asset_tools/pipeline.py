@@ -31,6 +31,7 @@ from robocas_ms3.core.errors import AssetError, RobocasError
 from robocas_ms3.core.files import atomic_folder, write_json
 from robocas_ms3.core.output_folder import check_replaceable
 from robocas_ms3.core.strict_model import validate_json
+from robocas_ms3.core.text import format_count
 from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 
 MADE_FROM = "made_from.json"  # file of a pack: asset id -> hash of its inputs
@@ -63,7 +64,7 @@ class AssetJob:
         id: id of the asset.
         make: writes the files of the asset to a folder and returns its manifest entry; must be picklable.
         content: hash of all inputs of the asset, see `content_hash`.
-        error: error that is known before the build, or None.
+        error: error that was found before the build, or None.
     """
 
     id: str
@@ -81,10 +82,10 @@ class AssetJobResult:
 
     Attributes:
         id: id of the asset.
-        asset: manifest entry; None if the job failed.
-        error: reason of the failure.
-        reused: whether the asset is from the cache.
-        seconds: duration of the build.
+        asset: manifest entry of the asset; None if the job failed.
+        error: reason of the failure; empty if the job succeeded.
+        reused: whether the asset was copied from the cache.
+        seconds: duration of the build; 0 for a copy from the cache.
     """
 
     id: str
@@ -95,7 +96,7 @@ class AssetJobResult:
 
 
 def make_failing_job(id_: str, error: AssetError) -> AssetJob:
-    """Return a job that raises an error when it runs, so that it can be skipped like other failures."""
+    """Return a job that raises ``error`` when it runs, so that ``skip_errors`` also skips assets with early errors."""
     return AssetJob(id_, partial(_fail, error), content_hash(str(error)), error)
 
 
@@ -104,21 +105,21 @@ def _fail(error: AssetError, folder: Path) -> ObjectAsset:
 
 
 def check_jobs(jobs: Iterable[AssetJob]) -> None:
-    """Raise AssetError for the first job whose `error` was found before the build."""
+    """Raise AssetError for the first job whose ``error`` was found before the build."""
     for job in jobs:
         if job.error is not None:
             raise AssetError(_failed_result(job, str(job.error)).error.rstrip("."), fix=SKIP_FIX)
 
 
-def make_assets(jobs: Sequence[AssetJob], out: Path, cache: Path, *, processes: int = 1) -> Iterator[AssetJobResult]:
-    """Build assets in ``out/<id>``, or copy them from the cache; yield each result when it is done.
+def build_assets(jobs: Sequence[AssetJob], out: Path, cache: Path, *, processes: int = 1) -> Iterator[AssetJobResult]:
+    """Build assets in ``out/<id>``, or copy them from the cache; yield each result as soon as it is available.
 
     An interrupted run continues where it stopped, since every finished asset is cached.
 
     Args:
         jobs: assets to build.
-        out: folder of the pack.
-        cache: folder of finished assets.
+        out: existing folder of the pack.
+        cache: folder of the cache, which is created if it is missing.
         processes: number of worker processes.
     """
     _delete_old_entries(cache)
@@ -135,18 +136,19 @@ def make_assets(jobs: Sequence[AssetJob], out: Path, cache: Path, *, processes: 
         if made.asset is None or _copy_from_cache(place, out / made.id) or _copy_from_cache(place, out / made.id):
             yield made
         else:
-            yield AssetJobResult(made.id, None, f"{made.id}: the finished asset was removed from {place.parent}")
+            message = f"{made.id}: another process removed the finished asset from the cache {place.parent}"
+            yield AssetJobResult(made.id, None, message)
 
 
-def content_hash(*parts: object, files: Iterable[Path] = (), packages: Sequence[str] = ()) -> str:
-    """Return a hash of the inputs of an asset: settings, source files, code and versions of libraries.
+def content_hash(*settings: object, files: Iterable[Path] = (), packages: Sequence[str] = ()) -> str:
+    """Return the SHA-256 of the inputs of an asset: settings, source files, code and versions of libraries.
 
     Args:
-        parts: settings; their ``repr`` must show all values.
-        files: source files; names are part of the hash.
-        packages: further folders of ``asset_tools`` with code and YAML, in addition to the shared code.
+        settings: values that affect the asset; each ``repr`` must contain the complete value.
+        files: source files; the hash depends on their names and contents.
+        packages: subfolders of ``asset_tools`` with code and YAML that affect the asset; shared code is always hashed.
     """
-    digest = hashlib.sha256(repr((SCHEMA_VERSION, parts)).encode())
+    digest = hashlib.sha256(repr((SCHEMA_VERSION, settings)).encode())
     for path in files:
         digest.update(f"{path.name} {sha256(path)}".encode())
     for package in ("", "quality", "readers", *packages):
@@ -201,7 +203,12 @@ def _failed_result(job: AssetJob, message: str) -> AssetJobResult:
 
 
 def _copy_from_cache(place: Path, folder: Path) -> ObjectAsset | FurnitureAsset | None:
-    """Copy an asset from the cache and return its entry; None if it is missing or damaged."""
+    """Copy an asset from the cache and return its manifest entry; None if the cached asset is missing or damaged.
+
+    Args:
+        place: folder of the asset in the cache.
+        folder: new folder of the asset in the pack.
+    """
     try:
         asset = validate_json(_ASSET, (place / ENTRY).read_bytes())
         place.touch()
@@ -232,17 +239,20 @@ def write_pack(
     record: bool = True,
     on_made: Callable[[AssetJobResult], None] = lambda made: None,
 ) -> list[AssetJobResult]:
-    """Build a pack of assets; the folder appears atomically when all assets are done.
+    """Build a pack of assets; the folder is created or replaced in one step when all assets are complete.
 
     Args:
         jobs: assets to build.
-        folder: of the pack; its name is the name of the pack.
-        cache: see `make_assets`.
+        folder: folder of the pack; the name of the folder is the name of the pack.
+        cache: folder of finished assets, see `build_assets`.
         description: description in the manifest.
         processes: number of worker processes.
-        skip_errors: whether to skip assets with errors instead of raising.
-        record: whether to store the hashes of the inputs, for `is_up_to_date`.
-        on_made: called after each asset.
+        skip_errors: whether to leave out assets with errors instead of raising.
+        record: whether to store the hashes of the inputs, which `is_up_to_date` compares.
+        on_made: called with the result of each asset.
+
+    Returns:
+        One result per job.
 
     Raises:
         AssetError: an asset cannot be built or simulated, or all assets failed.
@@ -250,7 +260,7 @@ def write_pack(
     check_pack_folder(folder)
     results = []
     with atomic_folder(folder) as tmp:
-        for made in make_assets(jobs, tmp, cache, processes=processes):
+        for made in build_assets(jobs, tmp, cache, processes=processes):
             if made.asset is None and not skip_errors:
                 raise AssetError(made.error.rstrip("."), fix=SKIP_FIX)
             results.append(made)
@@ -258,7 +268,8 @@ def write_pack(
         results = _remove_hull_violations(results, tmp, skip_errors)
         assets = sorted((made.asset for made in results if made.asset), key=lambda asset: (asset.kind, asset.id))
         if not assets:
-            raise AssetError("all assets failed", where=folder, found=results[0].error)
+            found = f"{format_count(len(results), 'error')}; the first: {results[0].error}"
+            raise AssetError("no asset could be built", where=folder, expected="at least one asset", found=found)
         manifest = PackManifest(name=folder.name, description=description, assets=assets)
         (tmp / MANIFEST).write_text(manifest.model_dump_json(indent=1) + "\n", encoding="utf-8")
         if record:
@@ -268,7 +279,11 @@ def write_pack(
 
 
 def _remove_hull_violations(results: list[AssetJobResult], folder: Path, skip_errors: bool) -> list[AssetJobResult]:
-    """Skip assets with hulls that the physics engine shrinks or rejects, or raise AssetError."""
+    """Remove assets with hulls that PhysX shrinks or rejects from the pack; without ``skip_errors``, raise AssetError.
+
+    Returns:
+        ``results``, with failures in place of the removed assets.
+    """
     violations: dict[str, str] = {}
     for violation in find_hull_violations(folder):
         violations.setdefault(violation.asset.partition("/")[0], str(violation))
@@ -293,7 +308,13 @@ def check_pack_folder(folder: Path) -> None:
 
 
 def is_up_to_date(jobs: Sequence[AssetJob], folder: Path, *, skip_errors: bool = False) -> bool:
-    """Return whether a pack was built from the same inputs; with ``skip_errors`` it may lack failed assets."""
+    """Return whether a pack was built from the inputs of ``jobs``.
+
+    Args:
+        jobs: jobs of all assets.
+        folder: folder of the pack.
+        skip_errors: whether a pack without the assets that failed also counts as up to date.
+    """
     try:
         found = load_json(folder / MADE_FROM)
         return found["content"] == {job.id: job.content for job in jobs} and (skip_errors or not found["skipped"])

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from asset_tools.readers.model import read_model
-from asset_tools.readers.surface import Textures
+from asset_tools.readers.surface import MultiTextureMaterial
 from asset_tools.repair import close_scan
-from asset_tools.scan import METRES_PER_UNIT, PLAUSIBLE, Unit, Up, guess_unit, guess_up, rotate_upright
+from asset_tools.scan import METRES_PER_UNIT, PLAUSIBLE, Unit, Up, guess_common_unit, guess_up, rotate_upright
 from asset_tools.solids import to_mesh, to_solid
 from robocas_ms3.core.errors import AssetError
 
@@ -34,14 +34,15 @@ UNIT_NAMES = {"cm": "centimetres", "mm": "millimetres", "inch": "inches"}
 
 @dataclass(frozen=True)
 class PreparedScan:
-    """A scan, ready for hulls and grasps.
+    """A repaired scan, from which hulls and grasps can be computed.
 
     Attributes:
         mesh: visual mesh: textured, metres, z up, outward faces.
-        closed: watertight mesh of the same body in the same frame.
+        closed: watertight mesh of the body, in the frame of ``mesh``.
         up: axis of the file that points up.
         unit: unit of the file.
-        repairs: repairs, substitutions and omissions, one line each; lines with "warning:" change the appearance.
+        repairs: one line for each repair, replaced file and ignored feature. A line that starts with "warning:" is a
+            change of the appearance.
     """
 
     mesh: trimesh.Trimesh
@@ -54,11 +55,11 @@ class PreparedScan:
 def prepare_scan(
     path: Path | Sequence[Path], *, root: Path | None = None, up: Up | None = None, unit: Unit | None = None
 ) -> PreparedScan:
-    """Read a scan and repair it: files, faces, holes, axis, unit, base.
+    """Read a scan, repair its faces, close its holes, flatten its base, and convert it to metres with z up.
 
     Args:
-        path: a mesh file, a folder with its files, or several files, which may be versions of one mesh.
-        root: the imported folder; no files outside of it are read. None: the scan's own folder.
+        path: a mesh file, a folder of mesh files, or several mesh files, which may be versions of one mesh.
+        root: the imported folder; files outside of this folder are not read. None: the folder of the scan.
         up: axis of the file that points up; None: guessed.
         unit: unit of the file; None: guessed.
 
@@ -73,14 +74,14 @@ def prepare_scan(
     known = up or model.up
     up = known or guess_up(solid.mesh)
     if up != "z":
-        repairs.append(f"turned {up} up" if known else f"turned {up} up, a guess")
+        repairs.append(f"rotated {up} up" if known else f"rotated {up} up (guessed)")
     longest = float(solid.mesh.extents.max())
-    unit = unit or guess_unit([longest])
+    unit = unit or guess_common_unit([longest])
     if not PLAUSIBLE[0] <= longest * METRES_PER_UNIT[unit] <= PLAUSIBLE[1]:
         raise AssetError(
             "implausible size of a scan",
             where=path if isinstance(path, Path) else path[0],
-            expected=f"{PLAUSIBLE[0]} to {PLAUSIBLE[1]} m for the longest side",
+            expected=f"a longest side of {PLAUSIBLE[0]} to {PLAUSIBLE[1]} m",
             found=f"{longest * METRES_PER_UNIT[unit]:g} m ({longest:g} taken as {UNIT_NAMES.get(unit, 'metres')})",
             fix="Pass --units with the unit of the file.",
         )
@@ -97,7 +98,7 @@ def _about_colours(mesh: trimesh.Trimesh) -> list[str]:
     if visual.kind == "vertex":
         return ["baked colours into a texture"]
     if visual.kind == "texture":
-        several = isinstance(visual.material, Textures)
+        several = isinstance(visual.material, MultiTextureMaterial)
         return ["baked several textures and colours into one texture"] if several else []
     return ["has no colours"]
 
@@ -105,15 +106,15 @@ def _about_colours(mesh: trimesh.Trimesh) -> list[str]:
 def level_base(
     mesh: trimesh.Trimesh, closed: trimesh.Trimesh, repairs: list[str]
 ) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
-    """Flatten a broad base that bulges, so that the object does not rock.
+    """Flatten a broad base that bulges downwards, so that the object does not rock.
 
     Args:
         mesh: visual mesh, metres, z up.
-        closed: watertight mesh of the same body in the same frame.
-        repairs: list to which a note is added.
+        closed: watertight mesh of the body, in the frame of ``mesh``.
+        repairs: list to which the function appends a note if it changes the meshes.
 
     Returns:
-        Both meshes; unchanged if the base is flat or round.
+        Both meshes with a flat base; the input meshes if the base is already flat, or round as that of a ball.
     """
     center = np.asarray(closed.center_mass)
     low, height = float(closed.bounds[0, 2]), float(closed.extents[2])
@@ -135,13 +136,22 @@ def level_base(
 
 
 def _reach(closed: trimesh.Trimesh, height: float, center: Array) -> float:
-    """Return the smallest distance from the centre of mass to the outline of the section at a height."""
+    """Return the smallest horizontal distance in m from the centre of mass to the outline of a horizontal section.
+
+    Args:
+        closed: watertight mesh, metres, z up.
+        height: z of the section, m.
+        center: (3,) centre of mass.
+    """
     section = closed.section([0, 0, 1], [0, 0, height])
     return 0.0 if section is None else _edge_distance(np.asarray(section.vertices)[:, :2], center)
 
 
 def _edge_distance(flat: Array, center: Array) -> float:
-    """Return the distance from the centre of mass to the nearest edge of the convex outline of points (N, 2)."""
+    """Return the distance from a point, xy of ``center``, to the nearest edge of the convex outline of points (N, 2).
+
+    The distance is negative if the point is outside, and 0 if the points enclose no area.
+    """
     try:
         return float((-(ConvexHull(flat).equations @ [*center[:2], 1.0])).min())
     except (QhullError, ValueError):

@@ -27,11 +27,11 @@ class RenderBody:
     """A body in an image, given by a mesh file or by triangles.
 
     Attributes:
-        points: (N, 3) points in the body's frame that must be in the image; may be empty.
+        points: (N, 3) points in the body's frame; the camera is moved so that all of them are visible. May be empty.
         file: mesh file, or None.
         faces: (F, 3, 3) corners of flat-shaded triangles, or None.
         colour: colour of the triangles.
-        pose: (4, 4) pose of the body.
+        pose: (4, 4) pose of the body in the world frame.
     """
 
     points: Array
@@ -42,10 +42,10 @@ class RenderBody:
 
 
 class Renderer:
-    """A scene with lights and an orthographic camera.
+    """A scene with lights and an orthographic camera, which renders bodies.
 
     Args:
-        size: width and height of the images, pixels.
+        size: width and height of the images in pixels.
 
     Raises:
         AssetError: no render device is available.
@@ -57,7 +57,7 @@ class Renderer:
             self._scene = sapien.Scene([sapien.render.RenderSystem()])
         except RuntimeError as error:
             fix = "Install a Vulkan driver; see `robocas doctor`."
-            raise AssetError("no render device", found=error, fix=fix) from error
+            raise AssetError("no render device is available", found=error, fix=fix) from error
         self._scene.set_ambient_light([0.45, 0.45, 0.45])
         self._sun = self._scene.add_directional_light([0, 0, -1], [1.7, 1.7, 1.7])
         self._fill = self._scene.add_directional_light([0, 0, -1], [0.6, 0.6, 0.6])
@@ -67,8 +67,14 @@ class Renderer:
         holder.add_component(self._camera)
         self._scene.add_entity(holder)
 
-    def image(self, bodies: Sequence[RenderBody], azimuth: float, elevation: float) -> Image.Image:
-        """Render the bodies from a direction: azimuth from +x and elevation above the horizon, degrees."""
+    def render(self, bodies: Sequence[RenderBody], azimuth: float, elevation: float) -> Image.Image:
+        """Return an image of bodies, which fill the frame.
+
+        Args:
+            bodies: the bodies.
+            azimuth: direction from the bodies to the camera, degrees from +x about +z.
+            elevation: angle of this direction above the horizon, degrees.
+        """
         entities = [self._entity(body) for body in bodies]
         for entity in entities:
             self._scene.add_entity(entity)
@@ -128,15 +134,22 @@ class Renderer:
         return entity
 
 
-def box_faces(low: Iterable[float], high: Iterable[float]) -> Array:
-    """Return the triangles (12, 3, 3) of an axis-aligned box."""
-    corners = np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), dtype=float).reshape(3, 8).T
+def make_box_faces(lower_corner: Iterable[float], upper_corner: Iterable[float]) -> Array:
+    """Return the triangles (12, 3, 3) of an axis-aligned box.
+
+    Args:
+        lower_corner: (3,) lower corner.
+        upper_corner: (3,) upper corner.
+    """
+    corners = (
+        np.array(np.meshgrid(*zip(lower_corner, upper_corner, strict=True), indexing="ij"), dtype=float).reshape(3, 8).T
+    )
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     return np.array([[corners[a], corners[b], corners[c]] for q in quads for a, b, c in (q[:3], (q[0], q[2], q[3]))])
 
 
 def _rotation_from_x(direction: Array) -> Array:
-    """Return the quaternion wxyz of a rotation from +x to a direction (3,)."""
+    """Return the quaternion wxyz of the shortest rotation from +x to a direction (3,)."""
     direction = direction / np.linalg.norm(direction)
     if direction[0] < -0.999999:
         return np.array([0.0, 0.0, 0.0, 1.0])

@@ -37,12 +37,12 @@ NEIGHBOURS = 6  # samples that determine the side of the surface for a close poi
 
 @dataclass(frozen=True)
 class ClosedScan:
-    """A closed scan.
+    """A scan and a watertight mesh of its body.
 
     Attributes:
-        mesh: watertight mesh with outward faces, in the scan's frame and unit.
-        scan: visual mesh without dirt and inner shells, with outward faces.
-        repairs: notes on repairs.
+        mesh: watertight mesh with outward faces, in the frame and unit of the scan.
+        scan: visual mesh with outward faces, without scanner dirt and inner shells, in the same frame and unit.
+        repairs: one note per repair.
     """
 
     mesh: trimesh.Trimesh
@@ -51,12 +51,13 @@ class ClosedScan:
 
 
 def close_scan(scan: trimesh.Trimesh) -> ClosedScan:
-    """Convert a scan to a watertight solid: merge vertices, drop dirt, orient faces, fill holes, or else remesh.
+    """Convert a scan to a watertight solid.
 
-    Shells inside the outer surface (a transparent can) are dropped.
+    The function merges vertices, removes scanner dirt, orients the faces and fills holes. If the mesh is still open,
+    it is remeshed. Shells inside the outer surface, as in the scan of a transparent can, are dropped.
 
     Args:
-        scan: any unit; may have UV seams.
+        scan: mesh in any unit; UV seams are allowed.
 
     Raises:
         AssetError: the scan is a sheet without volume, or cannot be closed.
@@ -75,8 +76,8 @@ def close_scan(scan: trimesh.Trimesh) -> ClosedScan:
     diagonal = float(np.linalg.norm(shown.extents))
     if solid is None or solid.volume() < max(LEAST_VOLUME * _hull_volume(mesh), FOIL * shown.area * diagonal):
         raise AssetError(
-            "cannot close the mesh to a solid",
-            expected=f"at most small holes, and at least {LEAST_VOLUME:.0%} of the convex hull's volume",
+            "cannot convert the mesh to a solid",
+            expected=f"only small holes, and a volume of at least {LEAST_VOLUME:.0%} of the convex hull",
             found=f"{_open_edges(mesh)} open edges of {len(mesh.edges_unique)}, in {mesh.body_count} pieces",
             fix="Repair the scan, or skip it.",
         )
@@ -84,16 +85,16 @@ def close_scan(scan: trimesh.Trimesh) -> ClosedScan:
     lost = float(np.abs(closed.bounds - shown.bounds).max())
     if lost > LOST * diagonal:
         raise AssetError(
-            "closing the mesh would lose a part of it",
-            expected=f"a change of the bounding box of at most {LOST:.0%}",
-            found=f"{lost / diagonal:.0%} of its diagonal",
+            "the closed mesh lacks a part of the scan",
+            expected=f"a bounding box that changes by at most {LOST:.0%} of its diagonal",
+            found=f"a change of {lost / diagonal:.0%}",
             fix="Repair the mesh: join its parts to one closed surface.",
         )
     return ClosedScan(closed, shown, tuple(repairs))
 
 
 def _hull_volume(mesh: trimesh.Trimesh) -> float:
-    """Return the volume of the convex hull, 0 for a flat mesh."""
+    """Return the volume of the convex hull of a mesh; 0 for a flat mesh."""
     try:
         return float(mesh.convex_hull.volume)
     except QhullError:
@@ -103,7 +104,19 @@ def _hull_volume(mesh: trimesh.Trimesh) -> float:
 def _filled(
     mesh: trimesh.Trimesh, shown: trimesh.Trimesh, repairs: list[str]
 ) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
-    """Fill each hole with a simple loop as rim by a fan around its centre, in both meshes."""
+    """Fill the holes of a mesh with triangles around the centre of each hole.
+
+    Args:
+        mesh: mesh with vertices merged by position.
+        shown: visual mesh with equal faces in equal order.
+        repairs: list to which the function appends a note.
+
+    Returns:
+        Both meshes with filled holes; the input meshes if two holes share a vertex.
+
+    Raises:
+        AssetError: the holes are larger than 35 % of the surface.
+    """
     rim_edges = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
     edges = mesh.edges[rim_edges]
     following = {int(a): int(b) for b, a in edges}  # the fill traverses the rim in the opposite direction
@@ -129,10 +142,10 @@ def _filled(
         holes += 1
     if area > FILLED * mesh.area:
         raise AssetError(
-            "cannot close the mesh to a solid",
-            expected=f"holes of at most {FILLED:.0%} of its surface",
+            "the holes of the mesh are too large",
+            expected=f"holes of at most {FILLED:.0%} of the surface",
             found=f"{area / mesh.area:.0%}",
-            fix="Scan it from all sides, or skip it.",
+            fix="Scan the object from all sides, or skip the scan.",
         )
     repairs.append(f"filled {holes} hole{'s' if holes > 1 else ''}")
     filled = trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False)
@@ -141,13 +154,13 @@ def _filled(
 
 
 def _patched(shown: trimesh.Trimesh, face: Ints, corner: Ints, middles: Array) -> trimesh.Trimesh:
-    """Add a triangle from each edge of a hole's rim to the hole's centre, in the colours of the edge.
+    """Add triangles that fill holes: one from each edge of a rim to the centre of the hole, in the colours of the edge.
 
     Args:
         shown: textured or coloured mesh.
-        face: (E,) face of each edge.
-        corner: (E,) first corner of the edge in its face.
-        middles: (E, 3) centre of the hole of each edge.
+        face: (E,) index of the face at each edge of a rim.
+        corner: (E,) index 0, 1 or 2 of the corner of this face at which the edge starts.
+        middles: (E, 3) centre of the hole at each edge.
     """
     old = np.asarray(shown.faces)
     first, second = old[face, corner], old[face, (corner + 1) % 3]
@@ -172,7 +185,7 @@ def _patched(shown: trimesh.Trimesh, face: Ints, corner: Ints, middles: Array) -
 
 
 def _as_solid(mesh: trimesh.Trimesh) -> Manifold | None:
-    """Convert a mesh to a solid with outward faces; None if it is not closed or has no volume."""
+    """Convert a mesh to a solid with outward faces; return None if the mesh is not closed or has no volume."""
     if not mesh.is_watertight:
         return None
     if mesh.volume < 0:
@@ -185,9 +198,9 @@ def _as_solid(mesh: trimesh.Trimesh) -> Manifold | None:
 
 
 def _union_of_pieces(mesh: trimesh.Trimesh, repairs: list[str]) -> Manifold | None:
-    """Return the union of closed pieces that share edges and parts of faces; None if a piece is not closed.
+    """Return the union of the closed pieces of a mesh, which may touch; None if a piece is not closed.
 
-    Only edges of exactly two faces connect faces to a piece; an edge shared by two boxes has four faces.
+    Only edges of exactly two faces connect the faces of a piece. An edge at which two boxes touch has four faces.
     """
     count = len(mesh.faces)
     pieces = trimesh.graph.connected_components(mesh.face_adjacency, nodes=np.arange(count), min_len=1)
@@ -204,7 +217,11 @@ def _union_of_pieces(mesh: trimesh.Trimesh, repairs: list[str]) -> Manifold | No
 
 
 def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Remesh the zero level of the distance to the surface on a grid, signed by the winding number."""
+    """Return a closed mesh around an open surface.
+
+    The function computes the distance to the surface on a grid. The winding number gives the sign of the distance. The
+    result is the mesh of the zero level, from marching cubes.
+    """
     from skimage.measure import marching_cubes
 
     pitch = float(mesh.extents.max()) / CELLS
@@ -221,7 +238,7 @@ def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     few = slice(None, None, max(1, count // WINDING_SAMPLES))
     scale = 1 / pitch  # numbers near 1 keep single precision accurate
     middle = grid.mean(axis=0)
-    inside = winding_number(
+    inside = compute_winding_numbers(
         (grid - middle) * scale, (samples[few] - middle) * scale, normals[few], mesh.area * scale**2
     )
     outwards = 1.0 if np.abs(inside.max()) >= np.abs(inside.min()) else -1.0
@@ -243,10 +260,11 @@ def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return joined
 
 
-def winding_number(points: Array, samples: Array, normals: Array, area: float) -> Array:
-    """Return the winding number (N,) of an open or closed surface: 1 inside, 0 outside, in between near a hole.
+def compute_winding_numbers(points: Array, samples: Array, normals: Array, area: float) -> Array:
+    """Return the winding number (N,) of a surface at N points: 1 inside, 0 outside, between 0 and 1 near a hole.
 
-    Samples approximate the surface; the result is accurate at distances above two samples' spacing.
+    Samples approximate the surface. The result is accurate at points farther from the surface than twice the distance
+    between neighbouring samples.
 
     Args:
         points: (N, 3) query points.
@@ -265,7 +283,7 @@ def winding_number(points: Array, samples: Array, normals: Array, area: float) -
 
 
 def _light(solid: Manifold, diagonal: float) -> trimesh.Trimesh:
-    """Return the simplified, closed surface of a solid, within about 0.1 % of its size."""
+    """Return the closed surface of a solid, simplified to at most 5000 faces if this keeps 95 % of the volume."""
     for tolerance in TOLERANCES:
         if solid.num_tri() <= FACES:
             break

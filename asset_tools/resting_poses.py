@@ -11,11 +11,11 @@ from scipy.spatial import ConvexHull, QhullError
 from asset_tools.stability import (
     BELOW,
     UPRIGHT_DEG,
+    find_stable_directions,
     merge_poses,
     pool_probabilities,
     rocks_in_place,
     select_poses,
-    stable_directions,
     toppling_angle,
 )
 from robocas_ms3.assets.hulls import find_box
@@ -54,8 +54,8 @@ class RestingPoses:
 
     Attributes:
         poses: (S, 4, 4) ``T_plane_object``: pose of the object in a frame with the plane at z = 0 and the centre of
-            mass at x = y = 0; the rotation is the shortest one, without yaw.
-        probabilities: (S,) fraction of random drops that end in each pose; the sum is 1.
+            mass at x = y = 0. The rotation is the shortest rotation to this pose, so it has no yaw.
+        probabilities: (S,) estimated fraction of random drops that end in each pose; the sum is 1.
         display_pose: index of the pose in which the object's +z points up within 10 deg, or -1.
     """
 
@@ -70,8 +70,8 @@ class _Body:
     points: Array  # (K, 3) corners of the hull of all hulls
     cooked: Array  # (L, 3) corners of the hull of the engine's shapes
 
-    def rest(self, up: Array) -> Array:
-        """Return the pose (4, 4) on the plane in which a direction (3,) of the object's frame points up."""
+    def place_with_up(self, up: Array) -> Array:
+        """Return the pose (4, 4) of the object on the plane z = 0 in which ``up``, (3,) in its frame, points up."""
         pose = np.eye(4)
         pose[:3, :3] = _turn_up(up)
         pose[:2, 3] = -(pose[:2, :3] @ self.solid.center_of_mass)
@@ -80,14 +80,15 @@ class _Body:
         return pose
 
 
-def resting_poses(solid: RigidBody) -> RestingPoses:
-    """Find the poses in which a placed object stays; deterministic.
+def find_resting_poses(solid: RigidBody) -> RestingPoses:
+    """Find the poses in which an object stays when it is placed on a table; deterministic.
 
-    Poses with a probability below 2 % are dropped, unless all are rare. Probabilities of poses with equal height are
-    added, since a cylinder has many poses on its side.
+    The function drops poses with a probability below 2 %, unless all poses are rarer. For this limit, the
+    probabilities of poses with equal height of the centre of mass are added, since a cylinder has many poses on its
+    side.
 
     Args:
-        solid: the object; the table's friction is 0.99.
+        solid: the object; the friction coefficient of the table is 0.99.
 
     Raises:
         AssetError: the hulls are flat, the centre of mass is outside of them, or no pose is stable.
@@ -99,7 +100,7 @@ def resting_poses(solid: RigidBody) -> RestingPoses:
         hull = ConvexHull(np.concatenate([_cooked(np.asarray(piece, float)) for piece in solid.hulls]))
     except (QhullError, ValueError, RuntimeError) as error:
         raise AssetError("the convex hulls enclose no volume", found=str(error).split("\n")[0]) from error
-    directions, probabilities, heights = stable_directions(hull, solid.center_of_mass)
+    directions, probabilities, heights = find_stable_directions(hull, solid.center_of_mass)
     kept = select_poses(directions, probabilities, heights, RAREST)
     probabilities = pool_probabilities(directions, probabilities, kept)
     body = _Body(solid, points, hull.points[hull.vertices])
@@ -107,21 +108,24 @@ def resting_poses(solid: RigidBody) -> RestingPoses:
     settled, which = _firm(body, settled, which)
     if not which:
         raise AssetError(
-            "the object has no stable pose", expected=f"one of {len(kept)} poses to be stable", fix="Check its mass."
+            "the object has no stable pose",
+            expected="at least one stable pose",
+            found=f"none of {len(kept)} poses was stable",
+            fix="Check the mass of the object.",
         )
     directions, probabilities, _ = merge_poses(settled, probabilities[which], np.zeros(len(which)))
-    poses = np.array([body.rest(up) for up in directions])
+    poses = np.array([body.place_with_up(up) for up in directions])
     upright = np.flatnonzero(poses[:, 2, 2] > np.cos(np.radians(UPRIGHT_DEG)))
     return RestingPoses(poses, probabilities / probabilities.sum(), int(upright[0]) if len(upright) else -1)
 
 
 def _cooked(piece: Array) -> Array:
-    """Return the corners (V, 3) of the engine's shape for a convex hull; boxes are exact."""
+    """Return the corners (V, 3) of the shape that PhysX makes of a convex hull; a box keeps its corners."""
     return piece if find_box(piece) is not None else make_convex_shape(piece, physx.PhysxMaterial(1, 1, 0)).vertices
 
 
 def _turn_up(up: Array) -> Array:
-    """Return the shortest rotation (3, 3) of a unit vector to +z; a half turn about x for -z."""
+    """Return the shortest rotation (3, 3) from a unit vector (3,) to +z; for -z, a half turn about x."""
     x, y, z = up
     if z < -1 + 1e-9:
         return np.diag([1.0, -1.0, -1.0])
@@ -130,15 +134,19 @@ def _turn_up(up: Array) -> Array:
 
 
 def _settle(body: _Body, directions: Array) -> tuple[Array, list[int]]:
-    """Place the object in each pose, and again in the pose that it reaches, until it stays.
+    """Simulate the object from each pose until it stays; after a motion, place it again in the pose that it reached.
+
+    Args:
+        body: the object.
+        directions: (N, 3) directions of the object's frame that point up in the poses.
 
     Returns:
-        Stable up directions (M, 3), and the indices of the initial directions.
+        The up directions (M, 3) of the poses in which the object stayed, and the M indices of the poses at the start.
     """
     waiting, ups, found = list(range(len(directions))), directions.copy(), {}
     points = np.stack([body.solid.center_of_mass, np.zeros(3)])
     for _ in range(ROUNDS):
-        placed = np.array([turn @ body.rest(ups[i]) for i in waiting for turn in TURNS])
+        placed = np.array([turn @ body.place_with_up(ups[i]) for i in waiting for turn in TURNS])
         ends = _simulate(body, placed + LIFT)
         moves = np.linalg.norm(
             points @ (ends - placed)[:, :3, :3].transpose(0, 2, 1) + (ends - placed)[:, None, :3, 3], axis=2
@@ -161,7 +169,16 @@ def _settle(body: _Body, directions: Array) -> tuple[Array, list[int]]:
 
 
 def _firm(body: _Body, directions: Array, which: list[int]) -> tuple[Array, list[int]]:
-    """Drop poses with small toppling angles, unless there are no others; arguments and result as in `_settle`."""
+    """Drop poses with toppling angles below 3 deg, unless all are smaller or the object only rocks.
+
+    Args:
+        body: the object.
+        directions: (M, 3) up directions of the poses.
+        which: M indices of the poses.
+
+    Returns:
+        The directions and indices of the remaining poses.
+    """
     if len(directions) == 0:
         return directions, which
     margins = np.array([toppling_angle(body.cooked, body.solid.center_of_mass, up) for up in directions])
@@ -171,7 +188,7 @@ def _firm(body: _Body, directions: Array, which: list[int]) -> tuple[Array, list
 
 
 def _simulate(body: _Body, starts: Array) -> Array:
-    """Return the poses (N, 4, 4) after 1 s of objects placed in poses (N, 4, 4)."""
+    """Simulate N separate copies of an object from poses (N, 4, 4); return their poses (N, 4, 4) after 1 s."""
     offsets = grid_origins(len(starts))
     with engine_settings():
         scene = make_scene()

@@ -26,13 +26,13 @@ MIN_UPRIGHT_RATIO = 0.27  # thickness over height; thinner boxes are not placed 
 BOX_FILL = 0.93  # outline over bounding rectangle of a box; 0.785 for an ellipse
 
 
-def guess_unit(longest: Sequence[float]) -> Unit:
-    """Guess the common unit of scans: metres, centimetres or millimetres.
+def guess_common_unit(longest: Sequence[float]) -> Unit:
+    """Guess one unit for all scans: metres, centimetres or millimetres.
 
-    Inches cannot be distinguished from centimetres by size.
+    Inches are never guessed, since sizes in inches and in centimetres are too similar.
 
     Args:
-        longest: longest side of each scan, in its unit.
+        longest: longest side of each scan, in the unknown unit.
 
     Raises:
         AssetError: the size is implausible for picking in every unit.
@@ -42,18 +42,21 @@ def guess_unit(longest: Sequence[float]) -> Unit:
     if not PLAUSIBLE[0] <= middle * METRES_PER_UNIT[best] <= PLAUSIBLE[1]:
         raise AssetError(
             "cannot guess the unit of the scans",
-            expected=f"{PLAUSIBLE[0]} to {PLAUSIBLE[1]} m for the longest side",
-            found=f"{middle:g} units",
-            fix="Pass --units.",
+            expected=f"a longest side of {PLAUSIBLE[0]} to {PLAUSIBLE[1]} m in metres, centimetres or millimetres",
+            found=f"a longest side of {middle:g}",
+            fix="Pass --units with the unit of the files.",
         )
     return best  # pyright: ignore[reportReturnType]
 
 
 def guess_units(longest: Mapping[str, float]) -> dict[str, Unit]:
-    """Guess the unit of each scan of a folder: the common unit, except for scans that it makes too large or too small.
+    """Guess the unit of each scan of a folder.
+
+    Scans have the common unit of the folder. A scan that would be too large or too small in this unit gets another
+    unit.
 
     Args:
-        longest: name -> longest side in the unit of the scan.
+        longest: name of the scan -> longest side, in the unknown unit.
 
     Raises:
         AssetError: the size of a scan is implausible for picking in every unit.
@@ -67,7 +70,7 @@ def guess_units(longest: Mapping[str, float]) -> dict[str, Unit]:
     for name, side in longest.items():
         fits = PLAUSIBLE[0] <= side * METRES_PER_UNIT[usual] <= GIANT * TYPICAL
         try:
-            units[name] = usual if fits else guess_unit([side])
+            units[name] = usual if fits else guess_common_unit([side])
         except AssetError as error:
             raise AssetError(
                 error.what, where=name, expected=error.expected, found=error.found, fix=error.fix
@@ -76,12 +79,13 @@ def guess_units(longest: Mapping[str, float]) -> dict[str, Unit]:
 
 
 def guess_up(mesh: trimesh.Trimesh) -> Up:
-    """Guess the axis that points up: y or z, the two conventions of software.
+    """Guess the axis that points up: y or z, the two conventions of modelling software.
 
-    The long axis is assumed to be vertical, except for flat boxes. Flat objects are assumed to lie on their broad side.
+    If y or z is the longest axis, the object is assumed to stand along this axis, unless it is a thin box. Otherwise
+    the object is assumed to lie on its broad side.
 
     Args:
-        mesh: any unit.
+        mesh: mesh in any unit.
     """
     hull = mesh.convex_hull
     x, y, z = np.ptp(hull.vertices, axis=0)
@@ -96,7 +100,7 @@ def guess_up(mesh: trimesh.Trimesh) -> Up:
 
 
 def rotate_upright(mesh: trimesh.Trimesh, up: Up) -> trimesh.Trimesh:
-    """Return a copy with an axis of the file rotated to +z."""
+    """Return a copy of a mesh, rotated so that the axis ``up`` becomes +z."""
     turned = mesh.copy(include_cache=True)  # keeps its normals
     axis = np.zeros(3)
     axis["xyz".index(up[-1])] = -1.0 if up.startswith("-") else 1.0
@@ -109,7 +113,12 @@ def rotate_upright(mesh: trimesh.Trimesh, up: Up) -> trimesh.Trimesh:
 
 
 def _fill(hull: trimesh.Trimesh, axis: int) -> float:
-    """Return the area of a convex body's outline along an axis over that of its smallest rectangle."""
+    """Return how much of a rectangle the outline of a convex body fills, 0 to 1, seen along an axis.
+
+    Args:
+        hull: convex mesh.
+        axis: index of the axis of view.
+    """
     flat = np.delete(hull.vertices, axis, axis=1)
     outline = MultiPoint(flat).convex_hull
     return float(outline.area / outline.minimum_rotated_rectangle.area)

@@ -19,10 +19,14 @@ LEFT = 0.8  # minimum fraction of area and volume after simplification; less mea
 
 
 def simplify_mesh(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
-    """Merge vertices by position, reduce the faces to the limit, and orient them outwards.
+    """Return a mesh with few faces, merged vertices and outward faces.
 
-    Meshes with many holes or pieces cannot be reduced to the limit without losing parts. For them, up to six times the
-    limit is accepted; if that is not enough, vertices are merged on a grid.
+    A mesh with many holes or pieces would lose parts. Such a mesh keeps up to six times the limit of faces. If the
+    mesh would still lose parts, its vertices are merged on a grid.
+
+    Args:
+        mesh: mesh in any unit.
+        triangles: limit of the number of faces.
 
     Raises:
         AssetError: no face is left.
@@ -59,14 +63,14 @@ def simplify_mesh(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
 
 
 def merge_vertices(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return the faces of a mesh in the same order, with vertices merged by position."""
+    """Return a copy of a mesh with vertices merged by position, and faces in the same order."""
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     body.merge_vertices(digits_vertex=None)
     return body
 
 
 def orient_outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return a mesh with merged vertices and outward faces in the same order."""
+    """Return a copy of a mesh with vertices merged by position, and outward faces in the same order."""
     body = merge_vertices(mesh)
     if body.volume < 0:
         body.faces = np.array(body.faces)[:, ::-1]
@@ -74,7 +78,11 @@ def orient_outward(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _collapsed(vertices: Array, faces: NDArray, triangles: int) -> tuple[Array, NDArray]:
-    """Collapse edges until the limit, or as close to it as possible; return vertices and faces."""
+    """Collapse edges until at most ``triangles`` faces are left, if possible.
+
+    Returns:
+        Vertices (V, 3) and faces (F, 3).
+    """
     gentle = (2, 3) if len(faces) > DENSE * triangles else ()
     for aggression in (*gentle, 5, 7, 9, 12, 16, 20):  # the library may stop above the limit
         before = np.inf
@@ -88,7 +96,11 @@ def _collapsed(vertices: Array, faces: NDArray, triangles: int) -> tuple[Array, 
 
 
 def _merged(vertices: Array, faces: NDArray, cells: int) -> tuple[Array, NDArray]:
-    """Merge the vertices in each cell of a grid with ``cells`` cells per unit; return vertices and faces."""
+    """Merge the vertices in each cell of a grid with ``cells`` cells per unit of length.
+
+    Returns:
+        Vertices (V, 3) and the faces (F, 3) that are not degenerate.
+    """
     _, cell, counts = np.unique(np.floor(vertices * cells), axis=0, return_inverse=True, return_counts=True)
     cell = cell.reshape(-1)
     means = np.stack([np.bincount(cell, column) / counts for column in vertices.T], axis=1)

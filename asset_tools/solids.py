@@ -8,7 +8,7 @@ from manifold3d import Error, Manifold, Mesh64
 
 
 def to_solid(mesh: trimesh.Trimesh) -> Manifold | None:
-    """Convert a watertight mesh with outward faces to a solid; return None if it is not a valid solid."""
+    """Convert a watertight mesh with outward faces to a solid of manifold3d; return None if the solid is invalid."""
     # copies, since manifold3d requires writable arrays
     vertices, faces = np.array(mesh.vertices, np.float64, order="C"), np.array(mesh.faces, np.uint64, order="C")
     solid = Manifold(Mesh64(vertices, faces))
@@ -16,6 +16,6 @@ def to_solid(mesh: trimesh.Trimesh) -> Manifold | None:
 
 
 def to_mesh(solid: Manifold) -> trimesh.Trimesh:
-    """Convert the surface of a solid to a mesh."""
+    """Convert a solid of manifold3d to a watertight mesh."""
     mesh = solid.to_mesh64()
     return trimesh.Trimesh(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts, np.int64), process=False)

@@ -1,4 +1,4 @@
-"""Sources of assets: the interface between importers, which create meshes, and the build of assets."""
+"""Sources of assets. An importer creates a source from files, and `build` writes the asset."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ import numpy as np
 import trimesh
 
 from asset_tools.grasps import Grasps
-from asset_tools.inertia import piece_inertia, to_moments, to_tuple
+from asset_tools.inertia import compute_piece_inertia, round_moments, round_vector
 from robocas_ms3.assets.manifest import Handle, InnerBox, Joint, Link, Surface, check_asset_name
 
 
 @dataclass(frozen=True)
 class ObjectSource:
-    """Source of an object.
+    """Meshes and properties from which an object is built.
 
     Attributes:
-        id: id and folder name.
+        id: id of the object and name of its folder.
         name: name in instructions.
         category: category of the object.
         mesh: visual mesh: textured, metres, z up, any origin.
-        closed: watertight mesh of the same body in the same frame, for volume, hulls and grasps.
-        mass: kg.
+        closed: watertight mesh of the body in the frame of ``mesh``, from which volume, hulls and grasps are computed.
+        mass: mass in kg.
         friction: friction coefficient of the surface.
         source: source of the geometry.
         licence: licence of the mesh.
         attribution: credit for the mesh.
         repairs: repairs of the source mesh.
-        graspnet_id: id of the same object, or of the replaced object, in GraspNet-1Billion.
-        pieces: (V, 3) corners of convex pieces in the mesh's frame; None: computed by decomposition.
+        graspnet_id: number in GraspNet-1Billion of this object, or of the object that it replaces; None: none.
+        pieces: corners (V, 3) of each convex piece in the mesh's frame; None: computed by decomposition.
         grasps: known grasps in the mesh's frame; None: sampled.
-        hollow: whether the object is a container or thin; its hulls are then checked by surface distance.
+        hollow: whether the object is a container or thin. If so, the hulls are checked by surface distance, not by IoU.
     """
 
     id: str
@@ -63,9 +63,9 @@ class LinkSource:
         name: name of the link.
         joint: joint between the link and its parent.
         mesh: visual mesh.
-        pieces: (V, 3) corners of each convex collision piece.
-        mass: kg; centre of mass and inertia are those of the solid pieces.
-        parent: name of another link; empty: the fixed body.
+        pieces: corners (V, 3) of each convex collision piece.
+        mass: mass in kg. Centre of mass and inertia are computed from the pieces with uniform density.
+        parent: name of the link to which the joint connects this link; empty: the fixed body.
     """
 
     name: str
@@ -81,35 +81,36 @@ class LinkSource:
 
     def to_link(self) -> Link:
         """Return the manifest entry of the link."""
-        center, inertia, axes = piece_inertia(self.pieces, self.mass)
+        center, inertia, axes = compute_piece_inertia(self.pieces, self.mass)
         return Link(
             name=self.name,
             parent=self.parent,
             joint=self.joint,
             mass=self.mass,
-            center_of_mass=to_tuple(center),
-            inertia=to_moments(inertia),
+            center_of_mass=round_vector(center),
+            inertia=round_moments(inertia),
             inertia_wxyz=axes,
         )
 
 
 @dataclass(frozen=True)
 class FurnitureSource:
-    """Source of a piece of furniture, in its own frame; metres.
+    """Meshes and properties from which a piece of furniture is built, in the furniture's frame; metres.
 
     Attributes:
-        id: id and folder name.
+        id: id of the furniture and name of its folder.
         name: name in instructions.
         category: category of the furniture.
-        mesh: visual mesh of the fixed body.
-        pieces: (V, 3) corners of each convex collision piece of the fixed body.
-        mass: kg; None: the body is fixed. Centre of mass and inertia are those of the solid pieces.
+        mesh: visual mesh of the body without moving parts.
+        pieces: corners (V, 3) of each convex collision piece of this body.
+        mass: mass in kg; None: the body is fixed in the scene. Centre of mass and inertia are computed from the pieces.
         origin_height: height of the frame's origin above the lowest point, m.
-        surfaces: surfaces for objects.
-        inner: inside of a container.
-        links: moving parts, parents first.
-        handles: grasps of the moving parts.
-        finishes: part -> finish -> mesh of the part, not included in ``mesh``; the first finish is the default.
+        surfaces: name -> surface on which objects can be placed.
+        inner: free space inside a container; None: not a container.
+        links: moving parts; each parent is before its children.
+        handles: name -> grasp of a moving part.
+        finishes: name of a part -> name of a finish -> mesh of the part with this finish. The meshes are not included
+            in ``mesh``. The first finish is the default.
     """
 
     id: str

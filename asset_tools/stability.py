@@ -18,15 +18,25 @@ BELOW = 0.0004  # m: tolerated depth of corners below the plane
 ROCKING_DEG = tuple(range(1, 11))  # tilts of the check for rocking
 
 
-def stable_directions(hull: ConvexHull, center: Array) -> tuple[Array, Array, Array]:
-    """Return up directions (N, 3) of stable facets, their probabilities and the heights of the centre of mass.
+def find_stable_directions(hull: ConvexHull, center: Array) -> tuple[Array, Array, Array]:
+    """Find the facets of a convex hull on which the body is stable.
 
-    The probability of a facet is its solid angle seen from the centre of mass. If the foot of the perpendicular is
-    outside of a facet, the object topples over that edge to another facet (Goldberg et al. 1999).
+    The probability of a facet is the solid angle of the facet, seen from the centre of mass. If the centre of mass is
+    not above a facet, the body topples over an edge to another facet, which gets the probability
+    (Goldberg et al. 1999).
+
+    Args:
+        hull: convex hull of the body, m.
+        center: (3,) centre of mass, m.
+
+    Returns:
+        For each of N stable facets: the direction (N, 3) of the body's frame that points up, the probability (N,), and
+        the height (N,) of the centre of mass in m. The most probable facet is first.
     """
     normals, heights = hull.equations[:, :3], -(hull.equations[:, :3] @ center + hull.equations[:, 3])
     if heights.min() <= 0:
-        raise AssetError("the centre of mass is outside the hulls", found=np.round(center, 4).tolist())
+        found, expected = f"a centre of mass at {np.round(center, 4).tolist()} m", "a point inside the convex hull"
+        raise AssetError("the centre of mass is outside the hulls", expected=expected, found=found)
     corners = hull.points[hull.simplices] - center
     a, b, c = corners.transpose(1, 0, 2)
     la, lb, lc = np.linalg.norm(corners, axis=-1).T
@@ -53,7 +63,16 @@ def stable_directions(hull: ConvexHull, center: Array) -> tuple[Array, Array, Ar
 
 
 def merge_poses(directions: Array, probabilities: Array, heights: Array) -> tuple[Array, Array, Array]:
-    """Merge poses with similar up directions into the most probable one; return them by descending probability."""
+    """Merge poses whose up directions differ by less than 5 deg into the most probable of them.
+
+    Args:
+        directions: (N, 3) up directions.
+        probabilities: (N,) probabilities.
+        heights: (N,) heights of the centre of mass, m.
+
+    Returns:
+        Directions (M, 3), added probabilities (M,) and heights (M,) by descending probability.
+    """
     kept: list[int] = []
     sums: list[float] = []
     # rounded, so that noise does not change the order of equal values
@@ -71,9 +90,17 @@ def merge_poses(directions: Array, probabilities: Array, heights: Array) -> tupl
 
 
 def select_poses(directions: Array, probabilities: Array, heights: Array, minimum: float) -> list[int]:
-    """Return indices of the poses to try: one of each probable family first, then spread over directions.
+    """Return the indices of at most 12 poses to simulate.
 
-    The upright pose is always included, since people place objects upright.
+    A family is a set of poses with equal height of the centre of mass. The upright pose is always first, since people
+    place objects upright. Then follows one pose of each family that is probable enough, and then poses that differ in
+    direction from the poses selected before.
+
+    Args:
+        directions: (N, 3) up directions.
+        probabilities: (N,) probabilities.
+        heights: (N,) heights of the centre of mass, m.
+        minimum: smallest probability of a family.
     """
     family = np.full(len(heights), -1)
     for i in range(len(heights)):
@@ -97,15 +124,28 @@ def select_poses(directions: Array, probabilities: Array, heights: Array, minimu
 
 
 def pool_probabilities(directions: Array, probabilities: Array, kept: list[int]) -> Array:
-    """Return the probabilities of the kept poses; add those of other poses to the nearest kept pose."""
+    """Add the probability of each dropped pose to the nearest pose that is kept.
+
+    Args:
+        directions: (N, 3) up directions.
+        probabilities: (N,) probabilities.
+        kept: K indices of the poses that are kept.
+
+    Returns:
+        Probabilities (K,) of the kept poses.
+    """
     nearest = (directions @ directions[kept].T).argmax(1)
     return np.bincount(nearest, probabilities, len(kept))
 
 
 def rocks_in_place(points: Array, up: Array) -> bool:
-    """Return whether a body with corners (V, 3), relative to its centre of mass, rocks around a pose without toppling.
+    """Return whether a tilted body rocks back to about the same pose instead of toppling to another pose.
 
     Example: an oval bottle on its side, which has several facets with tiny toppling angles.
+
+    Args:
+        points: (V, 3) corners relative to the centre of mass, m.
+        up: (3,) unit vector in the body's frame that points up.
     """
     across = np.linalg.svd(up[None])[2][1:]
     turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
@@ -116,7 +156,7 @@ def rocks_in_place(points: Array, up: Array) -> bool:
 
 
 def toppling_angle(points: Array, center_of_mass: Array, up: Array) -> float:
-    """Return the smallest angle in degrees at which a tilted body topples.
+    """Return the smallest angle in degrees by which the body must be tilted to topple.
 
     Args:
         points: (V, 3) corners, m.

@@ -15,7 +15,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from asset_tools.glb import get_rgba, get_roughness
-from asset_tools.readers.surface import TEXTURE, TINT, Textures, decode_srgb, encode_srgb
+from asset_tools.readers.surface import TEXTURE, TINT, MultiTextureMaterial, decode_srgb, encode_srgb
 from asset_tools.simplify import merge_vertices, orient_outward, simplify_mesh
 from robocas_ms3.core.errors import AssetError
 
@@ -27,17 +27,17 @@ NEAR = 20  # compared faces for layered surfaces
 NORMAL_WEIGHT = 0.02  # of the diagonal; separates the two sides of a thin shell
 
 
-def to_display(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: int = 512) -> trimesh.Trimesh:
-    """Return a copy of a mesh with few faces, one small texture and outward normals, in the same frame.
+def make_display_mesh(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: int = 512) -> trimesh.Trimesh:
+    """Return a copy of a mesh for rendering, with few faces, one small texture and outward normals.
 
-    A textured mesh within the limit keeps its vertices and UVs. A larger mesh is simplified and unwrapped again, and
-    its colours are baked into a new texture, like vertex and face colours. A mesh of one colour has no texture.
-    Transparency is dropped.
+    A textured mesh with at most ``triangles`` faces keeps its vertices and UVs. A larger mesh is simplified and
+    unwrapped again, and its colours are baked into a new texture. Vertex and face colours are also baked. A mesh of one
+    colour gets no texture. Transparency is dropped.
 
     Args:
-        mesh: textured, coloured or plain; any unit.
-        triangles: maximum number of faces; up to six times this number for meshes with many holes or pieces.
-        texture_size: largest side of the texture, pixels.
+        mesh: textured or coloured mesh in any frame and unit.
+        triangles: maximum number of faces; a mesh with many holes or pieces may keep six times as many.
+        texture_size: width and height of the texture, at most, in pixels.
 
     Returns:
         A mesh with a ``PBRMaterial`` and vertex normals.
@@ -46,16 +46,20 @@ def to_display(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: in
         AssetError: the mesh has no faces, or has NaN or infinite vertices.
     """
     if len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
+        finite = np.isfinite(mesh.vertices).all(axis=1)
         raise AssetError(
-            "cannot render this mesh", expected="faces, and finite vertices", found=f"{len(mesh.faces)} faces"
+            "cannot render this mesh",
+            expected="at least one face, and finite vertices",
+            found=f"{len(mesh.faces)} faces, {int((~finite).sum())} vertices with NaN or infinite values",
+            fix="Export the mesh again.",
         )
     source = Appearance(mesh)
-    if len(mesh.faces) <= triangles and (source.plain or source.single is not None):
+    if len(mesh.faces) <= triangles and (source.plain or source.single_image is not None):
         vertices, faces, normals, origin = _shaded(mesh)
         if mesh.volume < 0:
             faces, normals = faces[:, ::-1], -normals
         uv = None if source.plain else source.uv[origin]
-        texture = None if source.single is None else _shrunk(source.single, texture_size)
+        texture = None if source.single_image is None else _shrunk(source.single_image, texture_size)
     else:
         kept = source.layered and len(mesh.faces) <= triangles
         body = orient_outward(mesh) if kept else simplify_mesh(mesh, triangles)
@@ -82,17 +86,17 @@ def to_display(mesh: trimesh.Trimesh, *, triangles: int = 1500, texture_size: in
 
 
 class Appearance:
-    """Appearance of a mesh: images and UVs with linear tints, or colours of the corners (sRGB, 0 to 255).
+    """Colours of a mesh: texture images, or one colour per corner of a face.
 
     Attributes:
-        images: RGB images; empty: only colours.
+        images: RGB texture images; empty: the mesh has only colours.
         texture: (F,) index of the image of each face.
         uv: (V, 2) texture coordinates.
-        tints: (F, 3, 3) linear tints of the corners, or None.
-        colors: (F, 3, 3) colours of the corners, if there are no images.
-        plain: whether the mesh has one colour.
-        factor: (3,) or (4,) linear colour factor of the resulting material, 0 to 255.
-        roughness: roughness of the resulting material.
+        tints: (F, 3, 3) linear RGB factors per corner, by which the image is multiplied; None: no factors.
+        colors: (F, 3, 3) sRGB colours per corner, 0 to 255; used if there are no images.
+        plain: whether the whole mesh has one colour.
+        factor: (3,) or (4,) linear colour factor of the material that is written, 0 to 255.
+        roughness: roughness of the material that is written.
     """
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
@@ -103,7 +107,7 @@ class Appearance:
         self.uv = np.zeros((0, 2)) if uv is None else np.array(uv, dtype=float)
         self.texture, self.tints = np.zeros(len(mesh.faces), int), None
         images: Sequence[Image.Image | None]
-        if isinstance(material, Textures):
+        if isinstance(material, MultiTextureMaterial):
             images = material.images
             self.texture = np.asarray(mesh.vertex_attributes[TEXTURE])[mesh.faces[:, 0]]
             self.tints = np.asarray(mesh.vertex_attributes[TINT])[mesh.faces]
@@ -125,21 +129,21 @@ class Appearance:
 
     @property
     def layered(self) -> bool:
-        """Whether surfaces of different appearance may be close to each other."""
+        """Whether surfaces with different images or tints may be close to each other, such as a label on a bottle."""
         return len(self.images) > 1 or self.tints is not None
 
     @property
-    def single(self) -> Image.Image | None:
-        """The only image of a mesh without tints, or None."""
+    def single_image(self) -> Image.Image | None:
+        """The image of a mesh with exactly one image and without tints; otherwise None."""
         return self.images[0] if len(self.images) == 1 and self.tints is None else None
 
-    def at(self, faces: NDArray, face: NDArray, weights: Array) -> Array:
-        """Return colours (N, 3) of points, sRGB, 0 to 255.
+    def sample_colors(self, faces: NDArray, face: NDArray, weights: Array) -> Array:
+        """Return the sRGB colours (N, 3) of N points on the mesh, 0 to 255.
 
         Args:
             faces: (F, 3) faces of the mesh.
-            face: (N,) face of each point.
-            weights: (N, 3) barycentric weights.
+            face: (N,) index of the face of each point.
+            weights: (N, 3) barycentric weights of each point in its face.
         """
         if not self.images:
             return np.einsum("nc,ncd->nd", weights, self.colors[face])
@@ -167,9 +171,10 @@ def _shrunk(image: Image.Image, size: int) -> Image.Image:
 
 
 def _shaded(mesh: trimesh.Trimesh) -> tuple[Array, NDArray, Array, NDArray]:
-    """Return vertices, faces and normals of a mesh, and the original index of each vertex.
+    """Return a mesh with vertex normals: the normals of the file, or else normals with sharp edges above 40 deg.
 
-    If the mesh has no normals, vertices are split at sharp edges.
+    Returns:
+        Vertices (V, 3), faces (F, 3), normals (V, 3), and for each vertex the index (V,) of a vertex of ``mesh``.
     """
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     own = mesh._cache.cache.get("vertex_normals")
@@ -185,7 +190,7 @@ def _shaded(mesh: trimesh.Trimesh) -> tuple[Array, NDArray, Array, NDArray]:
 
 
 def _crease_normals(body: trimesh.Trimesh) -> Array:
-    """Return corner normals (F, 3, 3): the mean over adjacent faces without a sharp edge in between."""
+    """Return a normal per corner of each face (F, 3, 3): the mean over adjacent faces within 40 deg of the face."""
     faces = np.asarray(body.faces)
     corner_vertex = faces.reshape(-1)
     order = np.argsort(corner_vertex, kind="stable")
@@ -205,7 +210,12 @@ def _crease_normals(body: trimesh.Trimesh) -> Array:
 
 
 def _unwrapped(body: trimesh.Trimesh, size: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Unwrap a mesh; return the vertex of each UV vertex, faces of UV vertices, and UVs (V, 2) without overlaps."""
+    """Unwrap a mesh to a square texture of ``size`` pixels.
+
+    Returns:
+        The vertex of ``body`` (W,) for each of W UV vertices, the faces (F, 3) as indices of UV vertices, and the
+        UVs (W, 2) in 0..1 without overlaps.
+    """
     import xatlas
 
     scaled = (np.asarray(body.vertices) - body.bounds[0]) / np.linalg.norm(body.extents)
@@ -228,16 +238,16 @@ def _baked(
     *,
     same_faces: bool = False,
 ) -> Image.Image:
-    """Bake a new texture: each texel gets the colour of the closest point on the original surface.
+    """Bake a texture for a simplified mesh: each texel gets the colour of the closest point of the original mesh.
 
     Args:
-        mesh: the original mesh.
-        source: appearance of the original mesh.
-        body: simplified mesh for the texture.
-        corner_uv: (F, 3, 2) UVs of its corners.
-        corner_normals: (F, 3, 3) normals of its corners.
-        size: size of the texture, pixels.
-        same_faces: whether ``body`` has the faces of ``mesh`` in the same order.
+        mesh: original mesh.
+        source: colours of the original mesh.
+        body: simplified mesh.
+        corner_uv: (F, 3, 2) UVs of the corners of ``body``.
+        corner_normals: (F, 3, 3) normals of the corners of ``body``.
+        size: width and height of the texture in pixels.
+        same_faces: whether ``body`` and ``mesh`` have equal faces in equal order.
     """
     rows, columns, face, weights = _rasterised(corner_uv, size)
     if same_faces:
@@ -247,7 +257,7 @@ def _baked(
         points = np.einsum("nc,ncd->nd", weights, np.asarray(body.triangles)[face])
         normals = np.einsum("nc,ncd->nd", weights, corner_normals[face])
         origin_face, origin_weights = _closest(mesh, points, normals, layered=source.layered)
-    colors = source.at(np.asarray(mesh.faces), origin_face, origin_weights)
+    colors = source.sample_colors(np.asarray(mesh.faces), origin_face, origin_weights)
     pixels = np.zeros((size, size, 3), dtype=np.uint8)
     empty = np.ones((size, size), dtype=bool)
     pixels[rows, columns] = np.clip(np.rint(colors), 0, 255)
@@ -257,7 +267,15 @@ def _baked(
 
 
 def _rasterised(corner_uv: Array, size: int) -> tuple[NDArray, NDArray, NDArray, Array]:
-    """Return row, column, face and barycentric weights (N, 3) of texels that a face covers, with a margin of 1."""
+    """Find the texels that faces cover in a texture, with a margin of 1 texel.
+
+    Args:
+        corner_uv: (F, 3, 2) UVs of the corners of the faces.
+        size: width and height of the texture in pixels.
+
+    Returns:
+        Row (N,), column (N,), face (N,) and barycentric weights (N, 3) in this face, for each of N texels.
+    """
     corners = corner_uv * (size, -size) + (-0.5, size - 0.5)  # (F, 3, 2) column, row; integers are centres of texels
     areas = _double_area(corners)
     index = np.flatnonzero(areas > 1e-9)
@@ -280,13 +298,13 @@ def _rasterised(corner_uv: Array, size: int) -> tuple[NDArray, NDArray, NDArray,
 
 
 def _closest(mesh: trimesh.Trimesh, points: Array, normals: Array, *, layered: bool) -> tuple[NDArray, Array]:
-    """Return the closest face of the original mesh for each point, and barycentric weights (N, 3).
+    """Return the closest face (N,) of a mesh for each point, and barycentric weights (N, 3) in this face.
 
     Args:
-        mesh: the original mesh.
+        mesh: original mesh.
         points: (N, 3) points.
-        normals: (N, 3) normals; faces with other directions count as far.
-        layered: whether surfaces of different appearance may be close, such as a label on a bottle.
+        normals: (N, 3) normals at the points; faces with other normals count as far.
+        layered: whether surfaces with different images may be close to each other, such as a label on a bottle.
     """
     triangles = np.asarray(mesh.triangles)
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -314,7 +332,13 @@ def _closest(mesh: trimesh.Trimesh, points: Array, normals: Array, *, layered: b
 
 
 def _barycentric(triangles: Array, face: NDArray, points: Array) -> Array:
-    """Return barycentric weights (N, 3) of points, projected to the plane of their face, in any dimension."""
+    """Return the barycentric weights (N, 3) of points, projected to the planes of their faces.
+
+    Args:
+        triangles: (F, 3, D) corners of the faces, in any dimension D.
+        face: (N,) face of each point.
+        points: (N, D) points.
+    """
     first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     aa, ab, bb = (first * first).sum(axis=1), (first * second).sum(axis=1), (second * second).sum(axis=1)
     scale = 1 / np.maximum(aa * bb - ab * ab, 1e-300)
@@ -336,7 +360,7 @@ def _double_area(corners: Array) -> Array:
 
 
 def _bilinear(image: NDArray[np.float32], uv: Array) -> Array:
-    """Return colours (N, 3) at UVs (N, 2), v upward; the image repeats outside of 0..1."""
+    """Return bilinear samples (N, 3) of an image at UVs (N, 2) with v upward; the image repeats outside of 0..1."""
     height, width = image.shape[:2]
     column, row = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
     left, top = np.floor(column).astype(int), np.floor(row).astype(int)

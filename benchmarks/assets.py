@@ -21,11 +21,11 @@ from asset_tools.build import write_visuals
 from asset_tools.builtin.catalogue import products
 from asset_tools.decompose import decompose
 from asset_tools.grasps import sample_grasps
-from asset_tools.inertia import principal_inertia
-from asset_tools.quality.drops import drop_test
-from asset_tools.quality.grasp_hold import hold_test
-from asset_tools.quality.hulls import hull_quality
-from asset_tools.resting_poses import resting_poses
+from asset_tools.inertia import compute_principal_inertia
+from asset_tools.quality.drops import run_drop_test
+from asset_tools.quality.grasp_hold import run_hold_test
+from asset_tools.quality.hulls import measure_hull_quality
+from asset_tools.resting_poses import find_resting_poses
 from robocas_ms3.assets.physics import RigidBody
 
 
@@ -58,16 +58,16 @@ def main(cfg: Benchmark) -> None:
         with timed("hulls"):
             hulls = list(shape.pieces) or decompose(closed).hulls
         center = np.asarray(closed.center_mass)
-        inertia, axes = principal_inertia(closed, spec.mass)
+        inertia, axes = compute_principal_inertia(closed, spec.mass)
         solid = RigidBody(hulls, spec.mass, center, np.array(inertia), np.array(axes))
         with timed("resting poses"):
-            rest = resting_poses(solid)
+            rest = find_resting_poses(solid)
         with timed("grasps"):
             grasps = sample_grasps(closed, center, np.random.default_rng(0), count=800)
         with timed("quality"):
-            hull_quality(closed, hulls, hollow=spec.hollow)
-            drop_test(solid, rest.poses)
-            hold_test(solid, grasps.tcp_in_object[:20])
+            measure_hull_quality(closed, hulls, hollow=spec.hollow)
+            run_drop_test(solid, rest.poses)
+            run_hold_test(solid, grasps.tcp_in_object[:20])
     steps = {
         step: {"median_s": round(float(np.median(list(v.values()))), 2), "max_s": round(max(v.values()), 2)}
         for step, v in seconds.items()

@@ -1,4 +1,4 @@
-"""Catalogue of GraspNet-1Billion objects: numbers, ids, names and masses."""
+"""Catalogue of the objects of GraspNet-1Billion: numbers, ids, names and masses."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ COUNT = 88  # objects in the dataset, numbered from 0
 
 @dataclass(frozen=True)
 class CatalogueEntry:
-    """An object of the dataset.
+    """An object of GraspNet-1Billion.
 
     Attributes:
-        number: number in the dataset.
-        id: id and folder in a pack, the same as that of the builtin stand-in.
+        number: number of the object in the dataset.
+        id: id in a pack; the stand-in in the builtin pack has the same id.
         name: name in instructions.
         category: category of the object.
-        mass: kg; None: estimated from the volume.
-        hollow: whether the object is a container or thin; its hulls are then checked by distance instead of volume.
+        mass: mass in kg; None: estimated from the volume.
+        hollow: whether the object is a container or thin. If so, the hulls are checked by surface distance, not by IoU.
     """
 
     number: int
@@ -29,7 +29,7 @@ class CatalogueEntry:
 
     @property
     def folder(self) -> str:
-        """Folder in ``models``, and prefix of the label file."""
+        """Name of the object's folder in ``models``, and prefix of its label file: the number with three digits."""
         return f"{self.number:03d}"
 
 
@@ -95,12 +95,12 @@ ENTRIES: dict[int, CatalogueEntry] = dict(
 NUMBERS: dict[str, int] = {entry.id: number for number, entry in ENTRIES.items()}
 
 
-def catalogue_entry(number: int) -> CatalogueEntry:
-    """What an object of the dataset is called here; those that RoboCAS doesn't use have no name of their own.
+def find_catalogue_entry(number: int) -> CatalogueEntry:
+    """Return the entry of the object with a number; objects that RoboCAS-v0 does not use have generic names.
 
     Raises:
-        ValueError: there is no such number.
+        ValueError: the number is not between 0 and 87.
     """
     if not 0 <= number < COUNT:
-        raise ValueError(f"GraspNet-1Billion has objects 0 to {COUNT - 1}, no {number}")
+        raise ValueError(f"invalid number {number} of a GraspNet-1Billion object: expected 0 to {COUNT - 1}")
     return ENTRIES.get(number) or CatalogueEntry(number, f"graspnet_{number:03d}", f"object {number}", "object")

@@ -11,8 +11,8 @@ import numpy as np
 import trimesh
 
 from asset_tools.build import FEW_GRASPS, GRASPS, build_object
-from asset_tools.graspnet.catalogue import COUNT, ENTRIES, catalogue_entry
-from asset_tools.graspnet.labels import label_checksums, label_grasps
+from asset_tools.graspnet.catalogue import COUNT, ENTRIES, find_catalogue_entry
+from asset_tools.graspnet.labels import label_checksums, load_label_grasps
 from asset_tools.grasps import Grasps, sample_grasps
 from asset_tools.import_scans import estimate_mass
 from asset_tools.inspection import Inspect, Inspection, ModelSource, inspect_models
@@ -26,13 +26,13 @@ LICENCE = "CC BY-NC-SA 4.0"
 ATTRIBUTION = "GraspNet-1Billion (H.-S. Fang, C. Wang, M. Gou, C. Lu, CVPR 2020)"
 
 
-def graspnet_jobs(root: Path, ids: Sequence[int] = (), inspect: Inspect = inspect_models) -> list[AssetJob]:
-    """Return the jobs that import the dataset; an unreadable model gives a failing job.
+def make_graspnet_jobs(root: Path, ids: Sequence[int] = (), inspect: Inspect = inspect_models) -> list[AssetJob]:
+    """Return one job per object of GraspNet-1Billion; the job of an unreadable model raises an error when it runs.
 
     Args:
-        root: folder of the dataset.
+        root: folder of the dataset, which contains ``models``.
         ids: numbers of objects; empty: the 46 objects of RoboCAS-v0.
-        inspect: inspects the models; `inspect_models` with its options.
+        inspect: function that inspects all models: `inspect_models` with chosen options.
 
     Raises:
         AssetError: a number is invalid, or a model is missing.
@@ -40,27 +40,28 @@ def graspnet_jobs(root: Path, ids: Sequence[int] = (), inspect: Inspect = inspec
     numbers = sorted(set(ids)) or list(ENTRIES)
     unknown = [number for number in numbers if not 0 <= number < COUNT]
     if unknown:
-        what = "no such objects in GraspNet-1Billion"
+        what = "unknown numbers of GraspNet-1Billion objects"
         raise AssetError(what, expected=f"numbers from 0 to {COUNT - 1}", found=_listed(unknown))
     missing = [number for number in numbers if not _model(root, number).is_dir()]
     if missing:
         raise AssetError(
             "models of GraspNet-1Billion are missing",
             where=root,
-            expected=f"models/NNN for {len(numbers)} objects",
+            expected=f"a folder models/NNN for each of {len(numbers)} objects",
             found=f"no folder for the numbers {_listed(missing)}",
-            fix="Pass the folder that contains models/, not models/ itself; choose objects with --ids.",
+            fix="Pass the folder that contains models/, or select the objects that you have with --ids.",
         )
     models = {str(number): ModelSource((_mesh(root, number),), root) for number in numbers}
     inspected = inspect(models)
     return [_job(root, number, inspected[str(number)]) for number in numbers]
 
 
-def graspnet_source(root: Path, number: int) -> ObjectSource:
-    """Return the source of an object of the dataset, with its labelled grasps if the label file exists.
+def load_graspnet_source(root: Path, number: int) -> ObjectSource:
+    """Load an object of GraspNet-1Billion as the source of an asset.
 
-    If fewer than 50 labelled grasps fit the gripper, more grasps are sampled, with a note in ``repairs``. Models are in
-    metres with z up; their frame is kept, since the labels are given in this frame.
+    If the label file of the object exists, the source has grasps from this file. If fewer than 50 of these grasps fit
+    the gripper, more grasps are sampled, with a note in ``repairs``. Models are in metres with z up. The source keeps
+    the frame of the model, since the labels are given in this frame.
 
     Args:
         root: folder of the dataset.
@@ -69,7 +70,7 @@ def graspnet_source(root: Path, number: int) -> ObjectSource:
     Raises:
         AssetError: the model is missing, damaged or cannot be closed, or the label file is damaged.
     """
-    entry = catalogue_entry(number)
+    entry = find_catalogue_entry(number)
     model = prepare_scan(_mesh(root, number), root=root, up="z", unit="m")
     grasps, notes = _grasps(_labels(root, number), model.closed, entry.id)
     return ObjectSource(
@@ -90,20 +91,31 @@ def graspnet_source(root: Path, number: int) -> ObjectSource:
 
 
 def _grasps(labels: Path, closed: trimesh.Trimesh, id_: str) -> tuple[Grasps | None, tuple[str, ...]]:
-    """Return the labelled grasps that fit, completed by sampled grasps if needed, and notes."""
+    """Return the grasps of an object from its label file, and notes.
+
+    Args:
+        labels: path of the label file.
+        closed: watertight mesh of the object, m.
+        id_: id of the object, which is the seed of sampling.
+
+    Returns:
+        The labelled grasps that fit the gripper; if they are fewer than 50, with sampled grasps in addition. None if
+        there is no label file.
+        Notes on sampled grasps.
+    """
     if not labels.is_file():
         return None, ()
-    found, labelled = label_grasps(labels, closed)
+    found, labelled = load_label_grasps(labels, closed)
     if len(found) >= FEW_GRASPS:
         return found, ()
     rng = np.random.default_rng(zlib.crc32(id_.encode()))
     sampled = sample_grasps(closed, np.asarray(closed.center_mass), rng, count=GRASPS - len(found))
-    note = f"of {labelled} good grasp labels {len(found)} fit the gripper; sampled {len(sampled)} more"
+    note = f"{len(found)} of {labelled} good grasp labels fit the gripper; sampled {len(sampled)} more grasps"
     return found.concatenate(sampled), (note,)
 
 
 def _job(root: Path, number: int, inspected: Inspection) -> AssetJob:
-    id_, labels = catalogue_entry(number).id, _labels(root, number)
+    id_, labels = find_catalogue_entry(number).id, _labels(root, number)
     if inspected.error is not None:
         return make_failing_job(id_, inspected.error)
     try:
@@ -115,21 +127,21 @@ def _job(root: Path, number: int, inspected: Inspection) -> AssetJob:
 
 
 def _make(root: Path, number: int, folder: Path) -> ObjectAsset:
-    return build_object(graspnet_source(root, number), folder)
+    return build_object(load_graspnet_source(root, number), folder)
 
 
 def _model(root: Path, number: int) -> Path:
-    return root / "models" / catalogue_entry(number).folder
+    return root / "models" / find_catalogue_entry(number).folder
 
 
 def _mesh(root: Path, number: int) -> Path:
-    """Return the path of a model's textured mesh, or its folder without such a file."""
+    """Return the path of ``textured.obj`` of a model; if this file is missing, the path of the model's folder."""
     textured = _model(root, number) / "textured.obj"
     return textured if textured.is_file() else _model(root, number)
 
 
 def _labels(root: Path, number: int) -> Path:
-    return root / "grasp_label" / f"{catalogue_entry(number).folder}_labels.npz"
+    return root / "grasp_label" / f"{find_catalogue_entry(number).folder}_labels.npz"
 
 
 def _listed(numbers: Sequence[int]) -> str:

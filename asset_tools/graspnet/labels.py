@@ -19,7 +19,7 @@ import trimesh
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from asset_tools.grasps import Grasps, local_points, select_spread, surface_samples
+from asset_tools.grasps import Grasps, sample_surface_points, select_diverse_grasps, to_local_frames
 from robocas_ms3.assets.annotations import GRIPPER_BOXES
 from robocas_ms3.core.errors import AssetError
 
@@ -43,15 +43,15 @@ SHAPES = {
 
 @dataclass(frozen=True)
 class Labels:
-    """Labels (N,) in the model's frame.
+    """N grasp labels in the frame of the model.
 
     Attributes:
         points: (N, 3) points on the object, m.
-        views: indices of the views.
-        angles: in-plane angles, rad.
-        depths: distance of the finger tips beyond the point, m.
-        widths: finger opening, m.
-        frictions: smallest friction coefficient for force closure.
+        views: (N,) indices of the views, see `make_view_directions`.
+        angles: (N,) rotations of the gripper about the approach direction, rad.
+        depths: (N,) distances of the finger tips beyond the point, m.
+        widths: (N,) distances of the fingers, m.
+        frictions: (N,) smallest friction coefficients for force closure.
     """
 
     points: Array
@@ -67,14 +67,20 @@ class Labels:
 
 @dataclass(frozen=True)
 class _Member:
-    """An open array of a label file, with its length and type."""
+    """An open array of a label file.
+
+    Attributes:
+        file: stream of the values.
+        count: length of the first axis.
+        dtype: type of the values.
+    """
 
     file: IO[bytes]
     count: int
     dtype: np.dtype
 
     def take(self, name: str, rows: int) -> NDArray:
-        """Read the next rows."""
+        """Read the next ``rows`` rows of the array; ``name`` is the name of the array."""
         shape = (rows, *SHAPES[name])
         size = int(np.prod(shape)) * self.dtype.itemsize
         data = self.file.read(size)
@@ -83,15 +89,15 @@ class _Member:
         return np.frombuffer(data, self.dtype).reshape(shape)
 
     def end(self) -> None:
-        """Read to the end, so that the checksum is verified."""
+        """Read the end of the stream, so that zipfile verifies the checksum."""
         self.file.read(1)
 
 
-def label_grasps(path: Path, closed: trimesh.Trimesh) -> tuple[Grasps, int]:
-    """Return labelled grasps that the open gripper reaches along a straight approach, spread over the object.
+def load_label_grasps(path: Path, closed: trimesh.Trimesh) -> tuple[Grasps, int]:
+    """Load labelled grasps that the open gripper reaches on a straight path, spread over the object.
 
     Args:
-        path: ``NNN_labels.npz``.
+        path: path of ``NNN_labels.npz``.
         closed: watertight mesh of the object in the model's frame, m.
 
     Returns:
@@ -102,22 +108,22 @@ def label_grasps(path: Path, closed: trimesh.Trimesh) -> tuple[Grasps, int]:
     """
     rng = np.random.default_rng(0)
     labels = read_labels(path, rng)
-    poses = tcp_poses(labels)
-    points = surface_samples(closed, POINTS, rng)[0]
+    poses = to_tcp_poses(labels)
+    points = sample_surface_points(closed, POINTS, rng)[0]
     clear = np.flatnonzero(_clear(poses, points))
     poses, frictions = poses[clear], labels.frictions[clear]
     to_center = np.asarray(closed.center_mass) - poses[:, :3, 3]
     # a centre of mass far from the approach line rotates the object in the pads
     lever = np.linalg.norm(np.cross(to_center, poses[:, :3, 2]), axis=1)
     scores = -2.0 * frictions - lever / 0.15 - np.linalg.norm(to_center, axis=1) / 0.3
-    chosen = select_spread(poses, scores, MOST_GRASPS)
+    chosen = select_diverse_grasps(poses, scores, MOST_GRASPS)
     return Grasps(poses[chosen], labels.widths[clear][chosen], frictions[chosen]), len(labels)
 
 
 def label_checksums(path: Path) -> tuple[tuple[str, int, int], ...]:
-    """Return names, sizes and CRCs of the arrays in a label file without reading it.
+    """Return name, size and CRC of each array in a label file, without reading the arrays.
 
-    For a file that is not a zip archive, return its name and size; `read_labels` raises the error.
+    A file that is not a zip archive gives its own name and size. The error is raised later by `read_labels`.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -127,17 +133,17 @@ def label_checksums(path: Path) -> tuple[tuple[str, int, int], ...]:
 
 
 def read_labels(path: Path, rng: np.random.Generator) -> Labels:
-    """Read the labels of good grasps: friction 0 < f <= 0.3, at most 0.08 m wide, not in collision.
+    """Read the good labels of a file: friction 0 < f <= 0.3, at most 0.08 m wide, not in collision.
 
-    RoboCAS-v0 also accepts 0, which is not a friction coefficient: valid labels start at 0.1, and the dataset's own
-    tools skip 0 as well as -1, which means "never holds".
+    RoboCAS-v0 also accepts the friction 0. This value is not a friction coefficient: valid labels start at 0.1, and
+    the tools of the dataset skip 0 and -1, where -1 means that the grasp never holds.
 
     Args:
-        path: ``NNN_labels.npz``.
-        rng: selects uniformly if there are more than 20 000 good labels.
+        path: path of ``NNN_labels.npz``.
+        rng: random generator, which selects labels uniformly if there are more than 20 000 good labels.
 
     Returns:
-        Labels in file order.
+        The labels in the order of the file.
 
     Raises:
         AssetError: the file is missing, damaged or has another format.
@@ -165,8 +171,8 @@ def read_labels(path: Path, rng: np.random.Generator) -> Labels:
     return Labels(points[point.astype(int)], view.astype(np.int64), angles, depths, widths, frictions)
 
 
-def view_directions() -> Array:
-    """Return the views (300, 3): outward unit vectors, opposite to the approach of the gripper."""
+def make_view_directions() -> Array:
+    """Return the 300 view directions of the dataset (300, 3): unit vectors from the object to the gripper."""
     i = np.arange(VIEWS)
     z = (2 * i + 1) / VIEWS - 1
     around = 2 * np.pi * i * (np.sqrt(5) - 1) / 2
@@ -174,13 +180,14 @@ def view_directions() -> Array:
     return np.column_stack([radius * np.cos(around), radius * np.sin(around), z])
 
 
-def tcp_poses(labels: Labels) -> Array:
-    """Return TCP poses (N, 4, 4) in the model's frame: z approach, y closing, origin between the finger tips.
+def to_tcp_poses(labels: Labels) -> Array:
+    """Convert labels to poses of the TCP (N, 4, 4) in the frame of the model, m.
 
-    In GraspNet's gripper frame x is the approach and, at angle 0, the closing axis y is horizontal; the angle is a
-    rotation about the approach. The finger tips are ``depth`` beyond the point.
+    In the TCP frame, z is the approach direction, y the closing direction, and the origin is between the finger tips.
+    In the gripper frame of GraspNet-1Billion, x is the approach direction. Its closing axis y is horizontal at angle 0,
+    and the angle is a rotation about x. The finger tips are ``depth`` beyond the point of the label.
     """
-    approach = -view_directions()[labels.views]
+    approach = -make_view_directions()[labels.views]
     level = np.column_stack([-approach[:, 1], approach[:, 0], np.zeros(len(labels))])  # no view is vertical
     level /= np.linalg.norm(level, axis=1, keepdims=True)
     cos, sin = np.cos(labels.angles)[:, None], np.sin(labels.angles)[:, None]
@@ -194,11 +201,16 @@ def tcp_poses(labels: Labels) -> Array:
 
 
 def _clear(poses: Array, points: Array) -> NDArray[np.bool_]:
-    """Return whether the straight approach of the open gripper hits no point (P, 3), for each pose (N,)."""
+    """Return whether the open gripper reaches each pose (N,) on a straight path without touching the object.
+
+    Args:
+        poses: (N, 4, 4) poses of the TCP.
+        points: (P, 3) points on the object.
+    """
     free = np.ones(len(poses), dtype=bool)
     for start in range(0, len(poses), CHUNK):
         chunk = slice(start, start + CHUNK)
-        x, y, z = local_points(points, poses[chunk, :3, :3], poses[chunk, :3, 3])
+        x, y, z = to_local_frames(points, poses[chunk, :3, :3], poses[chunk, :3, 3])
         x, y = np.abs(x), np.abs(y)
         for low, high in GRIPPER_BOXES:
             # the box sweeps all points behind its front during the approach
@@ -216,7 +228,15 @@ def _read_points(path: Path) -> Array:
 
 
 def _slices(path: Path, count: int) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
-    """Yield offsets (K, 300, 12, 4, 3), scores and collision (K, 300, 12, 4) for batches of points."""
+    """Yield the label arrays in batches of K points.
+
+    Args:
+        path: path of the label file.
+        count: number of points in the file.
+
+    Yields:
+        ``offsets`` (K, 300, 12, 4, 3), ``scores`` (K, 300, 12, 4) and ``collision`` (K, 300, 12, 4).
+    """
     names = ("offsets", "scores", "collision")
     with _opened(path) as members:
         size = sum(int(np.prod(SHAPES[name])) * members[name].dtype.itemsize for name in names)
@@ -230,20 +250,23 @@ def _slices(path: Path, count: int) -> Iterator[tuple[NDArray, NDArray, NDArray]
 
 @contextmanager
 def _opened(path: Path) -> Iterator[dict[str, _Member]]:
-    """Open and check the arrays of a label file; each is positioned at its first value."""
+    """Open the arrays of a label file and check their shapes; each stream is at the first value of its array."""
     try:
         with ExitStack() as stack:
             archive = stack.enter_context(zipfile.ZipFile(path))
             found = {name.removesuffix(".npy") for name in archive.namelist()}
             if not set(SHAPES) <= found:
-                raise _damaged(path, ", ".join(SHAPES), ", ".join(sorted(found)) or "nothing")
+                expected, names = f"the arrays {', '.join(SHAPES)}", ", ".join(sorted(found)) or "no array"
+                raise _damaged(path, expected, names)
             members = {name: _member(path, name, stack.enter_context(archive.open(f"{name}.npy"))) for name in SHAPES}
             counts = {member.count for member in members.values()}
             if len(counts) > 1 or 0 in counts:
-                raise _damaged(path, "the same number of points in each array", ", ".join(map(str, sorted(counts))))
+                numbers = f"the numbers of points {', '.join(map(str, sorted(counts)))}"
+                raise _damaged(path, "the same number of points, at least 1, in each array", numbers)
             yield members
     except FileNotFoundError as error:
-        raise AssetError("no such label file of GraspNet grasps", where=path) from error
+        fix = "Download the grasp labels of GraspNet-1Billion."
+        raise AssetError("missing file of GraspNet-1Billion's grasp labels", where=path, fix=fix) from error
     except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, OSError, NotImplementedError) as error:
         raise _damaged(path, "an npz archive", str(error) or type(error).__name__) from error
 
@@ -254,7 +277,7 @@ def _member(path: Path, name: str, file: IO[bytes]) -> _Member:
     kind = "b" if name == "collision" else "f"
     if shape[1:] != SHAPES[name] or dtype.kind != kind or columns_first:
         expected = f"{name} (P, {', '.join(map(str, SHAPES[name]))}) of {'bool' if kind == 'b' else 'floats'}"
-        raise _damaged(path, expected, f"{shape} of {dtype}")
+        raise _damaged(path, expected, f"shape {shape} of {dtype}")
     return _Member(file, shape[0], dtype)
 
 

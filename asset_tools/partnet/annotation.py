@@ -21,7 +21,7 @@ Scale = Annotated[float, Field(ge=1e-4, le=1e4)]
 
 
 class HandleAnnotation(StrictModel):
-    """Grasp of the part that a joint moves: TCP pose in the furniture's frame with closed joints."""
+    """Grasp of a moving part: pose of the TCP in the furniture's frame with all joints closed, m; width in m."""
 
     joint: str
     position: Vec3
@@ -30,7 +30,7 @@ class HandleAnnotation(StrictModel):
 
 
 class JointAnnotation(StrictModel):
-    """Properties of a joint that replace those of the URDF."""
+    """Properties of a joint that replace the properties in the URDF."""
 
     mass: Positive | None = Field(
         default=None, description="mass of the moved part, kg; none: estimated from the volume"
@@ -47,7 +47,11 @@ class JointAnnotation(StrictModel):
 
 
 class ModelAnnotation(StrictModel):
-    """Content of an annotation file; surfaces of the fixed body have no ``link``, others have the URDF's name."""
+    """Content of an annotation file.
+
+    A surface of a moving part has the name of the part's link in the URDF as ``link``. A surface of the fixed body has
+    no ``link``.
+    """
 
     name: Annotated[str, Field(min_length=1)]
     category: Annotated[str, Field(min_length=1)]
@@ -60,11 +64,11 @@ class ModelAnnotation(StrictModel):
 
 
 def find_annotation(model_id: str, folder: Path | None = None) -> ModelAnnotation:
-    """Load the annotation of a model: the user's file, or else the bundled file.
+    """Load the annotation of a model from the user's folder, or, if there is none, the bundled annotation.
 
     Args:
         model_id: name of the model's folder.
-        folder: folder of the user's annotations.
+        folder: folder of the user's annotations, or None.
 
     Raises:
         AssetError: the annotation is missing or invalid.
@@ -91,5 +95,5 @@ def load_annotation(path: Path) -> ModelAnnotation:
     try:
         data = load_yaml(path)
     except (OSError, DocumentError) as error:
-        raise AssetError("cannot read the annotation", where=path, found=error) from error
+        raise AssetError("cannot read the annotation", where=path, expected="a YAML file", found=error) from error
     return parse(ModelAnnotation, data, AssetError, where=path, about="invalid annotation")

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from asset_tools.quality.overlap import ConvexBody, make_convex_body, overlap
+from asset_tools.quality.overlap import ConvexBody, compute_overlap, make_convex_body
 from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.manifest import Joint
 
@@ -23,15 +23,18 @@ STOPS = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.4, 0.
 
 
 def trim_pieces(pieces: Sequence[Array], others: Sequence[Array], joint: Joint) -> list[Array]:
-    """Trim the pieces of a moving part so that they pass the rest of the furniture over the whole range.
+    """Cut the pieces of a moving part so that they do not touch the rest of the furniture while the joint moves.
 
-    Each piece is cut by the plane that removes least. A piece stays unchanged if the cut would be deeper than 3 cm or
-    would remove most of the piece.
+    A piece that would touch another hull is cut by a plane; of all possible planes, the plane with the smallest depth
+    is used. A piece stays unchanged if the cut would be deeper than 3 cm, or would leave less than 20 % of the piece.
 
     Args:
-        pieces: (V, 3) corners of each hull, m, with the joint closed.
-        others: (V, 3) corners of the hulls that do not move.
-        joint: joint of the part; it is open at the limit that is farther from 0.
+        pieces: corners (V, 3) of each piece with the joint closed, m.
+        others: corners (V, 3) of each hull that does not move, m.
+        joint: joint of the part. It is closed at 0 and open at the limit that is farther from 0.
+
+    Returns:
+        Corners (V, 3) of each piece after the cuts, m.
     """
     stops = STOPS if joint.kind == "revolute" else (0.0, 1.0)  # the volume swept by sliding is convex
     passed = [_passed(other, joint, span) for span in pairwise(stops) for other in others]
@@ -41,7 +44,7 @@ def trim_pieces(pieces: Sequence[Array], others: Sequence[Array], joint: Joint) 
         for _ in range(PASSES):
             before = body
             for other in passed:
-                depth, plane = overlap(body, other, GAP)
+                depth, plane = compute_overlap(body, other, GAP)
                 if plane is None or depth > DEEPEST:
                     continue
                 cut = _below(body.points, plane)
@@ -54,7 +57,13 @@ def trim_pieces(pieces: Sequence[Array], others: Sequence[Array], joint: Joint) 
 
 
 def _passed(other: Array, joint: Joint, span: tuple[float, float]) -> ConvexBody:
-    """Return the volume of a static hull in the frame of the link while its joint moves through a span."""
+    """Return the volume through which a static hull moves, seen from the moving part.
+
+    Args:
+        other: corners (V, 3) of the static hull, m.
+        joint: joint of the moving part.
+        span: start and end of the motion, as fractions of the range of the joint.
+    """
     far = max(joint.limits, key=abs)
     places = []
     for fraction in dict.fromkeys(span):
@@ -64,7 +73,12 @@ def _passed(other: Array, joint: Joint, span: tuple[float, float]) -> ConvexBody
 
 
 def _below(points: Array, plane: Array) -> Array | None:
-    """Return the corners of the part of a hull below a plane; None if it has no volume."""
+    """Cut a hull by a plane; return the corners (V, 3) below the plane, or None if this part has no volume.
+
+    Args:
+        points: (P, 3) corners of the hull.
+        plane: (4,) normal and offset; a point x is below if ``normal @ x + offset < 0``.
+    """
     heights = points @ plane[:3] + plane[3]
     corners = ConvexHull(points).simplices
     edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])

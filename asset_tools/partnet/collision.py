@@ -1,4 +1,4 @@
-"""Decompose furniture into convex pieces part by part, so that drawers and compartments stay open."""
+"""Decompose each part of furniture into convex pieces, so that drawers and compartments stay open."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ CUTS, STEPS, DEPTH = 6, 5, 4  # tried planes per axis: at faces and evenly space
 
 @dataclass(frozen=True)
 class CollisionPart:
-    """A part of the furniture in PartNet.
+    """A part of furniture, as PartNet divides it.
 
     Attributes:
         name: name of the part, such as ``drawer_side-23``.
-        meshes: (F, 3, 3) triangles of each mesh, m.
+        meshes: triangles (F, 3, 3) of each mesh of the part, m.
     """
 
     name: str
@@ -53,15 +53,16 @@ class CollisionPart:
 
 
 def make_pieces(parts: Sequence[CollisionPart], middle: Array) -> list[Array]:
-    """Return the corners (V, 3) of at most 40 convex pieces of a link's parts.
+    """Decompose the parts of a link into at most 40 convex pieces; return the corners (V, 3) of each piece, m.
 
-    A part that nearly fills its hull is one piece. Other parts are split into their meshes, meshes into connected
-    components, open shells into walls, and the rest by the planes that reduce the hull volume most. For furniture made
-    of boards, such planes are more exact and faster than a general decomposition.
+    A part that nearly fills its convex hull becomes one piece. Another part is split into its meshes, and each mesh
+    into its connected components. A component that is an open shell is split into walls. Other components are cut by
+    the planes that reduce the volume of the hulls most. For furniture made of boards, such cuts are more exact and
+    faster than a general convex decomposition.
 
     Args:
         parts: parts of the link.
-        middle: (3,) centre of the furniture; vertical sheets are thickened towards it.
+        middle: (3,) centre of the furniture, m; vertical sheets get their thickness towards this point.
 
     Raises:
         AssetError: all parts are too small.
@@ -74,8 +75,9 @@ def make_pieces(parts: Sequence[CollisionPart], middle: Array) -> list[Array]:
     hulls = [reduce_vertices(piece, bevel=0) for piece in found]
     hulls = _without_hidden(hulls)
     if not hulls:
-        where, expected = ", ".join(part.name for part in parts)[:80], f"a part of {TINY * 1000:g} mm"
-        raise AssetError("no collision shape", where=where, expected=expected, found="smaller parts only")
+        where, expected = ", ".join(part.name for part in parts)[:80], f"a part of at least {TINY * 1000:g} mm"
+        fix = "Set `scale` in the annotation, or fix the joint of these parts."
+        raise AssetError("no collision shape", where=where, expected=expected, found="only smaller parts", fix=fix)
     if len(hulls) > MOST:
         order = np.argsort([-np.ptp(hull, axis=0).max() for hull in hulls], kind="stable")[:MOST]
         hulls = [hulls[index] for index in sorted(order)]
@@ -83,7 +85,13 @@ def make_pieces(parts: Sequence[CollisionPart], middle: Array) -> list[Array]:
 
 
 def limit_for_gpu(hull: Array) -> list[Array]:
-    """Return a hull (V, 3), or, if it is too slender for a GPU, its two halves or its bounding box."""
+    """Return a hull as one or two hulls that are not too slender for PhysX on a GPU.
+
+    A hull that is too slender is replaced by its two halves, or by its oriented bounding box.
+
+    Args:
+        hull: (V, 3) corners, m.
+    """
     if _sturdy(hull):
         return [hull]
     axis = int(np.ptp(hull, axis=0).argmax())
@@ -101,7 +109,7 @@ def _sturdy(hull: Array) -> bool:
 
 
 def _size(points: Array, rank: int) -> float:
-    """Return the longest (0), middle (1) or shortest (2) extent in m."""
+    """Return the longest (``rank`` 0), middle (1) or shortest (2) extent of points (P, 3) along x, y and z, m."""
     return float(np.sort(np.ptp(points, axis=0))[2 - rank])
 
 
@@ -122,7 +130,7 @@ def _split(meshes: Sequence[Array], fine: bool, middle: Array) -> list[Array]:
 
 
 def _is_shell(body: trimesh.Trimesh) -> bool:
-    """Return whether a mesh is an open shell, which only a lid could close."""
+    """Return whether a mesh is an open shell: closing it would add more than 10 % to its area."""
     if body.is_watertight:
         return False
     try:
@@ -132,7 +140,13 @@ def _is_shell(body: trimesh.Trimesh) -> bool:
 
 
 def _cut(triangles: Array, fine: bool, depth: int) -> list[Array]:
-    """Cut a closed mesh by planes across x, y or z into nearly convex pieces; return their points."""
+    """Cut a closed mesh by planes across x, y or z into nearly convex pieces; return the points (P, 3) of each piece.
+
+    Args:
+        triangles: (F, 3, 3) triangles, m.
+        fine: whether the mesh is a handle, which needs small tolerances.
+        depth: maximum number of successive cuts.
+    """
     points = triangles.reshape(-1, 3)
     size = np.ptp(points, axis=0)
     if depth == 0 or size.max() <= TINY or _fits(triangles, True, TINY if fine else SMALL):
@@ -157,11 +171,11 @@ def _cut(triangles: Array, fine: bool, depth: int) -> list[Array]:
 
 
 def _places(triangles: Array, across: Array) -> list[tuple[int, float]]:
-    """Return axes and positions of cuts to try: at the largest faces across x, y and z, then at even steps.
+    """Return axis and position of each cut to try: at the largest faces across x, y and z, then at even steps.
 
     Args:
-        triangles: (F, 3, 3).
-        across: (3,) whether to cut across each axis; boards are not split into thinner boards.
+        triangles: (F, 3, 3) triangles, m.
+        across: (3,) whether to cut across x, y and z; False for the thin side of a board.
     """
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     level = np.abs(cross) > 0.99 * np.linalg.norm(cross, axis=1, keepdims=True)
@@ -201,7 +215,12 @@ def _welded(triangles: Array) -> trimesh.Trimesh:
 
 
 def _flat_hull(points: Array, middle: Array) -> Array | None:
-    """Return the thickened hull of coplanar points, or None if they are not coplanar."""
+    """Return points (2 P, 3) of a slab for coplanar points (P, 3); None if the points are not coplanar.
+
+    Args:
+        points: (P, 3) points, m.
+        middle: (3,) centre of the furniture, towards which a vertical sheet gets its thickness.
+    """
     center = points.mean(axis=0)
     spread = np.linalg.svd(points - center, full_matrices=False)
     normal = spread[2][-1]
@@ -211,13 +230,19 @@ def _flat_hull(points: Array, middle: Array) -> Array | None:
 
 
 def _thickness(normal: Array, inward: Array) -> Array:
-    """Return the vector in m by which a sheet with this normal is thickened."""
+    """Return the vector (3,) in m from a sheet to the other side of its slab: down, or, if vertical, to the inside."""
     level = abs(normal[2]) > LEVEL
     return normal * (SHEET if (-normal[2] if level else normal @ inward) > 0 else -SHEET)
 
 
 def _fits(triangles: Array, fine: bool, small: float = SMALL) -> bool:
-    """Return whether the convex hull of a part approximates it well enough."""
+    """Return whether a part is small, or close enough to its convex hull, to be replaced by the hull.
+
+    Args:
+        triangles: (F, 3, 3) triangles of the part, m.
+        fine: whether to use the small tolerance for handles.
+        small: extent below which a part always counts, m.
+    """
     points = triangles.reshape(-1, 3)
     if np.ptp(points, axis=0).max() <= small:
         return True
@@ -243,7 +268,7 @@ def _distances(body: trimesh.Trimesh, points: Array) -> Array:
 
 
 def _walls(body: trimesh.Trimesh) -> list[Array]:
-    """Return an inward slab for each flat face of an open shell."""
+    """Return the points (P, 3) of a slab for each flat face of an open shell; slabs are on the inside."""
     groups = [np.asarray(group) for group in body.facets]
     single = np.setdiff1d(np.arange(len(body.faces)), np.concatenate(groups) if groups else [])
     groups += [np.array([face]) for face in single]
@@ -262,7 +287,10 @@ def _walls(body: trimesh.Trimesh) -> list[Array]:
 
 
 def _convex_outlines(triangles: Array) -> list[Array]:
-    """Return convex polygons (V, 2) that cover coplanar triangles (F, 3, 2); join them if the union is convex."""
+    """Return convex polygons (V, 2) that cover coplanar triangles (F, 3, 2).
+
+    Neighbours with a convex union are joined.
+    """
     shapes = [Polygon(triangle) for triangle in triangles]
     union = unary_union(shapes)
     whole = [one for one in (union.geoms if isinstance(union, MultiPolygon) else [union]) if isinstance(one, Polygon)]
@@ -286,7 +314,7 @@ def _convex_outlines(triangles: Array) -> list[Array]:
 
 
 def _without_hidden(hulls: list[Array]) -> list[Array]:
-    """Remove pieces that are inside another piece."""
+    """Return the hulls that are not completely inside another hull."""
     planes = [ConvexHull(hull).equations for hull in hulls]
     sizes = [ConvexHull(hull).volume for hull in hulls]
     kept = []

@@ -1,4 +1,4 @@
-"""Read the faces of a model's shapes (mesh files and primitives); skip and report unusable shapes."""
+"""Read the faces of the shapes of a model: mesh files and primitives. Unusable shapes are skipped and noted."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ SIDES = 32  # of a cylinder
 
 
 class Geometry:
-    """Reader of the shapes of one model; it reads each mesh file once.
+    """Reader of the shapes of one model, which reads each mesh file once.
 
     Args:
-        folder: of the model; files outside of it are not read.
+        folder: folder of the model; files outside of this folder are not read.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -38,7 +38,11 @@ class Geometry:
         self._left = MOST_TRIANGLES
 
     def check(self, link: str, visuals: Sequence[Visual]) -> None:
-        """Check that the files of a link exist, without reading them.
+        """Check that the mesh files of a link exist; the files are not read.
+
+        Args:
+            link: name of the link, for errors; empty: the fixed body.
+            visuals: shapes of the link.
 
         Raises:
             AssetError: most files are missing, or a file is outside of the folder or has an unsupported format.
@@ -46,10 +50,10 @@ class Geometry:
         self._check_most(link, [self._missing(one.shape) for one in visuals])
 
     def faces(self, link: str, visuals: Sequence[Visual]) -> list[tuple[str, str, Faces]]:
-        """Return part name, file and faces of each shape of a link, in the furniture's frame.
+        """Read the shapes of a link; return tuples of part name, file name and faces in the furniture's frame.
 
         Args:
-            link: name of the link, for messages.
+            link: name of the link, for errors; empty: the fixed body.
             visuals: shapes of the link.
 
         Raises:
@@ -66,7 +70,8 @@ class Geometry:
             self._left -= sum(len(faces.corners) for faces in shown)
             if self._left < 0:
                 where, expected = self.files.root / URDF, f"at most {MOST_TRIANGLES:,} triangles"
-                raise AssetError("the model is too detailed", where=where, expected=expected, fix="Reduce its meshes.")
+                fix = "Reduce the number of faces of the meshes."
+                raise AssetError("the model has too many triangles", where=where, expected=expected, fix=fix)
             turn, shift = visual.pose[:3, :3], visual.pose[:3, 3]
             source = visual.shape.filename or f"shape {index}"
             found += [(visual.part, source, replace(one, corners=one.corners @ turn.T + shift)) for one in shown]
@@ -75,12 +80,18 @@ class Geometry:
         return found
 
     def _check_most(self, link: str, reasons: Sequence[str]) -> None:
-        """Raise AssetError if more than half of a link's shapes are missing."""
+        """Raise AssetError if more than half of the shapes of a link are unusable.
+
+        Args:
+            link: name of the link; empty: the fixed body.
+            reasons: for each shape, why it is unusable; empty: usable.
+        """
         lost = [reason for reason in reasons if reason]
         if len(lost) > len(reasons) / 2:
             what = f"most shapes of {f'the link {link}' if link else 'the fixed body'} are unusable"
-            found = f"{len(lost)} of {len(reasons)}: {lost[0]}"
-            raise AssetError(what, where=self.files.root / URDF, found=found, fix="Download the model again.")
+            found = f"{len(lost)} unusable shapes of {len(reasons)}; the first: {lost[0]}"
+            expected, fix = "at least half of the shapes", "Download the model again."
+            raise AssetError(what, where=self.files.root / URDF, expected=expected, found=found, fix=fix)
 
     def _missing(self, shape: Shape) -> str:
         """Return the reason why a shape is unusable; empty if it is usable."""
@@ -97,7 +108,10 @@ class Geometry:
         return ""
 
     def _path(self, shape: Shape) -> Path | None:
-        """Return the path of a mesh file in a URDF; ``package://NAME/`` is the model's folder, or a folder in it."""
+        """Return the path of the mesh file of a shape, or None if it is missing.
+
+        ``package://NAME/`` in a URDF is the subfolder NAME of the model if it exists, otherwise the model's folder.
+        """
         name, root = shape.filename, self.files.root
         if name.startswith(SCHEMES):
             package, _, inside = unquote(name.partition("://")[2]).partition("/")
@@ -125,7 +139,7 @@ class Geometry:
 def _read_stl(path: Path, files: ModelFiles, color: tuple[float, float, float] | None) -> list[Faces]:
     corners = [part.vertices[part.faces] for part in read_exchange(path, files)]
     if not all(np.isfinite(one).all() for one in corners):
-        raise AssetError("the mesh has vertices that are NaN or infinite", where=path)
+        raise AssetError("the mesh has NaN or infinite vertices", where=path, fix="Export the mesh again.")
     return [Faces(one, np.zeros((len(one), 3, 2)), Material(color or GREY)) for one in corners if has_area(one)]
 
 

@@ -1,4 +1,4 @@
-"""Convert a PartNet-Mobility model with its annotation to the source of furniture."""
+"""Import PartNet-Mobility models: convert a model and its annotation to the source of a piece of furniture."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from asset_tools.build import build_furniture
-from asset_tools.import_scans import object_id
+from asset_tools.import_scans import make_object_id
 from asset_tools.partnet.annotation import LARGEST, JointAnnotation, ModelAnnotation, find_annotation
 from asset_tools.partnet.clearance import trim_pieces
 from asset_tools.partnet.collision import CollisionPart, limit_for_gpu, make_pieces
@@ -20,7 +20,7 @@ from asset_tools.partnet.obj import Faces
 from asset_tools.partnet.textures import merge_faces
 from asset_tools.partnet.urdf import URDF, MovingLink, PartnetModel, Visual, find_urdf, read_urdf
 from asset_tools.pipeline import AssetJob, content_hash, make_failing_job
-from asset_tools.readers.files import LARGEST_FILE, files_below
+from asset_tools.readers.files import LARGEST_FILE, find_files
 from asset_tools.readers.limits import reading_limits
 from asset_tools.sources import FurnitureSource, LinkSource
 from robocas_ms3.assets.manifest import BODY, FurnitureAsset, Handle, Joint, Surface
@@ -41,13 +41,14 @@ EDGE = 0.002  # m, tolerance for surfaces beyond the model's bounds
 
 
 def read_partnet(folder: Path, annotation: ModelAnnotation) -> FurnitureSource:
-    """Read a model: collision pieces, one textured mesh per link, joints, surfaces and handles.
+    """Read a model as the source of a piece of furniture.
 
-    The frame is that of RoboCAS-v0: origin of the model, x out of its front, z up; joints are closed at 0. Links and
-    joints keep the URDF's names if these are valid in a pack.
+    The source has collision pieces and one textured mesh per link, joints, surfaces and handles. As in RoboCAS-v0, the
+    origin of its frame is the origin of the model, x points out of the front, and z points up. Joints are closed at 0.
+    Links and joints keep their names in the URDF if these names are valid in a pack.
 
     Args:
-        folder: of the model; its name is the id. Files outside of it are not read.
+        folder: folder of the model, whose name is the id. Files outside of this folder are not read.
         annotation: annotation of the model.
 
     Raises:
@@ -64,15 +65,19 @@ def read_partnet(folder: Path, annotation: ModelAnnotation) -> FurnitureSource:
     empty = next((name for name, group in faces_by_link.items() if not group), None)
     if empty is not None:
         what = f"the moving link {empty} has no mesh" if empty else "the fixed body has no mesh"
-        fix = "Fix the joint in the annotation: `fixed: true`."
-        raise AssetError(what, where=folder / URDF, expected="a <visual> of each body", fix=fix)
+        fix = "Fix the joint of the link in the annotation with `fixed: true`." if empty else "Use another model."
+        raise AssetError(what, where=folder / URDF, expected="a <visual> with faces in each link", fix=fix)
     bounds = np.array([corners.min(axis=0), corners.max(axis=0)])
     _check_size(bounds, folder.name)
     _check(model, annotation, bounds)
     if annotation.mass is not None and model.links:
-        fix = "Remove `mass`; masses of moving parts belong under `joints`."
+        fix = "Remove `mass` at the top level; set masses of moving parts under `joints`."
         raise AssetError(
-            "furniture with moving parts must be fixed", where=folder.name, expected="no mass", found="a mass", fix=fix
+            "furniture with moving parts must be fixed",
+            where=folder.name,
+            expected="an annotation without `mass`",
+            found=f"mass: {annotation.mass:g}",
+            fix=fix,
         )
     repairs = [*model.repairs, *geometry.repairs]
     ids = _ids([link.name for link in model.links], repairs)
@@ -93,7 +98,7 @@ def read_partnet(folder: Path, annotation: ModelAnnotation) -> FurnitureSource:
         links.append(LinkSource(ids[link.name], joints[link.name], mesh, pieces[link.name], mass, parent))
     moved = {link.joint: ids[link.name] for link in model.links}
     return FurnitureSource(
-        id=object_id(folder.name),
+        id=make_object_id(folder.name),
         name=annotation.name,
         category=annotation.category,
         mesh=merge_faces([faces for _, _, faces in faces_by_link[""]]),
@@ -117,16 +122,21 @@ def read_partnet(folder: Path, annotation: ModelAnnotation) -> FurnitureSource:
 
 
 def _groups(model: PartnetModel) -> list[tuple[str, list[Visual]]]:
-    """Return name and shapes of the fixed body, whose name is empty, and of each moving link."""
+    """Return the name and the shapes of the fixed body, whose name is empty, and of each moving link."""
     return [("", model.body), *((link.name, link.visuals) for link in model.links)]
 
 
 def _ids(names: Sequence[str], repairs: list[str]) -> dict[str, str]:
-    """Map names of a URDF to unique names in a pack: lower-case letters, digits and underscores."""
+    """Map names of a URDF to unique names in a pack, of lower-case letters, digits and underscores.
+
+    Args:
+        names: names in the URDF.
+        repairs: list to which the function appends one note per changed name.
+    """
     ids: dict[str, str] = {}
     taken = {BODY}
     for name in names:
-        plain = name if re.fullmatch("[a-z0-9_]+", name) else object_id(name)
+        plain = name if re.fullmatch("[a-z0-9_]+", name) else make_object_id(name)
         found, number = plain, 2
         while found in taken:
             found, number = f"{plain}_{number}", number + 1
@@ -138,7 +148,7 @@ def _ids(names: Sequence[str], repairs: list[str]) -> dict[str, str]:
 
 
 def _short(repairs: Sequence[str]) -> tuple[str, ...]:
-    """Remove duplicate lines, and limit the number of lines."""
+    """Return at most 30 notes without duplicates; a last line has the number of notes that are left out."""
     lines = list(dict.fromkeys(repairs))
     left = len(lines) - MOST_REPAIRS
     return (*lines[:MOST_REPAIRS], *([f"{left} more lines"] if left > 0 else []))
@@ -148,26 +158,27 @@ def _for_gpu(pieces: Sequence[np.ndarray]) -> list[np.ndarray]:
     return [part for piece in pieces for part in limit_for_gpu(piece)]
 
 
-def partnet_jobs(folders: Sequence[Path], annotations: Path | None = None) -> list[AssetJob]:
-    """Return the jobs that import models.
+def make_partnet_jobs(folders: Sequence[Path], annotations: Path | None = None) -> list[AssetJob]:
+    """Return one job per model; the job of a model with an error raises the error when it runs.
 
     Args:
-        folders: folders of the models with ``mobility.urdf``; their names are the ids.
-        annotations: folder of the user's ``<id>.yaml`` files, which have priority over bundled ones.
+        folders: folders of the models, each with a ``mobility.urdf``; the names of the folders are the ids.
+        annotations: folder of the user's ``<id>.yaml`` files, which have priority over bundled annotations.
 
     Returns:
-        Jobs; failing jobs come first, so that an import stops before it builds an asset.
+        The jobs. Jobs of models with errors come first, so that an import stops before it builds an asset.
     """
     good: dict[str, AssetJob] = {}
     bad: dict[str, AssetJob] = {}
     for folder in dict.fromkeys(folder.resolve() for folder in folders):
-        name = object_id(folder.name)
+        name = make_object_id(folder.name)
         try:
             if name in good or name in bad:
-                raise AssetError("two models have the same id", where=folder, found=name, fix="Rename one of them.")
+                fix = "Rename the folder of one of the two models."
+                raise AssetError("two models have the same id", where=folder, found=name, fix=fix)
             good[name] = _job(name, folder, annotations)
         except AssetError as error:
-            label = name if name not in good and name not in bad else object_id(str(folder))
+            label = name if name not in good and name not in bad else make_object_id(str(folder))
             bad[label] = make_failing_job(label, error)
     return [*bad.values(), *good.values()]
 
@@ -183,9 +194,9 @@ def _job(name: str, folder: Path, annotations: Path | None) -> AssetJob:
 
 
 def _files(folder: Path) -> list[Path]:
-    """Return the files that a model may use."""
+    """Return the URDF of a model and all mesh, material and image files in its folder."""
     found = [folder / URDF]
-    for path in files_below(folder):
+    for path in find_files(folder):
         inside = path.suffix.lower() in SUFFIXES and path.is_file() and path.resolve().is_relative_to(folder)
         if inside and path.stat().st_size <= LARGEST_FILE:  # larger files are not read
             found.append(path)
@@ -208,7 +219,9 @@ def _parts(group: Sequence[tuple[str, str, Faces]]) -> list[CollisionPart]:
 def _joint(link: MovingLink, name: str, annotation: ModelAnnotation) -> Joint:
     note, limits = annotation.joints.get(link.joint, JointAnnotation()), link.limits
     if not limits[0] <= 0 <= limits[1] or limits[0] == limits[1]:
-        raise AssetError("limits of a joint must include 0 (closed)", where=link.joint, found=limits)
+        fix = "Correct `limits` or `closed` of the joint in the annotation."
+        expected, found = "limits that include 0, the closed position", f"{limits[0]:g} to {limits[1]:g}"
+        raise AssetError("invalid limits of a joint", where=link.joint, expected=expected, found=found, fix=fix)
     x, y, z = (float(value) for value in np.round(link.axis, 9) + 0.0)
     a, b, c = (float(value) for value in np.round(link.origin, 9) + 0.0)
     return Joint(
@@ -223,7 +236,7 @@ def _joint(link: MovingLink, name: str, annotation: ModelAnnotation) -> Joint:
 
 
 def _carried(model: PartnetModel, name: str) -> set[str]:
-    """Return the names of a link and all links that it carries."""
+    """Return the names of a link and of all links that move with it."""
     carried = {name}
     for link in model.links:
         if link.parent in carried:
@@ -242,22 +255,24 @@ def _check(model: PartnetModel, annotation: ModelAnnotation, bounds: Array) -> N
         if handle.joint not in moving:
             expected = f"one of {', '.join(sorted(moving)) or '(none)'}"
             found, known = handle.joint, handle.joint in model.joints
-            what = f"handle {name!r} of {'a fixed joint' if known else 'an unknown joint'}"
+            what = f"handle {name!r} in the annotation belongs to {'a fixed joint' if known else 'an unknown joint'}"
             fix = "Give the joint `limits` in the annotation, or remove the handle." if known else ""
             raise AssetError(what, where=where, expected=expected, found=found, fix=fix)
     links = {"", *(link.name for link in model.links)}
     for name, surface in annotation.surfaces.items():
         if surface.link not in links:
-            expected = f"one of {', '.join(sorted(links - {''})) or '(none)'}"
+            expected = f"a moving link, which is one of {', '.join(sorted(links - {''})) or '(none)'}"
             found = surface.link
-            raise AssetError(f"surface {name!r} of an unknown link", where=where, expected=expected, found=found)
+            what = f"surface {name!r} in the annotation has an unknown link"
+            raise AssetError(what, where=where, expected=expected, found=found)
         _check_surface(name, surface, bounds, where)
 
 
 def _check_size(bounds: Array, where: str) -> None:
     size = float((bounds[1] - bounds[0]).max())
     if size < SMALLEST or np.abs(bounds).max() > LARGEST:
-        expected, found = f"{SMALLEST} to {LARGEST:g} m", f"{size:.4g} m"
+        expected = f"a longest side of at least {SMALLEST} m, and coordinates of at most {LARGEST:g} m"
+        found = f"a longest side of {size:.4g} m, coordinates of up to {float(np.abs(bounds).max()):.4g} m"
         fix = "Set `scale` in the annotation: metres per unit of the model."
         raise AssetError("implausible size of furniture", where=where, expected=expected, found=found, fix=fix)
 
@@ -267,4 +282,5 @@ def _check_surface(name: str, surface: Surface, bounds: Array, where: str) -> No
     if (low < bounds[0] - EDGE).any() or (high > bounds[1] + EDGE).any():
         span = " ".join(f"{axis} {a:.3f}..{b:.3f}" for axis, a, b in zip("xyz", *bounds, strict=True))
         found = f"{[round(float(value), 3) for value in low]} to {[round(float(value), 3) for value in high]}"
-        raise AssetError(f"surface {name!r} is outside of the model", where=where, expected=span, found=found)
+        what, expected = f"surface {name!r} in the annotation is outside of the model", f"coordinates within {span}"
+        raise AssetError(what, where=where, expected=expected, found=found)

@@ -21,11 +21,11 @@ OBJ_LIMIT = 64 * 2**20  # bytes; the largest of PartNet-Mobility have some 10 MB
 
 @dataclass(frozen=True)
 class Material:
-    """Material of faces.
+    """Material of faces: a texture, or one colour.
 
     Attributes:
-        color: (3,) in 0..1, used without a texture.
-        image: resolved path of the texture, or None.
+        color: sRGB colour in 0..1, used if there is no texture.
+        image: path of the texture without links, or None.
     """
 
     color: tuple[float, float, float] = GREY
@@ -37,8 +37,8 @@ class Faces:
     """Triangles of one material.
 
     Attributes:
-        corners: (F, 3, 3) m.
-        uv: (F, 3, 2), v upward; zeros if missing.
+        corners: (F, 3, 3) corners of the triangles, m.
+        uv: (F, 3, 2) texture coordinates, v upward; zeros if the file has none.
         material: material of the faces.
     """
 
@@ -48,12 +48,12 @@ class Faces:
 
 
 def read_obj(path: Path, files: ModelFiles, color: tuple[float, float, float] | None) -> list[Faces]:
-    """Read a mesh; return [] if all faces are degenerate.
+    """Read an OBJ file as one group of faces per material; return [] if all faces are degenerate.
 
     Args:
-        path: of the mesh.
-        files: files of the model; notes on missing files are added.
-        color: (3,) in 0..1, for faces with an unknown material.
+        path: path of the file.
+        files: files of the model; notes on missing files are added to ``files.notes``.
+        color: sRGB colour in 0..1 of faces without a known material; None: grey.
 
     Raises:
         AssetError: a file cannot be read, or is outside of the model's folder.
@@ -61,11 +61,13 @@ def read_obj(path: Path, files: ModelFiles, color: tuple[float, float, float] | 
     data = files.read(path)
     if len(data) > OBJ_LIMIT:
         expected, found = f"at most {OBJ_LIMIT >> 20} MB", f"{len(data) >> 20} MB"
-        raise AssetError("the mesh is too detailed", where=path, expected=expected, found=found, fix="Reduce it.")
+        raise AssetError(
+            "the mesh file is too large", where=path, expected=expected, found=found, fix="Reduce the mesh."
+        )
     mesh = parse_obj(decode_text(data), path)
     corners = mesh.vertices[mesh.faces]
     if not np.isfinite(corners).all():
-        raise AssetError("the mesh has vertices that are NaN or infinite", where=path)
+        raise AssetError("the mesh has NaN or infinite vertices", where=path, fix="Export the mesh again.")
     if not has_area(corners):
         return []
     uvs = np.concatenate([mesh.uvs, np.zeros((1, 2))])[mesh.face_uvs]  # index -1: zeros
@@ -84,13 +86,13 @@ def read_obj(path: Path, files: ModelFiles, color: tuple[float, float, float] | 
 
 
 def has_area(corners: Array) -> bool:
-    """Return whether any of the triangles (F, 3, 3) is not degenerate."""
+    """Return whether at least one of the triangles (F, 3, 3) has an area above 0."""
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     return len(areas) > 0 and bool(areas.max() > 0)
 
 
 def _materials(mesh: ObjMesh, path: Path, files: ModelFiles) -> dict[int, tuple[MtlMaterial, Path]]:
-    """Return material index -> material and the folder of its images."""
+    """Return index of the material in the mesh -> material and folder in which its images are searched."""
     known: dict[str, MtlMaterial] = {}
     homes: dict[str, Path] = {}
     for file in _libraries(mesh, path, files):
@@ -110,7 +112,7 @@ def _materials(mesh: ObjMesh, path: Path, files: ModelFiles) -> dict[int, tuple[
 
 
 def _libraries(mesh: ObjMesh, path: Path, files: ModelFiles) -> list[Path]:
-    """Return the MTL files of a mesh; a missing file is replaced by the file with the mesh's name."""
+    """Return the paths of the MTL files of a mesh; ``<mesh>.mtl`` replaces a missing file."""
     found = []
     for line in mesh.libraries:
         whole = files.find(line, path.parent)

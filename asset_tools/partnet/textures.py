@@ -1,4 +1,4 @@
-"""One textured mesh of many: what a link's parts show is packed into one image."""
+"""Merge the faces of a link to one mesh whose textures are packed into one image."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ENOUGH = 0.6  # minimum resolution relative to the desired one for using another
 
 @dataclass(frozen=True)
 class _Tile:
-    """A part of a texture in UV coordinates, or one colour."""
+    """A rectangle of a texture, given in UV coordinates, or one colour."""
 
     color: tuple[int, int, int] = (0, 0, 0)
     image: Image.Image | None = None
@@ -52,7 +52,7 @@ class _Tile:
         return width, height
 
     def draw(self, width: int, height: int) -> Image.Image:
-        """Draw the tile of a repeating texture with padding."""
+        """Return the image of the tile with a size in pixels and padding on each side; the texture repeats."""
         if self.image is None:
             return Image.new("RGB", (width + 2 * PADDING, height + 2 * PADDING), self.color)
         wanted = np.subtract(self.high, self.low) * self.image.size / (width, height)
@@ -73,13 +73,13 @@ class _Tile:
 
 
 def merge_faces(faces: Sequence[Faces]) -> trimesh.Trimesh:
-    """Merge faces to a mesh with one texture and the same appearance.
+    """Merge faces with different materials to one mesh with one texture and an equal appearance.
 
-    Ornamental parts with thousands of faces are simplified. Repetitions of textures are written out, with at most 400
-    pixels per metre.
+    Parts with more than 500 faces, such as ornaments, are simplified. A texture that repeats is copied as often as it
+    repeats, with at most 400 pixels per metre.
 
     Args:
-        faces: faces in one frame, metres.
+        faces: faces of each material in one frame, metres.
 
     Raises:
         AssetError: a texture cannot be read.
@@ -134,7 +134,7 @@ def _welded(corners: Array) -> trimesh.Trimesh:
 
 
 def _simplified(faces: Faces) -> Faces:
-    """Faces of carved work reduced; they come out with both sides."""
+    """Simplify faces if there are more than 500; the result has each triangle twice, once per side."""
     body = _welded(faces.corners)
     keep = np.flatnonzero(body.nondegenerate_faces() & body.unique_faces())
     if len(keep) <= HEAVY:
@@ -163,7 +163,16 @@ def _simplified(faces: Faces) -> Faces:
 
 
 def _tiles(corners: Array, uv: Array, image: Image.Image) -> tuple[list[_Tile], Array, Array]:
-    """Tiles of a texture that faces show: the tiles, which one each face is on, and (F, 3, 2) where on it, 0 to 1."""
+    """Find the rectangles of a texture that faces use.
+
+    Args:
+        corners: (F, 3, 3) corners of the faces, m.
+        uv: (F, 3, 2) texture coordinates of the corners.
+        image: the texture.
+
+    Returns:
+        The tiles, the index (F,) of the tile of each face, and the position (F, 3, 2) of each corner in its tile, 0..1.
+    """
     charts = _charts(corners, uv)
     count = int(charts.max()) + 1
     low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
@@ -193,7 +202,7 @@ def _tiles(corners: Array, uv: Array, image: Image.Image) -> tuple[list[_Tile], 
 
 
 def _charts(corners: Array, uv: Array) -> Array:
-    """(F,) number of the group of faces, joined at corners, that each belongs to."""
+    """Return the number (F,) of the chart of each face: faces with common corners, in 3D and UV, form a chart."""
     keys = np.round(np.concatenate([corners, uv], axis=2).reshape(-1, 5) * 1e4).astype(np.int64)
     nodes = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1, 3)
     links = np.concatenate([nodes[:, [0, 1]], nodes[:, [1, 2]]])
@@ -208,7 +217,11 @@ def _areas(corners: Array) -> Array:
 
 
 def _packed(tiles: Sequence[_Tile]) -> tuple[Image.Image, Array]:
-    """The image, and (T, 4) left, top, width and height of each tile in it without its padding, pixels."""
+    """Pack tiles into one image.
+
+    Returns:
+        The image, and the box (T, 4) of each tile in pixels: left, top, width, height, without padding.
+    """
     shrink = 1.0
     while True:
         sizes = np.array([tile.size(shrink) for tile in tiles])
@@ -217,7 +230,12 @@ def _packed(tiles: Sequence[_Tile]) -> tuple[Image.Image, Array]:
             break
         shrink *= 0.9
         if shrink < 0.01:
-            raise AssetError("the textures don't fit into one image", found=f"{len(tiles)} pieces")
+            raise AssetError(
+                "the textures of a link do not fit into one image",
+                expected=f"an image of at most {SIDE} x {SIDE} pixels",
+                found=f"{len(tiles)} pieces of textures",
+                fix="Reduce the number of materials of the model.",
+            )
     texture_image = Image.new("RGB", (width, height))
     for tile, (left, top, across, down) in zip(tiles, boxes.astype(int).tolist(), strict=True):
         texture_image.paste(tile.draw(across, down), (left - PADDING, top - PADDING))
@@ -225,7 +243,14 @@ def _packed(tiles: Sequence[_Tile]) -> tuple[Image.Image, Array]:
 
 
 def _shelves(sizes: Array) -> tuple[Array, int, int]:
-    """Boxes (T, 4) in rows, tallest first; height and width of all."""
+    """Arrange boxes in rows, tallest first.
+
+    Args:
+        sizes: (T, 2) width and height of each box, pixels.
+
+    Returns:
+        Left, top, width and height (T, 4) of each box, and the height and the width of the whole image.
+    """
     outer = sizes + 2 * PADDING
     width = int(max(outer[:, 0].max(), min(SIDE, 2 ** np.ceil(np.log2(np.sqrt(outer.prod(axis=1).sum()))))))
     boxes, left, top, row = np.zeros((len(sizes), 4)), 0, 0, 0

@@ -1,4 +1,4 @@
-"""Read PartNet-Mobility's ``mobility.urdf``: shapes and joints of all links, in one frame with closed joints."""
+"""Read ``mobility.urdf`` of PartNet-Mobility: the shapes and joints of all links in one frame, with closed joints."""
 
 from __future__ import annotations
 
@@ -37,7 +37,13 @@ FAR = 1e6  # largest position, size or angle
 
 @dataclass(frozen=True)
 class Shape:
-    """A `<geometry>`: tag, dimensions in m (mesh scale; box size; radius and length; radius) and mesh file."""
+    """The `<geometry>` of a URDF.
+
+    Attributes:
+        kind: tag of the shape, such as mesh, box, cylinder or sphere.
+        size: mesh: scale (3 factors); box: 3 sides; cylinder: radius and length; sphere: radius; m.
+        filename: mesh file; empty for other shapes.
+    """
 
     kind: str
     size: tuple[float, ...] = ()
@@ -46,10 +52,13 @@ class Shape:
 
 @dataclass(frozen=True)
 class Visual:
-    """A shape of a part such as ``drawer_side-23``, with its pose (4, 4) in the furniture's frame, joints closed.
+    """A shape of a part of furniture.
 
     Attributes:
-        color: (3,) in 0..1, for a shape without a material.
+        part: name of the part, such as ``drawer_side-23``.
+        shape: geometry of the part.
+        pose: (4, 4) pose of the shape in the furniture's frame with closed joints.
+        color: RGB colour in 0..1 of a shape whose file has no material; None: not given.
     """
 
     part: str
@@ -60,9 +69,17 @@ class Visual:
 
 @dataclass(frozen=True)
 class MovingLink:
-    """A moving link in the furniture's frame with joints closed; metres, radians.
+    """A moving link in the furniture's frame with closed joints; metres and radians.
 
-    ``parent`` is a moving link, or empty for the fixed body. The shapes include those of links fixed to this link.
+    Attributes:
+        name: name of the link.
+        parent: name of the moving link to which the joint is attached; empty: the fixed body.
+        joint: name of the joint that moves the link.
+        kind: type of the joint.
+        axis: (3,) unit vector of the joint's axis.
+        origin: (3,) a point on the axis.
+        limits: lower and upper limit of the joint's position.
+        visuals: shapes of the link and of all links that are fixed to it.
     """
 
     name: str
@@ -77,7 +94,15 @@ class MovingLink:
 
 @dataclass(frozen=True)
 class PartnetModel:
-    """A model: shapes of the fixed body, moving links (parents first), names of all movable joints, repairs."""
+    """Content of the URDF of a model.
+
+    Attributes:
+        folder: folder of the model.
+        body: shapes of the fixed body.
+        links: moving links; each parent is before its children.
+        joints: names of all joints that are not of the type "fixed".
+        repairs: notes on joints that were fixed and on replaced shapes.
+    """
 
     folder: Path
     body: list[Visual]
@@ -97,11 +122,13 @@ class _Joint:
 
 
 def read_urdf(folder: Path, notes: Mapping[str, JointAnnotation] | None = None, scale: float = 1.0) -> PartnetModel:
-    """Read the links and joints of a model; joints without finite limits are fixed unless a note gives limits.
+    """Read the links and joints of a model.
+
+    A joint without finite limits becomes fixed, unless its annotation has limits.
 
     Args:
-        folder: of the model, with ``mobility.urdf``.
-        notes: annotations by joint.
+        folder: folder of the model, with ``mobility.urdf``.
+        notes: name of a joint -> annotation.
         scale: metres per unit of the URDF.
 
     Raises:
@@ -123,7 +150,7 @@ class _Reader:
         if len(named[0]) > MOST_LINKS or shapes > MOST_SHAPES:
             expected = f"at most {MOST_LINKS} links and {MOST_SHAPES} shapes"
             found = f"{len(named[0])} links, {shapes} shapes"
-            raise AssetError("the model is too large", where=self._path, expected=expected, found=found)
+            raise AssetError("the model has too many links or shapes", where=self._path, expected=expected, found=found)
         for material in root.findall("material"):
             self._color(material)
         links = dict(zip(self._names(named[0]), named[0], strict=True))
@@ -142,14 +169,16 @@ class _Reader:
         below: dict[str, list[_Joint]] = {name: [] for name in visuals}
         for joint in joints:
             if joint.parent not in visuals or joint.child not in visuals:
-                found = f"{joint.name}: {joint.parent} {joint.child}"
-                raise AssetError("a joint of unknown links", where=self._path, found=found)
+                what, expected = "a joint refers to a link that the file does not define", "the name of a <link>"
+                found = f"{joint.name} with parent {joint.parent!r} and child {joint.child!r}"
+                raise AssetError(what, where=self._path, expected=expected, found=found)
             below[joint.parent].append(joint)
         children = {joint.child for joint in joints}
         roots = [name for name in visuals if name not in children]
         if len(roots) != 1 or len(children) != len(joints):
-            found = ", ".join(roots) or "a loop"
-            raise AssetError("the links do not form a tree", where=self._path, expected="one root", found=found)
+            expected = "exactly one link without a parent, and one joint per other link"
+            found = f"links without a parent: {', '.join(roots) or 'none'}"
+            raise AssetError("the links do not form a tree", where=self._path, expected=expected, found=found)
         body: list[Visual] = []
         links: list[MovingLink] = []
         queue: list[tuple[str, Array, MovingLink | None]] = [(roots[0], TURNED, None)]
@@ -171,21 +200,20 @@ class _Reader:
                 queue.append((joint.child, frame @ _motion(kind, axis, closed), links[-1]))
         if len(queue) != len(visuals):
             lost = sorted(visuals.keys() - {name for name, _, _ in queue})
-            raise AssetError(
-                "the links do not form a tree", where=self._path, expected="one root", found=f"a loop of {lost}"
-            )
+            expected, found = "joints without a loop", f"a loop of the links {', '.join(lost)}"
+            raise AssetError("the links do not form a tree", where=self._path, expected=expected, found=found)
         return body, links
 
     def _range(self, joint: _Joint) -> tuple[float, tuple[float, float]] | None:
-        """Return the closed position in the URDF's units, and the limits relative to it; None for a fixed joint."""
+        """Return closed position and limits, relative to the closed position; None for a fixed joint."""
         note = self._notes.get(joint.name, JointAnnotation())
         if joint.kind == "fixed" or note.fixed:
             return None
         if joint.kind not in KINDS:
-            fix = f"Fix it in the annotation: `joints: {{{joint.name}: {{fixed: true}}}}`."
-            expected = ", ".join(["fixed", *KINDS])
-            found = f"{joint.name}: {joint.kind!r}"
-            raise AssetError("a joint of an unknown type", where=self._path, expected=expected, found=found, fix=fix)
+            fix = f"Fix the joint in the annotation: `joints: {{{joint.name}: {{fixed: true}}}}`."
+            expected = f"one of {', '.join(['fixed', *KINDS])}"
+            found = f"{joint.kind!r} of {joint.name}"
+            raise AssetError("unknown type of a joint", where=self._path, expected=expected, found=found, fix=fix)
         if joint.element.find("mimic") is not None:
             self._repairs.append(f"the joint {joint.name} moves independently: `mimic` is not simulated")
         unit = self._scale if joint.kind == "prismatic" else 1.0
@@ -203,7 +231,7 @@ class _Reader:
         return closed, (low - closed, high - closed)
 
     def _limits(self, joint: _Joint, note: JointAnnotation, unit: float) -> tuple[float, float]:
-        """Return the limits in m or rad, relative to the URDF's zero; infinite if missing."""
+        """Return the limits of a joint in m or rad, relative to the zero position of the URDF; infinite if missing."""
         limit = joint.element.find("limit")
         if limit is None or joint.kind == "continuous":
             return -np.inf, np.inf
@@ -214,9 +242,9 @@ class _Reader:
         ends = np.array([low, high])
         usable = low <= high and not (np.isfinite(ends) & (np.abs(ends) > LARGEST)).any()
         if not usable and note.limits is None:
-            found = f"{joint.name}: {limit.get('lower', '0')} to {limit.get('upper', '0')}"
-            fix = "Give the joint `limits` in the annotation, or fix it: `fixed: true`."
-            expected = f"lower <= upper, at most {LARGEST:g} m or rad, or `inf`"
+            found = f"lower {limit.get('lower', '0')}, upper {limit.get('upper', '0')} of {joint.name}"
+            fix = "Set `limits` of the joint in the annotation, or fix the joint with `fixed: true`."
+            expected = f"lower <= upper, each at most {LARGEST:g} m or rad, or infinite"
             raise AssetError("invalid limits of a joint", where=self._path, expected=expected, found=found, fix=fix)
         return (low, high) if usable else (-np.inf, np.inf)
 
@@ -225,12 +253,12 @@ class _Reader:
         for element in elements:
             name = check_name(element.get("name", ""), AssetError, where=f"{self._path}, name of a <{element.tag}>")
             if name in names:
-                raise AssetError(f"duplicate name of a {element.tag}", where=self._path, found=repr(name))
+                raise AssetError(f"two <{element.tag}> elements have the same name", where=self._path, found=repr(name))
             names[name] = None
         return list(names)
 
     def _visuals(self, name: str, link: ET.Element) -> list[Visual]:
-        """Return the visual shapes of a link in its frame, or else its collision shapes."""
+        """Return the visual shapes of a link in the frame of the link; without visual shapes, the collision shapes."""
         found, tag = link.findall("visual"), "visual"
         if not found and link.find("collision") is not None:
             found, tag = link.findall("collision"), "collision"
@@ -251,18 +279,19 @@ class _Reader:
         if shape.tag == "mesh":
             factors = _numbers(shape.get("scale", "1 1 1"), where, (1, 3)) * self._scale
             if not factors.all():
-                raise AssetError("zero scale of a mesh", where=where, found=factors.tolist())
+                what, expected = "invalid scale of a mesh", "factors other than 0"
+                raise AssetError(what, where=where, expected=expected, found=factors.tolist())
             return Shape("mesh", tuple(np.broadcast_to(factors, 3).tolist()), shape.get("filename", ""))
         if shape.tag not in SIZES:
             return Shape(shape.tag)
         names, count = SIZES[shape.tag]
         sizes = _numbers(" ".join(shape.get(name, "") for name in names.split()), where, (count,)) * self._scale
         if not (sizes > 0).all():
-            raise AssetError("invalid size of a shape", where=where, expected="sizes > 0", found=sizes.tolist())
+            raise AssetError("invalid size of a shape", where=where, expected="numbers above 0", found=sizes.tolist())
         return Shape(shape.tag, tuple(sizes.tolist()))
 
     def _color(self, material: ET.Element) -> tuple[float, float, float] | None:
-        """Return the colour of a material, which may be defined elsewhere in the file by name."""
+        """Return the RGB colour of a material in 0..1; a material without a colour has one elsewhere by its name."""
         name, color = material.get("name", ""), material.find("color")
         if color is None:
             return self._colors.get(name)
@@ -273,7 +302,8 @@ class _Reader:
     def _joint(self, name: str, element: ET.Element) -> _Joint:
         ends = [element.find(end) for end in ("parent", "child")]
         if any(end is None for end in ends):
-            raise AssetError("a joint without parent or child", where=self._path, found=name)
+            what, expected = "a joint has no parent or no child", "a <parent> and a <child>"
+            raise AssetError(what, where=self._path, expected=expected, found=name)
         parent, child = (end.get("link", "") for end in ends if end is not None)
         pose = self._pose(element.find("origin"), f"{self._path}, the joint {name}")
         return _Joint(name, element.get("type", ""), parent, child, pose, element)
@@ -283,7 +313,8 @@ class _Reader:
         axis = _numbers("1 0 0" if element is None else element.get("xyz", "1 0 0"), where, (3,))
         length = float(np.linalg.norm(axis))
         if length < 1e-9:
-            raise AssetError("zero axis of a joint", where=where, found=axis.tolist())
+            what, expected = "invalid axis of a joint", "a vector of a length above 0"
+            raise AssetError(what, where=where, expected=expected, found=axis.tolist())
         return axis / length
 
     def _pose(self, origin: ET.Element | None, where: str) -> Array:
@@ -295,11 +326,15 @@ class _Reader:
 
 
 def find_urdf(folder: Path) -> Path:
-    """Return the path of a model's URDF; raise AssetError if it is missing."""
+    """Return the path of ``mobility.urdf`` in the folder of a model.
+
+    Raises:
+        AssetError: the file is missing.
+    """
     path = folder / URDF
     if not path.exists():
-        expected = "the folder of a PartNet-Mobility model"
-        raise AssetError("no such file", where=path, expected=expected, fix="Pass the folder of the model.")
+        expected = f"a folder of a PartNet-Mobility model, which contains {URDF}"
+        raise AssetError(f"missing {URDF}", where=folder, expected=expected, fix="Pass the folder of the model.")
     return path
 
 
@@ -308,14 +343,15 @@ def _parse(folder: Path) -> ET.Element:
     data = read_file(path, folder)
     if len(data) > URDF_LIMIT:
         expected, found = f"at most {URDF_LIMIT >> 20} MB", f"{len(data) >> 20} MB"
-        raise AssetError("the URDF is too large", where=path, expected=expected, found=found)
+        raise AssetError("the URDF file is too large", where=path, expected=expected, found=found)
     tree, reader = ET.TreeBuilder(), expat.ParserCreate()
     reader.StartElementHandler, reader.EndElementHandler = tree.start, tree.end
     reader.StartDoctypeDeclHandler = partial(_refuse_doctype, path)
     try:
         reader.Parse(data, True)
     except (expat.ExpatError, LookupError, ValueError) as error:  # also for unknown encodings
-        raise AssetError("cannot read the URDF", where=path, found=error) from error
+        fix = "Download the model again."
+        raise AssetError("cannot read the URDF", where=path, expected="XML", found=error, fix=fix) from error
     root = tree.close()
     if root.tag != "robot":
         raise AssetError("the file is not a URDF", where=path, expected="<robot>", found=f"<{root.tag[:40]}>")
@@ -334,7 +370,7 @@ def _numbers(text: str, where: str, counts: tuple[int, ...]) -> Array:
     except ValueError:
         values = np.zeros(0)
     if len(values) not in counts or not (np.abs(values) <= FAR).all():  # false for NaN
-        expected = f"{' or '.join(map(str, counts))} numbers, at most {FAR:g}"
+        expected = f"{' or '.join(map(str, counts))} numbers, each between -{FAR:g} and {FAR:g}"
         raise AssetError("invalid numbers", where=where, expected=expected, found=repr(text[:80]))
     return values
 

@@ -1,4 +1,4 @@
-"""Drop test: measure whether an object comes to rest in a listed pose, without penetration or jitter."""
+"""Drop test: measure whether a dropped object comes to rest in one of its annotated resting poses."""
 
 from __future__ import annotations
 
@@ -41,16 +41,16 @@ CHECK_INTERVAL = 10  # time steps between checks of the pose of a rolling object
 
 @dataclass(frozen=True)
 class DropReport:
-    """Results of N drops.
+    """Results of N drops of an object.
 
     Attributes:
-        ends: (N, 4, 4) last poses of the object, relative to the plane z = 0 below its start.
-        rest_times: (N,) s from release to rest or to uniform rolling; 3 s: still moving.
-        matches: (N,) index of the resting pose; -1: not listed.
-        penetrations: (N,) m, largest final depth of corners below the plane and of the engine's contacts.
-        jitters: (N,) J, largest kinetic energy in the last second.
-        rolling: (N,) bool: at rest in time only if uniform rolling counts as rest.
-        good: (N,) bool: at rest in time in a listed pose.
+        ends: (N, 4, 4) last poses of the object; the table is the plane z = 0, and x = y = 0 is below the start.
+        rest_times: (N,) times from release to rest or to uniform rolling, s; 3 s: the object still moves.
+        matches: (N,) index of the resting pose that equals the last pose; -1: none.
+        penetrations: (N,) largest final depth of corners below the table and of contacts in PhysX, m.
+        jitters: (N,) largest kinetic energy in the last second, J.
+        rolling: (N,) whether the object rolls uniformly at the end, which counts as rest.
+        good: (N,) whether the object was at rest within 2 s and ended in a resting pose of the list.
     """
 
     ends: Array
@@ -62,24 +62,24 @@ class DropReport:
     good: NDArray[np.bool_]
 
 
-def drop_test(solid: RigidBody, resting_poses: Array, *, seed: int = 0) -> DropReport:
+def run_drop_test(solid: RigidBody, resting_poses: Array, *, seed: int = 0) -> DropReport:
     """Drop an object 20 times from 5 cm onto a table in random orientations and simulate 3 s; deterministic.
 
-    An object is at rest from the time on at which its kinetic energy stays below 4.5e-4 J/kg; an object that trembles
-    is never at rest.
+    An object is at rest as soon as its kinetic energy stays below 4.5e-4 J/kg until the end. An object that trembles is
+    never at rest.
 
-    Two poses are equal if the object fills the same heights and distances from the vertical through its centre of
-    mass, with a tolerance of 3 mm, or of 3 deg at its farthest point, for 95 % of points on its surface. Poses that
-    differ by yaw or by a symmetry of the object are therefore equal. A ball has one pose; a can has two, upright
-    (either end up) and on its side; a box has one per pair of faces.
+    Two poses are compared by points on the surface: by their heights, and by their distances from the vertical line
+    through the centre of mass. The poses are equal if 95 % of the points agree within 3 mm, or within 3 deg at the
+    point farthest from the centre of mass. So poses that differ by yaw or by a symmetry of the object are equal. A ball
+    has one pose. A can has two: upright (either end up) and on its side. A box has one per pair of faces.
 
-    The engine has no rolling resistance, so a can does not stop. Uniform rolling counts as rest from its start: from
-    then to the end, for at least 1 s, the object stays in listed poses and its displacement is at least 80 % of its
-    path. Rocking and trembling objects do not meet this condition.
+    PhysX has no rolling resistance, so a can on its side does not stop. Uniform rolling therefore counts as rest. An
+    object rolls uniformly if, for at least 1 s until the end, it stays in resting poses of the list and its
+    displacement is at least 80 % of its path. Rocking and trembling objects do not meet this condition.
 
     Args:
         solid: the object.
-        resting_poses: (S, 4, 4) ``T_plane_object``, the listed poses.
+        resting_poses: (S, 4, 4) ``T_plane_object``, the list of resting poses.
         seed: seed of the orientations.
     """
     poses, velocities, energies, sunk = _fall(solid, seed)
@@ -102,14 +102,19 @@ def drop_test(solid: RigidBody, resting_poses: Array, *, seed: int = 0) -> DropR
 
 
 def _advances(velocities: Array) -> bool:
-    """Return whether a motion with velocities (T, 2) has mainly one direction."""
+    """Return whether an object with velocities (T, 2) in m/s moves mainly in one direction, by at least 1 cm."""
     path = TIME_STEP * np.linalg.norm(velocities, axis=1).sum()
     ahead = TIME_STEP * np.linalg.norm(velocities.sum(axis=0))
     return bool(path >= LEAST_PATH and ahead >= ONE_WAY * path)
 
 
 def _fall(solid: RigidBody, seed: int) -> tuple[Array, Array, Array, Array]:
-    """Return poses (T, N, 4, 4), horizontal velocities (T, N, 2), energies (T, N) in J, final penetrations (N,)."""
+    """Simulate N drops of T time steps.
+
+    Returns:
+        Poses (T, N, 4, 4), horizontal velocities (T, N, 2) in m/s, kinetic energies (T, N) in J, and penetrations (N,)
+        at the end in m.
+    """
     vertices = np.concatenate([np.asarray(hull, float) for hull in solid.hulls])
     turns = Rotation.from_quat(
         np.random.default_rng(seed).normal(size=(DROPS, 4))
@@ -151,7 +156,7 @@ def _energy(body: physx.PhysxRigidDynamicComponent, solid: RigidBody) -> float:
 
 
 class _Comparison:
-    """Comparison of poses with the listed poses (S, 4, 4); see `drop_test`."""
+    """Comparison of poses of an object with its S resting poses, by the rule in `run_drop_test`."""
 
     def __init__(self, solid: RigidBody, listed: Array) -> None:
         points = sample_surface([Hull(*make_convex_mesh(np.asarray(hull, float))) for hull in solid.hulls], SPACING)
@@ -163,12 +168,12 @@ class _Comparison:
         self._trees = [KDTree(profile) for profile in self._listed]
 
     def find(self, pose: Array) -> int:
-        """Return the index of the listed resting pose that matches `pose` (4, 4) within the tolerance, or -1."""
+        """Return the index of the resting pose that is most similar to ``pose`` (4, 4); -1 if none is equal."""
         apart = [self._apart(pose, index) for index in range(len(self._listed))]
         return int(np.argmin(apart)) if min(apart) <= self._limit else -1
 
     def since(self, poses: Array) -> int:
-        """Return the number of leading poses (T, 4, 4) that are equal to a listed pose."""
+        """Return how many of the poses (T, 4, 4), counted from the first, are equal to a resting pose without a gap."""
         likely = list(range(len(self._listed)))
         for count, pose in enumerate(poses):
             found = next((index for index in likely if self._apart(pose, index) <= self._limit), None)
@@ -184,7 +189,10 @@ class _Comparison:
         return float(max(np.percentile(there, 95), np.percentile(back, 95)))
 
     def _profile(self, pose: Array) -> Array:
-        """Return heights above the plane and distances from the vertical through the centre of mass (P, 2), m."""
+        """Return (P, 2) for points on the surface: height above the table, and distance from the vertical line, m.
+
+        The vertical line passes through the centre of mass of the object in ``pose`` (4, 4).
+        """
         placed = (self._points - self._center) @ pose[:3, :3].T
         heights = placed[:, 2] + pose[2, :3] @ self._center + pose[2, 3]
         return np.stack([heights, np.linalg.norm(placed[:, :2], axis=1)], axis=1)

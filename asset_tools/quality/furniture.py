@@ -1,4 +1,4 @@
-"""Test furniture in the physics engine: opening and closing of joints, and objects on surfaces."""
+"""Test furniture in PhysX: open and close joints, and place objects on surfaces."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import sapien
 from sapien import physx
 
 from asset_tools.quality.furniture_scene import FurnitureModel, FurnitureScene, make_model
-from asset_tools.quality.overlap import distances, make_convex_body, max_overlap
-from asset_tools.quality.surfaces import BLOCKED, Probe, clearances, make_probes
+from asset_tools.quality.overlap import compute_distances, compute_max_overlap, make_convex_body
+from asset_tools.quality.surfaces import BLOCKED, Probe, make_probes, measure_clearances
 from asset_tools.sources import FurnitureSource
 from robocas_ms3.assets.hulls import make_convex_mesh
 from robocas_ms3.assets.kinematics import link_poses
@@ -36,18 +36,20 @@ PROBE_DENSITY = 500.0  # kg/m3
 
 @dataclass(frozen=True)
 class JointReport:
-    """Response of a joint to a force; positions are fractions of its range.
+    """Results of the test of a joint: wait, open and close with a pulling force.
+
+    Positions are fractions of the range of the joint; 0 is closed.
 
     Attributes:
         opened: position after opening.
         closed: position after closing.
-        drifted: largest motion within 1 s without force, closed.
+        drifted: largest position within 1 s without force, before opening.
         fastest: largest speed of any joint during the test, m/s or rad/s; infinite for NaN.
-        bounded: whether all speeds could be caused by the hand.
-        overlap: largest overlap with parts that do not move with it, over the whole range, m. The engine ignores
-            contacts between a link and its parent, so that a drawer could slide through a wall.
-        grip: largest distance of a handle from its part, m; 0 without handles; infinite if the open fingers would
-            collide.
+        bounded: whether no speed was larger than a pulling hand can cause.
+        overlap: largest overlap of the moving part with other parts at any position of the joint, m. This is computed,
+            since PhysX ignores contacts between a link and its parent and would let a drawer slide through a wall.
+        grip: largest distance of a handle's grasp from the moving part, m; 0 without handles; infinite if the open
+            fingers would collide.
     """
 
     opened: float
@@ -60,22 +62,22 @@ class JointReport:
 
     @property
     def works(self) -> bool:
-        """Whether the joint opens, closes and stays still, without overlaps and with reachable handles."""
+        """Whether the joint opens, closes and stays closed without force, without overlaps and with usable handles."""
         moves = self.bounded and self.opened >= OPEN and abs(self.closed) <= CLOSED and self.drifted <= STILL
         return moves and self.overlap <= JAMMED and self.grip <= GRIP
 
 
 @dataclass(frozen=True)
 class SurfaceReport:
-    """Results of placing objects on a surface.
+    """Results of the test of a surface: objects are placed on it and simulated for 1 s.
 
     Attributes:
         probes: number of placed objects.
-        slid: largest motion along the surface in 1 s, m.
-        off: largest distance from the surface's height after 1 s, m.
-        speed: largest speed after 1 s, m/s.
-        headroom: smallest free height above the surface, m; infinite if nothing is above it.
-        enough: whether the headroom is at least the declared one.
+        slid: largest motion of an object along the surface in 1 s, m.
+        off: largest vertical motion of an object in 1 s, m.
+        speed: largest speed of an object after 1 s, m/s.
+        headroom: smallest free height above the surface, m; infinite if nothing is above the surface.
+        enough: whether the free height is at least the headroom that the manifest declares.
     """
 
     probes: int
@@ -87,21 +89,21 @@ class SurfaceReport:
 
     @property
     def holds(self) -> bool:
-        """Whether objects stay on the surface, and the declared headroom is free."""
+        """Whether objects stay at rest on the surface, and the declared headroom is free."""
         stays = self.slid < SLID and self.off <= OFF and self.speed < SPEED
         return self.probes > 0 and stays and self.enough
 
 
 @dataclass(frozen=True)
 class FurnitureReport:
-    """Results for each joint and surface, by name."""
+    """Results of the tests of a piece of furniture: name of a joint or surface -> results."""
 
     joints: dict[str, JointReport]
     surfaces: dict[str, SurfaceReport]
 
 
 def measure_furniture(furniture: FurnitureSource | LoadedFurniture) -> FurnitureQuality:
-    """Measure hull counts and the fractions of working joints and stable surfaces; deterministic.
+    """Measure the quality of furniture: hull counts and fractions of working joints and surfaces; deterministic.
 
     Raises:
         AssetError: the physics engine rejects a hull.
@@ -117,7 +119,7 @@ def measure_furniture(furniture: FurnitureSource | LoadedFurniture) -> Furniture
 
 
 def examine_furniture(furniture: FurnitureSource | LoadedFurniture) -> FurnitureReport:
-    """Measure each joint and surface.
+    """Test each joint and each surface of furniture in PhysX; deterministic.
 
     Raises:
         AssetError: the physics engine rejects a hull.
@@ -153,7 +155,7 @@ def _try_joint(model: FurnitureModel, link: Link) -> JointReport:
         if not step():
             break
         drifted = max(drifted, abs(stage.position(joint.name)) / abs(far))
-    point = grip_point(link, model.pieces[link.name], model.handles)
+    point = find_grip_point(link, model.pieces[link.name], model.handles)
     reach = _lever(link, point)
     steps = round((2 * abs(far) * reach / HAND_SPEED + 1) / TIME_STEP)
     reached = []
@@ -169,7 +171,10 @@ def _try_joint(model: FurnitureModel, link: Link) -> JointReport:
 
 
 def _jam(model: FurnitureModel, link: Link) -> float:
-    """Return the largest overlap in m of a part and the links it carries with the rest, other joints closed."""
+    """Return the largest overlap in m of a moving part with the rest of the furniture, at any position of its joint.
+
+    Links that are attached to the part move with it. All other joints are closed.
+    """
     carried = {link.name}
     for other in model.links:
         if other.parent in carried:
@@ -180,12 +185,15 @@ def _jam(model: FurnitureModel, link: Link) -> float:
     found = 0.0
     for share in (*STOPS, -low / (high - low)):
         pose = link_poses(model.links, {link.joint.name: low + share * (high - low)})[link.name]
-        found = max(found, max_overlap([body.moved(pose) for body in moving], rest))
+        found = max(found, compute_max_overlap([body.transform(pose) for body in moving], rest))
     return found
 
 
 def _grip(model: FurnitureModel, link: Link) -> float:
-    """Return the largest distance in m of a handle from its part; infinite if an open finger would collide."""
+    """Return the largest distance in m of a handle's grasp from the moving part; infinite if a finger would collide.
+
+    Without handles, the result is 0.
+    """
     worst = 0.0
     everything = [piece for pieces in model.pieces.values() for piece in pieces]
     for handle in model.handles.values():
@@ -193,17 +201,17 @@ def _grip(model: FurnitureModel, link: Link) -> float:
             continue
         tcp = np.array(handle.position)
         fingers = tcp + OPENING / 2 * np.outer((-1, 1), sapien.Pose(q=handle.wxyz).to_transformation_matrix()[:3, 1])
-        worst = max(worst, float(distances(model.pieces[link.name], tcp[None])[0]))
-        if (distances(everything, fingers) <= 0).any():
+        worst = max(worst, float(compute_distances(model.pieces[link.name], tcp[None])[0]))
+        if (compute_distances(everything, fingers) <= 0).any():
             worst = np.inf
     return worst
 
 
-def grip_point(link: Link, pieces: Sequence[Array], handles: Mapping[str, Handle]) -> Array:
-    """Return the point (3,) at which a moving part is pulled.
+def find_grip_point(link: Link, pieces: Sequence[Array], handles: Mapping[str, Handle]) -> Array:
+    """Return the point (3,) of a moving part at which the test pulls, in the furniture's frame with closed joints, m.
 
-    The point is the first handle, or else the centre of mass of a drawer or the point of a door farthest from the
-    hinge.
+    The point is the first handle of the part. Without a handle, the point is the centre of mass of a drawer, or the
+    corner of a door farthest from the hinge.
     """
     for name in sorted(handles):
         if handles[name].link == link.name:
@@ -215,14 +223,22 @@ def grip_point(link: Link, pieces: Sequence[Array], handles: Mapping[str, Handle
 
 
 def _lever(link: Link, point: Array) -> float:
-    """Return the motion of a point in m per unit of the joint's position."""
+    """Return by how many metres a point (3,) of a moving part moves per m or rad of the joint's position."""
     if link.joint.kind == "prismatic":
         return 1.0
     return float(np.linalg.norm(np.cross(link.joint.axis, point - np.asarray(link.joint.origin))))
 
 
 def _pull(stage: FurnitureScene, link: Link, point: Array, way: float, reach: float) -> None:
-    """Apply the hand's force for one step along the possible motion of the point."""
+    """Apply a pulling force to a moving part for one simulation step, in the direction in which the joint moves.
+
+    Args:
+        stage: scene with the furniture.
+        link: the moving part.
+        point: (3,) point of the part at which the force acts, in the furniture's frame with closed joints, m.
+        way: 1 to increase the position of the joint, -1 to decrease it.
+        reach: motion of the point in m per m or rad of the joint's position.
+    """
     pose = stage.matrix(link.name)
     axis, place = pose[:3, :3] @ link.joint.axis, pose[:3, :3] @ point + pose[:3, 3]
     if link.joint.kind == "revolute":
@@ -234,7 +250,7 @@ def _pull(stage: FurnitureScene, link: Link, point: Array, way: float, reach: fl
 
 
 def _try_surface(model: FurnitureModel, surface: Surface) -> SurfaceReport:
-    """Place objects with all joints closed and, for a surface of a moving part, also with this part open."""
+    """Test a surface with all joints closed; if the surface moves and stays level, also with its part open."""
     states: list[dict[str, float]] = [{}]
     for link in model.links:
         level = link.joint.kind == "prismatic" or abs(link.joint.axis[2]) > 1 - 1e-6
@@ -243,7 +259,7 @@ def _try_surface(model: FurnitureModel, surface: Surface) -> SurfaceReport:
     things = make_probes(surface)
     closed = [piece for pieces in model.pieces.values() for piece in pieces]
     spots = np.array([(*thing.xy, surface.z + BLOCKED) for thing in things]).reshape(-1, 3)
-    room = float(clearances(closed, spots)[1].min() + BLOCKED) if things else 0.0
+    room = float(measure_clearances(closed, spots)[1].min() + BLOCKED) if things else 0.0
     found = np.max([_put_down(model, surface, things, state) for state in states], axis=0)
     slid, off, speed = (float(value) for value in found)
     return SurfaceReport(len(things), slid, off, speed, room, room >= (surface.headroom or np.inf) - OFF)
@@ -252,7 +268,18 @@ def _try_surface(model: FurnitureModel, surface: Surface) -> SurfaceReport:
 def _put_down(
     model: FurnitureModel, surface: Surface, things: Sequence[Probe], state: Mapping[str, float]
 ) -> tuple[float, float, float]:
-    """Return largest motion along the surface in 1 s and distance from its height in m, and largest speed in m/s."""
+    """Place probe objects on a surface and simulate them for 1 s.
+
+    Args:
+        model: the furniture.
+        surface: the surface.
+        things: the probe objects.
+        state: name of a joint -> position; other joints are closed.
+
+    Returns:
+        Over all objects, the largest motion along the surface in m, the largest vertical motion in m, and the largest
+        speed at the end in m/s.
+    """
     stage = FurnitureScene(model, state)
     start = link_poses(model.links, state)[surface.link] if surface.link else np.eye(4)
     bodies = []

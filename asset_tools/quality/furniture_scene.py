@@ -1,4 +1,4 @@
-"""Build furniture with a fixed body and free joints in the physics engine."""
+"""Build a scene in PhysX with one piece of furniture, whose body is fixed and whose joints move freely."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ Array = np.ndarray
 
 @dataclass(frozen=True)
 class FurnitureModel:
-    """Properties of furniture for the tests, from files or from a source.
+    """Properties of furniture that the tests need.
 
     Attributes:
-        pieces: (V, 3) corners of the hulls of each link; the fixed body has an empty name.
-        links: moving parts, parents first.
-        surfaces: surfaces for objects.
-        handles: handles of the moving parts.
-        friction: friction coefficient.
+        pieces: name of a link -> corners (V, 3) of each hull, m; the fixed body has an empty name.
+        links: moving parts; each parent is before its children.
+        surfaces: name -> surface on which objects can be placed.
+        handles: name -> grasp of a moving part.
+        friction: friction coefficient of all parts.
     """
 
     pieces: dict[str, list[Array]]
@@ -39,7 +39,7 @@ class FurnitureModel:
 
 
 def make_model(furniture: FurnitureSource | LoadedFurniture) -> FurnitureModel:
-    """Return the model of furniture from files or from a source."""
+    """Return the properties of furniture, given by its source or loaded from a pack."""
     if isinstance(furniture, LoadedFurniture):
         facts = furniture.asset
         pieces = {"": furniture.hulls} | {name: part.hulls for name, part in furniture.links.items()}
@@ -55,7 +55,12 @@ def make_model(furniture: FurnitureSource | LoadedFurniture) -> FurnitureModel:
 
 
 class FurnitureScene:
-    """A scene with furniture, whose body is fixed and whose frame is the world frame."""
+    """A scene with one piece of furniture, whose body is fixed and whose frame is the world frame.
+
+    Args:
+        model: the furniture.
+        positions: name of a joint -> initial position in m or rad; other joints start closed, at 0.
+    """
 
     def __init__(self, model: FurnitureModel, positions: Mapping[str, float] | None = None) -> None:
         self.scene = make_scene()
@@ -102,7 +107,8 @@ class FurnitureScene:
             try:
                 component.attach(make_shape(piece, self.material))
             except RuntimeError as error:
-                raise AssetError("the physics engine rejected a convex hull", found=error) from error
+                fix = "Simplify the collision mesh."
+                raise AssetError("PhysX cannot build a convex hull", found=error, fix=fix) from error
 
     def position(self, joint: str) -> float:
         """Return the position of a joint in m or rad."""
@@ -113,5 +119,5 @@ class FurnitureScene:
         return float(self.articulation.qvel[self.order[joint]])
 
     def matrix(self, link: str) -> Array:
-        """Return the pose (4, 4) of a link."""
+        """Return the pose (4, 4) of a link in the world frame."""
         return pose_matrix(self.links[link]) if self.links else np.eye(4)

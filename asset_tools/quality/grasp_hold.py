@@ -1,4 +1,4 @@
-"""Hold test: execute grasps with the gripper alone (close, lift, shake) and check whether they hold."""
+"""Hold test: close the gripper around an object in each grasp, lift and shake it, and check whether it stays."""
 
 from __future__ import annotations
 
@@ -53,26 +53,25 @@ class _Hand:
     palm: physx.PhysxArticulationLinkComponent  # its frame is the TCP's
 
 
-def hold_test(solid: RigidBody, grasps_tcp_in_object: Array) -> NDArray[np.bool_]:
-    """Return for each grasp whether the object stays in the hand; deterministic.
+def run_hold_test(solid: RigidBody, grasps_tcp_in_object: Array) -> NDArray[np.bool_]:
+    """Simulate each grasp and return whether the object stays in the hand (G,); deterministic.
 
-    The hand points down around an object that floats in the pose of the grasp. The hand closes, then gravity is
-    switched on. The hand rises by 10 cm in 0.5 s. For 1.5 s it moves by 3 cm along the diagonal of the pads at 2 Hz, by
-    3 cm up and down (up to 6 m/s2), and tilts by 20 deg at 1 Hz (up to 25 rad/s2). A grasp holds if the object has
-    moved by less than 2 cm at its centre of mass and rotated by less than 30 deg in the hand since it closed.
+    The hand points down, and the object floats between the open fingers in the pose of the grasp. The hand closes, and
+    gravity is switched on. The hand rises by 10 cm in 0.5 s. Then the hand shakes for 1.5 s: it moves by 3 cm along the
+    diagonal of the pads at 2 Hz and by 3 cm up and down (up to 6 m/s2), and tilts by 20 deg at 1 Hz (up to 25 rad/s2).
+    The object has stayed if, relative to the closed hand, its centre of mass moved by less than 2 cm and it rotated by
+    less than 30 deg.
 
     Args:
         solid: the object.
-        grasps_tcp_in_object: (G, 4, 4) poses of the TCP: z approach, y closing.
-
-    Returns:
-        (G,).
+        grasps_tcp_in_object: (G, 4, 4) poses of the TCP in the object's frame: z approach, y closing.
     """
     if len(grasps_tcp_in_object) == 0:
         return np.zeros(0, bool)
     turned = np.linalg.det(np.asarray(grasps_tcp_in_object)[:, :3, :3])
     if not np.allclose(turned, 1, atol=1e-3):
-        raise AssetError("a grasp is not a rigid pose", expected="determinant 1", found=float(turned.min()))
+        expected, found = "rotations with determinant 1", f"determinants {turned.min():.3g} to {turned.max():.3g}"
+        raise AssetError("invalid poses of grasps", expected=expected, found=found)
     with engine_settings():
         scene = make_scene(TIME_STEP)
         hands, objects = [], []
@@ -102,7 +101,11 @@ def hold_test(solid: RigidBody, grasps_tcp_in_object: Array) -> NDArray[np.bool_
 
 
 def _motion() -> NDArray[np.float64]:
-    """Return positions and velocities (T, 3, 2) of the carriages: up (m), sideways (m), tilt (rad)."""
+    """Return the targets of the three joints that move the hand: rise (m), sideways (m) and tilt (rad).
+
+    Returns:
+        (T, 3, 2) per time step, per joint: position and velocity.
+    """
     rise = np.arange(1, round(LIFTING / TIME_STEP) + 1) * TIME_STEP / LIFTING
     time = np.arange(1, round(SHAKING / TIME_STEP) + 1) * TIME_STEP
     swell = np.clip(np.minimum(time, SHAKING - time) / FADE, 0, 1)
@@ -117,12 +120,19 @@ def _motion() -> NDArray[np.float64]:
 
 
 def _in_hand(hands: list[_Hand], objects: list[physx.PhysxRigidDynamicComponent]) -> Array:
-    """Return the poses (N, 4, 4) of the objects in the TCP frame."""
+    """Return the pose (N, 4, 4) of each object in the TCP frame of its hand."""
     return np.array([inverse(pose_matrix(h.palm)) @ pose_matrix(o) for h, o in zip(hands, objects, strict=True)])
 
 
 def _add_hand(scene: sapien.Scene, tcp_in_world: Array) -> _Hand:
-    """Add an open hand on carriages; initially all its frames are the TCP frame."""
+    """Add an open hand to a scene, with three joints that lift, shift and tilt it.
+
+    In this initial state, the frames of all links are equal to the TCP frame.
+
+    Args:
+        scene: the scene.
+        tcp_in_world: (4, 4) initial pose of the TCP.
+    """
     builder = scene.create_articulation_builder()
     builder.set_initial_pose(sapien.Pose(tcp_in_world))
     link = builder.create_link_builder()
@@ -170,6 +180,6 @@ def _add_hand(scene: sapien.Scene, tcp_in_world: Array) -> _Hand:
 
 
 def _along(axis: Array) -> sapien.Pose:
-    """Return a joint frame whose x axis is along ``axis`` (3,)."""
+    """Return the frame of a joint whose x axis, the axis of motion, has the direction ``axis`` (3,)."""
     turn = Rotation.align_vectors([axis], [[1.0, 0.0, 0.0]])[0].as_quat()
     return sapien.Pose(q=turn[[3, 0, 1, 2]])

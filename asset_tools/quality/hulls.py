@@ -10,7 +10,7 @@ from manifold3d import Manifold, OpType
 from scipy.spatial import KDTree
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from asset_tools.grasps import surface_samples
+from asset_tools.grasps import sample_surface_points
 from asset_tools.solids import to_solid
 from robocas_ms3.core.errors import AssetError
 
@@ -27,14 +27,16 @@ SLIT = 0.001  # m; narrower slits are ignored: they are cutting planes of the de
 
 @dataclass(frozen=True)
 class HullQuality:
-    """Quality of an object's hulls.
+    """Comparison of the convex hulls of an object with its closed mesh.
 
     Attributes:
-        compact: False: thin or hollow; check ``surface_p95`` instead of ``volume_iou``.
+        compact: whether the object is neither thin nor hollow. A compact object is judged by ``volume_iou``, another
+            object by ``surface_p95``.
         hull_count: number of hulls.
-        hull_vertices: number of vertices of the largest hull.
-        volume_iou: overlap of the union of the hulls with the closed mesh.
-        surface_p95: 95th percentile of the distances from either surface to the other, m; the larger of both ways.
+        hull_vertices: number of vertices of the hull with most vertices.
+        volume_iou: volume IoU of the closed mesh and the union of the hulls.
+        surface_p95: 95th percentile of the distances between the two surfaces, m. Distances are measured from the mesh
+            to the hulls and from the hulls to the mesh; the larger percentile counts.
     """
 
     compact: bool
@@ -44,22 +46,22 @@ class HullQuality:
     surface_p95: float
 
 
-def hull_quality(closed: trimesh.Trimesh, hulls: list[Array], *, hollow: bool = False) -> HullQuality:
-    """Compare hulls with their source mesh; deterministic.
+def measure_hull_quality(closed: trimesh.Trimesh, hulls: list[Array], *, hollow: bool = False) -> HullQuality:
+    """Compare convex hulls with the closed mesh from which they were made; deterministic.
 
     Args:
-        closed: watertight, m.
-        hulls: (V, 3) vertices each, in its frame.
-        hollow: whether the object is a container, which is checked by distance for any wall thickness.
+        closed: watertight mesh, m.
+        hulls: vertices (V, 3) of each hull, in the frame of the mesh.
+        hollow: whether the object is a container, which is judged by distance for any wall thickness.
 
     Raises:
         AssetError: the mesh is not a solid.
     """
-    overlap = volume_iou(closed, hulls)
+    overlap = compute_volume_iou(closed, hulls)
     union = _union(hulls).to_mesh()
     surface = trimesh.Trimesh(np.asarray(union.vert_properties)[:, :3], np.asarray(union.tri_verts), process=False)
     return HullQuality(
-        compact=not hollow and mean_thickness(closed) >= THIN,
+        compact=not hollow and compute_mean_thickness(closed) >= THIN,
         hull_count=len(hulls),
         hull_vertices=max(len(hull) for hull in hulls),
         volume_iou=overlap,
@@ -70,19 +72,20 @@ def hull_quality(closed: trimesh.Trimesh, hulls: list[Array], *, hollow: bool = 
     )
 
 
-def volume_iou(closed: trimesh.Trimesh, hulls: list[Array]) -> float:
-    """Return the volume IoU of a body and the union of convex hulls.
+def compute_volume_iou(closed: trimesh.Trimesh, hulls: list[Array]) -> float:
+    """Return the volume IoU, 0 to 1, of a closed mesh and the union of convex hulls.
 
     Args:
         closed: watertight mesh.
-        hulls: (V, 3) vertices each, in its frame.
+        hulls: vertices (V, 3) of each hull, in the frame of the mesh.
 
     Raises:
         AssetError: the mesh is not a solid.
     """
     solid = to_solid(closed)
     if solid is None:
-        raise AssetError("the mesh is not a solid", expected="watertight", fix="Close it first.")
+        expected, found = "a watertight mesh with outward faces", f"watertight: {closed.is_watertight}"
+        raise AssetError("the mesh is not a solid", expected=expected, found=found, fix="Close the mesh first.")
     union = _union(hulls)
     shared = (solid ^ union).volume()
     return float(shared / (solid.volume() + union.volume() - shared))
@@ -92,18 +95,23 @@ def _union(hulls: list[Array]) -> Manifold:
     return Manifold.batch_boolean([Manifold.hull_points(hull) for hull in hulls], OpType.Add)
 
 
-def mean_thickness(closed: trimesh.Trimesh) -> float:
-    """Return 2 V / A in m: the thickness of a plate, 1/2 of the diameter of a rod, 1/3 of that of a ball."""
+def compute_mean_thickness(closed: trimesh.Trimesh) -> float:
+    """Return 2 * volume / area in m: the thickness of a plate, 1/2 of a rod's diameter, or 1/3 of a ball's diameter."""
     return float(2 * closed.volume / closed.area)
 
 
 def _samples(mesh: trimesh.Trimesh, count: int) -> tuple[Array, Array]:
-    """Return points (P, 3) on a surface and their faces (P,)."""
-    return surface_samples(mesh, count, np.random.default_rng(0))
+    """Return random points (P, 3) on a mesh and the face (P,) of each point; deterministic."""
+    return sample_surface_points(mesh, count, np.random.default_rng(0))
 
 
 def _outside_of_slits(union: trimesh.Trimesh, samples: tuple[Array, Array]) -> Array:
-    """Return the points of samples on hulls that are not in a slit between two hulls."""
+    """Return the samples (K, 3) on a union of hulls that are not in a slit between two hulls.
+
+    Args:
+        union: mesh of the union.
+        samples: points (P, 3) on the mesh, and the face (P,) of each point.
+    """
     points, faces = samples
     normals = np.asarray(union.face_normals)[faces]
     caster = RayMeshIntersector(union)
@@ -116,7 +124,7 @@ def _outside_of_slits(union: trimesh.Trimesh, samples: tuple[Array, Array]) -> A
 
 
 def _distance_p95(points: Array, target: trimesh.Trimesh) -> float:
-    """Return the 95th percentile of distances of points (P, 3) from the triangles of the nearest samples."""
+    """Return the 95th percentile of the distances of points (P, 3) from the surface of a mesh, m."""
     samples, faces = _samples(target, TARGETS)
     nearest = faces[KDTree(samples).query(points, k=NEAREST)[1]]
     starts = np.repeat(points, NEAREST, axis=0)

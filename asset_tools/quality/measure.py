@@ -1,4 +1,4 @@
-"""Measure the objects of a pack, and check the values against the requirements for a pack."""
+"""Measure the quality of the objects of a pack, and check it against the requirements for a pack."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from asset_tools.quality.drops import DropReport, drop_test
-from asset_tools.quality.grasp_hold import hold_test
-from asset_tools.quality.hulls import hull_quality
+from asset_tools.quality.drops import DropReport, run_drop_test
+from asset_tools.quality.grasp_hold import run_hold_test
+from asset_tools.quality.hulls import measure_hull_quality
 from robocas_ms3.assets.annotations import Annotations
 from robocas_ms3.assets.manifest import ObjectAsset, ObjectQuality
 from robocas_ms3.assets.pack import LoadedObject
@@ -37,13 +37,13 @@ MEDIAN_HELD = 0.80  # fraction of the top grasps
 
 @dataclass(frozen=True)
 class Violation:
-    """A requirement that is not met.
+    """A requirement for a pack that is not met.
 
     Attributes:
-        asset: id of the asset; empty: the whole pack.
-        what: measured quantity.
-        expected: required value.
-        found: measured value.
+        asset: id of the asset; empty: the requirement is for the whole pack.
+        what: measured quantity, such as "volume IoU".
+        expected: required value as text.
+        found: measured value as text.
     """
 
     asset: str
@@ -55,15 +55,17 @@ class Violation:
 def measure_object(
     closed: trimesh.Trimesh, solid: RigidBody, annotations: Annotations, *, hollow: bool = False
 ) -> ObjectQuality:
-    """Measure an object during its build; deterministic.
+    """Measure the quality of an object during its build; deterministic.
+
+    The function compares the hulls with the closed mesh, drops the object, and tests its best 20 grasps.
 
     Args:
-        closed: watertight source mesh of the hulls, m, asset's frame.
-        solid: the object with hulls as read from ``hulls.obj``.
-        annotations: resting poses and grasps.
-        hollow: whether the object is a container, which is checked by surface distance.
+        closed: watertight mesh from which the hulls were made, in the object's frame, m.
+        solid: the object with the hulls read from ``hulls.obj``.
+        annotations: resting poses and grasps of the object.
+        hollow: whether the object is a container, whose hulls are judged by surface distance.
     """
-    hulls = hull_quality(closed, list(solid.hulls), hollow=hollow)
+    hulls = measure_hull_quality(closed, list(solid.hulls), hollow=hollow)
     return ObjectQuality(
         compact=hulls.compact,
         hull_count=hulls.hull_count,
@@ -75,9 +77,9 @@ def measure_object(
 
 
 def measure_again(loaded: LoadedObject) -> ObjectQuality:
-    """Repeat the measurement of hull sizes, drops and grasps for an object of a pack.
+    """Measure the quality of an object of a pack again: hull sizes, drops and grasps; deterministic.
 
-    The comparison of the hulls with the closed mesh is read from the manifest, since packs do not contain this mesh.
+    The comparison of the hulls with the closed mesh is copied from the manifest, since packs do not contain this mesh.
     """
     facts = loaded.asset
     solid = RigidBody(
@@ -98,16 +100,16 @@ def measure_again(loaded: LoadedObject) -> ObjectQuality:
     )
 
 
-def top_grasps(annotations: Annotations) -> NDArray[np.intp]:
-    """Return indices (K,) of the best grasps, by friction, then in the order of the annotations."""
+def select_top_grasps(annotations: Annotations) -> NDArray[np.intp]:
+    """Return the indices (K,) of the 20 grasps with the lowest required friction, best first."""
     return np.argsort(annotations.grasp_qualities, kind="stable")[:TOP_GRASPS]
 
 
 def check_objects(assets: Mapping[str, ObjectAsset]) -> list[Violation]:
-    """Return unmet requirements for each object and for the medians of a pack.
+    """Return the requirements that objects do not meet, one by one or in the medians over the pack.
 
     Args:
-        assets: objects by id, with measured quality.
+        assets: id -> object with its measured quality.
     """
     found: list[Violation] = []
     for name, asset in assets.items():
@@ -141,11 +143,11 @@ def check_objects(assets: Mapping[str, ObjectAsset]) -> list[Violation]:
 
 
 def compare_with_manifest(loaded: LoadedObject, measured: ObjectQuality) -> list[Violation]:
-    """Return differences between the manifest of an object and a new measurement.
+    """Return the differences between the quality of an object in its manifest and a new measurement.
 
     Args:
         loaded: the object.
-        measured: result of `measure_again`.
+        measured: result of `measure_again` for this object.
     """
     asset = loaded.asset
     stored, found = asset.quality.model_dump(), measured.model_dump()
@@ -164,12 +166,14 @@ HEADER = ("object", "kind", "hulls", "IoU (stored)", "p95 mm (stored)", "rest %"
 )
 
 
-def object_rows(qualities: Mapping[str, ObjectQuality]) -> list[tuple[str, ...]]:
-    """Return table rows with the columns of `HEADER` for each object, and a last row of medians.
+def make_object_rows(qualities: Mapping[str, ObjectQuality]) -> list[tuple[str, ...]]:
+    """Return one table row per object with the columns of `HEADER`, and a last row of medians.
 
-    Medians are over the applicable objects: IoU over compact objects, p95 over the others, held grasps over objects
-        with
-    grasps.
+    The median of the IoU is over compact objects, that of p95 is over thin or hollow objects, and that of held grasps
+    is over objects with grasps.
+
+    Args:
+        qualities: id of an object -> quality.
     """
 
     def row(name: str, kind: str, numbers: Sequence[float]) -> tuple[str, ...]:
@@ -200,10 +204,10 @@ def object_rows(qualities: Mapping[str, ObjectQuality]) -> list[tuple[str, ...]]
 
 
 def _physics(solid: RigidBody, annotations: Annotations) -> dict[str, Any]:
-    """Return the fields of `ObjectQuality` that are measured by simulation."""
-    dropped = drop_test(solid, annotations.resting_poses)
-    grasps = np.asarray(annotations.grasps_tcp_in_object, float)[top_grasps(annotations)]
-    held = hold_test(solid, grasps)
+    """Run the drop test and the hold test; return the fields of `ObjectQuality` that they measure."""
+    dropped = run_drop_test(solid, annotations.resting_poses)
+    grasps = np.asarray(annotations.grasps_tcp_in_object, float)[select_top_grasps(annotations)]
+    held = run_hold_test(solid, grasps)
     return dict(
         rest_share=round(float(dropped.good.mean()), 4),
         rolling_share=round(float(np.mean(dropped.good & dropped.rolling)), 4),
@@ -216,12 +220,12 @@ def _physics(solid: RigidBody, annotations: Annotations) -> dict[str, Any]:
 
 
 def _jitter(dropped: DropReport) -> float:
-    """Return the largest kinetic energy in J in the last second of drops that do not roll."""
+    """Return the largest kinetic energy in J in the last second of all drops in which the object does not roll."""
     return float(max(dropped.jitters[~dropped.rolling], default=0.0))
 
 
 def _check_medians(qualities: list[ObjectQuality]) -> list[Violation]:
-    """Return unmet requirements for the medians; the overlap is over compact objects only."""
+    """Return the requirements for medians over the objects of a pack that are not met."""
     medians = [
         ("median volume IoU", [q.volume_iou for q in qualities if q.compact], MEDIAN_OVERLAP, ".2f", True),
         ("median hulls", [q.hull_count for q in qualities], MEDIAN_HULLS, "g", False),

@@ -17,7 +17,11 @@ Quality = ObjectQuality | FurnitureQuality
 
 
 def measure_pack(pack: Pack, processes: int = 1) -> Iterator[tuple[str, Quality]]:
-    """Yield the id and the quality of each asset of a pack, objects first, in the pack's order.
+    """Measure all assets of a pack again; yield the id and the quality of each asset, objects first.
+
+    Args:
+        pack: the pack.
+        processes: number of worker processes.
 
     Raises:
         AssetError: a process that measured an asset crashed.
@@ -31,8 +35,12 @@ def measure_pack(pack: Pack, processes: int = 1) -> Iterator[tuple[str, Quality]
 FURNITURE_HEADER = ("furniture", "hulls", "vertices", "working joints %", "stable surfaces %")
 
 
-def furniture_rows(qualities: Mapping[str, FurnitureQuality]) -> list[tuple[str, ...]]:
-    """Return table rows with the columns of `FURNITURE_HEADER`."""
+def make_furniture_rows(qualities: Mapping[str, FurnitureQuality]) -> list[tuple[str, ...]]:
+    """Return one table row per piece of furniture with the columns of `FURNITURE_HEADER`.
+
+    Args:
+        qualities: id of the furniture -> quality.
+    """
 
     def percent(value: float | None) -> str:
         return "-" if value is None else f"{100 * value:.0f}"
@@ -44,7 +52,11 @@ def furniture_rows(qualities: Mapping[str, FurnitureQuality]) -> list[tuple[str,
 
 
 def check_furniture(qualities: Mapping[str, FurnitureQuality]) -> list[Violation]:
-    """Return unmet requirements for joints, surfaces and hull sizes of furniture."""
+    """Return the requirements for joints, surfaces and hull sizes that furniture does not meet.
+
+    Args:
+        qualities: id of the furniture -> quality.
+    """
     found = []
     for name, quality in qualities.items():
         for what, fraction in (

@@ -1,4 +1,4 @@
-"""Make probe objects for a surface, and measure the free height above it."""
+"""Make probe objects for the test of a surface, and measure the free height above the surface."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ BLOCKED = 0.01  # m; geometry up to this height above the surface belongs to the
 
 @dataclass(frozen=True)
 class Probe:
-    """A probe object for a surface.
+    """A box or cylinder that is placed on a surface in a test.
 
     Attributes:
-        xy: (2,) position of its centre in the furniture's frame, m.
-        corners: (V, 3) corners with the bottom at z = 0, m.
+        xy: (2,) position of the centre in the furniture's frame, m.
+        corners: (V, 3) corners relative to this position, with the bottom at z = 0, m.
     """
 
     xy: Array
@@ -34,7 +34,7 @@ class Probe:
 
 
 def make_probes(surface: Surface) -> list[Probe]:
-    """Return boxes and cylinders on a grid over a whole surface; [] if the surface is too small."""
+    """Return boxes and cylinders, 5 cm wide, on a grid over a surface; [] if the surface is too small."""
     low = np.add(surface.min_xy, WIDTH / 2 + EDGE)
     high = np.subtract(surface.max_xy, WIDTH / 2 + EDGE)
     if (high < low - 1e-9).any():
@@ -55,15 +55,16 @@ def _prism(sides: int, height: float) -> Array:
     return np.concatenate([np.column_stack([ring, np.full(sides, z)]) for z in (0.0, height)])
 
 
-def clearances(pieces: Sequence[Array], points: Array) -> tuple[Array, Array]:
-    """Return the free heights below and above points in m.
+def measure_clearances(pieces: Sequence[Array], points: Array) -> tuple[Array, Array]:
+    """Measure the free height below and above points.
 
     Args:
-        pieces: (V, 3) corners of convex hulls.
-        points: (P, 3) points.
+        pieces: corners (V, 3) of each convex hull, m.
+        points: (P, 3) points, m.
 
     Returns:
-        Vertical distances (P,) down and up to the nearest hull: infinite without a hull, 0 inside a hull.
+        The vertical distance (P,) from each point down to the nearest hull, and the distance (P,) up, m. A distance is
+        infinite if there is no hull in this direction, and 0 inside a hull.
     """
     below, above = np.full(len(points), np.inf), np.full(len(points), np.inf)
     for piece in pieces:

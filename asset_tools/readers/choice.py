@@ -1,4 +1,4 @@
-"""Choose the files of a folder that form an object: the best of several versions, or all of several parts."""
+"""Choose the mesh files of a folder that form one object: the best of several versions, or all of several parts."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ SAMPLES, TRIED = 20_000, 500  # points on a surface, and number of points compar
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A mesh file that may be the object or a part of it.
+    """A mesh file that may be the whole object, or a part of the object.
 
     Attributes:
-        path: of the file.
-        parts: content of the file.
+        path: path of the file.
+        parts: triangles of the file, one element per material.
     """
 
     path: Path
@@ -55,7 +55,7 @@ class Candidate:
 
     @cached_property
     def bounds(self) -> Array:
-        """Bounding box (2, 3) of all faces."""
+        """Bounding box (2, 3) of all faces: lower and upper corner."""
         return np.array([self.samples.min(axis=0), self.samples.max(axis=0)])
 
     @cached_property
@@ -69,15 +69,15 @@ class Candidate:
         return any(part.uvs is not None and part.material.image is not None for part in self.parts)
 
     @property
-    def rank(self) -> tuple[bool, bool, int, int, str]:
-        """Sort key, best first: textured, coloured, detailed, preferred format, name."""
+    def sort_key(self) -> tuple[bool, bool, int, int, str]:
+        """Key to sort candidates, best first: textured, coloured, many faces, preferred format, name."""
         coloured = any(part.colors is not None or part.material.color != (1.0, 1.0, 1.0) for part in self.parts)
         faces, suffix = sum(len(part.faces) for part in self.parts), self.path.suffix.lower()
         return not self.textured, not coloured, -min(faces, ENOUGH_FACES), FORMATS.index(suffix), self.path.name
 
     @cached_property
     def samples(self) -> Array:
-        """Points (N, 3) on the surface, including extreme vertices."""
+        """Points (N, 3) on the surface: 20,000 random points and the vertices at the sides of the bounding box."""
         offsets = np.cumsum([0] + [len(part.vertices) for part in self.parts[:-1]])
         vertices = np.concatenate([part.vertices for part in self.parts])
         faces = np.concatenate([part.faces + offset for part, offset in zip(self.parts, offsets, strict=True)])
@@ -89,11 +89,11 @@ class Candidate:
 
     @cached_property
     def tree(self) -> KDTree:
-        """KD tree of the samples."""
+        """KD tree of `samples`."""
         return KDTree(self.samples)
 
     def contains(self, points: Array) -> bool:
-        """Return whether nearly all points (N, 3) are on the surface."""
+        """Return whether at least 90 % of points (N, 3) are on the surface, within 2 % of the diagonal."""
         reach = SAME * self.diagonal
         near = ((points >= self.bounds[0] - reach) & (points <= self.bounds[1] + reach)).all(axis=1)
         if near.mean() < COVERED:
@@ -101,17 +101,18 @@ class Candidate:
         return bool((self.tree.query(points, distance_upper_bound=reach)[0] <= reach).mean() >= COVERED)
 
 
-def mesh_files(folder: Path) -> list[Path]:
-    """Return the mesh files of an object's folder and its subfolders, sorted by name.
+def find_mesh_files(folder: Path) -> list[Path]:
+    """Return the mesh files in the folder of an object and its subfolders, sorted by name.
 
     Raises:
-        AssetError: the folder has no mesh files, or more than 64 without collision meshes.
+        AssetError: the folder has no mesh files, or more than 64 that are not collision meshes.
     """
     found = _meshes_below(folder, DEPTH)
     if not found:
         others = sorted({path.suffix.lower() for path in folder.iterdir() if path.is_file()} - {""})
         fix = f"Export the mesh in one of {', '.join(FORMATS)}."
-        raise AssetError("no mesh in this folder", where=folder, found=", ".join(others), fix=fix)
+        found_types = f"files of type {', '.join(others)}" if others else "no files"
+        raise AssetError("no mesh in this folder", where=folder, found=found_types, fix=fix)
     shown = [path for path in found if not is_collision(path, folder)]
     if len(shown) > MOST_FILES:
         fix, expected = "Use one folder per object, or join the parts into one file.", f"at most {MOST_FILES}"
@@ -120,12 +121,12 @@ def mesh_files(folder: Path) -> list[Path]:
 
 
 def is_mesh(path: Path) -> bool:
-    """Return whether a path is a file with the suffix of a mesh format, and not hidden."""
+    """Return whether a path is a mesh file by its suffix; hidden files do not count."""
     return path.suffix.lower() in FORMATS and not path.name.startswith(".") and not path.is_dir()
 
 
 def is_collision(path: Path, folder: Path) -> bool:
-    """Return whether the name of a file, or of its folders below ``folder``, indicates a collision mesh."""
+    """Return whether a file is a collision mesh by its name, or by the name of a subfolder of ``folder`` around it."""
     folders = {part.lower() for part in path.relative_to(folder).parts[:-1]}
     return COLLISION.search(path.stem.lower()) is not None or bool(folders & COLLISION_FOLDERS)
 
@@ -133,19 +134,20 @@ def is_collision(path: Path, folder: Path) -> bool:
 def choose_candidates(candidates: Sequence[Candidate], folder: Path, notes: list[str]) -> list[Candidate]:
     """Return the candidates that together form the object.
 
-    Other versions and parts of a mesh are ignored; the textured and most detailed version stays. The remaining meshes
-    must look like parts of one object, which touch each other.
+    If several candidates are versions of one mesh, the most detailed version stays; textured versions come first. A
+    candidate that another candidate contains is also ignored. The remaining candidates must be parts of one object,
+    which touch each other.
 
     Args:
-        candidates: meshes with faces; no collision meshes, unless there are no others.
+        candidates: meshes with faces; collision meshes only if there are no other meshes.
         folder: folder of the object.
-        notes: list to which notes on used and ignored files are added.
+        notes: list to which the function appends one note per used or ignored file.
 
     Raises:
         AssetError: several files do not look like parts of one object.
     """
     ignored: dict[Path, str] = {}
-    left = _without_hulls(sorted(candidates, key=lambda one: one.rank), ignored)
+    left = _without_hulls(sorted(candidates, key=lambda one: one.sort_key), ignored)
     best: list[Candidate] = []
     for candidate in left:
         other = next((kept for kept in best if _are_versions(kept, candidate)), None)
@@ -180,7 +182,14 @@ def _meshes_below(folder: Path, depth: int) -> list[Path]:
 
 
 def _without_hulls(candidates: list[Candidate], ignored: dict[Path, str]) -> list[Candidate]:
-    """Remove candidates with names of hulls, if the others are about as large."""
+    """Return the candidates without collision hulls, recognised by their names.
+
+    A hull stays if the other meshes together are smaller than 60 % of it, since then it may be a part of the object.
+
+    Args:
+        candidates: all candidates.
+        ignored: path -> reason; the function adds the removed candidates.
+    """
     hulls = [one for one in candidates if HULL.search(one.path.stem.lower())]
     others = [one for one in candidates if one not in hulls]
     if not hulls or not others:
@@ -193,7 +202,7 @@ def _without_hulls(candidates: list[Candidate], ignored: dict[Path, str]) -> lis
 
 
 def _are_versions(first: Candidate, second: Candidate) -> bool:
-    """Return whether two files have the same mesh, possibly in another unit or with another up axis."""
+    """Return whether two files are versions of one mesh, possibly in different units or with different up axes."""
     one, other = (_version_name(candidate.path) for candidate in (first, second))
     alike = one == other and first.path.parent == second.path.parent
     if alike and np.abs(first.bounds - second.bounds).max() <= SAME * first.diagonal:
@@ -209,7 +218,7 @@ def _are_versions(first: Candidate, second: Candidate) -> bool:
 
 
 def _same_surface(first: Candidate, second: Candidate, transform: Array) -> bool:
-    """Return whether a surface, transformed by a matrix (3, 3), equals another one."""
+    """Return whether the surface of ``second``, transformed by a matrix (3, 3), equals the surface of ``first``."""
     if not first.contains(second.samples[:TRIED] @ transform.T):
         return False
     return second.contains(first.samples[:TRIED] @ np.linalg.inv(transform).T)
@@ -238,16 +247,21 @@ def _check_parts(parts: Sequence[Candidate], folder: Path) -> None:
                 queue.append(index)
     if len(joined) < len(parts) or (_around_one_axis(bounds, SAME * diagonal) and _inside(parts)):
         raise AssetError(
-            "several mesh files that do not look like parts of one object",
+            "the mesh files are not parts of one object",
             where=folder,
-            expected="parts that touch each other",
+            expected="files whose meshes touch each other and are not inside each other",
             found=", ".join(_name(part, folder) for part in parts),
             fix="Use one folder per object, or join the parts into one file.",
         )
 
 
 def _around_one_axis(bounds: Array, tolerance: float) -> bool:
-    """Return whether boxes (N, 2, 3) have the same centre, or the same base plane and axis."""
+    """Return whether all bounding boxes (N, 2, 3) have equal centres, or equal base planes and axes.
+
+    Args:
+        bounds: (N, 2, 3) lower and upper corner of each box.
+        tolerance: largest difference of coordinates that count as equal.
+    """
     middles = bounds.mean(axis=1)
     apart = np.ptp(middles, axis=0) > tolerance
     bases_apart = np.ptp(bounds[:, 0], axis=0) > tolerance
@@ -255,7 +269,7 @@ def _around_one_axis(bounds: Array, tolerance: float) -> bool:
 
 
 def _inside(parts: Sequence[Candidate]) -> bool:
-    """Return whether a large fraction of a part is inside the convex hull of another part."""
+    """Return whether more than 5 % of a part is inside the convex hull of another part."""
     for one in parts:
         try:
             planes = ConvexHull(one.samples).equations

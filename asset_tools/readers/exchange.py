@@ -34,15 +34,15 @@ BLACK = 0.02  # linear
 
 
 def read_exchange(path: Path, files: ModelFiles) -> list[MeshPart]:
-    """Read a mesh file.
+    """Read a PLY, STL, OFF, COLLADA or 3MF file as one part per mesh.
 
     Args:
-        path: the file.
-        files: reads the file and its textures; warnings are added to its notes.
+        path: path of the file.
+        files: files of the model, which reads the file and its textures; warnings are added to ``files.notes``.
 
     Raises:
         AssetError: the file is damaged or too large, or a texture is missing.
-        MissingExtraError: COLLADA, without pycollada.
+        MissingExtraError: the file is COLLADA, and pycollada is not installed.
     """
     data, suffix = files.read(path), path.suffix.lower()[1:]
     if suffix == "dae":
@@ -71,13 +71,14 @@ def read_exchange(path: Path, files: ModelFiles) -> list[MeshPart]:
         raise AssetError("the file is truncated", where=path, expected=f"{faces} faces", found=found, fix=fix)
     if count > MOST_FACES:
         expected = f"at most {MOST_FACES:,}"
-        raise AssetError("the mesh has too many faces", where=path, expected=expected, fix="Reduce it.")
+        fix = "Reduce the number of faces."
+        raise AssetError("the mesh has too many faces", where=path, expected=expected, found=f"{count:,}", fix=fix)
     return parts
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Disable trimesh's log lines, which have tracebacks; problems are reported by errors and notes."""
+    """Disable the log of trimesh during the block, since it has tracebacks of problems that become errors or notes."""
     logger = logging.getLogger("trimesh")
     disabled, logger.disabled = logger.disabled, True
     try:
@@ -87,7 +88,7 @@ def _quiet() -> Iterator[None]:
 
 
 class _Textures(Resolver):
-    """Resolver that finds textures for trimesh anywhere below the model's folder."""
+    """Resolver that gives trimesh the textures of a model, found by name anywhere below the model's folder."""
 
     def __init__(self, path: Path, files: ModelFiles) -> None:
         self._path, self._files = path, files
@@ -95,11 +96,11 @@ class _Textures(Resolver):
         self.error: AssetError | None = None
 
     def note(self, text: str) -> None:
-        """Add a warning."""
+        """Add a note to the notes of the model."""
         self._files.notes.append(text)
 
     def get(self, name: str) -> bytes:
-        """Return an image as BMP with 8 bits per channel."""
+        """Return the texture with a name as the content of a BMP file, 8 bits per channel."""
         try:
             file = self._files.find(name, self._path.parent)
             if file is None:
@@ -113,32 +114,32 @@ class _Textures(Resolver):
         return stream.getvalue()
 
     def keys(self) -> list[str]:
-        """Return no names, since textures are found on demand."""
+        """Return an empty list, since textures are searched only when trimesh asks for them."""
         return []
 
     def namespaced(self, namespace: str) -> _Textures:
-        """Return itself; names are not changed."""
+        """Return this resolver, since names are relative to the model's folder in every namespace."""
         return self
 
     def write(self, name: str, data: Any) -> None:
-        """Refuse to write."""
+        """Raise NotImplementedError; trimesh only reads with this resolver."""
         raise NotImplementedError
 
     def shared(self, image: Image.Image) -> Image.Image:
-        """Return the same object for images with equal content."""
+        """Return an image as RGB; images with equal content become one object."""
         image = image.convert("RGB")
         return self._images.setdefault(image.tobytes(), image)
 
 
 def _check_archive(data: bytes, path: Path, files: ModelFiles) -> None:
-    """Check the unpacked size of a 3MF file; warn about colours, which are not read."""
+    """Check the unpacked size of a 3MF file; add a warning if the file has colours, which are not read."""
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
         size = sum(info.file_size for info in archive.infolist())
         if size > LARGEST_FILE:
             expected, found = f"at most {LARGEST_FILE >> 20} MB unpacked", f"{size >> 20} MB"
             raise AssetError(
-                "the file is too large", where=path, expected=expected, found=found, fix="Reduce the mesh."
+                "the unpacked file is too large", where=path, expected=expected, found=found, fix="Reduce the mesh."
             )
         models = [archive.read(info) for info in archive.infolist() if info.filename.lower().endswith(".model")]
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, RuntimeError, EOFError) as error:
@@ -148,7 +149,11 @@ def _check_archive(data: bytes, path: Path, files: ModelFiles) -> None:
 
 
 def _ply_checked(data: bytes, path: Path, textures: _Textures) -> tuple[bytes, int]:
-    """Check the counts of a PLY file; return it with a header for trimesh, and its number of faces."""
+    """Check the counts of elements in the header of a PLY file.
+
+    Returns:
+        The content of the file with a simplified header for trimesh, and the number of faces in the header.
+    """
     end = data.find(b"end_header", 0, LONGEST_HEADER)
     if end < 0:
         raise AssetError("cannot read this mesh", where=path, expected="a PLY header", fix="Export it again.")
@@ -165,9 +170,9 @@ def _ply_checked(data: bytes, path: Path, textures: _Textures) -> tuple[bytes, i
             kind, count = [*words[1:], b"", b""][:2]
             limit = MOST_FACES if kind == b"face" else MOST_VERTICES
             if not (count.isdigit() and len(count) < 12 and int(count) <= limit):
-                what = f"the mesh has too many elements of type {decode_text(kind)[:20]!r}"
-                found = decode_text(count)[:20]
-                raise AssetError(what, where=path, expected=f"at most {limit:,}", found=found, fix="Reduce it.")
+                what = f"invalid number of elements of type {decode_text(kind)[:20]!r} in the PLY header"
+                found, fix = decode_text(count)[:20], "Reduce the mesh, or export it again."
+                raise AssetError(what, where=path, expected=f"0 to {limit:,}", found=found, fix=fix)
             faces = int(count) if kind == b"face" else faces
             header.append(line)
         elif words[:1] == [b"property"]:
@@ -179,7 +184,7 @@ def _ply_checked(data: bytes, path: Path, textures: _Textures) -> tuple[bytes, i
 
 
 def _off_faces(data: bytes, path: Path, files: ModelFiles) -> int:
-    """Return the number of faces in the header of an OFF file; warn about colours, which are not read."""
+    """Return the number of faces in the header of an OFF file; add a warning if the file has vertex colours."""
     words = re.sub(rb"#[^\n]*", b"", data[:LONGEST_HEADER]).split()
     if words and words[0].upper().startswith(b"C"):
         files.notes.append(f"warning: {path.name}: ignored vertex colours of an OFF file")
@@ -187,8 +192,14 @@ def _off_faces(data: bytes, path: Path, files: ModelFiles) -> int:
     if len(counts) < 2 or not all(count.isdigit() and len(count) < 12 for count in counts):
         raise AssetError("cannot read this mesh", where=path, expected="an OFF header", fix="Export it again.")
     if int(counts[0]) > MOST_VERTICES or int(counts[1]) > MOST_FACES:
-        expected = f"at most {MOST_FACES:,} faces"
-        raise AssetError("the mesh has too many faces or vertices", where=path, expected=expected, fix="Reduce it.")
+        expected, found = f"at most {MOST_FACES:,} faces and {MOST_VERTICES:,} vertices", "{1} faces, {0} vertices"
+        raise AssetError(
+            "the mesh has too many faces or vertices",
+            where=path,
+            expected=expected,
+            found=found.format(*(int(count) for count in counts)),
+            fix="Reduce the mesh.",
+        )
     return int(counts[1])
 
 
@@ -230,7 +241,7 @@ def _part(mesh: trimesh.Trimesh, textures: _Textures) -> MeshPart:
 
 
 def _plain(material: Any) -> tuple[float, float, float]:
-    """Return the linear colour of a COLLADA material; white for materials of PLY files."""
+    """Return the linear colour (3,) of a material of a COLLADA file; white for materials of other files."""
     if not isinstance(material, PBRMaterial) or material.baseColorFactor is None:
         return 1.0, 1.0, 1.0
     red, green, blue = (float(value) for value in decode_srgb(np.asarray(material.baseColorFactor)[:3]))

@@ -1,4 +1,4 @@
-"""Read files of a model: only regular files of bounded size in the imported folder."""
+"""Read files of a model safely: only regular files of limited size in the imported folder."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def read_file(path: Path, *roots: Path) -> bytes:
     """Read a regular file in the imported folder.
 
     Args:
-        path: the file.
-        roots: folders that may be read, see `check_inside`.
+        path: path of the file.
+        roots: folders from which files may be read, including their subfolders.
 
     Raises:
         AssetError: the file is missing, outside of ``roots``, not regular (pipe, device), or larger than 200 MB.
@@ -35,7 +35,13 @@ def read_file(path: Path, *roots: Path) -> bytes:
         with open(descriptor, "rb") as file:
             status = os.fstat(descriptor)
             if not stat.S_ISREG(status.st_mode):
-                raise AssetError("not a regular file", where=path, fix="Replace it by the file itself.")
+                raise AssetError(
+                    "not a regular file",
+                    where=path,
+                    expected="a file with content",
+                    found="a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, socket or device",
+                    fix="Replace it by the file itself.",
+                )
             if status.st_size > LARGEST_FILE:
                 raise AssetError(
                     "the file is too large",
@@ -50,10 +56,10 @@ def read_file(path: Path, *roots: Path) -> bytes:
 
 
 def check_inside(path: Path, *roots: Path) -> None:
-    """Check that a path, after resolving links, is below one of the folders, which may be links themselves.
+    """Check that a path is below one of several folders, after links in both paths are resolved.
 
     Raises:
-        AssetError: the path is outside.
+        AssetError: the path is outside all folders, or cannot be resolved.
     """
     try:
         inside = any(path.resolve().is_relative_to(root.resolve()) for root in roots)
@@ -61,7 +67,7 @@ def check_inside(path: Path, *roots: Path) -> None:
         raise AssetError("cannot read this file", where=path, found=error) from error
     if not inside:
         raise AssetError(
-            "the path leaves the imported folder",
+            "the path leads out of the imported folder",
             where=path,
             expected=f"a file below {roots[0]}",
             fix="Copy the file into the folder, or import the folder that contains both.",
@@ -73,11 +79,11 @@ class ModelFiles:
     """The files of one model.
 
     Attributes:
-        root: the imported folder; only files below it or below ``home`` are read.
-        home: the model's folder, in which files are searched by name; may be a link.
-        stem: stem of a mesh file that shares ``home`` with other models; None: ``home`` belongs to the model.
-        notes: notes on substituted files, one line each.
-        used: files that were read, for the content hash.
+        root: the imported folder. Only files below ``root`` or ``home`` are read.
+        home: the folder of the model, in which files are searched by name; may be a link.
+        stem: stem of the mesh file, if ``home`` also contains other models; None: ``home`` belongs to this model.
+        notes: notes on replaced and ignored files, one line each.
+        used: files that were read, for the hash of the inputs.
     """
 
     root: Path
@@ -88,32 +94,39 @@ class ModelFiles:
 
     @cached_property
     def listing(self) -> list[Path]:
-        """Files in which others are searched: all below ``home``, or next to the model and in folders for it."""
+        """Files among which missing files are searched by name.
+
+        If ``stem`` is None, these are all files below ``home``. Otherwise they are the files in ``home``, and those in
+        subfolders for textures or with the name of the model.
+        """
         if self.stem is None:
-            return list(files_below(self.home))
+            return list(find_files(self.home))
         entries = sorted(path for path in self.home.iterdir() if not path.name.startswith("."))
         own = [path for path in entries if path.is_dir() and _is_for(path.name, self.stem)]
-        return [path for path in entries if not path.is_dir()] + [file for path in own for file in files_below(path)]
+        return [path for path in entries if not path.is_dir()] + [file for path in own for file in find_files(path)]
 
     def read(self, path: Path) -> bytes:
-        """Return the content of a file, see `read_file`."""
+        """Return the content of a file below ``root`` or ``home``, and add the file to ``used``."""
         data = read_file(path, self.root, self.home)
         if path not in self.used:
             self.used.append(path)
         return data
 
     def find(self, name: str, folder: Path) -> Path | None:
-        """Find a file by the name that a model gives it, which may be of another machine or differ in letter case.
+        """Find a file by the path that is written in a model.
+
+        This path may come from another machine, or differ in letter case. If no file has this path, the function
+        searches ``listing`` for the file name alone.
 
         Args:
-            name: as the model has it: relative to ``folder``, or absolute; with slashes or backslashes.
-            folder: of the file that names it.
+            name: path in the model: relative to ``folder``, or absolute; with slashes or backslashes.
+            folder: folder of the file in which the path is written.
 
         Returns:
-            The path; None if there is no such file.
+            The path of the file; None if there is no such file.
 
         Raises:
-            AssetError: the name leads out of ``root``, and no file below ``home`` has its last part as a name.
+            AssetError: the path leads out of ``root``, and no file of ``listing`` has this file name.
         """
         name = name.strip().strip('"')
         plain = name.replace("\\", "/").removeprefix("file://")
@@ -131,8 +144,8 @@ class ModelFiles:
         if alike:
             found = min(alike, key=lambda path: (len(path.parts), path.as_posix()))
             taken = found.relative_to(self.home).as_posix()
-            text = f"took {taken} for {name if name != taken else folder.name + '/' + name}"
-            self._note(f"warning: {text}, of {len(alike)} files of this name" if len(alike) > 1 else text)
+            text = f"used {taken} instead of {name if name != taken else folder.name + '/' + name}"
+            self._note(f"warning: {text}, one of {len(alike)} files of this name" if len(alike) > 1 else text)
             return found
         if "%" in name and unquote(name) != name:
             return self.find(unquote(name), folder)
@@ -146,13 +159,18 @@ class ModelFiles:
 
 
 def missing_path(name: str, folder: Path) -> Path:
-    """Return the path to name in an error for a file that `ModelFiles.find` did not find."""
+    """Return the path for the message of an error about a file that `ModelFiles.find` did not find.
+
+    Args:
+        name: path in the model.
+        folder: folder of the file in which the path is written.
+    """
     plain = name.replace("\\", "/")
     return Path(plain) if ":" in plain else folder / plain
 
 
-def files_below(folder: Path) -> Iterator[Path]:
-    """Yield all files below a folder, hidden ones and links to folders left out; the order is that of names."""
+def find_files(folder: Path) -> Iterator[Path]:
+    """Yield the files below a folder, sorted by name, without hidden files and linked folders."""
     count = 0
     for place, folders, names in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
@@ -165,10 +183,10 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 def _is_for(folder: str, stem: str) -> bool:
-    """Return whether a folder may hold the textures of a mesh file next to it."""
+    """Return whether a folder may contain the textures of a mesh file with the stem ``stem`` next to the folder."""
     return folder.lower() in TEXTURE_FOLDERS or _letters(folder).startswith(_letters(stem))
 
 
 def _letters(name: str) -> str:
-    """Return a name without letter case, its accents written in one way."""
+    """Return a name in lower case and with normalised accents, for comparisons."""
     return unicodedata.normalize("NFC", name).casefold()

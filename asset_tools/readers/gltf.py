@@ -1,4 +1,4 @@
-"""Read the triangles of glTF 2.0 files (``.gltf`` and ``.glb``) as shown by a viewer.
+"""Read the triangles, colours and textures of glTF 2.0 files (``.gltf`` and ``.glb``).
 
 The reader follows the specification (registry.khronos.org/glTF) and the extensions in
 `gltf_materials.READ_EXTENSIONS`. Other visible features are ignored with a warning.
@@ -32,11 +32,11 @@ LINES, STRIP, FAN = (0, 1, 2, 3), 5, 6
 
 
 def read_gltf(path: Path, files: ModelFiles) -> list[MeshPart]:
-    """Read a glTF file.
+    """Read a glTF file as one part per primitive.
 
     Args:
-        path: the file.
-        files: reads the file and its buffers and images; warnings are added to its notes.
+        path: path of the file.
+        files: files of the model, which reads the file, its buffers and images; warnings are added to ``files.notes``.
 
     Raises:
         AssetError: the file is damaged or compressed, has wrong types, or needs a missing file.
@@ -49,9 +49,13 @@ def read_gltf(path: Path, files: ModelFiles) -> list[MeshPart]:
         raise _damaged(path, f"{'.'.join(map(str, first['loc'])) or 'file'}: {first['msg']}") from error
     compressed = sorted(COMPRESSED & set(model.extensionsRequired))
     if compressed:
-        fix = "Export it without compression."
-        what = "unsupported compression of the file"
-        raise AssetError(what, where=path, found=", ".join(compressed), fix=fix)
+        raise AssetError(
+            "the file is compressed",
+            where=path,
+            expected="no compression",
+            found=f"extensionsRequired {', '.join(compressed)}",
+            fix="Export the mesh without compression.",
+        )
     ignored = {f"the extension {name}" for name in set(model.extensionsRequired) - READ_EXTENSIONS}
     try:
         parts = _parts(model, blob, path, files, ignored)
@@ -64,14 +68,15 @@ def read_gltf(path: Path, files: ModelFiles) -> list[MeshPart]:
 
 
 def _split(data: bytes, path: Path) -> tuple[Any, bytes]:
-    """Return the JSON of a file, and the binary chunk of a GLB."""
+    """Return the JSON value of a glTF file, and the binary chunk of a GLB file; the chunk of a .gltf file is empty."""
     blob, text = b"", data
     if data[:4] == b"glTF":
         if len(data) < 20:
             raise _damaged(path, "the file is truncated")
         version, _, length = struct.unpack_from("<III", data, 4)
         if version != 2:
-            raise AssetError("cannot read this mesh", where=path, expected="glTF 2", found=f"version {version}")
+            what, expected, found = "unsupported version of glTF", "version 2", f"version {version}"
+            raise AssetError(what, where=path, expected=expected, found=found, fix="Export the mesh as glTF 2.0.")
         text, start = data[20 : 20 + length], 20 + length
         if start + 8 <= len(data):
             blob = data[start + 8 : start + 8 + struct.unpack_from("<I", data, start)[0]]
@@ -100,13 +105,14 @@ def _parts(model: schema.Gltf, blob: bytes, path: Path, files: ModelFiles, ignor
             faces += len(part.faces)
             if faces > MOST_FACES:
                 expected = f"at most {MOST_FACES:,}"
-                raise AssetError("the mesh has too many faces", where=path, expected=expected, fix="Reduce it.")
+                fix = "Reduce the number of faces."
+                raise AssetError("the mesh has too many faces", where=path, expected=expected, fix=fix)
             found.append(_moved(part, pose))
     return found
 
 
 def _placed(model: schema.Gltf) -> list[tuple[schema.Node, Array]]:
-    """Return the nodes with a mesh of the scene, and their poses (4, 4)."""
+    """Return the nodes of the scene that have a mesh, and their poses (4, 4) in the frame of the scene."""
     children = {child for node in model.nodes for child in node.children}
     if model.scenes:
         roots = entry(model.scenes, model.scene, "scenes").nodes
@@ -132,17 +138,17 @@ def _part(primitive: schema.Primitive, buffers: Buffers, materials: Materials, i
     """Return the triangles of a primitive in the frame of its node."""
     attributes = primitive.attributes
     if "POSITION" not in attributes:
-        raise ValueError("a primitive without POSITION")
+        raise ValueError("a primitive has no POSITION attribute")
     compressed = COMPRESSED & set(primitive.extensions)
     if compressed and not buffers.has_data(attributes["POSITION"]):
-        raise ValueError(f"its triangles are compressed ({', '.join(compressed)})")
+        raise ValueError(f"the triangles are compressed ({', '.join(compressed)})")
     vertices = buffers.vectors(attributes["POSITION"], 3)
     if primitive.indices is None:
         faces = _triangles(np.arange(len(vertices)), primitive.mode)
     else:
         faces = _triangles(buffers.values(primitive.indices).reshape(-1).astype(np.int64), primitive.mode)
     if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
-        raise ValueError(f"a face refers to vertex {int(faces.max())} of {len(vertices)}")
+        raise ValueError(f"a face refers to vertex {int(faces.max())}, but there are only {len(vertices)} vertices")
     normals = buffers.vectors(attributes["NORMAL"], 3) if "NORMAL" in attributes else None
     colors = buffers.colors(attributes["COLOR_0"]) if "COLOR_0" in attributes else None
     uv_sets = {key.removeprefix("TEXCOORD_") for key in attributes if key.startswith("TEXCOORD_")}
@@ -157,14 +163,21 @@ def _part(primitive: schema.Primitive, buffers: Buffers, materials: Materials, i
         uvs[:, 1] = 1 - uvs[:, 1]
     for name, values in (("normals", normals), ("vertex colours", colors), ("texture coordinates", uvs)):
         if values is not None and len(values) != len(vertices):
-            raise ValueError(f"{len(values)} {name} of {len(vertices)} vertices")
+            raise ValueError(f"the numbers of {name} ({len(values)}) and vertices ({len(vertices)}) differ")
     if "JOINTS_0" in attributes:
         ignored.add("a skin")
     return MeshPart(vertices, faces, uvs, colors, normals, material)
 
 
 def _moved(part: MeshPart, pose: Array) -> MeshPart:
-    """Return a part in the frame of the scene; mirroring keeps its faces outwards."""
+    """Transform a part from the frame of a node to the frame of the scene, and return it.
+
+    If the pose mirrors the part, the faces are flipped so that they stay oriented outwards.
+
+    Args:
+        part: the part, which is changed.
+        pose: (4, 4) pose of the node in the frame of the scene.
+    """
     linear = pose[:3, :3]
     part.vertices = part.vertices @ linear.T + pose[:3, 3]
     if part.normals is not None:

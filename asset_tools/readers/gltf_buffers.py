@@ -24,13 +24,13 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "M
 
 
 class Buffers:
-    """Decoded data of a glTF file.
+    """Reader of the binary data of a glTF file.
 
     Args:
-        model: the JSON.
-        blob: the binary chunk of a GLB file, or empty.
-        path: the file.
-        files: reads the referenced files.
+        model: JSON of the file.
+        blob: binary chunk of a GLB file, or empty.
+        path: path of the file.
+        files: files of the model, which reads referenced files.
     """
 
     def __init__(self, model: schema.Gltf, blob: bytes, path: Path, files: ModelFiles) -> None:
@@ -39,7 +39,7 @@ class Buffers:
         self._quantised = "KHR_mesh_quantization" in model.extensionsUsed
 
     def content(self, uri: str) -> tuple[bytes, Path]:
-        """Return the content of a URI and its file."""
+        """Return the bytes of a URI, and the path of the file that contains them."""
         if uri.startswith("data:"):
             try:
                 return base64.b64decode(unquote(uri.partition(",")[2]), validate=True), self._path
@@ -52,22 +52,25 @@ class Buffers:
         return self._files.read(file), file
 
     def view(self, index: int) -> tuple[bytes, schema.BufferView]:
-        """Return the bytes of a buffer view, and its entry."""
+        """Return the bytes of the buffer view with an index, and the entry of the buffer view in the JSON."""
         view = entry(self._model.bufferViews, index, "bufferViews")
         if any("meshopt" in name for name in view.extensions):
-            raise ValueError("its data is compressed (meshopt)")
+            raise ValueError("the data is compressed (meshopt)")
         if view.buffer not in self._buffers:
             buffer = entry(self._model.buffers, view.buffer, "buffers")
             self._buffers[view.buffer] = self._blob if buffer.uri is None else self.content(buffer.uri)[0]
             if sum(map(len, self._buffers.values())) > 2 * LARGEST_FILE:
-                raise ValueError(f"more than {2 * LARGEST_FILE >> 20} MB of buffers")
+                raise ValueError(f"the buffers have more than {2 * LARGEST_FILE >> 20} MB")
         data = self._buffers[view.buffer][view.byteOffset : view.byteOffset + view.byteLength]
         if len(data) < view.byteLength:
-            raise ValueError(f"bufferViews.{index} has {len(data)} of {view.byteLength} bytes")
+            raise ValueError(f"bufferViews.{index} needs {view.byteLength} bytes, but the buffer has only {len(data)}")
         return data, view
 
     def values(self, index: int) -> NDArray:
-        """Return the values (count, width) of an accessor; normalised integers as floats in -1..1 or 0..1."""
+        """Return the values (count, width) of the accessor with an index.
+
+        Integers that the file marks as normalised become floats in -1..1 or 0..1.
+        """
         accessor = entry(self._model.accessors, index, "accessors")
         dtype, width = np.dtype(DTYPES[accessor.componentType]), WIDTHS[accessor.type]
         if accessor.bufferView is None:
@@ -85,15 +88,15 @@ class Buffers:
         return _normalised(values) if accessor.normalized else values
 
     def has_data(self, index: int) -> bool:
-        """Return whether an accessor has data, instead of zeros that an extension fills."""
+        """Return whether the accessor with an index has data; an accessor of compressed data may have none."""
         accessor = entry(self._model.accessors, index, "accessors")
         return accessor.bufferView is not None or accessor.sparse is not None
 
     def vectors(self, index: int, width: int) -> Array:
-        """Return the (V, width) vectors of an accessor.
+        """Return the vectors (V, width) of the accessor with an index as floats.
 
         Raises:
-            ValueError: the vectors have another width.
+            ValueError: the vectors of the file have another width.
         """
         values = self.values(index)
         if values.shape[1] != width:
@@ -101,14 +104,17 @@ class Buffers:
         return values.astype(float)
 
     def coordinates(self, index: int) -> Array:
-        """Return (V, 2) texture coordinates, v downward; integers are normalised unless the file is quantised."""
+        """Return the texture coordinates (V, 2), v downward, of the accessor with an index.
+
+        Integers are divided by the largest value of their type, unless the file uses KHR_mesh_quantization.
+        """
         values = self.values(index)
         if values.shape[1] != 2:
             raise ValueError(f"accessors.{index} has {values.shape[1]} components, expected 2")
         return (values if self._quantised else _normalised(values)).astype(float)
 
     def colors(self, index: int) -> Array:
-        """Return (V, 3) linear vertex colours, which may be NaN; integers are always normalised."""
+        """Return the linear vertex colours (V, 3) in 0..1 of the accessor with an index; values may be NaN."""
         values = self.values(index)
         if values.shape[1] not in (3, 4):
             raise ValueError(f"accessors.{index} has {values.shape[1]} components, expected 3 or 4")
@@ -116,13 +122,18 @@ class Buffers:
 
 
 def entry(items: Sequence[Item], index: int | None, name: str) -> Item:
-    """Return an entry of a list of the file.
+    """Return the entry with an index of a list in the file.
+
+    Args:
+        items: the list.
+        index: index of the entry; None: the file gives no index.
+        name: name of the list, for the error.
 
     Raises:
         ValueError: the entry does not exist.
     """
     if index is None or not 0 <= index < len(items):
-        raise ValueError(f"{name} has no entry {index}, of {len(items)}")
+        raise ValueError(f"{name} has no entry {index}; it has {len(items)} entries")
     return items[index]
 
 
@@ -134,9 +145,18 @@ def _normalised(values: NDArray) -> NDArray:
 
 
 def _rows(data: bytes, offset: int, stride: int | None, dtype: np.dtype, width: int, count: int) -> NDArray:
-    """Return values (count, width) with a distance of ``stride`` bytes; None: contiguous."""
+    """Return ``count`` rows of ``width`` values (count, width) from bytes.
+
+    Args:
+        data: the bytes.
+        offset: position of the first row, bytes.
+        stride: distance between the starts of two rows, bytes; None: rows without gaps.
+        dtype: type of a value.
+        width: number of values per row.
+        count: number of rows.
+    """
     size = dtype.itemsize * width
     stride = stride or size
     if count and offset + stride * (count - 1) + size > len(data):
-        raise ValueError(f"an accessor of {count} elements in {len(data)} bytes")
+        raise ValueError(f"an accessor of {count} elements does not fit in {len(data)} bytes")
     return np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize))

@@ -1,4 +1,4 @@
-"""Convert materials of a glTF file to one image and one colour: base colour plus emission."""
+"""Convert each material of a glTF file to one image and one colour, the sum of base colour and emitted light."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ BLACK = 0.02  # linear; darker base colours show nothing
 
 @dataclass(frozen=True)
 class TextureMapping:
-    """How an image is laid over a surface.
+    """Mapping from the texture coordinates of a mesh to an image.
 
     Attributes:
-        uv_set: the number N of ``TEXCOORD_N``.
-        transform: of the coordinates, v downward: ((a, b, shift), (c, d, shift)).
-        wrap: how the image continues across and down: repeated, mirrored, or by its edges.
+        uv_set: number N of the vertex attribute ``TEXCOORD_N`` with the coordinates.
+        transform: affine transform (2, 3) of the coordinates, v downward.
+        wrap: wrap modes of glTF for u and v outside of 0..1: `REPEAT`, `MIRROR` or `CLAMP`.
     """
 
     uv_set: int
@@ -41,12 +41,17 @@ class TextureMapping:
     wrap: tuple[int, int] = (schema.REPEAT, schema.REPEAT)
 
     def apply(self, uvs: Array) -> Array:
-        """Return transformed coordinates (V, 2)."""
+        """Return texture coordinates (V, 2) after the transform."""
         matrix = np.array(self.transform)
         return uvs @ matrix[:, :2].T + matrix[:, 2]
 
     def repeating(self, image: Image.Image, uvs: Array) -> tuple[Image.Image, Array]:
-        """Return an image and coordinates that show the same where images repeat."""
+        """Convert the wrap modes to `REPEAT`: return an image and coordinates (V, 2) with equal colours on the mesh.
+
+        Args:
+            image: texture image.
+            uvs: (V, 2) coordinates after the transform, which are changed.
+        """
         for axis, wrap in enumerate(self.wrap):
             image, uvs[:, axis] = _repeating(image, uvs[:, axis], wrap, axis)
         return image, uvs
@@ -54,20 +59,20 @@ class TextureMapping:
 
 @dataclass(frozen=True, eq=False)
 class MappedImage:
-    """An image, and where it is shown."""
+    """A texture image and its mapping."""
 
     image: Image.Image
     mapping: TextureMapping
 
 
 class Materials:
-    """The materials of a glTF file.
+    """Reader of the materials of a glTF file.
 
     Args:
-        model: the JSON.
-        buffers: reads the images.
-        notes: gets a line per texture that was shrunk.
-        ignored: gets what a viewer would show and is left out.
+        model: JSON of the file.
+        buffers: reader of the binary data.
+        notes: list to which one note per shrunk texture is appended.
+        ignored: set to which the names of visible features that are not read are added.
     """
 
     def __init__(self, model: schema.Gltf, buffers: Buffers, notes: list[str], ignored: set[str]) -> None:
@@ -76,11 +81,11 @@ class Materials:
         self._materials: dict[tuple[int, frozenset[int]], tuple[Material, TextureMapping]] = {}
 
     def material(self, index: int | None, uv_sets: frozenset[int]) -> tuple[Material, TextureMapping]:
-        """Return a material, and how its image is laid over a mesh.
+        """Return a material and the mapping of its image.
 
         Args:
-            index: of the material; None: white.
-            uv_sets: that the mesh has; an image on another one is left out.
+            index: index of the material; None: the mesh has no material and is white.
+            uv_sets: numbers of the UV sets of the mesh; images that need another set are ignored.
         """
         if index is None:
             return Material(), TextureMapping(0)
@@ -115,12 +120,19 @@ class Materials:
     def _combined(
         self, base: MappedImage | None, color: Array, light: MappedImage | None, glow: Array
     ) -> tuple[Material, TextureMapping]:
-        """Return the sum of base colour and emitted light; each is an image (None: white) times a linear colour."""
+        """Return the sum of base colour and emitted light as one material, and the mapping of its image.
+
+        Args:
+            base: image of the base colour; None: white.
+            color: (3,) linear factor of ``base``.
+            light: image of the emitted light; None: white.
+            glow: (3,) linear factor of ``light``.
+        """
         if light is not None and color.max() < BLACK:
             return Material(_triple(glow), light.image), light.mapping
         if not glow.any() or (base is not None and light is not None and base.mapping != light.mapping):
             if glow.any():
-                self._ignored.add("an emissive texture laid out in another way than the base colour")
+                self._ignored.add("an emissive texture with other texture coordinates than the base colour")
             return Material(_triple(color), base and base.image), base.mapping if base else TextureMapping(0)
         shown = base or light
         if shown is None:
@@ -154,7 +166,7 @@ class Materials:
             elif image.uri is not None:
                 data, where = self._buffers.content(image.uri)
             else:
-                raise ValueError(f"images.{source} has no data")
+                raise ValueError(f"images.{source} has neither a bufferView nor a uri")
             self._images[source] = open_texture(data, where, self._notes)
         return MappedImage(self._images[source], mapping)
 
@@ -177,9 +189,16 @@ def _triple(color: Array) -> tuple[float, float, float]:
 
 
 def _repeating(image: Image.Image, values: Array, wrap: int, axis: int) -> tuple[Image.Image, Array]:
-    """Convert an image with another wrap mode along an axis (0: across) to a repeating image and coordinates.
+    """Convert an image with any wrap mode to an image and coordinates for the mode `REPEAT`, along one axis.
 
-    A mirrored image is joined to its mirror image. Edges continue for at most one width of the image.
+    An image with the mode `MIRROR` is joined to its mirror image. An image with the mode `CLAMP` is extended with the
+    colours of its edges, at each side by at most its own size.
+
+    Args:
+        image: texture image.
+        values: (V,) coordinates along the axis.
+        wrap: wrap mode.
+        axis: 0 for u, 1 for v.
     """
     if wrap not in (schema.MIRROR, schema.CLAMP) or len(values) == 0:
         return image, values

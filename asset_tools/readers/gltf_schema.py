@@ -1,4 +1,4 @@
-"""Models of the parts of a glTF 2.0 file that are read."""
+"""Pydantic models of the parts of a glTF 2.0 file that are read."""
 
 # Names are the specification's.
 # ruff: noqa: N815
@@ -20,13 +20,13 @@ REPEAT, CLAMP, MIRROR = 10497, 33071, 33648
 
 
 class Schema(BaseModel):
-    """Base class of models that ignore unknown keys and refuse NaN."""
+    """Base class of the models, which ignores unknown keys and rejects NaN and infinite values."""
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
 
 class SparseIndices(Schema):
-    """Indices of replaced values of an accessor."""
+    """Indices of the values that a sparse accessor replaces."""
 
     bufferView: NonNegativeInt
     byteOffset: NonNegativeInt = 0
@@ -34,14 +34,14 @@ class SparseIndices(Schema):
 
 
 class SparseValues(Schema):
-    """Replacement values of an accessor."""
+    """Values that a sparse accessor puts at the indices."""
 
     bufferView: NonNegativeInt
     byteOffset: NonNegativeInt = 0
 
 
 class Sparse(Schema):
-    """Values of an accessor that differ from its buffer view."""
+    """Values of an accessor that replace values of the buffer view: count, indices and new values."""
 
     count: NonNegativeInt
     indices: SparseIndices
@@ -84,7 +84,7 @@ class Image(Schema):
 
 
 class Sampler(Schema):
-    """Wrapping of an image outside of 0..1."""
+    """Wrap modes of an image for texture coordinates outside of 0..1."""
 
     wrapS: int = REPEAT
     wrapT: int = REPEAT
@@ -99,7 +99,7 @@ class Texture(Schema):
 
 
 class TextureInfo(Schema):
-    """A texture and the number of its coordinates."""
+    """Reference to a texture, with the number of the UV set."""
 
     index: NonNegativeInt
     texCoord: NonNegativeInt = 0
@@ -107,7 +107,7 @@ class TextureInfo(Schema):
 
 
 class Transform(Schema):
-    """The extension KHR_texture_transform."""
+    """The extension KHR_texture_transform: offset, rotation in rad and scale of texture coordinates."""
 
     offset: tuple[float, float] = (0.0, 0.0)
     rotation: float = 0.0
@@ -116,7 +116,7 @@ class Transform(Schema):
 
 
 class MetallicRoughness(Schema):
-    """The metallic-roughness material."""
+    """Base colour and roughness of a material in the metallic-roughness model."""
 
     baseColorFactor: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
     baseColorTexture: TextureInfo | None = None
@@ -124,20 +124,20 @@ class MetallicRoughness(Schema):
 
 
 class SpecularGlossiness(Schema):
-    """The extension KHR_materials_pbrSpecularGlossiness."""
+    """The extension KHR_materials_pbrSpecularGlossiness: diffuse colour of an older kind of material."""
 
     diffuseFactor: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
     diffuseTexture: TextureInfo | None = None
 
 
 class EmissiveStrength(Schema):
-    """The extension KHR_materials_emissive_strength."""
+    """The extension KHR_materials_emissive_strength: factor of the emitted light."""
 
     emissiveStrength: float = 1.0
 
 
 class Material(Schema):
-    """A material."""
+    """A material: base colour, emitted light, and maps that are not read."""
 
     pbrMetallicRoughness: MetallicRoughness = MetallicRoughness()
     emissiveFactor: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -160,14 +160,14 @@ class Primitive(Schema):
 
 
 class Mesh(Schema):
-    """Primitives."""
+    """A mesh: a list of primitives."""
 
     primitives: list[Primitive]
     weights: list[float] = []
 
 
 class Node(Schema):
-    """A pose, with a mesh and children."""
+    """A node of the scene graph: pose, mesh and indices of the children."""
 
     mesh: NonNegativeInt | None = None
     skin: NonNegativeInt | None = None
@@ -179,7 +179,7 @@ class Node(Schema):
     extensions: dict[str, Any] = {}
 
     def transform(self) -> NDArray[np.float64]:
-        """Return the pose (4, 4) in the parent's frame."""
+        """Return the pose (4, 4) of the node in the frame of its parent."""
         if self.matrix is not None:
             return np.array(self.matrix, float).reshape(4, 4).T
         pose = np.eye(4)
@@ -190,13 +190,13 @@ class Node(Schema):
 
 
 class Scene(Schema):
-    """Root nodes."""
+    """A scene: the indices of its root nodes."""
 
     nodes: list[NonNegativeInt] = []
 
 
 class Gltf(Schema):
-    """The whole file."""
+    """The JSON of a glTF file."""
 
     scene: NonNegativeInt = 0
     scenes: list[Scene] = []

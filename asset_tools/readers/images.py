@@ -1,4 +1,4 @@
-"""Textures: bounded in size, as 8-bit RGB whatever they are stored as."""
+"""Read textures of limited size and convert them to 8-bit RGB."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.text import one_line
 
 LARGEST_IMAGE = 16384**2  # pixels: 0.8 GB once unpacked
-USEFUL_SIDE = 4096  # pixels of the longer side; larger textures are shrunk before anything is done with them
-# others start programs (EPS) or are no textures
+USEFUL_SIDE = 4096  # pixels of the longer side; larger textures are shrunk when they are read
+# other formats start programs (EPS) or are not used for textures
 FORMATS = ("PNG", "JPEG", "MPO", "BMP", "TGA", "TIFF", "WEBP", "GIF", "PPM", "DDS", "JPEG2000", "AVIF")
 
 
 def open_texture(data: bytes, where: object, notes: list[str]) -> Image.Image:
-    """Return a texture as RGB with at most 4096 pixels a side.
+    """Return a texture as 8-bit RGB with at most 4096 pixels per side.
 
-    16-bit and floating-point images are scaled to 8 bits. Transparency is dropped.
+    Larger textures are shrunk. 16-bit and floating-point images are scaled to 8 bits. Transparency is dropped.
 
     Args:
-        data: of the image file.
-        where: for errors.
-        notes: gets a line if the texture was shrunk.
+        data: content of the image file.
+        where: path of the file, for errors.
+        notes: list to which a note is appended if the texture was shrunk.
 
     Raises:
-        AssetError: the data is no image, cut short, or of more than 16384 x 16384 pixels.
+        AssetError: the data is not an image, is truncated, or has more than 16384 x 16384 pixels.
     """
     Image.init()
     formats = [name for name in FORMATS if name in Image.OPEN]
@@ -41,15 +41,17 @@ def open_texture(data: bytes, where: object, notes: list[str]) -> Image.Image:
             return _rgb(_shrunk(image, notes))
     except (Image.DecompressionBombError, MemoryError) as error:
         expected = "at most 16384 x 16384 pixels"
-        raise AssetError("the texture is too large", where=where, expected=expected) from error
+        fix = "Shrink the texture."
+        raise AssetError("the texture is too large", where=where, expected=expected, fix=fix) from error
     except (OSError, SyntaxError, ValueError, EOFError, ArithmeticError, LookupError, TypeError) as error:
-        found = "no image" if isinstance(error, UnidentifiedImageError) else one_line(error)
-        raise AssetError("can't read the texture", where=where, found=found, fix="Save it as PNG.") from error
+        found = "data that is not an image" if isinstance(error, UnidentifiedImageError) else one_line(error)
+        fix = "Save the texture as PNG."
+        raise AssetError("cannot read the texture", where=where, found=found, fix=fix) from error
 
 
 @contextmanager
 def _size_limit() -> Iterator[None]:
-    """Let Pillow open images as large as textures may be; its own limit is lower."""
+    """Raise the limit of Pillow for the number of pixels to `LARGEST_IMAGE` during the block."""
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, LARGEST_IMAGE
     try:
         yield
@@ -71,7 +73,7 @@ def _shrunk(image: Image.Image, notes: list[str]) -> Image.Image:
 
 
 def _rgb(image: Image.Image) -> Image.Image:
-    """Return an image as RGB; Pillow itself cuts 16-bit greys off at 255."""
+    """Convert an image to 8-bit RGB; scale 16-bit and float values, which Pillow would clip at 255."""
     if image.mode.startswith("I") or image.mode == "F":
         values = np.nan_to_num(np.asarray(image))
         wide = image.mode.startswith("I;16") or (len(values) > 0 and float(values.max()) > 255)

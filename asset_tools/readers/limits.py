@@ -1,4 +1,4 @@
-"""Limit time and memory for reading untrusted files."""
+"""Limit the time and the memory for reading untrusted files."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ MAX_MEMORY = 2 * 2**30  # bytes
 
 @contextmanager
 def reading_limits(where: object) -> Iterator[None]:
-    """Abort the block after 25 s, or if it needs more than 2 GB of additional memory.
+    """Abort the block after 25 s, or if the block needs more than 2 GB of additional memory.
 
     The time limit applies only in the main thread, since other threads cannot set an alarm.
 
     Args:
-        where: the model, for messages.
+        where: path of the model, for errors.
 
     Raises:
         AssetError: a limit was exceeded.
@@ -62,7 +62,7 @@ def reading_limits(where: object) -> Iterator[None]:
 
 
 class _Timeout(BaseException):
-    """Timeout; not an Exception, so that parsers do not catch it."""
+    """Error that ends the block after the time limit; a BaseException, so that parsers do not catch it."""
 
 
 class _Alarm:

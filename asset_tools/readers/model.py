@@ -1,4 +1,4 @@
-"""Read the files of a model as one mesh."""
+"""Read the files of a model as one mesh, in all supported formats."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 import trimesh
 
-from asset_tools.readers.choice import FORMATS, Candidate, choose_candidates, is_collision, is_mesh, mesh_files
+from asset_tools.readers.choice import FORMATS, Candidate, choose_candidates, find_mesh_files, is_collision, is_mesh
 from asset_tools.readers.exchange import read_exchange
 from asset_tools.readers.files import ModelFiles
 from asset_tools.readers.gltf import read_gltf
@@ -38,9 +38,9 @@ class Model:
 
     Attributes:
         mesh: all triangles, in the unit and frame of the file.
-        up: axis that points up by the rules of the format; None: the format has no rule.
-        files: all files that were read, for a content hash.
-        notes: used and ignored files, substitutions and warnings, one line each.
+        up: axis that points up according to the file format; None: the format does not define it.
+        files: all files that were read, for the hash of the inputs.
+        notes: one line for each used, ignored or replaced file, and for each warning.
     """
 
     mesh: trimesh.Trimesh
@@ -50,15 +50,15 @@ class Model:
 
 
 def read_model(path: Path | list[Path], root: Path | None = None) -> Model:
-    """Read a model: a mesh file, a folder with its files, or several files, which may be versions of one mesh.
+    """Read a model as one mesh.
 
     Args:
-        path: of the model.
-        root: the imported folder; no files outside of it are read. None: the model's own folder.
+        path: a mesh file, a folder of mesh files, or several mesh files, which may be versions of one mesh.
+        root: the imported folder; files outside of this folder are not read. None: the folder of the model.
 
     Raises:
         AssetError: a file is missing, damaged, too large or outside of ``root``; the mesh is empty or has an invalid
-            size; or a folder contains several objects.
+            size; or the folder contains several objects.
     """
     paths = [Path(os.path.abspath(item)) for item in (path if isinstance(path, list) else [path])]
     is_folder = paths[0].is_dir()
@@ -67,14 +67,22 @@ def read_model(path: Path | list[Path], root: Path | None = None) -> Model:
     if len(paths) == 1 and not is_folder:
         chosen = [_candidate(paths[0], files)]
     else:
-        chosen = _chosen(mesh_files(home) if is_folder else paths, files)
+        chosen = _chosen(find_mesh_files(home) if is_folder else paths, files)
     mesh = to_mesh([part for candidate in chosen for part in candidate.parts])
     _check(mesh, paths[0])
     return Model(mesh, _up(chosen[0].path, files), tuple(files.used), tuple(dict.fromkeys(files.notes)))
 
 
 def _chosen(paths: list[Path], files: ModelFiles) -> list[Candidate]:
-    """Return the candidates that form the object; keep the notes of the used files only."""
+    """Read mesh files and return the candidates that form the object.
+
+    Args:
+        paths: mesh files.
+        files: files of the model; notes on the used files are added to ``files.notes``.
+
+    Raises:
+        AssetError: no file can be read, or the files are not parts of one object.
+    """
     collision = [path for path in paths if is_collision(path, files.home)]
     if len(collision) == len(paths):
         collision = []
@@ -105,22 +113,23 @@ def _chosen(paths: list[Path], files: ModelFiles) -> list[Candidate]:
 
 def _candidate(path: Path, files: ModelFiles) -> Candidate:
     if not os.path.lexists(path):
-        raise AssetError("no such mesh file", where=path)
+        raise AssetError("no such mesh file", where=path, fix="Check the path.")
     if not is_mesh(path):
-        raise AssetError("not a mesh file", where=path, expected=f"one of {', '.join(FORMATS)}", found=path.suffix)
+        expected, found = f"a file of type {', '.join(FORMATS)}", path.suffix or "a file without suffix"
+        raise AssetError("not a mesh file", where=path, expected=expected, found=found)
     parts = READERS.get(path.suffix.lower(), read_exchange)(path, files)
     parts = [_clean(part, path, files) for part in parts if len(part.faces)]
     if not parts:
-        fix = "Export it again, with its faces."
-        raise AssetError("the mesh is empty", where=path, expected="triangles", found="none", fix=fix)
+        fix = "Export the mesh again, with its faces."
+        raise AssetError("the mesh is empty", where=path, expected="triangles", found="no triangles", fix=fix)
     return Candidate(path, parts)
 
 
 def _clean(part: MeshPart, path: Path, files: ModelFiles) -> MeshPart:
-    """Return a part without unused vertices and without non-finite UVs and colours.
+    """Return a part without unused vertices, and without UVs, colours or normals that are NaN or infinite.
 
     Raises:
-        AssetError: faces have non-finite vertices.
+        AssetError: a face has a NaN or infinite vertex.
     """
     used, faces = np.unique(part.faces, return_inverse=True)
     vertices, uvs, colors, normals = (
@@ -128,8 +137,8 @@ def _clean(part: MeshPart, path: Path, files: ModelFiles) -> MeshPart:
     )
     assert vertices is not None
     if not np.isfinite(vertices).all():
-        found = f"{int((~np.isfinite(vertices).all(axis=1)).sum())} of {len(vertices)}"
-        fix = "Export it again."
+        found = f"{int((~np.isfinite(vertices).all(axis=1)).sum())} of {len(vertices)} vertices"
+        fix = "Export the mesh again."
         raise AssetError("the mesh has NaN or infinite vertices", where=path, found=found, fix=fix)
     if uvs is not None and not (np.abs(uvs) < LARGEST_UV).all():
         files.notes.append(f"warning: {path.name}: ignored a texture with NaN or infinite coordinates")
@@ -144,11 +153,11 @@ def _clean(part: MeshPart, path: Path, files: ModelFiles) -> MeshPart:
 
 def _check(mesh: trimesh.Trimesh, path: Path) -> None:
     if len(mesh.faces) > MOST_FACES:
-        expected = f"at most {MOST_FACES:,}"
-        raise AssetError("the mesh has too many faces", where=path, expected=expected, fix="Reduce it.")
-    size, fix = float(mesh.extents.max()), "Export it again, in metres."
+        expected, found, fix = f"at most {MOST_FACES:,}", f"{len(mesh.faces):,}", "Reduce the number of faces."
+        raise AssetError("the mesh has too many faces", where=path, expected=expected, found=found, fix=fix)
+    size, fix = float(mesh.extents.max()), "Export the mesh again, in metres."
     if not 1e-9 < size < 1e9:
-        expected, found = "1e-9 to 1e9 units", f"{size:g}"
+        expected, found = "a longest side of 1e-9 to 1e9 units", f"{size:g}"
         raise AssetError("invalid size of the mesh", where=path, expected=expected, found=found, fix=fix)
 
 

@@ -28,13 +28,13 @@ class MtlMaterial:
     """A material of an MTL file.
 
     Attributes:
-        name: name in the file, with single spaces.
-        color: Kd, (3,) 0 to 1, sRGB; None: not given.
-        emission: Ke, in the same format.
+        name: name in the file; several spaces become one.
+        color: diffuse sRGB colour (``Kd``), 0 to 1; None: not in the file.
+        emission: emitted sRGB colour (``Ke``), 0 to 1; None: not in the file.
         image: name of the colour texture (``map_Kd``, else ``map_Ka``); empty: none.
         emission_image: name of the emissive texture (``map_Ke``).
-        uv_scale: of the colour texture (``-s``).
-        uv_offset: of the colour texture (``-o``).
+        uv_scale: factors of the UVs of the colour texture (``-s``).
+        uv_offset: offsets of the UVs of the colour texture (``-o``), added after scaling.
         transparent: whether the material is transparent (``d``, ``Tr``, ``map_d``).
     """
 
@@ -50,19 +50,19 @@ class MtlMaterial:
 
 @dataclass
 class ObjMesh:
-    """The content of an OBJ file, polygons as triangles.
+    """The content of an OBJ file; polygons are split into triangles.
 
     Attributes:
-        vertices: (V, 3).
-        colors: (V, 3) 0 to 1, sRGB; None: no vertex has a colour.
-        uvs: (T, 2), v upward.
-        normals: (N, 3).
-        faces: (F, 3) indices of vertices.
+        vertices: (V, 3) positions.
+        colors: (V, 3) sRGB colours of the vertices, 0 to 1; None: no vertex has a colour.
+        uvs: (T, 2) texture coordinates, v upward.
+        normals: (N, 3) normals.
+        faces: (F, 3) indices of ``vertices``.
         face_uvs: (F, 3) indices of ``uvs``, -1 if missing.
         face_normals: (F, 3) indices of ``normals``, -1 if missing.
         face_materials: (F,) indices of ``material_names``; -1: before the first ``usemtl``.
-        material_names: names of ``usemtl``, with single spaces.
-        libraries: the rest of each ``mtllib`` line.
+        material_names: names in ``usemtl`` lines; several spaces become one.
+        libraries: text after ``mtllib`` of each such line: one file name with spaces, or several file names.
     """
 
     vertices: Array
@@ -78,7 +78,7 @@ class ObjMesh:
 
 
 def decode_text(data: bytes) -> str:
-    """Decode a text as UTF-8, with or without a byte order mark, or else as Windows-1252."""
+    """Decode bytes as UTF-8, with or without a byte order mark; if they are not valid UTF-8, as Windows-1252."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -86,7 +86,11 @@ def decode_text(data: bytes) -> str:
 
 
 def parse_mtl(text: str) -> dict[str, MtlMaterial]:
-    """Return the materials of an MTL file by name; invalid statements are ignored."""
+    """Parse an MTL file and return name -> material; invalid statements are ignored.
+
+    Args:
+        text: content of the file.
+    """
     found: dict[str, MtlMaterial] = {}
     current: MtlMaterial | None = None
     ambient: dict[str, str] = {}
@@ -119,7 +123,7 @@ def parse_mtl(text: str) -> dict[str, MtlMaterial]:
 
 
 def find_material(name: str, materials: dict[str, MtlMaterial]) -> MtlMaterial | None:
-    """Return a material by its exact name, or else by its name without regard to case."""
+    """Return the material with a name; if there is none, the material whose name differs only in letter case."""
     if name in materials:
         return materials[name]
     alike = [material for other, material in materials.items() if other.casefold() == name.casefold()]
@@ -131,7 +135,7 @@ def parse_obj(text: str, where: object) -> ObjMesh:
 
     Args:
         text: content of the file.
-        where: path, for messages.
+        where: path of the file, for errors.
 
     Raises:
         AssetError: a number or an index is invalid, or the file has too many faces or vertices.
@@ -178,11 +182,12 @@ def parse_obj(text: str, where: object) -> ObjMesh:
         if len(triangles) > MOST_FACES:
             raise _too_many("faces", MOST_FACES, where)
         table = np.array(corners, np.int64).reshape(-1, 3)
-        for column, count, what in zip(table.T, (len(points), len(uvs), len(normals)), ("v", "vt", "vn"), strict=True):
+        kinds = ("vertex (v)", "texture coordinate (vt)", "normal (vn)")
+        for column, count, what in zip(table.T, (len(points), len(uvs), len(normals)), kinds, strict=True):
             if len(column) and (column.max() >= count or column.min() < -1):
-                raise ValueError(f"a face refers to {what} {int(column.max()) + 1} of {count}")
+                raise ValueError(f"a face refers to {what} {int(column.max()) + 1}, but the file has only {count}")
         if len(table) and table[:, 0].min() < 0:
-            raise ValueError("a face refers to vertex 0")
+            raise ValueError("a face refers to vertex (v) 0, but indices start at 1")
         triangles = _with_concave(triangles, source, np.array(counts, np.int64), vertices[table[:, 0]])
         return ObjMesh(
             vertices,
@@ -197,11 +202,12 @@ def parse_obj(text: str, where: object) -> ObjMesh:
             libraries,
         )
     except (ValueError, IndexError, OverflowError) as error:
-        raise AssetError("cannot read this mesh", where=where, found=error) from error
+        fix = "Export the mesh again."
+        raise AssetError("cannot read this mesh", where=where, found=error, fix=fix) from error
 
 
 def _statements(text: str) -> Iterator[tuple[str, str]]:
-    """Yield keyword and rest of each line, without comments and with continued lines joined."""
+    """Yield the keyword and the rest of each line; comments are skipped, and continued lines are joined."""
     # an iterator, since a list of lines needs ten times the memory of the text
     for line in re.finditer(r"[^\r\n]+", re.sub(r"\\\r?\n", " ", text)):
         words = line[0].split(None, 1)
@@ -210,12 +216,19 @@ def _statements(text: str) -> Iterator[tuple[str, str]]:
 
 
 def _corner(word: str, points: int, uvs: int, normals: int) -> tuple[int, int, int]:
-    """Return the indices of ``v/vt/vn``, starting at 0; -1 for missing ones."""
+    """Parse the corner ``v/vt/vn`` of a face: return three indices that start at 0; -1 for a missing index.
+
+    Args:
+        word: text of the corner.
+        points: number of vertices so far, to which a negative index is relative.
+        uvs: number of texture coordinates so far.
+        normals: number of normals so far.
+    """
     parts = (word.split("/") + ["", ""])[:3]
     index = [int(part) if part else 0 for part in parts]
     counts = (points, uvs, normals)
     if not index[0] or any(-value > count for value, count in zip(index, counts, strict=True)):
-        raise ValueError(f"a face refers to {word} of {points} vertices")
+        raise ValueError(f"a face refers to {word}, but only {points} vertices precede the face")
     first, second, third = (
         value - 1 if value >= 0 else count + value for value, count in zip(index, counts, strict=True)
     )
@@ -223,7 +236,14 @@ def _corner(word: str, points: int, uvs: int, normals: int) -> tuple[int, int, i
 
 
 def _fans(counts: Ints) -> tuple[Ints, Ints]:
-    """Split polygons into fans; return triangles (F, 3) as corner indices, and the polygon (F,) of each triangle."""
+    """Split polygons into fans of triangles.
+
+    Args:
+        counts: (P,) number of corners of each polygon.
+
+    Returns:
+        Triangles (F, 3) as indices of corners, and the polygon (F,) of each triangle.
+    """
     starts = np.cumsum(counts) - counts
     many = counts - 2
     source = np.repeat(np.arange(len(counts)), many)
@@ -233,10 +253,10 @@ def _fans(counts: Ints) -> tuple[Ints, Ints]:
 
 
 def _with_concave(triangles: Ints, source: Ints, counts: Ints, points: Array) -> Ints:
-    """Replace the fans of concave polygons by proper triangulations.
+    """Replace the fans of concave polygons by triangles inside the polygon; return triangles (F, 3).
 
     Args:
-        triangles: (F, 3) fans as corner indices.
+        triangles: (F, 3) triangles of the fans as indices of corners.
         source: (F,) polygon of each triangle.
         counts: (P,) number of corners of each polygon.
         points: (C, 3) positions of the corners.
@@ -262,20 +282,29 @@ def _with_concave(triangles: Ints, source: Ints, counts: Ints, points: Array) ->
 
 
 def _numbers(rows: list[str], columns: int, fill: float | None = None) -> Array:
-    """Return the first numbers of each row, completed by ``fill``."""
+    """Parse rows of numbers and return the first ``columns`` numbers of each row (R, columns).
+
+    Args:
+        rows: text of each row.
+        columns: number of columns.
+        fill: value for missing numbers; None: a missing number is an error.
+    """
     found = np.empty((len(rows), columns))
     for start in range(0, len(rows), 100_000):  # in chunks, since words need much more memory than numbers
         words = [row.split() for row in rows[start : start + 100_000]]
         if fill is not None:
             words = [line + [str(fill)] * (columns - len(line)) for line in words]
         if any(len(line) < columns for line in words):
-            raise ValueError(f"a vertex, normal or coordinate with fewer than {columns} numbers")
+            raise ValueError(f"a vertex (v) or normal (vn) has fewer than {columns} numbers")
         found[start : start + len(words)] = np.array([line[:columns] for line in words], dtype=float)
     return found
 
 
 def _colors(rows: list[str]) -> Array | None:
-    """Return vertex colours (x y z r g b), white if missing; None if no vertex has a colour."""
+    """Return the colours (V, 3) in 0..1 of vertices "x y z r g b"; None if no vertex has a colour.
+
+    A vertex without a colour is white.
+    """
     if len(rows) == 0 or not any(len(row.split()) in (6, 7) for row in (rows[0], rows[len(rows) // 2], rows[-1])):
         return None
     words = [row.split()[3:6] for row in rows]
@@ -297,7 +326,7 @@ def _color(rest: str) -> tuple[float, float, float] | None:
 
 
 def _map(rest: str) -> tuple[str, tuple[float, float], tuple[float, float]]:
-    """Return the file name of a map statement, which may have spaces, and scale and offset of its UVs."""
+    """Parse a map statement of an MTL file; return the file name, which may have spaces, and UV scale and offset."""
     vectors: dict[str, list[float]] = {}
     left = rest.strip()
     while left.startswith("-"):
@@ -332,4 +361,5 @@ def _pair(values: list[float], default: float) -> tuple[float, float]:
 
 
 def _too_many(what: str, limit: int, where: object) -> AssetError:
-    return AssetError(f"the mesh has too many {what}", where=where, expected=f"at most {limit:,}", fix="Reduce it.")
+    expected, fix = f"at most {limit:,}", "Reduce the mesh."
+    return AssetError(f"the mesh has too many {what}", where=where, expected=expected, fix=fix)

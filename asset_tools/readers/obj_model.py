@@ -25,12 +25,13 @@ MOST_MATERIALS = 1000
 def read_obj(path: Path, files: ModelFiles) -> list[MeshPart]:
     """Read an OBJ file as one part per material.
 
-    Faces without a known material get the only textured material. If there is no such material, or several, the faces
+    Faces without a known material get the textured material of the file if there is exactly one. Otherwise these faces
     are white.
 
     Args:
-        path: the file.
-        files: reads the file and its materials; a note per substitution is added.
+        path: path of the file.
+        files: files of the model, which reads the file, its materials and textures; notes on replaced files are added
+            to ``files.notes``.
 
     Raises:
         AssetError: the file is damaged, or a material file or texture that its faces need is missing.
@@ -45,7 +46,7 @@ def read_obj(path: Path, files: ModelFiles) -> list[MeshPart]:
     used, starts = np.unique(mesh.face_materials[order], return_index=True)
     if len(used) > MOST_MATERIALS:
         expected = f"at most {MOST_MATERIALS}"
-        fix = "Bake its materials into one texture."
+        fix = "Bake the materials into one texture."
         raise AssetError("the mesh has too many materials", where=path, expected=expected, found=len(used), fix=fix)
     for index, rows in zip(used.tolist(), np.split(order, starts[1:]), strict=True):
         name = mesh.material_names[index] if index >= 0 else ""
@@ -60,7 +61,7 @@ def read_obj(path: Path, files: ModelFiles) -> list[MeshPart]:
 
 
 def _libraries(mesh: ObjMesh, path: Path, files: ModelFiles) -> dict[str, tuple[MtlMaterial, Path]]:
-    """Return the materials of all MTL files of a mesh, with their files."""
+    """Read all MTL files of a mesh; return name of the material -> material and path of its MTL file."""
     places: list[Path] = []
     missing: list[str] = []
     for line in mesh.libraries:
@@ -87,13 +88,13 @@ def _libraries(mesh: ObjMesh, path: Path, files: ModelFiles) -> dict[str, tuple[
 
 
 def _find_sibling(path: Path, suffixes: tuple[str, ...]) -> Path | None:
-    """Return the file next to ``path`` with the same stem, ignoring case, and one of the suffixes."""
+    """Return the file in the folder of ``path`` with an equal stem, ignoring case, and one of the suffixes, or None."""
     alike = {file.suffix.lower(): file for file in path.parent.iterdir() if file.stem.lower() == path.stem.lower()}
     return next((alike[suffix] for suffix in suffixes if suffix in alike), None)
 
 
 def _only_library(mesh: ObjMesh, path: Path, files: ModelFiles) -> Path | None:
-    """Return the only MTL file next to an OBJ file, if it has all materials of the faces."""
+    """Return the MTL file in the folder of an OBJ file if it is the only one and has all materials of the faces."""
     found = [file for file in path.parent.iterdir() if file.suffix.lower() == ".mtl"]
     if len(found) != 1 or not mesh.material_names:
         return None
@@ -104,7 +105,15 @@ def _only_library(mesh: ObjMesh, path: Path, files: ModelFiles) -> Path | None:
 def _material(
     name: str, materials: dict[str, tuple[MtlMaterial, Path]], has_uvs: bool, path: Path, files: ModelFiles
 ) -> tuple[MtlMaterial, Path] | None:
-    """Return the material of faces and its file; None: white."""
+    """Choose the material of faces; return the material and the path of its file, or None for white faces.
+
+    Args:
+        name: name of the material in the OBJ file; empty: none.
+        materials: name -> material and path of its MTL file.
+        has_uvs: whether a face has texture coordinates.
+        path: path of the OBJ file.
+        files: files of the model; a note is added if another material or an image is used.
+    """
     exact = find_material(name, {key: material for key, (material, _) in materials.items()}) if name else None
     if exact is not None:
         return materials[exact.name]
@@ -136,7 +145,16 @@ def _part(
     images: dict[str, Image.Image],
     files: ModelFiles,
 ) -> MeshPart:
-    """Return the triangles of one material, with one vertex per distinct corner."""
+    """Return the part with the given faces; each distinct corner of a face becomes a vertex.
+
+    Args:
+        mesh: content of the OBJ file.
+        rows: (F,) indices of the faces.
+        material: material of the faces; None: white.
+        place: path of the material's MTL file.
+        images: name -> texture image; images that are read are added.
+        files: files of the model.
+    """
     use_normals = bool((mesh.face_normals[rows] >= 0).all())
     shown, uv_map = _resolve_material(material, place, images, files, bool((mesh.face_uvs[rows] >= 0).all()))
     columns = [mesh.faces[rows].reshape(-1)]
@@ -163,7 +181,7 @@ def _part(
 def _resolve_material(
     material: MtlMaterial | None, place: Path, images: dict[str, Image.Image], files: ModelFiles, has_uvs: bool
 ) -> tuple[Material, tuple[tuple[float, float], tuple[float, float]]]:
-    """Return the material for rendering, and scale and offset of its UVs."""
+    """Convert a material of an MTL file to a colour and an image; also return scale and offset of the UVs."""
     plain = (1.0, 1.0), (0.0, 0.0)
     if material is None:
         return Material(), plain

@@ -1,4 +1,4 @@
-"""Common representation of all formats: parts with one material each, which are joined to one mesh.
+"""Represent models of all formats as parts with one material each, and join the parts to one mesh.
 
 Colours are linear in 0..1, as in glTF; images and 8-bit colours are sRGB. Transparency is dropped.
 """
@@ -29,8 +29,8 @@ class Material:
     """Material of faces: an image multiplied by a colour.
 
     Attributes:
-        color: (3,) linear.
-        image: sRGB image, or None.
+        color: linear RGB colour, 0 to 1.
+        image: sRGB image; None: the faces have only the colour.
     """
 
     color: tuple[float, float, float] = WHITE
@@ -42,11 +42,11 @@ class MeshPart:
     """Triangles of one material.
 
     Attributes:
-        vertices: (V, 3) in the model's frame and unit.
-        faces: (F, 3).
-        uvs: (V, 2), v upward, or None.
-        colors: (V, 3) linear, multiplied by the material; None: white.
-        normals: (V, 3) unit normals of the file, or None.
+        vertices: (V, 3) positions in the frame and unit of the model.
+        faces: (F, 3) indices of vertices.
+        uvs: (V, 2) texture coordinates, v upward, or None.
+        colors: (V, 3) linear colours by which the material is multiplied; None: white.
+        normals: (V, 3) unit normals from the file, or None.
         material: material of all faces.
     """
 
@@ -58,10 +58,11 @@ class MeshPart:
     material: Material = field(default_factory=Material)
 
 
-class Textures(TrimeshMaterial):
-    """Material of a mesh with several or tinted textures.
+class MultiTextureMaterial(TrimeshMaterial):
+    """Material of a mesh with several texture images, or with an image that is multiplied by colours.
 
-    The mesh has the vertex attributes `TEXTURE`, index of the image, and `TINT`, (V, 3) linear factors.
+    A mesh with this material has two vertex attributes: `TEXTURE` (V,) is the index of the image, and `TINT` (V, 3) is
+    the linear RGB factor.
     """
 
     def __init__(self, images: Sequence[Image.Image]) -> None:
@@ -70,26 +71,27 @@ class Textures(TrimeshMaterial):
 
     @property
     def main_color(self) -> NDArray[np.uint8]:
-        """White."""
+        """White, RGBA (4,) in 0..255, since the colours are in the images."""
         return np.full(4, 255, np.uint8)
 
-    def copy(self) -> Textures:
-        """Return itself; images are immutable."""
+    def copy(self) -> MultiTextureMaterial:
+        """Return this material without a copy, since it is never changed."""
         return self
 
     def __hash__(self) -> int:
-        """Return a hash of the images."""
+        """Return a hash of the identities of the images."""
         return hash(tuple(map(id, self.images)))
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Textures) and other.images == self.images
+        return isinstance(other, MultiTextureMaterial) and other.images == self.images
 
 
 def to_mesh(parts: Sequence[MeshPart]) -> trimesh.Trimesh:
-    """Join parts to one mesh with the same colours.
+    """Join parts to one mesh with the colours of the parts.
 
-    Its visual is undefined if all parts are white, has vertex colours (sRGB) without images, a ``SimpleMaterial`` for
-    one untinted image, and `Textures` otherwise.
+    ``mesh.visual`` depends on the parts. If all parts are white, it is undefined. If no part has an image, it has sRGB
+    vertex colours. If all parts have one image and no other colours, it has a ``SimpleMaterial``. Otherwise it has a
+    `MultiTextureMaterial`.
     """
     parts = [part for part in parts if len(part.faces)]
     if not parts:
@@ -115,20 +117,20 @@ def to_mesh(parts: Sequence[MeshPart]) -> trimesh.Trimesh:
         images.append(Image.new("RGB", (1, 1), (255, 255, 255)))
     place = {id(image): i for i, image in enumerate(images)}
     which = [np.full(len(part.vertices), place.get(id(_image(part)), len(images) - 1)) for part in parts]
-    mesh.visual = TextureVisuals(uv=uvs, material=Textures(images))
+    mesh.visual = TextureVisuals(uv=uvs, material=MultiTextureMaterial(images))
     mesh.vertex_attributes[TEXTURE] = np.concatenate(which)
     mesh.vertex_attributes[TINT] = tints
     return mesh
 
 
 def decode_srgb(values: NDArray) -> Array:
-    """Convert sRGB colours in 0..255 to linear colours in 0..1."""
+    """Convert sRGB colours (...) in 0..255 to linear colours (...) in 0..1."""
     share = np.asarray(values, dtype=float) / 255
     return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
 
 def encode_srgb(values: Array) -> NDArray[np.uint8]:
-    """Convert linear colours in 0..1 to 8-bit sRGB colours."""
+    """Convert linear colours (...) in 0..1 to 8-bit sRGB colours (...) in 0..255."""
     linear = np.clip(values, 0, 1)
     share = np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
     return np.rint(255 * share).astype(np.uint8)

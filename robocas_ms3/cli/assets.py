@@ -128,13 +128,13 @@ class Build:
 
 def import_scans(command: ImportScans) -> int:
     require_mesh_tools()
-    from asset_tools.import_scans import ImportSettings, scan_jobs
+    from asset_tools.import_scans import ImportSettings, make_scan_jobs
 
     out, masses = _target(command.pack), _masses(command.masses)
     settings = ImportSettings(command.units, command.up, masses, command.licence, command.attribution)
     from robocas_ms3.cli.terminal import print_line
 
-    jobs = scan_jobs(
+    jobs = make_scan_jobs(
         command.source, settings, partial(_inspect, command), lambda reason: print_line(f"skipped {reason}")
     )
     return _import_pack(jobs, command, out, "scan")
@@ -142,19 +142,19 @@ def import_scans(command: ImportScans) -> int:
 
 def import_graspnet(command: ImportGraspNet) -> int:
     require_mesh_tools()
-    from asset_tools.graspnet.importer import graspnet_jobs
+    from asset_tools.graspnet.importer import make_graspnet_jobs
 
     out = _target(command.pack)
-    jobs = graspnet_jobs(command.root, command.ids, partial(_inspect, command))
+    jobs = make_graspnet_jobs(command.root, command.ids, partial(_inspect, command))
     return _import_pack(jobs, command, out, "GraspNet object")
 
 
 def import_ycb(command: ImportYCB) -> int:
     require_mesh_tools()
-    from asset_tools.import_ycb import ycb_jobs
+    from asset_tools.import_ycb import make_ycb_jobs
 
     out = _target(command.pack)
-    jobs = ycb_jobs(command.root, command.ids, partial(_inspect, command))
+    jobs = make_ycb_jobs(command.root, command.ids, partial(_inspect, command))
     return _import_pack(jobs, command, out, "YCB object")
 
 
@@ -162,7 +162,7 @@ def import_partnet(command: ImportPartNet) -> int:
     from robocas_ms3.core.errors import AssetError
 
     require_mesh_tools()
-    from asset_tools.partnet.importer import partnet_jobs
+    from asset_tools.partnet.importer import make_partnet_jobs
     from asset_tools.partnet.template import make_template
 
     if not command.models:
@@ -173,7 +173,7 @@ def import_partnet(command: ImportPartNet) -> int:
 
         print_text(make_template(command.models[0]))
         return 0
-    jobs = partnet_jobs(command.models, command.annotations)
+    jobs = make_partnet_jobs(command.models, command.annotations)
     return _import_pack(jobs, command, _target(command.pack), "PartNet model")
 
 

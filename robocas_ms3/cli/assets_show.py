@@ -168,8 +168,8 @@ def sheet(command: Sheet) -> int:
 
 def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
     require_mesh_tools()
-    from asset_tools.quality.measure import HEADER, check_objects, compare_with_manifest, object_rows
-    from asset_tools.quality.packs import FURNITURE_HEADER, check_furniture, furniture_rows, measure_pack
+    from asset_tools.quality.measure import HEADER, check_objects, compare_with_manifest, make_object_rows
+    from asset_tools.quality.packs import FURNITURE_HEADER, check_furniture, make_furniture_rows, measure_pack
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_table, table_console
     from robocas_ms3.core.files import write_json
@@ -184,7 +184,7 @@ def _verify_physics(pack: Pack, jobs: int, out: Path | None) -> int:
     objects = {name: measured[name] for name in pack.objects}
     furniture = {name: measured[name] for name in pack.furniture}
     console = table_console()
-    for header, cells in ((HEADER, object_rows(objects)), (FURNITURE_HEADER, furniture_rows(furniture))):
+    for header, cells in ((HEADER, make_object_rows(objects)), (FURNITURE_HEADER, make_furniture_rows(furniture))):
         print_table(header, cells)
     remeasured = {
         name: pack.objects[name].asset.model_copy(update={"quality": found}) for name, found in objects.items()

@@ -20,7 +20,7 @@ from models import texels, write_obj
 from PIL import Image
 
 from asset_tools.prepare import prepare_scan
-from asset_tools.visual import to_display
+from asset_tools.visual import make_display_mesh
 from robocas_ms3.core.errors import AssetError
 
 PROFILE = np.array([[0.03, 0.0], [0.03, 0.05], [0.03, 0.1], [0.012, 0.13], [0.012, 0.16]])  # radius, height in m
@@ -89,7 +89,7 @@ def check_bottle(scan, *, colors=True, volume=0.005):
     assert (np.einsum("fi,fi->f", middles, out * [1, 1, 0])[side] > 0).all()
     if not colors:
         return
-    light = to_display(scan.mesh, triangles=1000, texture_size=256)
+    light = make_display_mesh(scan.mesh, triangles=1000, texture_size=256)
     # so that each face counts that is seen from outside, and only from there
     points, faces = trimesh.sample.sample_surface(light, 4000, seed=1)[:2]
     seen = texels(light, points, faces)
@@ -137,7 +137,7 @@ def test_holes(tmp_path):
 def test_a_hole_too_large_is_an_error(tmp_path):
     vertices, uv, faces = bottle()
     half = vertices[faces].mean(axis=1)[:, 0] > 0
-    with pytest.raises(AssetError, match=r"cannot close the mesh to a solid.*holes of at most 35%"):
+    with pytest.raises(AssetError, match=r"the holes of the mesh are too large.*holes of at most 35%"):
         prepare_scan(write_scan(tmp_path, (vertices, uv, faces[half])))
 
 
@@ -207,10 +207,10 @@ def test_a_quarter_of_a_million_faces_take_less_than_a_gigabyte(tmp_path):
     code = f"""
 import re
 from asset_tools.prepare import prepare_scan
-from asset_tools.visual import to_display
+from asset_tools.visual import make_display_mesh
 from pathlib import Path
 scan = prepare_scan(Path({str(path)!r}))
-light = to_display(scan.mesh, triangles=12000, texture_size=1024)
+light = make_display_mesh(scan.mesh, triangles=12000, texture_size=1024)
 peak = re.search(r"VmHWM:\\s*(\\d+) kB", Path("/proc/self/status").read_text())[1]  # rusage has the parent's in it
 print(int(peak) / 1024**2, abs(light.volume / scan.mesh.volume - 1))
 """
@@ -223,7 +223,7 @@ print(int(peak) / 1024**2, abs(light.volume / scan.mesh.volume - 1))
 def test_other_units_and_y_up(tmp_path, scale, unit, words):
     scan = prepare_scan(write_scan(tmp_path, scale=scale, y_up=True))
     assert (scan.up, scan.unit) == ("y", unit)
-    assert scan.repairs == ("turned y up, a guess", f"scaled from {words}")
+    assert scan.repairs == ("rotated y up (guessed)", f"scaled from {words}")
     turned = scan.mesh.copy(include_cache=True), scan.closed.copy()
     # y up by [1, 2, 0] and back by a quarter turn about x leaves a quarter turn about z
     for mesh in turned:

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from asset_tools.contact_sheet import CAPTION, CELLS, GAP, LABEL, LARGE, write_contact_sheet
-from asset_tools.renderer import PAPER, RenderBody, Renderer, box_faces
+from asset_tools.renderer import PAPER, RenderBody, Renderer, make_box_faces
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import AssetError
 
@@ -47,8 +47,8 @@ def test_the_camera_renders_from_the_given_direction(studio):
     cubes = [
         RenderBody(faces.reshape(-1, 3), faces=faces, colour=colour)
         for faces, colour in (
-            (box_faces((-0.5, 1, -0.5), (0.5, 2, 0.5)), (0.9, 0.05, 0.05)),
-            (box_faces((-0.5, -2, -0.5), (0.5, -1, 0.5)), (0.05, 0.05, 0.9)),
+            (make_box_faces((-0.5, 1, -0.5), (0.5, 2, 0.5)), (0.9, 0.05, 0.05)),
+            (make_box_faces((-0.5, -2, -0.5), (0.5, -1, 0.5)), (0.05, 0.05, 0.9)),
         )
     ]
     image = studio.image(cubes, 0, 0)

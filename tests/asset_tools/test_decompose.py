@@ -10,7 +10,7 @@ from models import ball_dropped_into
 
 from asset_tools.decompose import GPU_LIMIT, MAX_VERTICES, count_flat_faces, decompose, reduce_vertices
 from asset_tools.prepare import prepare_scan
-from asset_tools.quality.hulls import hull_quality
+from asset_tools.quality.hulls import measure_hull_quality
 from robocas_ms3.assets.cooked_hulls import find_hull_violations
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.pack import HULLS
@@ -31,7 +31,7 @@ def test_a_scanned_cup_stays_hollow(tmp_path):
     closed = prepare_scan(tmp_path / "cup.ply", up="z").closed
     assert closed.volume == pytest.approx(mesh.volume, rel=0.02)
     found = decompose(closed)
-    quality = hull_quality(closed, found.hulls, hollow=True)
+    quality = measure_hull_quality(closed, found.hulls, hollow=True)
     assert quality.surface_p95 <= 0.004
     assert quality.hull_count <= 18
     assert (

@@ -8,11 +8,11 @@ import trimesh
 
 from asset_tools.partnet.annotation import BUNDLED_ANNOTATIONS, ModelAnnotation, find_annotation, load_annotation
 from asset_tools.partnet.collision import limit_for_gpu
-from asset_tools.partnet.importer import partnet_jobs, read_partnet
+from asset_tools.partnet.importer import make_partnet_jobs, read_partnet
 from asset_tools.partnet.template import make_template
 from asset_tools.pipeline import write_pack
 from asset_tools.quality.furniture import examine_furniture
-from asset_tools.quality.overlap import make_convex_body, max_overlap
+from asset_tools.quality.overlap import compute_max_overlap, make_convex_body
 from robocas_ms3.assets.hulls import find_box
 from robocas_ms3.assets.kinematics import joint_motion
 from robocas_ms3.assets.pack import load_pack
@@ -66,8 +66,9 @@ def chest(tmp_path):
 def overlap(link, others, share):
     """How deep a moving part reaches into others at a share of its range, m."""
     motion = joint_motion(link.joint, share * max(link.joint.limits, key=abs))
-    return max_overlap(
-        [make_convex_body(piece).moved(motion) for piece in link.pieces], [make_convex_body(other) for other in others]
+    return compute_max_overlap(
+        [make_convex_body(piece).transform(motion) for piece in link.pieces],
+        [make_convex_body(other) for other in others],
     )
 
 
@@ -181,16 +182,16 @@ def test_a_model_becomes_a_pack_and_the_same_bytes_again(chest, tmp_path):
     (notes / "chest.yaml").write_text("name: chest\ncategory: cabinet\norigin_lift: 0\n")
     packs = [tmp_path / "one" / "furniture", tmp_path / "two" / "furniture"]
     for number, out in enumerate(packs):
-        write_pack(partnet_jobs([chest], notes), out, tmp_path / f"kept{number}")
+        write_pack(make_partnet_jobs([chest], notes), out, tmp_path / f"kept{number}")
     loaded = load_pack(packs[0]).furniture["chest"]
     assert examine_furniture(loaded).joints["slide"].works  # from the files as well
     asset = loaded.asset
     assert (asset.source, asset.quality.joints_open) == ("partnet", 1.0)
     assert asset.files == load_pack(packs[1]).furniture["chest"].asset.files
-    before = partnet_jobs([chest], notes)[0].content
+    before = make_partnet_jobs([chest], notes)[0].content
     (chest / "paint.mtl").write_text("newmtl red\nKd 0.1 0.8 0.1\n")
-    assert partnet_jobs([chest], notes)[0].content != before
-    (job,) = partnet_jobs([chest, chest], notes)
+    assert make_partnet_jobs([chest], notes)[0].content != before
+    (job,) = make_partnet_jobs([chest, chest], notes)
     assert job.id == "chest"
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from asset_tools.import_scans import ImportSettings, estimate_mass, find_scans, object_id, scan_jobs
+from asset_tools.import_scans import ImportSettings, estimate_mass, find_scans, make_object_id, make_scan_jobs
 from asset_tools.pipeline import is_up_to_date, write_pack
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import AssetError
@@ -14,12 +14,12 @@ def write_box(folder, name, size=(4.0, 6.0, 10.0)):
 
 
 def test_names_become_ids_that_are_bounded_and_different():
-    assert object_id("Alphabet Soup (v2)") == "alphabet_soup_v2"
-    assert object_id("Käse") == "kase"
-    assert object_id("可乐") != object_id("牛奶") and object_id("可乐").startswith("object_")
-    assert len(object_id("a" * 250)) < 100 and object_id("a" * 250) != object_id("a" * 251)
-    assert object_id("../../x") == "x" and object_id("..").startswith("object_")
-    assert object_id("scan\udcff") == "scan"  # a file name that is no UTF-8
+    assert make_object_id("Alphabet Soup (v2)") == "alphabet_soup_v2"
+    assert make_object_id("Käse") == "kase"
+    assert make_object_id("可乐") != make_object_id("牛奶") and make_object_id("可乐").startswith("object_")
+    assert len(make_object_id("a" * 250)) < 100 and make_object_id("a" * 250) != make_object_id("a" * 251)
+    assert make_object_id("../../x") == "x" and make_object_id("..").startswith("object_")
+    assert make_object_id("scan\udcff") == "scan"  # a file name that is no UTF-8
 
 
 def test_mass_is_estimated_from_volume_within_limits():
@@ -47,11 +47,11 @@ def test_scans_in_centimetres_become_a_pack_without_the_bad_ones(tmp_path):
         (scans / f"{name}.ply").write_bytes(content)
     settings = ImportSettings(masses={"small": 0.2})
     with pytest.raises(AssetError) as error:
-        write_pack(scan_jobs(scans, settings), tmp_path / "mine", tmp_path / "kept")
+        write_pack(make_scan_jobs(scans, settings), tmp_path / "mine", tmp_path / "kept")
     assert "\n" not in str(error.value)
     assert not (tmp_path / "mine").exists() and not [path for path in tmp_path.rglob("*.tmp")]
 
-    results = write_pack(scan_jobs(scans, settings), tmp_path / "mine", tmp_path / "kept", skip_errors=True)
+    results = write_pack(make_scan_jobs(scans, settings), tmp_path / "mine", tmp_path / "kept", skip_errors=True)
     errors = {made.id: made.error for made in results if made.asset is None}
     assert errors.keys() == BAD.keys()
     assert all(name in message and "\n" not in message for name, message in errors.items())
@@ -66,10 +66,10 @@ def test_scans_in_centimetres_become_a_pack_without_the_bad_ones(tmp_path):
     assert len(box.annotations.resting_poses) == 6
     assert box.asset.grasp_count >= 50
     # nothing to do a second time, until a scan or a setting changes
-    assert is_up_to_date(scan_jobs(scans, settings), tmp_path / "mine", skip_errors=True)
-    assert not is_up_to_date(scan_jobs(scans, ImportSettings()), tmp_path / "mine", skip_errors=True)
+    assert is_up_to_date(make_scan_jobs(scans, settings), tmp_path / "mine", skip_errors=True)
+    assert not is_up_to_date(make_scan_jobs(scans, ImportSettings()), tmp_path / "mine", skip_errors=True)
     with pytest.raises(AssetError, match="found smal"):
-        scan_jobs(scans, ImportSettings(masses={"smal": 0.2}))
+        make_scan_jobs(scans, ImportSettings(masses={"smal": 0.2}))
 
 
 def test_a_folder_without_scans(tmp_path):

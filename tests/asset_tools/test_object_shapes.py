@@ -16,7 +16,7 @@ from asset_tools.decompose import decompose, limit_for_engine, reduce_vertices
 from asset_tools.repair import close_scan
 from asset_tools.simplify import simplify_mesh
 from asset_tools.sources import ObjectSource
-from asset_tools.visual import to_display
+from asset_tools.visual import make_display_mesh
 from robocas_ms3.assets.cooked_hulls import MAX_SHRINKAGE, MAX_SLENDERNESS, cook_hulls, find_hull_violations
 
 
@@ -191,7 +191,7 @@ def test_slender_hulls_are_thickened_as_a_gpu_needs_it():
 
 def test_a_mesh_that_cannot_be_simplified_to_the_limit_is_taken_with_more_faces():
     posts = joined(*[moved(cylinder(0.002, 0.05, sections=6), 0.01 * i, 0.01 * j, 0) for i, j in np.ndindex(10, 10)])
-    light = to_display(posts, triangles=1000)
+    light = make_display_mesh(posts, triangles=1000)
     assert 1000 < len(light.faces) <= 6000
     np.testing.assert_allclose(light.bounds, posts.bounds, atol=1e-3)
     few = simplify_mesh(posts, 100)
@@ -229,7 +229,7 @@ def test_simplifying_keeps_a_large_part_of_few_faces():
         cylinder(0.0006, 0.025, sections=6), np.linspace(-0.06, 0.06, 20), np.linspace(-0.01, 0.01, 8), 0.02
     )
     brush = joined(box([0.15, 0.03, 0.015]), *bristles)
-    light = to_display(brush, triangles=1000)
+    light = make_display_mesh(brush, triangles=1000)
     assert light.area == pytest.approx(brush.area, rel=0.1)
     np.testing.assert_allclose(light.bounds, brush.bounds, atol=1e-3)
 

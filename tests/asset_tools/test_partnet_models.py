@@ -11,7 +11,7 @@ from PIL import Image
 from trimesh.exchange.obj import export_obj
 
 from asset_tools.partnet.annotation import ModelAnnotation, find_annotation
-from asset_tools.partnet.importer import partnet_jobs, read_partnet
+from asset_tools.partnet.importer import make_partnet_jobs, read_partnet
 from asset_tools.partnet.template import make_template
 from asset_tools.pipeline import write_pack
 from robocas_ms3.core.errors import AssetError
@@ -172,7 +172,7 @@ def test_names_with_paths_are_refused_before_writing(folder, tmp_path, name, ele
     (folder / "mobility.urdf").write_text(urdf(**{element: name}).replace("\n", "&#10;"), encoding="utf-8")
     (tmp_path / "model.yaml").write_text("name: chest\ncategory: cabinet\norigin_lift: 0\n")
     before = sorted(tmp_path.rglob("*"))
-    (job,) = partnet_jobs([folder], tmp_path)
+    (job,) = make_partnet_jobs([folder], tmp_path)
     with pytest.raises(AssetError) as raised:
         job.make(tmp_path / "out")
     assert "mobility.urdf" in str(raised.value.where)
@@ -264,7 +264,7 @@ def test_a_bad_model_does_not_stop_the_others(folder, tmp_path):
     for name in ("model", "bad", "readme.txt"):
         (tmp_path / f"{name}.yaml").write_text("name: chest\ncategory: cabinet\norigin_lift: 0\n")
     models = [folder, bad, tmp_path / "nothing", file, tmp_path / "other" / "model"]
-    jobs = partnet_jobs(models, tmp_path)
+    jobs = make_partnet_jobs(models, tmp_path)
     assert len({job.id for job in jobs}) == len(jobs) == len(models)
     results = write_pack(jobs, tmp_path / "pack", tmp_path / "kept", skip_errors=True)
     assert sorted(made.id for made in results if made.asset) == ["model"]

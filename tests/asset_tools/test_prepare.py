@@ -5,9 +5,9 @@ import pytest
 import trimesh
 
 from asset_tools.decompose import decompose
-from asset_tools.inertia import principal_inertia
+from asset_tools.inertia import compute_principal_inertia
 from asset_tools.prepare import level_base, prepare_scan
-from asset_tools.resting_poses import resting_poses
+from asset_tools.resting_poses import find_resting_poses
 from robocas_ms3.assets.physics import RigidBody
 from robocas_ms3.core.errors import AssetError
 
@@ -25,9 +25,9 @@ def carton(bulge, size=0.07, height=0.19):
 
 
 def poses_of(closed):
-    inertia, axes = principal_inertia(closed, 0.3)
+    inertia, axes = compute_principal_inertia(closed, 0.3)
     hulls = decompose(closed).hulls
-    return resting_poses(RigidBody(hulls, 0.3, closed.center_mass, np.array(inertia), np.array(axes)))
+    return find_resting_poses(RigidBody(hulls, 0.3, closed.center_mass, np.array(inertia), np.array(axes)))
 
 
 def test_a_bulging_base_is_pressed_flat():
@@ -53,7 +53,7 @@ def test_axis_and_unit_can_be_given(tmp_path):
     assert (scan.up, scan.unit) == ("x", "inch")
     np.testing.assert_allclose(sorted(scan.closed.extents), [0.0254, 0.0508, 0.127])
     assert scan.closed.extents[2] == pytest.approx(0.0254)
-    assert {"turned x up", "scaled from inches"} <= set(scan.repairs)
+    assert {"rotated x up", "scaled from inches"} <= set(scan.repairs)
     with pytest.raises(AssetError, match="no such mesh"):
         prepare_scan(tmp_path / "lost.ply")
 

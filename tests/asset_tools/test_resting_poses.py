@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from sapien import physx
 
-from asset_tools.resting_poses import RestingPoses, resting_poses
+from asset_tools.resting_poses import RestingPoses, find_resting_poses
 from asset_tools.stability import toppling_angle
 from robocas_ms3.assets.physics import RigidBody
 from robocas_ms3.core.errors import AssetError
@@ -34,7 +34,7 @@ def solid(mesh: trimesh.Trimesh, mass: float = 0.3) -> RestingPoses:
     hull.density = mass / hull.volume
     moments = np.linalg.eigvalsh(hull.moment_inertia)
     # principal axes do not matter for whether a thing stays: only the moments' size does
-    result = resting_poses(body(np.asarray(hull.vertices), mass=mass, center=hull.center_mass, inertia=moments))
+    result = find_resting_poses(body(np.asarray(hull.vertices), mass=mass, center=hull.center_mass, inertia=moments))
     check(result, np.asarray(hull.vertices), np.asarray(hull.center_mass))
     return result
 
@@ -57,7 +57,7 @@ def check(result: RestingPoses, vertices: np.ndarray, center: np.ndarray) -> Non
 def test_box_has_its_six_faces_and_prefers_the_largest() -> None:
     points = box_points(0.04, 0.06, 0.10)
     inertia = box_inertia(0.2, 0.04, 0.06, 0.10)
-    result = resting_poses(body(points, mass=0.2, inertia=inertia))
+    result = find_resting_poses(body(points, mass=0.2, inertia=inertia))
     check(result, points, np.zeros(3))
     found = {
         tuple(np.round(pose[2, :3]).astype(int)): (p, pose[2, 3])
@@ -104,10 +104,10 @@ def test_resting_poses_are_deterministic_and_restore_the_engine_settings() -> No
 def test_weight_outside_and_flat_hulls_are_refused() -> None:
     points = box_points(0.04, 0.06, 0.10)
     with pytest.raises(AssetError, match="outside the hulls"):
-        resting_poses(body(points, center=(0.03, 0, 0)))
+        find_resting_poses(body(points, center=(0.03, 0, 0)))
     flat = points * [1, 1, 0]
     with pytest.raises(AssetError, match="no volume"):
-        resting_poses(body(flat))
+        find_resting_poses(body(flat))
 
 
 def test_toppling_angle_of_a_box_is_known():
@@ -123,7 +123,7 @@ def test_a_body_that_only_rocks_is_put_down_on_its_blunt_edges_too() -> None:
     """A bar 70 mm wide whose broad sides are roofs 1.1 mm high: each half is 1.8 deg off, and lets go at 1.8 deg."""
     outline = [(0.035, 0.0229), (0, 0.024), (-0.035, 0.0229), (-0.035, -0.0229), (0, -0.024), (0.035, -0.0229)]
     points = np.array([(x, y, z) for x, z in outline for y in (-0.085, 0.085)])
-    result = resting_poses(body(points, inertia=box_inertia(0.3, 0.07, 0.17, 0.047)))
+    result = find_resting_poses(body(points, inertia=box_inertia(0.3, 0.07, 0.17, 0.047)))
     ups = result.poses[:, 2, :3]
     slant = np.arctan(0.0011 / 0.035)
     broad = ups[np.abs(ups[:, 2]) > 0.9]
@@ -139,7 +139,7 @@ def test_box_with_its_weight_at_one_end_never_stands_on_a_slanted_far_end() -> N
         [(x, y, z) for y in (-0.03, 0.03) for x, z in ((-0.1, -0.03), (-0.1, 0.03), (0.1, -0.03), (0.04, 0.03))]
     )
     center = np.array([-0.08, 0.0, 0.0])
-    result = resting_poses(body(points, center=center, inertia=(2e-4, 4e-4, 4e-4)))
+    result = find_resting_poses(body(points, center=center, inertia=(2e-4, 4e-4, 4e-4)))
     check(result, points, center)
     downs = -result.poses[:, 2, :3]
     assert (downs[:, 0] < 0.1).all()
@@ -150,7 +150,7 @@ def test_box_with_its_weight_at_one_end_never_stands_on_a_slanted_far_end() -> N
 
 def test_an_eccentric_centre_of_mass_changes_the_poses() -> None:
     points = box_points(0.05, 0.05, 0.05)
-    low = resting_poses(body(points, mass=0.1, center=(0, 0, -0.02)))
+    low = find_resting_poses(body(points, mass=0.1, center=(0, 0, -0.02)))
     assert low.display_pose == 0
     # solid angle of the 0.05 m square seen from 5 mm above its middle
     assert low.probabilities[0] == pytest.approx(
@@ -167,7 +167,7 @@ def test_ball_gets_a_pose_that_stays() -> None:
 def test_an_object_of_two_pieces_stands_on_both() -> None:
     # A table of two legs: the convex hull bridges the gap, the pieces carry the weight
     legs = [box_points(0.02, 0.06, 0.05) + [side * 0.05, 0, 0] for side in (-1, 1)]
-    result = resting_poses(body(*legs, mass=0.2, inertia=(1e-4, 6e-4, 6e-4)))
+    result = find_resting_poses(body(*legs, mass=0.2, inertia=(1e-4, 6e-4, 6e-4)))
     check(result, np.concatenate(legs), np.zeros(3))
     assert len(result.poses) == 6
 
@@ -177,5 +177,5 @@ def test_a_pen_is_not_put_down_on_its_end(monkeypatch) -> None:
     points = box_points(0.004, 0.004, 0.15)
     pen = body(points, mass=0.01, inertia=box_inertia(0.01, 0.004, 0.004, 0.15))
     monkeypatch.setattr("asset_tools.resting_poses.RAREST", 0.0)
-    result = resting_poses(pen)
+    result = find_resting_poses(pen)
     assert np.abs(result.poses[:, 2, 2]).max() < 0.1

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from asset_tools.scan import guess_unit, guess_units, guess_up, rotate_upright
+from asset_tools.scan import guess_common_unit, guess_units, guess_up, rotate_upright
 from robocas_ms3.core.errors import AssetError
 
 
@@ -14,12 +14,12 @@ from robocas_ms3.core.errors import AssetError
     [([0.2], "m"), ([8.4, 14.8, 10.3, 19.2], "cm"), ([196.0], "mm"), ([0.05, 0.3], "m"), ([30.0], "cm")],
 )
 def test_units_are_guessed_from_sizes(longest, unit):
-    assert guess_unit(longest) == unit
+    assert guess_common_unit(longest) == unit
 
 
 def test_sizes_that_fit_no_unit_are_an_error():
-    with pytest.raises(AssetError, match=r"found 1e\+06 units\)\. Pass --units"):
-        guess_unit([1e6])
+    with pytest.raises(AssetError, match=r"found a longest side of 1e\+06\)\. Pass --units"):
+        guess_common_unit([1e6])
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from trimesh.visual.texture import TextureVisuals
 from asset_tools.glb import write_glb
 from asset_tools.readers.surface import Material, MeshPart, to_mesh
 from asset_tools.simplify import simplify_mesh
-from asset_tools.visual import to_display
+from asset_tools.visual import make_display_mesh
 
 COLORS = np.array([[220, 30, 30], [30, 200, 40], [30, 40, 220], [230, 220, 40], [200, 40, 210], [40, 210, 210]])
 SIDE = 0.1  # m
@@ -68,7 +68,7 @@ def fine_box() -> trimesh.Trimesh:
 
 @pytest.fixture(scope="module")
 def light_box(fine_box: trimesh.Trimesh) -> trimesh.Trimesh:
-    return to_display(fine_box, triangles=600, texture_size=128)
+    return make_display_mesh(fine_box, triangles=600, texture_size=128)
 
 
 def test_simplified_box_keeps_limits_frame_and_material(light_box):
@@ -116,7 +116,7 @@ def test_a_gradient_lands_where_it_was():
     """Colours follow the position within 2 % of the size, not merely the side."""
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
     ball.visual = trimesh.visual.ColorVisuals(ball, vertex_colors=(ball.vertices + 0.05) / 0.1)
-    points, colors = seen_colors(to_display(ball, triangles=1000, texture_size=256))
+    points, colors = seen_colors(make_display_mesh(ball, triangles=1000, texture_size=256))
     on_ball = points / np.linalg.norm(points, axis=1, keepdims=True) * 0.05
     assert np.abs(colors / 255 - (on_ball + 0.05) / 0.1).max() < 0.02
 
@@ -127,7 +127,7 @@ def test_thin_shell_keeps_inside_and_outside_apart():
     inner.invert()
     outer.visual.vertex_colors = [200, 0, 0, 255]
     inner.visual.vertex_colors = [0, 0, 200, 255]
-    light = to_display(trimesh.util.concatenate([outer, inner]), triangles=3000, texture_size=256)
+    light = make_display_mesh(trimesh.util.concatenate([outer, inner]), triangles=3000, texture_size=256)
     points, colors = seen_colors(light)
     facing_out = (points * np.repeat(light.face_normals, 4, axis=0)).sum(axis=1) > 0
     wanted = np.where(facing_out[:, None], [200, 0, 0], [0, 0, 200])
@@ -138,7 +138,7 @@ def test_thin_shell_keeps_inside_and_outside_apart():
 
 def test_glb_is_the_same_every_time_and_readable(fine_box, light_box, tmp_path):
     write_glb(light_box, tmp_path / "a.glb")
-    write_glb(to_display(fine_box, triangles=600, texture_size=128), tmp_path / "b.glb")
+    write_glb(make_display_mesh(fine_box, triangles=600, texture_size=128), tmp_path / "b.glb")
     data = (tmp_path / "a.glb").read_bytes()
     assert data == (tmp_path / "b.glb").read_bytes()
     assert struct.unpack("<4sII", data[:12]) == (b"glTF", 2, len(data))
@@ -184,7 +184,7 @@ def test_a_label_close_to_a_bottle_keeps_its_colour(triangles):
         uvs = np.full((len(wall.vertices), 2), 0.5)
         image = Image.new("RGB", (4, 4), color)
         parts.append(MeshPart(np.array(wall.vertices), np.array(wall.faces), uvs, material=Material(image=image)))
-    light = to_display(to_mesh(parts), triangles=triangles, texture_size=256)
+    light = make_display_mesh(to_mesh(parts), triangles=triangles, texture_size=256)
     points, faces = trimesh.sample.sample_surface(light, 3000, seed=0)[:2]
     radius = np.linalg.norm(points[:, :2], axis=1)
     side = np.abs(light.face_normals[faces, 2]) < 0.3
@@ -197,7 +197,7 @@ def test_a_label_close_to_a_bottle_keeps_its_colour(triangles):
 
 def test_round_things_have_smooth_normals():
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
-    light = to_display(ball, triangles=800)
+    light = make_display_mesh(ball, triangles=800)
     assert len(light.faces) <= 800
     outward = light.vertices / np.linalg.norm(light.vertices, axis=1, keepdims=True)
     assert (outward * light.vertex_normals).sum(axis=1).min() > 0.98
@@ -206,7 +206,7 @@ def test_round_things_have_smooth_normals():
 
 def test_light_mesh_keeps_geometry_and_uvs_and_shrinks_the_texture():
     box = textured_box(4)
-    light = to_display(box, triangles=192, texture_size=256)
+    light = make_display_mesh(box, triangles=192, texture_size=256)
     np.testing.assert_array_equal(light.vertices, box.vertices)
     np.testing.assert_array_equal(light.faces, box.faces)
     np.testing.assert_array_equal(light.visual.uv, box.visual.uv)
@@ -219,7 +219,7 @@ def test_light_mesh_keeps_geometry_and_uvs_and_shrinks_the_texture():
 def test_inward_mesh_is_turned_outward(cells):
     box = textured_box(cells)
     box.invert()
-    light = to_display(box, triangles=200, texture_size=64)
+    light = make_display_mesh(box, triangles=200, texture_size=64)
     assert light.volume == pytest.approx(SIDE**3, rel=1e-2)
     assert (np.einsum("fcd,fd->fc", light.vertex_normals[light.faces], light.face_normals) > 0.5).all()
 
@@ -227,7 +227,7 @@ def test_inward_mesh_is_turned_outward(cells):
 def test_plain_mesh_has_a_colour_and_no_texture():
     ball = trimesh.creation.icosphere(subdivisions=4)
     ball.visual.face_colors = [124, 188, 255, 255]
-    light = to_display(ball, triangles=500)
+    light = make_display_mesh(ball, triangles=500)
     assert light.visual.material.baseColorTexture is None
     assert light.visual.material.baseColorFactor.tolist() == [51, 128, 255, 255]  # linear, as glTF has it
 
@@ -237,7 +237,7 @@ def test_texture_that_repeats_is_looked_up_with_its_wrap():
     shifted = box.copy()
     shifted.visual.uv = box.visual.uv + [3, -2]
     images = [
-        np.asarray(to_display(m, triangles=300, texture_size=64).visual.material.baseColorTexture)
+        np.asarray(make_display_mesh(m, triangles=300, texture_size=64).visual.material.baseColorTexture)
         for m in (box, shifted)
     ]
     assert np.abs(images[0].astype(int) - images[1]).max() <= 1

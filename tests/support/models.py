@@ -195,7 +195,7 @@ def shown_colors(mesh: trimesh.Trimesh) -> np.ndarray:
     from asset_tools.visual import Appearance
 
     faces = np.arange(len(mesh.faces))
-    return np.rint(Appearance(mesh).at(np.asarray(mesh.faces), faces, np.full((len(faces), 3), 1 / 3)))
+    return np.rint(Appearance(mesh).sample_colors(np.asarray(mesh.faces), faces, np.full((len(faces), 3), 1 / 3)))
 
 
 def texels(mesh: trimesh.Trimesh, points: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from asset_tools.builtin import bottles, shapes
 from asset_tools.builtin.catalogue import products
 from asset_tools.decompose import GPU_LIMIT, count_flat_faces
 from asset_tools.glb import write_glb
-from asset_tools.quality.hulls import volume_iou
+from asset_tools.quality.hulls import compute_volume_iou
 
 GRIPPER_OPENING = 0.08  # m
 TOYS = {p.id for p in products().values() if p.model or p.category in ("ball", "toy")}
@@ -105,7 +105,7 @@ def test_pieces_fill_the_shape(spec):
     assert 1 <= len(pieces) <= (24 if toy else 13 if spec.hollow else 8)
     assert max(map(len, pieces)) <= 48 and max(map(count_flat_faces, pieces)) <= GPU_LIMIT
     if not (toy and spec.hollow):  # for thin walls 0.1 mm is a large fraction
-        assert volume_iou(closed, pieces) >= (0.75 if spec.hollow else 0.88 if toy else 0.9)
+        assert compute_volume_iou(closed, pieces) >= (0.75 if spec.hollow else 0.88 if toy else 0.9)
     if toy:
         points = trimesh.sample.sample_surface(closed, 4000, seed=0)[0]
         corners = [trimesh.sample.sample_surface(trimesh.convex.convex_hull(p), 3000, seed=0)[0] for p in pieces]

@@ -2,7 +2,7 @@ import re
 
 import pytest
 
-from asset_tools.graspnet.catalogue import ENTRIES, catalogue_entry
+from asset_tools.graspnet.catalogue import ENTRIES, find_catalogue_entry
 
 # numbers in the configurations of RoboCAS-v0
 V0_NUMBERS = [
@@ -49,9 +49,9 @@ def test_the_46_objects_have_unique_ids():
 
 
 def test_other_objects_are_named_by_their_number():
-    assert catalogue_entry(2).id == "tomato_soup_can"
-    assert catalogue_entry(2).folder == "002"
-    assert catalogue_entry(6).id == "graspnet_006"
-    assert catalogue_entry(87).mass is None
+    assert find_catalogue_entry(2).id == "tomato_soup_can"
+    assert find_catalogue_entry(2).folder == "002"
+    assert find_catalogue_entry(6).id == "graspnet_006"
+    assert find_catalogue_entry(87).mass is None
     with pytest.raises(ValueError, match="88"):
-        catalogue_entry(88)
+        find_catalogue_entry(88)

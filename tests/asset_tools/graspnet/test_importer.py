@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from asset_tools.graspnet.importer import graspnet_jobs, graspnet_source
-from asset_tools.graspnet.labels import view_directions
+from asset_tools.graspnet.importer import load_graspnet_source, make_graspnet_jobs
+from asset_tools.graspnet.labels import make_view_directions
 from asset_tools.grasps import sample_grasps
 from robocas_ms3.core.errors import AssetError
 
@@ -22,7 +22,7 @@ def write_models(root, numbers):
 
 def write_labels(path, poses, depth=0.02):
     """Label some grasps, turned onto the lattice; returns their TCP poses."""
-    views = view_directions()
+    views = make_view_directions()
     chosen = np.argmax(-poses[:, :3, 2] @ views.T, axis=1)
     approach = -views[chosen]
     level = np.column_stack([-approach[:, 1], approach[:, 0], 0 * approach[:, 0]])
@@ -49,7 +49,7 @@ def write_labels(path, poses, depth=0.02):
 
 
 def test_a_model_without_labels(tmp_path):
-    source = graspnet_source(write_models(tmp_path, [2]), 2)
+    source = load_graspnet_source(write_models(tmp_path, [2]), 2)
     assert (source.id, source.name, source.category) == ("tomato_soup_can", "tomato soup can", "can")
     assert source.graspnet_id == 2
     assert source.mass == 0.349
@@ -61,20 +61,20 @@ def test_a_model_without_labels(tmp_path):
 def test_missing_models_are_named_before_the_import(tmp_path):
     write_models(tmp_path, [1, 3])
     with pytest.raises(AssetError, match="numbers 2, 4"):
-        graspnet_jobs(tmp_path, [4, 1, 2])
+        make_graspnet_jobs(tmp_path, [4, 1, 2])
     with pytest.raises(AssetError, match="found 88, 90"):
-        graspnet_jobs(tmp_path, [1, 88, 90])
+        make_graspnet_jobs(tmp_path, [1, 88, 90])
     with pytest.raises(AssetError, match="46 objects"):
-        graspnet_jobs(tmp_path)
-    assert [job.id for job in graspnet_jobs(tmp_path, [3, 1])] == ["sugar_box", "mustard_bottle"]
+        make_graspnet_jobs(tmp_path)
+    assert [job.id for job in make_graspnet_jobs(tmp_path, [3, 1])] == ["sugar_box", "mustard_bottle"]
 
 
 def test_jobs_follow_their_files(tmp_path):
     write_models(tmp_path, [1])
-    first = graspnet_jobs(tmp_path, [1])[0].content
-    assert graspnet_jobs(tmp_path, [1])[0].content == first
+    first = make_graspnet_jobs(tmp_path, [1])[0].content
+    assert make_graspnet_jobs(tmp_path, [1])[0].content == first
     write_labels(tmp_path / "grasp_label" / "001_labels.npz", np.eye(4)[None])
-    assert graspnet_jobs(tmp_path, [1])[0].content != first
+    assert make_graspnet_jobs(tmp_path, [1])[0].content != first
 
 
 @pytest.fixture(scope="module")
@@ -82,10 +82,10 @@ def labelled_banana(shared_dir, tmp_path_factory):
     """The real model with labels made of sampled grasps: the source, and the poses that were labelled."""
     root = tmp_path_factory.mktemp("graspnet")
     (root / "models").symlink_to(shared_dir / "graspnet_sample" / "models")
-    plain = graspnet_source(root, 5)
+    plain = load_graspnet_source(root, 5)
     grasps = sample_grasps(plain.closed, plain.closed.center_mass, np.random.default_rng(0), count=30)
     poses = write_labels(root / "grasp_label" / "005_labels.npz", grasps.tcp_in_object)
-    return graspnet_source(root, 5), poses
+    return load_graspnet_source(root, 5), poses
 
 
 def test_a_banana_with_labels(labelled_banana):
@@ -97,7 +97,7 @@ def test_a_banana_with_labels(labelled_banana):
     assert source.mesh.visual.material.image is not None
     assert source.closed.bounds == pytest.approx(source.mesh.bounds, abs=1e-3)
     assert source.mesh.extents == pytest.approx([0.196, 0.079, 0.038], abs=1e-3)  # a banana on its side
-    fit, more = map(int, re.findall(r"of 30 good grasp labels (\d+) fit the gripper; sampled (\d+) more", notes)[0])
+    fit, more = map(int, re.findall(r"(\d+) of 30 good grasp labels fit the gripper; sampled (\d+) more", notes)[0])
     assert 10 <= fit <= 30 and len(source.grasps) == fit + more >= 50
     for pose in source.grasps.tcp_in_object[:fit]:
         assert np.abs(labelled - pose).max(axis=(1, 2)).min() < 1e-5
@@ -106,10 +106,10 @@ def test_a_banana_with_labels(labelled_banana):
 
 def test_enough_labels_need_no_sampled_grasps(tmp_path):
     write_models(tmp_path, [1])
-    plain = graspnet_source(tmp_path, 1)
+    plain = load_graspnet_source(tmp_path, 1)
     grasps = sample_grasps(plain.closed, plain.closed.center_mass, np.random.default_rng(0), count=90)
     write_labels(tmp_path / "grasp_label" / "001_labels.npz", grasps.tcp_in_object)
-    source = graspnet_source(tmp_path, 1)
+    source = load_graspnet_source(tmp_path, 1)
     assert source.grasps is not None
     assert 50 <= len(source.grasps) <= 90
     assert not any("label" in note for note in source.repairs)

@@ -5,7 +5,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from asset_tools.graspnet.labels import label_checksums, label_grasps, read_labels, tcp_poses, view_directions
+from asset_tools.graspnet.labels import (
+    label_checksums,
+    load_label_grasps,
+    make_view_directions,
+    read_labels,
+    to_tcp_poses,
+)
 from robocas_ms3.core.errors import AssetError
 
 TOP_VIEW = 299  # the last of the lattice, 4.7 deg off +z
@@ -37,7 +43,7 @@ def write(path, changes=(), at=(0, 0, 0), **options):
 
 
 def test_views_are_the_fibonacci_lattice():
-    views = view_directions()
+    views = make_view_directions()
     assert np.linalg.norm(views, axis=1) == pytest.approx(np.ones(300))
     assert views[:, 2] == pytest.approx((2 * np.arange(300) + 1) / 300 - 1)
     # the second: z = 3 / 300 - 1 = -0.99, so radius sqrt(1 - 0.9801) = 0.141067; 0.618034 turns = 222.4922 deg
@@ -56,7 +62,7 @@ def test_a_grasp_with_known_pose(tmp_path, quarters):
     # on the side of the box at -y
     path = write(tmp_path / "000_labels.npz", [((0, 150, 3 * quarters, 1), label)], at=(0.01, -0.05, 0.02))
 
-    pose = tcp_poses(read_labels(path, RNG))[0]
+    pose = to_tcp_poses(read_labels(path, RNG))[0]
     assert pose[:3, 2] == pytest.approx(approach, abs=2e-6)
     assert pose[:3, 1] == pytest.approx(closing, abs=2e-6)
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
@@ -67,20 +73,20 @@ def test_a_grasp_with_known_pose(tmp_path, quarters):
 def test_the_closing_axis_crosses_the_box_from_side_to_side(tmp_path):
     # From above at the middle of the top. At angle 0 the closing axis is (-ay, ax, 0) = (vy, -vx, 0); seen from above a
     # positive angle about a downward approach is clockwise, so its azimuth itself rotates it to +x.
-    view = view_directions()[TOP_VIEW]
+    view = make_view_directions()[TOP_VIEW]
     azimuth = np.arctan2(-view[0], view[1])
     labels = [((0, TOP_VIEW, i, 2), (azimuth + i * np.pi / 2, 0.03, 0.06, 0.1, False)) for i in (0, 1)]
     path = write(tmp_path / "000_labels.npz", labels, at=(0, 0, 0.03))
     box = trimesh.creation.box(SIZE)
 
-    along, across = tcp_poses(read_labels(path, RNG))
+    along, across = to_tcp_poses(read_labels(path, RNG))
     assert abs(along[0, 1]) > 0.99  # closes along x
     assert abs(across[1, 1]) > 0.99  # closes along y
     hits = box.ray.intersects_location([along[:3, 3]] * 2, [along[:3, 1], -along[:3, 1]])[0]
     assert sorted(hits[:, 0]) == pytest.approx([-0.02, 0.02], abs=1e-9)
     assert np.linalg.norm(hits[1] - hits[0]) == pytest.approx(0.04, rel=0.01)
 
-    grasps, labelled = label_grasps(path, box)  # along y the box is 10 cm wide: the open gripper would hit it
+    grasps, labelled = load_label_grasps(path, box)  # along y the box is 10 cm wide: the open gripper would hit it
     assert (len(grasps), labelled) == (1, 2)
     assert grasps.tcp_in_object[0] == pytest.approx(along)
     assert grasps.widths == pytest.approx([0.06])
@@ -146,7 +152,7 @@ def _flip(path):
         (_cut, "npz archive"),
         (_flip, "npz archive"),
         (lambda path: path.write_bytes(b"no archive"), "npz archive"),
-        (lambda path: path.unlink(), "no such label file"),
+        (lambda path: path.unlink(), "missing file of .* grasp labels"),
         (lambda path: np.savez(path, points=np.zeros((2, 3))), "found points"),
         (lambda path: np.savez(path, **arrays() | {"points": np.zeros((2, 3))}), "same number of points"),
         (lambda path: np.savez(path, **arrays() | {"points": np.full((1, 3), np.nan)}), "finite points"),

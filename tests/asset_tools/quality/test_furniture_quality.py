@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from asset_tools.quality.furniture import examine_furniture, measure_furniture
-from asset_tools.quality.surfaces import clearances
+from asset_tools.quality.surfaces import measure_clearances
 from asset_tools.sources import FurnitureSource, LinkSource
 from robocas_ms3.assets.manifest import Handle, Joint, Surface
 
@@ -154,6 +154,8 @@ def test_bad_surfaces_do_not_hold(change, why):
 
 def test_clearances_of_a_board_under_another():
     boards = [box((0, 0, 0), (1, 1, 0.1)), box((0, 0, 0.5), (1, 1, 0.6))]
-    below, above = clearances(boards, np.array([(0.5, 0.5, 0.3), (0.5, 0.5, 0.05), (2, 0.5, 0.3), (0.5, 0.5, 1.0)]))
+    below, above = measure_clearances(
+        boards, np.array([(0.5, 0.5, 0.3), (0.5, 0.5, 0.05), (2, 0.5, 0.3), (0.5, 0.5, 1.0)])
+    )
     assert below == pytest.approx([0.2, 0.0, np.inf, 0.4])
     assert above == pytest.approx([0.2, 0.0, np.inf, np.inf])

@@ -9,8 +9,8 @@ from asset_entries import QUALITY, object_asset
 from asset_tools.grasps import sample_grasps
 from asset_tools.quality import measure
 from asset_tools.quality.drops import DropReport
-from asset_tools.quality.measure import check_objects, compare_with_manifest, measure_object, object_rows
-from asset_tools.resting_poses import resting_poses
+from asset_tools.quality.measure import check_objects, compare_with_manifest, make_object_rows, measure_object
+from asset_tools.resting_poses import find_resting_poses
 from robocas_ms3.assets.annotations import Annotations, compute_footprints
 from robocas_ms3.assets.pack import LoadedObject
 
@@ -30,7 +30,7 @@ def but(**change):
 
 
 def annotate(mesh, solid, count=60):
-    rest = resting_poses(solid)
+    rest = find_resting_poses(solid)
     grasps = sample_grasps(mesh, solid.center_of_mass, np.random.default_rng(0), count=count)
     return Annotations(
         resting_poses=rest.poses,
@@ -71,7 +71,7 @@ def test_an_object_without_grasps(block):
         ("cube", "number of grasps"),
         ("", "number of objects that can be grasped"),
     ]
-    assert object_rows({"cube": quality})[0][-1] == "-"
+    assert make_object_rows({"cube": quality})[0][-1] == "-"
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_a_moving_drop_counts_as_jitter_unless_it_rolls(block):
     mesh, solid = trimesh.creation.box((0.05, 0.08, 0.12)), block(0.05, 0.08, 0.12)
     notes = annotate(mesh, solid, count=2)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(measure, "drop_test", lambda *_: REPORT)
+        patch.setattr(measure, "run_drop_test", lambda *_: REPORT)
         quality = measure_object(mesh, solid, notes)
     assert (quality.rest_share, quality.rolling_share) == (0.6667, 0.3333)
     assert quality.jitter == pytest.approx(0.006 / 0.2)  # J of the second drop, kg

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 from models import Gltf, box, image_file, write_obj
 
-from asset_tools.import_scans import ImportSettings, find_scans, scan_jobs
+from asset_tools.import_scans import ImportSettings, find_scans, make_scan_jobs
 from asset_tools.readers.model import read_model
 from robocas_ms3.core.errors import AssetError
 
@@ -135,7 +135,7 @@ def test_two_scans_with_one_id_fail_alone(tmp_path):
     write_obj(tmp_path, "mug")
     write_obj(tmp_path / "Mug", "other")
     write_obj(tmp_path / "cup")
-    jobs = {job.id: job for job in scan_jobs(tmp_path, ImportSettings())}
+    jobs = {job.id: job for job in make_scan_jobs(tmp_path, ImportSettings())}
     assert sorted(jobs) == ["cup", "mug"]
     with pytest.raises(AssetError):
         jobs["mug"].make(tmp_path / "out")
