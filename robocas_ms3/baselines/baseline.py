@@ -24,12 +24,12 @@ Fraction = Annotated[float, Field(ge=0, lt=1)]
 
 @dataclass
 class Progress:
-    """Functions that report the progress of a training run.
+    """Callbacks of `train_run` that report its progress; by default they do nothing.
 
     Attributes:
         message: called with a line of text.
-        on_read: called with the number of episodes read and their total number.
-        on_step: called with the number of optimiser steps done and their total number.
+        on_read: called with the number of episodes read so far, and the number of all episodes.
+        on_step: called with the number of training steps done so far, and the number of all steps.
     """
 
     message: Callable[[str], None] = lambda text: None
@@ -37,10 +37,12 @@ class Progress:
     on_step: Callable[[int, int], None] = lambda done, total: None
 
 
-def empty_split_error(path: Path, split: Split) -> EmptySplitError:
-    """Return the error of a split without episodes."""
-    fix = "Add episodes: 10 % of the seeds are the validation split."
-    return EmptySplitError("empty split of the dataset", where=path, expected=f"episodes in {split}", fix=fix)
+def make_empty_split_error(path: Path, split: Split) -> EmptySplitError:
+    """Make the error for a dataset whose split ``train`` or ``val`` has no episodes."""
+    fix = "Record more episodes: 10 % of the seeds are the validation split."
+    return EmptySplitError(
+        "empty split of the dataset", where=path, expected=f"episodes in {split}", found="none", fix=fix
+    )
 
 
 class TrainSettings(StrictModel):
@@ -50,19 +52,23 @@ class TrainSettings(StrictModel):
         steps: number of optimiser steps.
         batch_size: samples per step, summed over all processes.
         learning_rate: learning rate of AdamW after the warm-up.
-        min_learning_rate: learning rate at the end of the schedule.
-        weight_decay: weight decay of AdamW, for matrices and kernels; biases and norms have none.
+        min_learning_rate: learning rate at the end of the schedule, or of each period of ``restarts``.
+        weight_decay: weight decay of AdamW for matrices and kernels. Biases and norms have no weight decay.
         betas: betas of AdamW.
-        warmup_steps: steps in which the learning rate rises from 0.
-        schedule: ``cosine`` decays once over all steps, ``restarts`` repeatedly, ``constant`` not at all.
-        restart_epochs, restart_factor: first period of ``restarts`` in epochs, and the factor of each next period.
+        warmup_steps: number of first steps, in which the learning rate rises linearly from 0.
+        schedule: ``cosine``: the learning rate decays once, over all steps. ``restarts``: it decays in each of several
+            periods. ``constant``: it does not decay.
+        restart_epochs: length of the first period of ``restarts`` in epochs.
+        restart_factor: factor between the lengths of consecutive periods of ``restarts``.
         clip_norm: largest norm of the gradient; 0: no clipping.
-        ema: decay of the exponential moving average of the weights, which the policy uses; 0: no average.
+        ema: decay per step of the exponential moving average of the weights. The policy has the averaged weights; 0:
+            the policy has the last weights.
         seed: random seed.
-        precision: precision of the forward pass. auto: bf16 where the device supports it in hardware, else fp32.
-        workers: processes that read samples; 0: the training process reads them.
-        log_every, validate_every, save_every: steps between lines of the log, validations and checkpoints.
-        validation_samples: largest number of validation samples; the same samples at each validation.
+        precision: precision of the forward pass. ``auto``: bf16 if the device has bf16 hardware, otherwise fp32.
+        workers: number of processes that read samples; 0: the training process reads them.
+        log_every, validate_every, save_every: steps between lines of the log, between validations, and between
+            checkpoints.
+        validation_samples: maximum number of validation samples; each validation uses the same samples.
     """
 
     steps: int = Field(default=20_000, ge=1, le=10**9)
@@ -93,12 +99,12 @@ class BaselineConfig(StrictModel):
 
 
 class Samples(Protocol):
-    """Training samples: a map-style dataset that returns whole batches.
+    """Training samples of a baseline: a map-style PyTorch dataset whose ``__getitems__`` returns a batch.
 
     Attributes:
-        facts: JSON values that network and policy need: normalisation, rate, image sizes.
+        facts: values of the data that network and policy need, such as normalisation, rate and image sizes; JSON types.
         episodes: number of episodes.
-        scenes: optional `TrainingScenes`, for a warning in an evaluation with other scenes.
+        scenes: optional `TrainingScenes`: an evaluation in other scenes gives a warning.
     """
 
     facts: dict[str, Any]
@@ -111,22 +117,23 @@ class Samples(Protocol):
 
 @dataclass(frozen=True)
 class Baseline:
-    """Baseline that learns from demonstrations (``data``) or in simulation (``environments``).
+    """Baseline: network, policy and training data. It learns from demonstrations (``data``) or in simulation.
 
-    For demonstrations, the network's ``forward(batch)`` returns metrics by name, with ``loss``: means over the batch,
-    shape (). A metric that only some samples have is a sum and the number of these samples, shape (2,).
+    For demonstrations, ``forward(batch)`` of the network returns metrics by name, one of them ``loss``. A metric is the
+    mean over the batch, shape (). If only some samples of the batch have the metric, it is the sum over these samples
+    and their number, shape (2,).
 
     Attributes:
         name: name on the command line.
-        version: version of weights and inputs; runs of other versions can be neither continued nor used.
-        Config: model of the configuration; its ``train`` has at least ``batch_size``, ``seed`` and ``precision``.
-        model: function that makes the network, from configuration and facts.
-        policy: function that makes the policy, from configuration, facts and trained network.
-        data: function that reads the samples of a dataset's split, from configuration, path, split and progress
-            function. Raises DatasetError if the dataset does not suit, EmptySplitError if the split has no episodes.
-        environments: function that makes the training environments, from configuration and ``cpu`` or ``cuda``:
-            `Samples` without batches, with ``name`` and ``hash`` of their scenes, and ``close()``.
-        train: function that trains the network in these environments and writes to a `RunFolder`; see `train_ppo`.
+        version: version of weights and inputs. A run of another version can be neither continued nor evaluated.
+        Config: class of the configuration; its ``train`` has at least ``batch_size``, ``seed`` and ``precision``.
+        model: function (config, facts) that makes the network.
+        policy: function (config, facts, network) that makes the policy of a trained network.
+        data: function (config, path, split, on_read) that reads the training samples of a split of a dataset. Raises
+            DatasetError if the dataset does not suit, and EmptySplitError if the split has no episodes.
+        environments: function (config, ``cpu`` or ``cuda``) that makes the training environments: an object with the
+            attributes of `Samples`, ``name`` and ``hash`` of the scenes, and ``close()``.
+        train: function (run folder, network, config, environments) that trains the network, see `train_ppo`.
     """
 
     name: str

@@ -21,17 +21,17 @@ from robocas_ms3.baselines.baseline import (
     OnRead,
     Split,
     TrainSettings,
-    empty_split_error,
+    make_empty_split_error,
 )
 from robocas_ms3.baselines.chunks import (
     ROW,
     ChunkPolicy,
-    Scale,
-    chunk_losses,
+    Normalizer,
+    compute_chunk_losses,
+    compute_normalizer_statistics,
     encode_chunks,
+    encode_next_key_poses,
     encode_proprioception,
-    next_key_poses,
-    scale_statistics,
 )
 from robocas_ms3.baselines.dataset_checks import check_base_is_fixed
 from robocas_ms3.baselines.training.record import hash_dataset
@@ -61,12 +61,14 @@ class BcStateConfig(BaselineConfig):
         rate_hz: policy steps per second.
         chunk: number of predicted policy steps.
         width: size of the hidden layers.
-        blocks: number of residual blocks, of two layers each.
+        blocks: number of residual blocks; each has two linear layers.
         dropout: dropout rate in the blocks.
-        noise: standard deviation of the input noise in training, in standard deviations of the inputs.
-        keys_weight, gripper_weight, near_distance: see `SmallConfig`.
-        n_action_steps: steps of a chunk before the next one is predicted.
-        temporal_ensemble_coeff: decay of the weight of older predictions, see `ChunkPolicy`.
+        noise: standard deviation of the noise that training adds to the normalised inputs.
+        keys_weight, gripper_weight: loss weights of the next key pose and of the gripper commands.
+        near_distance: distance in m at which the loss weight of a pose is half of its weight at 0 m, see
+            `compute_chunk_losses`; 0: equal weights.
+        n_action_steps: policy steps of a chunk that are executed before the next prediction.
+        temporal_ensemble_coeff: decay of the weight of older predictions per policy step, see `ChunkPolicy`.
         train: see `TrainSettings`.
     """
 
@@ -87,22 +89,25 @@ class BcStateConfig(BaselineConfig):
 
 
 class StateSamples:
-    """Training samples of `bc-state`: ``inputs`` (B, D), ``chunk`` (B, K, 10) and ``key`` (B, 9)."""
+    """Training samples of `bc-state`, one per policy step of a split of a trajectory file.
+
+    A batch has ``inputs`` (B, D) of `make_inputs`, and the labels ``chunk`` (B, K, 10) and ``key`` (B, 9) of `chunks`.
+    """
 
     def __init__(self, config: BcStateConfig, path: Path, split: Split, on_read: OnRead) -> None:
-        arrays = load_states(path, config.rate_hz, on_read)
+        arrays = load_cached_states(path, config.rate_hz, on_read)
         train, val = split_by_seed(dict(enumerate(arrays["seeds"].tolist())))
         numbers = train if split == "train" else val
         self.episodes = len(numbers)
         if not numbers:
-            raise empty_split_error(path, split)
+            raise make_empty_split_error(path, split)
         with closing(open_source(path)) as source:
             self.scenes = read_training_scenes(source, source.numbers)
         ends = np.cumsum(arrays["lengths"])
         rows = [slice(int(ends[number] - arrays["lengths"][number]), int(ends[number])) for number in numbers]
         poses, opened = arrays["poses"], arrays["opened"]
         self._chunks = _concatenate([encode_chunks(poses[row], opened[row], config.chunk) for row in rows])
-        self._keys = _concatenate([next_key_poses(poses[row], opened[row]) for row in rows])
+        self._keys = _concatenate([encode_next_key_poses(poses[row], opened[row]) for row in rows])
         self._inputs = _concatenate(
             [make_inputs(arrays["state"][row], poses[row], arrays["widths"][row]) for row in rows]
         )
@@ -111,8 +116,8 @@ class StateSamples:
         self.facts: dict[str, Any] = {
             "rate_hz": config.rate_hz,
             "inputs": {"mean": values.mean(0).tolist(), "deviation": deviation.tolist()},
-            "chunk": scale_statistics(self._chunks[..., :9].numpy()),
-            "keys": scale_statistics(self._keys.numpy()),
+            "chunk": compute_normalizer_statistics(self._chunks[..., :9].numpy()),
+            "keys": compute_normalizer_statistics(self._keys.numpy()),
         }
 
     def __len__(self) -> int:
@@ -126,7 +131,10 @@ class StateSamples:
 def make_inputs(
     state: NDArray[np.floating], poses: NDArray[np.floating], widths: NDArray[np.floating]
 ) -> NDArray[np.float32]:
-    """Return inputs (N, D + 10): privileged state (N, D) and proprioception (N, 10)."""
+    """Return the inputs of the network (N, D + 10): privileged state (N, D), then proprioception (N, 10).
+
+    poses: (N, 4, 4) TCP poses in the arm's base frame. widths: (N,) gripper widths, m.
+    """
     return np.concatenate([state, encode_proprioception(poses, widths)], axis=1).astype(np.float32)
 
 
@@ -134,11 +142,15 @@ def _concatenate(parts: list[NDArray[np.float32]]) -> torch.Tensor:
     return torch.from_numpy(np.concatenate(parts))
 
 
-def load_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArray[Any]]:
-    """Return the arrays of `read_states`, from a cache if possible: reading 1000 episodes takes minutes."""
+def load_cached_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArray[Any]]:
+    """Return the arrays of `read_states`, from the cache if it has them; otherwise read and cache them.
+
+    Reading 1000 episodes takes minutes.
+    """
     if path.is_dir() or path.suffix != ".h5":
         fix = "Pass the trajectory.h5 of `robocas generate`."
-        raise DatasetError("bc-state trains on recorded states", where=path, expected="a trajectory.h5", fix=fix)
+        found = "a folder" if path.is_dir() else path.name
+        raise DatasetError("wrong input of bc-state", where=path, expected="a trajectory.h5", found=found, fix=fix)
     cached = _cache_path(path, rate_hz)
     if cached.is_file():
         with suppress(*DAMAGED_FILE_ERRORS), np.load(cached) as arrays:
@@ -159,11 +171,14 @@ def _cache_path(path: Path, rate_hz: float) -> Path:
 
 
 def read_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArray[Any]]:
-    """Restore each step of the successful episodes in their environment and read its privileged state.
+    """Read the privileged state of each policy step of the successful episodes of a trajectory file.
+
+    The recorded state of a step is set in the environment of the recording, which computes the privileged state.
 
     Returns:
-        Per step: ``state`` (N, D), ``poses`` (N, 4, 4) of the TCP in the arm's base frame, ``opened`` (N,) gripper
-        commands, ``widths`` (N,) m. Per episode: ``lengths``, ``seeds``.
+        Per policy step: ``state`` (N, D), ``poses`` (N, 4, 4) of the TCP in the arm's base frame, ``opened`` (N,)
+        gripper commands (1 = open), ``widths`` (N,) of the gripper in m. Per episode: ``lengths`` in policy steps,
+        ``seeds``.
     """
     parts: dict[str, list[NDArray[Any]]] = {name: [] for name in ("state", "poses", "opened", "widths")}
     lengths, seeds, env = [], [], None
@@ -182,11 +197,14 @@ def read_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArra
                 if env is None:
                     env = file.env.make(obs_mode="state_dict", render_backend="none", reward_mode="none")
                 env.reset(seed=recording.seed, options=dict(recording.reset_options))
-                rows = [_privileged_state(env.unwrapped, recording.state(int(sample))) for sample in samples]
+                rows = [_read_privileged_state(env.unwrapped, recording.state(int(sample))) for sample in samples]
                 if parts["state"] and parts["state"][0].shape[1] != len(rows[0]):
-                    expected = parts["state"][0].shape[1]
-                    what = "the number of objects differs between scenes"
-                    raise DatasetError(what, where=where, expected=expected, found=len(rows[0]))
+                    expected, found = (f"{size} numbers" for size in (parts["state"][0].shape[1], len(rows[0])))
+                    what, fix = (
+                        "privileged states of different sizes",
+                        "Record all episodes with one task configuration.",
+                    )
+                    raise DatasetError(what, where=where, expected=expected, found=found, fix=fix)
                 parts["state"].append(np.stack(rows))
                 parts["poses"].append(motion.tcp_in_base)
                 parts["opened"].append(motion.gripper_open)
@@ -197,29 +215,28 @@ def read_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArra
             if env is not None:
                 env.close()
     if not lengths:
-        raise DatasetError("no successful episodes", where=path)
+        fix = "Record demonstrations: robocas generate TASK --out DIR."
+        raise DatasetError("no successful episode in the trajectory file", where=path, fix=fix)
     arrays = {name: np.concatenate(part) for name, part in parts.items()}
     for name, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise DatasetError(
-                "NaN or infinite value", where=f"{path}, {name}", fix="Run `robocas validate` for details."
-            )
+            raise DatasetError("NaN or infinite value", where=f"{path}, {name}", fix="Record the trajectory again.")
     return {**arrays, "lengths": np.array(lengths), "seeds": np.array(seeds)}
 
 
-def _privileged_state(env: Any, state: dict[str, dict[str, NDArray[np.float32]]]) -> NDArray[np.float32]:
+def _read_privileged_state(env: Any, state: dict[str, dict[str, NDArray[np.float32]]]) -> NDArray[np.float32]:
     env.set_state_dict({kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()})
     return concatenate_privileged_state(env.get_obs({})["extra"])[0]
 
 
 class BcStateModel(nn.Module):
-    """Residual MLP that predicts a chunk and the next key pose from the privileged state."""
+    """Network of `bc-state`: a residual MLP that predicts a chunk and the next key pose from the inputs."""
 
     def __init__(self, config: BcStateConfig, facts: dict[str, Any]) -> None:
         super().__init__()
         self.config, width = config, config.width
-        self.input_scale = Scale(**facts["inputs"])
-        self.chunk_scale, self.key_scale = Scale(**facts["chunk"]), Scale(**facts["keys"])
+        self.input_scale = Normalizer(**facts["inputs"])
+        self.chunk_scale, self.key_scale = Normalizer(**facts["chunk"]), Normalizer(**facts["keys"])
         self.into = nn.Linear(len(facts["inputs"]["mean"]), width)
         self.blocks = nn.ModuleList(
             nn.Sequential(
@@ -234,7 +251,10 @@ class BcStateModel(nn.Module):
         self.out = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, config.chunk * ROW + 9))
 
     def predict(self, inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return normalised chunks (B, K, 10), with logits of gripper commands, and key poses (B, 9)."""
+        """Return predicted chunks (B, K, 10) and next key poses (B, 9) for inputs (B, D).
+
+        Poses are normalised. The last column of a chunk has the logits of the command to open the gripper.
+        """
         scaled = self.input_scale(inputs).clamp(-5, 5)
         if self.training and self.config.noise:
             scaled = scaled + self.config.noise * torch.randn_like(scaled)
@@ -245,23 +265,29 @@ class BcStateModel(nn.Module):
         return out[:, :-9].reshape(len(inputs), self.config.chunk, ROW), out[:, -9:]
 
     def forward(self, batch: Batch) -> dict[str, torch.Tensor]:
-        return chunk_losses(self, batch, *self.predict(batch["inputs"]))
+        """Return the losses and metrics of `compute_chunk_losses` for a batch of `StateSamples`."""
+        return compute_chunk_losses(self, batch, *self.predict(batch["inputs"]))
 
     def act(self, inputs: torch.Tensor) -> torch.Tensor:
-        """Return chunks (B, K, 10): poses and probabilities of the command to open the gripper."""
+        """Return predicted chunks (B, K, 10) for inputs (B, D).
+
+        The last column has the probabilities of the command to open the gripper.
+        """
         chunk, _ = self.predict(inputs)
         return torch.cat([self.chunk_scale.inverse(chunk[..., :9]), chunk[..., 9:].sigmoid()], dim=-1)
 
 
 def make_policy(config: BcStateConfig, facts: dict[str, Any], model: BcStateModel) -> ChunkPolicy:
-    """Make the policy of a trained network, on the device of its weights."""
+    """Make the policy of a trained network; it runs on the device of the weights."""
     device, size = next(model.parameters()).device, len(facts["inputs"]["mean"])
 
-    def predict(seen: Observations, row: int) -> NDArray[np.floating]:
-        assert seen.state is not None
+    def predict(observations: Observations, row: int) -> NDArray[np.floating]:
+        assert observations.state is not None
         one = slice(row, row + 1)
         inputs = make_inputs(
-            seen.state[one], from_wxyz(seen.tcp_in_base[one]), seen.robot[GRIPPER_WIDTH].reshape(-1)[one]
+            observations.state[one],
+            from_wxyz(observations.tcp_in_base[one]),
+            observations.robot[GRIPPER_WIDTH].reshape(-1)[one],
         )
         if inputs.shape[1] != size:
             what, fix = "wrong size of privileged state", "Evaluate in the task and configuration of the training data."

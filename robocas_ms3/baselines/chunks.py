@@ -1,8 +1,9 @@
 """Action chunks of future TCP poses: encoding, loss and policy, shared by `small` and `bc-state`.
 
-A row of a chunk is (10,): position in m, the first two columns of the rotation matrix (Zhou et al. 2019), both in the
-present TCP frame, and the gripper command (1 = open). Poses, unlike relative motions, do not depend on how far the last
-action moved the TCP, so the policy corrects tracking errors of the controller.
+A chunk has K rows, one per future policy step. A row has 10 numbers: position in m, the first two columns of the
+rotation matrix (Zhou et al. 2019), and the gripper command (1 = open). Position and rotation are in the present TCP
+frame. Poses, unlike relative motions, do not depend on how far the last action moved the TCP. Therefore the policy
+corrects tracking errors of the controller.
 """
 
 from __future__ import annotations
@@ -31,39 +32,46 @@ Predict = Callable[[Observations, int], NDArray[np.floating]]
 
 
 def encode_proprioception(poses: NDArray[np.floating], widths: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return proprioception (N, 10): TCP poses (N, 4, 4) in the arm's base frame, gripper widths (N,) m."""
-    return _rows(poses, widths / 0.08)
+    """Encode proprioception as rows (N, 10), with the gripper width divided by 8 cm in the last column.
+
+    poses: (N, 4, 4) TCP poses in the arm's base frame. widths: (N,) gripper widths, m.
+    """
+    return _encode_rows(poses, widths / 0.08)
 
 
-def encode_chunks(poses: Array, opened: NDArray[Any], steps: int) -> NDArray[np.float32]:
-    """Encode the chunk of each step of an episode.
+def encode_chunks(poses: Array, gripper: NDArray[Any], steps: int) -> NDArray[np.float32]:
+    """Encode a chunk for each of the T steps of an episode.
 
     Args:
         poses: (T, 4, 4) TCP poses in the arm's base frame.
-        opened: (T,) gripper commands as in ``gripper_status``: row t is the command that led to step t.
+        gripper: (T,) gripper commands as in ``gripper_status``: 1 = open; row t is the command that led to step t.
         steps: number of steps per chunk, K.
 
     Returns:
-        (T, K, 10); rows after the end of the episode repeat the last pose and command.
+        Chunks (T, K, 10). Rows after the end of the episode repeat the last pose and gripper command.
     """
     length = len(poses)
     ahead = np.minimum(np.arange(length)[:, None] + np.arange(1, steps + 1), length - 1)  # (T, K)
-    return _rows(inverse(poses)[:, None] @ poses[ahead], np.asarray(opened, np.float64)[ahead])
+    return _encode_rows(inverse(poses)[:, None] @ poses[ahead], np.asarray(gripper, np.float64)[ahead])
 
 
-def next_key_poses(poses: Array, opened: NDArray[Any]) -> NDArray[np.float32]:
-    """Return the next key poses (T, 9), encoded as in a chunk.
+def encode_next_key_poses(poses: Array, gripper: NDArray[Any]) -> NDArray[np.float32]:
+    """Encode the next key pose of each step of an episode, (T, 9): a row of a chunk without gripper command.
 
-    The next key pose of a step is the TCP pose at the next change of the gripper command, or at the end of the episode.
+    The next key pose of a step is the TCP pose at the next change of the gripper command, or at the end of the episode
+    if there is no change. ``poses`` and ``gripper`` are those of `encode_chunks`.
     """
     length = len(poses)
-    changes = np.flatnonzero(np.diff(np.asarray(opened, np.int8))).tolist()  # last steps before a change
+    changes = np.flatnonzero(np.diff(np.asarray(gripper, np.int8))).tolist()  # last steps before a change
     key_steps = np.array([next((change for change in changes if change >= t), length - 1) for t in range(length)])
-    return _rows(inverse(poses) @ poses[key_steps], np.zeros(length))[:, :9]
+    return _encode_rows(inverse(poses) @ poses[key_steps], np.zeros(length))[:, :9]
 
 
 def decode_chunk(rows: NDArray[np.floating], tcp: NDArray[np.floating]) -> tuple[Array, NDArray[np.float64]]:
-    """Decode rows (..., 10) to poses (..., 4, 4) in the arm's base frame and gripper commands (...)."""
+    """Return the poses (..., 4, 4) and the gripper commands (...) of rows of a chunk (..., 10).
+
+    tcp: (4, 4) TCP pose in the arm's base frame at the prediction. The returned poses are in the arm's base frame.
+    """
     rows = np.asarray(rows, np.float64)
     first = rows[..., 3:6] / np.maximum(np.linalg.norm(rows[..., 3:6], axis=-1, keepdims=True), 1e-9)
     second = rows[..., 6:9] - (first * rows[..., 6:9]).sum(-1, keepdims=True) * first
@@ -72,16 +80,18 @@ def decode_chunk(rows: NDArray[np.floating], tcp: NDArray[np.floating]) -> tuple
     return tcp @ from_rotation(rows[..., :3], rotations), rows[..., 9]
 
 
-def _rows(poses: NDArray[np.floating], last: NDArray[np.floating]) -> NDArray[np.float32]:
+def _encode_rows(poses: NDArray[np.floating], last_column: NDArray[np.floating]) -> NDArray[np.float32]:
     columns = poses[..., :3, :2].swapaxes(-1, -2).reshape(*poses.shape[:-2], 6)
-    return np.concatenate([poses[..., :3, 3], columns, last[..., None]], axis=-1).astype(np.float32)
+    return np.concatenate([poses[..., :3, 3], columns, last_column[..., None]], axis=-1).astype(np.float32)
 
 
-class Scale(torch.nn.Module):
-    """Normalisation to mean 0 and deviation 1; its buffers are saved with the weights and not trained.
+class Normalizer(torch.nn.Module):
+    """Module that normalises values to mean 0 and standard deviation 1.
+
+    Mean and deviation are buffers: they are saved with the weights, and training does not change them.
 
     Args:
-        mean, deviation: nested lists of numbers, of the same shape.
+        mean, deviation: nested lists of numbers with equal shapes.
     """
 
     mean: torch.Tensor
@@ -96,43 +106,53 @@ class Scale(torch.nn.Module):
         return (values - self.mean) / self.deviation
 
     def inverse(self, values: torch.Tensor) -> torch.Tensor:
-        """Undo the normalisation."""
+        """Return values from normalised values."""
         return values * self.deviation + self.mean
 
 
-def scale_statistics(motions: NDArray[np.floating]) -> dict[str, Any]:
-    """Return the arguments of a `Scale` for poses (N, ..., 9), per row of the chunk."""
+def compute_normalizer_statistics(motions: NDArray[np.floating]) -> dict[str, Any]:
+    """Return ``mean`` and ``deviation`` of a `Normalizer` for encoded poses (N, ..., 9), computed over N."""
     return {"mean": motions.mean(0).tolist(), "deviation": np.maximum(motions.std(0), _MIN_DEVIATION).tolist()}
 
 
 class ChunkModel(Protocol):
-    """Network that predicts chunks: loss weights in ``config``, scales of its predictions."""
+    """Network that predicts chunks and key poses.
+
+    Attributes:
+        config: configuration with the loss weights ``gripper_weight``, ``keys_weight`` and ``near_distance``.
+        chunk_scale: normalisation of the poses (K, 9) of a chunk.
+        key_scale: normalisation of a key pose (9,).
+    """
 
     config: Any
-    chunk_scale: Scale
-    key_scale: Scale
+    chunk_scale: Normalizer
+    key_scale: Normalizer
 
 
-def chunk_losses(model: ChunkModel, batch: Batch, chunk: torch.Tensor, key: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Return the losses of a batch: L1 of poses and key poses, cross entropy of gripper commands.
+def compute_chunk_losses(
+    model: ChunkModel, batch: Batch, chunk: torch.Tensor, key: torch.Tensor
+) -> dict[str, torch.Tensor]:
+    """Return the losses and metrics of a batch of predicted chunks and key poses.
 
-    The weight of a pose is near_distance / (near_distance + distance): 1 cm decides about a grasp and hardly matters
-    half a metre away.
+    The losses are the L1 errors of poses and key poses, and the cross entropy of gripper commands. The weight of a pose
+    in the L1 error is near_distance / (near_distance + distance to the present TCP): an error of 1 cm can make a grasp
+    fail, and hardly matters half a metre away.
 
     Args:
-        model: the network.
-        batch: with labels ``chunk`` (B, K, 10) and ``key`` (B, 9), not normalised.
-        chunk: (B, K, 10) predicted chunk: normalised poses, logits of the gripper commands.
-        key: (B, 9) predicted key pose, normalised.
+        model: network that made the predictions; has the loss weights and the normalisation.
+        batch: labels ``chunk`` (B, K, 10) and ``key`` (B, 9), not normalised.
+        chunk: (B, K, 10) predicted chunks: normalised poses, logits of the gripper commands.
+        key: (B, 9) predicted key poses, normalised.
 
     Returns:
-        ``loss`` and its terms ``motion``, ``gripper``, ``keys``; position errors in mm of the key pose (``key_mm``), of
-        key poses within 5 cm (``near_mm``), of the first and the last step of the chunk.
+        ``loss`` and its terms ``motion``, ``gripper``, ``keys``. Position errors in mm: ``key_mm`` of the key pose,
+        ``near_mm`` of key poses that are at most 5 cm from the present TCP, ``first_mm`` and ``last_mm`` of the first
+        and the last step of the chunk.
     """
     config = model.config
-    motion = _l1(chunk[..., :9], batch["chunk"][..., :9], model.chunk_scale, config.near_distance)
+    motion = _compute_pose_loss(chunk[..., :9], batch["chunk"][..., :9], model.chunk_scale, config.near_distance)
     gripper = F.binary_cross_entropy_with_logits(chunk[..., 9], batch["chunk"][..., 9])
-    keys = _l1(key, batch["key"], model.key_scale, config.near_distance)
+    keys = _compute_pose_loss(key, batch["key"], model.key_scale, config.near_distance)
     with torch.no_grad():
         key_error = (model.key_scale.inverse(key) - batch["key"])[:, :3].norm(dim=1)
         near = (batch["key"][:, :3].norm(dim=1) < _NEAR).float()
@@ -149,8 +169,10 @@ def chunk_losses(model: ChunkModel, batch: Batch, chunk: torch.Tensor, key: torc
     }
 
 
-def _l1(predicted: torch.Tensor, poses: torch.Tensor, scale: Scale, near_distance: float) -> torch.Tensor:
-    """Return the mean error of normalised poses (..., 9), weighted by distance, see `chunk_losses`."""
+def _compute_pose_loss(
+    predicted: torch.Tensor, poses: torch.Tensor, scale: Normalizer, near_distance: float
+) -> torch.Tensor:
+    """Return the mean L1 error of normalised poses (..., 9), weighted by distance as in `compute_chunk_losses`."""
     error = (predicted - scale(poses)).abs().mean(dim=-1)
     if not near_distance:
         return error.mean()
@@ -159,24 +181,26 @@ def _l1(predicted: torch.Tensor, poses: torch.Tensor, scale: Scale, near_distanc
 
 
 class ChunkPolicy:
-    """Policy that executes predicted chunks, in the ``robocas`` action convention relative to the TCP.
+    """Policy that executes predicted chunks, with actions of convention ``robocas`` and reference ``tcp``.
 
-    The policy executes a chunk for ``n_action_steps`` before the next prediction. A network that observes images
-    without velocities takes every step for the slow start of a motion: with a prediction at each step it would creep
-    and never close the gripper. The pose of a step is the mean of all predictions for it, weighted by
-    exp(-temporal_ensemble_coeff * age). Age 0 is the newest prediction; in ACT (Zhao et al. 2023) the oldest prediction
-    has the largest weight.
+    The policy executes ``n_action_steps`` steps of a chunk before the next prediction. Images do not show velocities,
+    so a network takes each image for the slow start of a motion. With a prediction at every step the arm would move
+    too slowly, and the gripper would never close. The commanded pose of a step is the mean of all predictions for this
+    step, weighted by exp(-temporal_ensemble_coeff * age). The newest prediction has age 0 and the largest weight; in
+    ACT (Zhao et al. 2023) the oldest prediction has the largest weight.
 
-    Reopen heuristic: a gripper that closed on nothing and has stopped moving is opened. It is not learned: a failed
-    grasp looks like pushing with a closed gripper, and the network would wait forever.
+    Reopen heuristic: the policy opens a gripper that has closed on nothing and has stopped moving. This is not learned:
+    a failed grasp looks like pushing with a closed gripper, and the network would wait forever.
 
     Args:
-        spec: specification of the policy; images are rendered for new chunks only.
-        predict: function from observations and a row to a chunk (K, 10).
+        spec: specification of the policy; ``observe_every`` becomes ``n_action_steps``.
+        predict: function that predicts the chunk (K, 10) of one env, from the observations and the row of the env. The
+            last column is the probability of the command to open the gripper.
         n_action_steps: policy steps of a chunk that are executed before the next prediction, at most K.
         temporal_ensemble_coeff: decay of the weight of older predictions, per policy step.
-        reopen: distance in m; an empty gripper that moved less during a chunk is opened. 0 switches it off.
-        description: entries of `describe`.
+        reopen: distance in m. The policy opens an empty gripper that has moved less than this distance since the last
+            prediction. 0 switches the heuristic off.
+        description: return value of `describe`.
     """
 
     def __init__(
@@ -195,6 +219,7 @@ class ChunkPolicy:
         self._chunk_start: dict[int, Array] = {}  # by env, (3,) TCP position at the last prediction, in the base frame
 
     def describe(self) -> dict[str, Any]:
+        """Return the entries that an evaluation records in its result."""
         return self._description
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
@@ -203,6 +228,7 @@ class ChunkPolicy:
             self._chunk_start.pop(episode.env, None)
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
+        """Return one action per env (E, 7)."""
         tcp = from_wxyz(observations.tcp_in_base)
         envs = observations.envs.tolist()
         for row, env in enumerate(envs):
@@ -212,32 +238,42 @@ class ChunkPolicy:
                     observations, row
                 )  # one env at a time: in a batch, rounding depends on the other rows
                 chunks.insert(0, _Chunk(*decode_chunk(rows, tcp[row])))
-                if self._is_stuck(env, tcp[row, :3, 3], float(observations.robot[GRIPPER_WIDTH].reshape(-1)[row])):
-                    chunks = [replace(one, opened=np.ones_like(one.opened)) for one in chunks]  # else outvoted
+                if self._update_stuck(env, tcp[row, :3, 3], float(observations.robot[GRIPPER_WIDTH].reshape(-1)[row])):
+                    chunks = [replace(one, gripper=np.ones_like(one.gripper)) for one in chunks]  # else outvoted
             self._chunks[env] = chunks
-        return np.stack([self._next(self._chunks[env], here) for env, here in zip(envs, tcp, strict=True)])
+        return np.stack([self._make_action(self._chunks[env], here) for env, here in zip(envs, tcp, strict=True)])
 
-    def _is_stuck(self, env: int, here: Array, width: float) -> bool:
-        """Return whether an empty gripper has not moved since the last prediction; store its position."""
-        before = self._chunk_start.get(env)
-        self._chunk_start[env] = here.copy()
-        return width < _EMPTY_WIDTH and before is not None and bool(np.linalg.norm(here - before) < self._reopen)
+    def _update_stuck(self, env: int, position: Array, width: float) -> bool:
+        """Return whether the gripper is empty and has not moved since the last prediction; store its position.
 
-    def _next(self, chunks: list[_Chunk], here: Array) -> NDArray[np.float64]:
+        position: (3,) TCP position in the arm's base frame, m. width: gripper width, m.
+        """
+        last = self._chunk_start.get(env)
+        self._chunk_start[env] = position.copy()
+        return width < _EMPTY_WIDTH and last is not None and bool(np.linalg.norm(position - last) < self._reopen)
+
+    def _make_action(self, chunks: list[_Chunk], here: Array) -> NDArray[np.float64]:
+        """Return the action (7,) from the TCP pose ``here`` (4, 4) to the mean of the predictions for this step."""
         weights = np.exp(-self._ensemble_coeff * np.array([one.age for one in chunks]))
         weights /= weights.sum()
         poses = np.stack([one.poses[one.age] for one in chunks])
-        opened = float(weights @ [one.opened[one.age] for one in chunks])
+        probability = float(weights @ [one.gripper[one.age] for one in chunks])
         rotation = Rotation.from_matrix(poses[:, :3, :3]).mean(weights)
         now = Rotation.from_matrix(here[:3, :3]).inv()
         motion = now.apply(weights @ poses[:, :3, 3] - here[:3, 3])
-        return np.array([*motion, *(now * rotation).as_euler("xyz"), float(opened > 0.5)])
+        return np.array([*motion, *(now * rotation).as_euler("xyz"), float(probability > 0.5)])
 
 
 @dataclass(frozen=True)
 class _Chunk:
-    """Decoded chunk: poses (K, 4, 4) in the arm's base frame, gripper commands (K,), age in policy steps."""
+    """Decoded chunk.
+
+    Attributes:
+        poses: (K, 4, 4) TCP poses in the arm's base frame.
+        gripper: (K,) probabilities of the command to open the gripper.
+        age: policy steps since the prediction; the index of the row for the present step.
+    """
 
     poses: Array
-    opened: NDArray[np.float64]
+    gripper: NDArray[np.float64]
     age: int = 0

@@ -1,4 +1,4 @@
-"""Checks that a dataset suits a baseline, before its images are decoded."""
+"""Checks before the training: whether a baseline can learn from a dataset."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Collection
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.baselines.baseline import Split, empty_split_error
+from robocas_ms3.baselines.baseline import Split, make_empty_split_error
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.manage.repairs import eef_turn
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource
@@ -19,29 +19,33 @@ _MAX_BASE_MOTION = 0.005  # m or rad; a standing base moves by less than 0.1 mm
 def check_dataset(
     source: EpisodeSource, split: Split, cameras: Collection[str], rate_hz: float, *, language: bool
 ) -> list[int]:
-    """Check that a split suits a baseline, and return the numbers of its episodes.
+    """Check that a baseline can learn from a split of a dataset; return the numbers of the episodes.
 
-    Checks the cameras, the instruction embeddings (with ``language``), the rate, the frame of the actions, and that the
-    base does not move.
+    The dataset must have these cameras, this rate, instruction embeddings (if ``language``), and actions in the frame
+    of ManiSkill's TCP. The base must not move.
 
     Raises:
-        DatasetError: one of these is missing or differs.
+        DatasetError: the dataset does not fulfil one of these conditions.
         EmptySplitError: the split has no episodes.
     """
     if any(camera not in source.cameras for camera in cameras):
-        fix = "Convert the trajectory with these cameras, or choose cameras: --set cameras (rt1), --set views (small)."
+        fix = (
+            "Convert with --cameras, or train with other cameras: --set views.CAMERA=null (small), --set cameras (rt1)."
+        )
         expected, found = ", ".join(cameras), ", ".join(source.cameras) or "none"
         raise DatasetError("missing camera in the dataset", where=source.root, expected=expected, found=found, fix=fix)
     if language and not source.has_embeddings:
-        fix = "Convert the trajectory with embeddings, or train small with --set language=false."
+        fix = "Convert with embeddings (the default), or train small with --set language=false."
         raise DatasetError("no instruction embeddings in the dataset", where=source.root, fix=fix)
     if source.rate_hz != rate_hz:
         fix = f"Convert with --rate {rate_hz:g}, or train with --set rate_hz={source.rate_hz:g}."
         expected, found = f"{rate_hz:g} Hz", f"{source.rate_hz:g} Hz"
-        raise DatasetError("wrong rate of the dataset", where=source.root, expected=expected, found=found, fix=fix)
+        raise DatasetError(
+            "the dataset has another rate than the policy", where=source.root, expected=expected, found=found, fix=fix
+        )
     numbers = source.split(split)
     if not numbers:
-        raise empty_split_error(source.root, split)
+        raise make_empty_split_error(source.root, split)
     check_tcp_frame(source, numbers[0])
     for number in numbers:
         motion = source.episode(number).read(["rel_agv_pose"])["rel_agv_pose"]
@@ -50,35 +54,36 @@ def check_dataset(
 
 
 def check_base_is_fixed(motion: NDArray[np.floating], where: object) -> None:
-    """Check that the base does not move, which 7-D actions cannot express.
+    """Check that the base does not move, because 7-D actions cannot move it.
 
     Args:
-        motion: (T, 3) motion of the base per step, m, m, rad.
-        where: place of the episode, for the error.
+        motion: (T, 3) motion of the base per step: x and y in m, yaw in rad.
+        where: file and episode; the error shows it.
 
     Raises:
-        DatasetError: the base moves.
+        DatasetError: the base moves by more than 5 mm or 0.005 rad.
     """
     path = np.cumsum(motion, axis=0, dtype=np.float64)
     furthest = float(np.abs(np.concatenate([motion, path])).max(initial=0))
     if not furthest <= _MAX_BASE_MOTION:  # NaN is refused too
         raise DatasetError(
-            "the base moves, which 7-D actions cannot express",
+            "the base moves, and 7-D actions cannot move it",
             where=where,
-            expected=f"within {_MAX_BASE_MOTION:g} m or rad of its first pose",
-            found=f"{furthest:.3g}",
-            fix="Train on a configuration without base_motion.",
+            expected=f"at most {_MAX_BASE_MOTION:g} m or rad from its first pose",
+            found=f"{furthest:.3g} m or rad",
+            fix="Record with a task configuration without base_motion.",
         )
 
 
 def check_tcp_frame(source: EpisodeSource, number: int) -> None:
-    """Check that actions are in the frame of ManiSkill's TCP.
+    """Check that the actions of an episode are in the frame of ManiSkill's TCP.
 
-    Episodes of `robocas convert` are. For other datasets the pose of the gripper camera shows the frame.
+    `robocas convert` writes such actions, and ``scene.json`` shows that it wrote the episode. For other episodes the
+    pose of the gripper camera shows the frame of the actions.
 
     Raises:
         DatasetError: the actions are in RoboCAS-v0's frame, which is rotated about z; or the frame is unknown, because
-            neither the gripper camera nor ``scene.json`` is there.
+            the episode has neither a gripper camera nor a ``scene.json``.
     """
     camera, episode = EE_CAMERA, source.episode(number)
     if episode.scene.get("env_info"):  # recorded by this package, in that frame, wherever the camera is mounted
@@ -89,15 +94,15 @@ def check_tcp_frame(source: EpisodeSource, number: int) -> None:
         raise DatasetError(
             "unknown frame of the actions",
             where=episode.where,
-            expected=f"{camera}, or the scene.json of robocas convert",
+            expected=f"{camera}, or a scene.json written by robocas convert",
+            found="neither",
             fix="Import the dataset with `robocas import-robocas`.",
         )
     turn = eef_turn(episode.camera_in_parent(camera))
     if turn:
         raise DatasetError(
-            "wrong frame of the actions",
+            "the actions are not in the frame of ManiSkill's TCP",
             where=source.root,
-            expected="frame of ManiSkill's TCP",
-            found=f"a frame rotated by {-turn} degrees about z",
+            found=f"a frame rotated by {-turn} degrees about z, as in RoboCAS-v0",
             fix="Import the dataset with `robocas import-robocas`, without --no-turn-eef.",
         )

@@ -17,19 +17,19 @@ from robocas_ms3.scenes.config import TaskConfig
 
 
 def shipped_small() -> RunPolicy:
-    """Make the policy ``small`` from the bundled weights, which are for pick; see docs/baselines.md."""
+    """Make the policy `small` with the bundled weights, which were trained for pick; see docs/baselines.md."""
     return RunPolicy(BUNDLED / "small")
 
 
 class RunPolicy:
-    """Policy of a training run.
+    """Policy with the weights of a training run.
 
     Args:
-        folder: folder of the run.
+        folder: output folder of `robocas train`.
         device: ``auto`` (a GPU if there is one), ``cpu`` or ``cuda``.
 
     Raises:
-        TrainingError: there is no run, its files are damaged, or it is a run of another version of the baseline.
+        TrainingError: the folder has no run, its files are damaged, or another version of the baseline wrote them.
     """
 
     def __init__(self, folder: Path, device: str = "auto") -> None:
@@ -41,21 +41,21 @@ class RunPolicy:
 
         if record.version != baseline.version:
             raise TrainingError(
-                f"run of another version of {record.baseline}",
+                f"the run was trained with another version of {record.baseline}",
                 where=folder,
-                expected=baseline.version,
-                found=record.version,
-                fix="Train again, or install the release that trained it (run.json, versions).",
+                expected=f"version {baseline.version}",
+                found=f"version {record.version}",
+                fix="Train again, or install the release of robocas-ms3 in run.json (versions).",
             )
         config = parse(baseline.Config, record.config, TrainingError, where=folder / RUN)
-        weights = checkpoints.load(folder / WEIGHTS, record.metadata)
+        weights = checkpoints.load_checkpoint(folder / WEIGHTS, record.metadata)
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
-        with _damaged_facts(folder / RUN):
+        with _convert_fact_errors(folder / RUN):
             model = baseline.model(config, record.facts)
         weights.load_model(model)
         model = model.to(device).eval()
-        with _damaged_facts(folder / RUN):
+        with _convert_fact_errors(folder / RUN):
             self._policy: Policy = baseline.policy(config, record.facts, model)
         self._name, self._scenes, self._has_warned = f"policy {folder.name}", record.data.scenes, False
         self._description = {
@@ -72,18 +72,22 @@ class RunPolicy:
 
     @property
     def spec(self) -> PolicySpec:
+        """Return the observations that the policy needs, its rate, and the convention of its actions."""
         return self._policy.spec
 
     def describe(self) -> dict[str, Any]:
+        """Return baseline, training data, configuration and weights hash, which an evaluation records in its result."""
         return {**self._description, **getattr(self._policy, "describe", dict)()}
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
+        """Start new episodes in some of the envs."""
         self._policy.reset(episodes)
 
     def protocol_warnings(self, configs: dict[str, TaskConfig]) -> list[str]:
-        """Return a warning about tasks, scenes, objects and cameras that the training data lacks.
+        """Warn if task configurations have tasks, scenes, objects or cameras that the training data lacks.
 
-        Each policy object warns once.
+        Returns:
+            One warning; empty if there is nothing to warn about, or if this object has warned before.
         """
         differences = [] if self._has_warned else self._scenes.differences(configs, self.spec.cameras)
         if not differences:
@@ -93,16 +97,16 @@ class RunPolicy:
         return [f"{what}. Not in the training data: {'; '.join(differences)}. Trained for: {self._scenes.summary()}."]
 
     def act(self, observations: Observations) -> Any:
-        """Return actions (E, A), or chunks (E, H, A)."""
+        """Return one action per env (E, A), or one chunk of H actions per env (E, H, A)."""
         return self._policy.act(observations)
 
 
 @contextmanager
-def _damaged_facts(path: Path) -> Iterator[None]:
-    """Convert errors of building a network from damaged facts to a TrainingError with their file."""
+def _convert_fact_errors(path: Path) -> Iterator[None]:
+    """Convert errors of damaged values in ``run.json``, which make no network, to a TrainingError."""
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:
         found = format_error(error, 200)
-        what = "config and facts do not make a network"
-        raise TrainingError(what, where=path, found=found) from error
+        what, fix = "cannot build the network from config and facts", "Restore the file, or train again."
+        raise TrainingError(what, where=path, found=found, fix=fix) from error

@@ -1,4 +1,4 @@
-"""Registry of the baselines, imported at first use; other packages add baselines by entry points."""
+"""Registry of the baselines. A baseline is imported at first use; other packages register theirs by entry points."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ GROUP = "robocas_ms3.baselines"
 
 
 @dataclass(frozen=True)
-class Builtin:
-    """Function that imports a baseline of this package.
+class BuiltinBaseline:
+    """Function that imports a baseline of this package and returns it.
 
     Attributes:
-        folder: module or package next to this file.
-        description: one line for `robocas list`.
+        folder: name of the module or package in `robocas_ms3.baselines`.
+        description: line of text for `robocas list`.
     """
 
     folder: str
@@ -39,21 +39,28 @@ BASELINES: Registry[Callable[[], Baseline]] = Registry(
     GROUP,
     Callable,
     {
-        "small": Builtin(
+        "small": BuiltinBaseline(
             "small", "base and gripper camera, language; action chunks by a small transformer; bundled weights for pick"
         ),
-        "bc-state": Builtin("bc_state", "privileged state of the simulator; action chunks by a residual MLP"),
-        "rt1": Builtin(
+        "bc-state": BuiltinBaseline("bc_state", "privileged state of the simulator; action chunks by a residual MLP"),
+        "rt1": BuiltinBaseline(
             "rt1", "RT-1 of the RoboCAS paper: base and gripper camera, language; action tokens by a transformer"
         ),
-        "ppo": Builtin("ppo", "reinforcement learning from dense rewards and privileged state; needs no data"),
+        "ppo": BuiltinBaseline("ppo", "reinforcement learning from dense rewards and privileged state; needs no data"),
     },
 )
-"""Functions that import a baseline, by name."""
+"""By name of a baseline, function that imports and returns it."""
 
 
 def find_baseline(name: str, *, where: object = "") -> Baseline:
-    """Import the baseline registered under a name; ``where`` is the place of the name, for errors."""
+    """Import and return the baseline with a name.
+
+    where: place of the name, such as a file; errors show it.
+
+    Raises:
+        TrainingError: there is no baseline of this name.
+        MissingExtraError: the extra ``train`` is not installed.
+    """
     if name not in BASELINES:
         known = list(BASELINES)
         expected = f"one of {', '.join(known)}"

@@ -136,7 +136,7 @@ def train(baseline: str, cfg: Training) -> int:
             baseline,
             data,
             out.absolute(),
-            layers=config_layers(cfg),
+            config_layers=config_layers(cfg),
             init_from=init_from,
             device=cfg.device,
             overwrite=cfg.overwrite,

@@ -33,7 +33,7 @@ def simulator(monkeypatch, tmp_path):
     def simulate(*states):
         rest = list(states)
         state = lambda *_: np.array(rest.pop(0) if len(rest) > 1 else rest[0])  # noqa: E731
-        monkeypatch.setattr(bc_state, "_privileged_state", state)
+        monkeypatch.setattr(bc_state, "_read_privileged_state", state)
         return made
 
     return simulate
@@ -123,7 +123,7 @@ def test_samples_are_learned_and_the_policy_has_the_same_inputs(simulator, traje
     samples = read(trajectory)
     model, losses = fit(BASELINE, config, samples, 60)
     assert losses[-1] < 0.4 * losses[0]
-    arrays = bc_state.load_states(trajectory, config.rate_hz, lambda done, total: None)
+    arrays = bc_state.load_cached_states(trajectory, config.rate_hz, lambda done, total: None)
     policy = BASELINE.policy(config, samples.facts, model)
     [number] = split_by_seed(dict(enumerate(arrays["seeds"].tolist())))[0]
     for step in (0, 4):

@@ -12,12 +12,12 @@ from synthetic_observations import observe, start
 
 from robocas_ms3.baselines.chunks import (
     ChunkPolicy,
-    Scale,
-    chunk_losses,
+    Normalizer,
+    compute_chunk_losses,
+    compute_normalizer_statistics,
     decode_chunk,
     encode_chunks,
-    next_key_poses,
-    scale_statistics,
+    encode_next_key_poses,
 )
 from robocas_ms3.evaluation.policy import PolicySpec
 
@@ -61,30 +61,30 @@ def test_key_poses_are_at_the_next_gripper_command():
     poses = np.tile(np.eye(4), (7, 1, 1))
     poses[:, 0, 3] = [0, 1, 2, 3, 4, 5, 6]
     # commands: close after step 2, open after step 4; then the end of the episode
-    keys = next_key_poses(poses, [1, 1, 1, 0, 0, 1, 1])
+    keys = encode_next_key_poses(poses, [1, 1, 1, 0, 0, 1, 1])
     assert keys[:, 0].tolist() == [2, 1, 0, 1, 0, 1, 0]
 
 
 def test_scale_and_inverse():
     motions = np.array([[[0.0] * 9], [[1.0] * 9]])  # two samples of one step: mean 0.5, deviation 0.5
-    scale = Scale(**scale_statistics(motions))
+    scale = Normalizer(**compute_normalizer_statistics(motions))
     assert torch.allclose(scale(torch.ones(1, 9)), torch.ones(1, 9))
     assert torch.allclose(scale.inverse(scale(torch.full((1, 9), 0.3))), torch.full((1, 9), 0.3))
-    assert min(scale_statistics(np.zeros((2, 1, 9)))["deviation"][0]) > 0
+    assert min(compute_normalizer_statistics(np.zeros((2, 1, 9)))["deviation"][0]) > 0
 
 
 def losses(near_distance):
     """Return the losses of two samples of one step: label at 0.1 m with an error of 0.3 m; label at 0.3 m, no error."""
     weights, one = (
         SimpleNamespace(near_distance=near_distance, gripper_weight=0.5, keys_weight=2.0),
-        Scale([0.0] * 9, [1.0] * 9),
+        Normalizer([0.0] * 9, [1.0] * 9),
     )
     model = SimpleNamespace(config=weights, chunk_scale=one, key_scale=one)
     chunk, key = torch.zeros(2, 1, 10), torch.zeros(2, 9)
     chunk[0, 0, 0], chunk[1, 0, 0], key[:, 1] = 0.1, 0.3, 0.04
     found = chunk.clone()
     found[0, 0, 0] += 0.3
-    return chunk_losses(model, {"chunk": chunk, "key": key}, found, key + 0.003)
+    return compute_chunk_losses(model, {"chunk": chunk, "key": key}, found, key + 0.003)
 
 
 def test_losses():

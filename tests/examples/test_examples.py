@@ -83,7 +83,7 @@ def test_ppo_trains_for_a_few_steps(tmp_path):
     small = ["--steps", 128, "--envs", 2, "--workers", 1, "--batch", 64, "--layouts", 2, "--test-episodes", 2]
     started, tested = run("ppo.py", *small, cwd=tmp_path)
     assert started.startswith("ppo: 0.05 M parameters, 128 steps in 2 layouts")
-    assert tested.startswith("test without noise, 2 other layouts: return ")
+    assert tested.startswith("test with mean actions, 2 new layouts: return ")
     with (tmp_path / "out/ppo/metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [(row["step"], row["split"]) for row in rows] == [("64", "train"), ("128", "train"), ("128", "val")]

@@ -1,8 +1,8 @@
 """Sizes of the baseline `small` for tests, which train in seconds."""
 
-from robocas_ms3.baselines.small.config import View
+from robocas_ms3.baselines.small.config import CameraView
 
-VIEW = View(image_size=(64, 48), size=(64, 48))
+VIEW = CameraView(image_size=(64, 48), size=(64, 48))
 TINY = dict(
     views={"base_camera": VIEW, "gripper_camera": VIEW},
     chunk=3,

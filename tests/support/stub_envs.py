@@ -48,13 +48,13 @@ class StubEnvironments:
 
     def __init__(self, config, device):
         self.config, self.episodes = config, config.layouts
-        self.envs = self.make(config.envs, 0, config.layouts - 1)
+        self.envs = self.make_envs(config.envs, 0, config.layouts - 1)
         self.made.append(self.envs)
 
     def __len__(self):
         return self.config.train.steps
 
-    def make(self, count, first_seed, last_seed):
+    def make_envs(self, count, first_seed, last_seed):
         return LeftOrRight(count)
 
     def close(self):

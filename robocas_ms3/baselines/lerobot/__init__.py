@@ -1,5 +1,5 @@
-"""LeRobot's policies (ACT, diffusion, ...), trained on exported datasets and evaluated over the policy socket.
+"""LeRobot's policies (ACT, diffusion and others), trained on LeRobot datasets and evaluated over the policy socket.
 
-``prepare`` reduces a dataset to what the policy socket sends. ``serve`` serves a checkpoint, in LeRobot's environment.
-``policy`` has the observations that both use. More: docs/baselines_lerobot.md.
+`prepare` reduces a dataset to the data that the policy socket sends. `serve` serves a checkpoint; it runs in LeRobot's
+environment. `policy` has the observations that both use. More: docs/baselines_lerobot.md.
 """

@@ -1,4 +1,4 @@
-"""Adapter from a LeRobot policy to `Policy`; runs in LeRobot's environment and uses only the policy's methods."""
+"""Adapter that makes a LeRobot policy a `Policy`. It runs in LeRobot's environment and does not import LeRobot."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH, STATE
 
 EMBEDDING, ACTION = "observation.environment_state", "action"
-"""Keys of LeRobot; here the environment's state is the embedding of the instruction."""
+"""LeRobot's keys. The embedding of the instruction is stored as the state of the environment."""
 STATE_NAMES = (
     *("x", "y", "z"),
     *("xx", "xy", "xz", "yx", "yy", "yz"),
@@ -34,15 +34,15 @@ Processor = Callable[[Any], Any]
 
 
 def make_state(position: NDArray, xyzw: NDArray, joints: NDArray, width: NDArray) -> NDArray[np.float32]:
-    """Return states (N, 17) as in `STATE_NAMES`.
+    """Return the states (N, 17) that LeRobot policies observe; `STATE_NAMES` names the values.
 
-    Axes represent the orientation, because the sign of a quaternion of a gripper that points down is random. The pose
-    of the base is not included: the policy socket does not send it.
+    The x and y axes represent the orientation of the TCP, because the sign of a quaternion of a gripper that points
+    down is random. The pose of the robot's base is not included, because the policy socket does not send it.
 
     Args:
         position: (N, 3) TCP position in the arm's base frame, m.
-        xyzw: (N, 4) TCP orientation in the arm's base frame.
-        joints: (N, 7) rad.
+        xyzw: (N, 4) TCP orientation in the arm's base frame, quaternion.
+        joints: (N, 7) joint positions of the arm, rad.
         width: (N, 1) gripper width, m.
     """
     axes = Rotation.from_quat(np.asarray(xyzw, np.float64)).as_matrix()
@@ -50,26 +50,27 @@ def make_state(position: NDArray, xyzw: NDArray, joints: NDArray, width: NDArray
 
 
 def scale_embeddings(embeddings: NDArray) -> NDArray[np.float32]:
-    """Scale embeddings (N, 384) to components of about 1: LeRobot does not normalise them."""
+    """Scale unit embeddings (N, 384) to components of about 1, because LeRobot does not normalise them."""
     return (np.asarray(embeddings) * np.sqrt(DIMENSIONS)).astype(np.float32)
 
 
 class LeRobotPolicy:
-    """Policy that calls a LeRobot policy once per step and env, as LeRobot's rollouts do.
+    """Policy that calls ``select_action`` of a LeRobot policy once per step and env, as LeRobot's rollouts do.
 
-    A LeRobot policy stores its history and the rest of a chunk, for one batch of envs that start together. Envs of an
-    evaluation start at any time, so each env has a copy of the policy with shared weights and its own queues.
+    A LeRobot policy stores past observations and the rest of a chunk, for a batch of envs that start together. The envs
+    of an evaluation start at different times. Therefore each env has a copy of the policy with its own queues and the
+    same weights.
 
     Args:
         model: LeRobot policy, with ``reset`` and ``select_action``.
-        preprocessor: LeRobot's preprocessor, from one observation to a normalised batch of one.
-        postprocessor: LeRobot's postprocessor, to an action (1, 7) in m, rad and gripper command.
-        inputs: shape of each input, as in the checkpoint's configuration; images are (3, H, W).
+        preprocessor: LeRobot's preprocessor, which makes a normalised batch of one observation.
+        postprocessor: LeRobot's postprocessor, which makes an action (1, 7) in m, rad and gripper command.
+        inputs: shape of each input by its LeRobot key, from the checkpoint's configuration; images are (3, H, W).
         rate_hz: actions per second.
-        description: entries of `describe`.
+        description: return value of `describe`.
 
     Raises:
-        EvaluationError: the inputs are not those of a dataset that `prepare` made.
+        EvaluationError: the inputs are not those of a dataset that `prepare_dataset` wrote.
     """
 
     def __init__(
@@ -88,9 +89,12 @@ class LeRobotPolicy:
             if re.fullmatch(f"{_IMAGES}{CAMERA_NAME}", key) and len(shape) == 3:
                 cameras[key.removeprefix(_IMAGES)] = (shape[2], shape[1])
             elif {STATE: (len(STATE_NAMES),), EMBEDDING: (DIMENSIONS,)}.get(key) != tuple(shape):
-                fix = "Train on a dataset of `python -m robocas_ms3.baselines.lerobot.prepare`."
+                fix = "Train on a dataset written by `python -m robocas_ms3.baselines.lerobot.prepare`."
                 raise EvaluationError(
-                    "the policy has other inputs than prepared datasets", where=key, found=list(shape), fix=fix
+                    "the policy has other inputs than prepared datasets",
+                    where=key,
+                    found=f"shape {list(shape)}",
+                    fix=fix,
                 )
         self.spec = PolicySpec(
             convention="robocas",
@@ -100,31 +104,31 @@ class LeRobotPolicy:
             language="embedding" if EMBEDDING in self._inputs else "text",
         )
         self._models: dict[int, Any] = {}
-        self._draws: dict[int, np.random.Generator] = {}
+        self._generators: dict[int, np.random.Generator] = {}
 
     def describe(self) -> dict[str, Any]:
         return self._description
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
-        """Start episodes: empty the queues, and seed the noise with the episode's seed."""
+        """Start episodes: empty the queues of their envs, and seed the noise of the policy with the episode's seed."""
         for episode in episodes:
             self._models[episode.env] = _copy_with_queues(self._model)
-            self._draws[episode.env] = np.random.default_rng([episode.seed, episode.episode])
+            self._generators[episode.env] = np.random.default_rng([episode.seed, episode.episode])
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Return actions (E, 7), computed per env, so that they do not depend on the other envs."""
+        """Return one action per env (E, 7). Each env is a batch of its own, so the envs do not influence each other."""
         return np.stack([self._act(env, observations, row) for row, env in enumerate(observations.envs.tolist())])
 
     def _act(self, env: int, observations: Observations, row: int) -> NDArray[np.float32]:
-        torch.manual_seed(int(self._draws[env].integers(2**63)))  # for the noise of diffusion policies
+        torch.manual_seed(int(self._generators[env].integers(2**63)))  # for the noise of diffusion policies
         with torch.inference_mode():
             action = self._postprocessor(
-                self._models[env].select_action(self._preprocessor(self._item(observations, row)))
+                self._models[env].select_action(self._preprocessor(self._make_item(observations, row)))
             )
         return action.reshape(-1).to("cpu", torch.float32).numpy()
 
-    def _item(self, observations: Observations, row: int) -> dict[str, Any]:
-        """Return an observation as an item of a LeRobot dataset: no batch axis, images (3, H, W) in 0..1."""
+    def _make_item(self, observations: Observations, row: int) -> dict[str, Any]:
+        """Return the observation of a row as LeRobot's datasets do: without batch axis, images (3, H, W) in 0..1."""
         one = slice(row, row + 1)
         tcp = observations.tcp_in_base[one]
         joints = observations.qpos[one, RobotDescription.arm_slice]
@@ -140,6 +144,7 @@ class LeRobotPolicy:
 
 
 def _copy_with_queues(model: Any) -> Any:
+    """Return a LeRobot policy with the same weights and its own empty queues."""
     copied = copy.copy(model)
     for name, value in vars(model).items():
         if hasattr(value, "reset"):  # such as ACT's temporal ensembler, which is reset in place

@@ -1,10 +1,10 @@
-"""Reduce a LeRobot export to what the policy socket sends, with the instruction's embedding, for LeRobot's training.
+"""Reduce a LeRobot dataset to the data that the policy socket sends, and add embeddings, for LeRobot's training.
 
     python -m robocas_ms3.baselines.lerobot.prepare DATASET OUT [--no-language]
 
-Images and episodes do not change (videos are hard links). The state is that of `policy.STATE_NAMES`.
-``observation.environment_state`` is the sentence embedding of the frame's instruction, because LeRobot's ACT and
-diffusion policy do not read text. Other actions than ``action`` are removed.
+Images and episodes do not change (videos are hard links). ``observation.state`` has the values in `policy.STATE_NAMES`.
+``observation.environment_state`` is the embedding of the frame's instruction, because LeRobot's ACT and diffusion
+policy do not read text. The only action is ``action``.
 """
 
 from __future__ import annotations
@@ -47,28 +47,28 @@ from robocas_ms3.robots.quantities import GRIPPER_WIDTH, STATE
 
 Embed = Callable[[Sequence[str]], NDArray[np.float32]]
 _NOT_COPIED = ("data", "episodes", "robocas", "depth", ".parts", STAGING)
-"""Folders that `prepare` writes, or that the policies do not need."""
+"""Folders that `prepare_dataset` writes itself, or that the policies do not need."""
 
 
-def prepare(source: Path, out: Path, embed: Embed | None) -> None:
-    """Write the reduced dataset atomically.
+def prepare_dataset(source: Path, out: Path, embed: Embed | None) -> None:
+    """Write the reduced dataset to a new folder, completely or not at all.
 
     Args:
         source: dataset folder of ``robocas convert --to lerobot``.
         out: output folder.
-        embed: function from texts to embeddings (N, 384) of unit length; None: no embeddings.
+        embed: function that returns the embeddings (N, 384) of N texts, with unit length; None: no embeddings.
 
     Raises:
-        DatasetError: the source is not such a dataset, or its base moves.
-        OutputExistsError: the output folder is in use.
+        DatasetError: the source is another dataset, or the base of the robot moves in it.
+        OutputExistsError: the output folder has other files.
     """
     check_replaceable(out)
-    dataset = _open(source)
+    dataset = _open_export(source)
     features = dataset.info["features"]
     depths = [key for key, feature in features.items() if is_depth(feature)]  # policies would read them as RGB
     with atomic_folder(out) as part:
         ignored = shutil.ignore_patterns(*_NOT_COPIED, *depths)
-        shutil.copytree(source, part, ignore=ignored, copy_function=_link, dirs_exist_ok=True)
+        shutil.copytree(source, part, ignore=ignored, copy_function=_link_or_copy, dirs_exist_ok=True)
         vectors: dict[str, NDArray[np.float32]] = {}
         if embed is not None:
             vectors = dict(zip(dataset.tasks, scale_embeddings(embed(dataset.tasks)), strict=True))
@@ -76,37 +76,37 @@ def prepare(source: Path, out: Path, embed: Embed | None) -> None:
         for path, rows in dataset.files("data").items():
             tables = []
             for episode in (dataset.episode(row["episode_index"]) for row in rows):
-                columns = _columns(episode, vectors)
+                columns = _make_columns(episode, vectors)
                 for key, values in columns.items():
                     parts[key].append(values)
                 indices = {key: episode.table.column(key) for key in INDICES}
                 tables.append(pa.table({**{key: as_column(values) for key, values in columns.items()}, **indices}))
-            _write(pa.concat_tables(tables), part / path.relative_to(source))
+            _write_table(pa.concat_tables(tables), part / path.relative_to(source))
         for path in sorted((source / "meta" / "episodes").rglob("*.parquet")):
             table = pq.read_table(
                 path
             )  # statistics per episode: LeRobot does not read them, and they are of other columns
             left_out = ("stats/", *(f"videos/{key}/" for key in depths))
             names = [name for name in table.column_names if not name.startswith(left_out)]
-            _write(table.select(names), part / path.relative_to(source))
+            _write_table(table.select(names), part / path.relative_to(source))
         _write_meta(dataset, part, {key: np.concatenate(values) for key, values in parts.items()})
 
 
-def _open(source: Path) -> LeRobotDataset:
-    what = "not a LeRobot dataset of this package"
-    fix = "Convert a trajectory: robocas convert TRAJECTORY --to lerobot --out DIR"
+def _open_export(source: Path) -> LeRobotDataset:
+    what = "not a LeRobot dataset written by robocas convert"
+    fix = "Convert a trajectory: robocas convert TRAJECTORY --to lerobot --out DIR."
     try:
         dataset = LeRobotDataset(source)
     except DatasetError as error:
         raise DatasetError(what, where=source, found=error, fix=fix) from error
     if dataset.layout is not V3 or not dataset.is_robocas or not dataset.cameras:
-        expected = f"{V3.codebase_version}, columns of robocas convert, a camera"
-        version = dataset.info["codebase_version"]
-        raise DatasetError(what, where=source, expected=expected, found=version, fix=fix)
+        expected = f"format {V3.codebase_version}, the columns of robocas convert, and a camera"
+        found = f"format {dataset.info['codebase_version']}, cameras {', '.join(dataset.cameras) or 'none'}"
+        raise DatasetError(what, where=source, expected=expected, found=found, fix=fix)
     return dataset
 
 
-def _columns(episode: LeRobotEpisode, vectors: dict[str, NDArray[np.float32]]) -> dict[str, NDArray]:
+def _make_columns(episode: LeRobotEpisode, vectors: dict[str, NDArray[np.float32]]) -> dict[str, NDArray]:
     arrays, steps = episode.arrays, episode.steps
     check_base_is_fixed(arrays["rel_agv_pose"], episode.where)
     parts = (arrays[key].reshape(steps, -1) for key in ("ee_pos", "ee_orn", "robot_joints", GRIPPER_WIDTH))
@@ -129,34 +129,34 @@ def _write_meta(dataset: LeRobotDataset, part: Path, columns: dict[str, NDArray]
     write_json(part / STATS_FILE, stats)
 
 
-def _write(table: pa.Table, path: Path) -> None:
+def _write_table(table: pa.Table, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     pq.write_table(table, path)
 
 
-def _link(source: str, target: str) -> None:
+def _link_or_copy(source: str, target: str) -> None:
     with suppress(OSError):  # another disk, or a disk without hard links
         if source.endswith(".mp4"):
             return os.link(source, target)
     shutil.copyfile(source, target)
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    """Run the command; return its exit status."""
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command with these arguments (None: those of the process); return the exit status."""
     parser = argparse.ArgumentParser(
-        description="Reduce a LeRobot export to what the policy socket sends, for the training of LeRobot's policies."
+        description="Reduce a LeRobot dataset to the data that the policy socket sends, to train LeRobot's policies."
     )
     parser.add_argument("dataset", type=Path, help="dataset folder of `robocas convert --to lerobot`")
     parser.add_argument("out", type=Path, help="output folder")
-    parser.add_argument("--no-language", action="store_true", help="leave out the embedding of the instruction")
-    cfg = parser.parse_args(words)
+    parser.add_argument("--no-language", action="store_true", help="omit the embedding of the instruction")
+    cfg = parser.parse_args(argv)
     try:
         embed = None
         if not cfg.no_language:
             from robocas_ms3.scenes.language.embed import TextEmbedder
 
             embed = TextEmbedder()
-        prepare(cfg.dataset, cfg.out, embed)
+        prepare_dataset(cfg.dataset, cfg.out, embed)
     except RobocasError as error:
         print(escape_controls(f"error: {error}"), file=sys.stderr)
         return 1

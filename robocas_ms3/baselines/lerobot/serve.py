@@ -28,10 +28,13 @@ INFO = "dataset/meta/info.json"
 
 
 def load_policy(checkpoint: Path, rate_hz: float, device: str, n_action_steps: int | None) -> LeRobotPolicy:
-    """Load the policy of a checkpoint of ``lerobot-train``; ``n_action_steps`` None: as trained."""
+    """Load the policy in a checkpoint folder of ``lerobot-train``.
+
+    n_action_steps: number of executed actions per chunk; None: that of the checkpoint.
+    """
     if not (checkpoint / "config.json").is_file():
-        fix = "Train first: bash scripts/train_lerobot.sh act DATASET OUT"
-        raise EvaluationError("no LeRobot checkpoint", where=checkpoint, expected="config.json", fix=fix)
+        fix = "Train a policy: bash scripts/train_lerobot.sh act DATASET OUT STEPS."
+        raise EvaluationError("no LeRobot checkpoint in this folder", where=checkpoint, expected="config.json", fix=fix)
     from lerobot.configs.policies import PreTrainedConfig  # pyright: ignore[reportMissingImports]
     from lerobot.policies.factory import (  # pyright: ignore[reportMissingImports]
         get_policy_class,
@@ -46,7 +49,7 @@ def load_policy(checkpoint: Path, rate_hz: float, device: str, n_action_steps: i
             config.__post_init__()
         except (ValueError, NotImplementedError) as error:
             found = f"{n_action_steps}: {error}"
-            raise EvaluationError("invalid number", where="--n-action-steps", found=found) from error
+            raise EvaluationError("invalid number of actions", where="--n-action-steps", found=found) from error
     model = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
     model.eval()
     overrides = {"device_processor": {"device": device}}  # instead of the device of the training
@@ -61,24 +64,27 @@ def load_policy(checkpoint: Path, rate_hz: float, device: str, n_action_steps: i
     return LeRobotPolicy(model, preprocessor, postprocessor, inputs, rate_hz, description)
 
 
-def read_rate(info: Path) -> float:
-    """Read the rate of a dataset, Hz, from its ``info.json``."""
+def read_dataset_rate(info: Path) -> float:
+    """Return the rate in Hz of a LeRobot dataset, from its ``info.json``."""
     try:
         rate_hz = load_json(info)["fps"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise EvaluationError("unknown rate", where=info, found=repr(error), fix="Pass --rate HZ.") from error
+        raise EvaluationError("cannot read the rate", where=info, found=repr(error), fix="Pass --rate HZ.") from error
     if type(rate_hz) not in (int, float) or not 0 < rate_hz <= 1000:
         found, fix = str(rate_hz)[:80], "Pass --rate HZ."
-        raise EvaluationError("unknown rate", where=info, expected="fps from 0 to 1000", found=found, fix=fix)
+        expected = "fps above 0 and at most 1000"
+        raise EvaluationError("invalid rate", where=info, expected=expected, found=found, fix=fix)
     return float(rate_hz)
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    """Run the command; return its exit status."""
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command with these arguments (None: those of the process); return the exit status."""
     parser = argparse.ArgumentParser(description="Serve a LeRobot checkpoint over the policy socket.")
     parser.add_argument("run", type=Path, help="output folder of train_lerobot.sh, or pretrained_model of a checkpoint")
     parser.add_argument(
-        "--host", default="127.0.0.1", help="address to listen on; there is no password: use the default and a tunnel"
+        "--host",
+        default="127.0.0.1",
+        help="address to listen on; the server has no password: keep the default and use an SSH tunnel",
     )
     parser.add_argument("--port", type=int, default=8000, help="port to listen on; default: 8000")
     parser.add_argument("--device", default="cpu", help="torch device of the policy; default: cpu")
@@ -86,13 +92,13 @@ def main(words: Sequence[str] | None = None) -> int:
         "--n-action-steps", type=int, metavar="N", help="number of executed actions per chunk; default: as trained"
     )
     parser.add_argument(
-        "--rate", type=float, metavar="HZ", help="actions per second; default: rate of the dataset in RUN"
+        "--rate", type=float, metavar="HZ", help="actions per second; default: the rate of the dataset in RUN"
     )
-    cfg = parser.parse_args(words)
+    cfg = parser.parse_args(argv)
     escape_log_lines()
     try:
         checkpoint = cfg.run if (cfg.run / "config.json").is_file() else cfg.run / CHECKPOINT
-        rate_hz = cfg.rate if cfg.rate is not None else read_rate(cfg.run / INFO)
+        rate_hz = cfg.rate if cfg.rate is not None else read_dataset_rate(cfg.run / INFO)
         policy = load_policy(checkpoint, rate_hz, cfg.device, cfg.n_action_steps)
         PolicyServer(policy, cfg.host, cfg.port).run(
             lambda url: print(escape_controls(f"{checkpoint} at {url}"), flush=True)

@@ -1,4 +1,4 @@
-"""Agent of `ppo`: policy and value networks, and the policy for evaluations."""
+"""Networks of `ppo` (policy and value function), and the policy for evaluations."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _SCALE = np.array([POSITION_SCALE] * 3 + [ROTATION_SCALE] * 3 + [1.0])
 
 
 class Agent(nn.Module):
-    """Policy and value network, with running statistics that normalise observations.
+    """Policy network and value network of PPO, with running statistics that normalise their observations.
 
     Args:
-        observation_size: size of an observation, O.
-        action_size: size of an action, A.
-        width: size of the hidden layers.
+        observation_size: number of values of an observation, O.
+        action_size: number of values of an action, A.
+        width: size of the two hidden layers.
     """
 
     mean: torch.Tensor
@@ -38,42 +38,42 @@ class Agent(nn.Module):
         self.register_buffer("mean", torch.zeros(observation_size))
         self.register_buffer("square", torch.ones(observation_size))
         self.register_buffer("count", torch.tensor(1e-4, dtype=torch.float64))
-        self.actor = _layers(observation_size, width, action_size, 0.01)
-        self.critic = _layers(observation_size, width, 1, 1.0)
+        self.actor = _make_layers(observation_size, width, action_size, 0.01)
+        self.critic = _make_layers(observation_size, width, 1, 1.0)
         self.log_std = nn.Parameter(torch.full((action_size,), -0.7))
 
     @torch.no_grad()
     def update_statistics(self, obs: torch.Tensor) -> None:
-        """Add observations (N, O) to the running mean and mean square."""
+        """Update the running mean and mean square with observations (N, O)."""
         self.count += len(obs)
         fraction = (len(obs) / self.count).float()
         self.mean += fraction * (obs.mean(dim=0) - self.mean)
         self.square += fraction * ((obs**2).mean(dim=0) - self.square)
 
     def normalize(self, obs: torch.Tensor) -> torch.Tensor:
-        """Return observations (N, O) with mean 0 and deviation 1, clipped to [-5, 5]."""
+        """Return normalised observations (N, O): mean 0, standard deviation 1, clipped to [-5, 5]."""
         deviation = (self.square - self.mean**2).clamp(min=1e-6).sqrt()
         return ((obs - self.mean) / deviation).clamp(-5, 5)
 
-    def policy(self, normalized: torch.Tensor) -> Normal:
-        """Return the distribution of actions (N, A) for normalised observations."""
+    def action_distribution(self, normalized: torch.Tensor) -> Normal:
+        """Return the distribution of the actions (N, A), for normalised observations (N, O)."""
         return Normal(self.actor(normalized), self.log_std.exp())
 
-    def value(self, normalized: torch.Tensor) -> torch.Tensor:
-        """Return values (N,) of normalised observations."""
+    def estimate_value(self, normalized: torch.Tensor) -> torch.Tensor:
+        """Return the estimated discounted returns (N,), for normalised observations (N, O)."""
         return self.critic(normalized)[:, 0]
 
     def mean_action(self, obs: torch.Tensor) -> torch.Tensor:
-        """Return mean actions (N, A) for observations (N, O) that are not normalised."""
+        """Return the mean actions (N, A), for observations (N, O) that are not normalised."""
         return self.actor(self.normalize(obs))
 
 
 def make_agent(config: PpoConfig, facts: dict[str, Any]) -> Agent:
-    """Make an agent with random weights."""
+    """Make an agent with random weights, for the observation and action sizes in ``facts``."""
     return Agent(facts["observation_size"], facts["action_size"], config.width)
 
 
-def _layers(inputs: int, width: int, outputs: int, gain: float) -> nn.Sequential:
+def _make_layers(inputs: int, width: int, outputs: int, gain: float) -> nn.Sequential:
     last = nn.Linear(width, outputs)
     layers = nn.Sequential(nn.Linear(inputs, width), nn.Tanh(), nn.Linear(width, width), nn.Tanh(), last)
     for layer in layers:
@@ -84,7 +84,7 @@ def _layers(inputs: int, width: int, outputs: int, gain: float) -> nn.Sequential
 
 
 class PpoPolicy:
-    """Policy that executes the mean action, in the convention of ``pd_ee_delta_pose``."""
+    """Policy of `ppo`: executes the mean action of the agent, as ``pd_ee_delta_pose`` in the training would."""
 
     def __init__(self, config: PpoConfig, facts: dict[str, Any], agent: Agent) -> None:
         # Rotations are about one axis: Euler angles and rotation vectors are equal
@@ -97,12 +97,12 @@ class PpoPolicy:
         pass
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Return actions (E, 7)."""
+        """Return one action per env (E, 7): translation in m, axis-angle rotation in rad, gripper command."""
         assert observations.state is not None
         width = observations.robot[GRIPPER_WIDTH]
         obs = join_observation(observations.qpos, observations.tcp_in_base, width, observations.state)
         if obs.shape[1] != self._size:
-            what, fix = "wrong size of the observation", "Evaluate in the task and scenes of the training."
+            what, fix = "wrong size of the observation", "Evaluate in the task configuration of the training."
             raise EvaluationError(what, where="ppo", expected=f"{self._size} numbers", found=obs.shape[1], fix=fix)
         with torch.inference_mode():
             action = expand_action(self._agent.mean_action(obs.to(self._agent.mean.device)))

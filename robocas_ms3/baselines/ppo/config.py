@@ -21,13 +21,13 @@ class PpoSettings(StrictModel):
     """Training settings of `ppo`.
 
     Attributes:
-        steps: number of environment steps, summed over environments; rounded up to whole updates.
-        batch_size: environment steps between updates, summed over environments.
+        steps: number of environment steps, summed over the environments; rounded up to a multiple of ``batch_size``.
+        batch_size: number of environment steps per update of the network, summed over the environments.
         learning_rate: learning rate of the optimiser.
         clip_norm: largest norm of the gradient; 0: no clipping.
-        seed: random seed, except of the environments.
+        seed: random seed of weights, actions and minibatches.
         precision: precision of the forward pass.
-        save_every: steps between checkpoints.
+        save_every: environment steps between checkpoints.
     """
 
     steps: int = Field(default=102_400, ge=1, le=10**9)
@@ -43,19 +43,23 @@ class PpoConfig(StrictModel):
     """Configuration of `ppo` (Schulman et al. 2017).
 
     Attributes:
-        task: short name of the task.
-        scenes: name of a bundled task configuration, or a YAML file; None: a single fruit on a table, which an agent
+        task: name of the task, such as ``pick``.
+        scenes: name of a bundled task configuration, or a YAML file. None: a single fruit on a table, which an agent
             learns to reach and hold in minutes on a CPU.
-        horizon: steps of 0.2 s per episode; None: 15 for the single fruit, otherwise as in docs/rl.md.
-        layouts: number of different layouts.
+        horizon: number of steps (0.2 s each) per episode. None: 15 for the single fruit, otherwise the horizon of the
+            task in docs/rl.md.
+        layouts: number of different layouts in the training.
         envs: number of environments.
-        workers: processes that run the environments on a CPU; None: one per environment, at most one per core.
-        epochs, minibatches: passes over each rollout, and minibatches per pass.
-        gamma, gae_lambda: discount, and lambda of the generalised advantage estimation.
+        workers: number of processes that run the environments on a CPU. None: one per environment, at most one per
+            core.
+        epochs: number of passes over each rollout.
+        minibatches: number of minibatches per pass.
+        gamma: discount factor.
+        gae_lambda: lambda of the generalised advantage estimation.
         clip_range: clipping range of the probability ratio.
-        entropy_coeff: weight of the entropy bonus.
+        entropy_coeff: weight of the entropy in the loss.
         width: size of the two hidden layers.
-        test_episodes: test episodes at the end, in other layouts and without noise; 0: none.
+        test_episodes: number of test episodes after the training, in new layouts and with mean actions; 0: no test.
         train: see `PpoSettings`.
     """
 

@@ -1,4 +1,4 @@
-"""Environments of `ppo`, with the observations and actions that its policy has in an evaluation."""
+"""Training environments of `ppo`. Observations and actions are those of its policy in an evaluation."""
 
 from __future__ import annotations
 
@@ -22,20 +22,19 @@ from robocas_ms3.scenes.config import TaskConfig, load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.rl import CONTROL_FREQ
 
-FIRST_TEST_SEED = 20_000  # of test layouts, which are not in the training
+FIRST_TEST_SEED = 20_000  # of test layouts; the training has only smaller seeds
 ACTION_SIZE = 5
 
 
 def expand_action(action: torch.Tensor) -> torch.Tensor:
-    """Expand 5-D actions to 7-D actions of ``pd_ee_delta_pose`` that keep the gripper's direction.
-
-    1 is a translation by 5 cm or a rotation by 0.25 rad. The gripper opens or closes fully, as in an evaluation.
+    """Expand 5-D actions to 7-D actions of ``pd_ee_delta_pose``, which do not tilt the gripper.
 
     Args:
-        action: (..., 5) translation along the TCP axes, rotation about the TCP's z axis, gripper; clipped to [-1, 1].
+        action: (..., 5) translation along the TCP axes (1 = 5 cm), rotation about the TCP's z axis (1 = 0.25 rad), and
+            gripper command (above 0: open). Values are clipped to [-1, 1].
 
     Returns:
-        (..., 7) actions.
+        Actions (..., 7) in the range of ``pd_ee_delta_pose``, [-1, 1]. The gripper command is -1 or 1.
     """
     x, y, z, yaw, gripper = action.clip(-1, 1).unbind(-1)
     zero = torch.zeros_like(x)
@@ -44,12 +43,19 @@ def expand_action(action: torch.Tensor) -> torch.Tensor:
 
 
 def join_observation(qpos: Any, tcp_in_base: Any, width: Any, state: Any) -> torch.Tensor:
-    """Concatenate proprioception and privileged state to observations (N, O) float32."""
+    """Return observations (N, O) float32: proprioception, then the privileged state.
+
+    qpos: (N, joints) joint positions. tcp_in_base: (N, 7) TCP pose in the arm's base frame. width: (N, 1) gripper
+    width, m. state: (N, D) privileged state.
+    """
     return torch.cat([torch.as_tensor(part).float() for part in (qpos, tcp_in_base, width, state)], dim=1)
 
 
 class TopDownActionWrapper(gym.Wrapper):
-    """Action wrapper for the 5-D actions of `expand_action`; wraps one env, or a batch on a GPU."""
+    """Wrapper that accepts the 5-D actions of `expand_action` and returns the observations of `join_observation`.
+
+    It wraps one environment, or a batch of environments on a GPU.
+    """
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
@@ -77,14 +83,20 @@ def _observation(obs: dict[str, Any]) -> torch.Tensor:
 
 
 class PpoEnvironments:
-    """Training environments of `ppo`. A success does not end an episode, and each env keeps its objects."""
+    """Vector environment in which `ppo` trains, and makes further ones for tests.
+
+    All episodes have the same length: a success does not end an episode. Each env keeps its objects; only the layout
+    changes at a reset.
+    """
 
     def __init__(self, config: PpoConfig, device: str) -> None:
         scenes = load_scenes(config)
         kwargs: dict[str, Any] = robocas_ms3.rl_kwargs(config.task, scenes) | {"obs_mode": "state_dict"}
         if kwargs["control_mode"] != "pd_ee_delta_pose":
-            what = "these scenes need base motion, and ppo moves only the arm"
-            raise TrainingError(what, where=config.scenes or config.task, fix="Choose scenes without base_motion.")
+            what = "the base moves in this task configuration, and ppo controls only the arm"
+            raise TrainingError(
+                what, where=config.scenes or config.task, fix="Choose a task configuration without base_motion."
+            )
         horizon = config.horizon or (ONE_FRUIT_STEPS if config.scenes is None else kwargs["max_episode_steps"])
         self._config, self._device = config, device
         self._kwargs: dict[str, Any] = kwargs | {"max_episode_steps": horizon}
@@ -94,7 +106,7 @@ class PpoEnvironments:
         self.episodes = config.layouts
         name = Path(config.scenes).stem if config.scenes else "one fruit"
         self.scenes = TrainingScenes(tasks=[config.task], configs={name: scene_settings(scenes)})
-        self.envs = self.make(config.envs, 0, config.layouts - 1)
+        self.envs = self.make_envs(config.envs, 0, config.layouts - 1)
         shape = self.envs.single_observation_space.shape
         assert shape is not None
         self.facts: dict[str, Any] = {
@@ -107,8 +119,8 @@ class PpoEnvironments:
     def __len__(self) -> int:
         return self._config.train.steps
 
-    def make(self, count: int, first_seed: int, last_seed: int) -> VectorEnv:
-        """Make a vector environment with the layouts of a range of seeds."""
+    def make_envs(self, count: int, first_seed: int, last_seed: int) -> VectorEnv:
+        """Make ``count`` environments that use the layouts of the seeds from ``first_seed`` to ``last_seed``."""
         return robocas_ms3.make_vec(
             next(spec.env_id for spec in TASKS.values() if self._config.task in (spec.name, spec.env_id)),
             count,
@@ -126,7 +138,7 @@ class PpoEnvironments:
 
 
 def load_scenes(config: PpoConfig) -> TaskConfig:
-    """Load the task configuration of a training; default: a single fruit on a table."""
+    """Load the task configuration ``config.scenes``; without one, make that of a single fruit on a table."""
     if config.scenes is not None:
         return load_task_config(config.scenes)
     return load_task_config(load_task_config("pick_table_scattered").model_dump(mode="json") | ONE_FRUIT)

@@ -14,25 +14,27 @@ from torch import nn
 from robocas_ms3.baselines.ppo.agent import Agent
 from robocas_ms3.baselines.ppo.config import PpoConfig
 from robocas_ms3.baselines.ppo.environments import FIRST_TEST_SEED, PpoEnvironments
-from robocas_ms3.baselines.training.checkpoints import Checkpoint, join_parts, optimizer_tensors
+from robocas_ms3.baselines.training.checkpoints import Checkpoint, flatten_optimizer_state, join_state_dicts
 from robocas_ms3.baselines.training.run_folder import RunFolder
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.signals import deferred_interrupts
 
-OUTCOMES = ("return", "held", "lifted", "success")  # of an episode; except the return, at its last step
-_LAST_EPISODES = 100  # averaged in the log
+OUTCOMES = ("return", "held", "lifted", "success")  # sum of rewards; then whether true at the last step of an episode
+_LAST_EPISODES = 100  # number of episodes that the log averages
 
 
 def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: PpoEnvironments) -> None:
-    """Train an agent up to the last step, then test it without noise in other layouts.
+    """Train an agent with PPO up to ``config.train.steps``, then test its mean actions in new layouts.
 
     A run that continues restores weights, optimiser, observation statistics, outcomes of the last episodes and random
-    states of the last update. Its environments start again with the next layouts, so the result is not bit-identical
-    to that of an uninterrupted run.
+    states from the checkpoint. Its environments start new episodes in the next layouts. Therefore the result is not
+    bit-identical to that of an uninterrupted run.
     """
     if run.accelerator.num_processes > 1:
         found, fix = f"{run.accelerator.num_processes} processes", "Call robocas train without `accelerate launch`."
-        raise TrainingError("ppo trains in one process only", where=run.record.baseline, found=found, fix=fix)
+        raise TrainingError(
+            "ppo trains in one process only", where=run.record.baseline, expected="1 process", found=found, fix=fix
+        )
     settings = config.train
     state = _TrainingState(agent, config, run.checkpoint)
     size = f"{len(environments)} steps in {environments.episodes} layouts"
@@ -44,7 +46,7 @@ def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: Ppo
         run.log(state.step, split, {**means, **metrics}, epoch=epoch, learning_rate=settings.learning_rate)
 
     def save() -> None:
-        run.save(state.step, state.tensors(), agent.state_dict())
+        run.save(state.step, state.checkpoint_tensors(), agent.state_dict())
 
     run.progress.on_step(min(state.step, settings.steps), settings.steps)
     saved_step = state.step
@@ -52,9 +54,9 @@ def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: Ppo
     try:
         while state.step < settings.steps:
             collector = collector or RolloutCollector(environments.envs, agent, config, state.episodes, state.outcomes)
-            rollout = collector.collect()
+            rollout = collector.collect_rollout()
             with deferred_interrupts():  # interrupt only after a complete update
-                losses = update(agent, state.optimizer, rollout, config)
+                losses = update_agent(agent, state.optimizer, rollout, config)
                 state.step += config.envs * steps_per_env(config)
                 _check_finite(run, losses, state.step)
                 state.episodes, state.outcomes = collector.episodes, collector.last_outcomes()
@@ -72,15 +74,23 @@ def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: Ppo
                 save()
             mean_return, *rates = outcomes.mean(dim=0).tolist()
             text = ", ".join(f"{name} {rate:.0%}" for name, rate in zip(OUTCOMES[1:], rates, strict=True))
-            run.progress.message(f"test without noise, {len(outcomes)} other layouts: return {mean_return:.2f}, {text}")
+            run.progress.message(
+                f"test with mean actions, {len(outcomes)} new layouts: return {mean_return:.2f}, {text}"
+            )
     except KeyboardInterrupt:
         if state.step > saved_step:
             save()
         raise
 
 
-def update(agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, config: PpoConfig) -> dict[str, float]:
-    """Update an agent with a rollout; return the mean losses, entropy and gradient norm."""
+def update_agent(
+    agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, config: PpoConfig
+) -> dict[str, float]:
+    """Update the networks of an agent with a rollout.
+
+    Returns:
+        Means over the minibatches: ``value_loss``, ``policy_loss``, ``entropy``, and the gradient norm ``gradient``.
+    """
     agent.update_statistics(rollout.obs)
     tensors = rollout.normalized, rollout.action, rollout.log_prob, rollout.advantage, rollout.returns
     metrics = []
@@ -88,12 +98,12 @@ def update(agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, con
         for rows in torch.randperm(len(rollout.normalized)).chunk(config.minibatches):
             obs, action, log_prob, advantage, returns = (tensor[rows] for tensor in tensors)
             advantage = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-8)
-            policy = agent.policy(obs)
+            policy = agent.action_distribution(obs)
             ratio = (policy.log_prob(action).sum(-1) - log_prob).exp()
             gain = torch.min(
                 ratio * advantage, ratio.clamp(1 - config.clip_range, 1 + config.clip_range) * advantage
             ).mean()
-            error = (agent.value(obs) - returns).square().mean()
+            error = (agent.estimate_value(obs) - returns).square().mean()
             entropy = policy.entropy().sum(-1).mean()
             optimizer.zero_grad()
             (error / 2 - gain - config.entropy_coeff * entropy).backward()
@@ -106,8 +116,8 @@ def update(agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, con
 
 @torch.inference_mode()
 def evaluate_agent(agent: Agent, environments: PpoEnvironments, count: int) -> torch.Tensor:
-    """Return `OUTCOMES` (count, 4) of test episodes without noise, in layouts that were not trained on."""
-    envs = environments.make(count, FIRST_TEST_SEED, FIRST_TEST_SEED + count - 1)
+    """Run test episodes with mean actions, in layouts that are not in the training; return `OUTCOMES` (count, 4)."""
+    envs = environments.make_envs(count, FIRST_TEST_SEED, FIRST_TEST_SEED + count - 1)
     try:
         obs, info = envs.reset(seed=FIRST_TEST_SEED)
         while "final_info" not in info:  # all episodes end at the same step
@@ -118,7 +128,10 @@ def evaluate_agent(agent: Agent, environments: PpoEnvironments, count: int) -> t
 
 
 class _TrainingState:
-    """State of a PPO training: optimiser, counts of steps and episodes, outcomes of the last episodes."""
+    """State of a training with PPO: optimiser, numbers of steps and episodes, outcomes of the last episodes.
+
+    The state comes from a checkpoint, if there is one.
+    """
 
     def __init__(self, agent: Agent, config: PpoConfig, checkpoint: Checkpoint | None) -> None:
         self.optimizer = torch.optim.Adam(agent.parameters(), lr=config.train.learning_rate, eps=1e-5)
@@ -136,14 +149,14 @@ class _TrainingState:
         if "random.cuda" in tensors and agent.mean.is_cuda:
             torch.cuda.set_rng_state(tensors["random.cuda"])
 
-    def tensors(self) -> dict[str, torch.Tensor]:
-        """Return the tensors of a checkpoint."""
+    def checkpoint_tensors(self) -> dict[str, torch.Tensor]:
+        """Return the tensors that a checkpoint stores."""
         random = {"cpu": torch.get_rng_state()}
         if self._agent.mean.is_cuda:
             random["cuda"] = torch.cuda.get_rng_state()
-        parts = join_parts(
+        parts = join_state_dicts(
             model=self._agent.state_dict(),
-            optimizer=optimizer_tensors(self.optimizer),
+            optimizer=flatten_optimizer_state(self.optimizer),
             episodes={"count": torch.tensor(self.episodes), "last": self.outcomes},
             random=random,
         )
@@ -153,19 +166,19 @@ class _TrainingState:
 def _check_finite(run: RunFolder, losses: dict[str, float], step: int) -> None:
     wrong = [name for name, value in losses.items() if not math.isfinite(value)]
     if wrong:
-        raise run.make_error(f"the {'gradient' if wrong == ['gradient'] else 'loss'} is NaN or infinite", step)
+        raise run.make_step_error(f"the {'gradient' if wrong == ['gradient'] else 'loss'} is NaN or infinite", step)
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """B steps of all environments.
+    """Steps of all environments between two updates, B in total.
 
     Attributes:
         obs: (B, O) observations.
-        normalized: (B, O) normalised observations, as the policy got them.
+        normalized: (B, O) normalised observations, from which the actions were sampled.
         action: (B, A) actions.
         log_prob: (B,) log probabilities of the actions.
-        advantage: (B,) advantages.
+        advantage: (B,) compute_advantages.
         returns: (B,) targets of the value network.
     """
 
@@ -178,7 +191,10 @@ class Rollout:
 
 
 class RolloutCollector:
-    """Collector of rollouts with exploration noise; keeps the outcomes of the last episodes."""
+    """Collects rollouts with actions sampled from the policy, and keeps the outcomes of the last episodes.
+
+    episodes, outcomes: number and outcomes of the episodes before the first rollout.
+    """
 
     def __init__(self, envs: VectorEnv, agent: Agent, config: PpoConfig, episodes: int, outcomes: torch.Tensor) -> None:
         self.episodes = episodes
@@ -188,24 +204,24 @@ class RolloutCollector:
         self._obs: torch.Tensor = envs.reset(seed=first % config.layouts)[0]
 
     def last_outcomes(self) -> torch.Tensor:
-        """Return `OUTCOMES` (n, 4) of the last episodes."""
+        """Return `OUTCOMES` (n, 4) of the last episodes that have ended."""
         return torch.tensor(list(self._outcomes)).reshape(-1, len(OUTCOMES))
 
     @torch.no_grad()
-    def collect(self) -> Rollout:
-        """Step the environments and return the rollout."""
+    def collect_rollout(self) -> Rollout:
+        """Step the environments ``steps_per_env`` times and return the rollout."""
         agent, config = self._agent, self._config
         steps = []
         for _ in range(steps_per_env(config)):
             obs = self._obs
             normalized = agent.normalize(obs)
-            policy = agent.policy(normalized)
+            policy = agent.action_distribution(normalized)
             action = policy.sample()
             self._obs, reward, _, truncated, info = self._envs.step(action)  # pyright: ignore[reportArgumentType]
             # Episodes end by truncation only, so the value of the final observation counts
-            next_value = agent.value(agent.normalize(info.get("final_obs", self._obs)))
+            next_value = agent.estimate_value(agent.normalize(info.get("final_obs", self._obs)))
             log_prob = policy.log_prob(action).sum(-1)
-            value = agent.value(normalized)
+            value = agent.estimate_value(normalized)
             steps.append((obs, normalized, action, log_prob, reward, value, next_value, truncated))
             if "final_info" in info:
                 ended = read_outcomes(info)
@@ -215,20 +231,21 @@ class RolloutCollector:
             torch.stack(part) for part in zip(*steps, strict=True)
         )
         deltas = reward + config.gamma * next_value - value
-        advantage = advantages(deltas, truncated, config.gamma * config.gae_lambda)
+        advantage = compute_advantages(deltas, truncated, config.gamma * config.gae_lambda)
         parts = (obs, normalized, action, log_prob, advantage, advantage + value)
         return Rollout(*(part.flatten(0, 1) for part in parts))
 
 
 def steps_per_env(config: PpoConfig) -> int:
-    """Return the number of steps of each environment between updates."""
+    """Return the number of steps per environment between two updates of the networks."""
     return max(config.train.batch_size // config.envs, 1)
 
 
-def advantages(deltas: torch.Tensor, truncated: torch.Tensor, decay: float) -> torch.Tensor:
-    """Return generalised advantages (T, N) of temporal differences (Schulman et al. 2016).
+def compute_advantages(deltas: torch.Tensor, truncated: torch.Tensor, decay: float) -> torch.Tensor:
+    """Return the generalised advantage estimates (T, N) for T steps of N environments (Schulman et al. 2016).
 
-    ``decay`` is gamma * lambda.
+    deltas: (T, N) temporal differences of the values. truncated: (T, N) bool, whether the episode ended at this step.
+    decay: gamma * lambda.
     """
     result, last = torch.zeros_like(deltas), torch.zeros_like(deltas[0])
     for t in reversed(range(len(deltas))):
@@ -237,7 +254,7 @@ def advantages(deltas: torch.Tensor, truncated: torch.Tensor, decay: float) -> t
 
 
 def read_outcomes(info: dict[str, Any]) -> torch.Tensor:
-    """Return `OUTCOMES` (n, 4) of the episodes that ended at this step."""
+    """Return `OUTCOMES` (n, 4) of the episodes that ended at a step, from the ``info`` of this step."""
     final = info["final_info"]
     held = final["reward_terms"]["grasp"] == 1
     parts = [final["episode"]["return"], held, final["target_lifted"], final["success"]]

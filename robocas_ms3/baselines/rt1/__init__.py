@@ -18,13 +18,13 @@ from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 
 class RT1Policy:
-    """Policy that executes the most probable action for the last six frames.
+    """Policy of `rt1`: executes the most probable action, predicted from the last ``config.frames`` observations.
 
-    At the start of an episode the first frame is repeated. Each frame is encoded once with the instruction of its step.
-    After an action with the terminate token, the policy does not move and repeats the last gripper command.
+    At the start of an episode the first frame is repeated. Each frame is encoded once, with the instruction of its
+    step. After an action whose terminate token is 1, the policy does not move and repeats the last gripper command.
 
-    Images are rendered in the size of the dataset and scaled as the training samples: images rendered at 320 x 256 have
-    another field of view than images of 640 x 480 scaled to 320 x 256.
+    The evaluation renders images in the size of the dataset, and the policy scales them as the training does. Images
+    rendered at 320 x 256 would have another field of view than images of 640 x 480 scaled to 320 x 256.
     """
 
     def __init__(self, config: RT1Config, facts: dict[str, Any], model: RT1Model) -> None:
@@ -40,7 +40,7 @@ class RT1Policy:
         )
 
     def describe(self) -> dict[str, Any]:
-        """Return the initial weights of the image encoders, for the record of a result."""
+        """Return the initial weights of the image encoders, which an evaluation records in its result."""
         path = self._config.image_weights
         name = path.name if path is not None and bool(self._model.from_imagenet) else "from scratch"
         return {"image_weights": name}
@@ -51,7 +51,10 @@ class RT1Policy:
             self._final.pop(episode.env, None)
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Return actions (E, 7), computed per env: in a batch, rounding depends on the other rows."""
+        """Return one action per env (E, 7).
+
+        Each env is a batch of its own, because the rounding of a row in a batch depends on the other rows.
+        """
         return np.stack([self._act(observations, row) for row in range(len(observations.envs))])
 
     def _act(self, observations: Observations, row: int) -> NDArray[np.floating]:

@@ -1,7 +1,8 @@
 """Configuration of `rt1`; the defaults are those of the RoboCAS paper's RT-1.
 
-The defaults come from RoboCAS-v0's training configuration. Its batch size is 24; the paper says 64. Values that it does
-not contain, such as TokenLearner's bottleneck, come from RT-1 (Brohan et al. 2022) and its code.
+The defaults come from RoboCAS-v0's training configuration. Its batch size is 24 on one GPU; the paper's is 64. Values
+that it does not contain, such as the width of TokenLearner's hidden layer, come from RT-1 (Brohan et al. 2022) and its
+code.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ _KERAS_STD = (0.47853944, 0.4732864, 0.47434163)
 class RT1Train(TrainSettings):
     """Training settings of RT-1.
 
-    140 000 steps are the paper's 20 epochs of about 2800 episodes of 60 steps. A subclass keeps the other defaults of
-    RT-1 when a configuration changes one value.
+    140 000 steps of 24 samples are 20 epochs, as in RoboCAS-v0's code, of 2800 episodes with about 60 steps, as in the
+    paper. The defaults are fields of a subclass, so a configuration can change one of them and keep the others.
     """
 
     steps: int = Field(default=140_000, ge=1)
@@ -48,14 +49,17 @@ class RT1Config(BaselineConfig):
     Attributes:
         cameras: cameras with one encoder each; their tokens are concatenated in this order.
         image_size: width and height that images are scaled to, pixels.
-        crop_height: number of image rows that are used: random rows in training, the middle rows in evaluation.
+        crop_height: number of image rows that the network observes: random rows in training, the middle rows in
+            evaluation.
         rate_hz: policy steps per second, of the data and of the policy.
-        frames: number of steps in the history, with the present step.
-        image_width, image_depth: coefficients of EfficientNet; 1.2 and 1.4 are B3.
-        drop_connect: probability that EfficientNet's last block is skipped in training; earlier blocks in proportion.
+        frames: number of observed policy steps, the present step included.
+        image_width, image_depth: width and depth coefficients of EfficientNet; 1.2 and 1.4 are EfficientNet-B3.
+        drop_connect: probability that training skips the last block of EfficientNet. It decreases linearly to 0 for the
+            first block.
         norm_momentum: momentum of EfficientNet's batch norms.
-        image_mean: mean that is subtracted from images in 0..1, per colour.
-        image_std: standard deviation that divides them; None: ImageNet's, or that of ``image_weights``.
+        image_mean: mean per colour that is subtracted from images in 0..1.
+        image_std: standard deviation per colour that divides images in 0..1. None: that of ImageNet, or with
+            ``image_weights`` that of EfficientNet's published weights.
         image_weights: file of EfficientNet's weights, such as ``model.safetensors`` of google/efficientnet-b3; None:
             random weights. Only a new run reads it.
         token_width: size of an image token.
@@ -64,7 +68,7 @@ class RT1Config(BaselineConfig):
         width: width of the transformer and of its feed-forward layer.
         layers, heads, key_width, dropout: sizes of the transformer.
         bins: number of bins per axis of an action.
-        terminate_steps: number of last actions of an episode that are labelled as terminal.
+        terminate_steps: number of last actions of each episode whose terminate token is 1.
         train: see `TrainSettings`.
     """
 
@@ -95,20 +99,20 @@ class RT1Config(BaselineConfig):
     @model_validator(mode="after")
     def _check(self) -> RT1Config:
         if not self.cameras or len(set(self.cameras)) < len(self.cameras):
-            raise ValueError("cameras: expected at least one name, each once")
+            raise ValueError(f"cameras {list(self.cameras)}: expected at least one name, and no name twice")
         if min(self.image_size) < 32:
-            raise ValueError("image_size: expected at least 32 x 32 pixels")
+            raise ValueError(f"image_size {list(self.image_size)}: expected at least 32 x 32 pixels")
         if self.crop_height > self.image_size[1]:
             raise ValueError(
                 f"crop_height {self.crop_height}: expected at most the {self.image_size[1]} rows of image_size"
             )
         if min(self.std) <= 0:
-            raise ValueError("image_std: expected values above 0")
+            raise ValueError(f"image_std {list(self.std)}: expected values above 0")
         return self
 
     @property
     def std(self) -> tuple[float, float, float]:
-        """Return the standard deviation that normalises images in 0..1."""
+        """Return the standard deviation per colour that divides images in 0..1: ``image_std`` or its default."""
         if self.image_std is not None:
             return self.image_std
         return _IMAGENET_STD if self.image_weights is None else _KERAS_STD

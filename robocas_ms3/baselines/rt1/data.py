@@ -18,19 +18,19 @@ from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset, read_epi
 
 
 class RT1Samples:
-    """Training samples of a dataset's split.
+    """Training samples of `rt1` from one split of a dataset.
 
     A batch of B samples with F frames and C cameras has
 
     =============  ====================  ===========================================================================
-    ``rgb``        (B, F, C, 3, h, w)    uint8, scaled to ``config.image_size``; its first image also before an episode
+    ``rgb``        (B, F, C, 3, h, w)    uint8, scaled to ``image_size``; before an episode its first image is repeated
     ``language``   (B, 384)              float32 embeddings of the instructions
     ``action``     (B, F, 7)             float32, m and rad in the TCP frame, gripper command (1 = open)
     ``mask``       (B, F)                bool, False before the start of the episode
-    ``terminate``  (B, F)                bool, whether the action is among the last ``terminate_steps`` of its episode
+    ``terminate``  (B, F)                bool, True for the last ``terminate_steps`` actions of an episode
     =============  ====================  ===========================================================================
 
-    The last action of an episode has index T - 2 and leads to its last step.
+    An episode of T steps has T - 1 actions. The last action has index T - 2 and leads to step T - 1.
     """
 
     def __init__(self, config: RT1Config, folder: Path, split: Split, on_read: OnRead) -> None:

@@ -20,7 +20,10 @@ _EXPECTED = "weights of transformers' EfficientNetModel"
 
 
 class FiLM(nn.Module):
-    """FiLM layer (Perez et al. 2018), initialised to the identity: language scales and shifts channels."""
+    """FiLM layer (Perez et al. 2018): an instruction embedding scales and shifts the channels of image features.
+
+    The initial scale is 1 and the initial shift is 0, so a new layer does not change its input.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -29,7 +32,7 @@ class FiLM(nn.Module):
         nn.init.zeros_(self.linear.bias)
 
     def forward(self, features: torch.Tensor, language: torch.Tensor) -> torch.Tensor:
-        """Return features (N, C, h, w) for features (N, C, h, w) and embeddings (N, 384)."""
+        """Return modulated features (N, C, h, w), from features (N, C, h, w) and instruction embeddings (N, 384)."""
         scale, shift = self.linear(language)[:, :, None, None].chunk(2, dim=1)
         return features * (1 + scale) + shift
 
@@ -43,20 +46,23 @@ class TokenLearner(nn.Module):
         self.hidden, self.score = nn.Linear(width, bottleneck), nn.Linear(bottleneck, tokens)
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """Return (N, tokens, C) for features (N, P, C)."""
+        """Return tokens (N, tokens, C), from the features (N, P, C) of P image positions."""
         logits = self.score(F.gelu(self.hidden(self.norm(features)), approximate="tanh"))
         return logits.softmax(dim=1).transpose(1, 2) @ features
 
 
 class StochasticDepth(nn.Module):
-    """Stochastic depth (Huang et al. 2016) per image; transformers uses plain dropout instead."""
+    """Stochastic depth (Huang et al. 2016): in training, drop the residual branch of some images.
+
+    It replaces the plain dropout in transformers' EfficientNet. ``rate`` is the probability that a branch is dropped.
+    """
 
     def __init__(self, rate: float) -> None:
         super().__init__()
         self.rate = rate
 
     def forward(self, branch: torch.Tensor) -> torch.Tensor:
-        """Return features (N, C, h, w) for features (N, C, h, w)."""
+        """Return the features (N, C, h, w) of a residual branch, 0 for dropped images."""
         if not self.training or self.rate == 0:
             return branch
         kept = torch.rand(len(branch), 1, 1, 1, device=branch.device) >= self.rate
@@ -64,14 +70,15 @@ class StochasticDepth(nn.Module):
 
 
 class ImageEncoder(nn.Module):
-    """Encoder of a camera's images to tokens.
+    """Image encoder of RT-1: EfficientNet with FiLM layers and TokenLearner, for the images of one camera.
 
-    FiLM layers follow each block of EfficientNet (26 in B3) and, as in RT-1's code, the convolution after the blocks.
+    A FiLM layer follows each block of EfficientNet (26 blocks in B3). As in RT-1's code, another FiLM layer follows the
+    convolution after the blocks.
     """
 
     def __init__(self, config: RT1Config) -> None:
         super().__init__()
-        self.net = efficientnet(config)
+        self.net = make_efficientnet(config)
         blocks = self.net.encoder.blocks
         self.films = nn.ModuleList([FiLM(block.projection.project_conv.out_channels) for block in blocks])
         features = self.net.encoder.top_conv.out_channels
@@ -79,8 +86,11 @@ class ImageEncoder(nn.Module):
         self.film = FiLM(config.token_width)
         self.learner = TokenLearner(config.token_width, config.token_bottleneck, config.image_tokens)
 
-    def features(self, images: torch.Tensor, language: torch.Tensor) -> torch.Tensor:
-        """Return features (N, token_width, h / 32, w / 32) for normalised images and embeddings (N, 384)."""
+    def compute_features(self, images: torch.Tensor, language: torch.Tensor) -> torch.Tensor:
+        """Return features (N, token_width, h / 32, w / 32) of normalised images (N, 3, h, w).
+
+        language: (N, 384) instruction embeddings.
+        """
         hidden = self.net.embeddings(images)
         encoder = self.net.encoder
         for block, film in zip(encoder.blocks, self.films, strict=True):
@@ -89,11 +99,18 @@ class ImageEncoder(nn.Module):
         return self.film(self.project(hidden), language)
 
     def forward(self, images: torch.Tensor, language: torch.Tensor) -> torch.Tensor:
-        """Return tokens (N, image_tokens, token_width) of images (N, 3, h, w) and embeddings (N, 384)."""
-        return self.learner(self.features(images, language).flatten(2).transpose(1, 2))
+        """Return tokens (N, image_tokens, token_width) of normalised images (N, 3, h, w).
 
-    def load_efficientnet(self, path: Path) -> None:
-        """Load EfficientNet's weights from a file; other tensors in it, such as a classifier's, are ignored."""
+        language: (N, 384) instruction embeddings.
+        """
+        return self.learner(self.compute_features(images, language).flatten(2).transpose(1, 2))
+
+    def load_efficientnet_weights(self, path: Path) -> None:
+        """Load the weights of EfficientNet from a file; ignore other tensors in the file, such as a classifier's.
+
+        Raises:
+            TrainingError: the file is unreadable, or the weights have other names or shapes than the network.
+        """
         tensors = {name.removeprefix("efficientnet."): value for name, value in _read_weights(path).items()}
         own = self.net.state_dict()
         counters = {name: value for name, value in own.items() if name.endswith("num_batches_tracked")}
@@ -101,10 +118,10 @@ class ImageEncoder(nn.Module):
         wrong = [name for name, value in own.items() if getattr(tensors.get(name), "shape", None) != value.shape]
         if wrong:
             raise TrainingError(
-                "the weights do not fit the network",
+                "the weights do not fit the EfficientNet of rt1",
                 where=path,
                 expected=f"{_EXPECTED}, such as {wrong[0]} {tuple(own[wrong[0]].shape)}",
-                found=f"{len(wrong)} of {len(own)} missing or of another shape",
+                found=f"{len(wrong)} of {len(own)} tensors missing or of another shape",
                 fix="Set image_width and image_depth to those of the weights: 1.2 and 1.4 for B3.",
             )
         self.net.load_state_dict({name: tensors[name] for name in own})
@@ -121,14 +138,17 @@ def _read_weights(path: Path) -> dict[str, Any]:
             found = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, SafetensorError, pickle.UnpicklingError, RuntimeError, EOFError, ValueError) as error:
         reason = str(error).partition("\n")[0]
-        raise TrainingError("unreadable file", where=path, expected=_EXPECTED, found=reason) from error
+        raise TrainingError("unreadable file of image_weights", where=path, expected=_EXPECTED, found=reason) from error
     if not isinstance(found, dict):
-        raise TrainingError("invalid file of weights", where=path, expected=_EXPECTED, found=type(found).__name__)
+        raise TrainingError("invalid file of image_weights", where=path, expected=_EXPECTED, found=type(found).__name__)
     return found
 
 
-def efficientnet(config: RT1Config) -> Any:
-    """Make transformers' EfficientNetModel with random weights; default: B3, with 10.7 M parameters."""
+def make_efficientnet(config: RT1Config) -> Any:
+    """Make an EfficientNetModel of transformers with random weights.
+
+    The default configuration is EfficientNet-B3, with 10.7 M parameters.
+    """
     require_extra("train", "rt1", "transformers")
     from transformers import EfficientNetConfig, EfficientNetModel
 
@@ -155,6 +175,6 @@ def efficientnet(config: RT1Config) -> Any:
 
 
 def _round_channels(channels: float) -> int:
-    """Round a number of channels as EfficientNet does: to a multiple of 8, by at most 10 % down."""
+    """Round a number of channels to a multiple of 8, and down by at most 10 %, as EfficientNet does."""
     rounded = max(8, int(channels + 4) // 8 * 8)
     return rounded + 8 if rounded < 0.9 * channels else rounded

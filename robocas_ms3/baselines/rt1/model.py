@@ -22,13 +22,13 @@ FRAME_TOKENS = ACTION_TOKENS + 1
 
 
 class ActionBins(nn.Module):
-    """Discretisation of actions into bins of equal width over the range of each axis.
+    """Convert actions to tokens and back: each axis has bins of equal width over its range.
 
-    The range of the gripper is 0..1. A value outside its range is in the first or last bin. An axis without a range
-    has one value.
+    The range of the gripper command is 0..1. A value outside the range is in the first or last bin. If the limits of an
+    axis are equal, its decoded value is constant.
 
     Args:
-        low, high: (6,) limits of the motion, m and rad.
+        low, high: (6,) limits of the translation in m and of the Euler angles in rad, per policy step.
         bins: number of bins per axis.
     """
 
@@ -43,17 +43,17 @@ class ActionBins(nn.Module):
         self.register_buffer("span", (ends[1] - ends[0]).clamp(min=0).float(), persistent=False)
 
     def encode(self, actions: torch.Tensor) -> torch.Tensor:
-        """Return the int64 tokens (..., 7) of actions (..., 7)."""
+        """Return the bin indices (..., 7) int64 of actions (..., 7)."""
         fraction = (actions - self.low) / torch.where(self.span > 0, self.span, 1.0)
         return (fraction * self.bins).floor().clamp(0, self.bins - 1).long()
 
     def decode(self, tokens: torch.Tensor) -> torch.Tensor:
-        """Return the actions (..., 7) of tokens: the centres of their bins."""
+        """Return actions (..., 7), the centres of the bins with these indices (..., 7)."""
         return self.low + (tokens + 0.5) / self.bins * self.span
 
 
-class Layer(nn.Module):
-    """Transformer layer; its feed-forward part is a single linear map, as in RT-1."""
+class TransformerLayer(nn.Module):
+    """Transformer layer whose feed-forward part is a single linear layer, as in RT-1."""
 
     def __init__(self, config: RT1Config) -> None:
         super().__init__()
@@ -64,7 +64,10 @@ class Layer(nn.Module):
         self.feed_forward = nn.Linear(config.width, config.width)
 
     def forward(self, tokens: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-        """Return tokens (B, L, width); row i of ``mask`` (L, L) bool attends to the columns that are true."""
+        """Return the next tokens (B, L, width).
+
+        tokens: (B, L, width). mask: (L, L) bool; token i attends to token j if ``mask[i, j]``.
+        """
         projected = self.qkv(self.norm(tokens)).unflatten(-1, (3, self.heads, -1))
         query, key, value = projected.permute(2, 0, 3, 1, 4)  # (B, heads, L, key width) each
         dropout = self.dropout if self.training else 0.0
@@ -74,11 +77,11 @@ class Layer(nn.Module):
 
 
 class Transformer(nn.Module):
-    """Transformer that predicts the logits of the action tokens of each frame.
+    """Transformer that predicts the action tokens and the terminate token of each frame.
 
-    A frame has the image tokens of its cameras and one empty token per predicted token. Tokens attend to earlier image
-    tokens, image tokens also to themselves. As in RT-1, no token attends to predicted tokens, so all are predicted at
-    once.
+    The input has, per frame, the image tokens of the cameras and 8 tokens of zeros. The outputs at the tokens of zeros
+    are the predictions. Each token attends to the image tokens that precede it, and an image token also to itself. As
+    in RT-1, no token attends to predicted tokens. Therefore one forward pass predicts all tokens.
     """
 
     mask: torch.Tensor
@@ -91,12 +94,12 @@ class Transformer(nn.Module):
         self.position_embedding = nn.Parameter(
             torch.randn(config.frames * (images + FRAME_TOKENS), config.width) * 0.02
         )
-        self.layers = nn.ModuleList([Layer(config) for _ in range(config.layers)])
+        self.layers = nn.ModuleList([TransformerLayer(config) for _ in range(config.layers)])
         self.head = nn.Linear(config.width, config.bins)
-        self.register_buffer("mask", attention_mask(config.frames, images, FRAME_TOKENS), persistent=False)
+        self.register_buffer("mask", make_attention_mask(config.frames, images, FRAME_TOKENS), persistent=False)
 
     def forward(self, image_tokens: torch.Tensor) -> torch.Tensor:
-        """Return logits (B, frames, 8, bins) for image tokens (B, frames, images, token_width)."""
+        """Return logits (B, frames, 8, bins) for image tokens (B, frames, image tokens per frame, token_width)."""
         projected = self.input_projection(image_tokens)
         empty = projected.new_zeros(len(projected), self.frames, FRAME_TOKENS, projected.shape[-1])
         tokens = torch.cat([projected, empty], dim=2).flatten(1, 2) + self.position_embedding
@@ -105,19 +108,22 @@ class Transformer(nn.Module):
         return self.head(tokens.unflatten(1, (self.frames, -1))[:, :, self.images :])
 
 
-def attention_mask(frames: int, images: int, predicted: int) -> torch.Tensor:
-    """Return the attention mask (L, L) bool: token (row) attends to token (column)."""
+def make_attention_mask(frames: int, images: int, predicted: int) -> torch.Tensor:
+    """Return the attention mask (L, L) bool of `Transformer`: token i attends to token j if ``mask[i, j]``.
+
+    frames: number of frames. images, predicted: number of image tokens and of predicted tokens per frame.
+    """
     is_image = torch.arange(frames * (images + predicted)) % (images + predicted) < images
     return torch.ones(len(is_image), len(is_image), dtype=torch.bool).tril() & is_image
 
 
 class RT1Model(nn.Module):
-    """RT-1: image encoders, transformer and action bins."""
+    """Network of RT-1: image encoders (`ImageEncoder`), `Transformer` and `ActionBins`."""
 
     mean: torch.Tensor
     std: torch.Tensor
     from_imagenet: torch.Tensor
-    """() bool, whether the encoders started from the weights of a file; saved with the weights."""
+    """() bool buffer: whether the image encoders were initialised from ``image_weights``; saved with the weights."""
 
     def __init__(self, config: RT1Config, facts: dict[str, Any]) -> None:
         super().__init__()
@@ -131,15 +137,15 @@ class RT1Model(nn.Module):
         has_weights = config.image_weights is not None and config.image_weights.is_file()
         if config.image_weights is not None and has_weights:
             for encoder in encoders:
-                encoder.load_efficientnet(config.image_weights)
+                encoder.load_efficientnet_weights(config.image_weights)
         self.register_buffer("from_imagenet", torch.tensor(has_weights))
 
     def encode(self, images: torch.Tensor, language: torch.Tensor) -> torch.Tensor:
-        """Return image tokens (N, images, token_width).
+        """Return image tokens (N, cameras * image_tokens, token_width).
 
         Args:
             images: (N, cameras, 3, h, w) uint8.
-            language: (N, 384) embeddings.
+            language: (N, 384) instruction embeddings.
         """
         scaled = (crop_rows(images, self.config.crop_height, random=self.training) - self.mean) / self.std
         return torch.cat([encoder(scaled[:, view], language) for view, encoder in enumerate(self.encoders)], dim=1)
@@ -152,40 +158,43 @@ class RT1Model(nn.Module):
         return self.transformer(tokens.unflatten(0, (-1, frames))).float()
 
     def forward(self, batch: Batch) -> dict[str, torch.Tensor]:
-        """Return the cross entropy, and the accuracies of the action, gripper and terminate tokens."""
+        """Return the metrics of a batch of `RT1Samples`: ``loss`` (cross entropy) and the accuracies of the tokens."""
         if self.training and self.config.image_weights is not None and not self.from_imagenet:
             raise TrainingError(
-                "missing file of ImageNet weights",
+                "missing file of image_weights",
                 where=f"image_weights {self.config.image_weights}",
-                fix="Set image_weights to a file of EfficientNet's weights, or leave it out.",
+                fix="Set image_weights to an existing file of EfficientNet's weights, or omit the option.",
             )
         logits, mask = self.logits(batch), batch["mask"]
         end = torch.where(batch["terminate"], TERMINATE, CONTINUE)
         labels = torch.cat([self.bins.encode(batch["action"]), end[..., None]], dim=-1)
         losses = F.cross_entropy(logits.flatten(0, 2), labels.flatten(), reduction="none").view_as(labels)
         with torch.no_grad():
-            correct = (likeliest_tokens(logits) == labels).float()
+            correct = (most_probable_tokens(logits) == labels).float()
         return {
-            "loss": _mean(losses, mask),
-            "action_accuracy": _mean(correct[..., :ACTION_TOKENS], mask),
-            "gripper_accuracy": _mean(correct[..., ACTION_TOKENS - 1 : ACTION_TOKENS], mask),
-            "terminate_accuracy": _mean(correct[..., ACTION_TOKENS:], mask),
+            "loss": _masked_mean(losses, mask),
+            "action_accuracy": _masked_mean(correct[..., :ACTION_TOKENS], mask),
+            "gripper_accuracy": _masked_mean(correct[..., ACTION_TOKENS - 1 : ACTION_TOKENS], mask),
+            "terminate_accuracy": _masked_mean(correct[..., ACTION_TOKENS:], mask),
         }
 
     def act(self, tokens: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return actions (B, 7) and termination (B,) bool, for image tokens (B, frames, images, token_width)."""
-        predicted = likeliest_tokens(self.transformer(tokens)[:, -1].float())
+        """Return the actions (B, 7) of the last frame, and whether each is the last of its episode (B,) bool.
+
+        tokens: (B, frames, cameras * image_tokens, token_width), see `encode`.
+        """
+        predicted = most_probable_tokens(self.transformer(tokens)[:, -1].float())
         return self.bins.decode(predicted[:, :ACTION_TOKENS]), predicted[:, ACTION_TOKENS] == TERMINATE
 
 
-def likeliest_tokens(logits: torch.Tensor) -> torch.Tensor:
-    """Return the most probable tokens (..., 8) for logits (..., 8, bins)."""
+def most_probable_tokens(logits: torch.Tensor) -> torch.Tensor:
+    """Return the most probable action and terminate tokens (..., 8), from logits (..., 8, bins)."""
     action, end = logits[..., :ACTION_TOKENS, :], logits[..., ACTION_TOKENS:, : TERMINATE + 1]
     return torch.cat([action.argmax(-1), end.argmax(-1)], dim=-1)
 
 
 def crop_rows(images: torch.Tensor, height: int, *, random: bool) -> torch.Tensor:
-    """Crop images (..., 3, h, w) to ``height`` rows, float32: the middle rows, or random rows per image."""
+    """Return ``height`` rows of images (..., 3, h, w), float32: the middle rows, or random rows per image."""
     spare = images.shape[-2] - height
     if not random:
         first = spare // 2
@@ -197,6 +206,6 @@ def crop_rows(images: torch.Tensor, height: int, *, random: bool) -> torch.Tenso
     return flat.gather(2, rows).view(*images.shape[:-2], height, -1).float()
 
 
-def _mean(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-    """Return the mean of values (B, frames, K) over the frames of a mask (B, frames)."""
+def _masked_mean(values: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    """Return the mean () of values (B, frames, K) over the frames where ``mask`` (B, frames) is true."""
     return (values * mask[..., None]).sum() / (mask.sum() * values.shape[-1]).clamp(min=1)

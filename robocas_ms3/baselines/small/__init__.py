@@ -19,14 +19,16 @@ from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 
 
 def make_policy(config: SmallConfig, facts: dict[str, Any], model: SmallModel) -> ChunkPolicy:
-    """Make the policy of a trained network, on the device of its weights."""
+    """Make the policy of a trained network; it runs on the device of the weights."""
     device = next(model.parameters()).device
 
-    def predict(seen: Observations, row: int) -> NDArray[np.floating]:
-        text = seen.embeddings[row] if seen.embeddings is not None else np.zeros(384, np.float32)
+    def predict(observations: Observations, row: int) -> NDArray[np.floating]:
+        text = observations.embeddings[row] if observations.embeddings is not None else np.zeros(384, np.float32)
         one = slice(row, row + 1)
-        state = encode_proprioception(from_wxyz(seen.tcp_in_base[one]), seen.robot[GRIPPER_WIDTH].reshape(-1)[one])
-        images = {camera: crop_image(seen.images[camera][row], view) for camera, view in config.views.items()}
+        state = encode_proprioception(
+            from_wxyz(observations.tcp_in_base[one]), observations.robot[GRIPPER_WIDTH].reshape(-1)[one]
+        )
+        images = {camera: crop_image(observations.images[camera][row], view) for camera, view in config.views.items()}
         batch = {**images, "text": text, "state": state[0]}
         with torch.inference_mode():
             chunks = model.act({name: torch.from_numpy(value)[None].to(device) for name, value in batch.items()})

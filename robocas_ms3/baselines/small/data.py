@@ -1,4 +1,4 @@
-"""Training samples of `small`: images of a dataset, decoded once and kept in memory, and the poses to predict."""
+"""Training samples of `small`: the images of a dataset, decoded once and kept in memory, and the labels."""
 
 from __future__ import annotations
 
@@ -19,16 +19,21 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.baselines.baseline import Batch, OnRead, Split
-from robocas_ms3.baselines.chunks import encode_chunks, encode_proprioception, next_key_poses, scale_statistics
+from robocas_ms3.baselines.chunks import (
+    compute_normalizer_statistics,
+    encode_chunks,
+    encode_next_key_poses,
+    encode_proprioception,
+)
 from robocas_ms3.baselines.dataset_checks import check_dataset
-from robocas_ms3.baselines.small.config import SmallConfig, View
-from robocas_ms3.baselines.small.localization import project_points
+from robocas_ms3.baselines.small.config import CameraView, SmallConfig
+from robocas_ms3.baselines.small.localization import project_points_to_view
 from robocas_ms3.baselines.small.objects import (
     SceneObjects,
-    calibration,
-    in_camera_parent,
+    calibrations_agree,
     locate_objects,
-    same_calibration,
+    read_calibration,
+    to_camera_parent_frame,
 )
 from robocas_ms3.baselines.training.scenes import read_training_scenes
 from robocas_ms3.core.errors import DatasetError
@@ -43,7 +48,7 @@ _KEYS = ("ee_pos", "ee_orn", GRIPPER_WIDTH, "gripper_status", "base_pos", "base_
 
 
 class SmallSamples:
-    """Samples of `small`, one per step of a dataset's split."""
+    """Training samples of `small`, one per policy step of a split of a dataset."""
 
     def __init__(self, config: SmallConfig, path: Path, split: Split, on_read: OnRead) -> None:
         self._config, self._source = config, open_source(path)
@@ -55,7 +60,7 @@ class SmallSamples:
         sizes = {camera: (shape[1], shape[0]) for camera, shape in shapes.items()}
         base = first.read(["base_pos", "base_orn"])
         self._calibration = {
-            camera: calibration(first, camera, base, sizes[camera], view) for camera, view in views.items()
+            camera: read_calibration(first, camera, base, sizes[camera], view) for camera, view in views.items()
         }
         lengths = [source.lengths[number] for number in numbers]
         count = sum(lengths)
@@ -80,13 +85,13 @@ class SmallSamples:
                 on_read(len(scenes), len(numbers))
         self._choose_object_texts(scenes if config.language else [replace(objects, target="") for objects in scenes])
         if config.language and split == "train" and not (self._classes >= 0).any():
-            what = "no object poses in scene.json: image cells are learned for the next key pose only"
+            what = "no object poses in scene.json, so the network does not learn to locate the named object"
             _log.warning("%s: %s", path, what)
         self.facts: dict[str, Any] = {
             "rate_hz": source.rate_hz,
             "image_sizes": {camera: list(size) for camera, size in sizes.items()},
-            "chunk": scale_statistics(self._chunks[..., :9].numpy()),
-            "keys": scale_statistics(self._keys.numpy()),
+            "chunk": compute_normalizer_statistics(self._chunks[..., :9].numpy()),
+            "keys": compute_normalizer_statistics(self._keys.numpy()),
             **({"calibration": self._calibration} if config.unproject else {}),
             "heights": _height_statistics(self._state.numpy(), self._keys.numpy()),
             "text": _text_statistics(self._texts.numpy()),
@@ -99,18 +104,18 @@ class SmallSamples:
         """Return a batch of B samples.
 
         Inputs:
-            CAMERA: (B, h, w, 3) uint8 images of each camera.
-            state: (B, 10) proprioception.
+            CAMERA: (B, h, w, 3) uint8 images of each camera, cropped and scaled to its view.
+            state: (B, 10) proprioception, see `encode_proprioception`.
             text: (B, 384) embedding of the instruction.
 
         Labels, for up to N objects per scene:
-            chunk: (B, K, 10), see `chunks`.
+            chunk: (B, K, 10) chunk, see `chunks`.
             key: (B, 9) next key pose in the TCP frame.
-            CAMERA_key_pixel: (B, 2) its pixel in each camera.
-            CAMERA_object_pixels: (B, N, 2) pixels of the objects; NaN: not known.
+            CAMERA_key_pixel: (B, 2) pixel of the next key pose in each view.
+            CAMERA_object_pixels: (B, N, 2) pixels of the objects in each view; NaN: unknown.
             object_heights: (B, N) heights of the objects in the arm's base frame, m.
             object_texts: (B, N, 384) embeddings of instructions that name the objects.
-            object_classes: (B, N) class of each object; -1: no instruction of the dataset names it.
+            object_classes: (B, N) class index of each object; -1: no instruction of the dataset names the object.
         """
         rows = torch.tensor(indices)
         episodes = self._episode[rows]
@@ -128,7 +133,11 @@ class SmallSamples:
         }
 
     def _read_images(self, number: int, start: int) -> dict[str, tuple[int, int]]:
-        """Read the images of an episode into the rows from ``start`` on; return their stored sizes by camera."""
+        """Store the images of an episode in the rows from ``start`` on.
+
+        Returns:
+            Width and height of the images in the dataset, by camera.
+        """
         episode, stored = self._source.episode(number), {}
         for camera, view in self._config.views.items():
             with closing(episode.frames(camera, "rgb", 0, self._source.lengths[number])) as images:
@@ -138,7 +147,15 @@ class SmallSamples:
         return stored
 
     def _read_arrays(self, index: int, number: int, start: int, stored: dict[str, tuple[int, int]]) -> SceneObjects:
-        """Read the arrays of an episode into the rows from ``start`` on; return its objects."""
+        """Store the state and the labels of an episode in the rows from ``start`` on.
+
+        Args:
+            index: number of the episode among these samples; ``number`` is its number in the dataset.
+            stored: result of `_read_images`.
+
+        Returns:
+            Objects of the episode.
+        """
         config, episode = self._config, self._source.episode(number)
         arrays = episode.read([*_KEYS, *(["language_embedding"] if config.language else [])])
         length = self._source.lengths[number]
@@ -150,40 +167,40 @@ class SmallSamples:
         opened, rows = arrays["gripper_status"].reshape(-1), slice(start, start + length)
         self._state[rows] = torch.from_numpy(encode_proprioception(poses, arrays[GRIPPER_WIDTH].reshape(-1)))
         self._chunks[rows] = torch.from_numpy(encode_chunks(poses, opened, config.chunk))
-        keys = next_key_poses(poses, opened)
+        keys = encode_next_key_poses(poses, opened)
         key_points = (poses[:, :3, :3] @ keys[:, :3, None])[..., 0] + poses[:, :3, 3]  # in the arm's base frame
         self._keys[rows] = torch.from_numpy(keys)
         if config.language:
             self._texts[index] = torch.from_numpy(arrays["language_embedding"])
         projections: dict[str, Callable[[Array], NDArray[np.float32]]] = {}
         for camera, view in config.views.items():
-            found = calibration(episode, camera, arrays, stored[camera], view)
+            found = read_calibration(episode, camera, arrays, stored[camera], view)
             self._check_calibration(camera, found, episode.where)
             projections[camera] = partial(
-                project_points,
-                camera=episode.camera_in_parent(camera),
+                project_points_to_view,
+                camera_in_parent=episode.camera_in_parent(camera),
                 intrinsic=episode.intrinsic(camera),
                 stored=stored[camera],
                 view=view,
             )
-            points = in_camera_parent(episode.camera_parent(camera), key_points[:, None], poses, arrays)[:, 0]
+            points = to_camera_parent_frame(episode.camera_parent(camera), key_points[:, None], poses, arrays)[:, 0]
             self._key_pixels[camera][rows] = torch.from_numpy(projections[camera](points))
         return locate_objects(episode, arrays, poses, projections)
 
     def _check_calibration(self, camera: str, found: dict[str, Any], where: object) -> None:
         first = self._calibration[camera]
-        if self._config.unproject and not same_calibration(first, found):
-            key = "mount" if not same_calibration(first, found, ["mount"]) else "intrinsic"
+        if self._config.unproject and not calibrations_agree(first, found):
+            key = "mount" if not calibrations_agree(first, found, ["mount"]) else "intrinsic"
             raise DatasetError(
                 "camera calibration differs between episodes",
                 where=f"{where}, {camera}, {key}",
                 expected=np.round(first[key], 4).tolist(),
                 found=np.round(found[key], 4).tolist(),
-                fix="Train with --set unproject=false, or on episodes of one calibration relative to the arm.",
+                fix="Train with --set unproject=false, or only on episodes with equal camera calibration.",
             )
 
     def _choose_object_texts(self, scenes: list[SceneObjects]) -> None:
-        """Choose for each object the instruction of an episode whose target is an object of that class."""
+        """Choose an instruction for each object, from an episode whose target has the class of the object."""
         most = max(len(objects.classes) for objects in scenes)
         names = sorted({objects.target for objects in scenes} - {""})
         named = {name: [index for index, objects in enumerate(scenes) if objects.target == name] for name in names}
@@ -214,14 +231,17 @@ def _check_memory(config: SmallConfig, count: int, path: Path) -> None:
         raise DatasetError(
             "the images of the dataset do not fit into memory",
             where=path,
-            expected=f"{needed / 1e9:.1f} GB",
-            found=f"{free / 1e9:.1f} GB free",
-            fix="Choose smaller views, or fewer episodes (robocas split).",
+            expected=f"{needed / 1e9:.1f} GB of free memory",
+            found=f"{free / 1e9:.1f} GB",
+            fix="Set a smaller views.CAMERA.size, or train on fewer episodes (robocas split).",
         )
 
 
 def _height_statistics(state: NDArray[np.floating], keys: NDArray[np.floating]) -> dict[str, float]:
-    """Return mean and deviation of the heights of key poses (N, 9), m, for states (N, 10)."""
+    """Return the mean and standard deviation of the heights of key poses in the arm's base frame, m.
+
+    state: (N, 10) proprioception. keys: (N, 9) next key poses in the TCP frame.
+    """
     x, y = state[:, 3:6], state[:, 6:9]
     axes = np.stack([x[:, 2], y[:, 2], np.cross(x, y)[:, 2]], axis=1)  # the last row of the TCP's rotation
     heights = (axes * keys[:, :3]).sum(axis=1) + state[:, 2]
@@ -229,9 +249,9 @@ def _height_statistics(state: NDArray[np.floating], keys: NDArray[np.floating]) 
 
 
 def _text_statistics(embeddings: NDArray[np.floating]) -> dict[str, Any]:
-    """Return the arguments of a `Scale` of instruction embeddings (N, 384).
+    """Return ``mean`` and ``deviation`` of a `Normalizer` for instruction embeddings (N, 384).
 
-    The instructions of a task differ only in the object's name, which changes the embedding by about a hundredth.
+    The instructions of a task differ only in the name of the object. This name changes a component by about 0.01.
     """
     return {
         "mean": embeddings.mean(0).tolist(),
@@ -239,21 +259,28 @@ def _text_statistics(embeddings: NDArray[np.floating]) -> dict[str, Any]:
     }
 
 
-def crop_image(image: NDArray[Any], view: View, where: object = "") -> NDArray[Any]:
-    """Crop and scale an image (H, W, 3) to a view (h, w, 3), by area averaging."""
+def crop_image(image: NDArray[Any], view: CameraView, where: object = "") -> NDArray[Any]:
+    """Crop an image (H, W, 3) and scale it to the size of a view (h, w, 3).
+
+    Raises:
+        DatasetError: the image has another aspect ratio than ``view.image_size`` or is smaller; ``where`` is its place.
+    """
     width, height = view.image_size
     if image.shape[1::-1] != (width, height):
         if image.shape[1] * height != image.shape[0] * width or image.shape[1] < width:
-            found, fix = f"{image.shape[1]} x {image.shape[0]}", f"robocas convert --size {width} {height}"
+            found, fix = (
+                f"{image.shape[1]} x {image.shape[0]}",
+                f"Convert again with `robocas convert --size {width} {height}`",
+            )
             raise DatasetError(
                 "wrong image size",
                 where=where,
                 expected=f"{width} x {height}",
                 found=found,
-                fix=f"{fix}, or --set views.CAMERA.image_size.",
+                fix=f"{fix}, or train with `--set views.CAMERA.image_size=[W,H]`.",
             )
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    left, top, right, bottom = view.box()
+    left, top, right, bottom = view.crop_box()
     crop = image[top:bottom, left:right]
     smaller = crop.shape[1] >= view.size[0]
     return np.ascontiguousarray(

@@ -1,10 +1,10 @@
-"""Locate the object that an instruction names: its cell in an image, and its point in space by unprojection.
+"""Locate the named object and the next key pose: the cell in each image, and the point in space by unprojection.
 
-The loss of the chunks alone teaches the network poorly which object an instruction names. Auxiliary losses therefore
-train attention over image cells. Their labels are the TCP position at the next change of the gripper command and, until
-that change, the objects of the layout, with the instructions of other episodes. An image gives the direction of an
-object to a few millimetres but not its distance. The point is therefore the intersection of the ray through a pixel
-with the horizontal plane at a predicted height.
+The loss of the chunks alone teaches the network poorly which object an instruction names. Therefore auxiliary losses
+train attention over the cells of each image. One label is the cell of the next key pose. The other labels are the cells
+of all objects, each with an instruction that names it; they are known until the gripper command changes. An image shows
+the direction of an object to a few millimetres, but not its distance. The point is therefore the intersection of the
+ray through a pixel with the horizontal plane at a predicted height.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from robocas_ms3.baselines.small.config import View
-from robocas_ms3.baselines.training.metrics import mean_of_sum
+from robocas_ms3.baselines.small.config import CameraView
+from robocas_ms3.baselines.training.metrics import mean_of_sum_and_count
 from robocas_ms3.core.poses import Array, inverse, transform_points
 
 CELL = 8
@@ -33,31 +33,31 @@ _FURTHEST = 2.0  # m along a ray
 _FLATTEST = 0.03  # smallest downward component of a ray's direction; flatter rays are clamped to it
 
 
-def project_points(
-    points: NDArray[np.floating], camera: Array, intrinsic: Array, stored: tuple[int, int], view: View
+def project_points_to_view(
+    points: NDArray[np.floating], camera_in_parent: Array, intrinsic: Array, stored: tuple[int, int], view: CameraView
 ) -> NDArray[np.float32]:
-    """Project points into the pixel coordinates of a view.
+    """Project points to pixel coordinates in the view of a camera.
 
     Args:
-        points: (..., 3) m, in the frame of the camera's parent.
-        camera: (4, 4) pose of the OpenCV camera frame in that parent.
-        intrinsic: (4,) fx, fy, cx, cy of the stored images, pixels.
-        stored: width and height of the stored images, pixels.
+        points: (..., 3) points in the frame of the camera's parent, m.
+        camera_in_parent: (4, 4) pose of the OpenCV camera frame in the frame of the parent.
+        intrinsic: (4,) fx, fy, cx, cy of the images in the dataset, pixels.
+        stored: width and height of the images in the dataset, pixels.
         view: view of the camera.
 
     Returns:
-        (..., 2) x and y, also of points outside the view; NaN behind the camera.
+        Pixel coordinates x and y (..., 2), which may be outside the view; NaN for points behind the camera.
     """
-    in_camera = transform_points(inverse(camera), np.asarray(points, np.float64))
+    in_camera = transform_points(inverse(camera_in_parent), np.asarray(points, np.float64))
     depth = np.maximum(in_camera[..., 2:], _NEAREST)
     fraction = (in_camera[..., :2] / depth * intrinsic[:2] + intrinsic[2:]) / np.array(stored)
-    left, top, right, bottom = np.array(view.box()) / np.tile(view.image_size, 2)
+    left, top, right, bottom = np.array(view.crop_box()) / np.tile(view.image_size, 2)
     inside = (fraction - (left, top)) / (right - left, bottom - top)
     return np.where(in_camera[..., 2:] > _NEAREST, inside * view.size, np.nan).astype(np.float32)
 
 
-def pixel_to_cell(pixels: torch.Tensor, view: View) -> torch.Tensor:
-    """Return the row-major cell indices (...) of pixel coordinates (..., 2); `NOWHERE` outside the view."""
+def pixel_to_cell(pixels: torch.Tensor, view: CameraView) -> torch.Tensor:
+    """Return the row-major cell indices (...) of pixel coordinates (..., 2): `NOWHERE` for pixels outside the view."""
     size = torch.tensor(view.size, device=pixels.device)
     inside = ((pixels >= 0) & (pixels < size)).all(dim=-1)  # NaN is not
     cell = (pixels.nan_to_num(0.0) / CELL).floor().long()
@@ -65,18 +65,18 @@ def pixel_to_cell(pixels: torch.Tensor, view: View) -> torch.Tensor:
 
 
 class CellAttention(nn.Module):
-    """Attention of a query over the cells of a feature map.
+    """Attention of a query over the image cells, which are the positions of a fine feature map.
 
     Args:
         view: view of the camera.
         channels: channels of the feature map.
         width: size of a query.
-        has_output: whether `forward` is used, which returns a token.
+        has_output: whether to make the layer of `forward`; False if only `logits` is called.
     """
 
     cell_coordinates: torch.Tensor
 
-    def __init__(self, view: View, channels: int, width: int, *, has_output: bool = True) -> None:
+    def __init__(self, view: CameraView, channels: int, width: int, *, has_output: bool = True) -> None:
         super().__init__()
         columns, rows = view.size[0] // CELL, view.size[1] // CELL
         y, x = torch.meshgrid(torch.linspace(-1, 1, rows), torch.linspace(-1, 1, columns), indexing="ij")
@@ -87,13 +87,16 @@ class CellAttention(nn.Module):
             self.output = nn.Linear(channels + 2, width)
 
     def logits(self, features: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
-        """Return cell logits (B, Q, h w) for feature maps (B, C, h, w) and queries (B, Q, width)."""
+        """Return the attention logits of all cells (B, Q, h w).
+
+        features: (B, C, h, w) feature maps. queries: (B, Q, width).
+        """
         cells = self.cell_projection(features).flatten(2)
         scores = torch.einsum("bqc,bcn->bqn", self.query_projection(queries), cells).float()
         return scores / math.sqrt(cells.shape[1])
 
     def forward(self, features: torch.Tensor, query: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return a token (B, width) and cell logits (B, h w).
+        """Return a token with the attended features (B, width), and the attention logits of all cells (B, h w).
 
         Args:
             features: (B, C, h, w) feature maps.
@@ -105,16 +108,18 @@ class CellAttention(nn.Module):
         return self.output(torch.cat([attended, probability @ self.cell_coordinates], dim=1)), logits
 
 
-def cell_losses(logits: torch.Tensor, cells: torch.Tensor, columns: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the cross entropy of cell logits, and the number of predictions within one cell of a label.
+def compute_cell_losses(logits: torch.Tensor, cells: torch.Tensor, columns: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the cross entropy and the accuracy of predicted cells, over the queries with a label in the image.
+
+    A prediction is accurate if it is at most one cell away from a label.
 
     Args:
-        logits: (..., N).
-        cells: (..., I) labels, each of which counts as correct; `NOWHERE` outside the image.
-        columns: number of cells per row.
+        logits: (..., N) attention logits of N cells per query.
+        cells: (..., I) cell indices of the labels; each counts as correct. `NOWHERE`: outside the image.
+        columns: number of cells per row of the image.
 
     Returns:
-        Two tensors (2,): the sum over queries with a label in the image, and the number of these queries.
+        Cross entropy (2,) and accuracy (2,), each as the sum over these queries and the number of these queries.
     """
     visible = cells != NOWHERE
     has_label = visible.any(dim=-1)
@@ -130,13 +135,14 @@ def cell_losses(logits: torch.Tensor, cells: torch.Tensor, columns: int) -> tupl
 
 
 class Unproject(nn.Module):
-    """Unprojection of image cells to points in space.
+    """Unprojection of the attended image cell to a point in space.
 
     Args:
         view: view of the camera.
-        camera: calibration: ``intrinsic`` [fx, fy, cx, cy] in pixels of the view; ``mount`` (4, 4), pose of the OpenCV
-            camera frame in the TCP frame if ``on_hand``, else in the arm's base frame.
-        heights: mean and standard deviation of the points' heights in the arm's base frame, m.
+        camera: calibration of the camera. ``intrinsic``: [fx, fy, cx, cy] in pixels of the view. ``on_hand``: whether
+            the camera is mounted on the hand. ``mount``: (4, 4) pose of the OpenCV camera frame, in the TCP frame if
+            ``on_hand``, else in the arm's base frame.
+        heights: mean and standard deviation of the heights of the labels in the arm's base frame, m.
         channels: channels of the feature maps.
         width: size of a query.
     """
@@ -145,7 +151,9 @@ class Unproject(nn.Module):
     intrinsic: torch.Tensor
     cell_centers: torch.Tensor
 
-    def __init__(self, view: View, camera: dict[str, Any], heights: tuple[float, float], channels: int, width: int):
+    def __init__(
+        self, view: CameraView, camera: dict[str, Any], heights: tuple[float, float], channels: int, width: int
+    ):
         super().__init__()
         self._view, self._on_hand, self._heights = view, bool(camera["on_hand"]), heights
         columns = view.size[0] // CELL
@@ -160,17 +168,17 @@ class Unproject(nn.Module):
     def forward(
         self, features: torch.Tensor, query: torch.Tensor, logits: torch.Tensor, tcp: torch.Tensor, shift: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Locate the most probable cell of an attention map, without gradients.
+        """Unproject the most probable cell of an attention map. The results have no gradients.
 
         Args:
             features: (B, C, h, w) feature maps.
             query: (B, width).
-            logits: (B, h w) of `CellAttention`.
+            logits: (B, h w) attention logits of `CellAttention`.
             tcp: (B, 4, 4) TCP pose in the arm's base frame.
             shift: (B, 2) augmentation shift of the images, pixels.
 
         Returns:
-            Points (B, 3) in the TCP frame, m; their features (B, `POINT_FEATURES`).
+            Points (B, 3) in the TCP frame in m, and the features (B, `POINT_FEATURES`) that describe them.
         """
         probability, cell = logits.detach().softmax(dim=1).max(dim=1)
         rows = torch.arange(len(cell), device=cell.device)
@@ -179,16 +187,16 @@ class Unproject(nn.Module):
         offsets = self.offsets(features.detach()).flatten(2)[rows, :, cell].float()
         heights = self.height(torch.cat([cell_features, query.detach()], dim=1))[:, 0].float().detach()
         pixels = self.cell_centers[cell] + CELL * offsets.detach() - shift
-        points = self.locate(pixels, heights * self._heights[1] + self._heights[0], tcp)
+        points = self.unproject_pixels(pixels, heights * self._heights[1] + self._heights[0], tcp)
         coarse, fine = (points / _COARSE).clamp(-3, 3), (points / _FINE).clamp(-3, 3)
         return points, torch.cat([coarse, fine, probability[:, None]], dim=1)
 
-    def locate(self, pixels: torch.Tensor, heights: torch.Tensor, tcp: torch.Tensor) -> torch.Tensor:
-        """Return points (B, 3) in the TCP frame, m.
+    def unproject_pixels(self, pixels: torch.Tensor, heights: torch.Tensor, tcp: torch.Tensor) -> torch.Tensor:
+        """Return the points (B, 3) in the TCP frame, m, at which the rays through pixels reach given heights.
 
         Args:
-            pixels: (B, 2) in the view.
-            heights: (B,) in the arm's base frame, m.
+            pixels: (B, 2) pixel coordinates x and y in the view.
+            heights: (B,) heights of the points in the arm's base frame, m.
             tcp: (B, 4, 4) TCP pose in the arm's base frame.
         """
         flat = (pixels - self.intrinsic[2:]) / self.intrinsic[:2]
@@ -202,13 +210,15 @@ class Unproject(nn.Module):
     def loss(
         self, features: torch.Tensor, queries: torch.Tensor, pixels: torch.Tensor, heights: torch.Tensor
     ) -> torch.Tensor:
-        """Return the mean error () of Q queries.
+        """Return the unprojection loss (): the mean error over the queries that have a label in the view.
+
+        The error is the L1 distance between predicted and labelled pixel in cells, plus the height error in 5 cm.
 
         Args:
             features: (B, C, h, w) feature maps.
             queries: (B, Q, width).
-            pixels: (B, Q, 2) labels; NaN or outside the view: no label.
-            heights: (B, Q) labels in the arm's base frame, m.
+            pixels: (B, Q, 2) labelled pixels; NaN or outside the view: no label.
+            heights: (B, Q) labelled heights in the arm's base frame, m.
         """
         cells = pixel_to_cell(pixels, self._view)
         visible, at = cells != NOWHERE, cells.clamp(min=0)
@@ -218,21 +228,24 @@ class Unproject(nn.Module):
         predicted = self.height(torch.cat([cell_features, queries.detach()], dim=2))[..., 0].float()
         height_error = predicted * self._heights[1] + self._heights[0] - heights.nan_to_num(0.0)
         error = (offsets - expected).abs().sum(dim=-1) + height_error.abs() / _FINE
-        return mean_of_sum(torch.stack([(error * visible).sum(), visible.sum()]))
+        return mean_of_sum_and_count(torch.stack([(error * visible).sum(), visible.sum()]))
 
 
 def _rotate(rotations: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
-    """Rotate vectors (B, 3) by matrices (B, 3, 3) or (3, 3), in fp32: a bf16 matmul would round to 4 mm."""
+    """Return vectors (B, 3), rotated by matrices (B, 3, 3) or (3, 3); in fp32, because a bf16 matmul rounds to 4 mm."""
     return (rotations * vectors[:, None]).sum(dim=-1)
 
 
 def heights_in_base(points: torch.Tensor, tcp: torch.Tensor) -> torch.Tensor:
-    """Return the heights (B,) in the arm's base frame of points (B, 3) in the TCP frame, m."""
+    """Return the heights (B,) of points in the arm's base frame, m.
+
+    points: (B, 3) points in the TCP frame, m. tcp: (B, 4, 4) TCP pose in the arm's base frame.
+    """
     return _rotate(tcp[:, :3, :3], points)[:, 2] + tcp[:, 2, 3]
 
 
 def tcp_from_state(state: torch.Tensor) -> torch.Tensor:
-    """Return the TCP pose (B, 4, 4) in the arm's base frame for proprioception (B, 10)."""
+    """Return the TCP poses (B, 4, 4) in the arm's base frame, decoded from proprioception (B, 10)."""
     first, second = state[:, 3:6], state[:, 6:9]
     rotation = torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)
     last = torch.tensor([0.0, 0.0, 0.0, 1.0], device=state.device).expand(len(state), 1, 4)

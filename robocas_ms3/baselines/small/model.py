@@ -1,10 +1,10 @@
-"""The network of `small`: a convolutional network per camera, and a transformer over their feature maps.
+"""The network of `small`: a convolutional network per camera, and a transformer decoder over the feature maps.
 
-The decoder has one query per step of the chunk and one for the next key pose. The queries attend to feature maps at
-1/16 of the image size, to the language token and to the proprioception token. Language and proprioception also modulate
-the feature channels (FiLM, Perez et al. 2018). Per camera, attention over the cells of a finer map predicts where the
-gripper will close or open next; the features there are one more token. The finer maps do not depend on the query, so in
-training each image is used for the instructions of all objects in it.
+The decoder has one query per step of the chunk and one query for the next key pose. The queries attend to coarse
+feature maps (1/16 of the image size), to the language token and to the proprioception token. Language and
+proprioception also modulate the feature channels (FiLM, Perez et al. 2018). Per camera, attention over the cells of a
+fine feature map predicts where the gripper will close or open next; the attended features are one more token. The fine
+maps do not depend on the instruction. Therefore training uses each image with the instructions of all objects in it.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from torch import nn
 from torch.nn import functional as F
 
 from robocas_ms3.baselines.baseline import Batch
-from robocas_ms3.baselines.chunks import ROW, Scale, chunk_losses
-from robocas_ms3.baselines.small.config import SmallConfig, View
+from robocas_ms3.baselines.chunks import ROW, Normalizer, compute_chunk_losses
+from robocas_ms3.baselines.small.config import CameraView, SmallConfig
 from robocas_ms3.baselines.small.localization import (
     CELL,
     NOWHERE,
     POINT_FEATURES,
     CellAttention,
     Unproject,
-    cell_losses,
+    compute_cell_losses,
     heights_in_base,
     pixel_to_cell,
     tcp_from_state,
 )
-from robocas_ms3.baselines.training.metrics import mean_of_sum
+from robocas_ms3.baselines.training.metrics import mean_of_sum_and_count
 
 _TEXT, _STATE = 384, 10  # sizes of an instruction embedding and of proprioception
-_NEAR = 0.15  # m; `unproject_mm` averages points closer than this
+_NEAR = 0.15  # m; `unproject_mm` averages key poses closer than this to the TCP
 Maps = dict[str, tuple[torch.Tensor, torch.Tensor]]
 """Coarse and fine feature maps of `ImageEncoder`, by camera."""
 
 
-class Block(nn.Module):
+class ResidualBlock(nn.Module):
     """Residual block with two convolutions (He et al. 2016)."""
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
@@ -48,20 +48,27 @@ class Block(nn.Module):
         self.shortcut = nn.Identity() if stride == 1 and inputs == outputs else nn.Conv2d(inputs, outputs, 1, stride)
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """Return features (B, outputs, H / stride, W / stride) of features (B, inputs, H, W)."""
+        """Return features (B, outputs, H / stride, W / stride), from features (B, inputs, H, W)."""
         inner = F.relu(self.norms[0](self.first(features)))
         return F.relu(self.norms[1](self.second(inner)) + self.shortcut(features))
 
 
 class ImageEncoder(nn.Module):
-    """Encoder of a camera's images: tokens for the decoder, and a finer map for `CellAttention`."""
+    """Image encoder of one camera: computes feature maps, and from them the tokens of the decoder.
 
-    def __init__(self, view: View, channels: int, width: int, *, unproject: bool) -> None:
+    Args:
+        view: size of the images.
+        channels: channels of the first feature maps.
+        width: size of queries and tokens.
+        unproject: whether to make the attention for the named object, which only the unprojection uses.
+    """
+
+    def __init__(self, view: CameraView, channels: int, width: int, *, unproject: bool) -> None:
         super().__init__()
         self.stem = nn.Conv2d(3, channels, 4, 4)
         self.norm = nn.GroupNorm(8, channels)
-        self.fine = nn.Sequential(Block(channels, channels, 1), Block(channels, 2 * channels, 2))
-        self.coarse = Block(2 * channels, 4 * channels, 2)
+        self.fine = nn.Sequential(ResidualBlock(channels, channels, 1), ResidualBlock(channels, 2 * channels, 2))
+        self.coarse = ResidualBlock(2 * channels, 4 * channels, 2)
         self.down = nn.Conv2d(4 * channels, 2 * channels, 1)
         self.key_attention = CellAttention(view, 2 * channels, width)
         if unproject:
@@ -74,15 +81,25 @@ class ImageEncoder(nn.Module):
         self.position_embedding = nn.Parameter(torch.randn(view.size[0] * view.size[1] // 256, width) * 0.2)
 
     def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return coarse maps (B, 4 channels, h / 16, w / 16) and fine maps (B, 2 channels, h / 8, w / 8)."""
+        """Return the coarse and fine feature maps of normalised images (B, 3, h, w).
+
+        Coarse maps are (B, 4 * channels, h / 16, w / 16), fine maps (B, 2 * channels, h / 8, w / 8).
+        """
         fine = self.fine(F.relu(self.norm(self.stem(images))))
         coarse = self.coarse(fine)
         return coarse, fine + F.interpolate(self.down(coarse), scale_factor=2)
 
-    def tokens(self, maps: tuple[torch.Tensor, torch.Tensor], query: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return tokens (B, h w / 256 + 1, width) and cell logits (B, h w / 64) for a query (B, width).
+    def make_tokens(
+        self, maps: tuple[torch.Tensor, torch.Tensor], query: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the decoder's tokens (B, h w / 256 + 1, width) and the attention logits of the cells (B, h w / 64).
 
-        A learned vector marks the tokens by the attention of the query. The last token has the attended features.
+        There is one token per cell of the coarse map. A learned vector, weighted by the attention of the query to the
+        cell, is added to each of them. The last token has the attended features of the fine map.
+
+        Args:
+            maps: coarse and fine maps of `forward`.
+            query: (B, width) encoded instruction and proprioception.
         """
         coarse, fine = maps
         attended, logits = self.key_attention(fine, query)
@@ -94,15 +111,16 @@ class ImageEncoder(nn.Module):
 
 
 class Prediction(NamedTuple):
-    """Prediction of the network for a batch.
+    """Outputs of `SmallModel` for a batch of B samples.
 
     Attributes:
         chunk: (B, K, 10) normalised poses, with logits of the gripper commands.
         key: (B, 9) normalised next key pose.
         state: (B, width) encoded proprioception.
         query: (B, width) sum of encoded proprioception and encoded instruction.
-        cells: (B, h w / 64) attention logits of the query, by camera.
-        points: (B, 3) unprojected points in the TCP frame, m, by camera; empty without ``unproject``.
+        cells: by camera, (B, h w / 64) attention logits of the query over the cells of the fine map.
+        points: by camera, (B, 3) unprojected position of the next key pose in the TCP frame, m; empty without
+            ``unproject``.
     """
 
     chunk: torch.Tensor
@@ -114,13 +132,13 @@ class Prediction(NamedTuple):
 
 
 class SmallModel(nn.Module):
-    """Network that predicts chunks (B, K, 10) and next key poses (B, 9)."""
+    """Network of `small`: predicts chunks (B, K, 10) and next key poses (B, 9)."""
 
     def __init__(self, config: SmallConfig, facts: dict[str, Any]) -> None:
         super().__init__()
         self.config, width = config, config.width
-        self.chunk_scale, self.key_scale = Scale(**facts["chunk"]), Scale(**facts["keys"])
-        self.text_scale = Scale(**facts["text"])
+        self.chunk_scale, self.key_scale = Normalizer(**facts["chunk"]), Normalizer(**facts["keys"])
+        self.text_scale = Normalizer(**facts["text"])
         self.text_encoder = nn.Sequential(nn.Linear(_TEXT, width), nn.ReLU(), nn.Dropout(config.dropout))
         self.state_encoder = nn.Sequential(nn.Linear(_STATE, width), nn.ReLU(), nn.Linear(width, width))
         self.image_encoders = nn.ModuleDict(
@@ -147,21 +165,23 @@ class SmallModel(nn.Module):
         self.chunk_head, self.key_head = nn.Linear(width, ROW), nn.Linear(width, 9)
 
     def forward(self, batch: Batch) -> dict[str, torch.Tensor]:
-        """Return the losses and metrics of a batch of `SmallSamples`, see `chunk_losses` and `cell_losses`."""
+        """Return the losses and metrics of a batch of `SmallSamples`, by the names in docs/baselines.md (Metrics)."""
         images, pixels, shifts = {}, {}, {}
         for camera in self.config.views:
-            image, shift = self._shift(batch[camera])
+            image, shift = self._shift_in_training(batch[camera])
             images[camera], shifts[camera] = self._normalize(image), shift
             pixels[camera] = (batch[f"{camera}_key_pixel"] + shift, batch[f"{camera}_object_pixels"] + shift[:, None])
         maps = self._encode_images(images)
         text, object_texts = self._encode_text(batch["text"]), self._encode_text(batch["object_texts"])
         predicted = self._predict(maps, text, batch["state"], shifts)
-        losses = chunk_losses(self, batch, predicted.chunk, predicted.key)
+        losses = compute_chunk_losses(self, batch, predicted.chunk, predicted.key)
         classes = batch["object_classes"]
         same_class = (classes[:, :, None] == classes[:, None, :]) & (classes >= 0)[:, :, None]
         for camera, view in self.config.views.items():
             columns, (key_pixel, object_pixels) = view.size[0] // CELL, pixels[camera]
-            key_loss, key_found = cell_losses(predicted.cells[camera], pixel_to_cell(key_pixel, view)[:, None], columns)
+            key_loss, key_found = compute_cell_losses(
+                predicted.cells[camera], pixel_to_cell(key_pixel, view)[:, None], columns
+            )
             encoder: Any = self.image_encoders[camera]
             fine = maps[camera][1]
             if self.config.unproject:
@@ -169,9 +189,9 @@ class SmallModel(nn.Module):
             else:
                 logits = encoder.key_attention.logits(fine, object_texts + predicted.state.detach()[:, None])
             cells = pixel_to_cell(object_pixels, view)[:, None].where(same_class, NOWHERE)
-            object_loss, object_found = cell_losses(logits, cells, columns)
-            weighted_key_loss = self.config.key_cell_weight * mean_of_sum(key_loss)
-            weighted_object_loss = self.config.object_cell_weight * mean_of_sum(object_loss)
+            object_loss, object_found = compute_cell_losses(logits, cells, columns)
+            weighted_key_loss = self.config.key_cell_weight * mean_of_sum_and_count(key_loss)
+            weighted_object_loss = self.config.object_cell_weight * mean_of_sum_and_count(object_loss)
             losses["loss"] = losses["loss"] + (weighted_key_loss + weighted_object_loss)
             losses |= {f"{camera}_key_cell": key_loss, f"{camera}_key_cell_found": key_found}
             losses |= {f"{camera}_object_cell": object_loss, f"{camera}_object_cell_found": object_found}
@@ -181,7 +201,10 @@ class SmallModel(nn.Module):
         return losses
 
     def act(self, batch: Batch) -> torch.Tensor:
-        """Return chunks (B, K, 10): poses and probabilities of the command to open the gripper."""
+        """Return the predicted chunks (B, K, 10) of a batch: images by camera, ``text`` and ``state``.
+
+        The last column has the probabilities of the command to open the gripper.
+        """
         maps = self._encode_images({camera: self._normalize(batch[camera]) for camera in self.config.views})
         shifts = dict.fromkeys(maps, torch.zeros(1, 2, device=batch["state"].device))
         chunk = self._predict(maps, self._encode_text(batch["text"]), batch["state"], shifts).chunk
@@ -196,7 +219,11 @@ class SmallModel(nn.Module):
         object_texts: torch.Tensor,
         pixels: tuple[torch.Tensor, torch.Tensor],
     ) -> dict[str, torch.Tensor]:
-        """Return the unprojection loss of a camera, and the error in mm of key poses closer than `_NEAR`."""
+        """Return the metrics ``CAMERA_unproject`` and ``CAMERA_unproject_mm`` of a camera.
+
+        The first is the loss of both unprojections. The second is the position error in mm of key poses closer than
+        `_NEAR`. ``pixels`` are the labels: of the next key pose (B, 2) and of the objects (B, N, 2).
+        """
         key: Any = self.key_unprojectors[camera]
         objects: Any = self.object_unprojectors[camera]
         fine = maps[camera][1]
@@ -220,13 +247,20 @@ class SmallModel(nn.Module):
         return {camera: encoder(images[camera]) for camera, encoder in self.image_encoders.items()}
 
     def _predict(self, maps: Maps, text: torch.Tensor, state: torch.Tensor, shifts: Batch) -> Prediction:
-        """Predict from feature maps, an encoded instruction (B, width) and proprioception (B, 10)."""
+        """Return the outputs for encoded inputs.
+
+        Args:
+            maps: feature maps by camera.
+            text: (B, width) encoded instructions.
+            state: (B, 10) proprioception.
+            shifts: by camera, (B or 1, 2) augmentation shift of the images, pixels.
+        """
         encoded = self.state_encoder(state)
         decoder_query = query = text + encoded
         tokens, cells, points, features = {}, {}, {}, []
         for camera, (coarse, fine) in maps.items():
             encoder: Any = self.image_encoders[camera]
-            tokens[camera], cells[camera] = encoder.tokens((coarse, fine), query)
+            tokens[camera], cells[camera] = encoder.make_tokens((coarse, fine), query)
             if self.config.unproject:
                 object_logits = encoder.object_attention.logits(fine, text[:, None])[:, 0]
                 tcp, shift = tcp_from_state(state), shifts[camera]
@@ -240,8 +274,8 @@ class SmallModel(nn.Module):
         chunk, next_key = self.chunk_head(decoded[:, :-1]).float(), self.key_head(decoded[:, -1]).float()
         return Prediction(chunk, next_key, encoded, query, cells, points)
 
-    def _shift(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Shift images (B, h, w, 3) at random in training; return them and the shifts (B or 1, 2), pixels."""
+    def _shift_in_training(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return images (B, h, w, 3) and their shifts (B or 1, 2) in pixels: random in training, otherwise 0."""
         if not (self.training and self.config.shift):
             return images, torch.zeros(1, 2, device=images.device)
         limit = self.config.shift
@@ -249,7 +283,10 @@ class SmallModel(nn.Module):
         return shift_images(images, shift), shift
 
     def _normalize(self, images: torch.Tensor) -> torch.Tensor:
-        """Scale uint8 images (B, h, w, 3) to (B, 3, h, w) in [-1, 1], with color augmentation in training."""
+        """Return uint8 images (B, h, w, 3) as (B, 3, h, w) in [-1, 1].
+
+        In training, brightness and contrast of each image change at random.
+        """
         scaled = images.permute(0, 3, 1, 2).contiguous().float()  # group norms are slow in channels-last memory
         if not (self.training and self.config.brightness):
             return scaled / 127.5 - 1
@@ -261,7 +298,7 @@ class SmallModel(nn.Module):
 
 
 def shift_images(images: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
-    """Shift images (B, h, w, C) by (B, 2) pixels right and down, repeating the pixels at the edges."""
+    """Shift images (B, h, w, C) by ``shift`` (B, 2) pixels to the right and down; repeat the pixels at the edges."""
     count, height, width, _ = images.shape
     device = images.device
     rows = (torch.arange(height, device=device) - shift[:, 1:]).clamp(0, height - 1)  # (B, h)

@@ -1,6 +1,7 @@
-"""Locate the objects of an episode in its images, until the gripper command changes.
+"""Locate the objects of an episode in its images, for the steps before the first change of the gripper command.
 
-Until that step the objects are at the poses of the layout: the scripted policy reaches its target on a free path.
+In these steps the objects are at the poses of the layout, because the scripted policy touches no object on its way to
+the target.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.baselines.small.config import View
+from robocas_ms3.baselines.small.config import CameraView
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import Array, from_xyzw, inverse, transform_points
 from robocas_ms3.datasets.schema import SCENE_FILE
@@ -28,11 +29,11 @@ class SceneObjects:
 
     Attributes:
         steps: number of steps of the episode, T.
-        target: asset id of the target; empty: not known.
+        target: asset id of the target; empty: unknown.
         classes: asset id of each of N objects.
-        pixels: (T, N, 2) pixels in the view, by camera; NaN: behind the camera, or not known after a change of the
-            gripper command.
-        points: (N, 3) positions in the arm's base frame, m.
+        pixels: by camera, (T, N, 2) pixels of the objects in the view. NaN: the object is behind the camera, or the
+            gripper command has changed before this step.
+        points: (N, 3) positions of the objects in the arm's base frame at the start, m.
     """
 
     steps: int
@@ -48,13 +49,20 @@ def locate_objects(
     tcp_in_base: Array,
     projections: Mapping[str, Callable[[Array], NDArray[np.float32]]],
 ) -> SceneObjects:
-    """Return the objects of an episode; none without a known layout, or if another policy acted first.
+    """Return the objects of an episode and their pixels.
+
+    There are no objects if the dataset has no layout of the episode, or if the episode is an expert intervention: the
+    other policy may have moved the objects.
 
     Args:
         episode: the episode.
-        arrays: its ``base_pos``, ``base_orn`` and ``gripper_status``.
+        arrays: ``base_pos``, ``base_orn`` and ``gripper_status`` of the episode.
         tcp_in_base: (T, 4, 4) TCP poses in the arm's base frame.
-        projections: by camera, function from points (T, N, 3) in the frame of its parent to pixels (T, N, 2).
+        projections: by camera, function that projects points (T, N, 3) in the frame of the camera's parent to pixels
+            (T, N, 2).
+
+    Raises:
+        DatasetError: ``scene.json`` is damaged.
     """
     steps = len(tcp_in_base)
     try:
@@ -68,12 +76,13 @@ def locate_objects(
         classes = [name for name, is_present in zip(layout["object_ids"], present, strict=True) if is_present]
     except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
         where = f"{episode.where}/{SCENE_FILE}"
-        raise DatasetError("damaged description of a scene", where=where, found=error) from error
-    in_base = transform_points(inverse(_base(arrays)), points[None])
+        fix = "Convert the episode again."
+        raise DatasetError("damaged layout of an episode", where=where, found=error, fix=fix) from error
+    in_base = transform_points(inverse(_base_poses(arrays)), points[None])
     commands = arrays["gripper_status"].reshape(-1)
     unmoved = np.logical_and.accumulate(commands == commands[0])
     pixels = {
-        camera: project(in_camera_parent(episode.camera_parent(camera), in_base, tcp_in_base, arrays))
+        camera: project(to_camera_parent_frame(episode.camera_parent(camera), in_base, tcp_in_base, arrays))
         for camera, project in projections.items()
     }
     for values in pixels.values():
@@ -81,34 +90,46 @@ def locate_objects(
     return SceneObjects(steps, target_id, classes, pixels, in_base[0])
 
 
-def calibration(
-    episode: SourceEpisode, camera: str, arrays: Mapping[str, NDArray[Any]], stored: tuple[int, int], view: View
+def read_calibration(
+    episode: SourceEpisode, camera: str, arrays: Mapping[str, NDArray[Any]], stored: tuple[int, int], view: CameraView
 ) -> dict[str, Any]:
-    """Return the ``camera`` argument of `Unproject`.
+    """Return the calibration of a camera, the argument ``camera`` of `Unproject`.
 
-    The pose of a world camera is relative to the first pose of the arm's base.
+    If the parent of the camera is the world, ``mount`` is relative to the arm's base at the first step.
+
+    Args:
+        episode: an episode of the dataset.
+        camera: name of the camera.
+        arrays: ``base_pos`` and ``base_orn`` of the episode.
+        stored: width and height of the images in the dataset, pixels.
+        view: view of the camera.
     """
     mount, parent = episode.camera_in_parent(camera), episode.camera_parent(camera)
     if parent == "world":
-        mount = inverse(_base(arrays))[0] @ mount
-    left, top, right, bottom = np.array(view.box()) / np.tile(view.image_size, 2)
+        mount = inverse(_base_poses(arrays))[0] @ mount
+    left, top, right, bottom = np.array(view.crop_box()) / np.tile(view.image_size, 2)
     scale, intrinsic = np.array(view.size) / (right - left, bottom - top), episode.intrinsic(camera)
     focal, center = intrinsic[:2] / stored * scale, (intrinsic[2:] / stored - (left, top)) * scale
     return {"on_hand": parent == "ee", "mount": mount.tolist(), "intrinsic": [*focal.tolist(), *center.tolist()]}
 
 
-def same_calibration(one: dict[str, Any], other: dict[str, Any], keys: Sequence[str] = tuple(_TOLERANCES)) -> bool:
-    """Return whether two calibrations agree to 1 mm, 1 mrad and 0.01 pixels."""
-    return all(np.allclose(one[key], other[key], rtol=0, atol=_TOLERANCES[key]) for key in keys)
+def calibrations_agree(first: dict[str, Any], second: dict[str, Any], keys: Sequence[str] = tuple(_TOLERANCES)) -> bool:
+    """Return whether two calibrations are equal within 1 mm, 1 mrad and 0.01 pixels; ``keys`` are the compared keys."""
+    return all(np.allclose(first[key], second[key], rtol=0, atol=_TOLERANCES[key]) for key in keys)
 
 
-def in_camera_parent(parent: Parent, points: Array, tcp_in_base: Array, arrays: Mapping[str, NDArray[Any]]) -> Array:
-    """Transform points (T, N, 3) from the arm's base frame to the frame of a camera's parent."""
+def to_camera_parent_frame(
+    parent: Parent, points: Array, tcp_in_base: Array, arrays: Mapping[str, NDArray[Any]]
+) -> Array:
+    """Transform points (T, N, 3) from the arm's base frame to the frame of a camera's parent.
+
+    tcp_in_base: (T, 4, 4) TCP poses in the arm's base frame. arrays: ``base_pos`` and ``base_orn`` of the episode.
+    """
     if parent == "ee":
         return transform_points(inverse(tcp_in_base), points)
-    return transform_points(_base(arrays), points) if parent == "world" else points
+    return transform_points(_base_poses(arrays), points) if parent == "world" else points
 
 
-def _base(arrays: Mapping[str, NDArray[Any]]) -> Array:
+def _base_poses(arrays: Mapping[str, NDArray[Any]]) -> Array:
     """Return the poses (T, 4, 4) of the arm's base in the world frame."""
     return from_xyzw(arrays["base_pos"].astype(np.float64), arrays["base_orn"].astype(np.float64))

@@ -19,34 +19,34 @@ from robocas_ms3.core.files import add_path_to_errors, atomic_file, make_folder,
 _FIRST_COLUMNS = ("step", "split", "epoch", "seconds", "learning_rate")
 
 
-def mean_of_sum(sum_and_count: torch.Tensor) -> torch.Tensor:
-    """Return the mean () of a sum and a count (2,); 0 for a count of 0."""
+def mean_of_sum_and_count(sum_and_count: torch.Tensor) -> torch.Tensor:
+    """Return the mean (), for a tensor (2,) of the sum and the number of values; 0 if there are no values."""
     return sum_and_count[0] / sum_and_count[1].clamp(min=1)
 
 
-def batch_sum(metric: torch.Tensor, samples: int) -> torch.Tensor:
-    """Convert a batch metric to (sum, count), float64 of shape (2,).
+def convert_to_sum_and_count(metric: torch.Tensor, samples: int) -> torch.Tensor:
+    """Return the sum and the number of values of a batch metric, float64 (2,).
 
-    ``metric`` is a mean of shape (), or already (sum, count).
+    metric: the mean over the ``samples`` of the batch (), or already sum and number of values (2,).
     """
     metric = metric.detach().double()
     return metric if metric.ndim else torch.stack([metric * samples, torch.full_like(metric, samples)])
 
 
-def sums_to_means(sums: Mapping[str, torch.Tensor]) -> dict[str, float]:
-    """Return the means by name; NaN for a count of 0."""
-    return {name: float(mean_of_sum(value)) if value[1] else math.nan for name, value in sums.items()}
+def compute_means(sums: Mapping[str, torch.Tensor]) -> dict[str, float]:
+    """Return the mean of each metric, for tensors (2,) of the sum and the number of values; NaN without values."""
+    return {name: float(mean_of_sum_and_count(value)) if value[1] else math.nan for name, value in sums.items()}
 
 
 class MetricsLog:
-    """Log of metrics: ``metrics.csv`` and TensorBoard events.
+    """Log of metrics in a run folder: ``metrics.csv`` and TensorBoard events.
 
     Args:
         folder: folder of the run.
-        step: step of the checkpoint; later lines of a killed run are removed.
+        step: step from which the run continues; lines of later steps, which a killed process wrote, are removed.
 
     Attributes:
-        seconds: training time up to that step.
+        seconds: training time up to ``step``.
     """
 
     def __init__(self, folder: Path, step: int) -> None:
@@ -60,13 +60,13 @@ class MetricsLog:
             shutil.rmtree(folder / TENSORBOARD, ignore_errors=True)
         self._tensorboard = TensorBoardWriter(folder / TENSORBOARD, step + 1 if step else 0)
 
-    def has(self, step: int, split: str) -> bool:
-        """Return whether a line of a step and split was written before this run continued."""
+    def has_line(self, step: int, split: str) -> bool:
+        """Return whether the log had a line of this step and split when it was opened."""
         return (step, split) in self._written
 
-    def add(self, step: int, split: str, about: Mapping[str, float], metrics: Mapping[str, float]) -> None:
-        """Add metrics of a step; ``about`` has epoch, seconds and learning rate."""
-        row = {"step": step, "split": split, **about, **metrics}
+    def add(self, step: int, split: str, schedule: Mapping[str, float], metrics: Mapping[str, float]) -> None:
+        """Write a line and an event; ``schedule`` has ``epoch``, ``seconds`` and ``learning_rate``."""
+        row = {"step": step, "split": split, **schedule, **metrics}
         is_first = not self._columns
         if is_first:
             self._columns = [*_FIRST_COLUMNS, *metrics]
@@ -75,7 +75,7 @@ class MetricsLog:
             if is_first:
                 writer.writeheader()
             writer.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})
-        shown = {**metrics, "learning_rate": about["learning_rate"]}
+        shown = {**metrics, "learning_rate": schedule["learning_rate"]}
         self._tensorboard.add(step, {f"{split}/{key}": value for key, value in shown.items() if math.isfinite(value)})
 
     def close(self) -> None:
@@ -85,11 +85,11 @@ class MetricsLog:
         with self._path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
         whole = [row for row in rows if None not in row.values()]  # a kill may have cut off the last line
-        kept = [row for row in whole if _number(row["step"], math.inf) <= step]
+        kept = [row for row in whole if _parse_number(row["step"], math.inf) <= step]
         self._written = {(int(row["step"]), row["split"]) for row in kept}
         self._columns = list(rows[0]) if rows else []
         if kept:
-            self.seconds = _number(kept[-1]["seconds"], 0.0)
+            self.seconds = _parse_number(kept[-1]["seconds"], 0.0)
         with atomic_file(self._path) as tmp, tmp.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, self._columns, extrasaction="ignore", lineterminator="\n")
             if self._columns:
@@ -98,9 +98,12 @@ class MetricsLog:
 
 
 class TensorBoardWriter:
-    """Writer of TensorBoard events without a thread; TensorBoard's own writer reports errors late."""
+    """Writer of TensorBoard events that raises errors at once; TensorBoard's own writer has a thread.
 
-    def __init__(self, folder: Path, first: int = 0) -> None:
+    first_step: if above 0, viewers discard events of this step and later ones from earlier files in the folder.
+    """
+
+    def __init__(self, folder: Path, first_step: int = 0) -> None:
         from tensorboard.compat.proto import event_pb2, summary_pb2
         from tensorboard.summary.writer.record_writer import RecordWriter
 
@@ -112,12 +115,12 @@ class TensorBoardWriter:
         with add_path_to_errors(self._path):
             self._records: Any = RecordWriter(self._path.open("xb"))
         self._write(file_version="brain.Event:2")
-        if first:
+        if first_step:
             log = self._events.SessionLog
-            self._write(step=first, session_log=log(status=log.START))
+            self._write(step=first_step, session_log=log(status=log.START))
 
     def add(self, step: int, values: Mapping[str, float]) -> None:
-        """Write an event with scalars by name."""
+        """Write an event of a training step with one scalar per name."""
         summary = self._summaries.Summary
         scalars = [summary.Value(tag=name, simple_value=value) for name, value in values.items()]
         self._write(step=step, summary=summary(value=scalars))
@@ -132,8 +135,8 @@ class TensorBoardWriter:
             self._records.flush()
 
 
-def _number(text: Any, default: float) -> float:
-    """Parse a number; return the default for text that a kill has cut off."""
+def _parse_number(text: Any, default: float) -> float:
+    """Parse a number; return the default for a text that is none, such as the last one of a killed process."""
     try:
         return float(text)
     except (TypeError, ValueError):

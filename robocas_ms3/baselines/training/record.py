@@ -33,9 +33,9 @@ class DataRecord(StrictModel):
     """Training data of a run.
 
     Attributes:
-        name: name of the folder, file or scenes.
+        name: name of the dataset folder or trajectory file; for `ppo` the name of the scenes.
         hash: hash of the data, see `hash_dataset`.
-        episodes, samples: size of the training split.
+        episodes, samples: number of episodes and of samples in the training split.
         scenes: tasks, objects and scene settings of the training split.
     """
 
@@ -51,15 +51,16 @@ class RunRecord(StrictModel):
 
     Attributes:
         kind: constant that identifies the file.
-        baseline, version: the baseline and the version of its weights.
-        config: the complete configuration.
-        facts: facts of the training data, see `Samples`.
-        data: the training data.
-        versions: versions of packages.
+        baseline, version: name of the baseline, and version of its weights.
+        config: complete configuration of the baseline.
+        facts: values of the training data that network and policy need, see `Samples`.
+        data: description of the training data.
+        versions: versions of the installed packages, by name.
         device, precision: device and precision of the training, which determine rounding.
-        threads: number of CPU threads, which determines the order of sums; 0: a GPU, or not known.
-        hardware_changes: one line per continuation with another device, precision or number of threads.
-        init_from: run of the initial weights: folder name and hash; empty: random weights.
+        threads: number of CPU threads, which determines the order of sums; 0: a GPU, or unknown.
+        hardware_changes: one line for each time that the run continued with another device, precision or number of
+            threads.
+        init_from: folder name and hash of the run whose weights this run started from; empty: random weights.
     """
 
     kind: Literal["robocas training run"] = "robocas training run"
@@ -77,40 +78,48 @@ class RunRecord(StrictModel):
 
     @property
     def metadata(self) -> dict[str, str]:
-        """Return the metadata that its tensor files must have."""
+        """Return the metadata that checkpoint and weights file of this run must have."""
         return {"baseline": self.baseline, "version": str(self.version), "dataset": self.data.hash}
 
 
 def find_run(run: Path) -> Path:
-    """Return the folder of a run; the name of a bundled run means the bundled run."""
+    """Return the folder of a run: of the bundled run if ``run`` is its name, otherwise ``run`` itself."""
     return BUNDLED / run if len(run.parts) == 1 and (BUNDLED / run).is_dir() else run
 
 
 def read_run(folder: Path) -> RunRecord:
-    """Read the record of a training run, `run.json` in its folder; raise TrainingError if there is none."""
+    """Read ``run.json`` in the folder of a training run.
+
+    Raises:
+        TrainingError: the file is missing, unreadable or invalid.
+    """
     path = folder / RUN
     if not path.is_file():
-        fix = "Pass the --out folder of `robocas train`."
+        fix = "Pass the output folder (--out) of `robocas train`."
         raise TrainingError("not a training run", where=folder, expected=RUN, fix=fix, usage=True)
     try:
         record = load_json(path)
     except ValueError as error:
-        raise TrainingError("unreadable file", where=path, found=error) from error
+        raise TrainingError("unreadable JSON file", where=path, found=error) from error
     if not isinstance(record, dict) or record.get("kind") != RunRecord.model_fields["kind"].default:
-        raise TrainingError("not a training run", where=path, expected="kind robocas training run")
+        kind = f'"kind": "{RunRecord.model_fields["kind"].default}"'
+        raise TrainingError("not the run.json of a training run", where=path, expected=kind, found="another kind")
     return parse(RunRecord, record, TrainingError, where=path)
 
 
 def package_versions() -> dict[str, str]:
-    """Return the versions of the packages that a training depends on."""
+    """Return the installed versions of the packages that influence a training, by name."""
     return {name: version(name) for name in _PACKAGES}
 
 
 def hash_dataset(data: Path) -> str:
-    """Return the hex SHA-256 of a dataset.
+    """Return the hex SHA-256 of a dataset folder or a trajectory file.
 
-    For a trajectory: of the bytes of the file and of the JSON next to it. For a folder: of JSON files, tables, arrays,
-    and the sizes of all files.
+    The hash of a trajectory covers the bytes of the file and of the JSON file next to it. The hash of a folder covers
+    the names and sizes of all files, and the bytes of JSON files, tables and arrays. It does not cover image bytes.
+
+    Raises:
+        TrainingError: there is no such file or folder.
     """
     digest = hashlib.sha256()
     if data.is_file():
@@ -131,7 +140,7 @@ def hash_dataset(data: Path) -> str:
 
 
 def hash_weights(folder: Path) -> str:
-    """Return the hex SHA-256 of the weights of a run; empty if there are none yet."""
+    """Return the hex SHA-256 of the weights file in the folder of a run; empty if there is no file."""
     path, digest = folder / WEIGHTS, hashlib.sha256()
     if not path.is_file():
         return ""

@@ -1,4 +1,4 @@
-"""Folder and device of a training run, for the training loops."""
+"""Run folder and device that the training loops use."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of malloc.h
 
 
 class RunFolder:
-    """Writer of a run's record, metrics, checkpoints and weights; only the main process writes.
+    """Folder of a training run: writes record, metrics, checkpoint and weights, in the main process only.
 
     Attributes:
         record: record of the run.
-        accelerator: accelerate's accelerator, which has the device.
+        accelerator: ``accelerate.Accelerator``, which has device, precision and processes of the training.
         progress: functions that report the progress.
-        checkpoint: checkpoint to continue from; None: the run starts from step 0.
+        checkpoint: checkpoint from which the run continues; None: the run starts at step 0.
     """
 
     def __init__(self, output: OutputFolder, record: RunRecord, accelerator: Accelerator, progress: Progress) -> None:
@@ -42,27 +42,31 @@ class RunFolder:
         self._started_at = 0.0
         path = output.path / CHECKPOINT
         is_continued = output.recorded is not None and path.is_file()
-        self.checkpoint: Checkpoint | None = checkpoints.load(path, record.metadata) if is_continued else None
+        self.checkpoint: Checkpoint | None = (
+            checkpoints.load_checkpoint(path, record.metadata) if is_continued else None
+        )
 
     def close(self) -> None:
         if self._log is not None:
             self._log.close()
 
     def start(self, step: int, model: torch.nn.Module, weights: Tensors, size: str) -> None:
-        """Write the record and open the log; rewrite the weights if their step is not that of the checkpoint.
+        """Write the record, report the size of the training, and open the log.
+
+        If the weights file and the checkpoint have different steps, the weights file is written again.
 
         Args:
-            step: first step.
+            step: number of training steps that are done.
             model: the network.
-            weights: weights of the policy at that step.
-            size: size of the training data, for the log.
+            weights: weights of the policy at this step.
+            size: text with the number of samples, for the progress message.
         """
         accelerator, record = self.accelerator, self.record
         changes = _hardware_changes(record, accelerator)
         if self._output.recorded is not None and changes:
             record.hardware_changes.append(f"from step {step}: {changes}")
             what = "the result will differ from that of an uninterrupted run"
-            self.progress.message(f"hardware changed {record.hardware_changes[-1]}; {what}")
+            self.progress.message(f"other hardware {record.hardware_changes[-1]}; {what}")
         if accelerator.is_main_process:
             self._output.start(record.model_dump(mode="json"))
             if self.checkpoint is not None:
@@ -77,10 +81,11 @@ class RunFolder:
         self._started_at = time.monotonic() - (self._log.seconds if self._log else 0.0)
 
     def has_logged(self, step: int, split: str) -> bool:
-        """Return whether a line was logged before this run continued; call it in all processes."""
-        return broadcast_object_list([self._log is not None and self._log.has(step, split)])[0]
+        """Return whether the log had a line of this step and split at the start; all processes must call it."""
+        return broadcast_object_list([self._log is not None and self._log.has_line(step, split)])[0]
 
     def log(self, step: int, split: str, metrics: Mapping[str, float], *, epoch: float, learning_rate: float) -> None:
+        """Write the metrics of a step to the log; ``split`` is ``train`` or ``val``."""
         if self._log is None:
             return
         self._output.check_exists()
@@ -88,40 +93,51 @@ class RunFolder:
         self._log.add(step, split, {"epoch": epoch, "seconds": seconds, "learning_rate": learning_rate}, metrics)
 
     def save(self, step: int, state: Tensors, weights: Tensors) -> None:
-        """Write the weights of the policy, then the checkpoint, so that weights are never missing."""
+        """Write the weights of the policy, then the checkpoint, so that each checkpoint has its weights.
+
+        state: tensors of the checkpoint. weights: tensors of the policy's network.
+        """
         if not self.accelerator.is_main_process:
             return
         self._output.check_exists()
         with deferred_interrupts(second_ends=False):
-            checkpoints.save(self._output.path / WEIGHTS, weights, self.record.metadata, step)
-            checkpoints.save(self._output.path / CHECKPOINT, state, self.record.metadata, step)
+            checkpoints.save_tensors(self._output.path / WEIGHTS, weights, self.record.metadata, step)
+            checkpoints.save_tensors(self._output.path / CHECKPOINT, state, self.record.metadata, step)
 
-    def make_error(self, message: str, step: int) -> TrainingError:
-        """Make the error of a failed step."""
+    def make_step_error(self, message: str, step: int) -> TrainingError:
+        """Make the error of a training step that failed, with the folder, the step and a fix."""
         return TrainingError(
             message,
             where=f"{self._output.path}, step {step}",
-            fix="Start another run from this run's weights: --init-from RUN, with a lower train.learning_rate.",
+            fix="Start a new run from this one with --init-from, with a lower train.learning_rate.",
         )
 
     def _repair_weights(self, step: int, weights: Tensors) -> None:
         path = self._output.path / WEIGHTS
         try:
-            checkpoints.load(path, {**self.record.metadata, "step": str(step)})
+            checkpoints.load_checkpoint(path, {**self.record.metadata, "step": str(step)})
         except TrainingError:
-            checkpoints.save(path, weights, self.record.metadata, step)
+            checkpoints.save_tensors(path, weights, self.record.metadata, step)
 
 
 def _hardware_changes(record: RunRecord, accelerator: Accelerator) -> str:
-    """Return how this hardware differs from the recorded one, which changes rounding; empty if equal."""
+    """Return the recorded hardware values that have changed, such as ``threads 4``; empty: none has changed."""
     now = describe_hardware(accelerator) | ({} if record.threads else {"threads": 0})
     return ", ".join(f"{name} {value}" for name, value in now.items() if getattr(record, name) != value)
 
 
 def make_accelerator(device: str, precision: Precision) -> Accelerator:
-    """Make accelerate's accelerator for a device: ``auto`` (a GPU if there is one), ``cpu`` or ``cuda``."""
+    """Make the ``Accelerator`` of accelerate.
+
+    device: ``auto`` (a GPU if there is one), ``cpu`` or ``cuda``. precision: ``auto`` is bf16 if the hardware
+    has it.
+
+    Raises:
+        TrainingError: ``cuda`` without a GPU.
+    """
     if device == "cuda" and not torch.cuda.is_available():
-        raise TrainingError("no GPU available to torch", where="--device", found="cuda", fix="Pass --device cpu.")
+        fix = "Pass --device cpu, or install a build of torch for your GPU."
+        raise TrainingError("torch finds no GPU", where="--device", found="cuda", fix=fix)
     cpu = device == "cpu" or not torch.cuda.is_available()
     if cpu:
         _keep_freed_memory()
@@ -138,14 +154,14 @@ def make_accelerator(device: str, precision: Precision) -> Accelerator:
 
 
 def describe_hardware(accelerator: Accelerator) -> dict[str, Any]:
-    """Return the values of a `RunRecord` that determine rounding: device, precision, CPU threads."""
+    """Return ``device``, ``precision`` and ``threads`` of a `RunRecord`: these values determine rounding."""
     device = accelerator.device.type
     threads = torch.get_num_threads() if device == "cpu" else 0
     return {"device": device, "precision": str(accelerator.mixed_precision), "threads": threads}
 
 
 def _keep_freed_memory() -> None:
-    """Let glibc keep freed memory: requesting pages from the system takes 10 % of a training step."""
+    """Let glibc keep freed memory; otherwise requests of memory pages take 10 % of a training step."""
     with suppress(OSError, AttributeError):  # another C library
         libc = ctypes.CDLL(None)
         libc.mallopt(_M_MMAP_MAX, 0)

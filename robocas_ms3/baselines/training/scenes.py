@@ -1,4 +1,4 @@
-"""Scenes of a run's training data, and their differences from the task configurations of an evaluation."""
+"""Scenes of the training data of a run, compared with the task configurations of an evaluation."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _MAX_NAMES = 5  # that a message lists
 
 
 class TrainingScenes(StrictModel):
-    """Scenes of the training data of a run; an empty field is not known.
+    """Scenes of the training data of a run; an empty field is unknown.
 
     Attributes:
         tasks: short names of the tasks.
         objects: asset ids of the objects.
-        configs: scene settings by the name of a task configuration, see `scene_settings`.
+        configs: by name of a task configuration, its values that change the scene, see `scene_settings`.
     """
 
     tasks: list[str] = []
@@ -33,11 +33,14 @@ class TrainingScenes(StrictModel):
     configs: dict[str, dict[str, Any]] = {}
 
     def differences(self, configs: Mapping[str, TaskConfig], cameras: Collection[str]) -> list[str]:
-        """Return what task configurations have that the training data lacks, as phrases; empty: nothing.
+        """List the tasks, scene settings, objects and cameras of task configurations that the training data lacks.
 
         Args:
-            configs: task configurations by name.
-            cameras: cameras that the policy uses; settings of other cameras do not count.
+            configs: task configurations of an evaluation, by name.
+            cameras: cameras that the policy observes; settings of other cameras are not compared.
+
+        Returns:
+            Texts such as ``objects banana, plum``; empty if the training data has everything.
         """
         settings, objects = set[str](), set[str]()
         trained = [_select_cameras(values, cameras) for values in self.configs.values()]
@@ -54,16 +57,16 @@ class TrainingScenes(StrictModel):
             "objects": objects - set(self.objects),
             "cameras": {key.removeprefix("cameras.") for key in camera_settings},
         }
-        return [f"{kind} {_join(names)}" for kind, names in found.items() if names]
+        return [f"{kind} {_join_names(names)}" for kind, names in found.items() if names]
 
     def summary(self) -> str:
-        """Return one line with the tasks, configurations and objects."""
+        """Return the tasks, configurations and objects in one line of text."""
         parts = {"": self.tasks, "in ": list(self.configs), "objects ": self.objects}
-        return ", ".join(f"{word}{_join(names)}" for word, names in parts.items() if names)
+        return ", ".join(f"{word}{_join_names(names)}" for word, names in parts.items() if names)
 
 
 def read_training_scenes(source: EpisodeSource, numbers: Iterable[int]) -> TrainingScenes:
-    """Read the scenes of episodes from their ``scene.json``; fields stay empty where it lacks them."""
+    """Read the scenes of the episodes with these numbers from ``scene.json``; values that it lacks stay empty."""
     tasks, objects, configs, known = set[str](), set[str](), dict[str, dict[str, Any]](), set[str]()
     for number in numbers:
         scene = source.episode(number).scene
@@ -84,10 +87,10 @@ def read_training_scenes(source: EpisodeSource, numbers: Iterable[int]) -> Train
 
 
 def scene_settings(config: TaskConfig, cameras: Collection[str] | None = None) -> dict[str, Any]:
-    """Return the values of a task configuration that change what a policy observes, or where it acts.
+    """Return the values of a task configuration that change the scene or the images.
 
-    Keys are those of the configuration, ``randomisation.KEY``, ``objects.count``, and ``cameras.NAME`` or
-    ``static_camera`` of the named cameras (None: all).
+    Keys: those of the configuration; ``randomisation.KEY``; ``objects.count``; ``static_camera`` and ``cameras.NAME``,
+    only for the given ``cameras``. None: all cameras.
     """
     values = config.model_dump(mode="json")
     nested = {"randomisation": values.pop("randomisation"), "cameras": values.pop("cameras", {})}
@@ -98,7 +101,7 @@ def scene_settings(config: TaskConfig, cameras: Collection[str] | None = None) -
 
 
 def _select_cameras(settings: Mapping[str, Any], cameras: Collection[str]) -> dict[str, Any]:
-    """Remove settings of unused cameras; without cameras also those of lights and room."""
+    """Return the settings without those of unused cameras, and without lights and room if no camera is used."""
     unused = {"static_camera"} - set(cameras)
     if not cameras:
         unused |= {"lights", "room", "randomisation.lights", "randomisation.room", "randomisation.finishes"}
@@ -111,7 +114,7 @@ def _select_cameras(settings: Mapping[str, Any], cameras: Collection[str]) -> di
 
 
 def _object_ids(config: TaskConfig) -> set[str]:
-    """Return the asset ids of a configuration's objects; ids of other packs as written."""
+    """Return the asset ids of the objects of a configuration; for ids of another pack, the ids as written."""
     try:
         return set(find_objects(load_pack("builtin"), config))
     except ConfigError:  # ids of another pack
@@ -126,7 +129,7 @@ def _config_name(scene: Mapping[str, Any], known: Collection[str]) -> str:
     return name if name not in known else f"{name}-{len(known) + 1}"
 
 
-def _join(names: Collection[str]) -> str:
+def _join_names(names: Collection[str]) -> str:
     ordered = sorted(names)
     more = len(ordered) - _MAX_NAMES
     return ", ".join(ordered[:_MAX_NAMES]) + (f" and {more} more" if more > 0 else "")

@@ -50,18 +50,20 @@ class RunOptions:
         baseline: name of the baseline.
         data: dataset folder or trajectory.h5; None for a baseline that learns in simulation.
         out: folder of the run.
-        changes: nested values that differ from the default configuration; a run that continues needs none.
-        layers: (source, nested values) of files and options, below ``changes``; errors name the source.
-        init_from: folder of a run with the initial weights; also its scales and, below ``changes``, its configuration.
+        config_changes: nested configuration values that differ from the defaults. A run that continues has its own
+            configuration and needs none.
+        config_layers: further values, as pairs of their source (a file or an option, which errors name) and nested
+            values. Later layers override earlier layers, and ``config_changes`` overrides all of them.
+        init_from: folder of a run whose weights, normalisation and configuration replace the defaults.
         device: ``auto``, ``cpu`` or ``cuda``.
-        overwrite: start again; the run in ``out`` is replaced when the data is read.
+        overwrite: start again; the run in ``out`` is deleted once the new data has been read.
     """
 
     baseline: str
     data: Path | None
     out: Path
-    changes: Mapping[str, Any] = field(default_factory=dict)
-    layers: Sequence[tuple[str, Mapping[str, Any]]] = ()
+    config_changes: Mapping[str, Any] = field(default_factory=dict)
+    config_layers: Sequence[tuple[str, Mapping[str, Any]]] = ()
     init_from: Path | None = None
     device: str = "auto"
     overwrite: bool = False
@@ -69,12 +71,12 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class InitialWeights:
-    """Initial weights of a run, from another run.
+    """Weights of another run, from which a run starts.
 
     Attributes:
-        record: record of the other run.
-        name: name of its folder and hash of its weights.
-        weights: its weights; None if the new run already has a checkpoint.
+        record: ``run.json`` of the other run.
+        name: folder name and weights hash of the other run.
+        weights: weights of the other run; None if the new run has a checkpoint and does not need them.
     """
 
     record: RunRecord
@@ -83,12 +85,12 @@ class InitialWeights:
 
 
 def train_run(options: RunOptions, progress: Progress | None = None) -> RunRecord:
-    """Train a baseline, or continue a run with the same settings.
+    """Train a baseline and return the record of the run; continue the run in ``options.out`` if there is one.
 
     Raises:
-        TrainingError: invalid configuration or initial weights.
-        DatasetError: the data does not suit the baseline.
-        OutputExistsError: the folder has a run with other settings, versions or data, or other files.
+        TrainingError: the configuration or the initial weights are invalid, or the loss became NaN or infinite.
+        DatasetError: the baseline cannot be trained on the data.
+        OutputExistsError: the folder has a run with other settings, versions or data, or files of other origin.
         KeyboardInterrupt: Ctrl-C; the same call continues the run.
     """
     require_extra("train", "baselines", "accelerate", "safetensors", "tensorboard", "transformers")
@@ -104,12 +106,12 @@ def train_run(options: RunOptions, progress: Progress | None = None) -> RunRecor
         base = recorded or (initial.record if initial else None)
         values = base.config if base else baseline.Config().model_dump(mode="json")
         config: Any = None
-        for origin, changes in (*options.layers, (baseline.name, options.changes)):
+        for origin, changes in (*options.config_layers, (baseline.name, options.config_changes)):
             values = merge_configs(values, changes)
             config = parse(baseline.Config, values, TrainingError, where=origin)
         settings: dict[str, Any] = {"config": config.model_dump(mode="json")}
         output.check_settings(settings | ({"init_from": initial.name} if initial else {}))
-        accelerator = make_accelerator(options.device, _precision(config.train.precision, recorded))
+        accelerator = make_accelerator(options.device, _choose_precision(config.train.precision, recorded))
         if config.train.batch_size % accelerator.num_processes:
             found = f"{config.train.batch_size} for {accelerator.num_processes} processes"
             expected = "a multiple of the number of processes"
@@ -151,7 +153,7 @@ def train_run(options: RunOptions, progress: Progress | None = None) -> RunRecor
 
 
 def merge_configs(defaults: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested mappings with the values of ``changes`` in place of those of ``defaults``."""
+    """Return ``defaults`` with the values of ``changes``; nested mappings are merged."""
     result = dict(defaults)
     for key, value in changes.items():
         inner = result.get(key)
@@ -165,27 +167,46 @@ def merge_configs(defaults: Mapping[str, Any], changes: Mapping[str, Any]) -> di
 def load_initial_weights(
     baseline: Baseline, init_from: Path | None, recorded: RunRecord | None, out: Path
 ) -> InitialWeights | None:
-    """Load the initial weights from a run; None without ``init_from``."""
+    """Load the initial weights of a run.
+
+    Args:
+        baseline: baseline of the run.
+        init_from: folder of the run with the initial weights; None: there are none.
+        recorded: ``run.json`` in ``out``; None for a new run.
+        out: folder of the run.
+
+    Raises:
+        TrainingError: the run with the initial weights is missing or does not suit; or a run without a checkpoint is
+            continued without its ``init_from``.
+    """
     from robocas_ms3.baselines.training import checkpoints
 
     has_checkpoint = recorded is not None and (out / CHECKPOINT).is_file()
     if init_from is None:
         if recorded is not None and recorded.init_from and not has_checkpoint:
-            what, fix = "this run has no checkpoint and needs its initial weights", "Pass --init-from again."
+            what, fix = (
+                "missing initial weights of a run without a checkpoint",
+                "Pass --init-from as in the first call.",
+            )
             raise TrainingError(what, where=out, expected=recorded.init_from, fix=fix)
         return None
     folder = find_run(init_from)
     record = read_run(folder)
     expected = {"baseline": baseline.name, "version": str(baseline.version)}
-    weights = None if has_checkpoint else checkpoints.load(folder / WEIGHTS, expected)
+    weights = None if has_checkpoint else checkpoints.load_checkpoint(folder / WEIGHTS, expected)
     return InitialWeights(record, f"{folder.resolve().name}, {hash_weights(folder)[:12]}", weights)
 
 
 def combine_facts(own: dict[str, Any], initial: InitialWeights | None, data: Path | None) -> dict[str, Any]:
-    """Return the facts of a run: its own, or those that fit its initial weights.
+    """Return the facts that a run uses: of its own data, or with initial weights of the run they come from.
+
+    Args:
+        own: facts of the data of this run.
+        initial: initial weights; None: random weights.
+        data: dataset of this run, for errors; None: a baseline that learns in simulation, which uses its own facts.
 
     Raises:
-        TrainingError: the inputs differ from those of the run of the initial weights.
+        TrainingError: rate, image sizes, cameras, calibration or sizes of the two runs differ.
     """
     if initial is None:
         return own
@@ -194,8 +215,8 @@ def combine_facts(own: dict[str, Any], initial: InitialWeights | None, data: Pat
     for key in (*_INPUTS, *scales):
         tolerance = _TOLERANCE if key in _INPUTS else math.inf
         if changes := list_setting_changes(others.get(key), own.get(key), key, tolerance):
-            what, where = f"{key} differs from the run of --init-from", data or initial.name
-            fix = "Choose a run with the same inputs, convert the data as for that run, or omit --init-from."
+            what, where = f"the data has another {key} than the run of --init-from", data or initial.name
+            fix = "Convert the data as for that run, choose another run, or omit --init-from."
             raise TrainingError(what, where=where, found=changes[0], fix=fix)
     return own if data is None else others
 
@@ -203,14 +224,15 @@ def combine_facts(own: dict[str, Any], initial: InitialWeights | None, data: Pat
 def _check_data(baseline: Baseline, data: Path | None) -> None:
     if data is None and baseline.data is not None:
         expected = "a dataset folder or a trajectory.h5"
-        raise TrainingError(f"baseline {baseline.name} needs a dataset", where="--data", expected=expected)
+        fix = f"Pass --data DATASET: robocas train {baseline.name} --help."
+        raise TrainingError(f"baseline {baseline.name} needs a dataset", where="--data", expected=expected, fix=fix)
     if data is not None and baseline.data is None:
         raise TrainingError(f"baseline {baseline.name} takes no dataset", where="--data", fix="Omit --data.")
 
 
 @contextmanager
 def _open_output(options: RunOptions) -> Iterator[OutputFolder]:
-    """Lock the folder of a run, in the main process of `accelerate launch`; other processes only read it."""
+    """Open the folder of a run. The main process of `accelerate launch` locks it; other processes only read it."""
     output = OutputFolder(options.out, OUTPUT, overwrite=options.overwrite)
     if os.environ.get("RANK", "0") == "0":
         with output:
@@ -221,7 +243,11 @@ def _open_output(options: RunOptions) -> Iterator[OutputFolder]:
 
 
 def _read_recorded(output: OutputFolder, baseline: Baseline) -> RunRecord | None:
-    """Return the record of a run that continues, with defaults for configuration keys that it lacks."""
+    """Return ``run.json`` of the run in the output folder, or None; missing configuration keys get their defaults.
+
+    Raises:
+        OutputExistsError: the run has another baseline, or was made with other package versions.
+    """
     output.check_settings({"baseline": baseline.name, "version": baseline.version, "versions": package_versions()})
     if output.recorded is None:
         return None
@@ -233,18 +259,19 @@ def _read_recorded(output: OutputFolder, baseline: Baseline) -> RunRecord | None
     return recorded
 
 
-def _precision(precision: Precision, recorded: RunRecord | None) -> Precision:
-    """Return the precision: with ``auto`` a run continues with the precision it was started with."""
+def _choose_precision(precision: Precision, recorded: RunRecord | None) -> Precision:
+    """Return the configured precision; a run that continues with ``auto`` keeps the precision of its start."""
     if recorded is None or precision != "auto":
         return precision
     return "bf16" if recorded.precision == "bf16" else "fp32"
 
 
 def _read_validation(read: Callable[[Split, OnRead], Samples], progress: Progress) -> Samples | None:
+    """Read the validation samples; None if the dataset has no validation episodes."""
     try:
         return read("val", progress.on_read)
     except EmptySplitError:
-        progress.message("no validation: too few episodes")
+        progress.message("no validation: the val split of the dataset has no episodes")
         return None
 
 

@@ -1,6 +1,6 @@
-"""Supervised training on a CPU, a GPU or several (``accelerate launch``).
+"""Supervised training on a CPU, on one GPU, or on several GPUs (``accelerate launch``).
 
-Samples and learning rate depend on the step only, so a run can continue at any step.
+The samples of a batch and the learning rate depend only on the step. Therefore a run can continue at any step.
 """
 
 from __future__ import annotations
@@ -22,13 +22,16 @@ from robocas_ms3.core.signals import deferred_interrupts, exit_error
 def train_supervised(
     run: RunFolder, model: torch.nn.Module, settings: TrainSettings, samples: Samples, validation: Samples | None
 ) -> None:
-    """Train a network up to the last step, starting from the checkpoint of the run if there is one."""
+    """Train a network up to ``settings.steps``, from the checkpoint of the run if there is one.
+
+    samples: training samples. validation: validation samples; None: no validation.
+    """
     accelerator, count = run.accelerator, len(samples)
     learner = Learner(run, model, settings)
-    run.start(learner.step, model, learner.weights(), f"{count} samples of {samples.episodes} episodes")
+    run.start(learner.step, model, learner.policy_weights(), f"{count} samples of {samples.episodes} episodes")
 
     def log(split: str, metrics: dict[str, float]) -> None:
-        rate = learning_rate(learner.step - 1, count, settings)
+        rate = learning_rate_at(learner.step - 1, count, settings)
         run.log(learner.step, split, metrics, epoch=epoch_at(learner.step, count, settings), learning_rate=rate)
 
     def validate() -> None:
@@ -46,14 +49,14 @@ def train_supervised(
     try:
         if not run.has_logged(learner.step, "val"):  # interrupted before this validation
             validate()
-        process = (accelerator.process_index, accelerator.num_processes)
-        indices = batch_indices(count, settings, learner.step, process)
+        rank, world_size = accelerator.process_index, accelerator.num_processes
+        indices = batch_indices(count, settings, learner.step, rank, world_size)
         for batch in _read_batches(run, samples, indices, settings.workers):
             with deferred_interrupts():  # interrupt only after a complete step
-                learner.update(batch, learning_rate(learner.step, count, settings))
+                learner.update(batch, learning_rate_at(learner.step, count, settings))
                 is_last = learner.step == settings.steps
                 if is_last or learner.step % settings.log_every == 0:
-                    log("train", learner.take_means())
+                    log("train", learner.pop_means())
                 if is_last or learner.step % settings.save_every == 0:
                     learner.save()
                     saved_step = learner.step
@@ -66,21 +69,23 @@ def train_supervised(
 
 
 def batch_indices(
-    count: int, settings: TrainSettings, first: int = 0, process: tuple[int, int] = (0, 1)
+    count: int, settings: TrainSettings, first_step: int = 0, rank: int = 0, world_size: int = 1
 ) -> Iterator[list[int]]:
-    """Yield the sample indices of each batch, from one permutation per (seed, epoch).
+    """Yield the sample indices of each batch of one process, from the first step to the last.
 
-    A batch may contain the end of an epoch and the start of the next.
+    Each epoch is a random permutation of the samples, which depends on seed and epoch. A batch may contain the end of
+    an epoch and the start of the next epoch. The processes share each batch evenly.
 
     Args:
         count: number of samples, at least 1.
-        settings: seed, batch size, number of steps.
-        first: first step.
-        process: index and number of the processes that share each batch.
+        settings: seed, batch size and number of steps.
+        first_step: step of the first batch.
+        rank: index of this process.
+        world_size: number of processes.
     """
-    size, (number, processes) = settings.batch_size, process
+    size = settings.batch_size
     epoch, order = -1, torch.empty(0, dtype=torch.int64)
-    for step in range(first, settings.steps):
+    for step in range(first_step, settings.steps):
         indices: list[int] = []
         for place in range(step * size, (step + 1) * size):
             if place // count != epoch:
@@ -88,18 +93,19 @@ def batch_indices(
                 generator = torch.Generator().manual_seed((settings.seed * 1_000_003 + epoch) % 2**63)
                 order = torch.randperm(count, generator=generator)
             indices.append(int(order[place % count]))
-        yield indices[number::processes]
+        yield indices[rank::world_size]
 
 
 def epoch_at(step: int, count: int, settings: TrainSettings) -> float:
-    """Return the number of epochs after ``step`` steps of training on ``count`` samples."""
+    """Return the number of epochs after ``step`` training steps, with ``count`` samples per epoch."""
     return step * settings.batch_size / count
 
 
-def learning_rate(step: int, count: int, settings: TrainSettings) -> float:
-    """Return the learning rate after ``step`` steps of training on ``count`` samples.
+def learning_rate_at(step: int, count: int, settings: TrainSettings) -> float:
+    """Return the learning rate of the step after ``step`` training steps, with ``count`` samples per epoch.
 
-    ``restarts`` is cosine annealing with warm restarts (Loshchilov and Hutter 2017), with periods in epochs.
+    The schedule ``restarts`` is cosine annealing with warm restarts (Loshchilov and Hutter 2017); its periods are in
+    epochs.
     """
     if step < settings.warmup_steps:
         return settings.learning_rate * (step + 1) / settings.warmup_steps
@@ -117,7 +123,7 @@ def learning_rate(step: int, count: int, settings: TrainSettings) -> float:
 
 
 def _validation_batches(run: RunFolder, samples: Samples, settings: TrainSettings) -> Iterator[tuple[int, Batch]]:
-    """Yield this process's validation batches with their sizes, the same at each validation."""
+    """Yield the validation batches of this process, each with its size; every validation has the same batches."""
     accelerator = run.accelerator
     count = min(len(samples), settings.validation_samples)
     indices = torch.linspace(0, len(samples) - 1, count).long().tolist()
@@ -129,9 +135,9 @@ def _validation_batches(run: RunFolder, samples: Samples, settings: TrainSetting
 
 
 def _read_batches(run: RunFolder, samples: Samples, indices: Iterable[list[int]], workers: int) -> Iterator[Batch]:
-    """Yield the batches of sample indices on the device of a run."""
+    """Yield the batches of samples with these indices, on the device of a run."""
     loader = DataLoader(
-        _CaughtErrors(samples),  # pyright: ignore[reportArgumentType]
+        _SamplesWithReturnedErrors(samples),  # pyright: ignore[reportArgumentType]
         batch_sampler=indices,
         collate_fn=_identity,
         num_workers=workers,
@@ -145,10 +151,10 @@ def _read_batches(run: RunFolder, samples: Samples, indices: Iterable[list[int]]
         yield {name: tensor.to(run.accelerator.device, non_blocking=True) for name, tensor in batch.items()}
 
 
-class _CaughtErrors:
-    """Samples that return errors instead of raising them.
+class _SamplesWithReturnedErrors:
+    """Training samples that return errors instead of raising them.
 
-    From a worker process, a raised error would arrive as traceback text.
+    `_read_batches` raises the returned errors. An error that a worker process raises would arrive as a traceback text.
     """
 
     def __init__(self, samples: Samples) -> None:

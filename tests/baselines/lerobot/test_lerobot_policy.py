@@ -8,7 +8,7 @@ import torch
 from synthetic_observations import observe, start
 
 from robocas_ms3.baselines.lerobot.policy import EMBEDDING, LeRobotPolicy, make_state, scale_embeddings
-from robocas_ms3.baselines.lerobot.serve import load_policy, main, read_rate
+from robocas_ms3.baselines.lerobot.serve import load_policy, main, read_dataset_rate
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policy import describe_policy
 from robocas_ms3.robots.quantities import STATE
@@ -142,9 +142,9 @@ def test_missing_checkpoint_is_a_one_line_error(tmp_path, capsys):
     with pytest.raises(EvaluationError, match="no LeRobot checkpoint"):
         load_policy(tmp_path, 5, "cpu", None)
     (tmp_path / "info.json").write_text('{"fps": 5}')
-    assert read_rate(tmp_path / "info.json") == 5
+    assert read_dataset_rate(tmp_path / "info.json") == 5
     with pytest.raises(EvaluationError, match=r"Pass --rate HZ"):
-        read_rate(tmp_path / "nothing.json")
+        read_dataset_rate(tmp_path / "nothing.json")
     assert main([str(tmp_path), "--rate", "5"]) == 1
     error = capsys.readouterr().err
     assert error.count("\n") == 1

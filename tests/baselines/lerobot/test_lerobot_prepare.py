@@ -15,7 +15,7 @@ pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 
 from robocas_ms3.baselines.lerobot import prepare as module
 from robocas_ms3.baselines.lerobot.policy import EMBEDDING, STATE_NAMES
-from robocas_ms3.baselines.lerobot.prepare import main, prepare
+from robocas_ms3.baselines.lerobot.prepare import main, prepare_dataset
 from robocas_ms3.core.errors import DatasetError, OutputExistsError
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
@@ -46,7 +46,7 @@ def numbers(path, key):
 
 @pytest.fixture
 def out(source, tmp_path):
-    prepare(source, tmp_path / "out", embed)
+    prepare_dataset(source, tmp_path / "out", embed)
     return tmp_path / "out"
 
 
@@ -99,7 +99,7 @@ def test_videos_are_the_same_files(source, out):
     assert not [name for name in pq.read_table(out / EPISODES).column_names if "depth" in name]
     assert not (out / ".annotate_staging").exists()
     with pytest.raises(OutputExistsError):
-        prepare(source, out, embed)
+        prepare_dataset(source, out, embed)
 
 
 @pytest.mark.parametrize("key, value", [("action", np.nan), ("action.base", 0.02)])
@@ -112,7 +112,7 @@ def test_nan_and_base_motion_are_refused(source, tmp_path, key, value):
     column = pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
     pq.write_table(table.set_column(table.column_names.index(key), key, column), spoiled / DATA)
     with pytest.raises(DatasetError):
-        prepare(spoiled, tmp_path / "out", embed)
+        prepare_dataset(spoiled, tmp_path / "out", embed)
     assert not (tmp_path / "out").exists()
 
 
@@ -130,7 +130,7 @@ def test_videos_are_copied_without_hard_links(source, tmp_path, monkeypatch):
         raise OSError("no links here")
 
     monkeypatch.setattr(module.os, "link", refuse)
-    prepare(source, tmp_path / "out", None)  # without language
+    prepare_dataset(source, tmp_path / "out", None)  # without language
     assert EMBEDDING not in pq.read_table(tmp_path / "out" / DATA).column_names
     assert EMBEDDING not in json.loads((tmp_path / "out/meta/info.json").read_text())["features"]
     for path in (path for path in source.rglob("*.mp4") if "_depth" not in str(path)):

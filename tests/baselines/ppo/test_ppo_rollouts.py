@@ -8,7 +8,7 @@ from robocas_ms3.baselines.ppo.config import PpoConfig
 from robocas_ms3.baselines.ppo.train import (
     OUTCOMES,
     RolloutCollector,
-    advantages,
+    compute_advantages,
     read_outcomes,
 )
 
@@ -18,7 +18,11 @@ def test_advantages():
     deltas = torch.tensor([[1.0, 0.0, 0.0], [-3.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
     truncated = torch.zeros(3, 3, dtype=torch.bool)
     truncated[0, 1] = True
-    assert advantages(deltas, truncated, 0.25).T.tolist() == [[0.25, -3.0, 0.0], [0.0, 1.0, 0.0], [0.25, 1.0, 0.0]]
+    assert compute_advantages(deltas, truncated, 0.25).T.tolist() == [
+        [0.25, -3.0, 0.0],
+        [0.0, 1.0, 0.0],
+        [0.25, 1.0, 0.0],
+    ]
 
 
 def test_value_after_a_truncation_counts():
@@ -28,7 +32,7 @@ def test_value_after_a_truncation_counts():
     torch.nn.init.zeros_(agent.critic[-1].weight)
     torch.nn.init.constant_(agent.critic[-1].bias, 3.0)
     collector = RolloutCollector(LeftOrRight(1), agent, config, 0, torch.empty(0, len(OUTCOMES)))
-    rollout = collector.collect()
+    rollout = collector.collect_rollout()
     reward = (rollout.obs * rollout.action)[:, 0].clamp(-1, 1)
     torch.testing.assert_close(rollout.advantage, reward + 0.5 * 3 - 3)
     assert collector.episodes == 1

@@ -7,7 +7,7 @@ from safetensors.torch import save_file
 
 from robocas_ms3.baselines.rt1 import BASELINE
 from robocas_ms3.baselines.rt1.config import RT1Config
-from robocas_ms3.baselines.rt1.image import FiLM, ImageEncoder, StochasticDepth, TokenLearner, efficientnet
+from robocas_ms3.baselines.rt1.image import FiLM, ImageEncoder, StochasticDepth, TokenLearner, make_efficientnet
 from robocas_ms3.baselines.rt1.model import crop_rows
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.evaluation.policy import describe_policy
@@ -62,18 +62,18 @@ def test_film_layers_start_as_identity_and_use_language_after_training(config):
     images, words = torch.randn(2, 3, 40, 64), torch.randn(2, 384)
     with torch.no_grad():
         settle(encoder, images, words)
-        plain = encoder.features(images, torch.zeros(2, 384))
-        assert torch.equal(encoder.features(images, words), plain)
+        plain = encoder.compute_features(images, torch.zeros(2, 384))
+        assert torch.equal(encoder.compute_features(images, words), plain)
         # equal to transformers' EfficientNet with the convolution after it
         wanted = encoder.project(encoder.net(images).last_hidden_state)
         assert torch.allclose(plain, wanted, atol=1e-6)
         for number in (0, len(encoder.films) - 1):
             encoder.films[number].linear.weight.normal_(0, 0.1)
-            spoken = encoder.features(images, words)
+            spoken = encoder.compute_features(images, words)
             assert not torch.allclose(spoken, plain, rtol=1e-3)
             encoder.films[number].linear.weight.zero_()
         encoder.film.linear.weight.normal_(0, 0.1)
-        assert not torch.allclose(encoder.features(images, words), plain, rtol=1e-3)
+        assert not torch.allclose(encoder.compute_features(images, words), plain, rtol=1e-3)
 
 
 def test_token_learner_weights_positions():
@@ -109,7 +109,7 @@ def test_stochastic_depth_skips_whole_images():
 def weights(config):
     """Return weights of another network of this size, with transformers' names and a classifier."""
     torch.manual_seed(5)
-    made = {f"efficientnet.{name}": value + 1 for name, value in efficientnet(config).state_dict().items()}
+    made = {f"efficientnet.{name}": value + 1 for name, value in make_efficientnet(config).state_dict().items()}
     return {**made, "classifier.weight": torch.zeros(10, 320)}
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from robocas_ms3.baselines.rt1 import BASELINE
 from robocas_ms3.baselines.rt1.config import RT1Config
-from robocas_ms3.baselines.rt1.model import ActionBins, attention_mask, likeliest_tokens
+from robocas_ms3.baselines.rt1.model import ActionBins, make_attention_mask, most_probable_tokens
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.strict_model import parse
 
@@ -17,7 +17,7 @@ from robocas_ms3.core.strict_model import parse
 def test_tokens_attend_to_earlier_image_tokens_only():
     """Two frames with one image token and two predicted tokens each."""
     first, second = [1, 0, 0, 0, 0, 0], [1, 0, 0, 1, 0, 0]
-    assert attention_mask(2, 1, 2).int().tolist() == [first] * 3 + [second] * 3
+    assert make_attention_mask(2, 1, 2).int().tolist() == [first] * 3 + [second] * 3
 
 
 @pytest.mark.parametrize(("frame", "view"), [(0, 0), (3, 1), (5, 0)])
@@ -126,9 +126,9 @@ def test_termination_is_predicted_by_two_logits():
     logits = torch.zeros(8, 5)
     logits[:, 4] = 3.0
     logits[7, :2] = torch.tensor([1.0, 2.0])
-    assert likeliest_tokens(logits).tolist() == [4] * 7 + [1]
+    assert most_probable_tokens(logits).tolist() == [4] * 7 + [1]
     logits[7, 0] = 2.5
-    assert likeliest_tokens(logits).tolist() == [4] * 7 + [0]
+    assert most_probable_tokens(logits).tolist() == [4] * 7 + [0]
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from training_runs import fit
 
 from robocas_ms3.baselines.rt1 import BASELINE
 from robocas_ms3.baselines.rt1.config import RT1Config
-from robocas_ms3.baselines.rt1.model import likeliest_tokens
+from robocas_ms3.baselines.rt1.model import most_probable_tokens
 
 CAMERAS = ("base_camera", "gripper_camera")
 
@@ -55,7 +55,7 @@ def expected_action(model, images, words, step, first=0):
     frames = [max(number, first) for number in range(step - 5, step + 1)]
     rgb = torch.from_numpy(images[frames]).permute(0, 1, 4, 2, 3)  # (6, 2, 3, 48, 64)
     logits = model.logits({"rgb": rgb[None], "language": torch.from_numpy(words)[None]})
-    return model.bins.decode(likeliest_tokens(logits[0, -1])[:7]).numpy()
+    return model.bins.decode(most_probable_tokens(logits[0, -1])[:7]).numpy()
 
 
 def test_stored_tokens_give_the_actions_of_encoded_frames(policy, model, seen):

@@ -14,9 +14,9 @@ from training_runs import fit
 
 from robocas_ms3.baselines.chunks import decode_chunk
 from robocas_ms3.baselines.small import BASELINE, data
-from robocas_ms3.baselines.small.config import SmallConfig, View
+from robocas_ms3.baselines.small.config import CameraView, SmallConfig
 from robocas_ms3.baselines.small.data import crop_image
-from robocas_ms3.baselines.small.localization import CELL, NOWHERE, cell_losses
+from robocas_ms3.baselines.small.localization import CELL, NOWHERE, compute_cell_losses
 from robocas_ms3.baselines.small.model import shift_images
 from robocas_ms3.baselines.small.objects import SceneObjects
 from robocas_ms3.baselines.training.session import merge_configs
@@ -99,7 +99,9 @@ def test_samples_are_those_of_the_dataset(samples, folder):
 def test_arrays_are_read_by_one_thread(folder, monkeypatch):
     """NumPy reads headers with `ast`, which raised SystemError in threads of Python 3.11 (gh-106905)."""
     threads, load = set(), np.load
-    monkeypatch.setattr("numpy.load", lambda *args, **kwargs: threads.add(threading.get_ident()) or load(*args, **kwargs))
+    monkeypatch.setattr(
+        "numpy.load", lambda *args, **kwargs: threads.add(threading.get_ident()) or load(*args, **kwargs)
+    )
     read(folder)
     assert threads == {threading.get_ident()}
 
@@ -125,7 +127,7 @@ def test_objects_get_instructions_that_name_them(folder, monkeypatch, caplog):
 def test_images_are_cropped_and_scaled():
     image = np.zeros((48, 64, 3), np.uint8)
     image[24:, 32:] = 200
-    view = View(image_size=(64, 48), crop=(0.5, 0.5, 1.0, 1.0), size=(16, 16))
+    view = CameraView(image_size=(64, 48), crop=(0.5, 0.5, 1.0, 1.0), size=(16, 16))
     assert (crop_image(image, view) == 200).all()
     assert crop_image(image, view).shape == (16, 16, 3)
     larger = np.repeat(np.repeat(image, 2, 0), 2, 1)
@@ -154,10 +156,10 @@ def test_labels_move_with_the_shifted_image(samples, monkeypatch):
 
     def losses(logits, answers, columns):
         cells.append(answers)
-        return cell_losses(logits, answers, columns)
+        return compute_cell_losses(logits, answers, columns)
 
     monkeypatch.setattr(model, "_encode_images", encode)
-    monkeypatch.setattr("robocas_ms3.baselines.small.model.cell_losses", losses)
+    monkeypatch.setattr("robocas_ms3.baselines.small.model.compute_cell_losses", losses)
     model(batch)
     bright = seen[0][:, 0] > 0  # (64, 48, 64)
     for image, cell in zip(bright, cells[0][:, 0].tolist(), strict=True):
@@ -169,14 +171,14 @@ def test_labels_move_with_the_shifted_image(samples, monkeypatch):
 
 def test_images_are_requested_in_the_size_of_the_dataset(folder):
     """Rendering at half the size gives other images than scaling to half the size."""
-    half = View(image_size=(32, 24), size=(32, 32))
+    half = CameraView(image_size=(32, 24), size=(32, 32))
     views = {"base_camera": half, "gripper_camera": half}
     config, samples = SmallConfig(**{**TINY, "views": views}), read(folder, "val", views=views)
     policy = BASELINE.policy(config, samples.facts, BASELINE.model(config, samples.facts))
     assert (policy.spec.rate_hz, policy.spec.reference, policy.spec.observe_every) == (5.0, "tcp", 3)
     assert policy.spec.cameras == {"base_camera": (64, 48), "gripper_camera": (64, 48)}
     with pytest.raises(DatasetError, match="robocas convert --size 512 384"):
-        read(folder, views={"base_camera": View()})
+        read(folder, views={"base_camera": CameraView()})
 
 
 def test_training_without_a_camera_and_language(folder):
@@ -197,10 +199,10 @@ def test_training_without_a_camera_and_language(folder):
     [
         (SmallConfig, {**TINY, "heads": 3, "width": 32}),
         (SmallConfig, {**TINY, "views": {}}),
-        (View, {"size": (100, 96)}),
-        (View, {"crop": (0.5, 0, 0.4, 1)}),
-        (View, {"crop": (0, 0, 1.2, 1)}),
-        (View, {"image_size": (0, 0)}),
+        (CameraView, {"size": (100, 96)}),
+        (CameraView, {"crop": (0.5, 0, 0.4, 1)}),
+        (CameraView, {"crop": (0, 0, 1.2, 1)}),
+        (CameraView, {"image_size": (0, 0)}),
     ],
 )
 def test_invalid_configurations(model, values):

@@ -7,27 +7,27 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.baselines.small.config import View
+from robocas_ms3.baselines.small.config import CameraView
 from robocas_ms3.baselines.small.localization import (
     NOWHERE,
     POINT_FEATURES,
     CellAttention,
     Unproject,
-    cell_losses,
+    compute_cell_losses,
     heights_in_base,
     pixel_to_cell,
-    project_points,
+    project_points_to_view,
 )
-from robocas_ms3.baselines.training.metrics import mean_of_sum
+from robocas_ms3.baselines.training.metrics import mean_of_sum_and_count
 from robocas_ms3.core.poses import from_rotation, inverse, transform_points
 
 INTRINSIC = np.array([64.0, 64.0, 32.0, 24.0])  # of 64 x 48 images: 0.5 m to the side at 1 m is at the edge
-WHOLE = View(image_size=(64, 48), size=(64, 48))  # 8 x 6 cells
+WHOLE = CameraView(image_size=(64, 48), size=(64, 48))  # 8 x 6 cells
 
 
 def place(point, view=WHOLE, stored=(64, 48), intrinsic=INTRINSIC, camera=None):
     camera = np.eye(4) if camera is None else camera
-    return torch.from_numpy(project_points(np.array(point, float), camera, intrinsic, stored, view))
+    return torch.from_numpy(project_points_to_view(np.array(point, float), camera, intrinsic, stored, view))
 
 
 def cell(point, view=WHOLE, **more):
@@ -43,7 +43,7 @@ def test_pixels_and_cells_of_points():
 
 
 def test_cells_of_a_crop_another_size_or_another_camera():
-    right = View(image_size=(64, 48), crop=(0.5, 0.0, 1.0, 1.0), size=(64, 96))  # twice as large: 8 x 12 cells
+    right = CameraView(image_size=(64, 48), crop=(0.5, 0.0, 1.0, 1.0), size=(64, 96))  # twice as large: 8 x 12 cells
     assert cell([0.001, 0.001, 1], right) == 6 * 8
     assert cell([-0.01, 0, 1], right) == NOWHERE
     assert cell([0.1, -0.2, 1], stored=(128, 96), intrinsic=2 * INTRINSIC) == cell([0.1, -0.2, 1])
@@ -54,18 +54,18 @@ def test_cells_of_a_crop_another_size_or_another_camera():
 def test_losses_skip_labels_outside_the_image():
     logits = torch.zeros(3, 48)
     logits[0, 9], logits[1, 20] = 50.0, 50.0
-    loss, found = cell_losses(logits, torch.tensor([[9], [0], [NOWHERE]]), 8)
+    loss, found = compute_cell_losses(logits, torch.tensor([[9], [0], [NOWHERE]]), 8)
     assert loss.tolist() == [50.0, 2.0]  # right: 0; wrong: by 50
     assert found.tolist() == [1.0, 2.0]
-    _, near = cell_losses(logits, torch.tensor([[18], [NOWHERE], [NOWHERE]]), 8)  # one down, one right of 9
+    _, near = compute_cell_losses(logits, torch.tensor([[18], [NOWHERE], [NOWHERE]]), 8)  # one down, one right of 9
     assert near.tolist() == [1.0, 1.0]
-    assert cell_losses(logits, torch.full((3, 1), NOWHERE), 8)[0].tolist() == [0.0, 0.0]
+    assert compute_cell_losses(logits, torch.full((3, 1), NOWHERE), 8)[0].tolist() == [0.0, 0.0]
 
 
 def test_each_of_several_labels_is_correct():
     logits = torch.zeros(1, 1, 4)
     logits.requires_grad_()
-    loss, found = cell_losses(logits, torch.tensor([[[1, 3, NOWHERE]]]), 2)
+    loss, found = compute_cell_losses(logits, torch.tensor([[[1, 3, NOWHERE]]]), 2)
     assert loss.tolist() == [np.float32(np.log(2)), 1.0]  # half of what was said to be likely
     loss[0].backward()
     assert logits.grad.flatten().tolist() == [0.25, -0.25, 0.25, -0.25]
@@ -82,11 +82,11 @@ def test_attention_learns_to_find_the_queried_channel():
         maps = torch.nn.functional.one_hot(cells, 48).float().reshape(32, 4, 6, 8)
         names = torch.randint(0, 4, (32, 2))
         logits = attention.logits(maps, torch.nn.functional.one_hot(names, 4).float())
-        loss, found = cell_losses(logits, cells.gather(1, names)[..., None], 8)
+        loss, found = compute_cell_losses(logits, cells.gather(1, names)[..., None], 8)
         optimizer.zero_grad()
-        mean_of_sum(loss).backward()
+        mean_of_sum_and_count(loss).backward()
         optimizer.step()
-    assert mean_of_sum(found) == 1.0
+    assert mean_of_sum_and_count(found) == 1.0
 
 
 DOWN = [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1.0], [0, 0, 0, 1]]  # a metre above the base, looking straight down
@@ -104,7 +104,7 @@ def turned(seed=0):
 
 
 def test_height_above_the_camera_gives_no_point_behind_it():
-    found = unproject().locate(torch.tensor([[48.0, 24.0]]), torch.tensor([1.5]), torch.eye(4)[None])
+    found = unproject().unproject_pixels(torch.tensor([[48.0, 24.0]]), torch.tensor([1.5]), torch.eye(4)[None])
     assert found[0].tolist() == pytest.approx([0, 0, 1.0], abs=1e-6)
 
 
@@ -121,12 +121,12 @@ def test_visible_point_is_unprojected_to_its_position(x, y, z, seed, on_hand):
     assume(
         transform_points(inverse(camera), point[None])[0, 2] > 0.1 and camera[2, 3] > z + 0.05
     )  # before it, and below
-    place = project_points(point[None], camera, intrinsic, (64, 48), WHOLE)
+    place = project_points_to_view(point[None], camera, intrinsic, (64, 48), WHOLE)
     ray = point - camera[:3, 3]
     assume(-ray[2] > 0.05 * np.linalg.norm(ray))  # not level with it
     own = unproject(mount.tolist(), on_hand, intrinsic.tolist())
     with torch.autocast("cpu", torch.bfloat16):  # in which matrices are multiplied; a point stays where it is
-        found = own.locate(torch.from_numpy(place), torch.tensor([z]), torch.from_numpy(tcp).float())
+        found = own.unproject_pixels(torch.from_numpy(place), torch.tensor([z]), torch.from_numpy(tcp).float())
     expected = transform_points(inverse(tcp[0]), point[None])
     assert found.numpy() == pytest.approx(expected, abs=2e-3)
 

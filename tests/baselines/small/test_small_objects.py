@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from robocas_ms3.baselines.small.objects import in_camera_parent, locate_objects
+from robocas_ms3.baselines.small.objects import locate_objects, to_camera_parent_frame
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_rotation
 from robocas_ms3.robots.cameras import standard_camera_parent
@@ -55,7 +55,7 @@ def test_pixels_are_unknown_after_a_gripper_command():
 
 def test_world_camera_sees_points_in_the_world_frame():
     points = np.zeros((STEPS, 1, 3))
-    assert in_camera_parent("world", points, tcp([1] * STEPS), ARRAYS)[0, 0].tolist() == pytest.approx(BASE)
+    assert to_camera_parent_frame("world", points, tcp([1] * STEPS), ARRAYS)[0, 0].tolist() == pytest.approx(BASE)
 
 
 def test_no_objects_without_layout_or_after_another_policy():
@@ -68,5 +68,5 @@ def test_no_objects_without_layout_or_after_another_policy():
 
 @pytest.mark.parametrize("layout", [{"poses": [[1, 2]]}, {**LAYOUT, "present": [True]}, {"poses": LAYOUT["poses"]}])
 def test_damaged_scene_is_an_error(layout):
-    with pytest.raises(DatasetError, match="scene.json: damaged description of a scene"):
+    with pytest.raises(DatasetError, match="scene.json: damaged layout of an episode"):
         locate_objects(episode(layout), ARRAYS, tcp([1] * STEPS), PROJECTIONS)

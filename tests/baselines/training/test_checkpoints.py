@@ -15,12 +15,12 @@ def path(tmp_path):
 
 
 def test_save_and_load(path):
-    checkpoints.save(path, {"a.b": torch.arange(3.0), "a.c.d": torch.tensor(2), "e": torch.zeros(1)}, ABOUT, 7)
-    checkpoint = checkpoints.load(path, ABOUT)
+    checkpoints.save_tensors(path, {"a.b": torch.arange(3.0), "a.c.d": torch.tensor(2), "e": torch.zeros(1)}, ABOUT, 7)
+    checkpoint = checkpoints.load_checkpoint(path, ABOUT)
     assert checkpoint.step == 7 and checkpoint.tensors.keys() == {"a.b", "a.c.d", "e"}
-    part = checkpoint.part("a")
+    part = checkpoint.state_dict("a")
     assert part["b"].tolist() == [0, 1, 2] and part["c.d"].item() == 2 and len(part) == 2
-    assert checkpoints.join_parts(a=part).keys() == {"a.b", "a.c.d"}
+    assert checkpoints.join_state_dicts(a=part).keys() == {"a.b", "a.c.d"}
     assert [entry.name for entry in path.parent.iterdir()] == ["c.safetensors"]
 
 
@@ -30,18 +30,18 @@ def test_equal_contents_are_equal_files(path):
     tensors = {"b": torch.arange(7, dtype=torch.uint8), "a": torch.arange(3.0), "c": torch.tensor(2)}
     contents = set()
     for _ in range(5):
-        checkpoints.save(path, tensors, about, 1)
+        checkpoints.save_tensors(path, tensors, about, 1)
         contents.add(path.read_bytes())
     assert len(contents) == 1
-    back = checkpoints.load(path, about).tensors
+    back = checkpoints.load_checkpoint(path, about).tensors
     assert all(torch.equal(back[name], tensors[name]) for name in tensors)
 
 
 @pytest.mark.parametrize("key", ABOUT)
 def test_file_of_another_run_is_refused(path, key):
-    checkpoints.save(path, {"a": torch.zeros(1)}, ABOUT, 1)
+    checkpoints.save_tensors(path, {"a": torch.zeros(1)}, ABOUT, 1)
     with pytest.raises(TrainingError) as caught:
-        checkpoints.load(path, {**ABOUT, key: "other"})
+        checkpoints.load_checkpoint(path, {**ABOUT, key: "other"})
     assert (caught.value.where, caught.value.expected) == (path, "other")
 
 
@@ -56,19 +56,24 @@ def test_file_of_another_run_is_refused(path, key):
     ],
 )
 def test_damaged_and_missing_files(path, damage):
-    checkpoints.save(path, {"a": torch.zeros(1000)}, ABOUT, 1)
+    checkpoints.save_tensors(path, {"a": torch.zeros(1000)}, ABOUT, 1)
     damage(path)
     with pytest.raises(TrainingError) as caught:
-        checkpoints.load(path, ABOUT)
+        checkpoints.load_checkpoint(path, ABOUT)
     assert caught.value.where == path
 
 
 @pytest.mark.parametrize(
     ("tensors", "where", "expected", "found"),
     [
-        ({"weight": torch.zeros(2, 3)}, "bias", [2], "none"),
-        ({"weight": torch.zeros(2, 3), "bias": torch.zeros(2), "more": torch.zeros(1)}, "more", "none", [1]),
-        ({"weight": torch.zeros(2, 4), "bias": torch.zeros(2)}, "weight", [2, 3], [2, 4]),
+        ({"weight": torch.zeros(2, 3)}, "bias", "shape [2]", "no such tensor"),
+        (
+            {"weight": torch.zeros(2, 3), "bias": torch.zeros(2), "more": torch.zeros(1)},
+            "more",
+            "no such tensor",
+            "shape [1]",
+        ),
+        ({"weight": torch.zeros(2, 4), "bias": torch.zeros(2)}, "weight", "shape [2, 3]", "shape [2, 4]"),
     ],
 )
 def test_weights_of_another_model(path, tensors, where, expected, found):

@@ -160,7 +160,7 @@ def test_a_nan_ends_the_run_and_the_last_checkpoint_stays(stub, data, tmp_path, 
         train("stub", data, out, changes, progress=progress)
     assert_finite(out)
     for name in ("checkpoint", "weights"):
-        assert checkpoints.load(out / f"{name}.safetensors", {}).step == done[-1] > 0
+        assert checkpoints.load_checkpoint(out / f"{name}.safetensors", {}).step == done[-1] > 0
     assert load_file(out / "checkpoint.safetensors")["optimizer.0.step"] == done[-1]
 
 
@@ -174,7 +174,7 @@ def test_an_unchecked_nan_is_not_saved(stub, data, tmp_path, monkeypatch):
 
 def test_a_removed_folder_is_an_error(stub, data, tmp_path, monkeypatch):
     """Between two steps, and during a write."""
-    out, save = tmp_path / "run", checkpoints.save
+    out, save = tmp_path / "run", checkpoints.save_tensors
 
     def remove(done, total):
         if done == 5:
@@ -187,7 +187,7 @@ def test_a_removed_folder_is_an_error(stub, data, tmp_path, monkeypatch):
     with pytest.raises(RobocasError) as caught:
         train("stub", data, out, progress=Progress(on_step=remove))
     assert caught.value.where == out
-    monkeypatch.setattr(checkpoints, "save", remove_and_save)
+    monkeypatch.setattr(checkpoints, "save_tensors", remove_and_save)
     with pytest.raises(RobocasError) as caught:
         train("stub", data, out)
     assert caught.value.where == out

@@ -16,7 +16,7 @@ def test_lines_after_the_checkpoint_are_removed(tmp_path):
     log.close()
     assert path.read_text() == HEAD + "1000,train,1,60,0.1,2\n1000,val,1,61,0.1,3\n"
     assert log.seconds == 61
-    assert log.has(1000, "val") and not log.has(1050, "train")
+    assert log.has_line(1000, "val") and not log.has_line(1050, "train")
 
 
 def test_truncated_line_is_removed(tmp_path):
