@@ -146,7 +146,7 @@ def test_size_of_the_network_of_the_paper(paper):
     assert counts == [10_696_232, 14_689_440, 2 * 14_689_440 + 19_391_232]
     assert len(encoder.films) == 26
     with torch.device("meta"):
-        features = encoder.features(torch.zeros(2, 3, 236, 320), torch.zeros(2, 384))
+        features = encoder.compute_features(torch.zeros(2, 3, 236, 320), torch.zeros(2, 384))
         tokens = paper.encode(torch.zeros(2, 2, 3, 256, 320, dtype=torch.uint8), torch.zeros(2, 384))
     assert features.shape == (2, 512, 8, 10)  # 236 x 320 halved five times: 118, 59, 30, 15, 8 rows
     assert tokens.shape == (2, 2 * 8, 512)
