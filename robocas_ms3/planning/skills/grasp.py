@@ -112,7 +112,7 @@ def grasp_candidates(arm: Arm, slot: int, skip_kinds: int) -> Iterator[Array]:
     )
     reachable = np.flatnonzero(solved & solved_before)
     if not len(reachable):
-        raise PlanningError("grasp_sampling", "unreachable" if len(kept) else "all_filtered")
+        raise PlanningError("grasp_sampling", "unreachable" if len(kept) else "no_suitable_grasp")
     surface = arm.env.object_assets[0][slot].surface_points(SPACING)
     scores = score_grasps(
         tcp_in_base[reachable],
@@ -139,7 +139,7 @@ def grasp_candidates(arm: Arm, slot: int, skip_kinds: int) -> Iterator[Array]:
         found = True
         yield tcp_in_base[index]
     if not found:
-        raise PlanningError("grasp_sampling", "all_filtered")
+        raise PlanningError("grasp_sampling", "no_clear_grasp")
 
 
 def _skip_kinds(tcp: Array, count: int) -> list[int]:

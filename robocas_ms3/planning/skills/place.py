@@ -167,7 +167,7 @@ def _failure_reason(arm: Arm) -> str:
     for measure, reached in arm.env.success_conditions().items():
         if not bool(reached[0]):
             return f"not_{measure}"
-    return "unstable"
+    return "no_success"
 
 
 def sample_poses_above_container(
