@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+from pages import ROOT, blocks
 
 from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.small import BASELINE
@@ -30,6 +31,13 @@ def test_policy_by_name():
     assert (policy.spec.convention, policy.spec.rate_hz, policy.spec.language) == ("robocas", 5.0, "embedding")
     description = policy.describe()
     assert description["steps"] > 0 and description["trained_in"].startswith("pick, in pick_upstream_eval, objects ")
+
+
+def test_program_of_the_page(capsys):
+    """The program of docs/baselines_small.md runs and prints the values in its comments."""
+    (program,) = blocks(ROOT / "docs" / "baselines_small.md", "python")
+    exec(program, {})
+    assert capsys.readouterr().out.splitlines() == re.findall(r"^print\(.*\)  # (.*)$", program, re.MULTILINE)
 
 
 def configs_of(protocol, task):
