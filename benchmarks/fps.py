@@ -36,7 +36,7 @@ from robocas_ms3.scenes.cache import make_layout_source
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.task_specs import TASKS
-from robocas_ms3.tasks.engine import gpu_memory
+from robocas_ms3.tasks.engine import gpu_memory_limits
 
 
 @register_env("RoboCASBare-v1", max_episode_steps=10_000)
@@ -63,7 +63,7 @@ class BareEnv(BaseEnv):
             control_freq=20,
             spacing=10,
             scene_config=SceneConfig(contact_offset=CONTACT_OFFSET),
-            gpu_memory_config=gpu_memory(self.num_envs, self.model.config.objects.count),
+            gpu_memory_config=gpu_memory_limits(self.num_envs, self.model.config.objects.count),
         )
 
     @property

@@ -44,6 +44,6 @@ def _register(task: TaskSpec) -> None:
 
 
 def _make(name: str, **kwargs: Any) -> Any:
-    from robocas_ms3.tasks import env_class
+    from robocas_ms3.tasks import register_env_class
 
-    return env_class(name)(**kwargs)
+    return register_env_class(name)(**kwargs)

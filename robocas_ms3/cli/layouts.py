@@ -125,9 +125,9 @@ def check_stability(cache: LayoutCache, engine: Engine, **packs: str) -> int:
     """Simulate the unchecked layouts of the table; return the number of layouts whose objects move."""
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.scenes.layout_table import LayoutStatus
-    from robocas_ms3.tasks.layout_stability import check_layouts, status_of, unchecked_layouts
+    from robocas_ms3.tasks.layout_stability import check_layouts, find_unchecked_layouts, status_from_shift
 
-    seeds = unchecked_layouts(cache, engine)
+    seeds = find_unchecked_layouts(cache, engine)
     if seeds:
         found: dict[SeedPair, LayoutStatus] = {}
         checks = check_layouts(cache, engine, seeds, **packs)
@@ -135,7 +135,7 @@ def check_stability(cache: LayoutCache, engine: Engine, **packs: str) -> int:
             with ProgressBar("layouts simulated") as bar:
                 bar.start(sum(map(len, seeds.values())))
                 for pair, moved in checks:
-                    found[pair] = status_of(moved)
+                    found[pair] = status_from_shift(moved)
                     bar.advance()
         finally:  # keeps the results if interrupted
             cache.write_statuses(engine, found)

@@ -65,13 +65,13 @@ class EpisodeMetrics:
         state = env.success_check.state
         if state is not self._last_state:
             self._last_state = state
-            impulse = norm(state.forces).sum((1, 2)) * env.control_timestep
+            impulse = norm(state.gripper_forces).sum((1, 2)) * env.control_timestep
             sums[:, _IMPULSE] += impulse
             sums[:, _DISTURBED] = maximum(sums[:, _DISTURBED], as_float(state.disturbed.sum(1)))
             sums[:, _FALLEN] = maximum(sums[:, _FALLEN], as_float(env.success_check.fallen_objects().sum(1)))
-            target = terms.select_target(state.objects[..., :2], to_native(env.target_slot))
-            if state.basket is not None:  # without a basket the rule never holds
-                self._near = norm(target - state.basket[:, :2]) <= V0_RADIUS
+            target = terms.select_target(state.object_states[..., :2], to_native(env.target_slot))
+            if state.basket_pose is not None:  # without a basket the rule never holds
+                self._near = norm(target - state.basket_pose[:, :2]) <= V0_RADIUS
             if self._retrieval is not None:
                 self._retrieval.update(state)
         open_command = (
@@ -113,7 +113,7 @@ class RetrievalTracker:
     Call `update` after each control step and `end_step` after each policy step.
 
     An object counts as moved if it is displaced by more than 3 cm or has fallen over (``disturbed``) before the target
-    is first held. An object is needed if at the reset it is an obstacle of `occlusion.clutter`, if it hides at least
+    is first held. An object is needed if at the reset it is an obstacle of `occlusion.measure_clutter`, if it hides at least
     10 % of the target, or if it is on top of a needed object.
     """
 
@@ -139,7 +139,7 @@ class RetrievalTracker:
         over = env.pairwise_occlusion(envs) >= COVER_THRESHOLD
         rows = torch.arange(len(over), device=env.device)
         over[rows, env.target_slot[envs]] = False  # objects under the target may be moved before it
-        blocking = env.clutter(envs).obstacles | over[rows, :, env.target_slot[envs]]
+        blocking = env.measure_clutter(envs).obstacles | over[rows, :, env.target_slot[envs]]
         self._over[envs], self._needed[envs] = over, find_objects_to_move(blocking, over)
         some = to_native(envs)
         self._moved_at[some], self._moved_time[some], self._steps[some] = 0, _NEVER, 0
@@ -147,7 +147,7 @@ class RetrievalTracker:
 
     def update(self, state: TaskState) -> None:
         """Record the objects that have moved in a control step."""
-        self._held |= state.held
+        self._held |= state.target_held
         now = state.disturbed & (self._moved_at == 0) & ~self._held[:, None]
         if known_all_false(now):
             return

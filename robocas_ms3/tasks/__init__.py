@@ -14,8 +14,8 @@ from robocas_ms3.tasks.search import RoboCASSearchEnv
 from robocas_ms3.tasks.select import RoboCASSelectEnv
 
 
-def env_class(name: str) -> Any:
-    """Return the environment class of a task after registering it with ManiSkill.
+def register_env_class(name: str) -> Any:
+    """Register the environment of a task with ManiSkill and gymnasium, and return its class.
 
     Raises:
         ExtensionError: the task is unknown, or its environment can't be loaded.
@@ -28,7 +28,7 @@ def env_class(name: str) -> Any:
 
 
 for _name in TASKS.builtin:
-    env_class(_name)
+    register_env_class(_name)
 for _robot in ROBOTS.builtin.values():
     load_object(_robot.agent)
 
@@ -45,5 +45,5 @@ __all__ = [
     "RoboCASSearchEnv",
     "RoboCASSelectEnv",
     "TaskSpec",
-    "env_class",
+    "register_env_class",
 ]

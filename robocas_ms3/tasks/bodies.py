@@ -1,4 +1,4 @@
-"""Read poses and velocities of all bodies, and contact forces, from a scene in one call."""
+"""Read the states of all bodies, and the contact forces between bodies, from a scene in one call."""
 
 from __future__ import annotations
 
@@ -19,27 +19,31 @@ BODY = 13
 _PACKED_BODY = [4, 5, 6, 0, 1, 2, 3, *range(7, BODY)]  # SAPIEN packs the quaternion before the position
 _PACKED_PER_JOINT = 4  # positions of all joints, then velocities, then values that are not read here
 
-# Bodies with this distance in m can't have touched in the last physics step of 10 ms: it is more than the motion at
-# 4 m/s plus the distance at which PhysX creates contacts.
-_NEAR = 0.05
+# Bodies with a greater distance, in m, can't have touched in the last physics step of 10 ms: the value is greater than
+# the motion at 4 m/s plus the distance at which PhysX creates contacts.
+_CONTACT_DISTANCE = 0.05
 
 _Boxes = tuple[NDArray[np.float32], NDArray[np.float32]]
 _Batch = TypeVar("_Batch", torch.Tensor, NDArray[np.float32])
 
 
 class Bodies:
-    """The states of all bodies of a scene, in the format of ManiSkill's flat states.
+    """Reader of the states of all bodies of a scene, in the format of ManiSkill's flat states.
 
-    A state has ``BODY`` numbers for each of the A movable actors, then root state, qpos and qvel of each articulation.
+    The flat state (N, D) of N envs has ``BODY`` numbers for each of the A movable actors, then root state (``BODY``
+    numbers), qpos and qvel of each articulation.
 
-    On a CPU one call of SAPIEN returns the packed state; the result is reused while the packed bytes are unchanged. On
-    a GPU the state is gathered from the buffers at each call.
+    On a CPU, one call of SAPIEN returns the packed state of all bodies. The converted state is reused until the packed
+    bytes change. On a GPU, each call gathers the state from the buffers of PhysX.
 
     Args:
         scene: a scene that is ready to be simulated.
         robot: the articulation that `state_except_robot` omits.
-        objects: the actors that `objects` returns; they were built one after the other.
-        basket: the actor that `basket` returns, if the scene has one.
+        objects: the actors whose states `object_states` returns; they were built one after the other.
+        basket: the actor whose pose `basket_pose` returns; None if the scene has no basket.
+
+    Attributes:
+        actors: names of the A movable actors, in the order of the flat state.
 
     Raises:
         RobocasError: the installed version of SAPIEN packs states differently.
@@ -88,33 +92,33 @@ class Bodies:
 
     @property
     def state_except_robot(self) -> tuple[bytes, bytes] | None:
-        """Packed state of all bodies except the robot at the last `read`, for comparisons; None on a GPU."""
+        """Packed state of all bodies except the robot at the last `read`, to detect motion; None on a GPU."""
         if self._scene.gpu_sim_enabled:
             return None
         return self._packed[: self._robot.start], self._packed[self._robot.stop :]
 
     def actor_states(self, state: torch.Tensor) -> torch.Tensor:
-        """Return the states (N, A, 13) of the actors from a state (N, D), in the order of ``actors``."""
+        """Return the actor states (N, A, 13) in a flat state (N, D), in the order of ``actors``; a view."""
         count = len(self._actors)
         return state[:, : count * BODY].view(-1, count, BODY)
 
-    def objects(self, state: torch.Tensor) -> torch.Tensor:
-        """Return the states (N, K, 13) of the objects from a state (N, D); a view."""
+    def object_states(self, state: torch.Tensor) -> torch.Tensor:
+        """Return the object states (N, K, 13) in a flat state (N, D); a view."""
         return self.actor_states(state)[:, self._objects]
 
-    def basket(self, state: torch.Tensor) -> torch.Tensor | None:
-        """Return the pose (N, 7) of the basket from a state (N, D), a view; None if the scene has no basket."""
+    def basket_pose(self, state: torch.Tensor) -> torch.Tensor | None:
+        """Return the basket pose (N, 7) in a flat state (N, D), a view; None if the scene has no basket."""
         return None if self._basket is None else self.actor_states(state)[:, self._basket, :7]
 
-    def split(self, states: _Batch) -> dict[str, dict[str, _Batch]]:
-        """Split states (..., D) into ManiSkill's dictionary ``{"actors": {name: (..., 13)}, ...}`` of views."""
+    def to_state_dict(self, states: _Batch) -> dict[str, dict[str, _Batch]]:
+        """Convert flat states (..., D) to ManiSkill's dictionary ``{"actors": {name: (..., 13)}, ...}`` of views."""
         return {
             kind: {name: states[..., columns] for name, columns in found.items()}
             for kind, found in self._columns.items()
         }
 
     def _packed_order(self, robot: Articulation) -> tuple[NDArray[np.int64], slice]:
-        """Return the index of each state component in SAPIEN's packed state, and the robot's bytes."""
+        """Return the index (D,) of each number of a flat state in the packed state, and the bytes of the robot."""
         dynamic: list[Any] = self._px.rigid_dynamic_components
         first = {body: i * BODY for i, body in enumerate(dynamic)}
         order = [first[actor._bodies[0]] + k for actor in self._actors for k in _PACKED_BODY]
@@ -125,7 +129,7 @@ class Bodies:
                 start += BODY + _PACKED_PER_JOINT * link.articulation.dof
         found = len(self._px.pack())
         if found != 4 * start:
-            fix = "Install the version of sapien in requirements.lock."
+            fix = "Install the version of sapien that requirements.lock names."
             what = "unexpected size of SAPIEN's packed state"
             raise RobocasError(what, expected=f"{4 * start} bytes", found=f"{found} bytes", fix=fix)
         for articulation in self._articulations:
@@ -135,19 +139,19 @@ class Bodies:
         return np.array(order), slice(4 * start, 4 * (start + BODY + _PACKED_PER_JOINT * robot.max_dof))
 
     def set_object_poses(self, envs: torch.Tensor, poses: torch.Tensor) -> None:
-        """Set the object poses of some envs on a GPU; `ManiSkillScene._gpu_apply_all` then applies them.
+        """Write object poses of some envs to the buffers of a GPU; `ManiSkillScene._gpu_apply_all` applies them.
 
         Args:
-            envs: (E,) indices.
-            poses: (E, K, 7) in the world.
+            envs: (E,) indices of the envs.
+            poses: (E, K, 7) in the world frame: position m, quaternion wxyz.
         """
         if self._scene.parallel_in_single_scene:
             poses = poses.clone()
             poses[..., :3] += self._scene.scene_offsets[envs, None]
         self._px.cuda_rigid_body_data.torch()[self._rows[envs, self._objects], :7] = poses
 
-    def stop(self, envs: torch.Tensor) -> None:
-        """Set all velocities of some envs (E,) to zero on a GPU; see `set_object_poses`."""
+    def zero_velocities(self, envs: torch.Tensor) -> None:
+        """Write zero velocities of all bodies of some envs (E,) to the buffers of a GPU; see `set_object_poses`."""
         self._px.cuda_rigid_body_data.torch()[self._rows[envs].flatten(), 7:BODY] = 0.0
         for articulation in self._articulations:
             self._px.cuda_articulation_qvel.torch()[articulation._data_index[envs], : articulation.max_dof] = 0.0
@@ -163,7 +167,7 @@ class Bodies:
 
 
 def link_poses(scene: ManiSkillScene, links: Sequence[Link]) -> Array:
-    """Return the poses (N, L, 7) of links in the world: position m, quaternion wxyz; native (`arrays`)."""
+    """Return world poses (N, L, 7) of L links, position m and quaternion wxyz, as a native array (`core.arrays`)."""
     if scene.gpu_sim_enabled:
         return torch.stack([link.pose.raw_pose for link in links], dim=1)
     poses = [link._bodies[0].entity_pose for link in links]
@@ -171,13 +175,13 @@ def link_poses(scene: ManiSkillScene, links: Sequence[Link]) -> Array:
 
 
 class Contacts:
-    """The contact forces between a few bodies and many objects, read for all pairs in one pass.
+    """Reader of the contact forces between bodies and objects, for all pairs in one pass.
 
-    ManiSkill reads one pair at a time and, on a CPU, iterates over all contacts for each pair.
+    ManiSkill reads one pair at a time and, on a CPU, iterates over all contacts of the scene for each pair.
 
     Args:
         scene: a scene that is ready to be simulated.
-        bodies: B bodies.
+        bodies: B bodies, such as the links of the gripper.
         objects: K objects.
     """
 
@@ -198,20 +202,21 @@ class Contacts:
             self._rows: dict[Any, int] = {body: i for i, body in enumerate(self._bodies)}
             self._columns: dict[Any, int] = {body: i for i, body in enumerate(self._objects)}
 
-    def forces(self, still: object = None) -> Array:
+    def forces(self, object_state: object = None) -> Array:
         """Return the force of each object on each body in the last physics step, summed over contact points.
 
         Args:
-            still: a value that changes when an object moves, such as `Bodies.state_except_robot`; None: unknown.
+            object_state: a value that differs after an object has moved, such as `Bodies.state_except_robot`. While
+                it stays equal, bounding boxes of the objects are reused. None: read them again.
 
         Returns:
-            (N, B, K, 3) N, world frame, native (`arrays`); read only.
+            (N, B, K, 3) in newtons, world frame; a native array (`core.arrays`), read only.
         """
         if self._scene.gpu_sim_enabled:
             self._px.gpu_query_contact_pair_impulses(self._query)
             impulses = self._query.cuda_impulses.torch().view(*self._shape, -1, 3).permute(2, 0, 1, 3)
             return impulses / self._px.timestep
-        if self._apart(still):
+        if self._no_object_near(object_state):
             return self._none
         impulses, rows, columns = np.zeros((1, *self._shape, 3), np.float32), self._rows, self._columns
         for contact in self._px.get_contacts():
@@ -226,18 +231,18 @@ class Contacts:
                 total += sign * point.impulse
         return impulses / np.float32(self._px.timestep)
 
-    def _apart(self, still: object) -> bool:
-        """Return whether no object is near any body (on a CPU), so that the contacts need not be read."""
-        if self._boxes is None or still is None or self._boxes[0] != still:
-            self._boxes = still, _bounds(self._objects)
-        low, high = _bounds(self._bodies)
+    def _no_object_near(self, object_state: object) -> bool:
+        """Return whether every object is too far from every body for a contact; only on a CPU."""
+        if self._boxes is None or object_state is None or self._boxes[0] != object_state:
+            self._boxes = object_state, _bounding_boxes(self._objects)
+        low, high = _bounding_boxes(self._bodies)
         others_low, others_high = self._boxes[1]
         gaps = np.maximum(low[:, None] - others_high, others_low - high[:, None])  # (B, K, 3), along each axis
-        return bool((gaps.max(-1) > _NEAR).all())
+        return bool((gaps.max(-1) > _CONTACT_DISTANCE).all())
 
 
-def _bounds(bodies: list[Any]) -> _Boxes:
-    """Return least and greatest corners (B, 3) of the bounding boxes of bodies, world."""
+def _bounding_boxes(bodies: list[Any]) -> _Boxes:
+    """Return lower and upper corners (B, 3) of the bounding boxes of B bodies, world frame, m."""
     boxes = np.array([body.get_global_aabb_fast() for body in bodies])
     return boxes[:, 0], boxes[:, 1]
 
@@ -245,5 +250,5 @@ def _bounds(bodies: list[Any]) -> _Boxes:
 def contact_forces(
     scene: ManiSkillScene, bodies: Sequence[Actor | Link], objects: Sequence[Actor | Link]
 ) -> torch.Tensor:
-    """Return the force (N, B, K, 3) of each object on each body in the last physics step, N, world frame."""
+    """Return the force (N, B, K, 3) of each object on each body in the last physics step; newtons, world frame."""
     return as_tensor(Contacts(scene, bodies, objects).forces())

@@ -50,11 +50,11 @@ def check_engine(
     obs_mode: str | None = None,
     **_: Any,
 ) -> None:
-    """Check that this machine and process can run an environment with the given arguments.
+    """Check that this machine and process can run an environment with these arguments of ``gym.make``.
 
     Raises:
         VectorEnvError: several envs were requested and physics runs on a CPU, or PhysX does not start on the GPU.
-        ConfigError: the level of detail is unknown, or image observations were requested without a renderer.
+        ConfigError: ``visual_level`` is unknown, or ``obs_mode`` has images and ``render_backend`` is ``none``.
     """
     if visual_level not in VISUALS:
         expected = f"one of {list(VISUALS)}"
@@ -67,8 +67,9 @@ def check_engine(
     if num_envs > 1 or sim_backend.startswith(("physx_cuda", "cuda", "gpu")):
         _start_gpu_physics()
     if render_backend == "none" and obs_mode not in {None, "none", "state", "state_dict"}:
-        found, fix = f'"none", with obs_mode={obs_mode!r}', "Remove the argument render_backend, or use a state mode."
-        raise ConfigError("images need a renderer", where="render_backend", found=found, fix=fix)
+        found = f'"none" with obs_mode={obs_mode!r}'
+        fix = 'Remove render_backend="none", or pass obs_mode="state".'
+        raise ConfigError("image observations need a renderer", where="render_backend", found=found, fix=fix)
 
 
 def _start_gpu_physics() -> None:
@@ -84,7 +85,8 @@ def _start_gpu_physics() -> None:
         raise VectorEnvError(what, where="sim_backend", found=format_error(error), fix=fix) from error
 
 
-def sim_config(num_envs: int, config: TaskConfig) -> SimConfig:
+def make_sim_config(num_envs: int, config: TaskConfig) -> SimConfig:
+    """Return ManiSkill's simulation settings: rates, contact offset and limits of GPU memory."""
     distractors = config.randomisation.distractors
     objects = config.objects.count + (distractors.count[1] if distractors else 0)
     return SimConfig(
@@ -92,29 +94,29 @@ def sim_config(num_envs: int, config: TaskConfig) -> SimConfig:
         control_freq=STANDARD_FREQ,
         spacing=10,
         scene_config=SceneConfig(contact_offset=CONTACT_OFFSET),
-        gpu_memory_config=gpu_memory(num_envs, objects),
+        gpu_memory_config=gpu_memory_limits(num_envs, objects),
     )
 
 
-def gpu_memory(num_envs: int, objects: int) -> GPUMemoryConfig:
-    """Return memory limits of PhysX on a GPU for envs with ``objects`` each; at least ManiSkill's."""
-    least = GPUMemoryConfig()
+def gpu_memory_limits(num_envs: int, objects: int) -> GPUMemoryConfig:
+    """Return PhysX's limits of GPU memory for ``objects`` objects per env; never below ManiSkill's defaults."""
+    defaults = GPUMemoryConfig()
     contacts = num_envs * (CONTACTS_PER_OBJECT * objects + BASE_CONTACTS)
     patches = num_envs * (PATCHES_PER_OBJECT * objects + BASE_PATCHES)
     return GPUMemoryConfig(
-        temp_buffer_capacity=max(least.temp_buffer_capacity, _power_of_2(TEMPORARY_PER_CONTACT * contacts)),
-        max_rigid_contact_count=max(least.max_rigid_contact_count, _power_of_2(contacts)),
-        max_rigid_patch_count=max(least.max_rigid_patch_count, _power_of_2(patches)),
-        collision_stack_size=max(least.collision_stack_size, _power_of_2(STACK_PER_PATCH * patches)),
+        temp_buffer_capacity=max(defaults.temp_buffer_capacity, _next_power_of_2(TEMPORARY_PER_CONTACT * contacts)),
+        max_rigid_contact_count=max(defaults.max_rigid_contact_count, _next_power_of_2(contacts)),
+        max_rigid_patch_count=max(defaults.max_rigid_patch_count, _next_power_of_2(patches)),
+        collision_stack_size=max(defaults.collision_stack_size, _next_power_of_2(STACK_PER_PATCH * patches)),
     )
 
 
-def _power_of_2(least: int) -> int:
-    return 1 << (least - 1).bit_length()
+def _next_power_of_2(minimum: int) -> int:
+    return 1 << (minimum - 1).bit_length()
 
 
 def step_without_observation(env: Any, action: NDArray[Any]) -> None:
-    """Execute only the control step of ``BaseEnv.step``, in a single env on a CPU."""
+    """Execute a control step like ``BaseEnv.step``, without observation and reward; a single env on a CPU."""
     env.agent.set_action(torch.from_numpy(action.astype(np.float32, copy=False))[None])
     env._before_control_step()
     for _ in range(env._sim_steps_per_control):
@@ -126,43 +128,44 @@ def step_without_observation(env: Any, action: NDArray[Any]) -> None:
     env._elapsed_steps += 1
 
 
-def is_collection_due(device: sapien.Device | None, resets: int) -> bool:
-    """Return whether to collect garbage after a number of resets (8 MB per scene, 0.5 MB unrendered)."""
+def is_garbage_collection_due(device: sapien.Device | None, resets: int) -> bool:
+    """Return whether to collect garbage at this reset. An old scene keeps 8 MB, or 0.5 MB without a renderer."""
     return resets % (20 if can_render(device) else 30) == 0
 
 
-def keep_renderer(device: sapien.Device | None) -> None:
-    """Keep SAPIEN's shaders and meshes in memory between scenes if a CPU renders.
+def keep_render_system(device: sapien.Device | None) -> None:
+    """Keep SAPIEN's shaders and meshes in memory between scenes if the renderer runs on the CPU.
 
-    SAPIEN frees them with its last render system. Loading them again takes 6 s of CPU time for the first image of the
-    next environment, and 0.1 s per scene.
+    SAPIEN frees them when the last render system is deleted. Loading the shaders again takes 6 s of CPU time for the
+    first image of the next environment; loading the meshes takes 0.1 s per scene.
     """
     if device is not None and device.is_cpu() and can_render(device):
-        _render_system()
+        _shared_render_system()
 
 
 @cache
-def _render_system() -> sapien.render.RenderSystem:
-    atexit.register(_render_system.cache_clear)  # before the library is unloaded
+def _shared_render_system() -> sapien.render.RenderSystem:
+    atexit.register(_shared_render_system.cache_clear)  # before the library is unloaded
     return sapien.render.RenderSystem(sapien.Device("cpu"))
 
 
-class EngineErrors:
-    """A monitor of standard error, to which PhysX only prints that it dropped contacts."""
+class EngineErrorMonitor:
+    """Monitor of standard error. PhysX prints there that it dropped contacts, and reports it in no other way."""
 
     def __init__(self) -> None:
         self._log: IO[bytes] | None = None
 
     def open(self) -> None:
+        """Start to monitor standard error of this process."""
         if self._log is None:
-            self._log = open(_log_standard_error(), "rb", buffering=0)  # noqa: SIM115  (closed in `close`)
+            self._log = open(_copy_standard_error_to_file(), "rb", buffering=0)  # noqa: SIM115  (closed in `close`)
             self._log.seek(0, os.SEEK_END)
 
     def check(self) -> None:
-        """Check the output since the last check.
+        """Raise an error if PhysX has reported dropped contacts since the last call.
 
         Raises:
-            SimulationError: a physics engine of this process ran out of memory.
+            SimulationError: a physics engine of this process ran out of GPU memory.
         """
         if self._log is None or os.fstat(self._log.fileno()).st_size == self._log.tell():
             return
@@ -176,14 +179,14 @@ class EngineErrors:
             self._log.close()
 
 
-_tees: list[tuple[subprocess.Popen, IO[bytes], os.stat_result]] = []  # each with its log and its pipe
+_tees: list[tuple[subprocess.Popen, IO[bytes], os.stat_result]] = []  # process, log file and pipe of each tee
 
 
-def _log_standard_error() -> str:
-    """Copy standard error to a log file by ``tee``, which survives a crash; return the file's name."""
+def _copy_standard_error_to_file() -> str:
+    """Copy standard error to a temporary log file with ``tee``; return the name of the file."""
     if not _tees or not os.path.samestat(os.fstat(2), _tees[-1][2]):
         log = tempfile.NamedTemporaryFile(prefix="robocas-stderr-")  # noqa: SIM115  (removed when the process ends)
-        # a new session, so that Ctrl-C does not end tee
+        # a process of its own, so that output of a crash is copied; a new session, so that Ctrl-C does not end tee
         tee = subprocess.Popen(
             ["tee", "-a", log.name], stdin=subprocess.PIPE, stdout=2, stderr=2, start_new_session=True
         )

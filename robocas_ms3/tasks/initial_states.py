@@ -18,14 +18,14 @@ from robocas_ms3.scenes.layout_table import LayoutTable, is_usable
 
 @dataclass(frozen=True)
 class InitialStates:
-    """Layouts of E envs as tensors on their device. K object slots; world frame, m, quaternions wxyz.
+    """Initial states of E envs with K object slots, as tensors. Poses: world frame, position m, quaternion wxyz.
 
     Attributes:
         object_poses: (E, K, 7) float32.
-        robot_poses: (E, 7) poses of the robot's root.
+        robot_poses: (E, 7) poses of the robot's root link.
         basket_poses: (E, 7); NaN if the scene has no basket.
-        targets: (E,) int64, slots of the targets.
-        present: (E, K) bool, which slots are used.
+        targets: (E,) int64, slot of each target.
+        present: (E, K) bool, whether each slot has an object.
     """
 
     object_poses: torch.Tensor
@@ -36,23 +36,23 @@ class InitialStates:
 
     @classmethod
     def from_layouts(cls, layouts: Sequence[Layout], device: torch.device | str) -> InitialStates:
-        """Convert layouts to tensors on a device."""
+        """Convert E layouts to initial states on a device."""
 
-        def poses(matrices: list[NDArray[np.float64]]) -> torch.Tensor:
+        def to_tensor(matrices: list[NDArray[np.float64]]) -> torch.Tensor:
             return torch.from_numpy(to_wxyz(np.stack(matrices)).astype(np.float32)).to(device)
 
         baskets = [layout.basket_pose for layout in layouts if layout.basket_pose is not None]
         return cls(
-            poses([layout.object_poses for layout in layouts]),
-            poses([layout.robot_pose for layout in layouts]),
-            poses(baskets) if baskets else torch.full((len(layouts), 7), torch.nan, device=device),
+            to_tensor([layout.object_poses for layout in layouts]),
+            to_tensor([layout.robot_pose for layout in layouts]),
+            to_tensor(baskets) if baskets else torch.full((len(layouts), 7), torch.nan, device=device),
             torch.tensor([layout.target for layout in layouts], device=device),
             torch.from_numpy(np.stack([layout.present for layout in layouts])).to(device),
         )
 
-    def with_rows(self, rows: NDArray[np.bool_], others: InitialStates) -> InitialStates:
-        """Return these states in the rows (E,) that are True, and others in the remaining rows."""
-        order = torch.from_numpy(np.argsort(np.argsort(~rows, kind="stable"))).to(self.targets.device)
+    def interleave(self, from_self: NDArray[np.bool_], others: InitialStates) -> InitialStates:
+        """Merge with other states: row i is the next row of self if ``from_self[i]``, otherwise the next of others."""
+        order = torch.from_numpy(np.argsort(np.argsort(~from_self, kind="stable"))).to(self.targets.device)
         return InitialStates(
             **{
                 f.name: torch.cat([getattr(self, f.name), getattr(others, f.name)])[order]
@@ -62,14 +62,14 @@ class InitialStates:
 
 
 class InitialStateTable:
-    """Initial states of envs that keep their objects; a reset gathers them on the device.
+    """All initial states of a layout table on the device, for envs that keep their objects.
 
-    The device holds all layouts of these objects, 0.4 kB per layout of ten objects.
+    A reset selects its initial states on the device, without a copy from the host. A layout of ten objects has 0.4 kB.
 
     Args:
-        table: the layout table.
+        table: layout table that has the objects of the envs.
         objects_seeds: (N,) objects seed of each env.
-        device: device of the envs.
+        device: device of the tensors.
     """
 
     def __init__(self, table: LayoutTable, objects_seeds: NDArray[np.int64], device: torch.device | str) -> None:
@@ -80,12 +80,12 @@ class InitialStateTable:
         names = ("object_poses", "robot_pose", "basket_pose", "target", "present")
         self._columns = [torch.from_numpy(np.ascontiguousarray(taken[name])).to(device) for name in names]
 
-    def is_usable(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return (E,) whether layouts exist and are not marked unstable, by env (E,) and seed (E,)."""
+    def has_usable_layout(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return (E,) bool, whether envs (E,) have a layout for seeds (E,) that is not marked unstable."""
         return is_usable(self._table.find_records(self._objects_seeds[envs], seeds)[0])
 
-    def gather(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> InitialStates:
-        """Return the initial states of some envs (E,) by their layout seeds (E,), which must be usable."""
+    def gather_states(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> InitialStates:
+        """Return the initial states of envs (E,) for layout seeds (E,), which must have a usable layout."""
         columns = self._table.find_records(self._objects_seeds[envs], seeds)[2]
         row, column = (torch.from_numpy(index).to(self._device) for index in (self._row_of_env[envs], columns))
         objects, robots, baskets, targets, present = (columns[row, column] for columns in self._columns)
@@ -93,7 +93,7 @@ class InitialStateTable:
 
 
 def set_initial_states(env: Any, states: InitialStates, envs: torch.Tensor) -> None:
-    """Set robot, furniture, basket and objects of some envs (E,) to their initial states."""
+    """Put robot, furniture, basket and objects of envs (E,) into initial states, and store these in the env."""
     with torch.device(env.device):
         qpos: Any = torch.as_tensor(env.agent.keyframes[env.task_config.robot_start].qpos, dtype=torch.float32)
         env.agent.reset(qpos.repeat(len(envs), 1))

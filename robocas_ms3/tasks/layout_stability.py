@@ -17,8 +17,8 @@ _ENVS = {"cpu": 1, "gpu": 256}  # number of envs that run at once
 _BACKENDS = {"cpu": "physx_cpu", "gpu": "physx_cuda"}
 
 
-def unchecked_layouts(cache: LayoutCache, engine: Engine) -> dict[int, list[int]]:
-    """Return the seeds of unchecked layouts by objects seed."""
+def find_unchecked_layouts(cache: LayoutCache, engine: Engine) -> dict[int, list[int]]:
+    """Return the layout seeds whose layouts were not checked yet in a physics engine, by objects seed."""
     table = cache.load_table(engine)
     seeds: dict[int, list[int]] = {}
     for objects_seed, seed in table.find_pairs(LayoutStatus.UNCHECKED) if table else ():
@@ -29,22 +29,22 @@ def unchecked_layouts(cache: LayoutCache, engine: Engine) -> dict[int, list[int]
 def check_layouts(
     cache: LayoutCache, engine: Engine, seeds: dict[int, list[int]], **kwargs: Any
 ) -> Generator[tuple[SeedPair, float]]:
-    """Start an episode with each layout, hold the robot for 1 s, and measure the objects' motion.
+    """Simulate each layout for 1 s with a robot that does not move, and yield how far its objects shift.
 
     Args:
-        cache: cache of the layouts.
-        engine: physics engine to check.
-        seeds: layout seeds by objects seed (`unchecked_layouts`).
-        kwargs: arguments of ``gym.make``: the packs of the cache.
+        cache: cache that has the layouts.
+        engine: physics engine that simulates.
+        seeds: layout seeds by objects seed, as returned by `find_unchecked_layouts`.
+        kwargs: additional arguments of ``gym.make``, such as ``pack`` and ``furniture_pack``.
 
     Yields:
-        Seed pair, and the greatest shift of an object in m.
+        Seed pair of a layout, and the greatest shift of an object in m.
     """
-    first_row = next(iter(seeds))
+    first_objects_seed = next(iter(seeds))
 
     def layouts(objects_seed: int, seed: int) -> Layout:  # unlike the cache, it also returns unstable layouts
         known = objects_seed in seeds  # otherwise the env is being built
-        return cache.get(objects_seed, seed) if known else cache.get(first_row, first_row)
+        return cache.get(objects_seed, seed) if known else cache.get(first_objects_seed, first_objects_seed)
 
     count = min(_ENVS[engine], len(seeds))
     env: Any = gym.make(
@@ -78,6 +78,6 @@ def check_layouts(
         env.close()
 
 
-def status_of(moved: float) -> LayoutStatus:
-    """Return the status of a layout from the greatest shift of its objects, m."""
-    return LayoutStatus.STABLE if moved <= MAX_SHIFT else LayoutStatus.UNSTABLE
+def status_from_shift(shift: float) -> LayoutStatus:
+    """Return the status of a layout whose objects shift by at most ``shift`` m in the simulation."""
+    return LayoutStatus.STABLE if shift <= MAX_SHIFT else LayoutStatus.UNSTABLE

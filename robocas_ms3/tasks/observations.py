@@ -1,4 +1,4 @@
-"""Privileged observations, and the viewpoint of overview cameras."""
+"""Privileged observations of the simulator's state, and the viewpoint of overview cameras."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from robocas_ms3.scenes.model import SceneModel
 
 
 def privileged_observations(env: Any) -> dict[str, torch.Tensor]:
-    """Return poses of objects and basket, and the target's position relative to TCP and goal, (N, D) each."""
+    """Return the privileged observations of all tasks by name, (N, D) each; docs/rl.md lists them."""
     state, tcp = env.bodies.read(), env.tcp_in_world()
-    objects, basket = env.bodies.objects(state), env.bodies.basket(state)
+    objects, basket = env.bodies.object_states(state), env.bodies.basket_pose(state)
     center = env.target_center(to_native(objects))
     observations = {
         "object_poses": torch.where(env.present[..., None], objects[..., :7], 0.0).flatten(1),
@@ -26,22 +26,22 @@ def privileged_observations(env: Any) -> dict[str, torch.Tensor]:
         **({} if basket is None else {"basket_pose": basket}),
     }
     to_target = center - tcp[:, :3]
-    point = env.goal.position(None if basket is None else to_native(basket))
+    point = env.goal.goal_position(None if basket is None else to_native(basket))
     if point is None:
-        observations["tcp_to_target"] = in_tcp_frame(tcp, to_target[:, None])[:, 0]
+        observations["tcp_to_target"] = rotate_to_tcp_frame(tcp, to_target[:, None])[:, 0]
     else:
-        seen = in_tcp_frame(tcp, concatenate([to_target, point - center]).reshape(-1, 2, 3))
+        seen = rotate_to_tcp_frame(tcp, concatenate([to_target, point - center]).reshape(-1, 2, 3))
         observations |= {"tcp_to_target": seen[:, 0], env.goal.VECTOR_NAME: seen[:, 1]}
     return observations | {"target_extents": env.success_check.target_extents}
 
 
-def in_tcp_frame(tcp: Array, vectors: Array) -> torch.Tensor:
-    """Rotate vectors (N, V, 3) from the world frame to the frames of poses (N, 7); both native (`arrays`)."""
-    return as_tensor(vectors @ rotations.to_matrix(tcp[:, 3:]))
+def rotate_to_tcp_frame(tcp_poses: Array, vectors: Array) -> torch.Tensor:
+    """Rotate V vectors (N, V, 3) from the world frame to the frame of each TCP, given TCP poses (N, 7)."""
+    return as_tensor(vectors @ rotations.to_matrix(tcp_poses[:, 3:]))
 
 
-def over_the_shoulder(model: SceneModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a viewpoint over the robot's shoulder, and a point on the support, (3,) each, world, m."""
+def over_shoulder_viewpoint(model: SceneModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return a camera position over the robot's shoulder, and the point it looks at, (3,) each, world frame, m."""
     region, robot = model.region, model.robot_pose[:3, 3]
     middle = np.array([*np.add(region.min_xy, region.max_xy) / 2, region.z, 1.0])
     target = (model.support_pose @ middle)[:3]
@@ -51,8 +51,13 @@ def over_the_shoulder(model: SceneModel) -> tuple[NDArray[np.float64], NDArray[n
     return eye, target + [0, 0, 0.05]
 
 
-def place_camera(camera: CameraSpec, overview: tuple[NDArray[np.float64], NDArray[np.float64]]) -> CameraSpec:
-    """Place an overview camera at the viewpoint of the task; return other cameras unchanged."""
+def place_overview_camera(camera: CameraSpec, overview: tuple[NDArray[np.float64], NDArray[np.float64]]) -> CameraSpec:
+    """Return an overview camera with its pose in the scene; return any other camera unchanged.
+
+    Args:
+        camera: specification of the camera.
+        overview: camera position and the point it looks at (`RoboCASEnv.overview_viewpoint`).
+    """
     if not camera.overview:
         return camera
     eye, target = overview

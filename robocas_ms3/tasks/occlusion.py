@@ -1,9 +1,11 @@
-"""Measure which objects hide or surround a target, seen from above. N envs, K slots.
+"""Measure which objects hide a target, and which are obstacles next to it, seen from above. N envs, K object slots.
 
-Objects are given as points on their surfaces, m. The points of each object are projected to a grid of square cells
-around the target; a height map keeps the highest point of each cell. Comparing height maps shows which object hides
-which. The camera is that of p_vis (`scenes.visibility.top_down_camera`). It looks straight down, so that the highest
-point on a ray is the nearest one.
+Each object is given by points on its surface. They are projected to a grid of square cells around the target. A height
+map has the highest point of each cell. The height maps of two objects show which of them hides the other. The camera is
+that of the visible fraction (`scenes.visibility.top_down_camera`). It looks straight down, so the highest point in a
+cell is the nearest to the camera.
+
+An *obstacle* is an object that sticks out above the target's mean height within 1 cm of its outline (`Clutter`).
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from torch.nn.functional import pad
 
 CELL = 0.005  # edge of a cell at the target's depth, m
 CELLS = 64  # cells per side: the grid extends 0.16 m from the target's middle
-NEAREST = 0.05  # m below the camera; higher points are treated as if they were at this depth
+NEAREST = 0.05  # m below the camera; points that are higher are treated as if they were at this depth
 MAX_HIDDEN_FRACTION = 0.2  # greatest hidden fraction of a cleared target (paper)
 MAX_OBSTACLES = 1  # greatest number of obstacles around a cleared target (paper)
 REACH = 2  # cells (1 cm) around the target's outline in which objects count as neighbours
@@ -28,32 +30,32 @@ _NOTHING = -1e3  # height of an empty cell; finite, so that differences are fini
 
 
 class Clutter(NamedTuple):
-    """Objects that hide or surround a target.
+    """Clutter around the target of each env, seen from above.
 
     Attributes:
-        hidden_fraction: (N,) fraction of the target's outline that other objects cover, 1 - p_vis.
-        obstacles: (N, K) bool, which other objects are visible, higher than the target's mean height, and within 1 cm
-            of its outline.
+        hidden_fraction: (N,) fraction of the target's outline that other objects cover: 1 - p_vis of the paper.
+        obstacles: (N, K) bool, whether each object is an obstacle: visible from above, above the target's mean height,
+            and within 1 cm of the target's outline.
     """
 
     hidden_fraction: Tensor
     obstacles: Tensor
 
     @property
-    def cleared(self) -> Tensor:
-        """(N,) bool, the paper's rule: at most a fifth of the target is hidden, at most one obstacle left."""
+    def is_target_cleared(self) -> Tensor:
+        """(N,) bool, the paper's rule of a cleared target: at most 20 % hidden, and at most one obstacle."""
         return (self.hidden_fraction <= MAX_HIDDEN_FRACTION) & (self.obstacles.sum(dim=1) <= MAX_OBSTACLES)
 
 
-def surface_points(poses: Tensor, points: Tensor) -> Tensor:
-    """Transform points on objects to the world frame.
+def surface_points_in_world(poses: Tensor, points: Tensor) -> Tensor:
+    """Transform surface points of objects to the world frame.
 
     Args:
-        poses: (N, K, 7) position and unit quaternion wxyz.
-        points: (N, K, 3, P) in each object's frame, a column each.
+        poses: (N, K, 7) world poses of the objects: position m, unit quaternion wxyz.
+        points: (N, K, 3, P) P points per object in the object's frame, m.
 
     Returns:
-        (N, K, 3, P).
+        (N, K, 3, P) points in the world frame, m.
     """
     w, x, y, z = poses[..., 3:].unbind(-1)
     rows = (
@@ -69,33 +71,30 @@ def project_down(points: Tensor, eye: Tensor, depth: Tensor) -> Tensor:
     """Project points to a horizontal plane, as seen by a camera that looks straight down.
 
     Args:
-        points: (N, K, 3, P) in the world, m.
-        eye: (3,) position of the camera, world, m.
-        depth: (N,) m, depth of the plane below the camera.
+        points: (N, K, 3, P) points in the world frame, m.
+        eye: (3,) position of the camera in the world frame, m.
+        depth: (N,) distance of the plane below the camera, m.
 
     Returns:
-        (N, K, 2, P) m, coordinates in the plane along the world's x and y, relative to the camera.
+        (N, K, 2, P) x and y of the projected points, along the world's axes and relative to the camera, m.
     """
     below = (eye[2] - points[:, :, 2]).clamp(min=NEAREST)
     return (points[:, :, :2] - eye[:2, None]) * (depth[:, None, None] / below)[:, :, None]
 
 
-def has_moved_near(poses: Tensor, before: Tensor, radii: Tensor, target: Tensor, eye: Tensor) -> Tensor:
-    """Return whether an object that affects `clutter` has moved, targets included.
+def has_clutter_moved(poses: Tensor, earlier_poses: Tensor, radii: Tensor, target: Tensor, eye: Tensor) -> Tensor:
+    """Return (N,) bool, whether the target or an object near it has moved, so that its clutter may have changed.
 
     Args:
-        poses: (N, K, 7) current poses.
-        before: (N, K, 7) earlier poses.
+        poses: (N, K, 7) current world poses of the objects.
+        earlier_poses: (N, K, 7) their poses at the last measurement.
         radii: (N, K) radii of bounding spheres about the objects' origins, m.
-        target: (N,) slots of the targets.
-        eye: (3,) position of the camera, world, m.
-
-    Returns:
-        (N,) bool.
+        target: (N,) slot of each target.
+        eye: (3,) position of the camera in the world frame, m.
     """
     env = torch.arange(len(target), device=poses.device)
     near = torch.zeros_like(radii, dtype=torch.bool)
-    for at in (poses, before):
+    for at in (poses, earlier_poses):
         aside, below = at[..., :2] - eye[:2], (eye[2] - at[..., 2]).clamp(min=NEAREST)
         above = (below - radii).clamp(min=NEAREST)  # depth at which the sphere appears largest
         seen = aside / below[..., None]
@@ -103,20 +102,20 @@ def has_moved_near(poses: Tensor, before: Tensor, radii: Tensor, target: Tensor,
         # the target's outline, the cells around it, and one cell for rounding
         reach = size + size[env, target][:, None] + ((REACH + 1) * CELL / above[env, target])[:, None, None]
         near |= ((seen - seen[env, target][:, None]).abs() <= reach).all(dim=-1)
-    return (((poses - before).abs() > LEAST_MOTION).any(dim=-1) & near).any(dim=-1)
+    return (((poses - earlier_poses).abs() > LEAST_MOTION).any(dim=-1) & near).any(dim=-1)
 
 
-def clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor) -> Clutter:
-    """Measure the hidden fraction of the targets, and find the obstacles around them.
+def measure_clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor) -> Clutter:
+    """Measure the hidden fraction of each target, and find the obstacles around it.
 
-    A cell of the target is hidden if the highest point of another object is above the target's. Gaps of one cell
-    between the points of an object are closed.
+    A cell of the target is hidden if another object has a higher point in this cell. Gaps of one cell between the
+    points of an object are closed first.
 
     Args:
-        points: (N, K, 3, P) points on the objects' surfaces, world, m.
-        present: (N, K) bool, which slots are used.
-        target: (N,) slots of the targets.
-        eye: (3,) position of the camera, world, m.
+        points: (N, K, 3, P) points on the objects' surfaces, world frame, m.
+        present: (N, K) bool, whether each slot has an object.
+        target: (N,) slot of each target.
+        eye: (3,) position of the camera in the world frame, m.
     """
     env = torch.arange(len(target), device=points.device)
     own = points[env, target]  # (N, 3, P)
@@ -124,17 +123,17 @@ def clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor) -> Clu
     seen = project_down(points, eye, depth)
     outline = seen[env, target]
     middle = (outline.amin(dim=-1) + outline.amax(dim=-1)) / 2
-    cells, heights = _cells(seen, middle), points[:, :, 2]
+    cells, heights = _cell_indices(seen, middle), points[:, :, 2]
     others = present.scatter(1, target[:, None], False)  # assigning by index would synchronise with a GPU
     others_cells = torch.where(others[..., None], cells, _OUTSIDE).flatten(1)
     top = _height_map(others_cells, heights.flatten(1))
 
-    closed = _closed(torch.stack([_height_map(cells[env, target], own[:, 2]), top], dim=1))
+    closed = _close_gaps(torch.stack([_height_map(cells[env, target], own[:, 2]), top], dim=1))
     at_target, above_it = closed[:, 0], closed[:, 1] > closed[:, 0]
     filled = at_target > _NOTHING
     hidden_fraction = (filled & above_it).sum(dim=(1, 2)) / filled.sum(dim=(1, 2)).clamp(min=1)
 
-    around = _widened(filled.float(), REACH) > 0
+    around = _dilate(filled.float(), REACH) > 0
     sticks_out = around & (top > at_target) & (top > own[:, 2].mean(dim=-1)[:, None, None])
     # an object is an obstacle if one of its points is the highest of a cell that sticks out
     limit = torch.where(sticks_out, top, -_NOTHING).flatten(1)
@@ -144,15 +143,15 @@ def clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor) -> Clu
 
 
 def pairwise_occlusion(points: Tensor, present: Tensor, eye: Tensor) -> Tensor:
-    """Return which fraction of each object is hidden by each other object alone.
+    """Return the fraction of each object that each other object hides on its own, seen from above.
 
     Args:
-        points: (N, K, 3, P) points on the objects' surfaces, world, m.
-        present: (N, K) bool, which slots are used.
-        eye: (3,) position of the camera, world, m.
+        points: (N, K, 3, P) points on the objects' surfaces, world frame, m.
+        present: (N, K) bool, whether each slot has an object.
+        eye: (3,) position of the camera in the world frame, m.
 
     Returns:
-        (N, K, K) hidden fractions; rows: the object that hides, columns: the object that is hidden.
+        (N, K, K) fractions; entry [n, i, j] is the fraction of object j that object i hides.
     """
     count, slots = present.shape
     heights, fractions = points[:, :, 2], []
@@ -160,8 +159,8 @@ def pairwise_occlusion(points: Tensor, present: Tensor, eye: Tensor) -> Tensor:
         own = points[:, slot]
         seen = project_down(points, eye, (eye[2] - own[:, 2].mean(dim=-1)).clamp(min=NEAREST))
         outline = seen[:, slot]
-        cells = _cells(seen, (outline.amin(dim=-1) + outline.amax(dim=-1)) / 2)
-        maps = _closed(_height_map(cells.flatten(0, 1), heights.flatten(0, 1)).unflatten(0, (count, slots)))
+        cells = _cell_indices(seen, (outline.amin(dim=-1) + outline.amax(dim=-1)) / 2)
+        maps = _close_gaps(_height_map(cells.flatten(0, 1), heights.flatten(0, 1)).unflatten(0, (count, slots)))
         at_it = maps[:, slot : slot + 1]
         filled = at_it > _NOTHING
         fractions.append((filled & (maps > at_it)).sum(dim=(2, 3)) / filled.sum(dim=(2, 3)).clamp(min=1))
@@ -170,15 +169,15 @@ def pairwise_occlusion(points: Tensor, present: Tensor, eye: Tensor) -> Tensor:
 
 
 def push_point(points: Tensor, obstacles: Tensor, target: Tensor) -> Tensor:
-    """Return the start (N, 3) of the paper's push of the highest obstacle, on the target's side.
+    """Return the point where the paper's push of the highest obstacle starts: 2 cm from it, on the target's side.
 
     Args:
-        points: (N, K, 3, P) points on the objects' surfaces, world, m.
-        obstacles: (N, K) bool, see `Clutter`; without obstacles the middle of the target is returned.
-        target: (N,) slots of the targets.
+        points: (N, K, 3, P) points on the objects' surfaces, world frame, m.
+        obstacles: (N, K) bool, whether each object is an obstacle (`Clutter`).
+        target: (N,) slot of each target.
 
     Returns:
-        (N, 3) world.
+        (N, 3) points in the world frame, m; the middle of the target in envs without obstacles.
     """
     env = torch.arange(len(target), device=points.device)
     tops = points[:, :, 2].amax(dim=-1).masked_fill(~obstacles, -torch.inf)
@@ -191,25 +190,25 @@ def push_point(points: Tensor, obstacles: Tensor, target: Tensor) -> Tensor:
     return torch.where(obstacles.any(dim=1)[:, None], beside, goal)
 
 
-def _cells(points: Tensor, middle: Tensor) -> Tensor:
-    """Return (N, K, P) the cell index of each point (N, K, 2, P) in the grid around ``middle`` (N, 2)."""
+def _cell_indices(points: Tensor, middle: Tensor) -> Tensor:
+    """Return the cell index (N, K, P) of each point (N, K, 2, P) in the grid around ``middle`` (N, 2)."""
     cell = torch.floor((points - middle[:, None, :, None]) / CELL).long() + CELLS // 2
     inside = (cell >= 0) & (cell < CELLS)
     return torch.where(inside[:, :, 0] & inside[:, :, 1], cell[:, :, 0] * CELLS + cell[:, :, 1], _OUTSIDE)
 
 
 def _height_map(cells: Tensor, heights: Tensor) -> Tensor:
-    """Return the greatest height (N, CELLS, CELLS) of points (N, P) per cell; ``_NOTHING``: no point."""
+    """Return height maps (N, CELLS, CELLS) from cell indices (N, P) and heights (N, P); empty cell: ``_NOTHING``."""
     empty = torch.full((len(cells), _OUTSIDE + 1), _NOTHING, device=cells.device)
     return empty.scatter_reduce(1, cells, heights, "amax")[:, :_OUTSIDE].unflatten(1, (CELLS, CELLS))
 
 
-def _closed(maps: Tensor) -> Tensor:
-    """Close holes between the sampled points in height maps (N, M, CELLS, CELLS): dilate, then erode."""
-    return -_widened(-_widened(maps, 1), 1)
+def _close_gaps(maps: Tensor) -> Tensor:
+    """Fill gaps between the sampled points in height maps (N, M, CELLS, CELLS): dilate, then erode."""
+    return -_dilate(-_dilate(maps, 1), 1)
 
 
-def _widened(maps: Tensor, reach: int) -> Tensor:
-    """Return the greatest value within ``reach`` cells; on a CPU much faster than `max_pool2d`."""
+def _dilate(maps: Tensor, reach: int) -> Tensor:
+    """Dilate height maps (..., CELLS, CELLS) by ``reach`` cells; on a CPU much faster than `max_pool2d`."""
     across = pad(maps, (reach, reach), value=-torch.inf).unfold(-1, 2 * reach + 1, 1).amax(dim=-1)
     return pad(across, (0, 0, reach, reach), value=-torch.inf).unfold(-2, 2 * reach + 1, 1).amax(dim=-1)

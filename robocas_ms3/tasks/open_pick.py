@@ -1,4 +1,4 @@
-"""RoboCASOpenPick-v1: open a door or drawer, take the named object out, drop it into the basket."""
+"""RoboCASOpenPick-v1: open a door or drawer, take the named object out, and put it into the basket."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from robocas_ms3.scenes.task_specs import OPEN_PICK
 from robocas_ms3.tasks import rewards
 from robocas_ms3.tasks.base import STAGES, RoboCASEnv
 from robocas_ms3.tasks.bodies import link_poses
-from robocas_ms3.tasks.observations import in_tcp_frame
+from robocas_ms3.tasks.observations import rotate_to_tcp_frame
 
 
 class RoboCASOpenPickEnv(RoboCASEnv):
-    """Open a door or drawer and pick an object behind it.
+    """Open a door or drawer, and put the named object behind it into the basket.
 
-    The first stage is ``furniture_opened``: the joint was past ``opening.opened_at`` of its range. Success is that of
-    pick; it does not depend on how the policy took the object out.
+    The additional stage ``furniture_opened`` is reached when the joint is open by the fraction ``opening.opened_at`` of
+    its range. Success has the same conditions as in pick; the furniture need not be open.
     """
 
     SPEC = OPEN_PICK
     STAGES = ("furniture_opened", *STAGES)
     REWARDS = rewards.OPEN_PICK
 
-    def overview(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return a viewpoint above the basket's side, from which an opening door does not hide the gripper."""
+    def overview_viewpoint(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return camera position and look-at point, (3,) each, such that an opening door does not hide the gripper."""
         model, opening = self.model, self.task_config.opening
         assert opening is not None  # checked by the configuration
         assert model.basket_pose is not None
@@ -54,46 +54,46 @@ class RoboCASOpenPickEnv(RoboCASEnv):
         # the frames of all parts coincide while the furniture is closed
         self._handle = furniture.links_map[handle.link], to_native(torch.tensor([handle.position], device=self.device))
 
-    def opening_position(self) -> torch.Tensor:
-        """Return the position (N,) of the joint to open, m or rad."""
+    def opening_joint_position(self) -> torch.Tensor:
+        """Return the position (N,) of the joint that must be opened, m or rad."""
         furniture, joint = self._opening
         return furniture.get_qpos()[:, joint]
 
-    def handle_in_world(self) -> Array:
-        """Return the position (N, 3) m of the handle in the world, native (`arrays`)."""
+    def handle_position(self) -> Array:
+        """Return the position (N, 3) of the handle in the world frame, m, as a native array (`core.arrays`)."""
         link, position = self._handle
         pose = link_poses(self.scene, [link])[:, 0]
         return pose[:, :3] + rotations.rotate(pose[:, 3:], position)
 
-    def furniture_opened(self) -> torch.Tensor:
-        """Return (N,) bool, whether the furniture is currently open."""
-        goal, position = self.model.open_threshold, self.opening_position()
+    def is_furniture_open(self) -> torch.Tensor:
+        """Return (N,) bool, whether the joint is currently open by at least ``opening.opened_at`` of its range."""
+        goal, position = self.model.open_threshold, self.opening_joint_position()
         return position >= goal if goal > 0 else position <= goal
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Return the result of `RoboCASEnv.evaluate`, and ``furniture_opened`` (N,) bool."""
+        """Return the result of `RoboCASEnv.evaluate` and the stage ``furniture_opened`` (N,) bool."""
         found = super().evaluate()
-        opened = self.success_check.reach("furniture_opened", to_native(self.furniture_opened()))
+        opened = self.success_check.mark_reached("furniture_opened", to_native(self.is_furniture_open()))
         return {**found, "furniture_opened": opened}
 
-    def reward_progress(self) -> tuple[Array, dict[str, Array]]:
-        """Return stage and terms; see `RoboCASEnv`. The stage ``open`` comes before the stage ``grasp``."""
-        stage, found = super().reward_progress()
-        shut = (stage == self.REWARDS.index("grasp")) & ~self.success_check.stages["furniture_opened"]
+    def reward_stage_and_terms(self) -> tuple[Array, dict[str, Array]]:
+        """Return reward stage and terms of each env; the stage ``open`` comes before the stage ``grasp``."""
+        stage, found = super().reward_stage_and_terms()
+        shut = (stage == self.REWARDS.stage_index("grasp")) & ~self.success_check.stages["furniture_opened"]
         if not known_all_false(shut):
-            found["handle"] = rewards.closeness(self.tcp_in_world()[:, :3], self.handle_in_world())
+            found["handle"] = rewards.nearness(self.tcp_in_world()[:, :3], self.handle_position())
             found["open"] = self._opened_fraction()
-            stage = rewards.furthest_stage(stage, [(shut, self.REWARDS.index("open"))])
+            stage = rewards.furthest_stage(stage, [(shut, self.REWARDS.stage_index("open"))])
         return stage, found
 
     def _opened_fraction(self) -> Array:
-        return rewards.progress_fraction(to_native(self.opening_position()), 0.0, self.model.open_threshold)
+        return rewards.change_fraction(to_native(self.opening_joint_position()), 0.0, self.model.open_threshold)
 
     def privileged_observations(self) -> dict[str, torch.Tensor]:
-        """Return those of `RoboCASEnv`, ``opened_fraction`` (N, 1) and ``tcp_to_handle`` (N, 3)."""
+        """Return the observations of `RoboCASEnv`, ``opened_fraction`` (N, 1) and ``tcp_to_handle`` (N, 3), m."""
         tcp = self.tcp_in_world()
         return {
             **super().privileged_observations(),
             "opened_fraction": as_tensor(self._opened_fraction())[:, None],
-            "tcp_to_handle": in_tcp_frame(tcp, (self.handle_in_world() - tcp[:, :3])[:, None])[:, 0],
+            "tcp_to_handle": rotate_to_tcp_frame(tcp, (self.handle_position() - tcp[:, :3])[:, None])[:, 0],
         }

@@ -1,4 +1,4 @@
-"""RoboCASPick-v1: grasp the named object and drop it into the basket."""
+"""RoboCASPick-v1: grasp the named object and put it into the basket."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ from robocas_ms3.tasks.base import RoboCASEnv
 
 
 class RoboCASPickEnv(RoboCASEnv):
-    """Pick the object named by the instruction and put it into the basket."""
+    """Pick the object that the instruction names, and put it into the basket."""
 
     SPEC = PICK

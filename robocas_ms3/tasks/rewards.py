@@ -1,8 +1,8 @@
-"""Dense rewards: named terms in [0, 1], weighted by a task's table. N envs; arrays as in `terms`.
+"""Dense rewards: named terms in [0, 1], weighted by the reward table of a task. N envs; native arrays (`core.arrays`).
 
-A task is a sequence of stages, and each env is in one stage at a time. Terms of earlier stages count in full, terms of
-the current stage count with their values, terms of later stages don't count. So a later stage always has at least the
-reward of an earlier one.
+A task is a sequence of reward stages, and each env is in one stage at a time. Terms of earlier stages count in full,
+terms of the current stage count with their values, and terms of later stages don't count. So a later stage always has
+at least the reward of an earlier stage.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from robocas_ms3.core.arrays import Array, as_float, as_tensor, clamp, norm, to_
 from robocas_ms3.tasks.occlusion import MAX_HIDDEN_FRACTION, MAX_OBSTACLES
 from robocas_ms3.tasks.terms import BASKET_SHIFT
 
-_MANY_OBSTACLES = 5  # obstacles in addition to those of a cleared target at which the fraction is 0
-DENSE = ("normalized_dense", "dense", "progress")  # reward modes whose terms are computed
+_MANY_OBSTACLES = 5  # obstacles beyond those that a cleared target may have; more of them change no reward
+DENSE_MODES = ("normalized_dense", "dense", "progress")  # reward modes that need the terms
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class RewardTable:
     """Stages, weights and penalties of a task's dense reward.
 
     Attributes:
-        stages: weights of the terms of each stage; stages by name, in their order.
-        penalties: greatest fraction of the current stage's terms that each penalty subtracts; the sum is below 1.
+        stages: stage name -> term name -> weight, in the order of the stages.
+        penalties: penalty name -> greatest fraction of the current stage's terms that it subtracts; the sum is below 1.
     """
 
     stages: dict[str, dict[str, float]]
@@ -35,13 +35,16 @@ class RewardTable:
 
     @cached_property
     def weights(self) -> dict[str, float]:
+        """Weight of each term by name."""
         return {name: weight for terms in self.stages.values() for name, weight in terms.items()}
 
     @cached_property
     def total(self) -> float:
+        """Sum of the weights: the reward of success."""
         return sum(self.weights.values())
 
-    def index(self, stage: str) -> int:
+    def stage_index(self, stage: str) -> int:
+        """Return the place of a stage in the order of the stages, from 0."""
         return list(self.stages).index(stage)
 
 
@@ -64,19 +67,19 @@ OPEN_PICK = RewardTable({"open": {"handle": 1.0, "open": 3.0}, **_TRANSFER}, TRA
 def weighted_reward(
     table: RewardTable, stage: Array, terms: dict[str, Array], penalties: dict[str, Array]
 ) -> tuple[Array, dict[str, Array]]:
-    """Return the weighted reward of envs from their stages and terms.
+    """Return the weighted reward of each env from its reward stage, terms and penalties.
 
     Args:
         table: reward table of the task.
-        stage: (N,) indices into ``table.stages``; the number of stages for envs that have succeeded.
-        terms: values (N,) in [0, 1] of the terms by name; a missing term is 0 in its own stage.
+        stage: (N,) indices into ``table.stages``; ``len(table.stages)`` in envs that have succeeded.
+        terms: values (N,) in [0, 1] of the terms by name; a missing term counts as 0 in the current stage.
         penalties: values (N,) in [0, 1] of the penalties by name.
 
     Returns:
-        Rewards (N,) in [0, ``table.total``], and the counted values (N,) in [0, 1] of all terms by name.
+        Rewards (N,) in [0, ``table.total``], and the values (N,) in [0, 1] by term name that the rewards count.
     """
     none = 0.0 * as_float(stage)
-    kept = 1.0 - sum((share * penalties[name] for name, share in table.penalties.items()), none)
+    kept = 1.0 - sum((fraction * penalties[name] for name, fraction in table.penalties.items()), none)
     counted, reward = {}, none
     for place, own in enumerate(table.stages.values()):
         passed, here = as_float(stage > place), as_float(stage == place) * kept
@@ -86,96 +89,112 @@ def weighted_reward(
     return where(stage >= len(table.stages), none + table.total, reward), counted
 
 
-def furthest_stage(first: Array, conditions: list[tuple[Array, int]]) -> Array:
-    """Return (N,) the stage of the last condition (N,) that is true, or ``first`` (N,) if none is."""
-    stage = first
+def furthest_stage(default: Array, conditions: list[tuple[Array, int]]) -> Array:
+    """Return the furthest stage (N,) whose condition is true.
+
+    Args:
+        default: (N,) stage if no condition is true.
+        conditions: pairs of a condition (N,) bool and its stage; a later pair takes precedence.
+    """
+    stage = default
     for condition, place in conditions:
         stage = where(condition, 0 * stage + place, stage)
     return stage
 
 
-def closeness(points: Array, goals: Array, *, half: float = 0.1) -> Array:
-    """Return (N,) in (0, 1]: 1 for points (N, 3) at their goals, 0.5 at a distance of ``half`` metres."""
-    return half / (half + norm(goals - points))
+def nearness(points: Array, goals: Array, *, half_distance: float = 0.1) -> Array:
+    """Return the nearness (N,) in (0, 1] of points to goals (N, 3): 1 at the goal, 0.5 at ``half_distance`` m."""
+    return half_distance / (half_distance + norm(goals - points))
 
 
-def progress_fraction(value: Array, start: Array | float, by: float) -> Array:
-    """Return (N,) in [0, 1]: change of a value (N,) since its start, as a fraction of the change ``by``."""
-    return clamp((value - start) / by, 0.0, 1.0)
+def change_fraction(value: Array, start: Array | float, full_change: float) -> Array:
+    """Return (``value`` - ``start``) / ``full_change``, clipped to [0, 1], for values (N,)."""
+    return clamp((value - start) / full_change, 0.0, 1.0)
 
 
-def clear_fraction(hidden_fraction: Array, obstacles: Array) -> Array:
-    """Return (N,) in [0, 1]: 1 for a cleared target, less with hidden fraction (N,) and obstacles (N,)."""
+def clear_fraction(hidden_fraction: Array, obstacle_count: Array) -> Array:
+    """Return (N,) in [0, 1]: 1 for a cleared target, less for a greater hidden fraction (N,) or more obstacles (N,)."""
     hidden = clamp((hidden_fraction - MAX_HIDDEN_FRACTION) / (1 - MAX_HIDDEN_FRACTION), 0.0, 1.0)
-    around = clamp((as_float(obstacles) - MAX_OBSTACLES) / _MANY_OBSTACLES, 0.0, 1.0)
+    around = clamp((as_float(obstacle_count) - MAX_OBSTACLES) / _MANY_OBSTACLES, 0.0, 1.0)
     return 1 - (hidden + around) / 2
 
 
 def release_fraction(held: Array, touched: Array) -> Array:
-    """Return (N,): 0 while the gripper holds the target, 0.5 while it only touches it, 1 without contact."""
+    """Return (N,): 0 if the gripper holds the target, 0.5 if it only touches the target, 1 without contact."""
     return 1 - (as_float(held) + as_float(held | touched)) / 2
 
 
 def stillness(linear_velocity: Array, angular_velocity: Array) -> Array:
-    """Return (N,) in [0, 1]: 1 at rest, 0 at velocities (N, 3) of at least 0.3 m/s or 5 rad/s."""
+    """Return (N,) in [0, 1] from velocities (N, 3) in m/s and rad/s: 1 at rest, 0 from 0.3 m/s or 5 rad/s."""
     return 1 - clamp(norm(linear_velocity) / 0.3 + norm(angular_velocity) / 5.0, 0.0, 1.0)
 
 
-def count_fraction(count: Array) -> Array:
-    """Return (N,) in [0, 1]: a count (N,) divided by 3, at most 1."""
-    return clamp(as_float(count) / 3, 0.0, 1.0)
+def disturbed_fraction(disturbed_count: Array) -> Array:
+    """Return (N,) in [0, 1]: a third per disturbed object (N,), at most 1."""
+    return clamp(as_float(disturbed_count) / 3, 0.0, 1.0)
 
 
-def shift_fraction(position: Array, position_before: Array) -> Array:
-    """Return (N,) in [0, 1]: shift of a body at (N, 3), relative to the 0.1 m that a basket may be moved."""
-    return clamp(norm(position - position_before) / BASKET_SHIFT, 0.0, 1.0)
+def basket_shift_fraction(position: Array, start_position: Array) -> Array:
+    """Return (N,) in [0, 1]: shift of the basket (N, 3), as a fraction of the allowed 0.1 m."""
+    return clamp(norm(position - start_position) / BASKET_SHIFT, 0.0, 1.0)
 
 
-def action_rate(action: Array, before: Array) -> Array:
-    """Return (N,) in [0, 1]: half the mean change of an action's components (N, A) since the last action."""
-    return clamp(abs(action - before).mean(-1) / 2.0, 0.0, 1.0)
+def action_rate(action: Array, last_action: Array) -> Array:
+    """Return (N,) in [0, 1]: half the mean absolute change of the components of actions (N, A) in [-1, 1]."""
+    return clamp(abs(action - last_action).mean(-1) / 2.0, 0.0, 1.0)
 
 
 class DenseReward:
-    """The dense reward of an environment, with the last action and reward.
+    """Dense reward of an environment; stores the last action and the last normalized reward.
+
+    Args:
+        table: reward table of the task.
+        num_envs: N.
+        device: device of the envs.
 
     Attributes:
-        last_action: (N, A) last action since the reset, NaN: none; None before the first action.
-        last_level: (N,) last normalized reward since the reset in the mode ``progress``, NaN: none; None before the
-            first reward.
+        last_action: (N, A) last action of each env, NaN directly after its reset; None before the first action.
+        last_normalized_reward: (N,) last normalized reward of each env in the mode ``progress``, NaN directly after its
+            reset; None before the first reward.
     """
 
     def __init__(self, table: RewardTable, num_envs: int, device: torch.device) -> None:
         self._table, self._num_envs, self._device = table, num_envs, device
         self.last_action: torch.Tensor | None = None
-        self.last_level: torch.Tensor | None = None
+        self.last_normalized_reward: torch.Tensor | None = None
 
     def reset(self, envs: Any) -> None:
-        for last in (self.last_action, self.last_level):
+        """Forget the last action and the last reward of some envs."""
+        for last in (self.last_action, self.last_normalized_reward):
             if last is not None:
                 last[envs] = torch.nan
 
     def store_action(self, action: Any) -> None:
+        """Store an action (N, A) as the last action."""
         self.last_action = torch.as_tensor(action, device=self._device).reshape(self._num_envs, -1).clone()
 
-    def increase(self, level: torch.Tensor) -> torch.Tensor:
-        """Return the change of a reward (N,) since the last step; 0 in the first step."""
-        before = level if self.last_level is None else self.last_level
-        self.last_level = level.clone()
-        return (level - before).nan_to_num()
+    def change_since_last_step(self, normalized_reward: torch.Tensor) -> torch.Tensor:
+        """Return the change (N,) of the normalized reward (N,) since the last step; 0 in the first step."""
+        last = normalized_reward if self.last_normalized_reward is None else self.last_normalized_reward
+        self.last_normalized_reward = normalized_reward.clone()
+        return (normalized_reward - last).nan_to_num()
 
     def compute(
-        self, progress: tuple[Array, dict[str, Array]], penalties: dict[str, Array], action: Any, info: dict[str, Any]
+        self,
+        stage_and_terms: tuple[Array, dict[str, Array]],
+        penalties: dict[str, Array],
+        action: Any,
+        info: dict[str, Any],
     ) -> torch.Tensor:
-        """Return the reward (N,) in [0, ``table.total``], and add ``reward_terms`` to the info.
+        """Return the dense reward (N,) in [0, ``table.total``], and add ``reward_terms`` to the info.
 
         Args:
-            progress: stages and terms, see `Goal.progress`.
-            penalties: values (N,) in [0, 1] by name, native (`arrays`); ``action_rate`` is added to them.
-            action: action of this step.
-            info: info of this step, from `RoboCASEnv.evaluate`.
+            stage_and_terms: reward stages (N,) and terms by name, as returned by `Goal.stage_and_terms`.
+            penalties: values (N,) in [0, 1] by name; this method adds ``action_rate``.
+            action: action (N, A) of this step, or None.
+            info: info of this step, with ``success`` and ``fail``.
         """
-        stage, found = progress
+        stage, found = stage_and_terms
         penalties = {**penalties, "action_rate": self._action_rate(action)}
         penalties = {name: penalties[name] for name in self._table.penalties}
         stage = where(to_native(info["success"]), 0 * stage + len(self._table.stages), stage)
@@ -185,8 +204,8 @@ class DenseReward:
         return as_tensor(reward * ~to_native(info["fail"]))
 
     def _action_rate(self, action: Any) -> Array:
-        before = self.last_action
-        if action is None or before is None or before.shape[-1] != action.shape[-1]:
+        last = self.last_action
+        if action is None or last is None or last.shape[-1] != action.shape[-1]:
             return to_native(torch.zeros(self._num_envs, device=self._device))
         action = torch.as_tensor(action, device=self._device).reshape(self._num_envs, -1)
-        return action_rate(to_native(action), to_native(torch.where(before.isnan(), action, before)))
+        return action_rate(to_native(action), to_native(torch.where(last.isnan(), action, last)))

@@ -10,18 +10,19 @@ from robocas_ms3.scenes.config import TaskConfig, load_config_for
 from robocas_ms3.scenes.task_specs import TASKS
 
 CONTROL_FREQ = 5  # Hz, the rate for which `pd_ee_delta_pose` is scaled
-DRIVING_SECONDS = 30  # additional time if the base drives
+DRIVING_SECONDS = 30  # added to the horizon if the base may drive
 
 
 def rl_kwargs(task: str, config: str | Path | dict | TaskConfig | None = None) -> dict[str, Any]:
-    """Return arguments of ``gym.make`` and `make_vec` for training: states, dense rewards, 5 Hz.
+    """Return arguments of ``gym.make`` and `make_vec` for reinforcement learning from states at 5 Hz.
 
-    ``max_episode_steps`` is long enough for a demonstration (docs/rl.md). If the base may drive (``base_motion``),
-    actions include the base, and the horizon is longer.
+    The rewards are ``normalized_dense``, and actions are ``pd_ee_delta_pose``. ``max_episode_steps`` is long enough for
+    a demonstration (docs/rl.md). If the configuration has ``base_motion``, actions include the base, and
+    ``max_episode_steps`` is greater.
 
     Args:
-        task: name of the task, ``pick``, or of its environment, ``RoboCASPick-v1``.
-        config: task configuration; None: the task's default configuration.
+        task: name of the task, such as ``pick``, or gymnasium id of its environment, such as ``RoboCASPick-v1``.
+        config: name, path or content of a task configuration; None: the task's default configuration.
 
     Raises:
         ConfigError: the task or configuration does not exist, or they don't belong together.

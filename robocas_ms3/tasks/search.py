@@ -1,4 +1,4 @@
-"""RoboCASSearch-v1: find a hidden object in a heap, clear what covers it, drop it into the basket."""
+"""RoboCASSearch-v1: find a hidden object in a heap, move the obstacles away, and put it into the basket."""
 
 from __future__ import annotations
 
@@ -13,25 +13,28 @@ from robocas_ms3.scenes.targets import selection_camera
 from robocas_ms3.scenes.task_specs import SEARCH
 from robocas_ms3.tasks import occlusion, rewards, terms
 from robocas_ms3.tasks.base import STAGES, RoboCASEnv
-from robocas_ms3.tasks.rewards import DENSE
+from robocas_ms3.tasks.rewards import DENSE_MODES
 
 # Points per object. Hidden fractions differ from ray casting by 0.03 on average and 0.08 at the 95th percentile.
 _POINTS = 512
-MEASUREMENTS_PER_SECOND = 5  # measurements of the clutter
-ENVS_AT_ONCE = 512  # envs per measurement of the clutter: 0.25 GB with 15 objects each
+MEASUREMENTS_PER_SECOND = 5  # of the clutter around the target
+ENVS_AT_ONCE = 512  # envs whose clutter is measured in one tensor operation: 0.25 GB with 15 objects per env
 
 
 class RoboCASSearchEnv(RoboCASEnv):
-    """Find a partly hidden object in a heap and put it into the basket.
+    """Find a partly hidden object in a heap, and put it into the basket.
 
-    With ``target.max_visible_share``, the target's visible fraction p_vis from above is below this limit at the start.
+    At the start, the visible fraction of the target, seen from above, is below ``target.max_visible_share`` of the task
+    configuration, if this is set.
 
-    The additional stage ``obstacles_cleared`` means: seen from above, at most a fifth of the target is hidden, and at
-    most one other object sticks out next to it (`occlusion.clutter`). It is measured five times per second until the
-    gripper has held the target, so pulling the target out from under the heap does not reach this stage.
+    The additional stage ``obstacles_cleared`` is reached when, seen from above, at most 20 % of the target is hidden
+    and at most one obstacle is next to it (`occlusion.Clutter`). This is measured five times per second until the
+    gripper has held the target. So a policy that pulls the target out from under the heap does not reach the stage.
 
-    ``cleared_at_reset`` (N,) bool tells whether the target was clear at the start of the episode; then the stage is no
-    achievement of the policy.
+    ``info["cleared_at_reset"]`` (N,) bool reports whether the stage was already reached at the start of the episode.
+
+    Attributes:
+        hidden_fraction: (N,) last measured hidden fraction of the target.
     """
 
     SPEC = SEARCH
@@ -40,14 +43,14 @@ class RoboCASSearchEnv(RoboCASEnv):
 
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
-        points = [[_sample(asset.annotations.surface_points) for asset in row] for row in self.object_assets]
+        points = [[_sample_points(asset.annotations.surface_points) for asset in row] for row in self.object_assets]
         columns = np.ascontiguousarray(np.array(points).swapaxes(-1, -2))
         self._surface_points = torch.as_tensor(columns, dtype=torch.float32, device=self.device)
         self._radii = torch.linalg.vector_norm(self._surface_points, dim=-2).amax(dim=-1)
         eye = selection_camera(self.model).pose[:3, 3]
         self._eye = torch.as_tensor(eye, dtype=torch.float32, device=self.device)
         self._schedule = PeriodicSchedule(self.num_envs, self._measure_period, self.device)
-        self._measured: _Measured | None = None
+        self._last_measurement: _Measurement | None = None
         flags = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self._cleared_at_reset, self._measure_now, self._just_reset = flags, flags.clone(), flags.clone()
         self.hidden_fraction = torch.zeros(self.num_envs, device=self.device)
@@ -56,23 +59,23 @@ class RoboCASSearchEnv(RoboCASEnv):
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
-        self._measured = None
+        self._last_measurement = None
         self._schedule.reset(env_idx.cpu().numpy())
         self._just_reset[env_idx] = True
         self._measure_now[env_idx] = True
 
     def extra_state(self) -> dict:
-        """Return the extra state of `RoboCASEnv`, ``cleared_at_reset`` (N, 1) and ``hidden_fraction`` (N, 1)."""
+        """Return the extra state of `RoboCASEnv` with ``cleared_at_reset`` and ``hidden_fraction``, (N, 1) each."""
         state = super().extra_state()
         own = {"cleared_at_reset": self._cleared_at_reset, "hidden_fraction": self.hidden_fraction}
         return {**state, "task": {**state["task"], **{name: value[:, None].clone() for name, value in own.items()}}}
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
-        """Set the state; see `RoboCASEnv`. A heap that is not cleared is measured in the next step."""
+        """Set the state of some envs; see `RoboCASEnv.set_state_dict`. Their clutter is measured in the next step."""
         super().set_state_dict(state, env_idx)
         envs = slice(None) if env_idx is None else env_idx
-        self._schedule.every_step(slice(None) if env_idx is None else env_idx.cpu().numpy())
-        self._measured = None  # otherwise later results would depend on the state before
+        self._schedule.make_always_due(slice(None) if env_idx is None else env_idx.cpu().numpy())
+        self._last_measurement = None  # otherwise later results would depend on the state before
         self._just_reset[envs], self._measure_now[envs] = False, True
         self._cleared_at_reset = self._cleared_at_reset.clone()  # earlier infos refer to the old tensor
         own = {"cleared_at_reset": self._cleared_at_reset, "hidden_fraction": self.hidden_fraction}
@@ -80,30 +83,32 @@ class RoboCASSearchEnv(RoboCASEnv):
             if name in own:
                 own[name][envs] = torch.as_tensor(value).to(own[name]).reshape(-1)
 
-    def clutter(self, envs: Any = slice(None)) -> occlusion.Clutter:
-        """Return the current `occlusion.Clutter` around the targets of some envs."""
-        points = occlusion.surface_points(self.object_states[envs, :, :7], self._surface_points[envs])
-        return occlusion.clutter(points, self.present[envs], self.target_slot[envs], self._eye)
+    def measure_clutter(self, envs: Any = slice(None)) -> occlusion.Clutter:
+        """Measure the current clutter around the targets of some envs; default: all envs."""
+        points = occlusion.surface_points_in_world(self.object_states[envs, :, :7], self._surface_points[envs])
+        return occlusion.measure_clutter(points, self.present[envs], self.target_slot[envs], self._eye)
 
     def pairwise_occlusion(self, envs: Any = slice(None)) -> torch.Tensor:
-        """Return (E, K, K) the fraction of each object (column) that each other object (row) hides."""
-        points = occlusion.surface_points(self.object_states[envs, :, :7], self._surface_points[envs])
+        """Return fractions (E, K, K) for some envs: entry [e, i, j] is the fraction of object j that object i hides."""
+        points = occlusion.surface_points_in_world(self.object_states[envs, :, :7], self._surface_points[envs])
         return occlusion.pairwise_occlusion(points, self.present[envs], self._eye)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Return the result of `RoboCASEnv.evaluate`, ``obstacles_cleared`` and ``cleared_at_reset``."""
-        found, measured = super().evaluate(), self._measured
+        """Return the result of `RoboCASEnv.evaluate`, ``obstacles_cleared`` and ``cleared_at_reset``, (N,) bool."""
+        found, measured = super().evaluate(), self._last_measurement
         unchanged = (
-            measured is not None and measured.others is not None and measured.others == self.bodies.state_except_robot
+            measured is not None
+            and measured.state_except_robot is not None
+            and measured.state_except_robot == self.bodies.state_except_robot
         )
-        if not unchanged and not known_all_false(due := self._due()):
+        if not unchanged and not known_all_false(due := self._is_due()):
             state = self.success_check.state
             in_heap = (
-                terms.select_target(state.objects[..., 2], to_native(self.target_slot))
+                terms.select_target(state.object_states[..., 2], to_native(self.target_slot))
                 > self.success_check.fallen_below
             )
-            cleared = to_native(self._measure(as_tensor(due), as_tensor(state.objects[..., :7])))
-            found["obstacles_cleared"] = self.success_check.reach("obstacles_cleared", cleared & in_heap & due)
+            cleared = to_native(self._measure_due_envs(as_tensor(due), as_tensor(state.object_states[..., :7])))
+            found["obstacles_cleared"] = self.success_check.mark_reached("obstacles_cleared", cleared & in_heap & due)
         cleared_at_reset = torch.where(self._just_reset, found["obstacles_cleared"], self._cleared_at_reset)
         self._cleared_at_reset, self._just_reset = cleared_at_reset, torch.zeros_like(self._just_reset)
         return {**found, "cleared_at_reset": cleared_at_reset}
@@ -117,83 +122,89 @@ class RoboCASSearchEnv(RoboCASEnv):
         """Number of control steps between two measurements of the clutter."""
         return max(1, self.control_freq // MEASUREMENTS_PER_SECOND)
 
-    def _due(self) -> Array:
-        """Return (N,) bool, native: in which envs the clutter is measured in this step."""
+    def _is_due(self) -> Array:
+        """Return (N,) bool, native: whether the clutter of each env is measured in this step."""
         stages = self.success_check.stages
         settled = stages["target_grasped"] | stages["obstacles_cleared"]
         return ((to_native(self.elapsed_steps) % self._measure_period == 0) | to_native(self._measure_now)) & ~settled
 
-    def _measure(self, due: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
-        """Measure the clutter of the due envs, store it, and return (N,) bool: which targets are cleared.
+    def _measure_due_envs(self, due: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
+        """Measure and store the clutter of the due envs; return (N,) bool, whether each due target is cleared.
 
         Args:
-            due: (N,) bool, in which envs to measure.
-            poses: (N, K, 7) object poses.
+            due: (N,) bool, whether the clutter of each env is measured.
+            poses: (N, K, 7) world poses of the objects.
         """
-        others, measured = self.bodies.state_except_robot, self._measured
+        others, measured = self.bodies.state_except_robot, self._last_measurement
         if others is not None and measured is not None:  # on a CPU, motion is detected by comparing states
-            still = measured.others == others or not self._moved(poses, measured.poses)
-            if still:
-                self._measured = measured._replace(others=others)
+            unchanged = measured.state_except_robot == others or not self._has_clutter_moved(poses, measured.poses)
+            if unchanged:
+                self._last_measurement = measured._replace(state_except_robot=others)
                 return measured.cleared
         cleared = torch.zeros_like(due)
         # on a GPU more envs than necessary are measured, since selecting them would synchronise
-        envs_to_measure = self._schedule.due() if self.gpu_sim_enabled else due.nonzero()[:, 0]
+        envs_to_measure = self._schedule.due_envs() if self.gpu_sim_enabled else due.nonzero()[:, 0]
         for envs in envs_to_measure.split(ENVS_AT_ONCE):
-            found, taken = self.clutter(envs), due[envs]
-            cleared[envs] = found.cleared & taken
+            found, taken = self.measure_clutter(envs), due[envs]
+            cleared[envs] = found.is_target_cleared & taken
             self.hidden_fraction[envs] = torch.where(taken, found.hidden_fraction, self.hidden_fraction[envs])
             self._obstacles[envs] = torch.where(taken[:, None], found.obstacles, self._obstacles[envs])
-            if self._reward_mode in DENSE:
-                points = occlusion.surface_points(poses[envs], self._surface_points[envs])
+            if self._reward_mode in DENSE_MODES:
+                points = occlusion.surface_points_in_world(poses[envs], self._surface_points[envs])
                 push_point = occlusion.push_point(points, found.obstacles, self.target_slot[envs])
                 self._push_point[envs] = torch.where(taken[:, None], push_point, self._push_point[envs])
-        self._measured, self._measure_now = _Measured(others, poses, cleared), self._measure_now & ~due
+        self._last_measurement, self._measure_now = _Measurement(others, poses, cleared), self._measure_now & ~due
         return cleared
 
-    def _moved(self, poses: torch.Tensor, before: torch.Tensor) -> bool:
-        return bool(occlusion.has_moved_near(poses, before, self._radii, self.target_slot, self._eye).any())
+    def _has_clutter_moved(self, poses: torch.Tensor, earlier_poses: torch.Tensor) -> bool:
+        return bool(occlusion.has_clutter_moved(poses, earlier_poses, self._radii, self.target_slot, self._eye).any())
 
-    def reward_progress(self) -> tuple[Array, dict[str, Array]]:
-        """Return stage and terms; the stage ``clear`` lasts until the target is cleared or held."""
-        stage, found = super().reward_progress()
+    def reward_stage_and_terms(self) -> tuple[Array, dict[str, Array]]:
+        """Return reward stage and terms of each env; the stage ``clear`` lasts until the target is cleared or held."""
+        stage, found = super().reward_stage_and_terms()
         stages = self.success_check.stages
         settled = stages["obstacles_cleared"] | stages["target_grasped"]
-        covered = (stage == self.REWARDS.index("grasp")) & ~settled
+        covered = (stage == self.REWARDS.stage_index("grasp")) & ~settled
         if not known_all_false(covered):
-            found["push_point"] = rewards.closeness(self.tcp_in_world()[:, :3], to_native(self._push_point))
+            found["push_point"] = rewards.nearness(self.tcp_in_world()[:, :3], to_native(self._push_point))
             found["clear"] = rewards.clear_fraction(
                 to_native(self.hidden_fraction), to_native(self._obstacles.sum(dim=1))
             )
-            stage = rewards.furthest_stage(stage, [(covered, self.REWARDS.index("clear"))])
+            stage = rewards.furthest_stage(stage, [(covered, self.REWARDS.stage_index("clear"))])
         return stage, found
 
     def privileged_observations(self) -> dict[str, torch.Tensor]:
-        """Return those of `RoboCASEnv`, and the last measured ``hidden_fraction`` (N, 1)."""
+        """Return the observations of `RoboCASEnv`, and the last measured ``hidden_fraction`` (N, 1)."""
         return {**super().privileged_observations(), "hidden_fraction": self.hidden_fraction[:, None].clone()}
 
 
-class _Measured(NamedTuple):
-    """The last measurement of the clutter.
+class _Measurement(NamedTuple):
+    """Measurement of the clutter.
 
     Attributes:
-        others: `Bodies.state_except_robot` at the measurement.
-        poses: (N, K, 7) object poses at the measurement.
+        state_except_robot: `Bodies.state_except_robot` at the measurement.
+        poses: (N, K, 7) world poses of the objects at the measurement.
         cleared: (N,) bool, whether the target was cleared.
     """
 
-    others: object
+    state_except_robot: object
     poses: torch.Tensor
     cleared: torch.Tensor
 
 
-def _sample(points: np.ndarray) -> np.ndarray:
-    """Return ``_POINTS`` of points (P, 3) at even index distances; points repeat if P is smaller."""
+def _sample_points(points: np.ndarray) -> np.ndarray:
+    """Return ``_POINTS`` points with evenly spaced indices from points (P, 3); points repeat if P is smaller."""
     return points[np.linspace(0, len(points) - 1, _POINTS).round().astype(int)]
 
 
 class PeriodicSchedule:
-    """A schedule that is due once per period of control steps, counted from each env's reset."""
+    """Schedule of a measurement that is due in an env before its first step and then once per period.
+
+    Args:
+        num_envs: N.
+        period: number of control steps.
+        device: device of the envs.
+    """
 
     def __init__(self, num_envs: int, period: int, device: torch.device | str) -> None:
         self._period, self._device = period, device
@@ -203,20 +214,21 @@ class PeriodicSchedule:
         self._indices: list[torch.Tensor] = []  # by `_step` modulo the period; empty: to be made
 
     def reset(self, envs: NDArray[np.int64]) -> None:
-        """Restart the schedule of some envs (E,): they are due before their first step, then once per period."""
+        """Restart the schedule of some envs (E,), which have just been reset."""
         self._reset_at[envs], self._always[envs] = self._step, False
         self._indices = []
 
-    def every_step(self, envs: NDArray[np.int64] | slice) -> None:
+    def make_always_due(self, envs: NDArray[np.int64] | slice) -> None:
         """Make some envs due in every step until their next reset."""
         self._always[envs] = True
         self._indices = []
 
     def advance(self) -> None:
+        """Go to the next control step."""
         self._step += 1
 
-    def due(self) -> torch.Tensor:
-        """Return the int64 indices (D,) of the envs that are due in the current step."""
+    def due_envs(self) -> torch.Tensor:
+        """Return the indices (D,) int64 of the envs that are due in the current control step."""
         if not self._indices:  # for all phases at once, since a copy to the GPU within a step would synchronise
             phases = np.arange(self._period)[:, None]
             due = ((phases - self._reset_at) % self._period == 0) | self._always

@@ -1,4 +1,4 @@
-"""RoboCASSelect-v1: grasp one of several identical objects, named by its position."""
+"""RoboCASSelect-v1: pick one of several identical objects, which the instruction names by its position."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from robocas_ms3.tasks.base import RoboCASEnv
 
 
 class RoboCASSelectEnv(RoboCASEnv):
-    """Pick one of several identical objects by a relation, e.g. "the nearest soap", seen from the robot.
+    """Pick one of several identical objects by a relation as seen from the robot, such as "the nearest soap".
 
-    The relation is clear by at least 3 cm to every other object of the name. For success, no other object of the name
-    may be in the basket.
+    In the compared distance, the target differs by at least 3 cm from every other object with its name. For success, no
+    other object with its name may be in the basket.
     """
 
     SPEC = SELECT
@@ -25,18 +25,18 @@ class RoboCASSelectEnv(RoboCASEnv):
         self._kinds = torch.tensor([[row.index(name) for name in row] for row in names], device=self.device)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Return the result of `RoboCASEnv.evaluate`; ``success`` requires ``others_out`` too."""
+        """Return the result of `RoboCASEnv.evaluate`; ``success`` has the additional condition ``others_out``."""
         found = super().evaluate()
-        return {**found, "success": found["success"] & self._others_out()}
+        return {**found, "success": found["success"] & self._is_no_other_in_basket()}
 
     def success_conditions(self) -> dict[str, torch.Tensor]:
-        """Return those of `RoboCASEnv`, and ``others_out``: no other object of the name is in the basket."""
-        return {**super().success_conditions(), "others_out": self._others_out()}
+        """Return the conditions of `RoboCASEnv` and ``others_out``: no other object of the name is in the basket."""
+        return {**super().success_conditions(), "others_out": self._is_no_other_in_basket()}
 
-    def _others_out(self) -> torch.Tensor:
-        """Return (N,) bool, whether no other object of the target's name is in the basket."""
+    def _is_no_other_in_basket(self) -> torch.Tensor:
+        """Return (N,) bool, whether no other object with the target's name is in the basket."""
         inside = self.goal.is_at_goal(
-            self.success_check.centers(to_native(self.object_states)), to_native(self.basket_pose)
+            self.success_check.centers_of_mass(to_native(self.object_states)), to_native(self.basket_pose)
         )
-        others_in = terms.is_any_other_of_kind(inside, to_native(self._kinds), to_native(self.target_slot))
+        others_in = terms.has_other_of_kind(inside, to_native(self._kinds), to_native(self.target_slot))
         return as_tensor(~others_in)

@@ -21,19 +21,19 @@ from robocas_ms3.tasks.goals import TaskState
 class SuccessCheck:
     """Check of stages, success and failure of all envs; stores the stages reached since the reset.
 
-    On a CPU, the last result is reused while no object moves or touches the gripper.
+    On a CPU, the last result is reused while no object moves and no object touches the gripper.
 
     Args:
-        env: the `base.RoboCASEnv` with a loaded scene.
-        stages: names of the stages, in the order of recorded states.
+        env: the `base.RoboCASEnv`, with a loaded scene.
+        stages: names of the stages, in the order in which states store them.
 
     Attributes:
-        reached: (stages, N) bool, stages reached since the reset.
-        stages: rows of ``reached`` by name; views, native (`arrays`).
-        state: the `TaskState` of the last check; the same object while nothing changes.
-        target_extents: (N, 3) m, size of the target.
-        surface: height of the surface on which objects stand, m.
-        fallen_below: height below which an object counts as fallen off the surface, m.
+        reached: (stages, N) bool, whether each stage was reached since the reset.
+        stages: (N,) rows of ``reached`` by stage name; views, native arrays (`core.arrays`).
+        state: `TaskState` of the last check; a new object only if the result was computed again.
+        target_extents: (N, 3) size of the target's bounding box in its own frame, m.
+        surface: height of the surface on which objects stand, world frame, m.
+        fallen_below: height below which an object counts as fallen off the surface, world frame, m.
     """
 
     state: TaskState
@@ -56,48 +56,54 @@ class SuccessCheck:
         self.fallen_below = self.surface - terms.FALLEN
 
     def reset(self, envs: torch.Tensor) -> None:
-        """Clear the stages of some envs (E,), and update their targets."""
+        """Start an episode in envs (E,): no stage is reached, and the target may be another object."""
         self.reached[:, envs] = False
         self.target_extents = self._extents[torch.arange(len(self._extents), device=envs.device), self._env.target_slot]
         self._last = None
 
-    def restore(self, reached: Any, envs: Any) -> None:
-        """Set the reached stages (E, stages) of some envs; None leaves them unchanged."""
+    def restore_stages(self, reached: Any, envs: Any) -> None:
+        """Set the reached stages (E, stages) bool of some envs, from a state; None leaves them unchanged."""
         if reached is not None:
             reached = torch.as_tensor(reached, dtype=torch.bool, device=self.reached.device)
             self.reached[:, envs] = reached.reshape(-1, len(self.reached)).T
         self._last = None
 
-    def reach(self, stage: str, now: Array) -> torch.Tensor:
-        """Mark a stage as reached in envs (N,) bool, native; return (N,) bool, where it was reached."""
+    def mark_reached(self, stage: str, is_reached: Array) -> torch.Tensor:
+        """Mark a stage as reached where ``is_reached`` (N,) is true; return (N,) bool, reached since the reset."""
         row = self.stages[stage]
-        row |= now
+        row |= is_reached
         return as_tensor(row).clone()
 
     def check(self) -> dict[str, torch.Tensor]:
-        """Return stages, ``success`` and ``fail`` (N,) bool and ``disturbed`` (N,) int; read only."""
+        """Return the current stages, ``success`` and ``fail`` (N,) bool, and ``disturbed`` (N,) int; read only."""
         env = self._env
         state = env.bodies.read()
         forces = env.gripper_contacts.forces(env.bodies.state_except_robot)
-        depends_on = self._dependencies(forces)
+        depends_on = self._reuse_key(forces)
         if self._last is not None and depends_on is not None and self._last[0] == depends_on:
             return dict(self._last[1])
         # directly after a reset the engine still reports the contacts of the last episode
         forces = forces * to_native(env.elapsed_steps > 0)[:, None, None, None]
-        found = self._check(forces, *self._objects_and_basket(state))
-        self._last = self._dependencies(forces), found
+        found = self._compute_result(forces, *self._objects_and_basket(state))
+        self._last = self._reuse_key(forces), found
         return dict(found)
 
-    def _dependencies(self, forces: Array) -> object:
-        """Return a key of the next result, for reuse; None: unknown (GPU, or contact of the gripper)."""
+    def _reuse_key(self, forces: Array) -> object:
+        """Return a value on which the result depends; None if it can't be reused (GPU, or contact of the gripper)."""
         others = self._env.bodies.state_except_robot
         return None if others is None or forces.any() else (others, self.reached.numpy().tobytes())
 
-    def _check(self, forces: Array, objects: Array, basket: Array | None) -> dict[str, torch.Tensor]:
-        """Check native forces (N, 3, K, 3), object states (N, K, 13) and basket pose (N, 7) or None."""
+    def _compute_result(self, forces: Array, objects: Array, basket: Array | None) -> dict[str, torch.Tensor]:
+        """Compute the result of `check`, and set `state`; all arguments are native arrays.
+
+        Args:
+            forces: (N, 3, K, 3) force of each object on left finger, right finger and hand; newtons, world frame.
+            objects: (N, K, 13) states of the objects.
+            basket: (N, 7) pose of the basket, or None.
+        """
         env = self._env
         slot, goal = to_native(env.target_slot), env.goal
-        grasped, touched = self.grasped(forces), terms.is_touched(forces)
+        grasped, touched = self.is_object_grasped(forces), terms.is_touched(forces)
         lifted = terms.is_lifted(objects[..., 2], to_native(env.start_poses)[..., 2], grasped)
         conditions = self._conditions(touched, objects, basket)
         held = terms.select_target(grasped, slot)
@@ -111,30 +117,31 @@ class SuccessCheck:
         }
         for stage, flags in now.items():
             if stage in self.stages:
-                self.reach(stage, flags)
+                self.mark_reached(stage, flags)
         success = reduce(and_, conditions.values())
         if goal.REQUIRES_LIFT:
             success = self.stages["target_lifted"] & success
         fail = self._has_failed(conditions, objects, basket)
         stages = dict(zip(self.stages, self.reached.clone(), strict=True))
-        disturbed = self._disturbed(objects[..., :7])
+        disturbed = self._is_disturbed(objects[..., :7])
         self.state = TaskState(objects, basket, held, now["reached_target"], conditions[goal.NAME], disturbed, forces)
         flags = {"success": as_tensor(success), "fail": as_tensor(fail)}
         return {**stages, **flags, "disturbed": as_tensor(disturbed.sum(1))}
 
-    def centers(self, objects: Array) -> Array:
-        """Return the centres of mass (N, K, 3) of the objects in the world, from their states (N, K, 13)."""
-        return objects[..., :3] + rotations.rotate(objects[..., 3:7], self._centers_of_mass)
+    def centers_of_mass(self, object_states: Array) -> Array:
+        """Return the centres of mass (N, K, 3) of the objects, world frame, from their states (N, K, 13)."""
+        return object_states[..., :3] + rotations.rotate(object_states[..., 3:7], self._centers_of_mass)
 
-    def target_center(self, objects: Array) -> Array:
-        """Return the target's centre of mass (N, 3) in the world, from the objects' states (N, K, 13)."""
+    def target_center(self, object_states: Array) -> Array:
+        """Return the target's centre of mass (N, 3), world frame, from the states (N, K, 13) of all objects."""
         slot = to_native(self._env.target_slot)
-        target, center = terms.select_target(objects, slot), terms.select_target(self._centers_of_mass, slot)
+        target = terms.select_target(object_states, slot)
+        center = terms.select_target(self._centers_of_mass, slot)
         return target[:, :3] + rotations.rotate(target[:, 3:7], center)
 
-    def grasped(self, forces: Array) -> Array:
-        """Return (N, K) which objects both fingers hold, from forces (N, 3, K, 3) in N on the gripper; native."""
-        pressed = terms.is_pressed(forces[:, 0], forces[:, 1])
+    def is_object_grasped(self, forces: Array) -> Array:
+        """Return (N, K) bool, whether both fingers hold each object, from the gripper forces (N, 3, K, 3); native."""
+        pressed = terms.presses_both_fingers(forces[:, 0], forces[:, 1])
         if known_all_false(pressed):  # the usual case: the directions need not be checked
             return pressed
         finger = link_poses(self._env.scene, [self._env.agent.finger1_link])[:, 0]
@@ -143,18 +150,18 @@ class SuccessCheck:
         return terms.is_grasped(forces[:, 0], forces[:, 1], opening)
 
     def success_conditions(self) -> dict[str, torch.Tensor]:
-        """Return the simultaneous conditions of success in addition to the lift, (N,) bool each."""
+        """Return the success conditions that must hold at the same time, by name, (N,) bool each; without the lift."""
         touched = terms.is_touched(self._env.gripper_contacts.forces())
         found = self._conditions(touched, *self._objects_and_basket(self._env.bodies.read()))
         return {name: as_tensor(measure) for name, measure in found.items()}
 
     def _objects_and_basket(self, state: torch.Tensor) -> tuple[Array, Array | None]:
-        """Return native object states (N, K, 13) and basket pose (N, 7) or None from the full state."""
-        basket = self._env.bodies.basket(state)
-        return to_native(self._env.bodies.objects(state)), None if basket is None else to_native(basket)
+        """Return native object states (N, K, 13) and basket pose (N, 7), or None, from the flat state (N, D)."""
+        basket = self._env.bodies.basket_pose(state)
+        return to_native(self._env.bodies.object_states(state)), None if basket is None else to_native(basket)
 
     def _conditions(self, touched: Array, objects: Array, basket: Array | None) -> dict[str, Array]:
-        """Return native `success_conditions` from touched objects (N, K), object states and basket pose."""
+        """Return `success_conditions` as native arrays, from touched objects (N, K) bool and the current state."""
         goal, slot = self._env.goal, to_native(self._env.target_slot)
         target = terms.select_target(objects, slot)
         return {
@@ -165,36 +172,37 @@ class SuccessCheck:
         }
 
     def fallen_objects(self) -> Array:
-        """Return (N, K) which other objects have fallen off the surface and not into the goal; native.
+        """Return (N, K) bool, whether each object, except the target, has fallen off the surface; native.
 
-        They are at least 5 cm below the surface in `state`. The fall of the target is ``fail``.
+        In `state` its origin is more than 5 cm below the surface, and it is not at the goal. The fall of the target is
+        ``fail``.
         """
-        env, objects = self._env, self.state.objects
+        env, objects = self._env, self.state.object_states
         low = (objects[..., 2] < self.fallen_below) & to_native(env.present & ~env.is_target)
         if known_all_false(low):  # as nearly always
             return low
-        return low & ~env.goal.is_at_goal(self.centers(objects), self.state.basket)
+        return low & ~env.goal.is_at_goal(self.centers_of_mass(objects), self.state.basket_pose)
 
     def _has_failed(self, conditions: dict[str, Array], objects: Array, basket: Array | None) -> Array:
-        """Return native ``fail`` (N,) from success conditions, object states (N, K, 13) and basket pose."""
+        """Return ``fail`` (N,) bool as a native array: the target has fallen, or the goal can't be reached any more."""
         goal, slot = self._env.goal, to_native(self._env.target_slot)
         height = terms.select_target(objects[..., 2], slot)
-        low, lost = height < self.fallen_below, goal.is_lost(basket, conditions)
+        low, lost = height < self.fallen_below, goal.is_unreachable(basket, conditions)
         if lost is None and known_all_false(low):  # as nearly always
             return low
-        caught = goal.is_over_goal(terms.select_target(objects[..., :3], slot), basket)
+        caught = goal.is_above_goal(terms.select_target(objects[..., :3], slot), basket)
         fell = terms.has_target_fallen(
             height, self.surface, low & False if caught is None else caught, ~conditions["untouched"]
         )
         return fell if lost is None else fell | lost
 
-    def _disturbed(self, poses: Array) -> Array:
-        """Return (N, K) bool, which objects other than the target are disturbed, from poses (N, K, 7)."""
+    def _is_disturbed(self, poses: Array) -> Array:
+        """Return (N, K) bool, whether each object, except the target, is disturbed, from poses (N, K, 7)."""
         env, undo = self._env, None
         support = env.fixtures.furniture[env.task_config.surface.furniture]
         if isinstance(support, Articulation) and env.model.support_link:
             links = [support.links_map[name] for name in (BODY, env.model.support_link)]
             body, part = link_poses(env.scene, links).swapaxes(0, 1)
-            undo = terms.inverse_motion(body, part, self._support_shut)
+            undo = terms.inverse_part_motion(body, part, self._support_shut)
         moved = terms.is_disturbed(poses, to_native(env.start_poses), undo) & to_native(env.present)
         return moved & (arange(moved.shape[1], moved) != to_native(env.target_slot)[:, None])

@@ -1,6 +1,7 @@
-"""Terms of success and stages: pure functions on batched native arrays (`arrays`).
+"""Terms of success and stages: pure functions on batched native arrays (`core.arrays`).
 
-N envs, K object slots; world frame; m, N, m/s; quaternions wxyz. Flags are bool.
+N envs, K object slots. Positions are in m, forces in newtons, velocities in m/s and rad/s, all in the world frame.
+Quaternions are wxyz. Functions whose names begin with ``is`` or ``has`` return bool.
 """
 
 from __future__ import annotations
@@ -21,39 +22,41 @@ FALLEN = 0.05  # m below the surface from which an object counts as fallen off i
 DISTURBED_SHIFT, DISTURBED_TILT = 0.03, 30.0  # m and deg from which an object counts as disturbed
 
 
-def is_inside_box(points: Array, box_position: Array, box_quaternion: Array, low: Array, high: Array) -> Array:
-    """Return (N,) or (N, K) whether points are inside a box that is fixed to a moving frame.
+def is_inside_box(
+    points: Array, box_position: Array, box_quaternion: Array, lower_corner: Array, upper_corner: Array
+) -> Array:
+    """Return whether points are inside a box that is fixed to a moving frame.
 
     Args:
         points: (N, 3) or (N, K, 3).
         box_position: (N, 3) origin of the frame.
         box_quaternion: (N, 4) rotation of the frame.
-        low: (3,) least corner in the frame.
-        high: (3,) greatest corner in the frame.
+        lower_corner: (3,) least coordinates of the box in the frame.
+        upper_corner: (3,) greatest coordinates of the box in the frame.
 
     Returns:
-        (N,) or (N, K).
+        (N,) or (N, K) bool.
     """
     if points.ndim == 3:
         box_position, box_quaternion = box_position[:, None], box_quaternion[:, None]
     local = rotate_inverse(box_quaternion, points - box_position)
-    return ((local >= low) & (local <= high)).all(-1)  # pyright: ignore[reportReturnType]
+    return ((local >= lower_corner) & (local <= upper_corner)).all(-1)  # pyright: ignore[reportReturnType]
 
 
-def is_pressed(left_force: Array, right_force: Array) -> Array:
-    """Return (N, K) which objects press on both fingers in any direction, from forces (N, K, 3)."""
+def presses_both_fingers(left_force: Array, right_force: Array) -> Array:
+    """Return (N, K) bool, whether each object presses on both fingers, in any direction, from forces (N, K, 3)."""
     return (norm(left_force) >= MIN_GRASP_FORCE) & (norm(right_force) >= MIN_GRASP_FORCE)
 
 
-def is_grasped(left_force: Array, right_force: Array, closing_axis: Array) -> Array:
-    """Return (N, K) which objects press on both fingers along their opening directions.
+def is_grasped(left_force: Array, right_force: Array, opening_axis: Array) -> Array:
+    """Return (N, K) bool, whether each object presses both fingers apart.
 
     Args:
         left_force: (N, K, 3) force of each object on the left finger.
-        right_force: (N, K, 3) on the right finger.
-        closing_axis: (N, 3) unit vector of the left finger's opening direction.
+        right_force: (N, K, 3) force of each object on the right finger.
+        opening_axis: (N, 3) unit vector in which the left finger opens; the right finger opens in the other direction.
     """
-    opening = closing_axis[:, None]
+    opening = opening_axis[:, None]
     return _presses(left_force, opening) & _presses(right_force, -opening)
 
 
@@ -64,90 +67,90 @@ def _presses(force: Array, opening: Array) -> Array:
 
 
 def is_touched(forces: Array) -> Array:
-    """Return (N, K) which objects touch any of B bodies, from forces (N, B, K, 3)."""
+    """Return (N, K) bool, whether each object touches any of B bodies, from forces (N, B, K, 3)."""
     return (norm(forces) >= MIN_CONTACT_FORCE).any(1)  # pyright: ignore[reportReturnType]
 
 
 def is_lifted(height: Array, rest_height: Array, grasped: Array) -> Array:
-    """Return (N, K) which objects the gripper holds at least ``LIFT`` above their resting height."""
+    """Return (N, K) bool, whether each object is grasped at least ``LIFT`` above its resting height."""
     return grasped & (height - rest_height >= LIFT)
 
 
 def is_at_rest(linear_velocity: Array, angular_velocity: Array) -> Array:
-    """Return (N,) whether bodies with velocities (N, 3) in m/s and rad/s are at rest."""
+    """Return (N,) bool, whether bodies with velocities (N, 3) in m/s and rad/s are at rest."""
     return (norm(linear_velocity) <= REST_SPEED) & (norm(angular_velocity) <= REST_TURN)
 
 
-def is_basket_standing(position: Array, quaternion: Array, position_before: Array, quaternion_before: Array) -> Array:
-    """Return (N,) whether baskets stand within `BASKET_SHIFT` and `BASKET_TILT` of their start poses."""
-    shift = norm(position - position_before)
-    return (shift <= BASKET_SHIFT) & (_cosine_of_tilt(quaternion, quaternion_before) >= _cosine(BASKET_TILT))
+def is_basket_standing(position: Array, quaternion: Array, start_position: Array, start_quaternion: Array) -> Array:
+    """Return (N,) bool, whether baskets stand within `BASKET_SHIFT` and `BASKET_TILT` of their start poses."""
+    shift = norm(position - start_position)
+    return (shift <= BASKET_SHIFT) & (_cosine_of_tilt(quaternion, start_quaternion) >= _cosine(BASKET_TILT))
 
 
-def has_basket_fallen(position: Array, quaternion: Array, position_before: Array, quaternion_before: Array) -> Array:
-    """Return (N,) whether baskets have fallen: are lower than at the start, or strongly tilted."""
-    dropped = position_before[:, 2] - position[:, 2] > BASKET_DROP
-    return dropped | (_cosine_of_tilt(quaternion, quaternion_before) < _cosine(BASKET_FALL))
+def has_basket_fallen(position: Array, quaternion: Array, start_position: Array, start_quaternion: Array) -> Array:
+    """Return (N,) bool, whether baskets are lower by `BASKET_DROP` or tilted by `BASKET_FALL` since the start."""
+    dropped = start_position[:, 2] - position[:, 2] > BASKET_DROP
+    return dropped | (_cosine_of_tilt(quaternion, start_quaternion) < _cosine(BASKET_FALL))
 
 
 def has_target_fallen(height: Array, surface: float, above_basket: Array, touched: Array) -> Array:
-    """Return (N,) whether targets are below their surface, and neither above the basket nor touched."""
+    """Return (N,) bool, whether targets are below their surface, not above the basket, and not touched."""
     return (height < surface - FALLEN) & ~above_basket & ~touched
 
 
-def select_target(values: Array, target: Array) -> Array:
-    """Return the values (N, ...) of the targets from values per object (N, K, ...), by slots (N,)."""
-    return values[arange(len(target), values), target]
+def select_target(values: Array, target_slot: Array) -> Array:
+    """Return the target's values (N, ...) from the values (N, K, ...) of all objects, by target slot (N,)."""
+    return values[arange(len(target_slot), values), target_slot]
 
 
-def is_any_other_of_kind(marked: Array, kinds: Array, target: Array) -> Array:
-    """Return (N,) whether an object of the target's kind, other than the target, is marked.
+def has_other_of_kind(flags: Array, kinds: Array, target_slot: Array) -> Array:
+    """Return (N,) bool, whether a flag is true for another object of the target's kind.
 
     Args:
-        marked: (N, K) flags.
-        kinds: (N, K) integers that are equal for objects of a kind.
-        target: (N,) slots of the targets.
+        flags: (N, K) bool, one flag per object.
+        kinds: (N, K) integers; objects of the same kind have equal integers.
+        target_slot: (N,) slot of each target.
     """
     slots = arange(kinds.shape[1], kinds)
-    alike = (kinds == select_target(kinds, target)[:, None]) & (slots != target[:, None])
-    return (marked & alike).any(1)  # pyright: ignore[reportReturnType]
+    alike = (kinds == select_target(kinds, target_slot)[:, None]) & (slots != target_slot[:, None])
+    return (flags & alike).any(1)  # pyright: ignore[reportReturnType]
 
 
-def inverse_motion(body: Array, part: Array, part_before: Array) -> tuple[Array, Array]:
-    """Return the motion that brings a part of a body, such as a drawer, back to its start pose.
+def inverse_part_motion(body_pose: Array, part_pose: Array, start_part_in_body: Array) -> tuple[Array, Array]:
+    """Return the motion that brings a moving part, such as a drawer, back to its start pose in its body.
 
     Args:
-        body: (N, 7) pose of the body.
-        part: (N, 7) pose of the part.
-        part_before: (4, 4) start pose of the part in the body's frame.
+        body_pose: (N, 7) world pose of the body, such as a cabinet.
+        part_pose: (N, 7) world pose of the part.
+        start_part_in_body: (4, 4) start pose of the part in the frame of the body.
 
     Returns:
-        Rotation (N, 3, 3), and translation (N, 3) in m, which is applied after the rotation.
+        Rotation (N, 3, 3) and translation (N, 3) in m, in the world frame; the translation is applied last.
     """
-    turned = to_matrix(body[:, 3:])
-    turn = turned @ part_before[:3, :3] @ to_matrix(part[:, 3:]).swapaxes(1, 2)
-    position = body[:, :3] + turned @ part_before[:3, 3]
-    return turn, position - (turn @ part[:, :3, None])[..., 0]
+    body_rotation = to_matrix(body_pose[:, 3:])
+    turn = body_rotation @ start_part_in_body[:3, :3] @ to_matrix(part_pose[:, 3:]).swapaxes(1, 2)
+    position = body_pose[:, :3] + body_rotation @ start_part_in_body[:3, 3]
+    return turn, position - (turn @ part_pose[:, :3, None])[..., 0]
 
 
-def is_disturbed(poses: Array, start: Array, undo: tuple[Array, Array] | None = None) -> Array:
-    """Return (N, K) which objects were shifted or have fallen over.
+def is_disturbed(poses: Array, start_poses: Array, undo: tuple[Array, Array] | None = None) -> Array:
+    """Return (N, K) bool, whether each object was shifted by `DISTURBED_SHIFT` or tilted by `DISTURBED_TILT`.
 
     Args:
-        poses: (N, K, 7) current poses.
-        start: (N, K, 7) start poses.
-        undo: `inverse_motion` of their support; None: the support can't move.
+        poses: (N, K, 7) current world poses of the objects.
+        start_poses: (N, K, 7) world poses of the objects at the start.
+        undo: result of `inverse_part_motion` for the part that supports the objects; None: the support can't move.
     """
     position, up = poses[..., :3], vertical_axis(poses[..., 3:])
     if undo is not None:
         turn, shift = undo
         position, up = shift[:, None] + position @ turn.swapaxes(1, 2), up @ turn.swapaxes(1, 2)
-    upright = (up * vertical_axis(start[..., 3:])).sum(-1)  # cosine of the tilt
-    return (norm(position - start[..., :3]) > DISTURBED_SHIFT) | (upright < _cosine(DISTURBED_TILT))
+    upright = (up * vertical_axis(start_poses[..., 3:])).sum(-1)  # cosine of the tilt
+    return (norm(position - start_poses[..., :3]) > DISTURBED_SHIFT) | (upright < _cosine(DISTURBED_TILT))
 
 
-def _cosine_of_tilt(quaternion: Array, quaternion_before: Array) -> Array:
-    return (vertical_axis(quaternion) * vertical_axis(quaternion_before)).sum(-1)
+def _cosine_of_tilt(quaternion: Array, start_quaternion: Array) -> Array:
+    return (vertical_axis(quaternion) * vertical_axis(start_quaternion)).sum(-1)
 
 
 def _cosine(degrees: float) -> float:

@@ -27,12 +27,12 @@ class Heaps:
         self.elapsed_steps = torch.zeros(count, dtype=torch.int32)
 
     def make_state(self, *, held: bool = False):
-        return SimpleNamespace(disturbed=self.disturbed.numpy(), held=np.array([held] * len(self.disturbed)))
+        return SimpleNamespace(disturbed=self.disturbed.numpy(), target_held=np.array([held] * len(self.disturbed)))
 
     def pairwise_occlusion(self, envs):
         return OVER.repeat(len(envs), 1, 1)
 
-    def clutter(self, envs):
+    def measure_clutter(self, envs):
         return SimpleNamespace(obstacles=torch.zeros(len(envs), 4, dtype=torch.bool))
 
 

@@ -84,7 +84,7 @@ def test_removed_object_is_upright_at_a_free_position_of_the_table(generator, mo
     others = np.concatenate([surface(arm, slot) for slot in before if slot != moved])
     gaps = np.linalg.norm(after[:, None, :2] - others[None, ::10, :2], axis=2)
     assert gaps.min() > 0.02  # clear of all others, seen from above
-    assert not arm.env.grasped().any()
+    assert not arm.env.is_object_grasped().any()
     assert float(arm.env.agent.gripper_width[0]) > 0.07
 
 
@@ -132,7 +132,7 @@ def test_candidate_moves_start_with_pushes_of_the_highest_and_queries_have_no_si
     moves = list(heap.candidate_moves())
     assert target not in {move.slot for move in moves}
     assert len(set(moves)) == len(moves)
-    in_the_way = np.flatnonzero(heap.env.clutter().obstacles[0].numpy()).tolist()
+    in_the_way = np.flatnonzero(heap.env.measure_clutter().obstacles[0].numpy()).tolist()
     if in_the_way:
         assert moves[0] == Move("push", max(in_the_way, key=lambda slot: surface(arm, slot)[:, 2].max()))
 

@@ -16,7 +16,7 @@ import torch
 from mani_skill.utils.structs.types import GPUMemoryConfig
 
 from robocas_ms3.core.errors import SimulationError, VectorEnvError
-from robocas_ms3.tasks.engine import EngineErrors, check_engine, gpu_memory
+from robocas_ms3.tasks.engine import EngineErrorMonitor, check_engine, gpu_memory_limits
 
 COMPLAINT = "[2026-01-01 00:00:00.000] [SAPIEN] [error] Contact buffer overflow detected, please increase its size to 9"
 OTHERS = (
@@ -46,23 +46,23 @@ def test_failed_download_of_the_gpu_library_is_an_error(monkeypatch, num_envs, s
 
 
 def test_few_envs_have_the_limits_of_maniskill():
-    assert gpu_memory(1, 15) == gpu_memory(16, 10) == GPUMemoryConfig()
+    assert gpu_memory_limits(1, 15) == gpu_memory_limits(16, 10) == GPUMemoryConfig()
 
 
 def test_capacities_grow_with_envs_and_objects_by_hand():
-    found = gpu_memory(1024, 15)
+    found = gpu_memory_limits(1024, 15)
     assert found.max_rigid_contact_count == 2**20  # 1024 * (50 * 15 + 100) = 870 400
     assert found.max_rigid_patch_count == 2**19  # 1024 * (16 * 15 + 32) = 278 528
     assert found.collision_stack_size == 2**28  # 142.6 M
     assert found.temp_buffer_capacity == 2**26  # 55.7 M
-    assert gpu_memory(4096, 15).max_rigid_contact_count == 2**22
-    assert gpu_memory(4096, 4).max_rigid_contact_count == 2**21
+    assert gpu_memory_limits(4096, 15).max_rigid_contact_count == 2**22
+    assert gpu_memory_limits(4096, 4).max_rigid_contact_count == 2**21
 
 
 @contextmanager
-def capture_errors() -> Iterator[EngineErrors]:
+def capture_errors() -> Iterator[EngineErrorMonitor]:
     """Monitor standard error. Not a fixture, since pytest replaces standard error between fixtures and tests."""
-    errors = EngineErrors()
+    errors = EngineErrorMonitor()
     errors.open()
     try:
         yield errors
@@ -70,7 +70,7 @@ def capture_errors() -> Iterator[EngineErrors]:
         errors.close()
 
 
-def wait_for_error(errors: EngineErrors) -> None:
+def wait_for_error(errors: EngineErrorMonitor) -> None:
     """Check for an error repeatedly, for at most one second."""
     for _ in range(100):
         errors.check()
@@ -111,8 +111,8 @@ def test_two_envs_of_a_process_get_the_error(capfd):
 
 def test_output_of_a_crashing_process_is_kept():
     program = (
-        "import faulthandler, os\nfrom robocas_ms3.tasks.engine import EngineErrors\nfaulthandler.enable()\n"
-        "errors = EngineErrors()\nerrors.open()\nos.write(2, b'x' * 300_000 + b'\\n')\nos.abort()\n"
+        "import faulthandler, os\nfrom robocas_ms3.tasks.engine import EngineErrorMonitor\nfaulthandler.enable()\n"
+        "errors = EngineErrorMonitor()\nerrors.open()\nos.write(2, b'x' * 300_000 + b'\\n')\nos.abort()\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=60, check=False)
     assert done.returncode == -signal.SIGABRT

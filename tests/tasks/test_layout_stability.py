@@ -13,7 +13,7 @@ from robocas_ms3.scenes.layout import write_layout
 from robocas_ms3.scenes.layout_table import LayoutStatus
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.tasks import layout_stability
-from robocas_ms3.tasks.layout_stability import check_layouts, status_of, unchecked_layouts
+from robocas_ms3.tasks.layout_stability import check_layouts, find_unchecked_layouts, status_from_shift
 
 
 @pytest.fixture
@@ -33,18 +33,18 @@ def cache(tmp_path) -> LayoutCache:
 
 @pytest.mark.slow
 def test_unstable_heap_is_found(cache):
-    assert unchecked_layouts(cache, "gpu") == {}
-    seeds = unchecked_layouts(cache, "cpu")
+    assert find_unchecked_layouts(cache, "gpu") == {}
+    seeds = find_unchecked_layouts(cache, "cpu")
     assert seeds == {0: [0, 1], 1: [0, 1]}
     moved = dict(check_layouts(cache, "cpu", seeds))
     assert moved.keys() == {(0, 0), (0, 1), (1, 0), (1, 1)}
     assert moved.pop((1, 0)) > 0.02
     assert max(moved.values()) < 0.003
-    cache.write_statuses("cpu", {pair: status_of(by) for pair, by in moved.items()})
+    cache.write_statuses("cpu", {pair: status_from_shift(by) for pair, by in moved.items()})
     table = cache.load_table("cpu")
     assert table is not None
     assert table.find_pairs(LayoutStatus.STABLE) == [(0, 0), (0, 1), (1, 1)]
-    assert unchecked_layouts(cache, "cpu") == {1: [0]}
+    assert find_unchecked_layouts(cache, "cpu") == {1: [0]}
     assert count_layouts(cache.folder) == 4  # the check added no layouts
 
 
@@ -66,5 +66,5 @@ def test_statuses_found_before_an_interruption_are_stored(cache, monkeypatch):
 
 
 def test_three_millimetres_are_allowed():
-    assert status_of(0.0029) == LayoutStatus.STABLE
-    assert status_of(0.0031) == status_of(float("nan")) == LayoutStatus.UNSTABLE
+    assert status_from_shift(0.0029) == LayoutStatus.STABLE
+    assert status_from_shift(0.0031) == status_from_shift(float("nan")) == LayoutStatus.UNSTABLE

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from robocas_ms3.core.poses import to_wxyz
 from robocas_ms3.tasks.occlusion import (
     Clutter,
-    clutter,
-    has_moved_near,
+    has_clutter_moved,
+    measure_clutter,
     pairwise_occlusion,
     project_down,
     push_point,
-    surface_points,
+    surface_points_in_world,
 )
 
 
@@ -34,14 +34,14 @@ HIGH_ABOVE = torch.tensor([0.0, 0.0, 200.0])  # so far away that all rays are ve
 def measure(*others: torch.Tensor, present: list[bool] | None = None, eye: torch.Tensor = HIGH_ABOVE) -> Clutter:
     points = torch.stack([TARGET, *others])[None]
     flags = torch.tensor([present or [True] * points.shape[1]])
-    return clutter(points, flags, torch.tensor([0]), eye)
+    return measure_clutter(points, flags, torch.tensor([0]), eye)
 
 
 def test_target_without_neighbours_is_clear():
     found = measure(FAR)
     assert found.hidden_fraction.tolist() == [0]
     assert not found.obstacles.any()
-    assert found.cleared.tolist() == [True]
+    assert found.is_target_cleared.tolist() == [True]
 
 
 @pytest.mark.parametrize(("edge", "share"), [(0.0, 0.5), (0.03, 0.2), (-0.05, 1.0)])
@@ -85,9 +85,9 @@ def test_higher_neighbour_within_1_cm_is_an_obstacle():
 
 def test_two_obstacles_are_too_many():
     right, left = plate((0.055, 0.15), (-0.05, 0.05), 0.7), plate((-0.15, -0.055), (-0.05, 0.05), 0.7)
-    assert measure(right).cleared.tolist() == [True]
-    assert measure(right, left).cleared.tolist() == [False]
-    assert measure(right, left, present=[True, True, False]).cleared.tolist() == [True]
+    assert measure(right).is_target_cleared.tolist() == [True]
+    assert measure(right, left).is_target_cleared.tolist() == [False]
+    assert measure(right, left, present=[True, True, False]).is_target_cleared.tolist() == [True]
 
 
 def test_obstacle_below_another_is_not_visible():
@@ -98,7 +98,7 @@ def test_obstacle_below_another_is_not_visible():
 def test_envs_are_independent():
     cover = plate((-0.05, 0.05), (-0.05, 0.05), 0.7)
     points = torch.stack([torch.stack([TARGET, cover]), torch.stack([TARGET, FAR]), torch.stack([TARGET, cover])])
-    found = clutter(points, torch.ones(3, 2, dtype=torch.bool), torch.tensor([0, 0, 1]), HIGH_ABOVE)
+    found = measure_clutter(points, torch.ones(3, 2, dtype=torch.bool), torch.tensor([0, 0, 1]), HIGH_ABOVE)
     assert found.hidden_fraction.tolist() == pytest.approx([1, 0, 0])
     assert found.obstacles.tolist() == [[False, True], [False, False], [False, False]]
 
@@ -108,8 +108,8 @@ def test_envs_are_independent():
 def test_hidden_fraction_is_invariant_to_rigid_motion(x, y, yaw):
     pose = torch.tensor([x, y, 0.1, math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)])
     points = torch.stack([TARGET, plate((0.0, 0.05), (-0.05, 0.05), 0.7)])[None]
-    moved = surface_points(pose.expand(1, 2, 7), points)
-    found = clutter(moved, torch.ones(1, 2, dtype=torch.bool), torch.tensor([0]), HIGH_ABOVE)
+    moved = surface_points_in_world(pose.expand(1, 2, 7), points)
+    found = measure_clutter(moved, torch.ones(1, 2, dtype=torch.bool), torch.tensor([0]), HIGH_ABOVE)
     # the plate covers 10 to 12 of 20 or 21 rows of cells, since partly covered rows count
     assert found.hidden_fraction.item() == pytest.approx(0.5, abs=1.5 / 21 + 1e-3)
 
@@ -118,7 +118,7 @@ def test_points_follow_their_object():
     half = math.sqrt(0.5)
     pose = torch.tensor([[[1.0, 2, 3, half, 0, 0, half], [0, 0, 0, half, half, 0, 0]]])  # 90 deg about z; about x
     points = torch.tensor([[[0.1, 0, 0], [0, 0.1, 0]]])[..., None]
-    moved = surface_points(pose, points)
+    moved = surface_points_in_world(pose, points)
     assert torch.allclose(moved[..., 0], torch.tensor([[[1.0, 2.1, 3], [0, 0, 0.1]]]), atol=1e-6)
 
 
@@ -129,8 +129,8 @@ def test_objects_beyond_the_motion_check_do_not_change_the_clutter():
 
     def counted(x: float) -> bool:
         poses = torch.tensor([[[0.0, 0, 0.7, 1, 0, 0, 0], [x, 0, 0.8, 1, 0, 0, 0]]])
-        found = clutter(
-            surface_points(poses, ball.expand(1, 2, 3, -1)),
+        found = measure_clutter(
+            surface_points_in_world(poses, ball.expand(1, 2, 3, -1)),
             torch.ones(1, 2, dtype=torch.bool),
             torch.tensor([0]),
             HIGH_ABOVE,
@@ -146,7 +146,7 @@ def test_motion_far_away_is_ignored():
         return torch.tensor([[[x, y, 0.7, 1, 0, 0, 0] for x, y in places]])
 
     def moved(before: torch.Tensor, now: torch.Tensor) -> bool:
-        return bool(has_moved_near(now, before, torch.full((1, 2), 0.05), torch.tensor([0]), HIGH_ABOVE))
+        return bool(has_clutter_moved(now, before, torch.full((1, 2), 0.05), torch.tensor([0]), HIGH_ABOVE))
 
     still = at((0, 0), (0.11, 0))  # within two radii and three cells, along x and along y: 0.115 m
     assert not moved(still, still + 5e-5)
@@ -182,7 +182,7 @@ def test_motion_near_the_target_in_the_image_counts():
         before = torch.tensor([[[0.2, 0, 0.5, 1, 0, 0, 0], [x, 0, z, 1, 0, 0, 0]]])
         now = before.clone()
         now[0, 1, 0] += 1e-3
-        return bool(has_moved_near(now, before, radii, torch.tensor([0]), eye))
+        return bool(has_clutter_moved(now, before, radii, torch.tensor([0]), eye))
 
     assert moved(0.1, 0.75)  # between camera and target
     assert not moved(0.1, 0.5)
@@ -196,7 +196,7 @@ def test_hidden_fractions_agree_with_ray_casting():
     from robocas_ms3.scenes.config import load_task_config
     from robocas_ms3.scenes.model import SceneModel
     from robocas_ms3.scenes.targets import selection_camera
-    from robocas_ms3.tasks.search import _sample
+    from robocas_ms3.tasks.search import _sample_points
 
     pack = load_pack("builtin")
     model = SceneModel.load(load_task_config("search_table_stacked"), pack, pack)
@@ -205,11 +205,11 @@ def test_hidden_fractions_agree_with_ray_casting():
     for seed in range(3):
         layout = make_layout_source(model)(seed, seed)
         poses = torch.as_tensor(to_wxyz(layout.object_poses), dtype=torch.float32)[None]
-        sampled = [_sample(pack.objects[i].annotations.surface_points) for i in layout.object_ids]
+        sampled = [_sample_points(pack.objects[i].annotations.surface_points) for i in layout.object_ids]
         points = torch.as_tensor(np.array(sampled).swapaxes(1, 2), dtype=torch.float32)[None]
         count = len(sampled)
-        world = surface_points(poses, points).expand(count, -1, -1, -1)
-        found = clutter(world, torch.ones(count, count, dtype=torch.bool), torch.arange(count), eye)
+        world = surface_points_in_world(poses, points).expand(count, -1, -1, -1)
+        found = measure_clutter(world, torch.ones(count, count, dtype=torch.bool), torch.arange(count), eye)
         differences += np.abs(found.hidden_fraction.numpy() - (1 - layout.visible_fractions)).tolist()
     assert len(differences) > 30
     assert np.nanmean(differences) < 0.04

@@ -47,7 +47,7 @@ def test_furniture_is_open_from_the_configured_fraction(name):
         qpos = furniture.get_qpos()
         qpos[:, index] = factor * share * max(base.model.joint_to_open.limits, key=abs)
         furniture.set_qpos(qpos)
-        assert bool(base.furniture_opened()[0]) is opened
+        assert bool(base.is_furniture_open()[0]) is opened
     env.close()
 
 
@@ -148,7 +148,7 @@ def test_pull_opens_by_contact_and_releases_the_handle(tmp_path):
         assert set(touched) == {part.handle.link}  # and nothing else in the scene
         assert touched[part.handle.link] < 0.002
         assert part.joint_position(arm) == pytest.approx(0.95 * part.open_limit, abs=0.01)
-        assert bool(arm.env.furniture_opened()[0])
+        assert bool(arm.env.is_furniture_open()[0])
         # the gripper is open and off the handle
         bar = part.poses_in_world(arm, np.array([part.joint_position(arm)]))[0] @ part.grasp_in_part
         assert (np.linalg.inv(bar) @ arm.scene.arm_base_in_world @ arm.scene.tcp_in_base)[2, 3] < -0.05

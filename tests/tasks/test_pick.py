@@ -149,5 +149,5 @@ def test_result_is_reused_while_nothing_moves(env):
 
 
 def test_images_without_a_renderer_are_an_error():
-    with pytest.raises(ConfigError, match="render_backend: images need a renderer.*obs_mode='rgb'"):
+    with pytest.raises(ConfigError, match="render_backend: image observations need a renderer.*obs_mode='rgb'"):
         gym.make("RoboCASPick-v1", obs_mode="rgb", render_backend="none")

@@ -20,18 +20,18 @@ def floats(array) -> list[float]:
     return array.tolist()
 
 
-def test_closeness_by_distance(make):
+def test_nearness_by_distance(make):
     goals = make([[0.0, 0, 0]] * 4)
     points = make([[0.0, 0, 0], [0.06, 0.08, 0], [0, 0, 0.3], [0.9, 0, 0]])
-    assert floats(rewards.closeness(points, goals)) == pytest.approx([1, 0.5, 0.25, 0.1])
-    assert floats(rewards.closeness(points, goals, half=0.3))[2] == pytest.approx(0.5)
+    assert floats(rewards.nearness(points, goals)) == pytest.approx([1, 0.5, 0.25, 0.1])
+    assert floats(rewards.nearness(points, goals, half_distance=0.3))[2] == pytest.approx(0.5)
 
 
-def test_progress_fraction_in_both_directions(make):
+def test_change_fraction_in_both_directions(make):
     heights, starts = make([0.60, 0.615, 0.63, 0.8, 0.5]), make([0.60] * 5)
-    assert floats(rewards.progress_fraction(heights, starts, 0.03)) == pytest.approx([0, 0.5, 1, 1, 0], abs=1e-5)
+    assert floats(rewards.change_fraction(heights, starts, 0.03)) == pytest.approx([0, 0.5, 1, 1, 0], abs=1e-5)
     # a joint that opens backwards
-    assert floats(rewards.progress_fraction(make([0.0, -0.5, -2.0, 0.1]), 0.0, -1.0)) == pytest.approx([0, 0.5, 1, 0])
+    assert floats(rewards.change_fraction(make([0.0, -0.5, -2.0, 0.1]), 0.0, -1.0)) == pytest.approx([0, 0.5, 1, 0])
 
 
 def test_clear_fraction_is_1_for_a_cleared_target(make):
@@ -51,10 +51,10 @@ def test_stillness_depends_on_both_velocities(make):
 
 
 def test_penalties_are_fractions(make):
-    assert floats(rewards.count_fraction(make([0, 1, 3, 7]))) == pytest.approx([0, 1 / 3, 1, 1])
+    assert floats(rewards.disturbed_fraction(make([0, 1, 3, 7]))) == pytest.approx([0, 1 / 3, 1, 1])
     before = make([[1.0, 0, 0]] * 3)
     after = make([[1.0, 0, 0], [1.03, 0.04, 0], [0, 0, 0]])
-    assert floats(rewards.shift_fraction(after, before)) == pytest.approx([0, 0.5, 1], abs=1e-6)
+    assert floats(rewards.basket_shift_fraction(after, before)) == pytest.approx([0, 0.5, 1], abs=1e-6)
     # all of two components to and fro; one of them by half
     actions, last = make([[1.0, -1.0], [0.5, 0]]), make([[-1.0, 1.0], [0.0, 0]])
     assert floats(rewards.action_rate(actions, last)) == pytest.approx([1, 0.125])
@@ -118,7 +118,7 @@ def test_reward_tables_are_consistent(name):
     assert min(table.weights.values()) > 0
     assert list(table.weights)[-1] == "success"  # without it the reward stays below 1
     assert 0 < sum(table.penalties.values()) < 0.3
-    assert [table.index(stage) for stage in table.stages] == list(range(len(table.stages)))
+    assert [table.stage_index(stage) for stage in table.stages] == list(range(len(table.stages)))
 
 
 @pytest.mark.parametrize("name", TABLES)

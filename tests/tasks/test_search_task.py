@@ -56,7 +56,7 @@ def test_target_of_a_heap_is_partly_hidden(env):
     base = env.unwrapped
     layout = base.layout()
     assert layout.visible_fractions[layout.target] < base.task_config.target.max_visible_share
-    found = base.clutter()
+    found = base.measure_clutter()
     assert found.hidden_fraction.shape == (1,)
     assert found.obstacles.shape == (1, 8)
     assert not bool(found.obstacles[0, layout.target])
@@ -90,7 +90,7 @@ def test_clutter_is_measured_five_times_per_second(env):
 
 
 def test_cleared_at_reset_reports_a_target_that_was_clear_at_the_start(env, monkeypatch):
-    monkeypatch.setattr(occlusion.Clutter, "cleared", property(lambda found: found.hidden_fraction <= 1))
+    monkeypatch.setattr(occlusion.Clutter, "is_target_cleared", property(lambda found: found.hidden_fraction <= 1))
     _, info = env.reset(seed=0)
     assert bool(info["obstacles_cleared"][0])
     assert bool(info["cleared_at_reset"][0])
@@ -156,10 +156,10 @@ def test_schedule_is_due_before_the_first_step_and_every_period():
         if step == 4:
             schedule.reset(np.array([1, 2]))
         if step == 8:
-            schedule.every_step(np.array([3]))
-        found.append(schedule.due().tolist())
+            schedule.make_always_due(np.array([3]))
+        found.append(schedule.due_envs().tolist())
         schedule.advance()
     assert found == [[0, 1, 2, 3], [], [], [0, 1, 2, 3], [1, 2], [], [0, 3], [1, 2], [3], [0, 3]]
     schedule.reset(np.array([3]))
     schedule.advance()
-    assert schedule.due().tolist() == []
+    assert schedule.due_envs().tolist() == []

@@ -84,7 +84,7 @@ def test_an_unseeded_reset_of_one_env_draws_its_episode_seed_from_the_range():
 
 
 def test_single_seed_of_several_envs_is_continued_within_the_range(monkeypatch):
-    monkeypatch.setattr(tasks.base, "make_layout_source", lambda model, folder: Thing)
+    monkeypatch.setattr(tasks.scene_env, "make_layout_source", lambda model, folder: Thing)
     env, asked = several(None, monkeypatch, seeds=(10, 13))
     env.reset(seed=12)
     assert [seed for _, seed in asked[-1]] == [12, 13, 10, 11]
@@ -102,7 +102,7 @@ def test_only_a_requested_seed_must_have_a_layout(monkeypatch):
             raise LayoutError("none", where="layout")
         return Thing(objects, seed)
 
-    monkeypatch.setattr(tasks.base, "make_layout_source", lambda model, folder: layouts)
+    monkeypatch.setattr(tasks.scene_env, "make_layout_source", lambda model, folder: layouts)
     env, asked = several(None, monkeypatch, seeds=(10, 13))
     env.reset(seed=10)
     drawn = [seed for _, seed in asked[-1]]
@@ -125,7 +125,7 @@ def test_invalid_arguments():
 
 def test_several_envs_have_a_default_range_of_seeds(monkeypatch):
     low, high = SEVERAL_ENVS_SEEDS
-    monkeypatch.setattr(tasks.base, "make_layout_source", lambda model, folder: Thing)
+    monkeypatch.setattr(tasks.scene_env, "make_layout_source", lambda model, folder: Thing)
     env, asked = several(None, monkeypatch, num_envs=high - low + 3)
     assert asked[0] == [(i, i) for i in [*range(low, high + 1), low, low + 1]]
     assert env.seeds.object_ids[0] == env.seeds.object_ids[high - low + 1] != env.seeds.object_ids[1]
@@ -151,7 +151,7 @@ def without(*pairs):
 def test_unseeded_reset_draws_until_a_seed_has_a_layout(monkeypatch, caplog):
     bad = [(objects, seed) for objects in (1, 2) for seed in range(100) if seed % 2 and seed != objects]
     source, asked = without(*bad)
-    monkeypatch.setattr(tasks.base, "make_layout_source", lambda model, folder: source)
+    monkeypatch.setattr(tasks.scene_env, "make_layout_source", lambda model, folder: source)
     env, chosen = several(None, monkeypatch)
     for _ in range(30):
         env.reset()
@@ -167,7 +167,7 @@ def test_unseeded_reset_draws_until_a_seed_has_a_layout(monkeypatch, caplog):
 
 def test_configuration_without_layouts_fails_early(monkeypatch):
     source, asked = without(*((seed, seed) for seed in range(100)))
-    monkeypatch.setattr(tasks.base, "make_layout_source", lambda model, folder: source)
+    monkeypatch.setattr(tasks.scene_env, "make_layout_source", lambda model, folder: source)
     with pytest.raises(LayoutError, match="no object qualifies"):
         several(None, monkeypatch)
     assert len(asked) <= 3

@@ -55,7 +55,7 @@ def test_other_object_of_the_kind_is_not_the_target(make):
     kinds = make([[0, 0, 2, 2], [0, 1, 0, 1], [0, 0, 2, 2]])
     marked = make([[True, False, True, True], [False, True, True, False], [True, False, False, True]])
     target = make([0, 0, 1])
-    assert terms.is_any_other_of_kind(marked, kinds, target).tolist() == [False, True, True]
+    assert terms.has_other_of_kind(marked, kinds, target).tolist() == [False, True, True]
 
 
 def test_grasp_needs_both_fingers_pressed_apart(make):
@@ -69,7 +69,7 @@ def test_grasp_needs_both_fingers_pressed_apart(make):
 def test_pressing_needs_both_fingers_in_any_direction(make):
     left = make([[[0, 2.0, 0], [0, 2.0, 0], [0, -2.0, 0]]])
     right = make([[[3.0, 0, 0], [0, 0.4, 0], [0, 0.0, 0]]])
-    assert terms.is_pressed(left, right).tolist() == [[True, False, False]]
+    assert terms.presses_both_fingers(left, right).tolist() == [[True, False, False]]
 
 
 @pytest.mark.parametrize(("degrees", "shift", "expected"), [(29.0, 0.0, False), (31.0, 0.0, True), (0.0, 0.031, True)])
@@ -89,15 +89,17 @@ def test_disturbance_is_relative_to_the_support(make):
     assert terms.is_disturbed(now, start, back).tolist() == [[False, True]]
 
 
-def test_inverse_motion_of_a_drawer(make):
+def test_inverse_part_motion_of_a_drawer(make):
     # a cabinet at (1, 2, 0), facing y; its drawer was 0.5 m along the cabinet's own x, and is out by another 0.2 m
     body, part = make([[1.0, 2, 0, *YAW_90]]), make([[1.0, 2.7, 0, *YAW_90]])
     before = make([[1.0, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    turn, shift = terms.inverse_motion(body, part, before)
+    turn, shift = terms.inverse_part_motion(body, part, before)
     assert abs(turn[0] - make([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]])).max() < 1e-6
     assert abs(shift[0] - make([0.0, -0.2, 0])).max() < 1e-6
     # a door at the origin that has turned by 90 degrees about its hinge at (1, 0, 0)
-    turn, shift = terms.inverse_motion(make([[0.0, 0, 0, *UPRIGHT]]), make([[1.0, 0, 0, *YAW_90]]), make(hinge_at_1()))
+    turn, shift = terms.inverse_part_motion(
+        make([[0.0, 0, 0, *UPRIGHT]]), make([[1.0, 0, 0, *YAW_90]]), make(hinge_at_1())
+    )
     on_the_door = turn[0] @ make([1.0, 0.4, 0]) + shift[0]
     assert abs(on_the_door - make([1.4, 0, 0])).max() < 1e-6
 

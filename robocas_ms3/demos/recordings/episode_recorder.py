@@ -74,7 +74,7 @@ class EpisodeRecorder(gym.Wrapper):
     @property
     def states(self) -> dict[str, dict[str, NDArray[np.float32]]]:
         """States since the reset: ``{"actors": {name: (S + 1, 13)}, "articulations": {name: (S + 1, D)}}``."""
-        return self._base_env.bodies.split(np.stack(self._steps.states))
+        return self._base_env.bodies.to_state_dict(np.stack(self._steps.states))
 
     def finish(self, episode: dict[str, Any]) -> None:
         """Write the episode with its ``robocas`` metadata; the environment stays open."""

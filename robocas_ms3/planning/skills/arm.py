@@ -130,7 +130,7 @@ class Arm:
 
     def is_holding(self, slot: int) -> bool:
         """Return whether both fingers press on an object."""
-        return bool(self.env.grasped()[0, slot])
+        return bool(self.env.is_object_grasped()[0, slot])
 
     def plan_first_line(
         self, start: Array, goals: Iterable[Array], *, stage: str, check_collisions: bool = True

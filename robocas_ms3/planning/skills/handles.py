@@ -131,7 +131,7 @@ def is_opened(arm: Arm) -> bool:
     """Return whether the door or drawer of the task is open."""
     env = arm.env
     assert isinstance(env, RoboCASOpenPickEnv)
-    return bool(env.furniture_opened()[0])
+    return bool(env.is_furniture_open()[0])
 
 
 def pull_handle(arm: Arm, part: MovingPart) -> None:

@@ -67,7 +67,7 @@ class Heap:
     @property
     def target_uncovered(self) -> bool:
         """Whether the target is cleared by the paper's rule, seen from the camera above."""
-        return bool(self.env.clutter().cleared[0])
+        return bool(self.env.measure_clutter().is_target_cleared[0])
 
     @property
     def target_cleared(self) -> bool:
@@ -89,7 +89,7 @@ class Heap:
 
     def _find_obstacles(self) -> list[int]:
         """Return slots of objects that hide or surround the target, the highest first, then of grasp blockers."""
-        obstacles = np.flatnonzero(self.env.clutter().obstacles[0].cpu().numpy()).tolist()
+        obstacles = np.flatnonzero(self.env.measure_clutter().obstacles[0].cpu().numpy()).tolist()
         obstacles.sort(key=lambda slot: -self.arm.scene.object_points(slot)[:, 2].max())
         order = dict.fromkeys(obstacles[:MAX_OBSTACLES])
         order |= dict.fromkeys(
@@ -122,7 +122,7 @@ class Heap:
     def remaining_cost(self) -> float:
         """Return the estimated cost of the remaining work, s."""
         with self.arm.planning_time():
-            clutter = self.env.clutter()
+            clutter = self.env.measure_clutter()
             hidden, obstacles = float(clutter.hidden_fraction[0]), int(clutter.obstacles[0].sum())
             cost = COST_PER_OBSTACLE * max(0, obstacles - 1)
             cost += COST_PER_HIDDEN_FRACTION * max(0.0, hidden - MAX_HIDDEN_FRACTION)

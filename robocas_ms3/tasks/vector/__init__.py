@@ -35,27 +35,27 @@ def make_vec(
     limits: Limits = NO_LIMITS,
     **kwargs: Any,
 ) -> VectorEnv:
-    """Make a vector environment with the conventions of `RoboCASVectorEnv`.
+    """Make a `RoboCASVectorEnv` of N environments, in worker processes or in one batch on a GPU.
 
-    In processes, an env depends on its seeds and actions only, not on ``num_envs`` or ``workers``, and equals the
-    environment of ``gym.make``. With ``reconfiguration_freq=0`` env i keeps the objects of seed 2022 + i. The worker
-    processes end when the vector environment is closed or deleted, and when this process ends.
+    In worker processes, an env behaves exactly like an environment of ``gym.make``: it depends on its seeds and actions
+    only, not on ``num_envs`` or ``workers``. With ``reconfiguration_freq=0``, env i keeps the objects of seed 2022 + i.
+    The processes end when the vector environment is closed or deleted, and when this process ends.
 
     Args:
         env_id: gymnasium id, such as ``RoboCASPick-v1``; ``module:Id-v1`` imports the module first.
         num_envs: N.
-        backend: ``processes`` on the CPU, ``gpu`` in one batch, or ``auto``: a GPU if there is one.
+        backend: ``processes`` (on the CPU), ``gpu`` (one batch), or ``auto``: a GPU if there is one.
         workers: number of processes; default: one per env, at most one per core.
-        arrays: ``torch`` for tensors, or ``numpy``.
-        wrappers: functions that wrap each env (on a GPU the batch); the first one is the innermost.
-        limits: time and memory limits of a process for a step or a reset; a process that exceeds them is killed.
+        arrays: type of the results, ``torch`` or ``numpy``.
+        wrappers: functions that wrap each env, or the batch on a GPU; the first function makes the innermost wrapper.
+        limits: time and memory limits of a process per step or reset; a process that exceeds them is killed.
         kwargs: ``auto_reset``, ``ignore_terminations`` and ``record_metrics`` of `RoboCASVectorEnv`; other arguments
             are passed to ``gym.make``, such as ``obs_mode``, ``control_mode``, ``config``, ``max_episode_steps``.
 
     Raises:
-        VectorEnvError: the environment or backend does not exist, or the backend needs a missing GPU.
-        VectorEnvCrashError: a process died.
-        Exception: whatever making an environment raises.
+        VectorEnvError: an argument is invalid, or there is no GPU for this backend.
+        VectorEnvCrashError: a worker process crashed.
+        Exception: any error that ``gym.make`` raises.
     """
     for name, value in (("num_envs", num_envs), ("workers", 1 if workers is None else workers)):
         if not isinstance(value, int) or value < 1:
@@ -75,14 +75,14 @@ def make_vec(
 
 
 def choose_backend(backend: str, sim_backend: str = "auto") -> Literal["processes", "gpu"]:
-    """Return the backend of a vector environment.
+    """Return the backend on which a vector environment will run.
 
     Args:
-        backend: requested backend; ``auto``: a GPU if there is one and ``sim_backend`` is not a CPU.
-        sim_backend: ManiSkill's argument: ``auto``, or the device of the physics.
+        backend: requested backend; ``auto``: a GPU if there is one and ``sim_backend`` names no CPU.
+        sim_backend: argument of ManiSkill: ``auto``, or the device on which PhysX runs.
 
     Raises:
-        VectorEnvError: the backend is unknown, contradicts ``sim_backend``, or needs a missing GPU.
+        VectorEnvError: the backend is unknown or contradicts ``sim_backend``, or there is no GPU for it.
     """
     if backend not in get_args(Backend):
         expected = f"one of {list(get_args(Backend))}"
@@ -90,7 +90,7 @@ def choose_backend(backend: str, sim_backend: str = "auto") -> Literal["processe
     on_cpu = sim_backend in CPU_SIM_BACKENDS
     if (backend == "gpu" and on_cpu) or (backend == "processes" and sim_backend != "auto" and not on_cpu):
         found = f"backend={backend!r} and sim_backend={sim_backend!r}"
-        fix = "Remove one of them: physics runs on the CPU with processes, and on the GPU otherwise."
+        fix = "Remove one of the arguments. With processes, PhysX runs on the CPU; with gpu, on the GPU."
         raise VectorEnvError("backend and sim_backend contradict each other", where="make_vec", found=found, fix=fix)
     if backend == "processes" or on_cpu:
         return "processes"
@@ -104,19 +104,20 @@ def choose_backend(backend: str, sim_backend: str = "auto") -> Literal["processe
 
 
 class RoboCASVectorEnv(ManiSkillVectorEnv):
-    """ManiSkill's vector environment around a batched environment: on a GPU, or a `ProcessEnv`.
+    """Vector environment of ManiSkill around a batched environment: a batch on a GPU, or a `ProcessEnv`.
 
-    The last observations and infos of episodes have the names of gymnasium's ``AutoresetMode.SAME_STEP``:
-    ``final_obs`` and ``final_info``, with the flags ``_final_obs`` and ``_final_info`` (N,). ``info["episode"]`` and
-    ``info["final_info"]["episode"]`` have ``return``, ``episode_len``, ``reward`` per step, ``success_once`` and
-    ``success_at_end``. ``reset(seed=..., options={"env_idx": ...})`` resets some envs.
+    In a step in which an episode ends, ``info`` has the last observation and info of the episode in ``final_obs`` and
+    ``final_info``, and flags (N,) in ``_final_obs`` and ``_final_info``. These are the names of gymnasium's
+    ``AutoresetMode.SAME_STEP``. ``info["episode"]`` and ``info["final_info"]["episode"]`` have ``return``,
+    ``episode_len``, ``reward`` (mean per step), ``success_once`` and ``success_at_end``.
+    ``reset(seed=..., options={"env_idx": ...})`` resets some envs.
 
     Args:
         env: the batched environment.
         arrays: type of observations, rewards, flags and infos, ``torch`` or ``numpy``.
-        auto_reset: whether an env is reset in the step in which it ends; default: True.
-        ignore_terminations: whether an episode continues after success until the time limit; default: False.
-        record_metrics: whether infos have ``episode``; default: True.
+        auto_reset: whether an env is reset in the step in which its episode ends; default: True.
+        ignore_terminations: whether an episode continues after success or failure until the time limit; default: False.
+        record_metrics: whether infos have the entry ``episode``; default: True.
     """
 
     def __init__(self, env: gym.Env, arrays: Literal["torch", "numpy"] = "torch", **options: bool) -> None:
@@ -139,7 +140,7 @@ class RoboCASVectorEnv(ManiSkillVectorEnv):
         return _as_numpy(found) if self._in_numpy else found
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
-        """Call a method or read an attribute: in processes of each env (a tuple), on a GPU of the batch."""
+        """Call a method or read an attribute: of each env in processes (returns a tuple), of the batch on a GPU."""
         if isinstance(self._env, ProcessEnv):
             return self._env.call(name, *args, **kwargs)
         found = self._env.get_wrapper_attr(name)  # ManiSkill's method checks the outermost wrapper only
@@ -156,7 +157,7 @@ def _as_numpy(nested: Any) -> Any:
 
 def _check_id(env_id: str) -> None:
     ours = sorted(task.env_id for task in TASKS.values())
-    expected = f"one such as {', '.join(ours)}"
+    expected = f"a gymnasium id such as {', '.join(ours)}"
     try:
         known = gym.spec(env_id).id in {*ours, *REGISTERED_ENVS}
     except (gym.error.Error, ModuleNotFoundError) as error:

@@ -24,17 +24,17 @@ _POLL_MILLISECONDS = 200  # between two checks of signals and limits
 
 
 class PinnedWorkers(Generic[Task, Result]):
-    """Worker processes with one worker each; a crashed process is not replaced.
+    """Worker processes that each run one worker object; a crashed process is not replaced.
 
-    Unlike in a `WorkerPool`, the calling thread communicates with the processes, since steps of environments are short.
-    The processes start with the first tasks.
+    Unlike in a `WorkerPool`, no other thread communicates with the processes, because steps of environments are short.
+    The first call of `run` starts the processes.
 
     Args:
-        make_workers: functions that create the workers, one per process; sent by cloudpickle.
+        make_workers: functions that make the worker objects, one per process; sent with cloudpickle.
         limits: time and memory limits of a task.
 
     Attributes:
-        pids: ids of the processes, after they have started.
+        pids: ids of the processes; empty until they have started.
     """
 
     def __init__(self, make_workers: Sequence[Callable[[], Worker[Task, Result]]], limits: Limits) -> None:
@@ -44,44 +44,46 @@ class PinnedWorkers(Generic[Task, Result]):
         self._unread: set[int] = set()  # numbers of processes that have not answered yet
         self.pids: list[int] = []
         self._owner, self._ended = os.getpid(), threading.Event()
-        self._end = weakref.finalize(self, _end, self._processes, self._unread, self._ended, self._owner)
+        self._end = weakref.finalize(self, _end_processes, self._processes, self._unread, self._ended, self._owner)
 
     @property
     def closed(self) -> bool:
-        """Whether the processes have ended, or belong to the parent process of a fork."""
+        """Whether the processes have ended, or belong to another process because this process is a fork of it."""
         return not self._end.alive or self._owner != os.getpid()
 
     @property
     def busy(self) -> bool:
-        """Whether a task is running, after a call was interrupted."""
+        """Whether a process still runs a task of an interrupted call."""
         return bool(self._unread)
 
     def run(self, tasks: Sequence[Task]) -> list[Result]:
-        """Send each worker its task, and return all results; results of an interrupted call are read first.
+        """Send one task to each worker, and return the results in the order of the workers.
+
+        Results of an interrupted call are read and dropped first.
 
         Raises:
-            ProcessCrashError: a process died, or exceeded a limit.
-            Exception: whatever making a worker, or the first task that failed, raised.
+            ProcessCrashError: a process crashed or exceeded a limit.
+            Exception: error of making a worker, or of the first failed task.
         """
         if not self.pids:
             try:
                 self._launch()
-                self._exchange((), START_SECONDS)
-                self._exchange([process.pickled_worker for process in self._processes], START_SECONDS)
+                self._exchange_messages((), START_SECONDS)
+                self._exchange_messages([process.pickled_worker for process in self._processes], START_SECONDS)
             except BaseException:
                 self.close()
                 raise
         if self._unread:
-            self._exchange((), self._seconds)
-        return self._exchange(tasks, self._seconds)
+            self._exchange_messages((), self._seconds)
+        return self._exchange_messages(tasks, self._seconds)
 
     def close(self) -> None:
-        """End the processes; busy ones are killed. In a fork of this process, do nothing."""
+        """End the processes; kill those that run a task. In a fork of this process, do nothing."""
         self._end()
 
     def _launch(self) -> None:
         launched = Future[None]()
-        threading.Thread(target=_launch, args=(self._processes, launched, self._ended), daemon=True).start()
+        threading.Thread(target=_launch_processes, args=(self._processes, launched, self._ended), daemon=True).start()
         launched.result()
         self.pids = [process.pid for process in self._processes]
         self._poll = select.poll()
@@ -90,8 +92,8 @@ class PinnedWorkers(Generic[Task, Result]):
             self._poll.register(descriptor, select.POLLIN)
         self._unread.update(range(len(self._processes)))  # each process reports that it is ready
 
-    def _exchange(self, messages: Sequence[Any], seconds: float) -> list[Any]:
-        """Send a message to each process, or none; return the outstanding answers by process number."""
+    def _exchange_messages(self, messages: Sequence[Any], seconds: float) -> list[Any]:
+        """Send one message to each process, or no messages; wait for all answers, and return them by process number."""
         answers: list[Any] = [None] * len(self._processes)
         errors: dict[int, Exception] = {}
         deadline = time.monotonic() + seconds
@@ -119,7 +121,8 @@ class PinnedWorkers(Generic[Task, Result]):
         return answers
 
 
-def _launch(processes: list[WorkerProcess[Any, Any]], launched: Future[None], ended: threading.Event) -> None:
+def _launch_processes(processes: list[WorkerProcess[Any, Any]], launched: Future[None], ended: threading.Event) -> None:
+    """Launch the processes in this thread, and keep the thread alive until they have ended."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # for the processes, until they ignore Ctrl-C
     try:
         for process in processes:
@@ -130,7 +133,9 @@ def _launch(processes: list[WorkerProcess[Any, Any]], launched: Future[None], en
     ended.wait()  # the processes are killed when the thread that started them ends
 
 
-def _end(processes: list[WorkerProcess[Any, Any]], busy: set[int], ended: threading.Event, owner: int) -> None:
+def _end_processes(
+    processes: list[WorkerProcess[Any, Any]], busy: set[int], ended: threading.Event, owner: int
+) -> None:
     if os.getpid() != owner:
         return
     for number, process in enumerate(processes):

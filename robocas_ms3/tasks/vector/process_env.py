@@ -25,24 +25,24 @@ from robocas_ms3.tasks.vector.worker import EnvSettings, EnvWorker, Rows, join_r
 
 
 class ProcessEnv(gym.Env):
-    """Several single CPU environments in worker processes, batched like ``BaseEnv`` on a GPU.
+    """Single CPU environments in worker processes, with the interface of a batched ``BaseEnv`` on a GPU.
 
-    An env depends on its seeds and actions only, not on other envs or on its process. Without a seed, the random stream
-    of env i starts with 2022 + i, as in ManiSkill. benchmarks/vector.py compares this class with gymnasium's
-    ``AsyncVectorEnv``, which uses one process per env.
+    An env depends on its seeds and actions only, not on other envs or on its process. Before the first seed, the random
+    stream of env i starts with seed 2022 + i, as in ManiSkill. benchmarks/vector.py compares this class with
+    gymnasium's ``AsyncVectorEnv``, which uses one process per env.
 
     Args:
         env_id: gymnasium id of a ManiSkill environment.
-        num_envs: number of envs.
-        workers: number of processes; their numbers of envs differ by at most one.
-        kwargs: arguments of ``gym.make``; pickled by cloudpickle.
-        wrappers: functions that wrap each env, the first one is the innermost; pickled by cloudpickle.
-        limits: time and memory limits of a process for a step or a reset; a process that exceeds them is killed.
+        num_envs: number of envs, N.
+        workers: number of processes; each has equally many envs, or one more.
+        kwargs: arguments of ``gym.make``; sent with cloudpickle.
+        wrappers: functions that wrap each env; the first function makes the innermost wrapper. Sent with cloudpickle.
+        limits: time and memory limits of a process per step or reset; a process that exceeds them is killed.
 
     Raises:
-        VectorEnvError: the arguments can't be sent to processes.
-        VectorEnvCrashError: a process died.
-        Exception: whatever making an environment raises.
+        VectorEnvError: the arguments can't be sent to the processes.
+        VectorEnvCrashError: a worker process crashed.
+        Exception: any error that ``gym.make`` raises.
 
     Attributes:
         pids: ids of the worker processes.
@@ -68,12 +68,12 @@ class ProcessEnv(gym.Env):
             self.spec.max_episode_steps = kwargs["max_episode_steps"]
         self._seed_range: tuple[int, int] | None = kwargs.get("seeds")
         self._must_reset: set[int] = set()  # envs in an unknown state after an interrupted or failed call
-        self._parts: list[tuple[int, Rows]] = []  # last result of each worker, with its number of envs
+        self._last_results: list[tuple[int, Rows]] = []  # last result of each worker, with its number of envs
         self.elapsed_steps = torch.zeros(num_envs, dtype=torch.int32)
         registered = REGISTERED_ENVS.get(self.spec.id)
         module = registered.cls.__module__ if registered else "robocas_ms3"
         if module == "__main__":
-            fix = f'Register it in a module, and pass the id "my_module:{self.spec.id}".'
+            fix = f'Register the environment in a module, and pass the id "my_module:{self.spec.id}".'
             what = "worker processes can't import an environment that is registered in the main program"
             raise VectorEnvError(what, where=env_id, fix=fix)
         cuts = [num_envs * worker // workers for worker in range(workers + 1)]
@@ -84,7 +84,9 @@ class ProcessEnv(gym.Env):
             try:
                 pickled = cloudpickle.dumps(settings)
             except Exception as error:
-                raise VectorEnvError("arguments can't be sent to processes", where=env_id, found=error) from error
+                raise VectorEnvError(
+                    "the arguments can't be sent to worker processes", where=env_id, found=error
+                ) from error
             self._workers = PinnedWorkers(
                 [partial(EnvWorker, pickled, env_range) for env_range in self._env_ranges], limits
             )
@@ -95,28 +97,30 @@ class ProcessEnv(gym.Env):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset all envs, or those of ``options["env_idx"]``; the other envs stay unchanged.
+        """Reset all envs, or only the envs ``options["env_idx"]``.
 
         Args:
-            seed: seed of each env; for a single seed, the first env gets it and the others get the next seeds, within
-                the range ``seeds`` if it is in this range. None: each env draws from its random stream.
-            options: options of ``BaseEnv``.
+            seed: seed of each env. A single seed is for the first env; the other envs get the next seeds, which wrap
+                around in the range ``seeds`` if the seed is in it. None: each env draws from its random stream.
+            options: options of ``BaseEnv.reset``.
 
         Raises:
-            VectorEnvError: the number of seeds or the env indices are invalid.
-            LayoutError: a requested seed, or each of many drawn seeds, has no layout.
+            VectorEnvError: the number of seeds or ``env_idx`` is invalid, or the first reset is not of all envs.
+            LayoutError: a requested seed has no layout, or none of many drawn seeds has one.
         """
         options = dict(options or {})
-        envs = self._numbers(options.pop("env_idx")) if "env_idx" in options else list(range(self.num_envs))
-        seeds = dict(zip(envs, self._seeds(seed, len(envs)), strict=True))
-        if not self._parts and len(envs) < self.num_envs:
-            what = "the other environments have not been reset yet"
-            raise VectorEnvError(what, found=f"a reset of {name_envs(envs)}", fix="Reset all environments first.")
+        envs = self._parse_env_indices(options.pop("env_idx")) if "env_idx" in options else list(range(self.num_envs))
+        seeds = dict(zip(envs, self._seeds_per_env(seed, len(envs)), strict=True))
+        if not self._last_results and len(envs) < self.num_envs:
+            what = "the first reset must be of all environments"
+            raise VectorEnvError(what, found=f"a reset of {format_envs(envs)}", fix="Call reset without env_idx first.")
         self._must_reset |= set(envs)
         seeds_of_workers = [{env: seeds[env] for env in env_range if env in seeds} for env_range in self._env_ranges]
         new = [
             row
-            for rows in self._ask([("reset", seeds_of_worker, options) for seeds_of_worker in seeds_of_workers])
+            for rows in self._run_commands(
+                [("reset", seeds_of_worker, options) for seeds_of_worker in seeds_of_workers]
+            )
             for row in rows
         ]
         self._must_reset -= set(envs)
@@ -124,52 +128,54 @@ class ProcessEnv(gym.Env):
             paths = dict.fromkeys(
                 path for row in new for path in row
             )  # entries that a reset does not return are dropped
-            rows = dict(enumerate(row for part in self._parts for row in split_rows(*part)))
+            rows = dict(enumerate(row for part in self._last_results for row in split_rows(*part)))
             rows |= zip(sorted(envs), new, strict=True)
-            self._parts = [(1, {path: rows[i][path] for path in paths if path in rows[i]}) for i in sorted(rows)]
-        found = self._batch()
+            self._last_results = [(1, {path: rows[i][path] for path in paths if path in rows[i]}) for i in sorted(rows)]
+        found = self._batch_last_results()
         return found.get("obs", {}), found["info"]
 
     def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Step every env; see ``BaseEnv``.
+        """Step every env; returns the batched values of ``BaseEnv.step``.
 
         Args:
             action: (N, A) array or tensor; for one env also (A,).
 
         Raises:
-            VectorEnvError: the action has an invalid shape, or envs must be reset first.
+            VectorEnvError: the action has an invalid shape, or some envs must be reset after a failed call.
         """
         if self._must_reset:
-            envs = name_envs(sorted(self._must_reset))
-            what = "the environments are in an unknown state, since an earlier call was interrupted or failed"
-            raise VectorEnvError(what, where=envs, fix="Reset them first.")
+            envs = format_envs(sorted(self._must_reset))
+            what = "the state is unknown, because an earlier call was interrupted or failed"
+            raise VectorEnvError(what, where=envs, fix="Reset these environments before the next step.")
         action = action.cpu().numpy() if isinstance(action, torch.Tensor) else np.asarray(action)
         expected = self.action_space.shape
         if action.shape not in (expected, expected[1:] if self.num_envs == 1 else expected):  # pyright: ignore[reportOptionalSubscript]
-            raise VectorEnvError("invalid shape of actions", expected=expected, found=action.shape)
+            raise VectorEnvError("invalid shape of the actions", expected=expected, found=action.shape)
         action = action.astype(self.action_space.dtype).reshape(expected)
         self._must_reset = set(range(self.num_envs))
-        answers = self._ask([("step", action[env_range.start : env_range.stop]) for env_range in self._env_ranges])
+        answers = self._run_commands(
+            [("step", action[env_range.start : env_range.stop]) for env_range in self._env_ranges]
+        )
         self._must_reset = set()
-        self._parts = [*zip(map(len, self._env_ranges), answers, strict=True)]
-        found = self._batch()
+        self._last_results = [*zip(map(len, self._env_ranges), answers, strict=True)]
+        found = self._batch_last_results()
         return found.get("obs", {}), found["reward"], found["terminated"], found["truncated"], found["info"]
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call a method of each env, or read an attribute; return the results, which are pickled."""
-        answers = self._ask([("call", name, args, kwargs)] * len(self._env_ranges))
+        """Call a method or read an attribute of each env; return a tuple of N results, which must be picklable."""
+        answers = self._run_commands([("call", name, args, kwargs)] * len(self._env_ranges))
         return tuple(pickle.loads(result) for results in answers for result in results)
 
     def get_language_instruction(self) -> list[str]:
         return [text for texts in self.call("get_language_instruction") for text in texts]
 
     def render(self) -> Any:
-        """Return images (N, H, W, 3) of all envs in the mode ``render_mode``."""
+        """Return images (N, H, W, 3) of all envs in their ``render_mode``; None if they have no render mode."""
         images = self.call("render")
         return None if any(image is None for image in images) else torch.cat([*map(torch.as_tensor, images)])
 
     def close(self) -> None:
-        """Close all environments and end their processes; busy processes are killed."""
+        """Close all environments and end their processes; kill processes that still run a call."""
         if self._workers.closed:
             return
         try:
@@ -180,13 +186,13 @@ class ProcessEnv(gym.Env):
             self._must_reset.clear()
             self._workers.close()
 
-    def _ask(self, commands: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Send each worker its command, and return their answers.
+    def _run_commands(self, commands: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """Send one command to each worker, and return the results in the order of the workers.
 
         Raises:
-            VectorEnvError: it is closed.
-            VectorEnvCrashError: a process died; all of them are ended.
-            Exception: whatever the first env that failed raised.
+            VectorEnvError: the environments are closed.
+            VectorEnvCrashError: a worker process crashed; all processes are ended then.
+            Exception: error of the first failed env.
         """
         if self._workers.closed:
             raise VectorEnvError("the environments are closed", fix="Make a new vector environment.")
@@ -196,7 +202,9 @@ class ProcessEnv(gym.Env):
             env_range = self._env_ranges[self._workers.pids.index(crash.pid)]
             envs = [env for env in env_range if self._busy[env]] or list(env_range)
             fix = "Read the output above, run robocas doctor, and make a new vector environment."
-            died = VectorEnvCrashError("its worker process crashed", where=name_envs(envs), found=crash.found, fix=fix)
+            died = VectorEnvCrashError(
+                "its worker process crashed", where=format_envs(envs), found=crash.found, fix=fix
+            )
             died.envs = tuple(envs)
             self._must_reset.clear()
             self._workers.close()
@@ -206,10 +214,10 @@ class ProcessEnv(gym.Env):
                 failed.reraise()
         return [found for found, _ in answers]
 
-    def _batch(self) -> dict[str, Any]:
-        """Return the last rows of all envs as nested dictionaries of tensors (N, ...), or of lists."""
+    def _batch_last_results(self) -> dict[str, Any]:
+        """Return the last results of all envs as nested dictionaries of tensors (N, ...), or of lists of N values."""
         nested: dict[str, Any] = {}
-        for (*path, name), value in join_rows(self._parts).items():
+        for (*path, name), value in join_rows(self._last_results).items():
             inner = nested
             for part in path:
                 inner = inner.setdefault(part, {})
@@ -219,17 +227,18 @@ class ProcessEnv(gym.Env):
         self.elapsed_steps = nested["info"]["elapsed_steps"].clone()
         return nested
 
-    def _numbers(self, chosen: Any) -> list[int]:
+    def _parse_env_indices(self, chosen: Any) -> list[int]:
+        """Return the indices of the envs that ``env_idx`` names by indices or by flags (N,)."""
         chosen = np.asarray(chosen.cpu() if isinstance(chosen, torch.Tensor) else chosen)
         envs = np.flatnonzero(chosen) if chosen.dtype == bool and chosen.shape == (self.num_envs,) else chosen
         numbers = envs.tolist()
         if envs.ndim != 1 or len(set(numbers)) < len(numbers) or not set(numbers) <= set(range(self.num_envs)):
-            expected = f"different numbers from 0 to {self.num_envs - 1}"
-            raise VectorEnvError("invalid indices of environments", where="env_idx", expected=expected, found=numbers)
+            expected = f"different indices from 0 to {self.num_envs - 1}"
+            raise VectorEnvError("invalid env_idx", where="options", expected=expected, found=numbers)
         return numbers
 
-    def _seeds(self, seed: Any, count: int) -> list[tuple[int | None, bool]]:
-        """Return seeds, and whether another seed may replace one without layout because it was not requested."""
+    def _seeds_per_env(self, seed: Any, count: int) -> list[tuple[int | None, bool]]:
+        """Return the seed of each env to reset, and whether another seed may replace it if it has no layout."""
         if seed is None:  # each env draws until a seed has a layout
             return [(None, False)] * count
         if np.ndim(seed) == 0:
@@ -240,8 +249,8 @@ class ProcessEnv(gym.Env):
         return [(None if one is None else int(one), False) for one in seed]
 
 
-def name_envs(envs: Sequence[int]) -> str:
-    """Return the name of some environments for messages, such as "envs 0, 2"."""
+def format_envs(envs: Sequence[int]) -> str:
+    """Return the indices of environments as text for messages, such as "envs 0, 2"."""
     return f"env{'s' * (len(envs) > 1)} {', '.join(map(str, envs))}"
 
 

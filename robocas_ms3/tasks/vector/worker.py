@@ -1,4 +1,4 @@
-"""The worker of `ProcessEnv`: runs some of the environments in a process."""
+"""Worker of `ProcessEnv`, which runs some of the environments in a process."""
 
 from __future__ import annotations
 
@@ -24,29 +24,30 @@ from robocas_ms3.tasks.base import RoboCASEnv
 
 FIRST_SEED = 2022  # start of env 0's random stream, as in ManiSkill; env i has FIRST_SEED + i
 Rows = dict[tuple[str, ...], Any]
-"""Path in nested dictionaries -> array (E, ...) of all envs, or a list of E values if their shapes differ."""
+"""Flat form of a nested dictionary of E envs: path of keys -> array (E, ...), or list of E values."""
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class EnvSettings:
-    """Arguments from which all environments are made."""
+    """Settings from which a worker makes its environments."""
 
     env_id: str
     module: str  # module that registers the environment
     kwargs: dict[str, Any]  # arguments of `gym.make`
-    wrappers: tuple[Callable[[gym.Env], gym.Env], ...]  # the first one is the innermost
+    wrappers: tuple[Callable[[gym.Env], gym.Env], ...]  # the first function makes the innermost wrapper
     busy_file: str  # file of (num_envs,) bytes: 1 while an env is busy; read after a crash
 
 
 class EnvWorker:
-    """A worker that runs commands ``(method, *arguments)``; returns results and the first error.
+    """Worker that runs commands in some environments, and returns the results and the first error.
 
-    After an error in one env the command still runs in the others, so that an env does not depend on its process.
+    A command is a tuple of a method name (``step``, ``reset`` or ``call``) and its arguments. After an error in one
+    env, the command still runs in the other envs, so that an env does not depend on its process.
 
     Args:
         settings: pickled `EnvSettings`.
-        envs: indices of the environments.
+        envs: indices of the environments of this worker.
     """
 
     def __init__(self, settings: bytes, envs: range) -> None:
@@ -56,7 +57,7 @@ class EnvWorker:
         self._settings: EnvSettings = pickle.loads(settings)
         self._busy = np.memmap(self._settings.busy_file, mode="r+")
         self._first, self._envs = envs.start, dict[int, gym.Env]()
-        _, failed = self._each(envs, self._make)
+        _, failed = self._run_each(envs, self._make_env)
         if failed:
             self.close()
             failed.reraise()
@@ -66,30 +67,36 @@ class EnvWorker:
         return getattr(self, name)(*arguments)
 
     def close(self) -> None:
-        self._each(self._envs, lambda env: self._envs[env].close())
+        self._run_each(self._envs, lambda env: self._envs[env].close())
 
     def step(self, actions: np.ndarray) -> tuple[Rows, RemoteError | None]:
-        """Step all environments with actions (E, A)."""
-        rows, failed = self._each(self._envs, lambda env: self._step(env, actions[env - self._first]))
+        """Step all E environments of this worker with actions (E, A)."""
+        rows, failed = self._run_each(self._envs, lambda env: self._step_env(env, actions[env - self._first]))
         return join_rows([(1, row) for row in rows]), failed
 
     def reset(
         self, seeds: dict[int, tuple[int | None, bool]], options: dict[str, Any]
     ) -> tuple[list[Rows], RemoteError | None]:
-        """Reset some environments, by index: its seed or None, and whether another seed may replace it."""
-        return self._each(seeds, lambda env: self._reset(env, *seeds[env], dict(options)))
+        """Reset some environments.
+
+        Args:
+            seeds: index of an env -> its seed or None, and whether another seed may replace it if it has no layout.
+            options: options of ``BaseEnv.reset``.
+        """
+        return self._run_each(seeds, lambda env: self._reset_env(env, *seeds[env], dict(options)))
 
     def call(self, name: str, args: tuple, kwargs: dict[str, Any]) -> tuple[list[bytes], RemoteError | None]:
-        """Call a method of each environment, or read an attribute; the results are pickled."""
+        """Call a method or read an attribute of each environment; return pickled results."""
 
         def call(env: int) -> bytes:
             found: Any = self._envs[env].get_wrapper_attr(name)
             # pickled here, since the connection would put torch's tensors into shared memory
             return pickle.dumps(found(*args, **kwargs) if callable(found) else found)
 
-        return self._each(self._envs, call)
+        return self._run_each(self._envs, call)
 
-    def _each(self, envs: Iterable[int], act: Callable[[int], Any]) -> tuple[list[Any], RemoteError | None]:
+    def _run_each(self, envs: Iterable[int], act: Callable[[int], Any]) -> tuple[list[Any], RemoteError | None]:
+        """Call ``act`` with the index of each env; return the results and the first error."""
         results, failed = [], None
         for env in list(envs):
             self._busy[env] = 1
@@ -100,7 +107,7 @@ class EnvWorker:
             self._busy[env] = 0
         return results, failed
 
-    def _make(self, env: int) -> None:
+    def _make_env(self, env: int) -> None:
         importlib.import_module(self._settings.module)
         made: Any = gym.make(self._settings.env_id, **self._settings.kwargs)
         self._envs[env] = made
@@ -114,12 +121,12 @@ class EnvWorker:
         for wrap in self._settings.wrappers:
             made = self._envs[env] = wrap(made)
 
-    def _step(self, env: int, action: np.ndarray) -> Rows:
+    def _step_env(self, env: int, action: np.ndarray) -> Rows:
         obs, reward, terminated, truncated, info = self._envs[env].step(action)
         ends = {"terminated": np.array([bool(terminated)]), "truncated": np.array([bool(truncated)])}
-        return as_rows({"obs": obs, "reward": np.array([float(reward)], np.float32), **ends, "info": info})
+        return flatten_to_rows({"obs": obs, "reward": np.array([float(reward)], np.float32), **ends, "info": info})
 
-    def _reset(self, env: int, seed: int | None, replaceable: bool, options: dict) -> Rows:
+    def _reset_env(self, env: int, seed: int | None, replaceable: bool, options: dict) -> Rows:
         try:
             obs, info = self._envs[env].reset(seed=seed, options=options)
         except LayoutError as error:
@@ -127,31 +134,31 @@ class EnvWorker:
                 raise
             _log.warning("env %d: no layout for seed %d; drawing another seed: %s", env, seed, error)
             obs, info = self._envs[env].reset(options=options)
-        return as_rows({"obs": obs, "info": info})
+        return flatten_to_rows({"obs": obs, "info": info})
 
 
-def as_rows(nested: dict[str, Any], path: tuple[str, ...] = ()) -> Rows:
-    """Return nested dictionaries of one env as rows of arrays, which pickle 30 times faster than tensors."""
+def flatten_to_rows(nested: dict[str, Any], path: tuple[str, ...] = ()) -> Rows:
+    """Convert a nested dictionary of one env to NumPy `Rows`, which pickle 30 times faster than tensors."""
     rows: Rows = {}
     for name, value in nested.items():
-        rows |= as_rows(value, (*path, name)) if isinstance(value, dict) else {(*path, name): _as_row(value)}
+        rows |= flatten_to_rows(value, (*path, name)) if isinstance(value, dict) else {(*path, name): _to_row(value)}
     return rows
 
 
-def _as_row(leaf: Any) -> Any:
+def _to_row(leaf: Any) -> Any:
     if isinstance(leaf, torch.Tensor):
         leaf = (leaf.float() if leaf.dtype == torch.bfloat16 else leaf).detach().cpu().numpy()
     return leaf if isinstance(leaf, np.ndarray) and leaf.shape[:1] == (1,) else [leaf]
 
 
 def join_rows(parts: Sequence[tuple[int, Rows]]) -> Rows:
-    """Join several (number of envs, rows) to rows of all envs; a missing value is None."""
+    """Join pairs (number of envs, rows) to the rows of all envs; values that an env lacks are None."""
     paths = dict.fromkeys(path for _, rows in parts for path in rows)
-    return {path: _join([rows.get(path, [None] * count) for count, rows in parts]) for path in paths}
+    return {path: _join_pieces([rows.get(path, [None] * count) for count, rows in parts]) for path in paths}
 
 
-def _join(pieces: Sequence[Any]) -> Any:
-    """Join pieces into one new array, or into a list per env if types or shapes differ."""
+def _join_pieces(pieces: Sequence[Any]) -> Any:
+    """Join arrays or lists to one new array, or to a list with one value per env if types or shapes differ."""
     kinds = [isinstance(piece, np.ndarray) and (piece.dtype, piece.shape[1:]) for piece in pieces]
     if kinds[0] and kinds.count(kinds[0]) == len(kinds):
         return np.concatenate(pieces)
@@ -160,5 +167,5 @@ def _join(pieces: Sequence[Any]) -> Any:
 
 
 def split_rows(count: int, rows: Rows) -> list[Rows]:
-    """Split rows of several envs into rows of single envs, which are views."""
+    """Split the rows of ``count`` envs into a list of rows of single envs; the arrays are views."""
     return [{path: piece[i : i + 1] for path, piece in rows.items()} for i in range(count)]

@@ -92,7 +92,7 @@ def test_progress_sums_to_the_change_and_swaying_pays_nothing():
         action[1] += 0.5 * np.sin(2 * np.pi * min(k, 60) / 20)  # three times towards the table and back
         _, reward, *_, info = env.step(action)
         rewards.append(reward.item())
-        levels.append(base.dense_reward.last_level.item())
+        levels.append(base.dense_reward.last_normalized_reward.item())
     assert rewards[0] == 0
     assert np.sum(rewards) == pytest.approx(levels[-1] - levels[0], abs=1e-5)
     assert np.ptp(levels) > 0.004  # the reward did change
@@ -234,7 +234,7 @@ def test_tasks_add_their_observations(env_id, names):
     base: Any = env.unwrapped
     assert list(obs["extra"])[-len(names) - 1 :] == [*names, "tcp_pose"]
     if names[0] == "hidden_fraction":
-        assert obs["extra"]["hidden_fraction"].item() == pytest.approx(base.clutter().hidden_fraction.item())
+        assert obs["extra"]["hidden_fraction"].item() == pytest.approx(base.measure_clutter().hidden_fraction.item())
         _, terms, info = reward_now(base)
         assert bool(info["obstacles_cleared"]) is (terms["reach"] > 0)
         for slot in range(len(base.objects)):
@@ -246,7 +246,7 @@ def test_tasks_add_their_observations(env_id, names):
     else:
         assert obs["extra"]["opened_fraction"].item() == pytest.approx(0, abs=1e-3)
         furniture, joint = base._opening
-        handle = base.handle_in_world()[0].copy()
+        handle = base.handle_position()[0].copy()
         shut = reward_now(base)
         qpos = furniture.get_qpos().clone()
         qpos[:, joint] = base.model.open_threshold / 2
@@ -254,7 +254,7 @@ def test_tasks_add_their_observations(env_id, names):
         half = reward_now(base)
         assert (shut[1]["open"], half[1]["open"]) == pytest.approx((0, 0.5), abs=1e-3)
         assert half[0] > shut[0]
-        assert np.linalg.norm(base.handle_in_world()[0] - handle) > 0.1  # the handle moves with the door
+        assert np.linalg.norm(base.handle_position()[0] - handle) > 0.1  # the handle moves with the door
         qpos[:, joint] = base.model.open_threshold * 1.01
         furniture.set_qpos(qpos)
         assert reward_now(base)[0] > 4 / 14
