@@ -1,4 +1,4 @@
-"""Scripted policy of search: look, clear occluders, grasp the target, carry it to the basket.
+"""Scripted policy of search: look, clear obstacles, grasp the target, carry it to the basket.
 
 The policy plays several candidate moves and continues from the move with the lowest remaining cost.
 """
