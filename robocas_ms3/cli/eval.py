@@ -78,7 +78,7 @@ def run(settings: EvaluationSettings) -> int:
             bar.advance()
     result = read_result(session.folder)
     print_text(render_markdown(result))
-    errors, successes = result.error_count(), sum(outcome.success for outcome in outcomes)
+    errors, successes = result.count_errors(), sum(outcome.success for outcome in outcomes)
     print_line(f"{format_count(len(outcomes), 'episode')} run, {successes} succeeded")
     note = f", {errors} ended with an error (run them again with --retry-errors)" if errors else ""
     print_line(f"{session.folder}: {format_count(len(result.outcomes), 'episode')}{note}")

@@ -130,7 +130,7 @@ def verify(cfg: Verify) -> int:
     found = find_violations(result, _protocol_of(result, cfg.protocol))
     for violation in found:
         print_line(violation)
-    if broken := result.error_count():
+    if broken := result.count_errors():
         print_line(f"note: {format_count(broken, 'episode')} ended by an error, counted as failed")
     valid = f"{format_count(len(result.outcomes), 'episode')} of {result.run.protocol}, no violations"
     print_line(f"{', '.join(map(str, cfg.folders))}: {format_count(len(found), 'violation') if found else valid}")

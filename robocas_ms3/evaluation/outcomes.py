@@ -57,7 +57,7 @@ class Retrieval:
     def from_record(
         cls, record: NDArray[np.integer], objects: Sequence[str], held_at: int | None, *, cleared: bool
     ) -> Retrieval:
-        """Return the retrieval order from a record of `metrics.RetrievalTracker.read`.
+        """Return the retrieval order from a record of `metrics.RetrievalTracker.compute_record`.
 
         Args:
             record: (K, 3) values of the K objects by slot.

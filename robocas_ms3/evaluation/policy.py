@@ -33,12 +33,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TcpMotion:
-    """Relative motions of E TCPs in their own frames (z approach, y closing direction).
+    """Motions of the TCPs of E envs, each relative to the frame of its TCP (z approach, y closing direction).
 
     Attributes:
         translation: (E, 3) m.
         rotation: E rotations.
-        open: (E,) whether the gripper is commanded to open.
+        open: (E,) bool, True: command the gripper to open; False: to close.
     """
 
     translation: Array
@@ -48,25 +48,25 @@ class TcpMotion:
 
 @dataclass(frozen=True)
 class ActionConvention:
-    """An action convention.
+    """Meaning of the numbers of an action.
 
     Attributes:
-        size: numbers per action.
-        decode: converts actions (E, size) to motions; None: the actions are joint targets.
+        size: number of numbers per action.
+        decode: function that converts actions (E, size) to TCP motions; None: the actions are joint targets.
     """
 
     size: int
     decode: Callable[[Array], TcpMotion] | None
 
 
-def _motions(rotation: Callable[[Array], Rotation], open_above: float = 0.0) -> Callable[[Array], TcpMotion]:
-    def read(actions: Array) -> TcpMotion:
-        return TcpMotion(actions[:, :3], rotation(actions[:, 3:-1]), actions[:, -1] > open_above)
+def _make_decoder(to_rotation: Callable[[Array], Rotation], open_above: float = 0.0) -> Callable[[Array], TcpMotion]:
+    def decode(actions: Array) -> TcpMotion:
+        return TcpMotion(actions[:, :3], to_rotation(actions[:, 3:-1]), actions[:, -1] > open_above)
 
-    return read
+    return decode
 
 
-def _quaternions(wxyz: Array) -> Rotation:
+def _from_quaternions(wxyz: Array) -> Rotation:
     xyzw = wxyz[:, [1, 2, 3, 0]]
     lengths = np.linalg.norm(xyzw, axis=1, keepdims=True)
     return Rotation.from_quat(np.where(lengths > 1e-9, xyzw / np.maximum(lengths, 1e-9), [0.0, 0.0, 0.0, 1.0]))
@@ -76,10 +76,10 @@ _euler = partial(Rotation.from_euler, "xyz")
 # Translation in m, then rotation (Euler angles about fixed axes x, y, z in rad, a rotation vector in rad, or a
 # quaternion wxyz), both in the TCP's frame. The last number commands the gripper: open above 0, in `robocas` above 0.5.
 CONVENTIONS: dict[str, ActionConvention] = {
-    "robocas": ActionConvention(7, _motions(_euler, 0.5)),
-    "delta_euler": ActionConvention(7, _motions(_euler)),
-    "delta_axis_angle": ActionConvention(7, _motions(Rotation.from_rotvec)),
-    "delta_quaternion": ActionConvention(8, _motions(_quaternions)),
+    "robocas": ActionConvention(7, _make_decoder(_euler, 0.5)),
+    "delta_euler": ActionConvention(7, _make_decoder(_euler)),
+    "delta_axis_angle": ActionConvention(7, _make_decoder(Rotation.from_rotvec)),
+    "delta_quaternion": ActionConvention(8, _make_decoder(_from_quaternions)),
     "joint_positions": ActionConvention(8, None),  # seven joint targets, rad; gripper, -1 closed to 1 open
 }
 """Action conventions by name."""
@@ -87,20 +87,20 @@ CONVENTIONS: dict[str, ActionConvention] = {
 
 @dataclass(frozen=True)
 class PolicySpec:
-    """Specification that a policy declares.
+    """Actions and observations of a policy, as the policy declares them in its attribute ``spec``.
 
-    A policy that does not fit the protocol is refused before the first step.
+    An evaluation refuses a policy that does not fit the protocol before the first step.
 
     Attributes:
-        convention: action convention, one of `CONVENTIONS`.
-        reference: pose that motions are relative to: ``tcp`` (present TCP pose) or ``target`` (last commanded pose).
-        rate_hz: actions per second; None: the protocol's rate.
+        convention: name of the action convention, a key of `CONVENTIONS`.
+        reference: pose from which a motion starts: ``tcp`` (present TCP pose) or ``target`` (last commanded TCP pose).
+        rate_hz: actions per second, a divisor of 100; None: the rate of the protocol, or 20 if it has none.
         cameras: (width, height) in pixels by camera name; empty: no images.
-        depth: whether the policy observes depth images.
+        depth: whether the policy observes a depth image per camera.
         state: whether the policy observes privileged state (docs/rl.md).
-        language: form of the instruction.
-        observe_every: number of policy steps between rendered images, from the first step on. Images of other steps
-            are black, which saves rendering time. Chunk lengths must be multiples of this number.
+        language: form of the instruction: ``text``, ``embedding`` (text and its sentence embedding) or ``none``.
+        observe_every: number n of policy steps between rendered images: steps 0, n, 2 n, ... are rendered. The images
+            of other steps are black, which saves rendering time. Chunk lengths must be multiples of n.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")  # for specifications in messages and addresses
@@ -120,8 +120,8 @@ class PolicySpec:
             ("convention", self.convention in CONVENTIONS, f"one of {sorted(CONVENTIONS)}"),
             ("reference", self.reference in get_args(Reference), f"one of {list(get_args(Reference))}"),
             ("language", self.language in get_args(Language), f"one of {list(get_args(Language))}"),
-            ("cameras", not wrong_cameras, "camera names such as side_camera"),
-            ("observe_every", self.observe_every >= 1, "1 or more"),
+            ("cameras", not wrong_cameras, "names such as side_camera"),
+            ("observe_every", self.observe_every >= 1, "at least 1"),
         ):
             if not fits:
                 found = repr(wrong_cameras[0] if name == "cameras" else getattr(self, name))
@@ -130,17 +130,17 @@ class PolicySpec:
 
 @dataclass(frozen=True)
 class EpisodeSpec:
-    """Specification of an episode, as policies receive it.
+    """Episode that starts, as `Policy.reset` receives it.
 
     Attributes:
         env: index of the env that runs the episode, as in `Observations.envs`.
-        episode: number of the episode in the protocol.
-        task: short name of the task.
-        config_file: YAML file of the task configuration.
-        layouts_file: NumPy file of the scene layouts.
+        episode: number of the episode in the protocol, from 0 on.
+        task: short name of the task, such as ``pick``.
+        config_file: path of the YAML file of the task configuration.
+        layouts_file: path of the NumPy file of the scene layouts.
         pack: name or folder of the object pack.
         seed: seed of the scene.
-        instruction: text of the instruction.
+        instruction: text of the instruction; may be empty.
         robot: name of the robot.
     """
 
@@ -157,16 +157,16 @@ class EpisodeSpec:
 
 @dataclass(frozen=True)
 class Observations:
-    """Observations of E envs as NumPy arrays with one row per env.
+    """Observations of the E envs that need actions: NumPy arrays with one row per env.
 
     Attributes:
-        envs: (E,) indices of the envs.
-        instructions: E texts; empty with language ``none``.
-        embeddings: (E, 384) float32 sentence embeddings, or None.
-        images: (E, H, W, 3) uint8 by camera.
-        depths: (E, H, W, 1) int16 in mm by camera.
-        robot: (E, D) by name of `ROBOT_QUANTITIES`. Each quantity is also an attribute, such as ``qpos``.
-        state: (E, D) privileged state, or None.
+        envs: (E,) int64 indices of the envs.
+        instructions: E texts; empty texts with language ``none``.
+        embeddings: (E, 384) float32 sentence embeddings; None unless language is ``embedding``.
+        images: by camera name, (E, H, W, 3) uint8.
+        depths: by camera name, (E, H, W, 1) int16 in mm, 0: no measurement; empty without depth.
+        robot: by name in `ROBOT_QUANTITIES`, (E, D) float32. Each quantity is also an attribute, such as ``qpos``.
+        state: (E, D) float32 privileged state; None unless the policy observes it.
     """
 
     envs: NDArray[np.int64]
@@ -184,51 +184,60 @@ class Observations:
 
 
 def concatenate_privileged_state(extra: Mapping[str, Any]) -> NDArray[np.float32]:
-    """Return the privileged state (N, D) from ``obs["extra"]`` of an environment, arrays (N, ...)."""
+    """Concatenate the arrays of ``obs["extra"]`` (N, ...), except ``tcp_pose``, to the privileged state (N, D)."""
     return np.concatenate([np.asarray(value) for name, value in extra.items() if name != "tcp_pose"], axis=1)
 
 
 class Policy(Protocol):
-    """A policy that runs several episodes at a time.
+    """Interface of a policy, which runs several episodes at a time, one per env.
 
-    Optional methods: ``describe()`` returns a dict that results record. ``protocol_warnings(configs)`` gets the task
-    configurations of an evaluation by name and returns warnings, such as scenes that are not in the training data.
-    ``close()`` is called at the end.
+    Optional methods:
+
+    - ``describe()`` returns a dict that ``run.json`` of a result records.
+    - ``protocol_warnings(configs)`` gets the task configurations of an evaluation by name. It returns a list of
+      warnings, such as scenes that are not in the training data.
+    - ``close()`` is called at the end of the evaluation.
     """
 
     @property
     def spec(self) -> PolicySpec: ...
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
-        """Start one episode in each of some envs and drop the state of their previous episodes."""
+        """Start the given episodes, one per env, and drop the state of the previous episodes of these envs."""
         ...
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Return actions (E, A) or action chunks (E, H, A).
+        """Return one action (E, A) or a chunk of H actions (E, H, A) for each env of the observations.
 
-        All H steps of a chunk are executed before the next call for the env.
+        All H actions of a chunk are executed before the next call for this env.
         """
         ...
 
 
 def as_action_chunks(actions: ArrayLike, count: int, size: int | None, *, where: str = "") -> NDArray[np.float32]:
-    """Return actions (E, A) or (E, H, A) of ``count`` envs as chunks (E, H, A).
+    """Return actions (E, A) or (E, H, A) as chunks (E, H, A) float32.
+
+    Args:
+        actions: actions of a policy.
+        count: expected number E of envs.
+        size: expected number A of numbers per action; None: any number.
+        where: name of the policy or function, for the error.
 
     Raises:
-        EvaluationError: the actions are not numeric or have another shape; ``size`` None: any A is valid.
+        EvaluationError: the actions are not numeric or have another shape.
     """
     found = np.asarray(actions)
     chunks = found[:, None] if found.ndim == 2 else found
     fits = chunks.ndim == 3 and len(chunks) == count and chunks.shape[1] > 0 and size in (None, chunks.shape[2])
     if found.dtype.kind not in "iuf" or not fits:
-        expected = f"({count}, {size or 'size'}) or ({count}, chunk, {size or 'size'}) numbers"
+        expected = f"numbers of shape ({count}, {size or 'A'}) or ({count}, H, {size or 'A'})"
         what = f"{found.shape} {found.dtype}"
-        raise EvaluationError("invalid shape or type of actions", where=where, expected=expected, found=what)
+        raise EvaluationError("the actions have an invalid shape or type", where=where, expected=expected, found=what)
     return chunks.astype(np.float32)
 
 
 class ExternalPolicy:
-    """Placeholder policy of an external loop that calls `EvaluationSession.reset` and `step`."""
+    """Policy without actions, for an external loop that chooses the actions (`EvaluationSession.reset` and `step`)."""
 
     def __init__(self, spec: PolicySpec) -> None:
         self.spec = spec
@@ -237,28 +246,32 @@ class ExternalPolicy:
         pass
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        raise EvaluationError("ExternalPolicy returns no actions", fix="Call EvaluationSession.reset and step.")
+        raise EvaluationError(
+            "ExternalPolicy has no actions", fix="Call EvaluationSession.reset and step instead of run or run_episodes."
+        )
 
 
 def policy_spec_to_dict(spec: PolicySpec) -> dict[str, Any]:
-    """Return a specification as JSON values; ``observe_every`` is left out if it is 1."""
+    """Return a specification as a dict of JSON values; ``observe_every`` is left out if it is 1."""
     values = {**vars(spec), "cameras": {name: list(size) for name, size in spec.cameras.items()}}
     return {key: value for key, value in values.items() if key != "observe_every" or value != 1}
 
 
 def describe_policy(policy: Policy) -> dict[str, Any]:
-    """Return the description of a policy for results: class, specification and ``describe()``."""
+    """Return the class, the specification and the result of ``describe()`` of a policy, for ``run.json``."""
     where = f"policy {_class_name(policy)}, describe()"
     with forbid_policy_exit(policy):
         spec, added = policy_spec_to_dict(policy.spec), getattr(policy, "describe", dict)()
     if not isinstance(added, dict):
-        raise EvaluationError("invalid policy description", where=where, expected="a dict", found=type(added).__name__)
+        raise EvaluationError(
+            "the description of the policy is invalid", where=where, expected="a dict", found=type(added).__name__
+        )
     description = {"class": _class_name(policy), "spec": spec, **added}
     return json.loads(json_text(description, where, error=EvaluationError))
 
 
 def forbid_policy_exit(policy: Policy) -> AbstractContextManager[None]:
-    """Return a context in which a policy that tries to end the process raises an error (`forbid_exit`)."""
+    """Open a context in which an attempt of the policy to end the process raises an error (`forbid_exit`)."""
     return forbid_exit(f"policy {_class_name(policy)}")
 
 

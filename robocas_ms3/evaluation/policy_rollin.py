@@ -1,6 +1,6 @@
-"""Roll in a learned policy before the scripted policy continues (DAgger demonstrations).
+"""Run a learned policy before the scripted policy continues (DAgger demonstrations).
 
-The policy acts as in the protocol `PROTOCOL` (stepping of RoboCAS-v0 at 5 Hz), in scenes of any configuration.
+The policy acts by the rules of the protocol `PROTOCOL` (steps of RoboCAS-v0 at 5 Hz), in scenes of any configuration.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.vector import RoboCASVectorEnv
 
 PROTOCOL = "paper-v1"
-_STEPS = 410  # random stream of the number of steps
+_STEPS_STREAM = 410  # random stream of the number of steps
 _log = logging.getLogger(__name__)
 
 
 def sample_roll_in_steps(seed: int, after_steps: tuple[int, int]) -> int:
-    """Draw the number of policy steps for a seed, uniform in ``after_steps`` (both ends included)."""
-    return int(np.random.default_rng([seed, _STEPS]).integers(after_steps[0], after_steps[1] + 1))
+    """Return the number of policy steps for a seed, uniform in ``after_steps`` (both ends included)."""
+    return int(np.random.default_rng([seed, _STEPS_STREAM]).integers(after_steps[0], after_steps[1] + 1))
 
 
 def check_roll_in_policy(settings: EpisodeSettings) -> str:
-    """Check the policy of ``after_policy``; return the hash of its weights (empty without weights)."""
+    """Check that the policy ``after_policy`` fits `PROTOCOL`; return the hash of its weights, empty without weights."""
     with open_policy(settings.after_policy) as policy:
         load_protocol(PROTOCOL).rules.check_policy(policy.spec)
         if policy.spec.cameras:
@@ -49,11 +49,11 @@ def check_roll_in_policy(settings: EpisodeSettings) -> str:
 
 
 class PolicyRollIn:
-    """A worker (`core.workers.Worker`) that rolls in a policy in one environment, one scene per seed."""
+    """Worker (`core.workers.Worker`) that runs a policy in one environment until the scripted policy continues."""
 
     def __init__(self, settings: EpisodeSettings) -> None:
-        self._settings, self._open = settings, ExitStack()
-        self._policy: Policy = self._open.enter_context(open_policy(settings.after_policy))
+        self._settings, self._stack = settings, ExitStack()
+        self._policy: Policy = self._stack.enter_context(open_policy(settings.after_policy))
         spec = self._policy.spec
         env = gym.make(
             TASKS[settings.task].env_id,
@@ -68,38 +68,41 @@ class PolicyRollIn:
         self._base: Any = env.unwrapped
         options = {"auto_reset": False, "ignore_terminations": True, "record_metrics": False}
         self._vector = RoboCASVectorEnv(self._env, "numpy", **options)
-        folder = self._open.enter_context(tempfile.TemporaryDirectory(prefix="robocas-config-"))
+        folder = self._stack.enter_context(tempfile.TemporaryDirectory(prefix="robocas-config-"))
         self._config = Path(folder) / "config.yaml"  # policies expect a file
         config = load_task_config(settings.config).model_dump(mode="json")
         self._config.write_text(json.dumps(config), encoding="utf-8")
 
     def run(self, seed: int) -> Intervention:
-        """Run the policy in the scene of a seed and return the state in which it leaves the scene."""
+        """Run the policy in the scene of a seed; return the state of the scene after its steps.
+
+        The result has a ``skip_reason`` if no demonstration can start: no layout, success, failure, or an error.
+        """
         settings, steps = self._settings, sample_roll_in_steps(seed, self._settings.after_steps)
         batch = EpisodeBatch(self._vector, self._policy.spec, EndConditions(steps), 1 / V0_CONTROL_HZ, refill=False)
         try:
             self._vector.reset(seed=[seed])
-            (played,) = run_rollouts(batch, self._policy, [self._episode(seed)])
+            (ended,) = run_rollouts(batch, self._policy, [self._make_episode_spec(seed)])
         except LayoutError:
             return Intervention(seed, settings.after_policy, 0, {}, 1.0, "no_layout")
-        if played.error:
-            _log.warning("seed %d: %s", seed, played.error)
+        if ended.error:
+            _log.warning("seed %d is skipped: the policy failed: %s", seed, ended.error)
         reasons = {
-            "policy_failed": played.error,
-            "succeeded": played.at_end["success"],
-            "failed": played.at_end["fail"],
+            "policy_failed": ended.error,
+            "succeeded": ended.at_end["success"],
+            "failed": ended.at_end["fail"],
         }
         skip_reason = next((reason for reason, applies in reasons.items() if applies), "")
         state: dict[str, Any] = self._base.get_state_dict()
         state = {kind: to_numpy(values) for kind, values in state.items() if kind != "controller"}
         gripper = 1.0 if self._env.is_gripper_commanded_open else -1.0
-        return Intervention(seed, settings.after_policy, played.steps, state, gripper, skip_reason)
+        return Intervention(seed, settings.after_policy, ended.steps, state, gripper, skip_reason)
 
     def close(self) -> None:
         self._env.close()
-        self._open.close()
+        self._stack.close()
 
-    def _episode(self, seed: int) -> EpisodeSpec:
+    def _make_episode_spec(self, seed: int) -> EpisodeSpec:
         settings, text = self._settings, self._base.instruction().text
         files = (str(self._config), settings.layouts, settings.pack)
         return EpisodeSpec(-1, 0, settings.task, *files, seed, text, robot=settings.robot)

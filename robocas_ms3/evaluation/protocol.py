@@ -8,7 +8,7 @@
     layouts/NAME.npy         scene layouts of the episodes of a configuration (`scenes.layout_table.FrozenLayouts`)
     train/NAME.yaml          configurations for training, without the conditions that the protocol holds out
 
-Results with the same protocol hash were measured with the same files.
+The hash of a protocol covers all these files, so results with equal hashes are comparable.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from robocas_ms3.scenes.task_specs import TASKS
 INVALID_RULES = "invalid protocol rules"
 DEFAULT_HZ = 20  # actions per second if neither protocol nor policy has a rate
 TASK_ALIASES = {"select": "pick"}
-"""RoboCAS-v0's evaluator runs the first task in the episodes of the second task."""
+"""Task by its alias: RoboCAS-v0's evaluator runs select in the episodes of pick."""
 CONFIG_NAME = r"^[A-Za-z0-9_-]+$"
 EPISODES, CONFIGS, LAYOUTS, TRAIN = "episodes.jsonl", "configs", "layouts", "train"
 
 
 class Protocol(StrictModel):
-    """Rules of all episodes of a protocol."""
+    """Rules of a protocol, which hold for all its episodes: the file ``protocol.yaml``."""
 
     name: FileName = Field(description="name of the protocol and of the folder of its results")
     description: str = Field(description="what the protocol measures")
@@ -65,7 +65,7 @@ class Protocol(StrictModel):
         default=["tcp", "target"], description="allowed references of motions"
     )
     ends_on: list[Literal["success", "fail", "success_v0"]] = Field(
-        default=["success", "fail"], description="flags that end an episode"
+        default=["success", "fail"], description="flags that end an episode at the step at which they hold"
     )
     max_v0_steps: Annotated[int, Field(ge=1, le=10**7)] | None = Field(
         default=None, description="number of actions with RoboCAS-v0's success after which an episode ends"
@@ -82,42 +82,55 @@ class Protocol(StrictModel):
             if unknown:
                 raise ValueError(f"{key}: expected some of {', '.join(known)}, found {', '.join(unknown)}")
         if self.stepping == "upstream" and self.max_steps is None:
-            raise ValueError("stepping upstream requires max_steps: the duration of its steps varies")
+            raise ValueError(
+                "max_steps: missing; stepping: upstream needs it, because the duration of its steps varies"
+            )
         return self
 
     def step_limit(self, task: str, rate: int) -> int | None:
-        """Return the maximum number of actions per episode of a task at a rate; None: no maximum."""
+        """Return the maximum number of actions per episode of a task; None: no maximum.
+
+        ``rate``: actions per second, which converts ``max_seconds`` to actions.
+        """
         seconds = self.max_seconds.get(task) if self.stepping == "timed" else None
         ends = [self.max_steps, None if seconds is None else round(seconds * rate)]
         return min((steps for steps in ends if steps is not None), default=None)
 
     def check_policy(self, spec: PolicySpec) -> None:
-        """Check that a policy can be evaluated with this protocol."""
+        """Raise `EvaluationError` if the protocol does not allow the convention, reference or rate of a policy."""
         for what, found, allowed in (
             ("convention", spec.convention, self.conventions),
             ("reference", spec.reference, self.references),
         ):
             if found not in allowed:
-                message, expected = f"the protocol does not allow this {what} of a policy", " or ".join(allowed)
-                raise EvaluationError(message, where=self.name, expected=expected, found=found)
+                message, fix = (
+                    f"the protocol does not allow the {what} of the policy",
+                    f"Change {what} in the PolicySpec.",
+                )
+                expected = " or ".join(allowed)
+                raise EvaluationError(message, where=self.name, expected=expected, found=found, fix=fix)
         if self.rate_hz is not None and spec.rate_hz not in (None, self.rate_hz):
             expected, found = f"{self.rate_hz} Hz", f"{spec.rate_hz:g} Hz"
             raise EvaluationError(
-                "the policy has another action rate than the protocol", where=self.name, expected=expected, found=found
+                "the action rate of the policy differs from the rate of the protocol",
+                where=self.name,
+                expected=expected,
+                found=found,
+                fix=f"Set rate_hz={self.rate_hz} in the PolicySpec, or choose a protocol without a rate.",
             )
 
-    def action_rate(self, spec: PolicySpec) -> int:
-        """Return the number of actions per second."""
+    def choose_action_rate(self, spec: PolicySpec) -> int:
+        """Return the number of actions per second: the rate of the protocol, else of the policy, else 20."""
         rate = self.rate_hz or spec.rate_hz or DEFAULT_HZ
         if rate < 1 or rate != int(rate) or 100 % int(rate):
             raise EvaluationError(
-                "invalid action rate", where="rate_hz", expected="a divisor of 100", found=f"{rate:g}"
+                "invalid action rate", where="rate_hz", expected="a divisor of 100, in Hz", found=f"{rate:g} Hz"
             )
         return int(rate)
 
 
 class ProtocolEpisode(StrictModel):
-    """An episode of a protocol: a line of ``episodes.jsonl``."""
+    """Episode of a protocol: a line of ``episodes.jsonl``."""
 
     episode: Annotated[int, Field(ge=0, le=10**7)] = Field(description="number of the episode, from 0 on")
     task: str
@@ -129,13 +142,13 @@ class ProtocolEpisode(StrictModel):
     instruction: str = Field(description="instruction given to the policy")
     target: str = Field(description="id of the target object")
     p_vis: Annotated[float, Field(ge=0, le=1)] | None = Field(
-        default=None, description="visible fraction of the target from above (search)"
+        default=None, description="visible fraction of the target at the reset, seen from above; null: not measured"
     )
 
 
 @dataclass(frozen=True)
 class LoadedProtocol:
-    """A protocol in memory: folder, rules, and episodes in the order of their numbers."""
+    """Protocol that was read from a folder: its rules, and its episodes in the order of their numbers."""
 
     folder: Path
     rules: Protocol
@@ -166,14 +179,20 @@ class LoadedProtocol:
         return digest.hexdigest()
 
     def select_episodes(self, settings: EvaluationSettings) -> list[ProtocolEpisode]:
-        """Return the episodes that the settings select, at least one."""
-        tasks = {self.played_as(settings.tasks).get(task, task) for task in settings.tasks}
+        """Return the episodes that the tasks, split, shard and maximum number of the settings select, at least one.
+
+        Raises:
+            EvaluationError: the protocol has no such task or split, or no episode is selected.
+        """
+        tasks = {self.find_task_aliases(settings.tasks).get(task, task) for task in settings.tasks}
         splits = (settings.split,) if settings.split else ()
         for kind, where, names in (("task", "TASK", sorted(tasks)), ("split", "--split", splits)):
             known = dict.fromkeys(str(getattr(episode, kind)) for episode in self.episodes)
             for name in names:
                 if name not in known:
-                    other = "Choose another protocol (robocas eval protocols), or make one: robocas eval freeze."
+                    other = (
+                        "Choose another protocol (robocas eval protocols), or make your own with robocas eval freeze."
+                    )
                     expected, fix = ", ".join(known), did_you_mean(name, known) or other
                     what = f"the protocol has no episodes of this {kind}"
                     raise EvaluationError(what, where=where, expected=expected, found=name, fix=fix, usage=True)
@@ -186,16 +205,18 @@ class LoadedProtocol:
             if first and episode.episode % count == index:
                 chosen.append(episode)
         if not chosen:
-            raise EvaluationError("no episodes in this shard", where=self.rules.name, found=settings.shard)
+            what, found = "no episode is selected", f"shard {settings.shard}"
+            fix = "Use fewer shards, or more episodes (--episodes, --split, tasks)."
+            raise EvaluationError(what, where=self.rules.name, expected="at least 1 episode", found=found, fix=fix)
         return chosen
 
-    def played_as(self, tasks: Sequence[str]) -> dict[str, str]:
-        """Return the tasks that are evaluated in the episodes of another task, as in RoboCAS-v0.
+    def find_task_aliases(self, tasks: Sequence[str]) -> dict[str, str]:
+        """Return the tasks that run in the episodes of another task, as in RoboCAS-v0, with this other task.
 
-        Only tasks without own episodes in this protocol are returned, with the other task.
+        Example: ``{"select": "pick"}`` in ``paper-v1``, which has no episodes of select.
 
         Raises:
-            EvaluationError: both tasks are in ``tasks``; their episodes would be the same.
+            EvaluationError: ``tasks`` contains both tasks, whose episodes are equal.
         """
         known = {episode.task for episode in self.episodes}
         found = {task: TASK_ALIASES[task] for task in tasks if task in TASK_ALIASES and task not in known}
@@ -208,22 +229,24 @@ class LoadedProtocol:
         return found
 
     def check_cameras(self, spec: PolicySpec, episodes: Sequence[ProtocolEpisode]) -> None:
-        """Check that the configurations of episodes have the cameras that a policy observes."""
+        """Raise `EvaluationError` if the configuration of an episode lacks a camera that a policy observes."""
         robot = find_robot(self.rules.robot).description
         for config in dict.fromkeys(episode.config for episode in episodes):
             known = [camera.name for camera in load_task_config(self.config_file(config)).cameras_of(robot)]
             for name in spec.cameras:
                 if name not in known:
-                    where, expected = f"{self.rules.name}, {config}", f"some of {', '.join(known)}"
+                    where, expected = f"{self.rules.name}, {config}", f"one of {', '.join(known)}"
                     fix = did_you_mean(name, known)
-                    raise EvaluationError("unknown camera", where=where, expected=expected, found=name, fix=fix)
+                    raise EvaluationError(
+                        "the policy observes an unknown camera", where=where, expected=expected, found=name, fix=fix
+                    )
 
     def check_same_configuration(self, episodes: Sequence[ProtocolEpisode], fix: str = "") -> None:
-        """Check that episodes have the same configuration, so that they can run in one batch."""
+        """Raise `EvaluationError` if the episodes have different configurations, so that one batch cannot run them."""
         configs = list(dict.fromkeys(episode.config for episode in episodes))
         if len(configs) > 1:
-            what, found = "a batch needs episodes of one configuration", ", ".join(configs)
-            raise EvaluationError(what, where=self.rules.name, found=found, fix=fix)
+            what, found = "the episodes of a batch have different configurations", ", ".join(configs)
+            raise EvaluationError(what, where=self.rules.name, expected="one configuration", found=found, fix=fix)
 
     def config_file(self, config: str) -> Path:
         """Return the YAML file of a configuration."""
@@ -239,7 +262,7 @@ class LoadedProtocol:
 
 
 def list_protocol_files(folder: Path) -> list[Path]:
-    """Return all files of a protocol, sorted."""
+    """Return the paths of all files of a protocol, sorted."""
     patterns = (f"{CONFIGS}/*.yaml", f"{LAYOUTS}/*.npy", f"{TRAIN}/*.yaml")
     return sorted([folder / RULES, folder / EPISODES, *(path for name in patterns for path in folder.glob(name))])
 
@@ -262,30 +285,35 @@ def load_protocol(name: str | Path) -> LoadedProtocol:
     except (OSError, DocumentError) as error:
         raise EvaluationError(INVALID_RULES, where=folder / RULES, found=error) from error
     rules = parse(Protocol, data, EvaluationError, where=folder / RULES, about=INVALID_RULES)
-    loaded = LoadedProtocol(folder, rules, tuple(_episodes(folder / EPISODES)))
+    loaded = LoadedProtocol(folder, rules, tuple(_read_episodes(folder / EPISODES)))
     for task in {episode.task for episode in loaded.episodes}:
         if task not in TASKS:
-            raise EvaluationError("unknown task", where=folder / EPISODES, expected=", ".join(TASKS), found=task)
+            raise EvaluationError(
+                "unknown task of an episode", where=folder / EPISODES, expected=f"one of {', '.join(TASKS)}", found=task
+            )
         if rules.step_limit(task, 1) is None:
             fix = f"Set max_seconds.{task} or max_steps."
             raise EvaluationError("episodes of this task have no time limit", where=folder / RULES, found=task, fix=fix)
     for config in {episode.config for episode in loaded.episodes}:
         for path in (loaded.config_file(config), loaded.layouts_file(config)):
             if not path.is_file():
-                raise EvaluationError("missing file of the protocol", where=path)
+                raise EvaluationError(
+                    "missing file of the protocol", where=path, fix="Freeze or copy the protocol again."
+                )
     for path in sorted((folder / CONFIGS).glob("*.yaml")) + loaded.training_configs():
         check_no_extends(path)
     return loaded
 
 
-def _episodes(path: Path) -> Iterator[ProtocolEpisode]:
+def _read_episodes(path: Path) -> Iterator[ProtocolEpisode]:
     try:
         lines = read_text(path, JSON_LIMIT).splitlines()
     except (OSError, DocumentError) as error:
-        raise EvaluationError("cannot read the episodes", where=path, found=error) from error
+        raise EvaluationError("cannot read the episodes of the protocol", where=path, found=error) from error
     for number, line in enumerate(lines):
         where = f"{path}:{number + 1}"
         episode = parse_json(ProtocolEpisode, line, EvaluationError, where=where, about="invalid episode")
         if episode.episode != number:
-            raise EvaluationError("episode out of order", where=where, expected=number, found=episode.episode)
+            expected, found = f"episode {number} in this line", f"episode {episode.episode}"
+            raise EvaluationError("episode out of order", where=where, expected=expected, found=found)
         yield episode

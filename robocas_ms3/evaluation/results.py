@@ -34,12 +34,12 @@ _NO_RESULT = "invalid evaluation result"
 
 
 class PolicyRecord(BaseModel):
-    """The policy of a result. The policy may add entries (`policy.describe_policy`).
+    """Policy of a result: the entry ``policy`` of ``run.json``. A policy may add entries (`policy.describe_policy`).
 
     Attributes:
-        name: name of the policy as given by the user.
-        spec: specification of the policy, `PolicySpec`.
-        server: description by the policy server, if any.
+        name: value of --policy.
+        spec: JSON values of the `PolicySpec`.
+        server: description that a policy server sent; None without a server.
     """
 
     model_config = ConfigDict(strict=True, extra="allow")
@@ -50,7 +50,13 @@ class PolicyRecord(BaseModel):
 
 
 class MergedFolder(BaseModel):
-    """A folder that was merged into a result."""
+    """Partial result that was merged into a result.
+
+    Attributes:
+        folder: path of the partial result.
+        episodes: number of its episodes.
+        machine: processor and Python version of the machine that ran them.
+    """
 
     model_config = ConfigDict(strict=True)
 
@@ -60,11 +66,18 @@ class MergedFolder(BaseModel):
 
 
 class RunRecord(BaseModel):
-    """Settings of a result: ``run.json``.
+    """Settings of an evaluation: the file ``run.json`` of a result.
 
     Attributes:
-        played_as: tasks that were evaluated in the episodes of another task (`LoadedProtocol.played_as`).
-        merged_from: folders of the partial results, if the result was merged.
+        protocol, protocol_hash: name and hash of the protocol.
+        policy: name, specification and description of the policy.
+        weld: whether lifted objects were fixed to the hand (--weld).
+        played_as: tasks that were evaluated in the episodes of another task (`LoadedProtocol.find_task_aliases`).
+        backend: ``processes`` or ``gpu``.
+        versions: package versions by name.
+        pack_hashes: sha256 of the manifests of the object packs by name.
+        machine: processor and Python version of the machine.
+        merged_from: the partial results, if the result was merged.
     """
 
     model_config = ConfigDict(strict=True, extra="allow")
@@ -82,17 +95,17 @@ class RunRecord(BaseModel):
 
     @classmethod
     def from_values(cls, values: dict[str, Any], where: object) -> RunRecord:
-        """Return the validated record of some values; ``where`` is for error messages."""
+        """Validate values for ``run.json``; ``where``: file or policy that an error names."""
         return parse(cls, values, EvaluationError, where=where, about="invalid record of the evaluation")
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the values that were set, for ``run.json``."""
+        """Return the values that were given, for ``run.json``; fields that were left out stay out."""
         return self.model_dump(exclude_unset=True)
 
-    def identity(self) -> dict[str, Any]:
-        """Return the values that are equal in partial results of one evaluation.
+    def merge_settings(self) -> dict[str, Any]:
+        """Return the values that must be equal to merge partial results.
 
-        A policy server is identified by its policy, not by its address.
+        The address of a policy server is left out, so shards can use several servers with the same policy.
         """
         policy = self.policy.model_dump(exclude_unset=True)
         if self.policy.server and self.policy.name.startswith(("ws://", "wss://")):
@@ -100,26 +113,26 @@ class RunRecord(BaseModel):
         names = ("protocol", "protocol_hash", "weld", "played_as", "backend", "versions", "pack_hashes")
         return {"policy": policy, **{name: getattr(self, name) for name in names}}
 
-    def settings(self) -> dict[str, Any]:
+    def resume_settings(self) -> dict[str, Any]:
         """Return the values that must be equal to continue a result."""
-        return {**self.identity(), "machine": self.machine}
+        return {**self.merge_settings(), "machine": self.machine}
 
 
-def _recorded_settings(values: dict[str, Any]) -> dict[str, Any]:
-    return parse(RunRecord, values, EvaluationError, where=RUN, about=_NO_RESULT).settings()
+def _parse_settings(values: dict[str, Any]) -> dict[str, Any]:
+    return parse(RunRecord, values, EvaluationError, where=RUN, about=_NO_RESULT).resume_settings()
 
 
-OUTPUT = FolderKind("robocas eval", (RUN,), "protocol_hash", upgrade=_recorded_settings)
+OUTPUT = FolderKind("robocas eval", (RUN,), "protocol_hash", upgrade=_parse_settings)
 
 
 @dataclass(frozen=True)
 class Result:
-    """A result in memory.
+    """Result of an evaluation that was read from one folder, or from the folders of partial results.
 
     Attributes:
         folder: folder of the result, or of the first partial result.
-        run: settings of the result; for several partial results, the record of the first with ``merged_from``.
-        outcomes: outcomes by episode number, in ascending order.
+        run: settings of the evaluation. For partial results: of the first, with all in ``merged_from``.
+        outcomes: by number of the episode, in ascending order, the outcome.
     """
 
     folder: Path
@@ -127,24 +140,30 @@ class Result:
     outcomes: dict[int, Outcome]
 
     def rate(self, name: str = "success", outcomes: Iterable[Outcome] | None = None) -> SuccessRate:
-        """Return the success rate of a flag: the episodes in which it held at some step.
+        """Return the fraction of episodes in which a stage or success rule held, with its 95 % interval.
 
-        ``outcomes``: at least one outcome; None: all of the result.
+        Args:
+            name: key of `Outcome.flags`, which counts if it held at some step; or a field of `Outcome`, such as
+                ``success_at_end``.
+            outcomes: the episodes, at least one; None: all episodes of the result.
         """
         chosen = list(self.outcomes.values() if outcomes is None else outcomes)
         held = [getattr(one, name) if hasattr(one, name) else one.flags.get(name) is not None for one in chosen]
         return success_rate(sum(held), len(held))
 
-    def repeats_scenes(self) -> bool:
-        """Return whether episodes share scenes, such as splits do; such episodes must not be pooled."""
+    def has_repeated_scenes(self) -> bool:
+        """Return whether two episodes have the same scene, as in some splits; such episodes must not be pooled."""
         return len({(one.task, one.seed) for one in self.outcomes.values()}) < len(self.outcomes)
 
-    def error_count(self) -> int:
-        """Return the number of episodes that an error ended."""
+    def count_errors(self) -> int:
+        """Return the number of episodes that ended with an error."""
         return sum(bool(one.error) for one in self.outcomes.values())
 
     def group_by(self, name: str) -> dict[str, list[Outcome]]:
-        """Return the outcomes by an attribute such as ``config``, sorted; splits in the order of the protocol."""
+        """Return the outcomes by the value of a field of `Outcome`, such as ``config``.
+
+        The values are sorted; splits keep the order of the protocol.
+        """
         found: dict[str, list[Outcome]] = {}
         for outcome in self.outcomes.values():
             found.setdefault(getattr(outcome, name), []).append(outcome)
@@ -155,49 +174,54 @@ class Result:
 def open_result(
     folder: Path, run: RunRecord, *, overwrite: bool = False, retry_errors: bool = False
 ) -> Iterator[dict[int, Outcome]]:
-    """Lock a result folder, start or continue the result, and yield its outcomes by episode number.
+    """Lock a result folder, start or continue the result, and yield the recorded outcomes by episode number.
 
-    With ``retry_errors`` the outcomes of episodes that an error ended are dropped, so that these episodes run again.
+    Args:
+        folder: folder of the result; created if it does not exist.
+        run: settings of the evaluation.
+        overwrite: whether to delete an existing result and start again.
+        retry_errors: whether to delete the outcomes of episodes that ended with an error, so that they run again.
 
     Raises:
         OutputExistsError: the result has other settings, or the folder holds no result.
         RobocasError: another process writes to the folder, or the folder was removed.
     """
-    with OutputFolder(folder, OUTPUT, run.settings(), overwrite=overwrite) as output:
+    with OutputFolder(folder, OUTPUT, run.resume_settings(), overwrite=overwrite) as output:
         output.start(output.recorded or run.to_dict())
-        outcomes = _outcomes(folder)
+        outcomes = _read_outcomes(folder)
         if retry_errors and any(one.error for one in outcomes.values()):
             outcomes = {number: one for number, one in outcomes.items() if not one.error}
-            _ledger(folder).rewrite(outcomes.values())
+            _outcomes_file(folder).rewrite(outcomes.values())
         yield outcomes
 
 
 def append_outcome(folder: Path, outcome: Outcome) -> None:
-    """Append an outcome and flush it to disk."""
-    _ledger(folder).append([outcome], sync=True)
+    """Append an outcome to ``episodes.jsonl`` in a result folder and flush it to disk."""
+    _outcomes_file(folder).append([outcome], sync=True)
 
 
 def read_result(*folders: Path) -> Result:
-    """Read a result, or partial results of one evaluation.
+    """Read the result in a folder, or the partial results in several folders as one result.
 
-    Partial results may have common episodes if their outcomes are equal.
+    Two partial results may have the same episode if its outcomes are equal.
 
     Raises:
-        EvaluationError: a result is invalid, or the partial results have other settings or contradict each other.
+        EvaluationError: a result is invalid, or partial results have different settings or different outcomes of an
+            episode.
     """
-    parts = [_read(folder) for folder in folders]
+    parts = [_read_folder(folder) for folder in folders]
     first, outcomes = parts[0], dict[int, Outcome]()
     for part in parts:
-        expected, found = first.run.identity(), part.run.identity()
+        expected, found = first.run.merge_settings(), part.run.merge_settings()
         if key := next((key for key in found if expected[key] != found[key]), ""):
             changes = "; ".join(list_setting_changes(expected[key], found[key], key))
             raise EvaluationError(
-                f"not a partial result of the same evaluation as {first.folder}: different {key}",
+                f"cannot merge this result with {first.folder}: the settings {key} differ",
                 where=part.folder,
                 found=changes,
             )
         for outcome in part.outcomes.values():
-            _add(outcomes, outcome, str(part.folder))
+            _add_outcome(outcomes, outcome, str(part.folder))
     run = first.run
     if len(parts) > 1:
         records = [
@@ -209,11 +233,11 @@ def read_result(*folders: Path) -> Result:
 
 
 def group_partial_results(folders: Iterable[Path]) -> list[list[Path]]:
-    """Group folders into partial results of one evaluation: same settings and disjoint episodes."""
+    """Group result folders: folders with equal settings and without common episodes are one evaluation."""
     groups: list[tuple[dict[str, Any], set[int], list[Path]]] = []
     for folder in folders:
-        part = _read(folder)
-        key = part.run.identity()
+        part = _read_folder(folder)
+        key = part.run.merge_settings()
         for other, episodes, group in groups:
             if other == key and not episodes & part.outcomes.keys():
                 group.append(folder)
@@ -225,49 +249,49 @@ def group_partial_results(folders: Iterable[Path]) -> list[list[Path]]:
 
 
 def merge_results(folders: Sequence[Path], out: Path) -> Result:
-    """Merge partial results into one result folder, which is written atomically."""
+    """Merge partial results into one result and write its folder ``out`` atomically; return the result."""
     result = read_result(*folders)
     check_replaceable(out)
     with atomic_folder(out) as folder:
         write_json(folder / RUN, result.run.to_dict())
-        _ledger(folder).rewrite(result.outcomes.values())
+        _outcomes_file(folder).rewrite(result.outcomes.values())
     return read_result(out)
 
 
 def package_versions() -> dict[str, str]:
-    """Return the installed versions of the packages that can change a result."""
+    """Return the installed versions, by name, of the packages that can change a result."""
     return {name: version(name) for name in _PACKAGES}
 
 
-def _ledger(folder: Path) -> JsonLinesFile[Outcome]:
+def _outcomes_file(folder: Path) -> JsonLinesFile[Outcome]:
     return JsonLinesFile(folder / OUTCOMES, Outcome)
 
 
-def _read(folder: Path) -> Result:
+def _read_folder(folder: Path) -> Result:
     try:
         record = load_json(folder / RUN)
         run = parse(RunRecord, record, EvaluationError, where=folder / RUN, about=_NO_RESULT)
-        return Result(folder, run, dict(sorted(_outcomes(folder).items())))
+        return Result(folder, run, dict(sorted(_read_outcomes(folder).items())))
     except (OSError, ValueError) as error:
-        fix = "" if (folder / RUN).exists() else "Pass the --out folder of robocas eval."
+        fix = "" if (folder / RUN).exists() else "Pass the output folder of robocas eval."
         raise EvaluationError(_NO_RESULT, where=folder, found=error, fix=fix) from error
 
 
-def _outcomes(folder: Path) -> dict[int, Outcome]:
-    """Return the outcomes of a result; another process may be writing it."""
-    ledger, found = _ledger(folder), dict[int, Outcome]()
-    for line in ledger.lines():
+def _read_outcomes(folder: Path) -> dict[int, Outcome]:
+    """Read the outcomes of a result by episode number; another process may be writing the file."""
+    file, found = _outcomes_file(folder), dict[int, Outcome]()
+    for line in file.lines():
         if line.record is not None:
-            _add(found, line.record, f"{ledger.path}:{line.number}")
+            _add_outcome(found, line.record, f"{file.path}:{line.number}")
         elif not line.cut_off:
-            raise ledger.line_error(line, EvaluationError, "invalid outcome of an episode") from line.problem
+            raise file.line_error(line, EvaluationError, "invalid outcome of an episode") from line.problem
     return found
 
 
-def _add(outcomes: dict[int, Outcome], outcome: Outcome, where: str) -> None:
-    """Add an outcome; an existing outcome of the episode must be equal."""
+def _add_outcome(outcomes: dict[int, Outcome], outcome: Outcome, where: str) -> None:
+    """Add an outcome to ``outcomes``; raise `EvaluationError` if the episode has a different outcome there."""
     before = outcomes.setdefault(outcome.episode, outcome).reproducible_values()
     now = outcome.reproducible_values()
     if changes := [change for key in now for change in list_setting_changes(before[key], now[key], key)]:
-        what = f"contradicting outcomes of episode {outcome.episode}"
+        what = f"different outcomes of episode {outcome.episode}"
         raise EvaluationError(what, where=where, found="; ".join(changes))

@@ -35,13 +35,14 @@ _WELDS = "welds"  # key of ``info`` with the weld (`action_wrapper.Weld`)
 
 @dataclass
 class Rollout:
-    """An episode that is running or has ended; see `Outcome` for the other fields.
+    """Values of an episode that is running or has ended.
 
     Attributes:
         spec: specification of the episode.
-        at_end: value of each flag after the last step.
-        retrieval: (K, 3) array of `metrics.RetrievalTracker.read`, only in search.
-        inference_seconds: clock time of the policy; the time of a batch is divided by its number of envs.
+        steps, seconds, flags, flag_seconds, measures, error: as in `Outcome`.
+        at_end: by stage or success rule, whether it holds after the last step.
+        retrieval: (K, 3) record of `metrics.RetrievalTracker.compute_record` for this env; None except in search.
+        inference_seconds: wall-clock time of the policy; the time for a batch is divided equally between its envs.
     """
 
     spec: EpisodeSpec
@@ -55,8 +56,8 @@ class Rollout:
     inference_seconds: float = 0.0
     error: str = ""
 
-    def outcome(self, episode: ProtocolEpisode, objects: Sequence[str]) -> Outcome:
-        """Return the outcome of the episode; ``objects`` are the ids of the objects by slot."""
+    def make_outcome(self, episode: ProtocolEpisode, objects: Sequence[str]) -> Outcome:
+        """Return the outcome of this rollout of an episode; ``objects``: ids of the K objects by slot."""
         flags, order = self.flags, None
         if self.retrieval is not None:
             cleared = flags.get("obstacles_cleared") is not None
@@ -89,8 +90,9 @@ class EndConditions:
 
     Attributes:
         max_steps: maximum number of policy steps.
-        ends_on: flags that end the episode at once, such as ``success`` and ``fail``.
-        max_v0_steps: number of policy steps with RoboCAS-v0's success that ends the episode; None: no such end.
+        ends_on: names of entries of ``info``, such as ``success`` and ``fail``; the episode ends when one is true.
+        max_v0_steps: number of policy steps with success by RoboCAS-v0's rule after which the episode ends; None: the
+            rule ends no episode.
     """
 
     max_steps: int
@@ -99,18 +101,19 @@ class EndConditions:
 
 
 class EpisodeBatch:
-    """Several envs that run one episode each; the caller chooses the actions.
+    """Vector environment whose envs run one episode each; the caller chooses the actions.
 
     Args:
         env: vector environment (`make_vec`, NumPy arrays, no automatic resets) of `PolicyActionWrapper` envs.
         spec: specification of the policy.
         ends: conditions that end an episode.
         control_dt: simulated time per control step, s.
-        refill: whether an env can be reset while others run. Envs of a GPU batch are reset together.
+        refill: whether an env can start its next episode while other envs run. False on a GPU, where all envs are
+            reset together.
 
     Attributes:
         obs: last observation of the environment, arrays (N, ...).
-        running: running episodes by env. An episode with an ``error`` ends at the next step.
+        running: by index of the env, the running episode. An episode whose ``error`` is set ends at the next `step`.
     """
 
     def __init__(self, env: Any, spec: PolicySpec, ends: EndConditions, control_dt: float, *, refill: bool) -> None:
@@ -125,7 +128,10 @@ class EpisodeBatch:
         self._embed = TextEmbedder() if spec.language == "embedding" else None
 
     def start(self, pairs: list[tuple[int, EpisodeSpec]]) -> list[EpisodeSpec]:
-        """Reset envs to the initial states of episodes; return the specifications with ``env`` set."""
+        """Reset envs to the initial states of episodes, given as (index of the env, episode).
+
+        Returns the episodes with ``env`` set.
+        """
         envs = [env for env, _ in pairs]
         seeds = [start.seed for _, start in pairs]
         starts = [replace(start, env=env) for env, start in pairs]
@@ -144,7 +150,7 @@ class EpisodeBatch:
         return starts
 
     def observe(self, envs: list[int]) -> Observations:
-        """Return the last observations of some envs, one row per env."""
+        """Return the last observations of the envs with these indices, one row per env."""
         obs, spec, index = self.obs, self._spec, np.array(envs)
         agent, cameras = obs["agent"], obs.get("sensor_data", {})
         starts = [self.running[env].spec for env in envs]
@@ -160,9 +166,9 @@ class EpisodeBatch:
         )
 
     def step(self, actions: NDArray[np.float32]) -> Iterator[Rollout]:
-        """Step all envs once with actions (N, A) and yield the episodes that end."""
+        """Step all N envs once with actions (N, A) and yield the episodes that end."""
         for env in [env for env, episode in self.running.items() if episode.error]:
-            yield self._end(env)
+            yield self._end_episode(env)
         if not self.running:
             return
         self.obs, _, _, _, self._info = self.env.step(actions)
@@ -170,20 +176,20 @@ class EpisodeBatch:
             episode.steps += 1
         self._record_flags()
         for env in [env for env, episode in self.running.items() if self._is_over(episode)]:
-            yield self._end(env)
+            yield self._end_episode(env)
 
-    def fail_crashed(self, envs: Sequence[int], why: str) -> Iterator[Rollout]:
-        """Yield the running episodes of envs whose worker crashed, as failures without metrics."""
+    def fail_crashed(self, envs: Sequence[int], error: str) -> Iterator[Rollout]:
+        """Yield the running episodes of envs whose worker process crashed, as failed episodes without metrics."""
         for env in envs:
             if env in self.running:
-                episode = Rollout(self.running[env].spec, error=why)
+                episode = Rollout(self.running[env].spec, error=error)
                 episode.flags = episode.flag_seconds = dict.fromkeys(self._flags)
                 episode.measures = dict.fromkeys((*MEASURES, *([_WELDS] if _WELDS in self._info else [])), 0.0)
                 yield episode
 
-    def _end(self, env: int) -> Rollout:
+    def _end_episode(self, env: int) -> Rollout:
         episode, info = self.running.pop(env), self._info
-        episode.seconds = self._seconds(env)
+        episode.seconds = self._elapsed_seconds(env)
         for name in self._flags:
             episode.at_end[name] = bool(info[name][env])
             episode.flags.setdefault(name, None)
@@ -203,9 +209,9 @@ class EpisodeBatch:
             self._held[flag, env] = True
             if env in self.running:
                 episode, name = self.running[env], self._flags[flag]
-                episode.flags[name], episode.flag_seconds[name] = episode.steps, round(self._seconds(env), 4)
+                episode.flags[name], episode.flag_seconds[name] = episode.steps, round(self._elapsed_seconds(env), 4)
 
-    def _seconds(self, env: int) -> float:
+    def _elapsed_seconds(self, env: int) -> float:
         return float(self._info["elapsed_steps"][env]) * self._dt
 
     def _is_over(self, episode: Rollout) -> bool:
@@ -215,10 +221,10 @@ class EpisodeBatch:
 
 
 def run_rollouts(batch: EpisodeBatch, policy: Policy, episodes: Sequence[EpisodeSpec]) -> Iterator[Rollout]:
-    """Run episodes with a policy in idle envs; yield each episode as it ends, in any order.
+    """Run episodes with a policy, one per env at a time; yield each episode when it ends, in any order.
 
-    In worker processes an env starts the next episode at once. In a GPU batch, where the objects of all envs are built
-    together, it waits until all episodes of the batch have ended.
+    With worker processes, an env starts its next episode when its episode has ended. On a GPU, an env waits until the
+    episodes of all envs have ended, because the scenes of all envs are built together.
     """
     waiting, chunks = list(reversed(episodes)), dict[int, list[NDArray[np.floating]]]()
     while waiting or batch.running:
@@ -237,7 +243,10 @@ def run_rollouts(batch: EpisodeBatch, policy: Policy, episodes: Sequence[Episode
 
 
 def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list[NDArray[np.floating]]]) -> None:
-    """Request chunks for running envs without actions; set the error of episodes if the policy fails."""
+    """Request an action chunk for each running env that has no actions left; add it to ``chunks``.
+
+    If the policy raises `PolicyError`, the ``error`` of the episodes is set.
+    """
     running = batch.running
     envs = [env for env in running if not chunks[env]]
     if not envs:
@@ -258,9 +267,9 @@ def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list
     period = policy.spec.observe_every
     if new.shape[1] > 1 and new.shape[1] % period:
         raise EvaluationError(
-            "chunk length does not fit observe_every: the next chunk would start without images",
+            "the chunk length of the policy does not fit its observe_every",
             where=type(policy).__name__,
-            expected=f"a multiple of {period} steps",
+            expected=f"a multiple of {period} actions, so that each chunk starts with images",
             found=new.shape[1],
         )
     for env, chunk in zip(envs, new, strict=True):

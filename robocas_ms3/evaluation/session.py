@@ -1,4 +1,4 @@
-"""Run the episodes of a protocol with a policy, or for an external loop that chooses the actions."""
+"""Sessions that run the episodes of a protocol, with a policy or for an external loop that chooses the actions."""
 
 from __future__ import annotations
 
@@ -45,22 +45,26 @@ _log = logging.getLogger(__name__)
 
 
 class EvaluationSession:
-    """A session that runs episodes of a protocol, several at a time. Close it at the end.
+    """Session that runs episodes of a protocol, several at a time. Call `close` at the end.
 
-    `run` writes a result. `run_episodes` runs some episodes with the policy. With `reset` and `step` an external loop
-    runs the episodes, one per env, by the same steps, end conditions and metrics. The environment stays open while the
-    configuration of the episodes stays the same.
+    - `run` runs the selected episodes with the policy and writes a result.
+    - `run_episodes` runs given episodes with the policy and writes no files.
+    - `reset` and `step` run one episode per env for an external loop that chooses the actions.
+
+    Steps, end conditions and metrics are equal in all three cases. The environment stays open until an episode needs
+    another configuration.
 
     Args:
-        policy: the policy, or an `ExternalPolicy`.
+        policy: policy that chooses the actions, or an `ExternalPolicy` for an external loop.
         settings: protocol, episodes, number of envs, backend and output folder.
-        wrap_env: called with each vector environment after it is made; returns the environment to use.
+        wrap_env: function that gets each new vector environment and returns the environment to use.
 
     Attributes:
         episodes: the selected episodes of the protocol.
-        played_as: tasks that are evaluated in the episodes of another task (`LoadedProtocol.played_as`).
-        rate: control steps per second; with RoboCAS-v0's steps, see `PolicyActionWrapper`.
-        outcomes: outcomes by env of the episodes that have ended since the last `reset`.
+        played_as: tasks that are evaluated in the episodes of another task (`LoadedProtocol.find_task_aliases`).
+        rate: control steps per second. A policy step is one control step; with RoboCAS-v0's steps it is 1 to 7 control
+            steps at 5 Hz (`PolicyActionWrapper`).
+        outcomes: by index of the env, the outcome of the episode that has ended since the last `reset`.
 
     Raises:
         EvaluationError: the protocol does not exist, the policy or the weld does not fit it, no episode is selected,
@@ -75,18 +79,18 @@ class EvaluationSession:
         self.protocol, self.spec = load_protocol(settings.protocol), policy.spec
         rules = self.protocol.rules
         rules.check_policy(self.spec)
-        self.rate = V0_CONTROL_HZ if rules.stepping == "upstream" else rules.action_rate(self.spec)
+        self.rate = V0_CONTROL_HZ if rules.stepping == "upstream" else rules.choose_action_rate(self.spec)
         backend = choose_backend(settings.backend)
         if settings.weld:
             check_weld(rules.stepping, backend)
-        self.played_as = self.protocol.played_as(settings.tasks)
+        self.played_as = self.protocol.find_task_aliases(settings.tasks)
         self.episodes = self.protocol.select_episodes(settings)
         if self.spec.cameras:
             self.protocol.check_cameras(self.spec, self.episodes)
             require_renderer()
         self._log_policy_warnings()
         self.run_record = self._make_run_record(backend)
-        self.folder = settings.folder(rules.name, self.played_as)
+        self.folder = settings.choose_folder(rules.name, self.played_as)
         self.outcomes: dict[int, Outcome] = {}
         objects = load_pack(rules.pack).objects
         self._layouts_of = cache(lambda config: FrozenLayouts(self.protocol.layouts_file(config), objects))
@@ -98,7 +102,7 @@ class EvaluationSession:
         self._observed = 0.0  # clock time at which the external loop received the last observation, s
 
     def run(self, on_start: Callable[[int], None] = lambda count: None) -> Iterator[Outcome]:
-        """Run the episodes that are missing in the result; write and yield each outcome as its episode ends.
+        """Run the selected episodes that the result does not have yet; write and yield the outcome of each.
 
         ``on_start`` is called with the number of episodes to run.
 
@@ -118,13 +122,13 @@ class EvaluationSession:
                 yield outcome
 
     def max_steps(self, task: str) -> int:
-        """Return the maximum number of policy steps per episode of a task."""
+        """Return the maximum number of policy steps per episode of a task, by the rules of the protocol."""
         steps = self.protocol.rules.step_limit(task, self.rate)
         assert steps is not None  # `load_protocol` checks it
         return steps
 
     def make_episode_spec(self, episode: ProtocolEpisode) -> EpisodeSpec:
-        """Return the specification of an episode for policies; ``env`` is -1 until an env runs it."""
+        """Return the specification of an episode for `Policy.reset`, with ``env`` -1: no env runs it yet."""
         return EpisodeSpec(
             env=-1,
             episode=episode.episode,
@@ -138,9 +142,9 @@ class EvaluationSession:
         )
 
     def run_episodes(self, episodes: Sequence[ProtocolEpisode], max_steps: int | None = None) -> Iterator[Outcome]:
-        """Run episodes with the policy, one configuration after another; yield outcomes as episodes end.
+        """Run episodes with the policy, one configuration after another; yield the outcome of each when it ends.
 
-        ``max_steps`` replaces the protocol's maximum number of policy steps per episode.
+        ``max_steps``: maximum number of policy steps per episode; None: the maximum of the protocol.
 
         Raises:
             VectorEnvCrashError: a worker process crashed twice while it ran no episode.
@@ -153,10 +157,13 @@ class EvaluationSession:
             raise
 
     def reset(self, numbers: Sequence[int]) -> Observations:
-        """Start an episode in each env, by number in the protocol; running episodes are dropped.
+        """Start an episode in each env and return the first observations; running episodes are dropped.
+
+        ``numbers``: numbers of the episodes in the protocol, one per env, with equal configurations.
 
         Raises:
-            EvaluationError: an episode does not exist, or the episodes have different configurations.
+            EvaluationError: an episode does not exist, the number of episodes is not the number of envs, or the
+                episodes have different configurations.
         """
         where, known, count = self.protocol.rules.name, self.protocol.episodes, self.settings.envs
         for number in numbers:
@@ -165,7 +172,9 @@ class EvaluationSession:
                     "unknown episode number", where=where, expected=f"0 to {len(known) - 1}", found=number
                 )
         if len(numbers) != count:
-            raise EvaluationError("wrong number of episodes", where=where, expected=count, found=len(numbers))
+            raise EvaluationError(
+                "wrong number of episodes", where=where, expected=f"{count}, one per env", found=len(numbers)
+            )
         episodes = [known[number] for number in numbers]
         self.protocol.check_same_configuration(episodes)
         self._current, self.outcomes = episodes, {}
@@ -178,10 +187,10 @@ class EvaluationSession:
         return self._observe(batch)
 
     def step(self, actions: ArrayLike) -> Observations | None:
-        """Step the running episodes by actions (N, A) or by all steps of chunks (N, H, A).
+        """Execute actions (N, A), or all H actions of chunks (N, H, A), in the running episodes.
 
-        Rows of envs whose episode has ended have no effect. An episode with NaN or infinite actions ends with an error.
-        Returns the observations of the envs with a running episode; None if all episodes have ended.
+        Rows of envs whose episode has ended have no effect. A NaN or infinite action ends its episode with an error.
+        Returns the observations of the envs whose episode is running; None if all episodes have ended.
 
         Raises:
             EvaluationError: no episode is running, or the actions have another shape.
@@ -189,7 +198,7 @@ class EvaluationSession:
         """
         batch = self._batch
         if batch is None or not batch.running:
-            raise EvaluationError("no episode is running", fix="Call reset first.")
+            raise EvaluationError("no episode is running", fix="Call reset before step.")
         chunks = as_action_chunks(actions, batch.num_envs, batch.action_size, where="step")
         seconds = (time.perf_counter() - self._observed) / len(batch.running)
         for env, running in batch.running.items():
@@ -202,7 +211,7 @@ class EvaluationSession:
                 rows = np.zeros((batch.num_envs, batch.action_size), np.float32)
                 rows[active] = chunks[active, step]
                 for ended in batch.step(rows):
-                    self.outcomes[ended.spec.env] = self._outcome(ended, self._current[ended.spec.env])
+                    self.outcomes[ended.spec.env] = self._make_outcome(ended, self._current[ended.spec.env])
                 if not batch.running:
                     return None
         except Exception:
@@ -212,32 +221,36 @@ class EvaluationSession:
 
     @property
     def observation(self) -> dict[str, Any]:
-        """Return the last observation of the environment, arrays (N, ...)."""
+        """Return the last observation of the vector environment: a nested dict of arrays (N, ...)."""
         assert self._batch is not None
         return self._batch.obs
 
     def open_batch(self, episode: ProtocolEpisode, num_envs: int, max_steps: int | None = None) -> EpisodeBatch:
-        """Return envs for the configuration of an episode; make them if no fitting envs are open."""
+        """Return the open batch of envs if it fits, or open one.
+
+        It fits if it has the configuration of the episode, the number of envs and the maximum number of policy steps
+        (None: the maximum of the protocol).
+        """
         steps = self.max_steps(episode.task) if max_steps is None else max_steps
-        wanted, rules = (episode.config, num_envs, steps), self.protocol.rules
-        if self._batch is not None and self._open_for == wanted:
+        key, rules = (episode.config, num_envs, steps), self.protocol.rules
+        if self._batch is not None and self._open_for == key:
             return self._batch
-        if self._open_for is None or self._open_for[:2] != wanted[:2]:
+        if self._open_for is None or self._open_for[:2] != key[:2]:
             self.close()
             self._env = self._wrap_env(self._make_env(episode, num_envs))
         ends = EndConditions(steps, tuple(rules.ends_on), rules.max_v0_steps)
         self._batch = EpisodeBatch(self._env, self.spec, ends, 1 / self.rate, refill=self._refill)
-        self._open_for = wanted
+        self._open_for = key
         return self._batch
 
     def close(self) -> None:
-        """Close the environment; the next episode opens a new environment."""
+        """Close the vector environment. The next episode opens a new one."""
         env, self._env, self._batch, self._open_for = self._env, None, None, None
         if env is not None:
             env.close()
 
     def _run_configuration(self, episodes: list[ProtocolEpisode], max_steps: int | None) -> Iterator[Outcome]:
-        left, deaths = {episode.episode: episode for episode in episodes}, Counter[int]()
+        left, crashes = {episode.episode: episode for episode in episodes}, Counter[int]()
         while left:
             batch = None
             try:
@@ -245,28 +258,30 @@ class EvaluationSession:
                 for ended in run_rollouts(
                     batch, self.policy, [self.make_episode_spec(episode) for episode in left.values()]
                 ):
-                    yield self._outcome(ended, left.pop(ended.spec.episode))
+                    yield self._make_outcome(ended, left.pop(ended.spec.episode))
             except VectorEnvCrashError as error:
                 self.close()
                 lost = (
                     []
                     if batch is None
-                    else list(batch.fail_crashed(error.envs, f"the worker process of the env crashed: {error.found}"))
+                    else list(batch.fail_crashed(error.envs, f"the worker process crashed: {error.found}"))
                 )
-                deaths.update([ended.spec.episode for ended in lost] or [_NO_EPISODE])
-                if deaths[_NO_EPISODE] == MAX_STARTS:
+                crashes.update([ended.spec.episode for ended in lost] or [_NO_EPISODE])
+                if crashes[_NO_EPISODE] == MAX_STARTS:
                     raise
                 if not lost:
-                    _log.warning("the environments are restarted, no episode was interrupted: %s", error)
+                    _log.warning(
+                        "a worker process crashed while no episode was running; restarting the environments: %s", error
+                    )
                 for ended in lost:
                     number = ended.spec.episode
-                    if deaths[number] < MAX_STARTS:
-                        _log.warning("episode %d: %s; the episode is retried once", number, ended.error)
+                    if crashes[number] < MAX_STARTS:
+                        _log.warning("episode %d: %s; the episode is repeated once", number, ended.error)
                     else:
-                        yield self._outcome(ended, left.pop(number))
+                        yield self._make_outcome(ended, left.pop(number))
 
     def _log_policy_warnings(self) -> None:
-        """Log the warnings of a policy about the configurations of the episodes."""
+        """Log the warnings that ``policy.protocol_warnings`` returns for the configurations of the episodes."""
         warn: Callable[[dict[str, TaskConfig]], list[str]] | None = getattr(self.policy, "protocol_warnings", None)
         if warn is None:
             return
@@ -281,9 +296,9 @@ class EvaluationSession:
         self._observed = time.perf_counter()
         return observations
 
-    def _outcome(self, ended: Rollout, episode: ProtocolEpisode) -> Outcome:
+    def _make_outcome(self, ended: Rollout, episode: ProtocolEpisode) -> Outcome:
         layouts = self._layouts_of(episode.config)
-        outcome = ended.outcome(episode, layouts(episode.seed, episode.seed).object_ids)
+        outcome = ended.make_outcome(episode, layouts(episode.seed, episode.seed).object_ids)
         task = next((task for task, other in self.played_as.items() if other == episode.task), episode.task)
         return replace(outcome, task=task)
 
@@ -317,8 +332,11 @@ class EvaluationSession:
         rules, name = self.protocol.rules, self.settings.policy
         pack = sha256(load_pack(rules.pack).root / MANIFEST)
         if pack != rules.pack_hash:
-            what = "the object pack has another hash than the protocol requires"
-            raise EvaluationError(what, where=rules.name, expected=rules.pack_hash, found=pack)
+            what, fix = (
+                f"the object pack {rules.pack} differs from the pack of the protocol",
+                "Install the pack of the protocol.",
+            )
+            raise EvaluationError(what, where=rules.name, expected=rules.pack_hash, found=pack, fix=fix)
         values = {
             "protocol": rules.name,
             "protocol_hash": self.protocol.hash,

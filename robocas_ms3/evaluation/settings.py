@@ -55,9 +55,9 @@ class EvaluationSettings:
     """Run shard K of N: the episodes whose number is K modulo N, 0 <= K < N.
     `robocas eval merge` joins the results."""
     split: Annotated[str, _NO_HINT] = ""
-    """Run only the episodes of this split, such as `seen`. Default: all splits."""
+    """Run only the episodes of this split, such as `seen`; `robocas eval protocols` lists the splits. Default: all."""
     episodes: Annotated[int | None, _NO_HINT] = None
-    """Maximum number of episodes per configuration. Default: all."""
+    """Run only the first N episodes of each configuration. Default: all."""
     weld: bool = False
     """Fix lifted objects to the hand until the gripper is commanded to open, as RoboCAS-v0 does. Only for protocols
     with RoboCAS-v0's steps (paper-v1), in worker processes. Results with and without the weld are not comparable."""
@@ -72,8 +72,11 @@ class EvaluationSettings:
         check_number("--memory-gb", self.memory_gb, 0.1)
         parse_shard(self.shard, EvaluationError)
 
-    def folder(self, protocol: str, played_as: Iterable[str] = ()) -> Path:
-        """Return the output folder; by default results with ``played_as`` have a separate folder."""
+    def choose_folder(self, protocol: str, played_as: Iterable[str] = ()) -> Path:
+        """Return ``out``, or the default folder eval/PROTOCOL/POLICY of the working directory.
+
+        The default folder has the suffixes ``_TASK``, for each task in ``played_as``, and ``_weld``.
+        """
         suffixes = [*played_as, *(["weld"] if self.weld else [])]
         name = "_".join([re.sub(r"[^\w.-]+", "_", self.policy), *suffixes])
         return self.out or (Path("eval") / protocol / name).absolute()

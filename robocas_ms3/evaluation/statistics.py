@@ -16,7 +16,7 @@ _POWER = 0.8
 
 @dataclass(frozen=True)
 class SuccessRate:
-    """A success rate k / n with its 95 % interval, 0..1."""
+    """Success rate: k successes of n episodes, with the limits ``low`` and ``high`` of its 95 % interval, 0..1."""
 
     k: int
     n: int
@@ -25,13 +25,13 @@ class SuccessRate:
 
     @property
     def rate(self) -> float:
-        """Return k / n."""
+        """Return the success rate k / n."""
         return self.k / self.n
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Paired comparison of two runs, A and B, over the same scenes.
+    """Paired comparison of the successes of two runs, A and B, in the same scenes.
 
     Attributes:
         both, only_a, only_b, neither: numbers of scenes in which both runs, only A, only B or neither succeeded.
@@ -49,7 +49,7 @@ class Comparison:
 
     @classmethod
     def from_counts(cls, both: int, only_a: int, only_b: int, neither: int) -> Comparison:
-        """Return the comparison with these numbers of scenes."""
+        """Return the comparison for these numbers of scenes (fields of `Comparison`), with p-value and interval."""
         limits = paired_interval(only_a, only_b, both + only_a + only_b + neither)
         return cls(both, only_a, only_b, neither, mcnemar_p_value(only_a, only_b), *limits)
 
@@ -79,7 +79,7 @@ def success_rate(k: int, n: int) -> SuccessRate:
 
     Clopper and Pearson, Biometrika 26 (1934) 404-413, by quantiles of beta distributions. The interval contains the
     true rate in at least 95 % of all evaluations. At k = 0 the lower limit is 0, at k = n the upper limit is 1; the
-    other limit keeps half of the error probability.
+    other limit has an error probability of 2.5 %.
     """
     low = float(beta.ppf(_TAIL, k, n - k + 1)) if k else 0.0
     high = float(beta.isf(_TAIL, k + 1, n - k)) if k < n else 1.0
@@ -112,7 +112,7 @@ def paired_interval(only_a: int, only_b: int, n: int) -> tuple[float, float]:
     z2 = float(norm.isf(_TAIL)) ** 2
     middle = (only_a - only_b) / n
 
-    def excess(d: float) -> float:
+    def score_excess(d: float) -> float:
         if d == middle:
             return -1.0  # with zero variance the value is 0 here, which is no limit of the interval
         # q solves 2 n q^2 + linear q - only_b d (1 - d) = 0
@@ -121,20 +121,20 @@ def paired_interval(only_a: int, only_b: int, n: int) -> tuple[float, float]:
         return (only_a - only_b - n * d) ** 2 - z2 * n * (2 * q + d * (1 - d))
 
     low, high = (
-        float(root_scalar(excess, bracket=(middle, end), xtol=1e-14).root) if middle != end else end
+        float(root_scalar(score_excess, bracket=(middle, end), xtol=1e-14).root) if middle != end else end
         for end in (-1.0, 1.0)
     )
     return low, high
 
 
 def compare_successes(a: ArrayLike, b: ArrayLike) -> Comparison:
-    """Compare two runs by their successes (n,) bool, in the same order of scenes."""
+    """Compare two runs by their successes, each (n,) bool with the scenes in the same order."""
     a, b = np.asarray(a, dtype=bool), np.asarray(b, dtype=bool)
     return Comparison.from_counts(*(int(cases.sum()) for cases in (a & b, a & ~b, ~a & b, ~a & ~b)))
 
 
 def adjust_p_values(p_values: Sequence[float]) -> list[float]:
-    """Return p-values of several comparisons adjusted by Holm's method, in their order.
+    """Return the p-values of several comparisons, adjusted by Holm's method and in the given order.
 
     If a difference is claimed where the adjusted p-value is at most alpha, the probability of any false claim is at
     most alpha. The i-th smallest of m p-values is multiplied by m - i + 1, and is at least the previous adjusted value
@@ -148,12 +148,12 @@ def adjust_p_values(p_values: Sequence[float]) -> list[float]:
 
 
 def success_rates_by_bin(values: ArrayLike, successes: ArrayLike, edges: Sequence[float]) -> list[SuccessRate | None]:
-    """Return success rates by bins of a value per episode, such as p_vis; None: an empty bin.
+    """Return the success rate of each bin of a value per episode, such as p_vis; None for an empty bin.
 
     Args:
-        values: (n,) values within the outermost edges.
-        successes: (n,) bool.
-        edges: (bins + 1,) ascending; a bin contains its lower edge, the last bin also its upper edge.
+        values: (n,) values between the first and the last edge.
+        successes: (n,) bool, whether the episode succeeded.
+        edges: (bins + 1,) ascending edges; a bin contains its lower edge, the last bin also its upper edge.
     """
     done, ends = np.asarray(successes, dtype=bool), np.asarray(edges, dtype=float)
     place = np.minimum(np.searchsorted(ends, np.asarray(values), side="right") - 1, len(ends) - 2)
@@ -162,14 +162,14 @@ def success_rates_by_bin(values: ArrayLike, successes: ArrayLike, edges: Sequenc
 
 
 def mcnemar_power(n: int, difference: float, discordant: float, *, alpha: float = 0.05) -> float:
-    """Return the power of the exact McNemar test for two runs over the same n scenes.
+    """Return the probability that the exact McNemar test detects a difference of two runs over the same n scenes.
 
-    The power is summed exactly over the number of scenes in which the runs disagree and over the run that solves them.
+    The probability is summed exactly over the number of scenes in which the runs disagree.
 
     Args:
         n: number of scenes.
         difference: difference of the true rates, 0..1.
-        discordant: probability that the runs disagree in a scene, at least ``difference``.
+        discordant: probability that exactly one run succeeds in a scene, at least ``difference``.
         alpha: significance level of the p-value.
     """
     m = np.arange(1, n + 1)  # number of scenes in which the runs disagree
@@ -182,28 +182,29 @@ def mcnemar_power(n: int, difference: float, discordant: float, *, alpha: float 
 
 
 def smallest_paired_difference(n: int, discordant: float, *, alpha: float = 0.05) -> float | None:
-    """Return the smallest difference of rates that two runs over the same n scenes show with 80 % power.
+    """Return the smallest difference of two success rates that a comparison over n scenes detects with 80 % power.
 
-    None: n is too small for any difference; the p-value is below 0.05 from six scenes on that only one run solves.
+    Returns None if n is too small for any difference: a p-value below 0.05 needs at least six scenes that only one run
+    solves.
 
     Args:
         n: number of scenes.
-        discordant: fraction of scenes in which the runs disagree, 0..1. With a greater difference, the better run
-            solves all scenes in which they disagree.
+        discordant: fraction of scenes in which exactly one run succeeds, 0..1. For a greater difference, the better
+            run is assumed to solve all scenes in which the runs disagree.
         alpha: significance level of the p-value.
     """
 
-    def missing(difference: float) -> float:
+    def missing_power(difference: float) -> float:
         return _POWER - mcnemar_power(n, difference, max(difference, discordant), alpha=alpha)
 
-    return None if missing(1.0) > 0 else float(root_scalar(missing, bracket=(0.0, 1.0)).root)
+    return None if missing_power(1.0) > 0 else float(root_scalar(missing_power, bracket=(0.0, 1.0)).root)
 
 
 def power_warning(comparison: Comparison, *, alpha: float = 0.05) -> str | None:
-    """Return a warning if the difference is not significant at ``alpha``; None otherwise.
+    """Return a warning if the p-value of a comparison is above ``alpha``; None otherwise.
 
-    The warning names the smallest difference that this number of scenes shows with 80 % power. It assumes the observed
-    fraction of scenes in which the runs disagree, so it is an estimate.
+    The warning names the smallest difference that this number of scenes detects with 80 % power. This is an estimate,
+    because it assumes the observed fraction of scenes in which the runs disagree.
     """
     c = comparison
     if c.p_value <= alpha:

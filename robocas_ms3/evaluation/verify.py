@@ -1,4 +1,4 @@
-"""Checks of a result against its protocol and for internal consistency, based on its files."""
+"""Checks that a result fits its protocol and that its values are consistent."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from robocas_ms3.scenes.task_specs import TASKS
 
 
 def find_violations(result: Result, protocol: LoadedProtocol) -> list[str]:
-    """Return the violations in a result of a protocol, one text each; empty: no violation found."""
+    """Return one text per violation in a result; empty if the result fits the protocol and is consistent.
+
+    Violations are another hash, missing or unknown episodes, and values that contradict the protocol or other values.
+    """
     run, rules, count = result.run, protocol.rules, len(protocol.episodes)
     found = []
     if run.protocol_hash != protocol.hash:
@@ -22,13 +25,13 @@ def find_violations(result: Result, protocol: LoadedProtocol) -> list[str]:
         found.append(f"hash of pack {rules.pack}: {pack}, expected {rules.pack_hash}")
     if run.weld and rules.stepping != "upstream":
         found.append("weld: true, but the weld needs a protocol with RoboCAS-v0's steps")
-    if run.played_as != protocol.played_as(list(run.played_as)):
-        found.append(f"played_as is {run.played_as}, but the protocol has no such rule")
+    if run.played_as != protocol.find_task_aliases(list(run.played_as)):
+        found.append(f"played_as is {run.played_as}, but this protocol allows no such alias")
     for number, outcome in result.outcomes.items():
         if number < count:
             of_episode = _find_outcome_violations(outcome, protocol.episodes[number], protocol, run)
         else:
-            of_episode = ["not in the protocol"]
+            of_episode = ["this episode is not in the protocol"]
         found += [f"episode {number}: {problem}" for problem in of_episode]
     missing = len(set(range(count)) - result.outcomes.keys())
     if missing:
@@ -50,25 +53,25 @@ def _find_outcome_violations(
     rate = rules.rate_hz or run.policy.spec.get("rate_hz") or DEFAULT_HZ
     limit = rules.step_limit(episode.task, rate)
     if limit is not None and outcome.steps > limit:
-        yield f"{steps}, expected at most {limit}"
+        yield f"{steps}, expected at most {limit} by the rules of the protocol"
     if rules.stepping == "timed" and abs(outcome.seconds - outcome.steps / rate) > 1e-3:
-        yield f"{outcome.seconds:g} s, expected {outcome.steps / rate:g} s for {steps}"
+        yield f"seconds is {outcome.seconds:g}, expected {outcome.steps / rate:g} for {steps} at {rate:g} Hz"
     if outcome.success != (flags.get("success") is not None):
-        yield "success contradicts the flags"
+        yield f"success is {outcome.success}, but flags.success is {flags.get('success')}"
     if outcome.success_at_end and not outcome.success:
-        yield "success_at_end without success"
+        yield "success_at_end is True, but success is False"
     if outcome.success_v0 and flags.get("success_v0") is None:
-        yield "success_v0 contradicts the flags"
+        yield "success_v0 is True, but flags.success_v0 is None"
     stage = find_failure_stage(flags, outcome.error, TASKS[episode.task].stages)
     if outcome.failure_stage != stage:
         yield f"failure_stage is {outcome.failure_stage or 'empty'}, expected {stage or 'empty'} from the flags"
     late = [name for name, step in flags.items() if step is not None and step > outcome.steps]
     if late:
-        yield f"{', '.join(late)} held first after the last of {steps}"
+        yield f"flags: {', '.join(late)} first held after the last step, expected at most {outcome.steps}"
     for name in rules.ends_on:
         step = flags.get(name)
         if step is not None and 0 < step < outcome.steps:  # a flag that holds at the reset ends no episode
-            yield f"continued after {name}, which held at step {step} of {outcome.steps}"
+            yield f"{name} held at step {step}, where the protocol ends the episode, but the episode has {steps}"
     yield from _find_time_violations(outcome)
     yield from _find_retrieval_violations(outcome)
 
@@ -79,7 +82,7 @@ def _find_time_violations(outcome: Outcome) -> Iterator[str]:
         yield "flag_seconds and flags have different keys or values"
     late = [name for name, second in seconds.items() if second is not None and second > outcome.seconds]
     if late:
-        yield f"{', '.join(late)} held first after the end at {outcome.seconds:g} s"
+        yield f"flag_seconds: {', '.join(late)} first held after the end of the episode at {outcome.seconds:g} s"
 
 
 def _find_retrieval_violations(outcome: Outcome) -> Iterator[str]:
@@ -89,4 +92,4 @@ def _find_retrieval_violations(outcome: Outcome) -> Iterator[str]:
     late = [move for move in order.moved if not 0 < move.step <= outcome.steps]
     score = compute_order_score(order.moved, order.left, outcome.flags.get("target_grasped"))
     if "obstacles_cleared" not in outcome.flags or late or order.score != score:
-        yield "the retrieval order contradicts its score or the flags"
+        yield "retrieval: the score does not fit the moved objects, or the steps do not fit the episode"

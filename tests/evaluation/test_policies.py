@@ -86,8 +86,8 @@ def test_policy_modules_in_the_working_directory_are_found(here):
         ("own_spoilt:Mine", "own_spoilt: cannot import the module of the policy .*SyntaxError"),
         ("own_importing:Mine", "own_importing: cannot import the module of the policy .*not_there_at_all"),
         ("own_policy:NeedsArgument", "cannot make the policy .*without required arguments"),
-        ("own_policy:WithoutSpec", "the policy has no valid spec"),
-        ("own_policy:WithoutAct", "the policy has no valid act"),
+        ("own_policy:WithoutSpec", "attribute spec of the policy"),
+        ("own_policy:WithoutAct", "attribute act of the policy"),
     ],
 )
 def test_invalid_policy_names_are_errors_of_one_line(here, name, message):

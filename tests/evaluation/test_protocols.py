@@ -118,12 +118,15 @@ def test_a_configuration_that_extends_another_file_is_refused(folder, inside, ke
         ),
         (lambda f: change_rules(f, max_seconds={"pik": 3}), "invalid protocol rules.*max_seconds: expected.*found pik"),
         (lambda f: change_rules(f, max_seconds={"pick": 3}), "episodes of this task have no time limit.*max_seconds"),
-        (lambda f: change_rules(f, stepping="upstream"), "invalid protocol rules.*upstream requires max_steps"),
-        (lambda f: change_episode(f, 1, task="tidy"), "episodes.jsonl: unknown task.*found tidy"),
+        (lambda f: change_rules(f, stepping="upstream"), "invalid protocol rules.*max_steps: missing"),
+        (lambda f: change_episode(f, 1, task="tidy"), "episodes.jsonl: unknown task of an episode.*found tidy"),
         (lambda f: (f / EPISODES).unlink(), "episodes.jsonl: cannot read"),
         (lambda f: (f / EPISODES).write_text("{\n"), "episodes.jsonl:1: invalid episode"),
         (lambda f: change_episode(f, 1, seed=-1), "episodes.jsonl:2: invalid episode.*seed"),
-        (lambda f: change_episode(f, 1, episode=0), "episodes.jsonl:2: episode out of order.*expected 1, found 0"),
+        (
+            lambda f: change_episode(f, 1, episode=0),
+            "episodes.jsonl:2: episode out of order.*expected episode 1 in this line, found episode 0",
+        ),
         (lambda f: change_episode(f, 1, config="../x"), "episodes.jsonl:2: invalid episode.*config"),
         (
             lambda f: (f / "configs" / "open_pick_drawer.yaml").unlink(),
@@ -150,9 +153,9 @@ def test_step_limits_and_valid_action_rates():
     assert rules.model_copy(update={"max_steps": 300}).step_limit("pick", 5) == 200
     paper = load_protocol("paper-v1").rules
     assert paper.step_limit("pick", 5) == paper.step_limit("search", 5) == 150
-    assert [rules.action_rate(PolicySpec()), rules.action_rate(PolicySpec(rate_hz=10))] == [20, 10]
+    assert [rules.choose_action_rate(PolicySpec()), rules.choose_action_rate(PolicySpec(rate_hz=10))] == [20, 10]
     with pytest.raises(EvaluationError, match="divisor of 100"):
-        rules.action_rate(PolicySpec(rate_hz=30))
+        rules.choose_action_rate(PolicySpec(rate_hz=30))
 
 
 def test_bundled_protocols_have_descriptions_for_readers(folder):

@@ -101,9 +101,9 @@ def test_partial_results_with_other_clock_times_and_machines_are_merged(tmp_path
 def test_contradicting_partial_results_are_refused(tmp_path):
     write(tmp_path / "a", [outcome(0)])
     write(tmp_path / "b", [outcome(0, seconds=3.6)])
-    with pytest.raises(EvaluationError, match=r"contradicting outcomes of episode 0.*seconds: 3\.5 -> 3\.6"):
+    with pytest.raises(EvaluationError, match=r"different outcomes of episode 0.*seconds: 3\.5 -> 3\.6"):
         merge_results([tmp_path / "a", tmp_path / "b"], tmp_path / "both")
-    with pytest.raises(EvaluationError, match=r"jsonl:2: contradicting outcomes of episode 0"):
+    with pytest.raises(EvaluationError, match=r"jsonl:2: different outcomes of episode 0"):
         write(tmp_path / "c", [outcome(0), outcome(0, came_to=3)])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "c"]
 
@@ -124,7 +124,7 @@ def test_results_with_other_settings_are_neither_continued_nor_merged(tmp_path, 
     with pytest.raises(OutputExistsError, match=key):
         start(tmp_path / "a", {**RUN_OF, key: OTHERS[key]})
     write(tmp_path / "b", [outcome(1)], **{key: OTHERS[key]})
-    with pytest.raises(EvaluationError, match=f"different {key}.*{key}"):
+    with pytest.raises(EvaluationError, match=f"the settings {key} differ.*{key}"):
         merge_results([tmp_path / "a", tmp_path / "b"], tmp_path / "both")
     assert group_partial_results([tmp_path / "a", tmp_path / "b"]) == [[tmp_path / "a"], [tmp_path / "b"]]
     assert start(tmp_path / "a", {**RUN_OF, key: OTHERS[key]}, overwrite=True) == []
@@ -174,7 +174,7 @@ def test_address_of_a_server_is_not_part_of_the_settings(tmp_path):
     silent = {**SERVED, "server": None}  # a plain openpi server: its policy is unknown
     write(tmp_path / "c", [outcome(0)], policy={"name": "ws://a:1", **silent})
     write(tmp_path / "d", [outcome(1)], policy={"name": "ws://a:2", **silent})
-    with pytest.raises(EvaluationError, match="different policy"):
+    with pytest.raises(EvaluationError, match="the settings policy differ"):
         read_result(tmp_path / "c", tmp_path / "d")
 
 
@@ -182,7 +182,7 @@ def test_what_an_error_broke_off_is_played_again_if_that_is_asked_for(tmp_path):
     broken = outcome(1, 0, error="no server", failure_stage="error")
     write(tmp_path / "a", [outcome(0), broken, outcome(2)])
     assert start(tmp_path / "a") == [0, 1, 2]
-    assert read_result(tmp_path / "a").error_count() == 1
+    assert read_result(tmp_path / "a").count_errors() == 1
     assert start(tmp_path / "a", new=[outcome(1)], retry_errors=True) == [0, 2]
     assert read_result(tmp_path / "a").outcomes[1].success
 

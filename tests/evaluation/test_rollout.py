@@ -69,7 +69,7 @@ def test_chunk_lengths_must_be_multiples_of_observe_every(chunk, observe_every, 
     if fits:
         assert [one.steps for one in play(CountingEnv(1, None), policy, starts(4), 7)] == [4]
     else:
-        with pytest.raises(EvaluationError, match=f"a multiple of {observe_every} steps"):
+        with pytest.raises(EvaluationError, match=f"a multiple of {observe_every} actions"):
             play(CountingEnv(1, None), policy, starts(4), 7)
 
 
@@ -89,7 +89,7 @@ def test_an_episode_whose_policy_fails_or_acts_by_nan_ends_alone(fails):
     played = sorted(play(CountingEnv(2, None), policy, starts(4, 5, 3), 7), key=lambda one: one.spec.seed)
     error = "no plan" if fails else "NaN or infinite action of the policy"
     assert [(one.error, one.steps) for one in played] == [("", 3), (error, 0), ("", 5)]
-    outcome = played[1].outcome(load_protocol("smoke").episodes[0], ())
+    outcome = played[1].make_outcome(load_protocol("smoke").episodes[0], ())
     assert (outcome.success, outcome.failure_stage, outcome.error) == (False, "error", error)
 
 
@@ -98,4 +98,4 @@ def test_actions_of_another_shape_are_refused():
     policy.act = lambda observations: np.zeros((2, 6))
     with pytest.raises(EvaluationError) as error:
         play(CountingEnv(1, None), policy, starts(4), 7)
-    assert error.value.expected == "(1, 7) or (1, chunk, 7) numbers"
+    assert error.value.expected == "numbers of shape (1, 7) or (1, H, 7)"

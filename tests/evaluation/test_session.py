@@ -64,7 +64,7 @@ def test_env_stays_open_while_the_configuration_is_the_same(made):
 def test_reset_after_an_env_error_makes_a_new_env(made):
     external = open_session()
     external.reset([0])
-    with pytest.raises(EvaluationError, match=r"invalid shape or type of actions"):  # the env stays open
+    with pytest.raises(EvaluationError, match=r"the actions have an invalid shape or type"):  # the env stays open
         external.step(np.zeros((1, 6)))
     with pytest.raises(RuntimeError, match="the env broke"):
         external.step(ones(1, BREAKS))
@@ -110,8 +110,12 @@ def no_renderer() -> None:
 @pytest.mark.parametrize(
     ("settings", "spec", "message"),
     [
-        ({"protocol": "paper-v1"}, PolicySpec("joint_positions"), "does not allow this convention of a policy"),
-        ({"protocol": "paper-v1"}, PolicySpec(reference="tcp", rate_hz=10), "another action rate .*10 Hz"),
+        ({"protocol": "paper-v1"}, PolicySpec("joint_positions"), "does not allow the convention of the policy"),
+        (
+            {"protocol": "paper-v1"},
+            PolicySpec(reference="tcp", rate_hz=10),
+            "action rate of the policy differs .*10 Hz",
+        ),
         ({}, PolicySpec(rate_hz=7), "divisor of 100"),
         (
             {"tasks": ("nothing",)},
@@ -119,7 +123,7 @@ def no_renderer() -> None:
             "no episodes of this task .expected pick, select, search, open_pick, found nothing",
         ),
         ({"split": "seen"}, AT_5_HZ, "no episodes of this split .expected test, found seen"),
-        ({"tasks": ("pick",), "shard": "90/100"}, AT_5_HZ, "no episodes in this shard"),
+        ({"tasks": ("pick",), "shard": "90/100"}, AT_5_HZ, "no episode is selected"),
         ({"shard": "3/2"}, AT_5_HZ, "invalid shard"),
         ({}, PolicySpec(cameras={"side_camera": (8, 8)}), "unknown camera"),
         ({}, PolicySpec(cameras={"base_camera": (8, 8)}), "no render device"),
@@ -204,18 +208,18 @@ def test_episode_is_retried_once_after_a_crash_and_then_counts_as_failed(short, 
     found = evaluate(out, "noop", protocol=str(short), tasks=("pick", "select"))
     assert sorted(found) == [0, 1, 2, 3]
     assert [number for number, one in found.items() if one["error"]] == ([1] if times == 2 else [])
-    assert found[1]["error"] == ("the worker process of the env crashed: SIGSEGV" if times == 2 else "")
+    assert found[1]["error"] == ("the worker process crashed: SIGSEGV" if times == 2 else "")
     assert (found[1]["failure_stage"] == "error") == (times == 2)
     assert found[0]["steps"] == 20  # not affected by the other env
     assert [record.getMessage() for record in caplog.records] == [
-        "episode 1: the worker process of the env crashed: SIGSEGV; the episode is retried once"
+        "episode 1: the worker process crashed: SIGSEGV; the episode is repeated once"
     ]
     assert all(env.closed for env in made)
     violations = find_violations(results.read_result(out), protocol)
     assert not [one for one in violations if one.startswith("episode 1:") and times == 2]
     command = ["eval", "--policy", "noop", "--protocol", short, "--backend", "processes", "--out", out]
     assert cli([str(word) for word in command]) == times - 1  # the failed episode is not repeated
-    assert results.read_result(out).error_count() == times - 1
+    assert results.read_result(out).count_errors() == times - 1
 
 
 @pytest.mark.parametrize("times", [1, 2])

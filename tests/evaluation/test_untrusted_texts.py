@@ -66,7 +66,7 @@ def test_description_round_trips_and_does_not_rename_the_policy(tmp_path):
 def test_error_text_of_a_policy_round_trips(tmp_path):
     start = EpisodeSpec(0, 0, "pick", "table", "", "builtin", 0, "")
     episode = SimpleNamespace(episode=0, task="pick", config="table", seed=0, split="test", p_vis=None)
-    made = Rollout(start, error=f"{HOSTILE}\udcff").outcome(episode, [])
+    made = Rollout(start, error=f"{HOSTILE}\udcff").make_outcome(episode, [])
     assert made.error.isprintable()
     write(tmp_path / "out", [])
     results.append_outcome(tmp_path / "out", made)

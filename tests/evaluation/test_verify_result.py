@@ -51,17 +51,23 @@ def tamper_run(folder, **values):
         ({"config": "easier"}, "episode 0: config is easier, expected pick_table_scattered"),
         ({"split": "train"}, "episode 0: split is train, expected test"),
         ({"p_vis": 0.9}, "episode 0: p_vis is 0.9, expected None"),
-        ({"success": False}, "episode 0: success contradicts the flags"),
+        ({"success": False}, "episode 0: success is False, but flags.success is 70"),
         ({"failure_stage": "placed"}, "episode 0: failure_stage is placed, expected empty from the flags"),
-        ({"steps": 801}, "episode 0: 801 steps, expected at most 800"),  # 40 s at 20 Hz
-        ({"steps": 71}, "episode 0: continued after success, which held at step 70 of 71"),
-        ({"steps": 69}, "episode 0: success, success_v0 held first after the last of 69 steps"),
-        ({"success_at_end": True, "success": False}, "episode 0: success_at_end without success"),
-        ({"flags": {"success_v0": None}}, "episode 0: success_v0 contradicts the flags"),
-        ({"seconds": 3.0}, "episode 0: 3 s, expected 3.5 s for 70 steps"),
-        ({"flag_seconds": {"success": 3.6}}, "episode 0: success held first after the end at 3.5 s"),
+        ({"steps": 801}, "episode 0: 801 steps, expected at most 800 by the rules of the protocol"),  # 40 s at 20 Hz
+        (
+            {"steps": 71},
+            "episode 0: success held at step 70, where the protocol ends the episode, but the episode has 71 steps",
+        ),
+        ({"steps": 69}, "episode 0: flags: success, success_v0 first held after the last step, expected at most 69"),
+        ({"success_at_end": True, "success": False}, "episode 0: success_at_end is True, but success is False"),
+        ({"flags": {"success_v0": None}}, "episode 0: success_v0 is True, but flags.success_v0 is None"),
+        ({"seconds": 3.0}, "episode 0: seconds is 3, expected 3.5 for 70 steps at 20 Hz"),
+        (
+            {"flag_seconds": {"success": 3.6}},
+            "episode 0: flag_seconds: success first held after the end of the episode at 3.5 s",
+        ),
         ({"flag_seconds": {}}, "episode 0: flag_seconds and flags have different keys or values"),
-        ({"episode": 99}, "episode 99: not in the protocol"),
+        ({"episode": 99}, "episode 99: this episode is not in the protocol"),
     ],
 )
 def test_changed_outcomes_are_found(folder, protocol, values, said):
@@ -116,7 +122,7 @@ def test_an_outcome_of_select_is_valid_only_if_the_run_has_played_as(tmp_path):
         f"episode {number}: task is pick, expected select" for number in range(1, 200)
     }
     tamper_run(folder, played_as={"search": "pick"})
-    assert "played_as is {'search': 'pick'}, but the protocol has no such rule" in find_violations(
+    assert "played_as is {'search': 'pick'}, but this protocol allows no such alias" in find_violations(
         read_result(folder), protocol
     )
 
@@ -131,8 +137,9 @@ def test_inconsistent_retrieval_orders_are_found(folder, protocol, changed, well
     tamper(folder, 0, flags=flags, flag_seconds=seconds, retrieval={**ORDER, **changed})
     assert len(find_violations(read_result(folder), protocol)) == (0 if well else 1)
     tamper(folder, 1, retrieval=ORDER)
-    assert "episode 1: the retrieval order contradicts its score or the flags" in find_violations(
-        read_result(folder), protocol
+    assert (
+        "episode 1: retrieval: the score does not fit the moved objects, or the steps do not fit the episode"
+        in find_violations(read_result(folder), protocol)
     )
 
 

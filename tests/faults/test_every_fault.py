@@ -134,7 +134,7 @@ def test_task_process(command, expected_content, tmp_path, row, fault, times):
     found = content(command, out)
     row.compare(expected, found, without=(1,))
     if command.name == "eval":
-        assert dict(found)[1]["error"] == "the worker process of the env crashed: SIGSEGV"
+        assert dict(found)[1]["error"] == "the worker process crashed: SIGSEGV"
         row.note = "counted as failed"
     else:
         row.note = "another seed in its place"

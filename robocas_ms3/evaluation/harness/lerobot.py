@@ -20,7 +20,7 @@ from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 @EnvConfig.register_subclass("robocas")
 @dataclass
 class RoboCASEnvConfig(EnvConfig):
-    """Configuration of RoboCAS environments in LeRobot; the defaults fit our LeRobot datasets.
+    """Configuration ``--env.type=robocas`` of LeRobot. The defaults fit LeRobot datasets of `robocas convert`.
 
     Attributes:
         task: short names of tasks, separated by commas; ``all``: all tasks of the protocol.
@@ -30,9 +30,9 @@ class RoboCASEnvConfig(EnvConfig):
         cameras: names separated by commas. LeRobot records videos of the first camera.
         observation_width, observation_height: size of the images of each camera, pixels.
         depth: add the depth of each camera as ``observation.images.CAMERA_depth``, (1, H, W) float32 in mm.
-        convention, reference: action convention and reference of motions (docs/evaluation.md).
-        backend: ``processes``, ``gpu`` or ``auto``.
-        results: folder of the results for ``robocas eval report``, one subfolder per task.
+        convention, reference: as in `PolicySpec` (docs/evaluation.md).
+        backend: where the simulation runs: ``processes``, ``gpu`` or ``auto`` (a GPU if there is one).
+        results: folder for results that `robocas eval report` reads, one subfolder per task; None: no results.
         policy_name: name of the policy in these results.
     """
 
@@ -74,20 +74,23 @@ class RoboCASEnvConfig(EnvConfig):
     def spec(self) -> PolicySpec:
         """Return the policy specification of these settings."""
         size = (self.observation_width, self.observation_height)
-        cameras = dict.fromkeys(_names(self.cameras, "env.cameras"), size)
+        cameras = dict.fromkeys(_split_names(self.cameras, "env.cameras"), size)
         return PolicySpec(self.convention, cast(Reference, self.reference), self.fps, cameras, depth=self.depth)
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Return no arguments: `create_envs` does not call ``gym.make``."""
+        """Return an empty dict, because `create_envs` does not call ``gym.make``."""
         return {}
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
-        """Make the vector environments, ``{task: {0: environment}}``; ``use_async_envs`` is ignored."""
+        """Make one vector environment per task with ``n_envs`` envs; return ``{task: {0: environment}}``.
+
+        ``use_async_envs`` is ignored: `backend` decides where the envs run.
+        """
         from robocas_ms3.evaluation.harness.protocol_env import ProtocolVectorEnv
         from robocas_ms3.evaluation.settings import EvaluationSettings
 
-        tasks = _names(self.task or "", "env.task")
+        tasks = _split_names(self.task or "", "env.task")
         if tasks == ["all"]:
             protocol = load_protocol(self.protocol)
             episodes = [episode for episode in protocol.episodes if self.split in ("", episode.split)]
@@ -107,8 +110,8 @@ class RoboCASEnvConfig(EnvConfig):
         return envs
 
 
-def _names(text: str, where: str) -> list[str]:
+def _split_names(text: str, where: str) -> list[str]:
     names = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
     if not names:
-        raise EvaluationError("missing name", where=where, expected="names separated by commas", found=repr(text))
+        raise EvaluationError("missing names", where=where, expected="names separated by commas", found=repr(text))
     return names

@@ -17,25 +17,25 @@ from robocas_ms3.robots.quantities import ARM_BASE, STATE, feature_columns, lero
 from robocas_ms3.robots.registry import find_robot
 
 KEYS = {"agent_pos": STATE} | {key.removeprefix("observation."): key for key in lerobot_features() if key != STATE}
-"""Column of our LeRobot datasets by key of the observation of an environment."""
+"""Column of LeRobot datasets by key of the observation of a LeRobot environment."""
 WIDTHS = {name: next(one.width for one in schema.FEATURES if one.key == column) for name, column in KEYS.items()}
 _QUATERNIONS = {"agent_pos": feature_columns(STATE)["ee_orn"], "arm_base": feature_columns(ARM_BASE)["base_orn"]}
 _YAW = feature_columns(STATE)["agv_pose"].stop - 1  # in agent_pos
 
 
 def depth_key(camera: str) -> str:
-    """Return the key of a depth image in observations; LeRobot adds the prefix ``observation.``."""
+    """Return the key of the depth image of a camera in observations, to which LeRobot adds ``observation.``."""
     return schema.depth_key(camera).removeprefix("observation.")
 
 
 class Proprioception:
-    """State of the robots of N envs, read once per step."""
+    """Robot state of N envs in the columns of LeRobot datasets; call `compute` once per step and env."""
 
     def __init__(self, robot: str) -> None:
         self._spec = find_robot(robot)
 
     def reset(self, obs: dict[str, Any]) -> None:
-        """Start an episode in each env from the first observation, arrays (N, ...)."""
+        """Start an episode in each env; ``obs``: first observation of the vector environment, arrays (N, ...)."""
         robot, agent = self._spec.description, obs["agent"]
         poses = (agent["tcp_in_arm_base"], obs["extra"]["tcp_pose"])
         in_base, in_world = (from_wxyz(np.asarray(pose, np.float64)) for pose in poses)
@@ -43,16 +43,18 @@ class Proprioception:
         base_in_root = chain_poses(
             self._spec.files().urdf, robot.root_link, robot.arm_base_link, qpos[:, robot.base_slice]
         )
-        self._roots = (
-            in_world @ inverse(in_base) @ inverse(base_in_root)
-        )  # (N, 4, 4) poses of the root links, which do not move
+        # (N, 4, 4) poses of the root links, which do not move
+        self._roots = in_world @ inverse(in_base) @ inverse(base_in_root)
         self._widths = qpos[:, robot.finger_slice].sum(axis=1)  # initial gripper widths, m
         self._last: dict[int, dict[str, NDArray[np.float32]]] = {}  # by env
 
-    def read(self, env: int, obs: dict[str, Any], gripper: float | None) -> dict[str, NDArray[np.float32]]:
-        """Return the values (D,) of each key in `KEYS`.
+    def compute(self, env: int, obs: dict[str, Any], gripper: float | None) -> dict[str, NDArray[np.float32]]:
+        """Return the values (D,) float32 of an env for each key in `KEYS`.
 
-        ``gripper``: last gripper command, -1 closed to 1 open; None: no command in the episode yet.
+        Args:
+            env: index of the env.
+            obs: last observation of the vector environment, arrays (N, ...).
+            gripper: last gripper command, -1 closed to 1 open; None: no command in the episode yet.
         """
         qpos, qvel = (obs["agent"][name][env][None].astype(np.float64) for name in ("qpos", "qvel"))
         commands, width = np.array([] if gripper is None else [gripper]), float(self._widths[env])
@@ -62,18 +64,21 @@ class Proprioception:
         motion = Motion.from_joints(self._spec, self._roots[env][None], qpos, qvel, opened)
         columns = frame_columns(episode_arrays(motion, "", []))
         found = {name: columns[column][0] for name, column in KEYS.items()}
-        self._last[env] = _continued(self._last[env], found) if env in self._last else found
+        self._last[env] = _remove_jumps(self._last[env], found) if env in self._last else found
         return self._last[env]
 
 
-def _continued(
-    before: dict[str, NDArray[np.float32]], now: dict[str, NDArray[np.float32]]
+def _remove_jumps(
+    last_values: dict[str, NDArray[np.float32]], values: dict[str, NDArray[np.float32]]
 ) -> dict[str, NDArray[np.float32]]:
-    """Return the values without sign flips of quaternions and jumps by full turns, as in datasets."""
-    found = {name: values.copy() for name, values in now.items()}
+    """Return the values without sign flips of quaternions and without jumps of the yaw by full turns.
+
+    ``last_values``: values of the step before. Datasets have no such jumps either.
+    """
+    found = {name: array.copy() for name, array in values.items()}
     for name, turn in _QUATERNIONS.items():
-        if before[name][turn] @ found[name][turn] < 0:
+        if last_values[name][turn] @ found[name][turn] < 0:
             found[name][turn] *= -1
-    yaw, last = found["agent_pos"][_YAW], before["agent_pos"][_YAW]
+    yaw, last = found["agent_pos"][_YAW], last_values["agent_pos"][_YAW]
     found["agent_pos"][_YAW] = yaw + 2 * np.pi * np.round((last - yaw) / (2 * np.pi))
     return found

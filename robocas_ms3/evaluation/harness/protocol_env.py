@@ -23,15 +23,16 @@ from robocas_ms3.evaluation.settings import EvaluationSettings
 
 
 class ProtocolVectorEnv(gym.vector.VectorEnv):
-    """Vector environment that runs the frozen episodes of one task, N at a time.
+    """Vector environment that runs the episodes of one task of a protocol, N at a time.
 
-    A seed is the index of an episode in the task's list, modulo the length of the list. There is no automatic reset:
-    an env whose episode has ended returns its last observation until the next reset.
-
-    Observations: ``pixels`` by camera (N, H, W, 3) uint8; ``agent_pos`` (N, 18), ``joint_velocity`` (N, 7),
-    ``arm_base`` (N, 7) and ``gripper_open`` (N, 1) float32, the state columns of our LeRobot datasets; with depth
-    ``images.CAMERA_depth`` (N, 1, H, W) float32 in mm, 0: no measurement. Reward: 1 at the step where an episode ends
-    with success, else 0. ``info["is_success"]`` (N,) is also in ``info["final_info"]`` at steps where an episode ends.
+    - Seed: index of an episode in the list of the task's episodes, modulo the length of the list.
+    - No automatic reset: an env whose episode has ended returns its last observation until the next reset.
+    - Observations: ``pixels`` by camera, (N, H, W, 3) uint8. State columns of LeRobot datasets, float32: ``agent_pos``
+      (N, 18), ``joint_velocity`` (N, 7), ``arm_base`` (N, 7) and ``gripper_open`` (N, 1). With depth also
+      ``images.CAMERA_depth`` (N, 1, H, W) float32 in mm, 0: no measurement.
+    - Reward: 1 at the step at which an episode ends with success, else 0.
+    - ``info["is_success"]`` (N,) bool: whether the episode has succeeded; at the end of an episode also in
+      ``info["final_info"]``.
 
     Args:
         spec: cameras, action convention and rate.
@@ -54,7 +55,8 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         if (folder := settings.out) is not None:
             with ExitStack() as lock:
                 if lock.enter_context(results.open_result(folder, self._session.run_record)):
-                    raise EvaluationError("the folder already has a result", where=folder, fix="Choose another folder.")
+                    what, fix = "the output folder already has a result", "Choose another folder, or delete this one."
+                    raise EvaluationError(what, where=folder, fix=fix)
                 self._lock = lock.pop_all()  # held until `close`
         self._convention = CONVENTIONS[spec.convention]
         self._proprioception = Proprioception(self._session.protocol.rules.robot)
@@ -63,7 +65,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         self.render_mode = "rgb_array"
         rate = self._session.rate
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": rate, "autoreset_mode": AutoresetMode.DISABLED}
-        self.single_observation_space = _space(spec)
+        self.single_observation_space = _make_observation_space(spec)
         self.single_action_space = gym.spaces.Box(-np.inf, np.inf, (self._convention.size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, count)
         self.action_space = batch_space(self.single_action_space, count)
@@ -75,17 +77,17 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode in each env.
+        """Start an episode in each env; return the first observations and ``info``.
 
         Args:
-            seed: seed of the first env; the other envs get the next seeds. A list has one seed per env. None: the
-                episodes after those of the last reset.
+            seed: seed of the first env; the other envs get the next seeds. A list has one seed per env. None: continue
+                with the episodes after those of the last reset.
             options: ignored.
         """
         first: Any = self._next if seed is None else seed
         seeds = [first + env for env in range(self.num_envs)] if np.ndim(first) == 0 else list(first)
         if len(seeds) != self.num_envs or any(one is None for one in seeds):
-            raise ValueError(f"seed: expected {self.num_envs} integers, found {seeds}")
+            raise ValueError(f"seed: expected one integer, or one per env ({self.num_envs}), found {seeds}")
         indices = [int(one) % len(self._episodes) for one in seeds]
         self._next = indices[-1] + 1
         episodes = [self._episodes[index] for index in indices]
@@ -95,42 +97,42 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         self._grippers = [None] * self.num_envs
         self._proprioception.reset(self._session.observation)
         self._obs = cast(dict[str, Any], create_empty_array(self.single_observation_space, self.num_envs))
-        self._read(list(range(self.num_envs)))
-        return deepcopy(self._obs), self._info(np.zeros(self.num_envs, bool))  # a copy: the caller may keep it
+        self._update_observations(list(range(self.num_envs)))
+        return deepcopy(self._obs), self._make_info(np.zeros(self.num_envs, bool))  # a copy: the caller may keep it
 
     def step(
         self, actions: ArrayLike
     ) -> tuple[dict[str, Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Step the envs with a running episode by actions (N, A)."""
+        """Execute actions (N, A) in the envs whose episode is running; return what gymnasium's ``step`` returns."""
         acts = np.asarray(actions, np.float32)
         if acts.shape != self.action_space.shape:
-            raise ValueError(f"actions: expected {self.action_space.shape}, found {acts.shape}")
+            raise ValueError(f"actions: expected shape {self.action_space.shape}, found {acts.shape}")
         if not self._obs:
-            raise EvaluationError("no episode is running", fix="Call reset first.")
-        before = self._by_env(lambda outcome: True)
+            raise EvaluationError("no episode is running", fix="Call reset before step.")
+        before = self._ended_with(lambda outcome: True)
         if running := np.flatnonzero(~before).tolist():
             self._session.step(acts)
-            for env, command in zip(running, self._commands(acts[running]), strict=True):
+            for env, command in zip(running, self._gripper_commands(acts[running]), strict=True):
                 self._grippers[env] = command
-            self._read(running)
-        ended = self._by_env(lambda outcome: True)
-        self._record(np.flatnonzero(ended & ~before).tolist())
-        truncated = self._by_env(lambda outcome: not outcome.success and outcome.steps >= self._max_steps)
-        info = self._info(ended & ~before)
+            self._update_observations(running)
+        ended = self._ended_with(lambda outcome: True)
+        self._write_outcomes(np.flatnonzero(ended & ~before).tolist())
+        truncated = self._ended_with(lambda outcome: not outcome.success and outcome.steps >= self._max_steps)
+        info = self._make_info(ended & ~before)
         reward = (info["is_success"] & ~before).astype(np.float64)
         return deepcopy(self._obs), reward, ended & ~truncated, truncated, info
 
     def render(self) -> tuple[NDArray[np.uint8], ...]:
-        """Return the first camera's image (H, W, 3) of each env."""
+        """Return the last image (H, W, 3) uint8 of the first camera for each env."""
         return tuple(next(iter(self._obs["pixels"].values())).copy())
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """Return ``task``, ``task_description`` or ``_max_episode_steps`` of each env."""
+        """Return the value of ``task``, ``task_description`` or ``_max_episode_steps`` for each env."""
         if name == "task_description":
             return tuple(self._instructions)
         shared = {"task": self._task, "_max_episode_steps": self._max_steps}
         if name not in shared:
-            raise AttributeError(f"{name}: expected one of task_description, {', '.join(shared)}")
+            raise AttributeError(f"unknown attribute: expected task_description, {' or '.join(shared)}, found {name}")
         return (shared[name],) * self.num_envs
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
@@ -140,28 +142,28 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         self._session.close()
         self._lock.close()
 
-    def _commands(self, actions: NDArray[np.float32]) -> list[float]:
+    def _gripper_commands(self, actions: NDArray[np.float32]) -> list[float]:
         if self._convention.decode is None:
             return actions[:, -1].tolist()
         opened = self._convention.decode(np.nan_to_num(actions.astype(np.float64))).open
         return np.where(opened, 1.0, -1.0).tolist()
 
-    def _by_env(self, holds: Callable[[Outcome], bool]) -> NDArray[np.bool_]:
-        """Return (N,) whether the episode of each env has ended with an outcome for which ``holds`` is true."""
+    def _ended_with(self, condition: Callable[[Outcome], bool]) -> NDArray[np.bool_]:
+        """Return (N,) bool, whether the episode of each env has ended and its outcome satisfies ``condition``."""
         outcomes = [self._session.outcomes.get(env) for env in range(self.num_envs)]
-        return np.array([outcome is not None and holds(outcome) for outcome in outcomes])
+        return np.array([outcome is not None and condition(outcome) for outcome in outcomes])
 
-    def _record(self, envs: list[int]) -> None:
-        """Write the outcomes of envs to the result, each episode once."""
+    def _write_outcomes(self, envs: list[int]) -> None:
+        """Append the outcomes of the given envs to the result, each episode once."""
         for outcome in (self._session.outcomes[env] for env in envs):
             if self._folder is not None and outcome.episode not in self._recorded:
                 results.append_outcome(self._folder, outcome)
                 self._recorded.add(outcome.episode)
 
-    def _read(self, envs: list[int]) -> None:
+    def _update_observations(self, envs: list[int]) -> None:
         obs = self._session.observation
         for env in envs:
-            for name, values in self._proprioception.read(env, obs, self._grippers[env]).items():
+            for name, values in self._proprioception.compute(env, obs, self._grippers[env]).items():
                 self._obs[name][env] = values
         for camera, pixels in self._obs["pixels"].items():
             images = obs["sensor_data"][camera]
@@ -169,8 +171,8 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
             if self._spec.depth:
                 self._obs[depth_key(camera)][envs] = images["depth"][envs].transpose(0, 3, 1, 2)
 
-    def _info(self, just_ended: NDArray[np.bool_]) -> dict[str, Any]:
-        success = self._by_env(lambda outcome: outcome.success)
+    def _make_info(self, just_ended: NDArray[np.bool_]) -> dict[str, Any]:
+        success = self._ended_with(lambda outcome: outcome.success)
         info: dict[str, Any] = {"is_success": success, "_is_success": np.ones(self.num_envs, bool)}
         if just_ended.any():
             info["final_info"] = {"is_success": success.copy(), "_is_success": just_ended}
@@ -178,7 +180,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         return info
 
 
-def _space(spec: PolicySpec) -> gym.spaces.Dict:
+def _make_observation_space(spec: PolicySpec) -> gym.spaces.Dict:
     depths = [(depth_key(name), (1, h, w)) for name, (w, h) in spec.cameras.items()] if spec.depth else []
     shapes = [*((name, (width,)) for name, width in WIDTHS.items()), *depths]
     numbers: dict[str, gym.Space[Any]] = {name: gym.spaces.Box(-np.inf, np.inf, shape) for name, shape in shapes}

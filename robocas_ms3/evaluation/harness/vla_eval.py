@@ -35,14 +35,13 @@ _ROTATIONS = {
 
 
 class RoboCASBenchmark:
-    """Benchmark with the episodes of a protocol, for vla-eval's runners in mode ``sync``.
+    """Benchmark of vla-eval that runs the episodes of a protocol in mode ``sync``.
 
     Args:
         protocol: name of a bundled protocol, or a protocol folder.
         cameras: (width, height) in pixels by camera, in the order of the images that a model server receives.
-        convention: action convention, one of ``evaluation.policy.CONVENTIONS``.
-        reference: pose that motions are relative to: ``tcp`` or ``target``.
-        rate_hz: actions per second; None: the protocol's rate.
+        convention, reference: as in `PolicySpec`.
+        rate_hz: actions per second; None: the rate of the protocol, or 20 if it has none.
     """
 
     def __init__(
@@ -72,31 +71,31 @@ class RoboCASBenchmark:
         return {}
 
     def get_tasks(self) -> list[dict[str, Any]]:
-        """Return one task per configuration; the suite is the short name of the RoboCAS task."""
+        """Return one vla-eval task per configuration; its ``suite`` is the short name of the RoboCAS task."""
         return [
             {"name": config, "suite": episodes[0].task, "episodes": len(episodes)}
             for config, episodes in self._episodes_by_config.items()
         ]
 
     def get_metadata(self) -> dict[str, Any]:
-        """Return ``max_steps`` of the longest task; other tasks end by the rules of the protocol."""
+        """Return the largest ``max_steps`` of all tasks; the protocol ends episodes of other tasks earlier."""
         tasks = {episode.task for episode in self._session.protocol.episodes}
         return {"max_steps": max(self._session.max_steps(task) for task in tasks)}
 
     def get_metric_keys(self) -> dict[str, str]:
-        """Return the metrics that vla-eval averages over episodes."""
+        """Return the names of the metrics of which vla-eval computes the mean over the episodes."""
         names = ("success", "success_at_end", "success_v0", *PAPER_STAGES.values(), "seconds", *MEASURES)
         return dict.fromkeys(names, "mean")
 
     def get_action_spec(self) -> dict[str, Any]:
-        """Return vla-eval's description of the actions."""
+        """Return the parts of an action as vla-eval's ``DimSpec`` by name."""
         from vla_eval.specs import DimSpec  # pyright: ignore[reportMissingImports]
 
         convention = self._spec.convention
         if convention not in _ROTATIONS:
-            return {"joints": DimSpec("joints", 7, "absolute_joint_positions"), "gripper": _gripper(DimSpec)}
+            return {"joints": DimSpec("joints", 7, "absolute_joint_positions"), "gripper": _gripper_spec(DimSpec)}
         size, turn = _ROTATIONS[convention]
-        grip = DimSpec("gripper", 1, "binary_open_01", (0, 1)) if convention == "robocas" else _gripper(DimSpec)
+        grip = DimSpec("gripper", 1, "binary_open_01", (0, 1)) if convention == "robocas" else _gripper_spec(DimSpec)
         return {
             "position": DimSpec("position", 3, "delta_xyz", description="m, in the TCP's frame"),
             "rotation": DimSpec("rotation", size, turn, description="in the TCP's frame"),
@@ -104,7 +103,7 @@ class RoboCASBenchmark:
         }
 
     def get_observation_spec(self) -> dict[str, Any]:
-        """Return vla-eval's description of the observations."""
+        """Return the parts of an observation as vla-eval's ``DimSpec`` by name."""
         from vla_eval.specs import IMAGE_RGB, LANGUAGE, DimSpec  # pyright: ignore[reportMissingImports]
 
         images = dict.fromkeys(["image", *self._spec.cameras] if self._spec.cameras else [], IMAGE_RGB)
@@ -112,25 +111,28 @@ class RoboCASBenchmark:
 
     def get_hold_action(self, last_action: dict[str, Any] | None) -> dict[str, Any]:
         """Raise an error: mode ``live``, in which steps depend on clock time, is not supported."""
-        raise NotImplementedError("mode live is not supported: set mode: sync")
+        raise NotImplementedError("mode live is not supported. Set mode: sync.")
 
     async def start_episode(self, task: Mapping[str, Any], recorder: Any = None) -> None:
         """Start the episode ``episode_idx`` of a task of `get_tasks`."""
         episodes, number = self._episodes_by_config[task["name"]], task["episode_idx"]
         if number >= len(episodes):
-            what, expected = "the protocol has fewer episodes of this task", f"at most {len(episodes)}"
-            raise EvaluationError(what, where=task["name"], expected=f"episodes_per_task: {expected}", found=number + 1)
+            what, expected = (
+                "the protocol has fewer episodes of this task",
+                f"episodes_per_task of at most {len(episodes)}",
+            )
+            raise EvaluationError(what, where=task["name"], expected=expected, found=number + 1)
         episode = episodes[number]
         self._episode, self._recorder, self._started = episode, recorder, time.monotonic()
         self._observations = self._session.reset([episode.episode])
         self._proprioception.reset(self._session.observation)
-        self._record()
+        self._record_frame()
 
     async def apply_action(self, action: Mapping[str, Any]) -> None:
-        """Execute an action or all actions of a chunk."""
+        """Execute an action (A,), or all actions of a chunk (H, A)."""
         actions = parse_actions({"actions": action.get("actions", action.get("action"))}, self._spec.convention)
         self._observations = self._session.step(actions[None])
-        self._record()
+        self._record_frame()
 
     async def get_observation(self) -> dict[str, Any]:
         """Return ``images`` (H, W, 3) uint8 by camera, ``state`` and ``task_description``.
@@ -141,7 +143,7 @@ class RoboCASBenchmark:
         assert observations is not None  # vla-eval requests no observation after the end of an episode
         return {
             "images": {name: images[0] for name, images in observations.images.items()},
-            "state": self._proprioception.read(0, self._session.observation, None)["agent_pos"],
+            "state": self._proprioception.compute(0, self._session.observation, None)["agent_pos"],
             "task_description": observations.instructions[0],
         }
 
@@ -154,12 +156,12 @@ class RoboCASBenchmark:
         return time.monotonic() - self._started
 
     async def get_result(self) -> dict[str, Any]:
-        """Return the outcome of the episode, whether each flag ever held, protocol and package versions."""
+        """Return the outcome of the episode, whether each flag held at some step, protocol and package versions."""
         outcome, episode = self._session.outcomes.get(0), self._episode
         if outcome is None or episode is None:
             what, fix = (
-                "the episode was ended before the limit of the protocol",
-                "Remove max_steps from the configuration.",
+                "vla-eval ended the episode before the time limit of the protocol",
+                "Remove max_steps from the configuration of vla-eval.",
             )
             raise EvaluationError(what, where="max_steps", fix=fix)
         return {
@@ -178,13 +180,13 @@ class RoboCASBenchmark:
         images = self._observations.images if self._observations is not None else {}
         return next(iter(images.values()))[0] if images else None
 
-    def _record(self) -> None:
+    def _record_frame(self) -> None:
         if self._recorder is not None:
             self._recorder.record_video(self.render())
 
 
-def _gripper(spec: Any) -> Any:
-    return spec("gripper", 1, "binary_close_negative", (-1, 1))
+def _gripper_spec(dim_spec: Any) -> Any:
+    return dim_spec("gripper", 1, "binary_close_negative", (-1, 1))
 
 
 if "vla_eval" in sys.modules:  # `vla-eval test` checks that benchmarks derive from its base class

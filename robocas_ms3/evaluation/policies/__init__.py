@@ -1,7 +1,7 @@
 """Registry of policies by name.
 
-Names are built-in names, names of installed packages, ``replay:TRAJECTORY.h5``, ``module:Class``, ``ws://host:port``
-and folders of policies.
+A name is a built-in name, a name that an installed package registers, ``replay:TRAJECTORY.h5``, ``module:Class``,
+``ws://host:port`` or the folder of a policy.
 
 A package registers policies as entry points of the group `POLICY_GROUP` (docs/extending.md). A folder that holds a
 policy, such as a run of `robocas train`, is opened by an entry point of the group `POLICY_FOLDER_GROUP`; the name of
@@ -31,19 +31,19 @@ POLICY_GROUP = "robocas_ms3.policies"
 POLICY_FOLDER_GROUP = "robocas_ms3.policy_folders"
 
 
-def _scripted(convention: Literal["joint_positions", "robocas"], *, perturbed: bool = False) -> Policy:
+def _make_scripted(convention: Literal["joint_positions", "robocas"], *, perturbed: bool = False) -> Policy:
     from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy  # imports the simulator
 
     return ScriptedPolicy(convention, perturbed=perturbed)
 
 
-def _remote(address: str) -> Policy:
+def _make_remote(address: str) -> Policy:
     from robocas_ms3.evaluation.remote.client import RemotePolicy  # needs an extra
 
     return RemotePolicy(address)
 
 
-def _replay(trajectory: str) -> Policy:
+def _make_replay(trajectory: str) -> Policy:
     from robocas_ms3.evaluation.policies.replay import ReplayPolicy
 
     if not (path := Path(trajectory)).exists():
@@ -57,9 +57,9 @@ POLICIES: Registry[Callable[[], Policy]] = Registry(
     POLICY_GROUP,
     Callable,
     {
-        "scripted": partial(_scripted, "joint_positions"),
-        "scripted-ee-delta": partial(_scripted, "robocas"),
-        "scripted-perturbed": partial(_scripted, "robocas", perturbed=True),
+        "scripted": partial(_make_scripted, "joint_positions"),
+        "scripted-ee-delta": partial(_make_scripted, "robocas"),
+        "scripted-perturbed": partial(_make_scripted, "robocas", perturbed=True),
         "random": RandomPolicy,
         "noop": NoopPolicy,
     },
@@ -68,33 +68,37 @@ POLICIES: Registry[Callable[[], Policy]] = Registry(
 POLICY_FOLDERS: Registry[Callable[[Path], Policy]] = Registry(
     "kind of policy folder", POLICY_FOLDER_GROUP, Callable, {}
 )
-"""Functions that open a policy folder, by the name of a file in the folder."""
+"""Functions that make a policy from its folder, by the name of a file that such a folder contains."""
 
 
 def find_policy(name: str) -> Callable[[], Policy]:
-    """Return the factory of a policy by name; nothing is imported before the factory is called."""
+    """Return the factory of the policy with this name; the code of the policy is imported when the factory is called.
+
+    Raises:
+        EvaluationError: no policy has this name.
+    """
     known, (kind, _, rest) = [*POLICIES.builtin, *POLICIES.entry_points], name.partition(":")
     if name in known:
-        return lambda: _call(name, POLICIES[name])
+        return lambda: _call_factory(name, POLICIES[name])
     if kind in ("ws", "wss") and rest:
-        return partial(_remote, name)
+        return partial(_make_remote, name)
     if kind == "replay" and rest:
-        return partial(_replay, rest)
+        return partial(_make_replay, rest)
     folder = Path(name)
     for file in POLICY_FOLDERS.entry_points if folder.is_dir() else ():
         if (folder / file).is_file():
             return lambda: POLICY_FOLDERS[file](folder)
     if re.fullmatch(r"\w+(\.\w+)*", kind) and rest.isidentifier():
-        return partial(_make_own, name, kind, rest)
+        return partial(_make_from_module, name, kind, rest)
     expected = f"{', '.join(known)}, a folder of robocas train, replay:TRAJECTORY.h5, module:Class or ws://host:port"
     raise EvaluationError("unknown policy", where=name, expected=expected, fix=did_you_mean(name, known), usage=True)
 
 
 def make_policy(name: str) -> Policy:
-    """Make a policy.
+    """Make the policy with this name (`find_policy`).
 
     Raises:
-        EvaluationError: the policy is unknown (`find_policy`), or it lacks an attribute of `Policy`.
+        EvaluationError: no policy has this name, or the policy lacks an attribute of `Policy`.
         ExtensionError: the policy of a package cannot be loaded, or several packages register the name.
     """
     with forbid_exit(f"policy {name}"):
@@ -106,13 +110,15 @@ def make_policy(name: str) -> Policy:
         ):
             if not fits:
                 expected = "spec (robocas_ms3.evaluation.PolicySpec), reset(episodes) and act(observations)"
-                raise EvaluationError(f"the policy has no valid {what}", where=name, expected=expected)
+                raise EvaluationError(
+                    f"missing or invalid attribute {what} of the policy", where=name, expected=expected
+                )
     return policy
 
 
 @contextmanager
 def open_policy(name: str) -> Iterator[Policy]:
-    """Make a policy, and close it at the end if it has a ``close`` method."""
+    """Make the policy with this name; call ``close()`` of the policy, if it has this method, when the context ends."""
     with forbid_exit(f"policy {name}"):
         policy = make_policy(name)
         try:
@@ -121,11 +127,11 @@ def open_policy(name: str) -> Iterator[Policy]:
             getattr(policy, "close", lambda: None)()
 
 
-def _make_own(name: str, module: str, attribute: str) -> Policy:
+def _make_from_module(name: str, module: str, attribute: str) -> Policy:
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # last, so that a file in the folder hides no installed module
     try:
-        make: Any = getattr(importlib.import_module(module), attribute)
+        factory: Any = getattr(importlib.import_module(module), attribute)
     except AttributeError as error:
         raise EvaluationError("unknown policy", where=name, found=error, usage=True) from error
     except Exception as error:  # user code may raise any exception
@@ -136,12 +142,12 @@ def _make_own(name: str, module: str, attribute: str) -> Policy:
             raise EvaluationError("unknown policy", where=name, found=error, fix=fix, usage=True) from error
         what, found = "cannot import the module of the policy", f"{type(error).__name__}: {error}"
         raise EvaluationError(what, where=module, found=found) from error
-    return _call(name, make)
+    return _call_factory(name, factory)
 
 
-def _call(name: str, make: Any) -> Policy:
+def _call_factory(name: str, factory: Any) -> Policy:
     try:
-        return make()
+        return factory()
     except TypeError as error:
         if error.__traceback__ is not None and error.__traceback__.tb_next is None:  # the call itself failed
             what, expected = "cannot make the policy", "a class without required arguments"

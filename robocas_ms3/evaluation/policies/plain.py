@@ -1,4 +1,4 @@
-"""Policies without observations; they show the success rate that a task has by chance."""
+"""Policies that ignore the observations. Their success rate is the success rate by chance."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _CHANGE = 0.1  # probability that a random action opens or closes the gripper
 
 
 class NoopPolicy:
-    """Policy that does not move and keeps the gripper open."""
+    """Policy that keeps the arm still and the gripper open."""
 
     spec = PolicySpec(reference="tcp", language="none")
 
@@ -24,7 +24,11 @@ class NoopPolicy:
 
 
 class RandomPolicy:
-    """Policy that moves at random, seeded per episode."""
+    """Policy with random actions, drawn from a generator that is seeded per episode.
+
+    Each translation component is uniform in -5..5 cm and each Euler angle in -0.2..0.2 rad. An action opens or closes
+    the gripper with probability 0.1.
+    """
 
     spec = PolicySpec(reference="tcp", language="none")
 

@@ -1,4 +1,4 @@
-"""Policies that follow tracks of joint targets or TCP poses; `ReplayPolicy` replays recordings."""
+"""Policies whose actions are known at the start of an episode, as joint targets or as TCP poses."""
 
 from __future__ import annotations
 
@@ -25,13 +25,19 @@ Array = NDArray[np.floating]
 
 @dataclass
 class JointTrack:
-    """A track of joint targets (S, 8); the last target is held. With S = 0 the arm does not move."""
+    """Sequence of joint targets for one episode.
+
+    Attributes:
+        actions: (S, 8) seven joint targets in rad and the gripper, -1 closed to 1 open. After the last action, the last
+            action is repeated. With S = 0 the arm keeps its present joint angles and the gripper is open.
+        step: index of the next action.
+    """
 
     actions: Array
     step: int = 0
 
     def next_action(self, observations: Observations, row: int) -> Array:
-        """Return the next action (8,) for the env of a row."""
+        """Return the next action (8,), in the convention ``joint_positions``; ``row``: row of the env."""
         if not len(self.actions):
             self.actions = np.append(observations.qpos[row, RobotDescription.arm_slice], 1.0)[None]
         action = self.actions[min(self.step, len(self.actions) - 1)]
@@ -41,11 +47,13 @@ class JointTrack:
 
 @dataclass
 class PoseTrack:
-    """A track of TCP poses, one per policy step; each action moves from the present to the next pose.
+    """Sequence of TCP poses for one episode, one per policy step; an action moves from the present to the next pose.
 
     Attributes:
-        poses: (S, 4, 4) in the frame of the arm's base; with S = 0 the arm does not move.
-        open: (S,) bool, gripper commands.
+        poses: (S, 4, 4) in the frame of the arm's base. After the last pose, the last pose is held. With S = 0 the arm
+            does not move and the gripper is open.
+        open: (S,) bool gripper commands, True: open.
+        step: index of the next pose.
     """
 
     poses: Array
@@ -54,12 +62,12 @@ class PoseTrack:
 
     @classmethod
     def from_recording(cls, robot: RobotSpec, robot_states: Array, gripper: Array, stride: int) -> PoseTrack:
-        """Return the track of a recording with one pose per ``stride`` control steps.
+        """Return the TCP poses of a recording, one pose per ``stride`` control steps.
 
         Args:
-            robot: the robot.
-            robot_states: (S + 1, 37) after the reset and after each control step.
-            gripper: (S,) commands in [-1, 1].
+            robot: specification of the recorded robot.
+            robot_states: (S + 1, 37) ManiSkill states of the robot after the reset and after each of S control steps.
+            gripper: (S,) gripper commands, -1 closed to 1 open.
             stride: control steps per pose.
         """
         if not len(gripper):
@@ -68,42 +76,44 @@ class PoseTrack:
         return cls(motion.tcp_in_base[1:], motion.gripper_open[1:])
 
     def next_action(self, observations: Observations, row: int) -> Array:
-        """Return the next action (7,) for the env of a row, in the convention ``robocas``."""
-        place = min(self.step, len(self.poses) - 1)
+        """Return the next action (7,), in the convention ``robocas``; ``row``: row of the env."""
+        index = min(self.step, len(self.poses) - 1)
         self.step += 1
-        if place < 0:
+        if index < 0:
             return np.array([0, 0, 0, 0, 0, 0, 1.0])
         tcp = observations.tcp_in_base[row].astype(np.float64)
         turn = Rotation.from_quat(tcp[[4, 5, 6, 3]]).inv()
-        motion = turn.apply(self.poses[place, :3, 3] - tcp[:3])
-        angles = (turn * Rotation.from_matrix(self.poses[place, :3, :3])).as_euler("xyz")
-        return np.array([*motion, *angles, float(self.open[place])])
+        motion = turn.apply(self.poses[index, :3, 3] - tcp[:3])
+        angles = (turn * Rotation.from_matrix(self.poses[index, :3, :3])).as_euler("xyz")
+        return np.array([*motion, *angles, float(self.open[index])])
 
 
 class TrackPolicy(ABC):
-    """Base class of policies that follow one track per episode."""
+    """Base class of policies that compute a track of targets per episode and then follow it."""
 
     def __init__(self) -> None:
         self._tracks: dict[int, JointTrack | PoseTrack] = {}  # by env
 
     @abstractmethod
     def make_track(self, episode: EpisodeSpec) -> JointTrack | PoseTrack:
-        """Return the track of an episode."""
+        """Compute the track of targets for an episode that starts."""
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
         self._tracks |= {episode.env: self.make_track(episode) for episode in episodes}
 
     def act(self, observations: Observations) -> Array:
-        """Return (E, A) actions."""
+        """Return the next action (A,) of each env, (E, A)."""
         envs = observations.envs.tolist()
         return np.stack([self._tracks[env].next_action(observations, row) for row, env in enumerate(envs)])
 
 
 class ReplayPolicy(TrackPolicy):
-    """Policy that replays the actions of a trajectory file at its rate; it does not move for other seeds.
+    """Policy that replays recorded joint targets, at the control rate of the recording.
+
+    An episode replays the recording with the same seed. If there is none, the arm does not move.
 
     Args:
-        trajectory: HDF5 file of joint targets (``pd_joint_pos``) with a JSON file of the same name.
+        trajectory: HDF5 file with actions in the control mode ``pd_joint_pos``, next to its JSON file.
     """
 
     def __init__(self, trajectory: Path) -> None:
@@ -112,12 +122,12 @@ class ReplayPolicy(TrackPolicy):
         data = read_json(trajectory)
         env = read_recorded_env(data["env_info"], trajectory.with_suffix(".json"))
         if env.control_mode != "pd_joint_pos":
-            what, found = "cannot replay actions of this control mode", env.control_mode
+            what, found = "cannot replay a recording with this control mode", env.control_mode
             raise EvaluationError(what, where=trajectory, expected="pd_joint_pos", found=found)
         if any(map(is_intervention, data["episodes"])):
             what, fix = (
                 "cannot replay expert interventions, which start in a state of another policy",
-                "Use robocas replay.",
+                "Replay this file with `robocas replay`.",
             )
             raise EvaluationError(what, where=trajectory, expected="episodes that start with a reset", fix=fix)
         self._episodes = {
@@ -136,6 +146,6 @@ class ReplayPolicy(TrackPolicy):
         with open_trajectory(self._trajectory) as file:
             actions = read_actions(open_episode(file, number))
         if (found := actions.shape[1]) != 8:
-            where, expected = f"{self._trajectory}, traj_{number}", "8 numbers per action"
+            where, expected = f"{self._trajectory}, traj_{number}", "8 numbers per action, without the base"
             raise EvaluationError("cannot replay actions of this size", where=where, expected=expected, found=found)
         return JointTrack(actions)

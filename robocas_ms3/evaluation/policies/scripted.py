@@ -26,15 +26,15 @@ _OFFSET_STREAM = 411  # random stream of the offset
 
 
 class ScriptedPolicy(TrackPolicy):
-    """Policy that plans each episode from privileged state in a separate environment and replays the plan.
+    """Policy that plans a whole episode from privileged state, and then executes the plan open loop.
 
-    Its success rate is the rate of the scripted policies under the conditions of learned policies. It does not move in
-    episodes without a demonstration, and it does not drive the base.
+    The scripted policy of `robocas generate` makes the plan in a separate environment. If it finds no successful plan,
+    the arm does not move. The base of the robot never moves.
 
     Args:
-        convention: ``joint_positions``: planned joint targets at 20 Hz; ``robocas``: 7-D actions relative to the TCP
-            at 5 Hz.
-        perturbed: shift the motions horizontally (`sample_offset`), like a policy that misjudges positions.
+        convention: ``joint_positions``: joint targets at 20 Hz; ``robocas``: 7-D actions at 5 Hz, relative to the TCP.
+        perturbed: whether to shift all TCP poses of an episode by one horizontal offset (`sample_offset`), like a
+            policy that misjudges positions; only with the convention ``robocas``.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class ScriptedPolicy(TrackPolicy):
         self._generators: dict[EpisodeSettings, EpisodeGenerator] = {}  # most recently used last
 
     def make_track(self, episode: EpisodeSpec) -> JointTrack | PoseTrack:
-        """Plan an episode with the scripted policy and return its track; takes several seconds."""
+        """Plan an episode with the scripted policy and return the planned targets; takes several seconds."""
         actions, states = np.zeros((0, 8)), np.zeros((1, 37))
         generator = self._open_generator(episode)
         with tempfile.TemporaryDirectory() as folder:
@@ -63,15 +63,21 @@ class ScriptedPolicy(TrackPolicy):
         return track
 
     def close(self) -> None:
-        """Close all environments."""
+        """Close the environments in which the episodes were planned."""
         for generator in self._generators.values():
             generator.close()
 
     def _open_generator(self, episode: EpisodeSpec) -> EpisodeGenerator:
-        """Return the generator for an episode; close the least recently used generator if too many are open."""
+        """Return the generator for the configuration of an episode; open it if needed.
+
+        If more than `_MAX_GENERATORS` generators are open, the least recently used one is closed.
+        """
         for name in ("config_file", "layouts_file", "pack"):
             if not getattr(episode, name):
-                what, fix = "the policy server has no such file or pack", "Start the server with --protocol FOLDER."
+                what, fix = (
+                    "the policy server does not have this file or pack",
+                    "Start the server with --protocol FOLDER.",
+                )
                 expected = "a file of a bundled protocol or of a protocol that was passed to robocas serve-policy"
                 raise EvaluationError(what, where=f"start.{name}", expected=expected, fix=fix)
         TASKS.find(episode.task, where="start.task")
@@ -93,7 +99,7 @@ class ScriptedPolicy(TrackPolicy):
 
 
 def sample_offset(seed: int) -> NDArray[np.floating]:
-    """Return the horizontal offset (2,) of an episode, m in the frame of the arm's base (`OFFSETS`)."""
+    """Return the horizontal offset (2,) for the seed of an episode, in m in the frame of the arm's base (`OFFSETS`)."""
     generator = np.random.default_rng([seed, _OFFSET_STREAM])
     angle, distance = generator.uniform(0, 2 * np.pi), generator.uniform(*OFFSETS)
     return distance * np.array([np.cos(angle), np.sin(angle)])

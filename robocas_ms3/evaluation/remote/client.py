@@ -44,28 +44,31 @@ _T = TypeVar("_T")
 
 
 class _ConnectionLost(EvaluationError):
-    """The connection to a policy server was closed during an episode."""
+    """Error: the connection to the policy server was closed during an episode."""
 
 
 @dataclass
 class _Connection:
-    """A connection, and the envs whose episodes were started over it."""
+    """Connection to a policy server.
+
+    Attributes:
+        socket: the websocket.
+        envs: indices of the envs whose episodes were started over this connection.
+    """
 
     socket: ClientConnection
     envs: set[int] = field(default_factory=set)
 
 
 class RemotePolicy:
-    """Policy that requests the actions of all envs from a server at the same time.
+    """Policy that requests its actions from a policy server, for all envs at the same time.
 
-    A server that announces ``robocas_max_batch`` gets the observations of all envs in one request. Any other server
-    gets one request per env, each over its own connection, and all requests are in flight at the same time. Answers
-    are read in the order of the envs, so the order of arrival has no effect.
-
-    A lost connection ends the running episodes, because a restarted server does not know them. The connection is opened
-    again for the next episodes. If this fails, `act` raises an error that ends the evaluation.
-
-    A forked process cannot use the policy of its parent; it makes its own.
+    - A server that announces ``robocas_max_batch`` gets the observations of all envs in one request.
+    - Any other server gets one request per env. Each env has its own connection, and the requests of all envs are sent
+      at the same time. The results do not depend on the order in which the answers arrive.
+    - If a connection is lost, the episodes that were started over it end with an error. The connection is opened again
+      for the next episodes. If this fails, `act` raises an error that ends the evaluation.
+    - A forked process must make its own policy: the network thread of the parent does not exist there.
 
     Args:
         address: ``ws://host:port``, with options (`parse_address`).
@@ -82,8 +85,8 @@ class RemotePolicy:
         self._last_answer = 0.0  # clock time, s
         self._metadata = ServerMetadata()
         try:
-            self._metadata = self._run(self._fetch_metadata())
-            spec = self._spec_of(self._metadata)
+            self._metadata = self._run_on_network_thread(self._fetch_metadata())
+            spec = self._choose_spec(self._metadata)
         except BaseException:
             self.close()
             raise
@@ -91,33 +94,34 @@ class RemotePolicy:
         self.spec: PolicySpec = replace(spec, observe_every=1) if self._address.n_action_steps else spec
 
     def describe(self) -> dict[str, Any]:
-        """Return the description by the server and the options of the address."""
+        """Return the description that the server announces, and the options ``n_action_steps`` and ``rename``."""
         rename = {"rename": self._address.rename} if self._address.rename else {}
         return {"server": self._metadata.policy, "n_action_steps": self._address.n_action_steps, **rename}
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
-        """Start episodes; they are sent to the server with their first observation."""
+        """Start episodes. The server gets an episode together with its first observation."""
         self._starts |= {episode.env: episode for episode in episodes}
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
         """Return action chunks (E, H, A).
 
         Raises:
-            PolicyError: the server returned no valid actions for some envs.
+            PolicyError: at least one env got no valid actions.
+            EvaluationError: no connection to the server.
         """
         envs: list[int] = observations.envs.tolist()
         starts = {env: self._starts.pop(env) for env in envs if env in self._starts}
-        messages = [self._message(observations, row, starts.get(env)) for row, env in enumerate(envs)]
-        answers = self._run(self._ask(envs, messages, set(starts)))
+        messages = [self._make_message(observations, row, starts.get(env)) for row, env in enumerate(envs)]
+        answers = self._run_on_network_thread(self._request_actions(envs, messages, set(starts)))
         chunks: dict[int, NDArray[np.float32]] = {}
         reasons: dict[int, str] = {}
         for row, env in enumerate(envs):
             try:
-                chunks[row] = self._chunk(answers[row])
+                chunks[row] = self._parse_chunk(answers[row])
             except EvaluationError as error:
                 reasons[env] = str(error)
-                _log.warning("env %d: %s", env, error)
-                self._forget(env)
+                _log.warning("the episode in env %d ends: %s", env, error)
+                self._drop_episode(env)
         if not chunks:
             raise PolicyError(reasons)
         first = next(iter(chunks.values()))
@@ -130,50 +134,56 @@ class RemotePolicy:
         """Close all connections and stop the network thread."""
         if self._loop.is_closed():
             return
-        self._run(self._close(*self._connections))
+        self._run_on_network_thread(self._close(*self._connections))
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
 
-    def _run(self, work: Coroutine[Any, Any, _T]) -> _T:
-        future = asyncio.run_coroutine_threadsafe(work, self._loop)
+    def _run_on_network_thread(self, coroutine: Coroutine[Any, Any, _T]) -> _T:
+        future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
         try:
             return future.result()
         except BaseException:
             future.cancel()
             raise
 
-    def _message(self, observations: Observations, row: int, start: EpisodeSpec | None) -> dict[str, Any]:
+    def _make_message(self, observations: Observations, row: int, start: EpisodeSpec | None) -> dict[str, Any]:
         known = start if self._metadata.spec is not None else None  # a plain openpi server does not expect the key
         message = make_observation_message(observations, row, known, reset=start is not None)
         rename = self._address.rename
         return {rename.get(key.removeprefix(PREFIX), key): value for key, value in message.items()}
 
-    def _chunk(self, answer: Any) -> NDArray[np.float32]:
+    def _parse_chunk(self, answer: Any) -> NDArray[np.float32]:
         if isinstance(answer, EvaluationError):
             raise answer
         chunk = parse_actions(answer, self.spec.convention)[: self._address.n_action_steps]
         self._chunk_length = self._chunk_length or len(chunk)
         if len(chunk) != self._chunk_length:
-            raise WireError("chunk of another length than before", expected=self._chunk_length, found=len(chunk))
+            what, expected = "the length of the action chunks has changed", f"{self._chunk_length} actions"
+            raise WireError(what, expected=expected, found=len(chunk))
         return chunk
 
-    def _forget(self, env: int) -> None:
-        """Drop the episode of an env without an answer; without batches its connection is closed."""
+    def _drop_episode(self, env: int) -> None:
+        """End the episode of an env that got no valid actions; close the connection if only this env uses it."""
         if env in self._connections:
-            self._run(self._close(env))
+            self._run_on_network_thread(self._close(env))
         elif _SHARED in self._connections:
             self._connections[_SHARED].envs.discard(env)
 
-    async def _ask(self, envs: list[int], messages: list[dict[str, Any]], starting: set[int]) -> dict[int, Any]:
-        """Send one message per env; return answers or errors by row. Envs in ``starting`` start an episode."""
+    async def _request_actions(
+        self, envs: list[int], messages: list[dict[str, Any]], starting: set[int]
+    ) -> dict[int, Any]:
+        """Send one message per env; return the answers or errors by row.
+
+        ``starting``: indices of the envs that start an episode.
+        """
         answers: dict[int, Any] = {}
         size = min(self._metadata.max_batch or 1, LARGEST_BATCH)
         slots = asyncio.Semaphore(1 if self._metadata.max_batch else self._address.max_in_flight or len(envs))
 
         async def request(key: int, rows: list[int]) -> None:
             async with slots:
-                answers.update(await self._request(key, rows, envs, messages))
+                answers.update(await self._send_request(key, rows, envs, messages))
 
         rows = range(len(envs))
         for _ in range(2):  # repeat requests of new episodes once: the server may have restarted
@@ -193,26 +203,26 @@ class RemotePolicy:
             rows = [row for row in rows if envs[row] in starting and isinstance(answers[row], _ConnectionLost)]
         return answers
 
-    async def _request(
+    async def _send_request(
         self, key: int, rows: Sequence[int], envs: list[int], messages: list[dict[str, Any]]
     ) -> dict[int, Any]:
-        """Send one request and return the answers or errors by row."""
+        """Send the messages of ``rows`` in one request over a connection; return the answers or errors by row."""
         connection = self._connections.get(key)
         try:
             if connection is None:  # another request has closed it
                 raise _ConnectionLost("lost connection to the policy server")
             if self._metadata.max_batch is None:
-                answers = [await self._answer(connection.socket, messages[rows[0]])]
+                answers = [await self._exchange(connection.socket, messages[rows[0]])]
             else:
-                answer = await self._answer(connection.socket, {BATCH: [messages[row] for row in rows]})
-                answers = [_without_error(one) for one in parse_batch(answer, len(rows), len(rows))]
+                answer = await self._exchange(connection.socket, {BATCH: [messages[row] for row in rows]})
+                answers = [_actions_or_error(one) for one in parse_batch(answer, len(rows), len(rows))]
         except EvaluationError as error:
             await self._close(key)
             return dict.fromkeys(rows, error)
         connection.envs |= {envs[row] for row in rows}
         return dict(zip(rows, answers, strict=True))
 
-    async def _answer(self, socket: ClientConnection, message: dict[str, Any]) -> Any:
+    async def _exchange(self, socket: ClientConnection, message: dict[str, Any]) -> Any:
         """Send a message and return the answer.
 
         The time limit is counted from the last answer to any request, because a server may compute its answers one
@@ -233,7 +243,7 @@ class RemotePolicy:
                 if left <= 0:
                     raise EvaluationError(
                         f"no answer from the policy server within {timeout_s:g} s",
-                        fix="Increase timeout_s in the address.",
+                        fix="Increase the option timeout_s of the address.",
                     )
                 await asyncio.wait({answer}, timeout=left)
             self._last_answer = time.monotonic()
@@ -250,9 +260,13 @@ class RemotePolicy:
 
     async def _connect(self, key: int) -> None:
         socket, metadata = await self._open()
-        if self._spec_of(metadata) != self._spec_of(self._metadata) or metadata.max_batch != self._metadata.max_batch:
+        if (
+            self._choose_spec(metadata) != self._choose_spec(self._metadata)
+            or metadata.max_batch != self._metadata.max_batch
+        ):
             await close_connection(socket)
-            raise EvaluationError("the server now serves another policy", where=self._address.url)
+            what, fix = "the server now serves another policy", "Start the evaluation again with this policy."
+            raise EvaluationError(what, where=self._address.url, fix=fix)
         self._connections[key] = _Connection(socket)
 
     async def _open(self) -> tuple[ClientConnection, ServerMetadata]:
@@ -263,18 +277,23 @@ class RemotePolicy:
         found = [self._connections.pop(key) for key in keys if key in self._connections]
         await asyncio.gather(*(close_connection(connection.socket) for connection in found))
 
-    def _spec_of(self, metadata: ServerMetadata) -> PolicySpec:
-        """Return the specification of the policy, from either the server or the address."""
+    def _choose_spec(self, metadata: ServerMetadata) -> PolicySpec:
+        """Return the specification of the policy: from the server, else from the address, else the default.
+
+        Raises:
+            EvaluationError: both the server and the address have one.
+        """
         url, given = self._address.url, self._address.spec
         if metadata.spec is None:
             return given or PolicySpec()
         if given is not None:
-            fix = "Remove the fields of PolicySpec from the address."
-            raise EvaluationError("the server announces its policy specification", where=url, fix=fix)
+            what = "both the server and the address specify the policy"
+            fix = "Remove the options of the address that are fields of PolicySpec, such as cameras."
+            raise EvaluationError(what, where=url, fix=fix)
         return parse_policy_spec(metadata.spec, url)
 
 
-def _without_error(answer: dict[str, Any]) -> Any:
-    """Return an answer of a batch, or the error in it."""
+def _actions_or_error(answer: dict[str, Any]) -> Any:
+    """Return an answer of a batch, or an `EvaluationError` if the answer is the error of an env."""
     text = answer.get(ERROR)
     return make_server_error(text) if isinstance(text, str) else answer

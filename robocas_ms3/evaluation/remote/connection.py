@@ -39,14 +39,14 @@ _Text = Annotated[str, Field(min_length=1)]
 
 @dataclass(frozen=True)
 class PolicyAddress:
-    """Address of a remote policy with its options.
+    """Address of a policy server with its options.
 
     Attributes:
         url: address without options.
-        spec: specification of the policy, for servers that announce none; None: not given.
-        rename: keys in messages by the names of cameras and quantities, such as ``qpos`` or ``prompt``.
-        n_action_steps: number of actions of a chunk to execute before the next request; None: all.
-        max_in_flight: maximum number of unanswered requests to servers without batches; None: one per env.
+        spec: specification of the policy, for servers that do not announce one; None: not given.
+        rename: by name of a camera or quantity, such as ``qpos`` or ``prompt``, the key in messages.
+        n_action_steps: number of actions of a chunk to execute before the next request; None: all actions.
+        max_in_flight: maximum number of unanswered requests, for servers without batches; None: one per env.
         timeout_s: time limit for the answer to a request, s.
         connect_s: time limit to open a connection when an episode starts, s.
     """
@@ -66,10 +66,11 @@ _ADDRESS_ADAPTER = TypeAdapter(PolicyAddress)
 
 
 def parse_address(text: str) -> PolicyAddress:
-    """Parse an address; its options are the fields of `PolicySpec` and `PolicyAddress`.
+    """Parse the address of a policy server, ``ws://host:port?option=value&...``.
 
+    The options are the fields of `PolicySpec` and of `PolicyAddress`. Two options are lists of pairs:
     ``cameras=base_camera:224x224,gripper_camera:224x224`` (width x height) and
-    ``rename=base_camera:observation/image,qpos:observation/state`` are lists of pairs.
+    ``rename=base_camera:observation/image,qpos:observation/state``.
 
     Raises:
         EvaluationError: the address or an option is invalid.
@@ -99,9 +100,9 @@ def parse_address(text: str) -> PolicyAddress:
 def enable_tcp_keepalive(connection: Any) -> None:
     """Enable TCP keepalive: an idle connection closes 60 s after the other machine stops answering.
 
-    The kernel of the other machine answers the probes, so a busy process keeps its connections. The kernel sends no
-    probes while sent data are unacknowledged; pings and ``timeout_s`` detect a lost network in this case.
-    ``TCP_USER_TIMEOUT`` is not set: it would also close connections to a server that reads no data during inference.
+    The kernel of the other machine answers the keepalive probes, so a busy process keeps its connections. While sent
+    data are unacknowledged, the kernel sends no probes; then pings and ``timeout_s`` detect a lost network.
+    ``TCP_USER_TIMEOUT`` is not set, because it would close connections to a server that reads no data during inference.
     """
     tcp = connection.transport.get_extra_info("socket")
     tcp.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -111,9 +112,15 @@ def enable_tcp_keepalive(connection: Any) -> None:
 
 
 async def open_connection(url: str, connect_s: float, *, pings: bool) -> tuple[ClientConnection, ServerMetadata]:
-    """Connect to a policy server and read its metadata; retry for ``connect_s`` seconds.
+    """Connect to a policy server and return the connection and the metadata of the server.
 
-    ``pings``: whether the server answers websocket pings during inference.
+    Args:
+        url: address without options.
+        connect_s: time in s for which the connection is tried again.
+        pings: whether to send websocket pings; only for servers that answer pings during inference.
+
+    Raises:
+        EvaluationError: no connection within ``connect_s``, or invalid metadata.
     """
     deadline, warned = time.monotonic() + connect_s, False
     while True:
@@ -122,7 +129,10 @@ async def open_connection(url: str, connect_s: float, *, pings: bool) -> tuple[C
             break
         except CONNECTION_ERRORS as error:
             if deadline - time.monotonic() < _RETRY_S:
-                what, fix = f"no connection to the policy server within {connect_s:g} s", "Start the server and retry."
+                what, fix = (
+                    f"no connection to the policy server within {connect_s:g} s",
+                    "Start the server, then repeat this command.",
+                )
                 raise EvaluationError(what, where=url, found=one_line(error, 300), fix=fix) from error
             if not warned:
                 _log.warning("waiting up to %g s for the policy server at %s", connect_s, url)
@@ -144,23 +154,23 @@ async def close_connection(connection: ClientConnection) -> None:
 
 
 def decode_server_message(message: str | bytes) -> Any:
-    """Decode a message of a server.
+    """Decode a message that a server sent.
 
     Raises:
-        EvaluationError: the message is invalid, or it is a text: an error of the server.
+        EvaluationError: the message is invalid, or it is a text, which is an error of the server.
     """
     if isinstance(message, str):
         raise make_server_error(message)
     try:
         return decode_message(message, MAX_ANSWER)
     except WireError as error:
-        raise EvaluationError(f"the server sent an invalid message: {error}") from error
+        raise EvaluationError(f"the policy server sent an invalid message: {error}") from error
 
 
 def make_server_error(text: str) -> EvaluationError:
-    """Return the error in a text of a server, such as a traceback; its last line names the error."""
+    """Return the error for a text that a server sent, such as a traceback; the last line is the message."""
     lines = [line for line in text.splitlines() if line.strip()] or ["no message"]
-    return EvaluationError(f"the server failed: {one_line(lines[-1], 300)}")
+    return EvaluationError(f"the policy server failed: {one_line(lines[-1], 300)}")
 
 
 async def _handshake(url: str, pings: bool) -> tuple[ClientConnection, str | bytes]:

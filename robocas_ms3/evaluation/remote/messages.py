@@ -37,18 +37,18 @@ _Text = Annotated[str, Field(max_length=10_000)]
 _Number = Annotated[int, Field(ge=0, le=2**32 - 1)]
 
 
-def _short(description: JsonValue) -> JsonValue:
+def _check_length(description: JsonValue) -> JsonValue:
     if (found := len(json.dumps(description))) > _MAX_DESCRIPTION:
         raise ValueError(f"expected at most {_MAX_DESCRIPTION} characters of JSON, found {found}")
     return description
 
 
 class ServerMetadata(BaseModel):
-    """Metadata of a policy server. A plain openpi server announces none of these fields.
+    """Metadata that a policy server sends when a connection opens. A plain openpi server sends none of these fields.
 
     Attributes:
-        spec: specification of the policy as JSON values; None: not announced.
-        policy: description of the policy.
+        spec: `PolicySpec` of the policy as JSON values; None: not announced.
+        policy: description of the policy (`policy.describe_policy`).
         max_batch: maximum number of envs per batched request; None: no batched requests.
         answers_pings: whether the server answers websocket pings during inference.
     """
@@ -56,13 +56,13 @@ class ServerMetadata(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True)
 
     spec: Any = Field(default=None, alias="robocas_spec")
-    policy: Annotated[JsonValue, AfterValidator(_short)] = Field(default=None, alias="robocas_policy")
+    policy: Annotated[JsonValue, AfterValidator(_check_length)] = Field(default=None, alias="robocas_policy")
     max_batch: PositiveInt | None = Field(default=None, alias="robocas_max_batch")
     answers_pings: bool = Field(default=False, alias="robocas_answers_pings")
 
 
-class _Start(BaseModel):
-    """An `EpisodeSpec` in a request, without its env; some clients send no specification."""
+class _EpisodeFields(BaseModel):
+    """Fields of an `EpisodeSpec` in a request, except ``env``; clients may leave fields out."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
 
@@ -77,23 +77,27 @@ class _Start(BaseModel):
 
 
 class Request(BaseModel):
-    """Keys of a request without the observation (`parse_observations`)."""
+    """Keys of a request, except the arrays of the observation (`parse_observations`)."""
 
     model_config = ConfigDict(strict=True)
 
     env_id: int = 0
     reset: bool | None = None
     prompt: _Text = ""
-    start: _Start = _Start()
+    start: _EpisodeFields = _EpisodeFields()
 
     def make_episode_spec(self, env: int) -> EpisodeSpec:
-        """Return the specification of the episode that starts in an env of the policy."""
+        """Return the `EpisodeSpec` of this request; ``env``: index of the env on the server."""
         values: dict[str, Any] = {"instruction": self.prompt, **self.start.model_dump(exclude_none=True)}
         return EpisodeSpec(env=env, **values)
 
 
 def parse_request(message: Mapping[str, Any]) -> Request:
-    """Parse the keys of a request; unknown keys are ignored."""
+    """Parse the keys of a request; unknown keys are ignored.
+
+    Raises:
+        WireError: a value is invalid.
+    """
     try:
         return Request.model_validate(message)
     except ValidationError as problem:
@@ -101,7 +105,11 @@ def parse_request(message: Mapping[str, Any]) -> Request:
 
 
 def parse_metadata(message: Any, url: str) -> ServerMetadata:
-    """Parse the metadata of a server; unknown keys are ignored."""
+    """Parse the metadata of the server at ``url``; unknown keys are ignored.
+
+    Raises:
+        EvaluationError: a value is invalid.
+    """
     try:
         return ServerMetadata.model_validate(message if isinstance(message, dict) else {})
     except ValidationError as problem:
@@ -111,7 +119,7 @@ def parse_metadata(message: Any, url: str) -> ServerMetadata:
 
 
 def parse_policy_spec(message: Any, where: object) -> PolicySpec:
-    """Parse a policy specification; missing fields have the defaults of `PolicySpec`."""
+    """Parse a policy specification, a dict of JSON values; missing fields have the defaults of `PolicySpec`."""
     what = "invalid policy specification"
     try:
         return _POLICY_SPEC.validate_json(json.dumps(message), strict=True)
@@ -124,13 +132,13 @@ def parse_policy_spec(message: Any, where: object) -> PolicySpec:
 def make_observation_message(
     observations: Observations, row: int, start: EpisodeSpec | None, *, reset: bool
 ) -> dict[str, Any]:
-    """Return the message for a row of observations.
+    """Return the request for one env: a row of the observations, as a dict of values and arrays.
 
     Args:
         observations: observations of the envs.
-        row: row of the env.
-        start: specification of the episode that starts; None: it is not sent.
-        reset: whether an episode starts.
+        row: row of the env in the observations.
+        start: episode that starts, sent under the key ``start``; None: no such key.
+        reset: whether an episode starts; sent under the key ``reset``.
     """
     arrays: dict[str, Any] = {name: values[row] for name, values in observations.robot.items()}
     arrays |= {name: images[row] for name, images in observations.images.items()}
@@ -150,9 +158,12 @@ def make_observation_message(
 
 
 def parse_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int], spec: PolicySpec) -> Observations:
-    """Parse requests of one env each into the observations of a policy; ``envs``: indices of the envs."""
+    """Parse requests for one env each to the observations of a policy with one row per request.
 
-    def stack(name: str, dtype: str, *shape: int | None) -> NDArray[Any]:
+    ``envs``: indices of the envs on the server, in the order of the requests.
+    """
+
+    def stack_rows(name: str, dtype: str, *shape: int | None) -> NDArray[Any]:
         arrays: list[Any] = [message.get(PREFIX + name) for message in messages]
         for found in arrays:
             if not (
@@ -169,23 +180,28 @@ def parse_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int
                     found=what,
                 )
         if len({array.shape for array in arrays}) > 1:
-            raise WireError("observations of the batch have different shapes", where=PREFIX + name)
+            raise WireError("the observations of a batch have different shapes", where=PREFIX + name)
         return np.stack(arrays).astype(dtype)
 
     sizes = {name: (height, width) for name, (width, height) in spec.cameras.items()}
     return Observations(
         envs=np.array(envs),
         instructions=["" if spec.language == "none" else message.get(PROMPT, "") for message in messages],
-        embeddings=stack("embedding", "float32", None) if spec.language == "embedding" else None,
-        images={name: stack(name, "uint8", *size, 3) for name, size in sizes.items()},
-        depths={name: stack(f"{name}_depth", "int16", *size, 1) for name, size in sizes.items()} if spec.depth else {},
-        robot={name: stack(name, "float32", quantity.width) for name, quantity in ROBOT_QUANTITIES.items()},
-        state=stack("simulator_state", "float32", None) if spec.state else None,
+        embeddings=stack_rows("embedding", "float32", None) if spec.language == "embedding" else None,
+        images={name: stack_rows(name, "uint8", *size, 3) for name, size in sizes.items()},
+        depths={name: stack_rows(f"{name}_depth", "int16", *size, 1) for name, size in sizes.items()}
+        if spec.depth
+        else {},
+        robot={name: stack_rows(name, "float32", quantity.width) for name, quantity in ROBOT_QUANTITIES.items()},
+        state=stack_rows("simulator_state", "float32", None) if spec.state else None,
     )
 
 
 def file_name(path: str) -> str:
-    """Return the name of a protocol file in messages, or its path if a bundled protocol has the same name."""
+    """Return PROTOCOL/FOLDER/FILE as the name of a protocol file in messages.
+
+    Returns the whole path if the name would mean a file of a bundled protocol, but the path is another file.
+    """
     parts, shipped = Path(path).parts[-FILE_NAME_PARTS:], protocols_dir()
     if len(parts) < FILE_NAME_PARTS or ((shipped / parts[0]).exists() and not Path(path).is_relative_to(shipped)):
         return path
@@ -193,7 +209,7 @@ def file_name(path: str) -> str:
 
 
 def parse_actions(answer: Any, convention: str) -> NDArray[np.float32]:
-    """Return the actions (H, A) of an answer with actions (H, A) or (A,).
+    """Return the actions (H, A) float32 of an answer, which contains actions (H, A) or one action (A,).
 
     Raises:
         WireError: the actions are missing, do not fit the convention, or are NaN, infinite or too large.
@@ -203,33 +219,39 @@ def parse_actions(answer: Any, convention: str) -> NDArray[np.float32]:
     try:
         actions = np.asarray(values)
     except ValueError as error:  # lists of different lengths
-        raise WireError("invalid actions", expected=f"(chunk, {size}) numbers", found=one_line(error, 200)) from error
+        raise WireError(
+            "invalid actions", expected=f"numbers of shape (H, {size})", found=one_line(error, 200)
+        ) from error
     if actions.dtype.kind not in "iuf" or actions.ndim not in (1, 2) or actions.shape[-1] != size or not actions.size:
         found = one_line(answer, 200) if values is None else f"{actions.shape} {actions.dtype}"
-        raise WireError("invalid actions", expected=f"(chunk, {size}) numbers", found=found)
+        raise WireError("invalid actions", expected=f"numbers of shape (H, {size})", found=found)
     if not (np.abs(actions.astype(np.float64)) <= _LARGEST_ACTION).all():  # NaN too
-        expected, found = f"at most {_LARGEST_ACTION:g}", one_line(actions.tolist(), 200)
-        raise WireError("action value out of range", expected=expected, found=found)
+        expected, found = f"absolute values of at most {_LARGEST_ACTION:g}", one_line(actions.tolist(), 200)
+        raise WireError("action value out of range, NaN or infinite", expected=expected, found=found)
     return actions.reshape(-1, size).astype(np.float32)
 
 
-def parse_batch(message: Any, least: int, most: int) -> list[dict[str, Any]]:
-    """Return the maps of a batched request or answer, ``least`` to ``most`` maps."""
+def parse_batch(message: Any, min_size: int, max_size: int) -> list[dict[str, Any]]:
+    """Return the messages in a batched request or answer.
+
+    Raises:
+        WireError: the batch is invalid, or its number of messages is not from ``min_size`` to ``max_size``.
+    """
     batch = message.get(BATCH) if isinstance(message, dict) else None
     if not isinstance(batch, list) or not all(isinstance(one, dict) for one in batch):
         raise WireError("invalid batch", where=BATCH, expected="a list of maps", found=type(batch).__name__)
-    if not least <= len(batch) <= most:
-        raise WireError("invalid batch", where=BATCH, expected=f"{least} to {most} maps", found=len(batch))
+    if not min_size <= len(batch) <= max_size:
+        raise WireError("invalid batch", where=BATCH, expected=f"{min_size} to {max_size} maps", found=len(batch))
     return batch
 
 
 def request_size_limit(spec: PolicySpec, max_batch: int = 1) -> int:
-    """Return the size limit of a request in bytes: 8 MiB plus the images of at least 4 envs."""
+    """Return the size limit of a request in bytes: 8 MiB plus the images of ``max_batch`` envs, at least of 4 envs."""
     return min(MAX_BYTES, _OTHER_BYTES + max(4, max_batch) * _image_bytes(spec))
 
 
 def batch_limit(spec: PolicySpec, envs: int) -> int:
-    """Return the number of envs that fit in one request of `MAX_BYTES`, at least 1 and at most ``envs``."""
+    """Return the maximum number of envs per request: so many that the images fit in `MAX_BYTES`, from 1 to ``envs``."""
     return max(1, min(envs, LARGEST_BATCH, (MAX_BYTES - _OTHER_BYTES) // max(1, _image_bytes(spec))))
 
 

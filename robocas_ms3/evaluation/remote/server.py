@@ -62,12 +62,12 @@ _FAILED, _INVALID, _FULL = 1011, 1008, 1013  # close codes
 
 @dataclass(frozen=True)
 class ServedFiles:
-    """Files and packs that clients may select by name. No text of a message is used as a path.
+    """Files and packs of this machine that clients may select by name. No text of a message is used as a path.
 
     Attributes:
-        files: paths of configurations and layouts by their names in messages, such as ``smoke/configs/pick.yaml``, and
-            by their paths, for clients on the same machine.
-        packs: names of packs, or folders of packs as in the protocols of the server.
+        files: paths of configuration and layout files. Keys are names in messages, such as
+            ``smoke/configs/pick.yaml``, and also the paths themselves, for clients on the same machine.
+        packs: names of installed packs, and names or folders of further packs.
     """
 
     files: dict[str, str]
@@ -75,11 +75,14 @@ class ServedFiles:
 
     @classmethod
     def collect(cls, protocols: Iterable[Path] = (), packs: Iterable[str] = ()) -> ServedFiles:
-        """Collect the files of the bundled protocols, of other protocols, and the installed and other packs."""
+        """Return the files and packs to serve: bundled protocols, installed packs, and the given protocols and packs.
+
+        ``protocols``: folders of protocols. ``packs``: names or folders of packs.
+        """
         folders = {folder.name: folder for folder in protocols_dir().iterdir()}
         for folder in protocols:
             if folder.resolve() != folders.setdefault(folder.name, folder).resolve():
-                what, fix = "two protocol folders have the same name", "Rename one folder."
+                what, fix = "two protocol folders have the same name", "Rename one of the folders."
                 raise EvaluationError(what, where=folder, found=folders[folder.name], fix=fix)
         files = {}
         for pattern in ("configs/*.yaml", "layouts/*.npy"):
@@ -89,25 +92,28 @@ class ServedFiles:
         names = {folder.name for parent in installed if parent.is_dir() for folder in parent.iterdir()}
         return cls(files, frozenset({*names, *packs}))
 
-    def resolve(self, start: EpisodeSpec) -> EpisodeSpec:
-        """Return an episode of a client with paths of this machine; files that are not served become empty."""
+    def resolve_episode(self, start: EpisodeSpec) -> EpisodeSpec:
+        """Return an episode of a client with the paths on this machine.
+
+        The path or pack is an empty text if the server does not serve it.
+        """
         config, layouts = (self.files.get(name, "") for name in (start.config_file, start.layouts_file))
         pack = start.pack if start.pack in self.packs else ""
         return replace(start, config_file=config, layouts_file=layouts, pack=pack)
 
 
 class PolicyServer:
-    """Server of a policy; it answers one request after another in the thread that calls `run`.
+    """Websocket server of a policy, which answers one request after another in the thread that calls `run`.
 
-    The policy stays in the thread that made it, and Ctrl-C reaches its code. A second thread handles the network: it
-    answers pings and ``/healthz`` during inference.
+    The policy runs in the thread that made it, so Ctrl-C interrupts it. A second thread handles the network: it answers
+    pings and the health check ``/healthz`` during inference.
 
     Args:
         policy: the served policy.
         host: address to listen on. There is no password: everyone who can reach the address can use the policy.
         port: port to listen on; 0: a free port.
-        files: files that clients may select; default: the files of the bundled protocols.
-        max_batch: maximum number of envs per batched request; less if the images would exceed the message limit.
+        files: files and packs that clients may select; None: those of the bundled protocols.
+        max_batch: maximum number of envs per request; reduced if the images would exceed the limit of a message.
     """
 
     def __init__(
@@ -134,14 +140,17 @@ class PolicyServer:
         self._calls: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
         self._connections = 0
 
-    def run(self, listening: Callable[[str], object] = lambda url: None) -> None:
-        """Serve until `stop`; ``listening`` is called with the address when the server accepts connections."""
+    def run(self, on_listening: Callable[[str], object] = lambda url: None) -> None:
+        """Serve until `stop` is called.
+
+        ``on_listening`` is called once with the address (``ws://host:port``) when the server accepts connections.
+        """
         started: Future[tuple[str, Callable[[], object]]] = Future()
         network = threading.Thread(target=self._serve, args=(started,), name="robocas-server", daemon=True)
         network.start()
         url, end = started.result()
         try:
-            listening(url)
+            on_listening(url)
             while call := self._calls.get():
                 future, work = call
                 if future.set_running_or_notify_cancel():  # the client is still connected
@@ -151,7 +160,7 @@ class PolicyServer:
             network.join(_STOP_S)
 
     def stop(self) -> None:
-        """End `run` from another thread, after all received requests."""
+        """Stop the server from another thread: `run` answers all received requests and returns."""
         self._calls.put(None)
 
     def _serve(self, started: Future[tuple[str, Callable[[], object]]]) -> None:
@@ -183,7 +192,9 @@ class PolicyServer:
         try:
             running = await server
         except (OSError, UnicodeError) as error:
-            raise EvaluationError("cannot listen", where=_netloc(self._host, self._port), found=error) from error
+            raise EvaluationError(
+                "cannot listen on this address", where=_netloc(self._host, self._port), found=error
+            ) from error
         async with running:
             url = f"ws://{_netloc(self._host, next(iter(running.sockets)).getsockname()[1])}"
             started.set_result((url, lambda: loop.call_soon_threadsafe(ended.set)))
@@ -200,7 +211,7 @@ class PolicyServer:
             await client.send(self._metadata)
             while True:
                 message = await asyncio.wait_for(client.recv(), _IDLE)
-                reply = asyncio.wrap_future(self._submit(partial(self._reply, message, envs)))
+                reply = asyncio.wrap_future(self._submit(partial(self._make_reply, message, envs)))
                 await asyncio.wait({reply, closed}, return_when=asyncio.FIRST_COMPLETED)
                 if not reply.done():  # the client closed the connection
                     reply.cancel()
@@ -214,18 +225,18 @@ class PolicyServer:
         finally:
             closed.cancel()
             self._connections -= 1
-            self._submit(partial(self._handler.release, envs))
+            self._submit(partial(self._handler.release_envs, envs))
 
     def _submit(self, work: Callable[[], Any]) -> Future[Any]:
         future: Future[Any] = Future()
         self._calls.put((future, work))
         return future
 
-    def _reply(self, message: str | bytes, envs: dict[int, int]) -> tuple[str | bytes, int]:
-        """Return an answer and the close code of the connection; 0: the connection stays open."""
+    def _make_reply(self, message: str | bytes, envs: dict[int, int]) -> tuple[str | bytes, int]:
+        """Return the reply to a message, and the websocket close code; code 0: the connection stays open."""
         try:
             value = decode_message(message, self._max_bytes) if isinstance(message, bytes) else None
-            return encode_message(self._handler.answer(value, envs)), 0
+            return encode_message(self._handler.answer_message(value, envs)), 0
         except WireError as error:
             _log.warning("a client sent an invalid message: %s", error)
             return format_error(error, 300), _INVALID
@@ -236,10 +247,11 @@ class PolicyServer:
 class _RequestHandler:
     """Handler that converts requests to calls of a policy, and actions to answers.
 
-    A batched request becomes one call of ``reset`` with all starting episodes and one call of ``act`` with all
-    observations, in the order of the request, as in an evaluation without a server. A single request becomes a call
-    with one env. An env keeps the index of the client unless another client uses this index. Clients that send neither
-    ``env_id`` nor ``reset``, such as openpi's client, have one episode per connection.
+    - A batched request becomes one call of ``reset`` with all episodes that start and one call of ``act`` with all
+      observations, in the order of the request. An evaluation without a server makes the same calls.
+    - A single request becomes a call with one env.
+    - The policy gets the env index of the client, or another index if another client uses this one.
+    - Clients that send neither ``env_id`` nor ``reset``, such as openpi's client, have one episode per connection.
     """
 
     def __init__(self, policy: Policy, files: ServedFiles, max_batch: int) -> None:
@@ -248,38 +260,40 @@ class _RequestHandler:
             self._spec = policy.spec
         self._used: set[int] = set()  # envs of the policy in use
 
-    def answer(self, message: Any, envs: dict[int, int]) -> dict[str, Any]:
-        """Return the answer to a message.
+    def answer_message(self, message: Any, envs: dict[int, int]) -> dict[str, Any]:
+        """Return the answer to a request.
 
-        ``envs``: env of the policy by env of the client, for this connection; new envs are added.
+        ``envs``: index for the policy by index of the client, for the envs of this connection; new envs are added.
         """
         if not isinstance(message, dict):
-            raise WireError("invalid request", expected="a map")
+            raise WireError("invalid request", expected="a msgpack map", found=type(message).__name__)
         if BATCH not in message:
-            return {ACTIONS: self._act(*self._read([message], envs))[0]}
-        observations, starts = self._read(parse_batch(message, 1, self._max_batch), envs)
-        actions, reasons = self._act_or_explain(observations, starts)
+            return {ACTIONS: self._call_policy(*self._parse_messages([message], envs))[0]}
+        observations, starts = self._parse_messages(parse_batch(message, 1, self._max_batch), envs)
+        actions, reasons = self._call_policy_safely(observations, starts)
         rows = enumerate(observations.envs.tolist())
         return {BATCH: [{ERROR: reasons[env]} if env in reasons else {ACTIONS: actions[row]} for row, env in rows]}
 
-    def release(self, envs: dict[int, int]) -> None:
-        """Free the envs of a closed connection."""
+    def release_envs(self, envs: dict[int, int]) -> None:
+        """Free the indices of the envs of a closed connection, so that other clients can use them."""
         self._used -= set(envs.values())
 
-    def _read(self, messages: Sequence[dict[str, Any]], envs: dict[int, int]) -> tuple[Observations, list[EpisodeSpec]]:
+    def _parse_messages(
+        self, messages: Sequence[dict[str, Any]], envs: dict[int, int]
+    ) -> tuple[Observations, list[EpisodeSpec]]:
         numbers, starts = [], []
         for message in messages:
             request = parse_request(message)
-            number, is_new = self._env(request.env_id, request.reset, envs)
+            number, is_new = self._assign_env(request.env_id, request.reset, envs)
             numbers.append(number)
             if is_new or request.reset:
-                starts.append(self._files.resolve(request.make_episode_spec(number)))
+                starts.append(self._files.resolve_episode(request.make_episode_spec(number)))
         if len(set(numbers)) < len(numbers):
-            raise WireError("invalid batch", where=ENV, expected="each env at most once", found=sorted(numbers))
+            raise WireError("an env is twice in a batch", where=ENV, expected="different envs", found=sorted(numbers))
         return parse_observations(messages, numbers, self._spec), starts
 
-    def _env(self, env: int, reset: bool | None, envs: dict[int, int]) -> tuple[int, bool]:
-        """Return the env of the policy for an env of a client, and whether it is new."""
+    def _assign_env(self, env: int, reset: bool | None, envs: dict[int, int]) -> tuple[int, bool]:
+        """Return the index for the policy of an env of a client, and whether the env is new."""
         if env in envs:
             return envs[env], False
         if reset is False:
@@ -287,24 +301,27 @@ class _RequestHandler:
                 "no episode is running", where=f"{ENV} {env}", expected=f"{RESET}: true in the first request"
             )
         if len(self._used) >= _MAX_ENVS:
-            raise WireError("too many envs", expected=f"at most {_MAX_ENVS}")
-        wanted = [env] if 0 <= env < _MAX_ENVS else []  # the index of the client, if it is free
-        envs[env] = next(number for number in itertools.chain(wanted, itertools.count()) if number not in self._used)
+            raise WireError("too many envs of all clients", expected=f"at most {_MAX_ENVS}")
+        preferred = [env] if 0 <= env < _MAX_ENVS else []  # the index of the client, if it is free
+        envs[env] = next(number for number in itertools.chain(preferred, itertools.count()) if number not in self._used)
         self._used.add(envs[env])
         return envs[env], True
 
-    def _act(self, observations: Observations, starts: list[EpisodeSpec]) -> NDArray[Any]:
-        """Return the actions (E, H, A) of the policy."""
+    def _call_policy(self, observations: Observations, starts: list[EpisodeSpec]) -> NDArray[Any]:
+        """Start the given episodes and return the actions (E, H, A) of the policy for the observations."""
         with forbid_policy_exit(self._policy):
             if starts:
                 self._policy.reset(starts)
             return as_action_chunks(self._policy.act(observations), len(observations.envs), None)
 
-    def _act_or_explain(self, observations: Observations, starts: list[EpisodeSpec]) -> tuple[Any, dict[int, str]]:
-        """Return the actions (E, H, A) of the policy and the errors by env; other errors apply to all envs."""
+    def _call_policy_safely(self, observations: Observations, starts: list[EpisodeSpec]) -> tuple[Any, dict[int, str]]:
+        """Return the actions (E, H, A) of the policy, or None, and the errors by index of the env.
+
+        If the policy raises an exception, its text is the error of all envs.
+        """
         reasons: dict[int, str] = {}
         try:
-            return self._act(observations, starts), {}
+            return self._call_policy(observations, starts), {}
         except PolicyError as failed:
             text = _log_failure(failed)
             reasons = {env: one_line(reason, 300) for env, reason in failed.reasons.items()}
@@ -316,7 +333,7 @@ class _RequestHandler:
 
 
 def strip_brackets(host: str) -> str:
-    """Return a host without the brackets of an IPv6 address."""
+    """Return a host without brackets: ``[::1]`` becomes ``::1``."""
     return host[1:-1] if host.startswith("[") and host.endswith("]") else host
 
 
@@ -325,7 +342,7 @@ def _netloc(host: str, port: int) -> str:
 
 
 def _log_failure(error: Exception) -> str:
-    """Log an error of a policy and return it as one line; foreign exceptions are logged with a traceback."""
+    """Log an error of a policy and return it as one line; errors that are no `RobocasError` with a traceback."""
     _log.warning("the policy failed: %s", error, exc_info=None if isinstance(error, RobocasError) else error)
     return format_error(error, 300)
 

@@ -25,7 +25,7 @@ _ARRAY, _SCALAR = b"__ndarray__", b"__npgeneric__"
 
 
 def encode_message(value: Any) -> bytes:
-    """Encode a value made of maps, lists, texts, bytes, numbers, None and numeric NumPy arrays.
+    """Return the msgpack bytes of a value made of maps, lists, texts, bytes, numbers, None and numeric NumPy arrays.
 
     Raises:
         WireError: the value contains another type.
@@ -37,28 +37,33 @@ def encode_message(value: Any) -> bytes:
 
 
 def decode_message(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
-    """Decode a message.
+    """Decode the msgpack bytes of a message.
 
     Arrays are writable copies in native byte order. NumPy scalars become Python numbers.
 
     Raises:
-        WireError: the bytes are no valid message, or exceed a limit.
+        WireError: the message is invalid, or exceeds a limit.
     """
     if len(data) > max_bytes:
         raise WireError("message too large", expected=f"at most {max_bytes} bytes", found=len(data))
     items = 0
 
-    def count(container: Any) -> Any:
-        """Count items during decoding, so that a small message cannot fill the memory."""
+    def count_items(container: Any) -> Any:
+        """Count the items of a decoded map or list and return it, so that a small message cannot fill the memory."""
         nonlocal items
         items += 1 + len(container)
         if items > MAX_ITEMS:
-            raise ValueError(f"more than {MAX_ITEMS} items")
+            raise ValueError(f"too many items: expected at most {MAX_ITEMS}, found at least {items}")
         return container
 
     try:
         value = msgpack.unpackb(
-            data, object_hook=count, list_hook=count, max_array_len=_MAX_LIST, max_map_len=_MAX_MAP, max_ext_len=0
+            data,
+            object_hook=count_items,
+            list_hook=count_items,
+            max_array_len=_MAX_LIST,
+            max_map_len=_MAX_MAP,
+            max_ext_len=0,
         )
     except (ValueError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise WireError("invalid message", found=one_line(error, 200)) from error
@@ -77,7 +82,7 @@ def _encode(value: Any) -> dict[bytes, Any]:
 
 def _decode(value: Any, depth: int) -> Any:
     if depth > MAX_DEPTH:
-        raise WireError("message nested too deeply", expected=f"at most {MAX_DEPTH} levels")
+        raise WireError("too many levels of maps and lists in a message", expected=f"at most {MAX_DEPTH}")
     if isinstance(value, list):
         return [_decode(one, depth + 1) for one in value]
     if not isinstance(value, dict):
@@ -85,16 +90,16 @@ def _decode(value: Any, depth: int) -> Any:
             raise WireError("invalid message", found=one_line(value, 200))
         return value
     if _ARRAY in value:
-        return _array(value)
+        return _decode_array(value)
     if _SCALAR in value:
-        return _scalar(value)
+        return _decode_scalar(value)
     if not all(isinstance(key, str) for key in value):
-        raise WireError("invalid keys", expected="texts", found=one_line(list(value), 200))
+        raise WireError("invalid keys of a map", expected="texts", found=one_line(list(value), 200))
     return {key: _decode(one, depth + 1) for key, one in value.items()}
 
 
-def _array(value: dict[Any, Any]) -> NDArray[Any]:
-    data, shape, dtype = value.get(b"data"), value.get(b"shape"), _dtype(value.get(b"dtype"))
+def _decode_array(value: dict[Any, Any]) -> NDArray[Any]:
+    data, shape, dtype = value.get(b"data"), value.get(b"shape"), _parse_dtype(value.get(b"dtype"))
     if (
         len(value) != 4
         or not isinstance(data, bytes)
@@ -104,25 +109,24 @@ def _array(value: dict[Any, Any]) -> NDArray[Any]:
         or len(data) != math.prod(shape) * dtype.itemsize
     ):
         found = f"{type(data).__name__} of {len(data) if isinstance(data, bytes) else '?'} bytes, shape {shape}"
-        raise WireError("invalid array", expected="data, dtype and shape of equal size", found=one_line(found, 200))
-    stored = (
-        np.dtype(np.uint8) if dtype.kind == "b" else dtype
-    )  # received bytes may be any value; NumPy requires 0 or 1 for bool
+        raise WireError("invalid array", expected="data whose size fits dtype and shape", found=one_line(found, 200))
+    # Received bytes may have any value; NumPy requires 0 or 1 for bool.
+    stored = np.dtype(np.uint8) if dtype.kind == "b" else dtype
     try:
         return np.ndarray(shape, stored, buffer=data).astype(dtype.newbyteorder("="))
     except ValueError as error:  # an empty array with lengths beyond NumPy's limit
         raise WireError("invalid array", found=one_line(error, 200)) from error
 
 
-def _scalar(value: dict[Any, Any]) -> bool | int | float:
+def _decode_scalar(value: dict[Any, Any]) -> bool | int | float:
     number = value.get(b"data")
     if len(value) != 3 or not isinstance(number, bool | int | float):
         raise WireError("invalid scalar", expected="data and dtype of a number", found=one_line(value, 200))
-    _dtype(value.get(b"dtype"))
+    _parse_dtype(value.get(b"dtype"))
     return number
 
 
-def _dtype(text: Any) -> np.dtype:
+def _parse_dtype(text: Any) -> np.dtype:
     if isinstance(text, str) and _DTYPE.fullmatch(text):
         return np.dtype(text)
     raise WireError("invalid dtype", expected="such as <f4 or |u1", found=one_line(repr(text), 200))

@@ -24,9 +24,12 @@ _NESTED = {"flags": "int64", "flag_seconds": "float64", "measures": "float64"}  
 
 
 def write_report(result: Result, folder: Path, protocol: LoadedProtocol | None = None) -> list[Path]:
-    """Write the reports of a result into a folder and return their paths; the Parquet file needs pyarrow.
+    """Write ``report.md``, ``report.html`` and, if pyarrow is installed, ``episodes.parquet``; return their paths.
 
-    The page links the videos in ``videos``. With ``protocol`` it lists missing episodes.
+    Args:
+        result: the result.
+        folder: output folder; the page links the videos in its folder ``videos``.
+        protocol: protocol of the result; the page then also lists missing episodes.
     """
     make_folder(folder)
     written = []
@@ -42,7 +45,7 @@ def write_report(result: Result, folder: Path, protocol: LoadedProtocol | None =
 
 
 def write_parquet(result: Result, path: Path) -> None:
-    """Write a result as a Parquet table; columns have the names and units of `Outcome`."""
+    """Write a result as a Parquet file with a row per episode; columns have the names and units of `Outcome`."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

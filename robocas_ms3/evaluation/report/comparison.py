@@ -17,13 +17,13 @@ ALL = "all"
 
 
 @dataclass(frozen=True)
-class Row:
-    """A row of a comparison: two runs over the scenes of a configuration, a task or `ALL`.
+class ComparisonRow:
+    """Row of the table: the comparison of two results, or of two splits, in the scenes of a configuration or task.
 
     Attributes:
-        where: name of the configuration or task.
-        pair: names of the first and the second run.
-        found: comparison of the second run with the first.
+        where: name of the configuration or task, or `ALL`.
+        pair: names of the first and of the second result or split.
+        found: comparison with the second as run A and the first as run B.
     """
 
     where: str
@@ -32,16 +32,17 @@ class Row:
 
 
 def compare_results(results: Sequence[Result]) -> str:
-    """Compare two or more results over their common episodes; return Markdown.
+    """Compare two or more results over their common episodes; return a Markdown table.
 
     Raises:
-        EvaluationError: the protocols differ, only one result has the weld, or no episode is in all results.
+        EvaluationError: the results have different protocols, only some have the weld, or no episode is in all results.
     """
     first = results[0]
     for other in results[1:]:
         if first.run.protocol_hash != other.run.protocol_hash:
             expected, found = first.run.protocol_hash[:16], other.run.protocol_hash[:16]
             what = "cannot compare results of different protocols"
+            expected, found = f"protocol hash {expected}", f"protocol hash {found}"
             raise EvaluationError(what, where=other.folder, expected=expected, found=found)
         if first.run.weld != other.run.weld:
             welded = (first if first.run.weld else other).folder
@@ -52,7 +53,8 @@ def compare_results(results: Sequence[Result]) -> str:
             )
     shared = sorted(set.intersection(*(set(result.outcomes) for result in results)))
     if not shared:
-        raise EvaluationError("the results have no common episodes", where=results[-1].folder)
+        what, fix = "the results have no common episodes", "Compare results of the same episodes, or of all episodes."
+        raise EvaluationError(what, where=results[-1].folder, fix=fix)
     names = [chr(ord("A") + number) for number in range(len(results))]
     measured = first.run.protocol + (" with RoboCAS-v0's weld" if first.run.weld else "")
     runs = [f"{name}: {one.run.policy.name} ({one.folder})" for name, one in zip(names, results, strict=True)]
@@ -73,15 +75,22 @@ def compare_results(results: Sequence[Result]) -> str:
         successes = [[result.outcomes[number].success for number in numbers] for result in results]
         for one, other in combinations(range(len(results)), 2):
             found = compare_successes(successes[other], successes[one])
-            rows.append(Row(config, (names[one], names[other]), found))
-    return _table(head, "configuration", rows)
+            rows.append(ComparisonRow(config, (names[one], names[other]), found))
+    return _render_table(head, "configuration", rows)
 
 
 def compare_splits(result: Result, protocol: LoadedProtocol) -> str:
-    """Compare the splits of a result that have the same scenes with the first split; return Markdown."""
+    """Compare each split with the first split that has the same scenes, per task; return a Markdown table.
+
+    Raises:
+        EvaluationError: the result has another protocol hash, or no two splits have the same scenes.
+    """
     if (found := result.run.protocol_hash) != protocol.hash:
         raise EvaluationError(
-            "the result has another protocol hash", where=result.folder, expected=protocol.hash, found=found
+            "the result was measured with other files of the protocol",
+            where=result.folder,
+            expected=f"protocol hash {protocol.hash}",
+            found=found,
         )
     scenes: dict[tuple[str, bytes], list[tuple[str, str]]] = {}  # (split, configuration) with equal scenes
     for task, split, config in dict.fromkeys((one.task, one.split, one.config) for one in protocol.episodes):
@@ -89,23 +98,29 @@ def compare_splits(result: Result, protocol: LoadedProtocol) -> str:
     rows = []
     for (task, _), (first, *others) in scenes.items():
         for other in others:
-            sides = [
-                {one.seed: one.success for one in result.outcomes.values() if (one.split, one.config) == side}
-                for side in (first, other)
+            successes_by_seed = [
+                {
+                    one.seed: one.success
+                    for one in result.outcomes.values()
+                    if (one.split, one.config) == split_and_config
+                }
+                for split_and_config in (first, other)
             ]
-            seeds = sorted(sides[0].keys() & sides[1].keys())
+            seeds = sorted(successes_by_seed[0].keys() & successes_by_seed[1].keys())
             if seeds:
-                found = compare_successes([sides[1][seed] for seed in seeds], [sides[0][seed] for seed in seeds])
-                rows.append(Row(task, (first[0], other[0]), found))
+                found = compare_successes(
+                    [successes_by_seed[1][seed] for seed in seeds], [successes_by_seed[0][seed] for seed in seeds]
+                )
+                rows.append(ComparisonRow(task, (first[0], other[0]), found))
     if not rows:
-        fix = "Pass a second result."
+        fix = "Pass a second result folder to compare with."
         raise EvaluationError("no two splits of the result have the same scenes", where=result.folder, fix=fix)
     head = f"{result.run.policy.name} ({result.folder}), splits of {result.run.protocol} over the same scenes."
-    return _table(escape_markdown(head), "task", rows)
+    return _render_table(escape_markdown(head), "task", rows)
 
 
-def _table(head: str, where: str, rows: list[Row]) -> str:
-    """Return the table; rows over all configurations are adjusted as a family of their own."""
+def _render_table(head: str, where: str, rows: list[ComparisonRow]) -> str:
+    """Return the Markdown table with p-values that Holm's method adjusts: rows `ALL` are one family, others another."""
     adjusted: dict[int, tuple[float, int]] = {}
     for pooled in (False, True):
         family = [number for number, row in enumerate(rows) if (row.where == ALL) == pooled]

@@ -23,11 +23,11 @@ from robocas_ms3.evaluation.report.tables import (
     Table,
     get_failure_name,
     get_stage_names,
+    list_notes,
+    make_tables,
+    make_title,
     mean,
-    notes,
-    tables,
 )
-from robocas_ms3.evaluation.report.tables import title as title_of
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import SuccessRate, success_rate
 
@@ -35,19 +35,31 @@ VIDEOS = "videos"
 
 
 def video_file_name(episode: int) -> str:
-    """Return the file name of the video of an episode."""
+    """Return the file name of the video of the episode with this number."""
     return f"episode_{episode:05d}.mp4"
 
 
 def render_page(result: Result, folder: Path | None = None, protocol: LoadedProtocol | None = None) -> str:
-    """Return the HTML page of a result; videos in ``folder`` are linked (`write_report`)."""
+    """Return the report of a result as an HTML page.
+
+    Args:
+        result: the result.
+        folder: folder of the page; videos in its folder ``videos`` are linked.
+        protocol: protocol of the result; adds missing episodes, description and rules.
+    """
     here = files("robocas_ms3.evaluation.report")
     style, script = ((here / name).read_text(encoding="utf-8") for name in ("style.css", "script.js"))
-    title, parts = escape(title_of(result)), [_lead(result, protocol)]
+    title, parts = escape(make_title(result)), [_render_lead(result, protocol)]
     if result.outcomes:
-        success, *others = map(_table_section, tables(result))
-        parts += [success, _funnels(result), *others, _seconds(result), _table_section(_effort(result))]
-    parts += [_record(result, protocol), _failed_episodes(result, folder)]
+        success, *others = map(_render_table_section, make_tables(result))
+        parts += [
+            success,
+            _render_stages(result),
+            *others,
+            _render_seconds(result),
+            _render_table_section(_effort_table(result)),
+        ]
+    parts += [_render_settings(result, protocol), _render_failed_episodes(result, folder)]
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -56,67 +68,71 @@ def render_page(result: Result, folder: Path | None = None, protocol: LoadedProt
     )
 
 
-def _lead(result: Result, protocol: LoadedProtocol | None) -> str:
+def _render_lead(result: Result, protocol: LoadedProtocol | None) -> str:
     count = len(result.outcomes)
     total = count if protocol is None else len(protocol.episodes)
     episodes = format_count(count, "episode") if protocol is None else f"{count} of {format_count(total, 'episode')}"
-    texts = [escape(note, quote=False) for note in notes(result)]
+    texts = [escape(note, quote=False) for note in list_notes(result)]
     if protocol is not None and count < total:
         missing = Counter(episode.config for episode in protocol.episodes if episode.episode not in result.outcomes)
         of = ", ".join(f"{many} of {escape(config)}" for config, many in missing.items())
         texts.append(f"Incomplete result: {format_count(missing.total(), 'episode')} of the protocol missing ({of}).")
-    if broken := result.error_count():
+    if broken := result.count_errors():
         texts.append(f"Ended by an error: {format_count(broken, 'episode')}, counted as failed.")
     lead = f"{episodes}, protocol hash <code>{escape(result.run.protocol_hash[:16])}</code>."
     return f'<p class="lead">{lead}</p>\n' + "".join(f'<p class="note">{note}</p>\n' for note in texts)
 
 
-def _funnels(result: Result) -> str:
+def _render_stages(result: Result) -> str:
     cards = []
     for config, outcomes in result.group_by("config").items():
         rows = []
         for stage, name in get_stage_names(outcomes[0].task).items():
             if any(stage in outcome.flags for outcome in outcomes):
                 rate = result.rate(stage, outcomes)
-                shown = _bar(rate, "good" if stage == "success" else "")
+                shown = _rate_bar(rate, "good" if stage == "success" else "")
                 rows.append(
                     f'<div class="row"><span>{escape(name)}</span>{shown}<b>{100 * rate.rate:.0f} %</b></div>\n'
                 )
         cards.append(f"<figure><figcaption>{escape(config)}, n {len(outcomes)}</figcaption>{''.join(rows)}</figure>\n")
     note = "Fraction of the episodes that reached each stage, with its interval. An episode may skip a stage."
-    return _section("Stages", note, f'<div class="cards">\n{"".join(cards)}</div>\n')
+    return _render_section("Stages", note, f'<div class="cards">\n{"".join(cards)}</div>\n')
 
 
-def _seconds(result: Result) -> str:
+def _render_seconds(result: Result) -> str:
     taken = {
         config: [s for one in outcomes if (s := one.flag_seconds.get("success")) is not None]
         for config, outcomes in result.group_by("config").items()
     }
     if not any(taken.values()):
         return ""
-    most = _round_up(max(max(values, default=0.0) for values in taken.values()))
+    axis_end = _round_up(max(max(values, default=0.0) for values in taken.values()))
     rows = []
     for config, values in taken.items():
         cells = [f"{value:.1f}" for value in np.quantile(values, (0, 0.25, 0.5, 0.75, 1))] if values else [""] * 5
-        rows.append([escape(config), str(len(values)), *cells, _spread(values, most) if values else ""])
-    heads = ("configuration", "succeeded#", "min#", "25 %#", "median#", "75 %#", "max#", _axis(most, "s"))
+        rows.append([escape(config), str(len(values)), *cells, _distribution_bar(values, axis_end) if values else ""])
+    heads = ("configuration", "succeeded#", "min#", "25 %#", "median#", "75 %#", "max#", _render_axis(axis_end, "s"))
     note = "Simulated seconds of the successful episodes. A tick is an episode; the box contains half of them."
-    return _section("Seconds to success", note, _html_table(heads, rows))
+    return _render_section("Seconds to success", note, _render_table(heads, rows))
 
 
-def _effort(result: Result) -> Table:
+def _effort_table(result: Result) -> Table:
     rows = []
     for config, outcomes in result.group_by("config").items():
 
-        def of(name: str, outcomes: list[Outcome] = outcomes) -> list[float]:
+        def get_measures(name: str, outcomes: list[Outcome] = outcomes) -> list[float]:
             return [outcome.measures.get(name, np.nan) for outcome in outcomes]
 
-        disturbed, fallen, n = of("disturbed_most"), of("fallen"), len(outcomes)
+        disturbed, fallen, n = get_measures("disturbed_most"), get_measures("fallen"), len(outcomes)
         rows.append(
             (
                 *(config, success_rate(sum(x > 0 for x in disturbed), n), f"{mean(disturbed):.2f}"),
-                *(success_rate(sum(x > 0 for x in fallen), n), f"{mean(fallen):.2f}", f"{mean(of('path_length')):.2f}"),
-                f"{np.median(of('contact_impulse')):.1f}",
+                *(
+                    success_rate(sum(x > 0 for x in fallen), n),
+                    f"{mean(fallen):.2f}",
+                    f"{mean(get_measures('path_length')):.2f}",
+                ),
+                f"{np.median(get_measures('contact_impulse')):.1f}",
                 f"{mean([outcome.inference_ms for outcome in outcomes]):.1f}",
             )
         )
@@ -131,36 +147,40 @@ def _effort(result: Result) -> Table:
     return Table("Disturbance and effort", note, heads, rows)
 
 
-def _record(result: Result, protocol: LoadedProtocol | None) -> str:
+def _render_settings(result: Result, protocol: LoadedProtocol | None) -> str:
     run, policy = result.run, result.run.policy
     pairs: list[tuple[str, object]] = [("protocol", run.protocol), ("protocol hash", run.protocol_hash)]
     if protocol is not None:
         names = {"rate_hz", "stepping", "max_steps", "max_seconds", "ends_on", "max_v0_steps"}
         rules = protocol.rules.model_dump(mode="json", include=names, exclude_none=True)
-        pairs += [("description", protocol.description), ("rules", _plain(rules))]
+        pairs += [("description", protocol.description), ("rules", _to_text(rules))]
     entries = policy.model_dump(exclude_unset=True, exclude={"name"})
-    pairs += [("policy", policy.name), *((f"policy, {name}", _plain(value)) for name, value in entries.items())]
+    pairs += [("policy", policy.name), *((f"policy, {name}", _to_text(value)) for name, value in entries.items())]
     pairs += [("RoboCAS-v0's weld", "yes" if run.weld else "no")]
-    pairs += [("played_as", _plain(run.played_as))] if run.played_as else []
+    pairs += [("played_as", _to_text(run.played_as))] if run.played_as else []
     pairs += [("backend", run.backend)]
-    pairs += [("versions", _plain(run.versions)), *((f"pack {name}", hash_) for name, hash_ in run.pack_hashes.items())]
-    machines = {_plain(part.machine) for part in run.merged_from} or {_plain(run.machine or {})}
+    pairs += [
+        ("versions", _to_text(run.versions)),
+        *((f"pack {name}", hash_) for name, hash_ in run.pack_hashes.items()),
+    ]
+    machines = {_to_text(part.machine) for part in run.merged_from} or {_to_text(run.machine or {})}
     pairs += [("machine", machine) for machine in sorted(machines)]
     rows = [[escape(part.folder), str(part.episodes)] for part in run.merged_from]
-    parts = _html_table(("merged from", "episodes#"), rows) if rows else ""
-    return _section("Settings", "", _facts(pairs) + parts)
+    parts = _render_table(("merged from", "episodes#"), rows) if rows else ""
+    return _render_section("Settings", "", _render_list(pairs) + parts)
 
 
-def _plain(value: object) -> str:
-    """Return a dictionary as ``a 1, b 2``, a text unchanged, and other values as JSON."""
+def _to_text(value: object) -> str:
+    """Return a value as text: a dict as ``a 1, b 2``, a text unchanged, and other values as JSON."""
     if isinstance(value, dict):
         return ", ".join(
-            f"{name} {json.dumps(inner) if isinstance(inner, dict) else _plain(inner)}" for name, inner in value.items()
+            f"{name} {json.dumps(inner) if isinstance(inner, dict) else _to_text(inner)}"
+            for name, inner in value.items()
         )
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _failed_episodes(result: Result, folder: Path | None) -> str:
+def _render_failed_episodes(result: Result, folder: Path | None) -> str:
     """Return the section of failed episodes with links to videos; empty without failures."""
     failed = [outcome for outcome in result.outcomes.values() if not outcome.success]
     if not failed:
@@ -174,7 +194,7 @@ def _failed_episodes(result: Result, folder: Path | None) -> str:
         options = "".join(f"<option>{escape(value)}</option>" for value in sorted(values))
         choices = f'<option value="">all</option>{options}'
         filters += f'<label>{label} <select data-column="{column}">{choices}</select></label>\n'
-    rows = [_failed_row(outcome, folder) for outcome in failed]
+    rows = [_failed_episode_row(outcome, folder) for outcome in failed]
     heads = (
         *("episode#", "configuration", "seed#", "split", "first stage not reached", "ended by"),
         *("steps#", "s#", "p_vis#", "disturbed#", "error"),
@@ -186,11 +206,11 @@ def _failed_episodes(result: Result, folder: Path | None) -> str:
         f'<span id="count">{len(failed)}</span> of {format_count(len(result.outcomes), "episode")}. '
         f"Ended by: the time limit, a failure such as the target on the floor, or an error. {videos}"
     )
-    table = _html_table(heads, rows, "failed")
-    return _section("Failed episodes", note, f'<form class="filters">{filters}</form>\n{table}')
+    table = _render_table(heads, rows, "failed")
+    return _render_section("Failed episodes", note, f'<form class="filters">{filters}</form>\n{table}')
 
 
-def _failed_row(outcome: Outcome, folder: Path | None) -> list[str]:
+def _failed_episode_row(outcome: Outcome, folder: Path | None) -> list[str]:
     video = f"{VIDEOS}/{video_file_name(outcome.episode)}"
     linked = folder is not None and (folder / video).is_file()
     return [
@@ -208,36 +228,37 @@ def _failed_row(outcome: Outcome, folder: Path | None) -> list[str]:
     ]
 
 
-def _section(title: str, note: str, content: str) -> str:
+def _render_section(title: str, note: str, content: str) -> str:
     text = f"<p>{note}</p>\n" if note else ""
     return f"<section>\n<h2>{title}</h2>\n{text}{content}</section>\n"
 
 
-def _table_section(table: Table) -> str:
+def _render_table_section(table: Table) -> str:
     """Return the section of a table; rates have bars."""
     heads = []
     for head in map(escape, table.heads):
         heads += [f"{head[:-1]}#", "0 to 100 %"] if head.endswith("%") else [head]
     rows = [
-        [html for cell, head in zip(row, table.heads, strict=True) for html in _cells(cell, head)] for row in table.rows
+        [html for cell, head in zip(row, table.heads, strict=True) for html in _render_cells(cell, head)]
+        for row in table.rows
     ]
-    return _section(table.title, escape(table.note, quote=False), _html_table(heads, rows))
+    return _render_section(table.title, escape(table.note, quote=False), _render_table(heads, rows))
 
 
-def _html_table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
-    """Return an HTML table of HTML cells; columns whose head ends with ``#`` are aligned to the right."""
+def _render_table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
+    """Return an HTML table; cells are HTML, and columns whose head ends with ``#`` are aligned to the right."""
     right = ["number" if head.endswith("#") else "" for head in heads]
-    head = "".join(_tag("th", name.rstrip("#"), how) for name, how in zip(heads, right, strict=True))
+    head = "".join(_render_tag("th", name.rstrip("#"), how) for name, how in zip(heads, right, strict=True))
     body = "".join(
-        "<tr>" + "".join(_tag("td", cell, how) for cell, how in zip(row, right, strict=True)) + "</tr>\n"
+        "<tr>" + "".join(_render_tag("td", cell, how) for cell, how in zip(row, right, strict=True)) + "</tr>\n"
         for row in rows
     )
     kinds = f' class="{kind}"' if kind else ""
     return f'<div class="wide"><table{kinds}><thead><tr>{head}</tr></thead>\n<tbody>\n{body}</tbody></table></div>\n'
 
 
-def _bar(rate: SuccessRate, kind: str = "") -> str:
-    """Return an SVG bar of a rate on 0..100 % with its interval."""
+def _rate_bar(rate: SuccessRate, kind: str = "") -> str:
+    """Return an SVG bar of a success rate and its interval, on an axis of 0 to 100 %."""
     low, high, here = 100 * rate.low, 100 * rate.high, 100 * rate.rate
     label = f"{rate.k} of {rate.n}: {here:.1f} %, {low:.1f} to {high:.1f}"
     return (
@@ -248,10 +269,10 @@ def _bar(rate: SuccessRate, kind: str = "") -> str:
     )
 
 
-def _spread(values: Sequence[float], most: float) -> str:
-    """Return an SVG of values on 0..most: a tick per value, a box between the quartiles, and the median."""
-    low, middle, high = (100 * np.quantile(values, (0.25, 0.5, 0.75)) / most).tolist()
-    ticks = "".join(f"M{100 * value / most:.2f} 10V16" for value in values)
+def _distribution_bar(values: Sequence[float], axis_end: float) -> str:
+    """Return an SVG of a distribution on an axis from 0 to ``axis_end``: a tick per value, quartile box and median."""
+    low, middle, high = (100 * np.quantile(values, (0.25, 0.5, 0.75)) / axis_end).tolist()
+    ticks = "".join(f"M{100 * value / axis_end:.2f} 10V16" for value in values)
     return (
         '<svg class="bar" viewBox="0 0 100 16" preserveAspectRatio="none" role="img" aria-label="distribution">'
         f'<rect class="track" width="100" height="16"/><rect class="box" x="{low:.2f}" y="2" '
@@ -260,14 +281,14 @@ def _spread(values: Sequence[float], most: float) -> str:
     )
 
 
-def _axis(most: float, unit: str) -> str:
-    ends = [most * part / 4 for part in range(5)]
-    labels = "".join(f"<span>{end:g}{f' {unit}' if end == most else ''}</span>" for end in ends)
+def _render_axis(axis_end: float, unit: str) -> str:
+    ends = [axis_end * part / 4 for part in range(5)]
+    labels = "".join(f"<span>{end:g}{f' {unit}' if end == axis_end else ''}</span>" for end in ends)
     return f'<div class="axis">{labels}</div>'
 
 
-def _facts(pairs: Iterable[tuple[str, object]]) -> str:
-    """Return an HTML list of names and values in plain text."""
+def _render_list(pairs: Iterable[tuple[str, object]]) -> str:
+    """Return an HTML definition list of names and values, which are plain text."""
     entries = "".join(f"<dt>{escape(name)}</dt><dd>{escape(str(value))}</dd>\n" for name, value in pairs)
     return f"<dl>\n{entries}</dl>\n"
 
@@ -278,11 +299,11 @@ def _round_up(value: float) -> float:
     return float(next(power * step for step in (1, 2, 4, 8, 10) if power * step >= value * (1 - 1e-9)))
 
 
-def _cells(cell: Cell, head: str) -> list[str]:
+def _render_cells(cell: Cell, head: str) -> list[str]:
     """Return the HTML cells of a value; a rate in a ``%`` column takes two cells: text and bar."""
     if isinstance(cell, SuccessRate):
         rate = f"{100 * cell.rate:.0f} %<small>{100 * cell.low:.0f} to {100 * cell.high:.0f}</small>"
-        return [rate, _bar(cell, "good")] if head.endswith("%") else [rate]
+        return [rate, _rate_bar(cell, "good")] if head.endswith("%") else [rate]
     if isinstance(cell, FailureCount):
         return [f'<span class="heat" style="--fraction: {100 * cell.count / cell.n:.0f}%">{cell.count or ""}</span>']
     if cell is None:
@@ -290,5 +311,5 @@ def _cells(cell: Cell, head: str) -> list[str]:
     return [escape(cell)]
 
 
-def _tag(tag: str, content: str, kind: str) -> str:
+def _render_tag(tag: str, content: str, kind: str) -> str:
     return f'<{tag} class="{kind}">{content}</{tag}>' if kind else f"<{tag}>{content}</{tag}>"

@@ -34,18 +34,18 @@ STAGE_NAMES = {
     "target_in_basket": "target in basket",
     "success": "success",
 }
-"""Names of the stages, in the usual order."""
+"""Names for readers by stage, in the order of a search episode."""
 FAILURE_NAMES = {
     **{stage: name.split(" (")[0] for stage, name in STAGE_NAMES.items() if stage != "success"},
     "placed": "placed, at rest",
     "error": "ended by an error",
 }
-"""Names of the values of `outcomes.find_failure_stage`."""
+"""Names for readers by value of `outcomes.find_failure_stage`."""
 
 
 @dataclass(frozen=True)
 class FailureCount:
-    """A count out of n episodes; pages shade the cell by count / n."""
+    """Number of failed episodes out of n; the HTML page shades the cell by count / n."""
 
     count: int
     n: int
@@ -56,13 +56,13 @@ Cell = str | SuccessRate | FailureCount | None
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a report.
+    """Table of a report, for Markdown and HTML.
 
     Attributes:
         title: title of the section.
         note: explanation in plain text.
-        heads: column heads; a final ``#`` marks a column of numbers, ``%`` a column of rates with intervals.
-        rows: cells: plain text, rates, or counts.
+        heads: column heads. A final ``#`` marks a column of numbers; a final ``%`` a column of rates with intervals.
+        rows: cells of each row: text, success rate, count, or None for an empty cell.
     """
 
     title: str
@@ -71,32 +71,32 @@ class Table:
     rows: Sequence[Sequence[Cell]]
 
 
-def tables(result: Result) -> Iterator[Table]:
-    """Yield the tables of a result that has at least one episode."""
-    yield _success(result)
+def make_tables(result: Result) -> Iterator[Table]:
+    """Yield the tables of a report; the result must have at least one episode."""
+    yield _success_table(result)
     if len(result.group_by("split")) > 1:
-        yield _splits(result)
-    yield _failures(result)
+        yield _split_table(result)
+    yield _failure_table(result)
     hidden = [one for one in select_first_split(result) if one.p_vis is not None]
     if hidden:
-        yield _occlusion(hidden)
-    yield from _retrieval(result)
+        yield _occlusion_table(hidden)
+    yield from _retrieval_table(result)
 
 
 def render_markdown(result: Result) -> str:
-    """Return the tables of a result as Markdown."""
-    run, broken = result.run, result.error_count()
+    """Return the report of a result as Markdown: title, notes, settings and tables."""
+    run, broken = result.run, result.count_errors()
     versions = ", ".join(f"{name} {number}" for name, number in run.versions.items())
     lines = [
-        f"# {escape_markdown(title(result))}",
+        f"# {escape_markdown(make_title(result))}",
         "",
-        *(line for note in notes(result) for line in (f"**{escape_markdown(note)}**", "")),
+        *(line for note in list_notes(result) for line in (f"**{escape_markdown(note)}**", "")),
         f"Protocol hash {escape_markdown(run.protocol_hash[:16])}, {format_count(len(result.outcomes), 'episode')}, "
         f"{escape_markdown(run.backend)}; {escape_markdown(versions)}. "
         f"Intervals are Clopper-Pearson's, 95 %. {_STAGE_NOTE}",
         *(["", f"**Ended by an error: {format_count(broken, 'episode')}, counted as failed.**"] if broken else []),
     ]
-    for table in tables(result) if result.outcomes else ():
+    for table in make_tables(result) if result.outcomes else ():
         heads = " | ".join(escape_markdown(head.rstrip("#%")) for head in table.heads)
         lines += ["", f"## {table.title}", "", f"| {heads} |", "|" + "---|" * len(table.heads)]
         for row in table.rows:
@@ -105,14 +105,14 @@ def render_markdown(result: Result) -> str:
     return "\n".join(lines) + "\n"
 
 
-def title(result: Result) -> str:
-    """Return the title of a report: policy and protocol."""
+def make_title(result: Result) -> str:
+    """Return the title of the report: names of policy and protocol, and the weld."""
     weld = " with RoboCAS-v0's weld" if result.run.weld else ""
     return f"{result.run.policy.name} on {result.run.protocol}{weld}"
 
 
-def notes(result: Result) -> list[str]:
-    """Return the conditions of a result: the weld, aliases of tasks, and differences from the paper."""
+def list_notes(result: Result) -> list[str]:
+    """Return the notes under the title of a report: weld, task aliases, and differences from the paper."""
     played_as = [
         f"{task} was evaluated in the episodes of {other} (played_as), as RoboCAS-v0's evaluator does."
         for task, other in result.run.played_as.items()
@@ -122,7 +122,7 @@ def notes(result: Result) -> list[str]:
 
 
 def get_stage_names(task: str) -> dict[str, str]:
-    """Return the display names of the stages of a task, in order."""
+    """Return the names of the stages of a task for readers, by stage and in the order of the task."""
     row = TASKS.get(task)
     if row is None or row.stages == DEFAULT_STAGES:
         return STAGE_NAMES
@@ -130,13 +130,16 @@ def get_stage_names(task: str) -> dict[str, str]:
 
 
 def get_failure_name(stage: str) -> str:
-    """Return the display name of a failure stage."""
+    """Return the name of a failure stage for readers."""
     return FAILURE_NAMES.get(stage, stage.replace("_", " "))
 
 
 def select_first_split(result: Result) -> list[Outcome]:
-    """Return the outcomes; if scenes occur in several splits, only those of the first split of each task."""
-    if not result.repeats_scenes():
+    """Return the outcomes of a result, each scene once.
+
+    If scenes occur in several splits, only the outcomes of the first split of each task are returned.
+    """
+    if not result.has_repeated_scenes():
         return list(result.outcomes.values())
     first: dict[str, str] = {}
     for one in result.outcomes.values():
@@ -149,31 +152,32 @@ def mean(values: Sequence[float]) -> float:
     return sum(values) / len(values)
 
 
-def _success(result: Result) -> Table:
+def _success_table(result: Result) -> Table:
     def rate(flag: str, outcomes: list[Outcome]) -> SuccessRate | None:
         known = [one for one in outcomes if flag in one.flags]  # tasks without obstacles lack the stage CO
         error_count = [one for one in outcomes if one.error and not one.flags]
         return result.rate(flag, known + error_count) if known else None
 
     groups, rows = result.group_by("config"), []
-    for config, outcomes in groups.items() if result.repeats_scenes() else _with_all(groups):
+    for config, outcomes in groups.items() if result.has_repeated_scenes() else _add_pooled_group(groups):
         ends = (result.rate("success_at_end", outcomes), rate("success_v0", outcomes))
         stages = (rate(stage, outcomes) for stage in PAPER_STAGES.values())
         steps, seconds = mean([one.steps for one in outcomes]), mean([one.seconds for one in outcomes])
         overall = result.rate("success", outcomes)
         rows.append((config, str(overall.n), overall, *ends, *stages, f"{steps:.0f}", f"{seconds:.1f}"))
     note = (
-        "success: success at some step; at the end: success at the last step; RoboCAS-v0: its rule at the last step. "
+        "success: success at some step; at the end: success after the last step; RoboCAS-v0: success by the rule of "
+        "RoboCAS-v0 after the last step. "
         f"{_STAGE_NOTE} Intervals: Clopper-Pearson, 95 %. Steps and simulated seconds are means over all episodes."
-        + ("" if result.repeats_scenes() else " The row all pools the episodes of all configurations.")
+        + ("" if result.has_repeated_scenes() else " The row all pools the episodes of all configurations.")
     )
     heads = ("configuration", "n#", "success%", "at the end#", "RoboCAS-v0#", *(f"{name}#" for name in PAPER_STAGES))
     return Table("Success", note, (*heads, "steps#", "s#"), rows)
 
 
-def _splits(result: Result) -> Table:
+def _split_table(result: Result) -> Table:
     splits, rows = result.group_by("split"), []
-    for task, outcomes in _with_all(result.group_by("task")):
+    for task, outcomes in _add_pooled_group(result.group_by("task")):
         row: list[Cell] = [task]
         for split in splits:
             chosen = [outcome for outcome in outcomes if outcome.split == split]
@@ -183,7 +187,7 @@ def _splits(result: Result) -> Table:
     return Table("Splits", "Success rates by split.", ["task", *heads], rows)
 
 
-def _failures(result: Result) -> Table:
+def _failure_table(result: Result) -> Table:
     groups = result.group_by("config")
     counts = {config: Counter(one.failure_stage for one in outcomes) for config, outcomes in groups.items()}
     found = {stage for count in counts.values() for stage in count} - {""}
@@ -194,20 +198,20 @@ def _failures(result: Result) -> Table:
         cells = (FailureCount(count[stage], n) for stage in stages)
         rows.append((config, str(n), str(n - count[""]), *cells))
     heads = ("configuration", "n#", "failed#", *(f"{get_failure_name(stage)}#" for stage in stages))
-    note = "Number of episodes by the first stage not reached, counted from the furthest reached stage."
+    note = "Number of failed episodes by failure stage: the stage after the last reached stage."
     return Table("Where episodes failed", note, heads, rows)
 
 
-def _occlusion(hidden: list[Outcome]) -> Table:
+def _occlusion_table(hidden: list[Outcome]) -> Table:
     bins = success_rates_by_bin([one.p_vis or 0.0 for one in hidden], [one.success for one in hidden], P_VIS_EDGES)
     edges = zip(P_VIS_EDGES[:-1], P_VIS_EDGES[1:], bins, strict=True)
     rows = [(f"{low:g} to {high:g}", str(rate.n if rate else 0), rate) for low, high, rate in edges]
     configs = ", ".join(sorted({outcome.config for outcome in hidden}))
-    note = f"p_vis: visible fraction of the target from above at the reset. Episodes of {configs}."
+    note = f"p_vis: visible fraction of the target at the reset, seen from above. Episodes of {configs}."
     return Table("Success by occlusion", note, ("p_vis", "n#", "success%"), rows)
 
 
-def _retrieval(result: Result) -> Iterator[Table]:
+def _retrieval_table(result: Result) -> Iterator[Table]:
     rows = []
     for config, outcomes in result.group_by("config").items():
         orders = [one.retrieval for one in outcomes if one.retrieval is not None]
@@ -219,17 +223,17 @@ def _retrieval(result: Result) -> Iterator[Table]:
             counts = (f"{len(moved) / len(held):.1f}", f"{100 * needed:.0f} %", f"{left:.1f}")
             rows.append((config, str(len(held)), f"{score:.2f}", *counts))
     note = (
-        "Objects moved before the target was first held. Needed objects hid or hemmed in the target, or were on top of "
-        "a needed object. Order score: fraction of the moved and left objects that were needed and moved from the top "
-        "down."
+        "Objects moved before the target was first held. Needed: the object hid the target, was in the way, or was on "
+        "top of a needed object. Left: needed, but not moved. Order score: number of needed objects moved from the top "
+        "down, divided by the number of moved and left objects."
     )
     heads = ("configuration", "target held#", "order score#", "moved, mean#", "needed, % of moved#", "left, mean#")
     if rows:
         yield Table("Retrieval order", note, heads, rows)
 
 
-def _with_all(groups: dict[str, list[Outcome]]) -> list[tuple[str, list[Outcome]]]:
-    """Return the groups, and a last group of all outcomes if there are several groups."""
+def _add_pooled_group(groups: dict[str, list[Outcome]]) -> list[tuple[str, list[Outcome]]]:
+    """Return the groups as pairs; with several groups, also a last group ``all`` with all outcomes."""
     every = [outcome for outcomes in groups.values() for outcome in outcomes]
     return [*groups.items(), *([("all", every)] if len(groups) > 1 else [])]
 

@@ -27,28 +27,31 @@ _SPEED = 4  # playback speed relative to simulated time
 
 
 def choose_failed_episodes(result: Result, count: int) -> list[int]:
-    """Return numbers of failed episodes, alternating between configurations and failure stages."""
+    """Return the numbers of at most ``count`` failed episodes, chosen in turn per configuration and failure stage."""
     groups: dict[str, dict[str, list[int]]] = {}
     for outcome in result.outcomes.values():
         if not outcome.success:
             groups.setdefault(outcome.config, {}).setdefault(outcome.failure_stage, []).append(outcome.episode)
-    return sorted(_in_turn([_in_turn(list(stages.values())) for stages in groups.values()])[:count])
+    return sorted(_interleave([_interleave(list(stages.values())) for stages in groups.values()])[:count])
 
 
-def _in_turn(lists: list[list[int]]) -> list[int]:
+def _interleave(lists: list[list[int]]) -> list[int]:
     return [number for row in zip_longest(*lists) for number in row if number is not None]
 
 
 def record_videos(
     result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Sequence[int]
 ) -> Iterator[tuple[Path, bool]]:
-    """Run episodes again in worker processes and write videos into the folder ``videos`` of the result.
+    """Run episodes of a result again in worker processes and write a video of each into the folder ``videos``.
 
-    Yields the path of each video and whether the outcome equals the recorded outcome.
+    Yields the path of each video, and whether the outcome of the episode equals the recorded outcome.
     """
     if (expected := result.run.protocol_hash) != (found := protocol.hash):
         raise EvaluationError(
-            "the result has another protocol hash", where=result.folder, expected=expected, found=found
+            "the result was measured with other files of the protocol",
+            where=result.folder,
+            expected=f"protocol hash {expected}",
+            found=found,
         )
     require_renderer()
     recorder = _VideoRecorder()
@@ -74,7 +77,7 @@ def record_videos(
 
 
 class _VideoRecorder:
-    """Wrapper of a vector environment with one env that writes an image every ``period`` policy steps."""
+    """Wrapper of a vector environment with one env that adds an image to a video every ``period`` policy steps."""
 
     num_envs = 1
 

@@ -46,7 +46,7 @@ def act(*sums: float, gripper: float = 0.0) -> np.ndarray:
 
 def test_observations_are_in_the_declared_space_and_have_the_datasets_names(make):
     env = make()
-    with pytest.raises(EvaluationError, match="Call reset first"):
+    with pytest.raises(EvaluationError, match="Call reset before step"):
         env.step(act(0, 0))
     obs, info = env.reset(seed=0)
     assert env.observation_space.contains(obs)
@@ -106,7 +106,7 @@ def test_seeds_are_indices_of_the_tasks_episodes_modulo_their_number(make, made)
     env.reset(seed=[0, 0])
     assert env.episodes.tolist() == [4, 4]
     assert len(made) == 1 and made[0].num_envs == 2
-    with pytest.raises(ValueError, match="expected 2 integers"):
+    with pytest.raises(ValueError, match="expected one integer, or one per env"):
         env.reset(seed=[1])
     with pytest.raises(ValueError, match="actions: expected"):
         env.step(np.zeros((2, 6)))

@@ -100,9 +100,9 @@ def test_episodes_cut_short_or_that_the_protocol_lacks_and_mode_live_are_refused
     with pytest.raises(EvaluationError, match="Remove max_steps"):
         asyncio.run(play(benchmark, task, max_steps=4))
     assert asyncio.run(play(benchmark, task, max_steps=5))["metrics"]["success"]
-    with pytest.raises(EvaluationError, match="expected episodes_per_task: at most 2, found 3"):
+    with pytest.raises(EvaluationError, match="expected episodes_per_task of at most 2, found 3"):
         asyncio.run(play(benchmark, {**task, "episode_idx": 2}))
-    with pytest.raises(NotImplementedError, match="mode: sync"):
+    with pytest.raises(NotImplementedError, match="Set mode: sync"):
         benchmark.get_hold_action(None)
 
 

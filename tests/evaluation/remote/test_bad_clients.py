@@ -86,11 +86,11 @@ def test_files_of_bundled_and_passed_protocols_are_served(tmp_path):
     for name in (theirs.config_file, theirs.layouts_file):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).touch()
-    ours = ServedFiles.collect([tmp_path / "mine"], ["packs/own"]).resolve(theirs)
+    ours = ServedFiles.collect([tmp_path / "mine"], ["packs/own"]).resolve_episode(theirs)
     assert Path(ours.config_file) == tmp_path / theirs.config_file
     assert Path(ours.layouts_file) == tmp_path / theirs.layouts_file
     assert ours.pack == "packs/own"
-    assert ServedFiles.collect().resolve(theirs) == replace(theirs, config_file="", layouts_file="", pack="")
+    assert ServedFiles.collect().resolve_episode(theirs) == replace(theirs, config_file="", layouts_file="", pack="")
     assert file_name(make_episode().config_file) == "smoke/configs/pick_table_scattered.yaml"
     (tmp_path / "smoke").mkdir()
     with pytest.raises(EvaluationError):

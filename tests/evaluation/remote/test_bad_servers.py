@@ -36,7 +36,7 @@ from robocas_ms3.evaluation.remote.wire import encode_message
         (encode_message(7), "invalid actions"),
         (encode_message({"actions": "up"}), "invalid actions"),
         (encode_message({"actions": [[1.0], [1.0, 2.0]]}), "invalid actions"),
-        (encode_message({"actions": np.zeros((1, 8))}), r"expected \(chunk, 7\) numbers, found \(1, 8\)"),
+        (encode_message({"actions": np.zeros((1, 8))}), r"expected numbers of shape \(H, 7\), found \(1, 8\)"),
         (encode_message({"actions": np.zeros((0, 7))}), "invalid actions"),
         (encode_message({"actions": np.zeros((1, 2, 7))}), "invalid actions"),
         (encode_message({"actions": np.full((1, 7), np.nan)}), "out of range"),
@@ -160,7 +160,7 @@ def test_run_continues_after_policy_errors_and_ends_without_a_server():
         played = {one.spec.episode: one for one in play(env, remote, starts, 10)}
     assert {number: one.steps for number, one in played.items()} == {0: 4, 1: 4, 2: 0, 3: 4, 4: 4, 5: 0, 6: 4}
     assert {number for number, one in played.items() if one.error} == {2, 5}
-    assert played[2].error == "the server failed: RuntimeError: out of memory"
+    assert played[2].error == "the policy server failed: RuntimeError: out of memory"
     with pytest.raises(EvaluationError, match="no connection to the policy server within 0.5 s"):
         play(env, remote, starts, 10)
     remote.close()

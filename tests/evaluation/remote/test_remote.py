@@ -126,8 +126,8 @@ def test_batches_are_split_and_failures_end_only_their_episodes():
         with pytest.raises(PolicyError) as failed:
             remote.act(seen)
         assert [one.envs.tolist() for one in policy.seen] == [[0, 1], [2, 3], [4, 5]]
-        exception = "the server failed: RuntimeError: out of memory"
-        assert failed.value.reasons == {1: "the server failed: no plan", 4: exception, 5: exception}
+        exception = "the policy server failed: RuntimeError: out of memory"
+        assert failed.value.reasons == {1: "the policy server failed: no plan", 4: exception, 5: exception}
         np.testing.assert_array_equal(failed.value.actions[[0, 2, 3]], RecordingPolicy().act(seen)[[0, 2, 3]])
         assert remote.act(make_observations(0, 2)).shape == (2, 3, 7)
         with pytest.raises(PolicyError, match="lost connection"):
@@ -228,7 +228,7 @@ def test_message_names_the_robot_only_if_it_is_not_the_default():
         start = replace(make_episode(), robot=robot)
         message = make_observation_message(make_observations(0), 0, start, reset=True)
         assert message["start"].keys() & {"robot"} == keys
-        assert ServedFiles.collect().resolve(parse_request(message).make_episode_spec(0)) == start
+        assert ServedFiles.collect().resolve_episode(parse_request(message).make_episode_spec(0)) == start
 
 
 def test_openpi_client_with_our_server():
@@ -303,7 +303,10 @@ def test_options_of_an_address():
         max_in_flight=2,
         timeout_s=9.0,
     )
-    with serving(RecordingPolicy()) as url, pytest.raises(EvaluationError, match="announces its policy specification"):
+    with (
+        serving(RecordingPolicy()) as url,
+        pytest.raises(EvaluationError, match="both the server and the address specify"),
+    ):
         RemotePolicy(f"{url}?convention=delta_euler")
 
 

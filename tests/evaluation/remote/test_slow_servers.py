@@ -130,7 +130,7 @@ def test_timeout_ends_only_the_episode_of_its_env():
             remote.act(make_observations(*range(ENVS)))
         ended.set()
         assert failed.value.reasons == {
-            2: "no answer from the policy server within 1 s. Increase timeout_s in the address."
+            2: "no answer from the policy server within 1 s. Increase the option timeout_s of the address."
         }
         assert failed.value.actions[[0, 1, 3, 4], 0, 0].tolist() == [0, 1, 3, 4]
         remote.reset([make_episode(2)])

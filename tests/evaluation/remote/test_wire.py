@@ -125,7 +125,7 @@ def test_depth_and_size_are_bounded():
     for _ in range(wire.MAX_DEPTH):
         value = [value]
     assert decode_message(encode_message(value)) == value
-    with pytest.raises(WireError, match="nested too deeply"):
+    with pytest.raises(WireError, match="too many levels"):
         decode_message(encode_message([value]))
     with pytest.raises(WireError, match="too large"):
         decode_message(bytes(11), max_bytes=10)

@@ -127,7 +127,7 @@ def test_a_split_may_have_several_configurations(tmp_path):
 
 def test_splits_with_different_scenes_are_refused(tmp_path):
     result, _ = of_suite(tmp_path / "b", "instructions-v1", lambda one: True)
-    with pytest.raises(EvaluationError, match="another protocol hash"):
+    with pytest.raises(EvaluationError, match="other files of the protocol"):
         compare_splits(result, load_protocol("cameras-v1"))
     with pytest.raises(EvaluationError, match="no two splits of the result have the same scenes"):
         compare_splits(*of_suite(tmp_path / "a", "objects-v1", lambda one: True))

@@ -28,7 +28,7 @@ def test_all_kinds_of_failures_have_their_turn(tmp_path):
 def test_result_of_another_protocol_is_refused(tmp_path):
     result = of_protocol(tmp_path / "a", load_protocol("smoke"))
     result.run.protocol_hash = "0"
-    with pytest.raises(EvaluationError, match="another protocol hash"):
+    with pytest.raises(EvaluationError, match="other files of the protocol"):
         next(record_videos(result, load_protocol("smoke"), RandomPolicy(), [0]))
 
 
