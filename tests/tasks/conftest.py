@@ -7,11 +7,11 @@ import torch
 
 
 @pytest.fixture(params=["torch", "numpy"])
-def make(request):
-    """Return a function that makes native arrays of a GPU or a CPU (float32, bool or int64)."""
+def make_array(request):
+    """Return a function that converts nested lists to a native array: a tensor as on a GPU, or NumPy as on a CPU."""
 
-    def as_kind(values):
+    def convert(values):
         tensor = torch.as_tensor(values)
         return tensor if request.param == "torch" else tensor.numpy()
 
-    return as_kind
+    return convert

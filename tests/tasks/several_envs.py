@@ -1,4 +1,4 @@
-"""Several envs of a batch on a GPU, without a simulator."""
+"""Fake batch of several envs on a GPU, which has seeds and layouts but no simulator."""
 
 from typing import NamedTuple
 from unittest.mock import Mock
@@ -10,11 +10,11 @@ from sapien import physx
 from robocas_ms3.tasks import RoboCASPickEnv
 
 
-def several(folder, monkeypatch, num_envs=4, **arguments) -> tuple[RoboCASPickEnv, list]:
-    """Return an environment of several envs without a simulator, and the list of requested layouts."""
+def make_batch_env(folder, monkeypatch, num_envs=4, **arguments) -> tuple[RoboCASPickEnv, list]:
+    """Return a batch of pick envs without a simulator, and a list of the seed pairs (objects, layout) of each reset."""
     asked = []
 
-    def resets(env, seed=None, options=None):
+    def fake_reset(env, seed=None, options=None):
         index = torch.as_tensor((options or {}).get("env_idx", range(num_envs)))
         env._set_episode_rng(seed, index)
         if (options or {}).get("reconfigure"):
@@ -25,7 +25,7 @@ def several(folder, monkeypatch, num_envs=4, **arguments) -> tuple[RoboCASPickEn
         asked.append([(int(env.seeds.objects_seeds[i]), int(env.seeds.layout_seeds[i])) for i in index])
         return {}, {}
 
-    def makes(env, *args, num_envs, **rest):
+    def fake_init(env, *args, num_envs, **rest):
         env.num_envs, env._enhanced_determinism, env._batched_rng_backend = num_envs, False, "numpy:random_state"
         env._episode_seed, env._batched_episode_rng = None, None
         env.reset([2022 + i for i in range(num_envs)], {"reconfigure": True})  # as ManiSkill does
@@ -34,13 +34,13 @@ def several(folder, monkeypatch, num_envs=4, **arguments) -> tuple[RoboCASPickEn
     monkeypatch.setattr(physx, "enable_gpu", lambda: None)
     monkeypatch.setattr(BaseEnv, "_sim_device", Mock(is_cuda=lambda: True), raising=False)
     monkeypatch.setattr(BaseEnv, "device", torch.device("cpu"), raising=False)
-    monkeypatch.setattr(BaseEnv, "__init__", makes)
-    monkeypatch.setattr(BaseEnv, "reset", resets)
+    monkeypatch.setattr(BaseEnv, "__init__", fake_init)
+    monkeypatch.setattr(BaseEnv, "reset", fake_reset)
     return RoboCASPickEnv(num_envs=num_envs, layouts=folder, **arguments), asked
 
 
-class Thing(NamedTuple):
-    """A stand-in for a layout."""
+class FakeLayout(NamedTuple):
+    """Fake layout that stores its seeds."""
 
     objects: int
     seed: int

@@ -1,4 +1,4 @@
-"""States read in one call equal those that ManiSkill reads per actor, also directly after setting a state."""
+"""States that `Bodies` reads equal the states that ManiSkill reads, also directly after setting a state."""
 
 from types import SimpleNamespace
 
@@ -31,13 +31,13 @@ def env():
     env.close()
 
 
-def read_by_maniskill(base) -> torch.Tensor:
+def read_with_maniskill(base) -> torch.Tensor:
     parts = base.scene.get_sim_state()
     return torch.cat([state for found in parts.values() for state in found.values()], dim=1)
 
 
 def change_state(base):
-    """Change one part of the state after the other, each by its own setter."""
+    """Change pose, velocity or joints of one body after the other; yield after each change."""
     drawer = next(f for f in base.fixtures.furniture.values() if isinstance(f, Articulation))
     robot, thing = base.agent.robot, base.objects[1]
     yield thing.set_pose(Pose.create_from_pq(torch.tensor([[1.0, 2.0, 3.0]])))
@@ -57,19 +57,19 @@ def test_read_is_always_current(env):
     before, seen = base.get_state(), []
     for _ in change_state(base):
         seen.append(base.bodies.read())
-        assert torch.equal(seen[-1], read_by_maniskill(base))
-        assert torch.equal(base.get_state()[:, : seen[-1].shape[1]], read_by_maniskill(base))
+        assert torch.equal(seen[-1], read_with_maniskill(base))
+        assert torch.equal(base.get_state()[:, : seen[-1].shape[1]], read_with_maniskill(base))
         assert torch.equal(base.object_poses, torch.stack([a.pose.raw_pose for a in base.objects], dim=1))
         assert torch.equal(base.basket_pose, base.fixtures.basket.pose.raw_pose)
     assert not any(torch.equal(one, two) for one, two in zip(seen, seen[1:], strict=False))  # and none was written over
     base.set_state(before)
-    assert torch.equal(base.bodies.read(), read_by_maniskill(base))
+    assert torch.equal(base.bodies.read(), read_with_maniskill(base))
     rng = np.random.default_rng(0)
     for _ in range(5):
         env.step(np.array([*(MOBILE_PANDA.arm_rest + rng.normal(0, 0.2, 7)), -1], np.float32))
-        assert torch.equal(base.bodies.read(), read_by_maniskill(base))
+        assert torch.equal(base.bodies.read(), read_with_maniskill(base))
     env.reset(seed=1)
-    assert torch.equal(base.bodies.read(), read_by_maniskill(base))
+    assert torch.equal(base.bodies.read(), read_with_maniskill(base))
 
 
 def test_state_except_robot_is_unchanged_while_only_the_robot_moves(env):
@@ -97,7 +97,7 @@ def test_state_dict_equals_that_of_maniskill(env):
         for name, state in found.items():
             assert torch.equal(ours[kind][name], state)
     ours["actors"]["basket"][:] = 0  # belongs to whoever asked for it
-    assert torch.equal(base.bodies.read(), read_by_maniskill(base))
+    assert torch.equal(base.bodies.read(), read_with_maniskill(base))
 
 
 def test_unexpected_packed_state_is_an_error(env, monkeypatch):

@@ -35,11 +35,11 @@ HARMLESS = (
 
 @pytest.mark.parametrize(("num_envs", "sim_backend"), [(2, "auto"), (1, "physx_cuda"), (1, "gpu")])
 def test_failed_download_of_the_gpu_library_is_an_error(monkeypatch, num_envs, sim_backend):
-    def enable() -> None:
+    def fail_to_enable() -> None:
         raise ConnectionError("Failed to resolve 'github.com'")
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr("sapien.physx.enable_gpu", enable)
+    monkeypatch.setattr("sapien.physx.enable_gpu", fail_to_enable)
     check_engine(1, "full")
     with pytest.raises(VectorEnvError, match="ConnectionError.*github.*copy ~/.sapien/physx"):
         check_engine(num_envs, "full", sim_backend)
@@ -60,8 +60,8 @@ def test_capacities_grow_with_envs_and_objects_by_hand():
 
 
 @contextmanager
-def capture_errors() -> Iterator[EngineErrorMonitor]:
-    """Monitor standard error. Not a fixture, since pytest replaces standard error between fixtures and tests."""
+def monitor_standard_error() -> Iterator[EngineErrorMonitor]:
+    """Monitor standard error; not a fixture, because pytest replaces standard error between fixtures and tests."""
     errors = EngineErrorMonitor()
     errors.open()
     try:
@@ -70,43 +70,43 @@ def capture_errors() -> Iterator[EngineErrorMonitor]:
         errors.close()
 
 
-def wait_for_error(errors: EngineErrorMonitor) -> None:
-    """Check for an error repeatedly, for at most one second."""
+def check_for_one_second(errors: EngineErrorMonitor) -> None:
+    """Check for an error 100 times within one second."""
     for _ in range(100):
         errors.check()
         time.sleep(0.01)
 
 
 def test_overflow_is_an_error_with_a_fix_and_is_still_printed(capfd):
-    with capture_errors() as errors:
+    with monitor_standard_error() as errors:
         os.write(2, f"{COMPLAINT}\n{COMPLAINT}\nand something else\n".encode())
         with pytest.raises(SimulationError, match=r"ran out of memory.*its size to 9.*gpu_memory_config"):
-            wait_for_error(errors)
+            check_for_one_second(errors)
         errors.check()  # once
     assert f"{COMPLAINT}\n{COMPLAINT}\nand something else\n" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("line", OTHERS)
 def test_other_messages_of_physx_are_recognised(line, capfd):
-    with capture_errors() as errors:
+    with monitor_standard_error() as errors:
         os.write(2, f"{line}\n".encode())
         with pytest.raises(SimulationError):
-            wait_for_error(errors)
+            check_for_one_second(errors)
 
 
 def test_unrelated_output_is_ignored(capfd):
-    with capture_errors() as errors:
+    with monitor_standard_error() as errors:
         os.write(2, "\n".join(HARMLESS).encode() + b"\n")
         time.sleep(0.2)
         errors.check()
 
 
 def test_two_envs_of_a_process_get_the_error(capfd):
-    with capture_errors() as one, capture_errors() as other:
+    with monitor_standard_error() as one, monitor_standard_error() as other:
         os.write(2, f"{COMPLAINT}\n".encode())
         for errors in (one, other):
             with pytest.raises(SimulationError):
-                wait_for_error(errors)
+                check_for_one_second(errors)
 
 
 def test_output_of_a_crashing_process_is_kept():

@@ -18,7 +18,7 @@ from robocas_ms3.tasks.layout_stability import check_layouts, find_unchecked_lay
 
 @pytest.fixture
 def cache(tmp_path) -> LayoutCache:
-    """Return a cache of small heaps: two sets of objects with two layouts each; in one an object hangs in the air."""
+    """Return a cache with four layouts of small heaps; in the layout of seeds (1, 0) an object floats in the air."""
     pack = load_pack("builtin")
     cache = LayoutCache(SceneModel.load(load_task_config("search_table_small_heap"), pack, pack), tmp_path)
     pairs = seed_pairs([0, 1], [0, 1])
@@ -50,12 +50,12 @@ def test_unstable_heap_is_found(cache):
 
 @pytest.mark.slow
 def test_statuses_found_before_an_interruption_are_stored(cache, monkeypatch):
-    def tried(*args, **kwargs):
+    def check_until_interrupted(*args, **kwargs):
         yield (0, 0), 0.001
         yield (0, 1), 0.02
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(layout_stability, "check_layouts", tried)
+    monkeypatch.setattr(layout_stability, "check_layouts", check_until_interrupted)
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
             check_stability(cache, "cpu")

@@ -21,7 +21,7 @@ from robocas_ms3.tasks.occlusion import (
 
 
 def plate(x: tuple[float, float], y: tuple[float, float], z: float) -> torch.Tensor:
-    """Return (3, 1681) points of a horizontal rectangle, at most 2.5 mm apart for a side of 0.1 m."""
+    """Return 41 x 41 points (3, 1681) of a horizontal rectangle between the limits ``x`` and ``y``, at height ``z``."""
     u, v = (torch.linspace(low, high, 41) for low, high in (x, y))
     return torch.stack([*(g.flatten() for g in torch.meshgrid(u, v, indexing="ij")), torch.full((41 * 41,), z)])
 
@@ -31,14 +31,16 @@ FAR = plate((0.3, 0.4), (0.0, 0.1), 0.8)
 HIGH_ABOVE = torch.tensor([0.0, 0.0, 200.0])  # so far away that all rays are vertical
 
 
-def measure(*others: torch.Tensor, present: list[bool] | None = None, eye: torch.Tensor = HIGH_ABOVE) -> Clutter:
+def measure_around_target(
+    *others: torch.Tensor, present: list[bool] | None = None, eye: torch.Tensor = HIGH_ABOVE
+) -> Clutter:
     points = torch.stack([TARGET, *others])[None]
     flags = torch.tensor([present or [True] * points.shape[1]])
     return measure_clutter(points, flags, torch.tensor([0]), eye)
 
 
 def test_target_without_neighbours_is_clear():
-    found = measure(FAR)
+    found = measure_around_target(FAR)
     assert found.hidden_fraction.tolist() == [0]
     assert not found.obstacles.any()
     assert found.is_target_cleared.tolist() == [True]
@@ -46,7 +48,7 @@ def test_target_without_neighbours_is_clear():
 
 @pytest.mark.parametrize(("edge", "share"), [(0.0, 0.5), (0.03, 0.2), (-0.05, 1.0)])
 def test_hidden_fraction_is_the_fraction_of_cells_under_a_plate(edge, share):
-    found = measure(plate((edge, 0.05), (-0.05, 0.05), 0.7))
+    found = measure_around_target(plate((edge, 0.05), (-0.05, 0.05), 0.7))
     assert found.hidden_fraction.item() == pytest.approx(share, abs=0.05)  # one row of 20 cells
     assert found.obstacles.tolist() == [[False, True]]
 
@@ -54,10 +56,10 @@ def test_hidden_fraction_is_the_fraction_of_cells_under_a_plate(edge, share):
 def test_object_nearer_to_the_camera_hides_more():
     eye = torch.tensor([0.0, 0.0, 1.15])  # 0.5 m above the target
     half_way = plate((0.0, 0.025), (-0.025, 0.025), 0.9)  # 0.25 m below the camera, so it appears at twice its size
-    assert measure(half_way, eye=eye).hidden_fraction.item() == pytest.approx(0.5, abs=0.05)
-    assert measure(half_way).hidden_fraction.item() == pytest.approx(0.125, abs=0.05)
+    assert measure_around_target(half_way, eye=eye).hidden_fraction.item() == pytest.approx(0.5, abs=0.05)
+    assert measure_around_target(half_way).hidden_fraction.item() == pytest.approx(0.125, abs=0.05)
     beside = torch.tensor([0.0, 0.05, 1.15])  # sees the plate from the right, so further left
-    assert measure(half_way, eye=beside).hidden_fraction.item() == pytest.approx(0.25, abs=0.05)
+    assert measure_around_target(half_way, eye=beside).hidden_fraction.item() == pytest.approx(0.25, abs=0.05)
 
 
 def test_projected_points_by_hand():
@@ -68,31 +70,31 @@ def test_projected_points_by_hand():
 
 
 def test_object_below_the_target_hides_nothing():
-    found = measure(plate((-0.05, 0.05), (-0.05, 0.05), 0.62))
+    found = measure_around_target(plate((-0.05, 0.05), (-0.05, 0.05), 0.62))
     assert found.hidden_fraction.item() == 0
     assert not found.obstacles.any()
 
 
 def test_higher_neighbour_within_1_cm_is_an_obstacle():
-    def beside(gap: float, z: float) -> torch.Tensor:
+    def make_neighbour(gap: float, z: float) -> torch.Tensor:
         return plate((0.05 + gap, 0.15 + gap), (-0.05, 0.05), z)
 
-    assert measure(beside(0.006, 0.66)).obstacles.tolist() == [[False, True]]
-    assert measure(beside(0.006, 0.64)).obstacles.tolist() == [[False, False]]  # lower
-    assert measure(beside(0.020, 0.66)).obstacles.tolist() == [[False, False]]  # too far
-    assert measure(beside(0.006, 0.66)).hidden_fraction.item() == 0
+    assert measure_around_target(make_neighbour(0.006, 0.66)).obstacles.tolist() == [[False, True]]
+    assert measure_around_target(make_neighbour(0.006, 0.64)).obstacles.tolist() == [[False, False]]  # lower
+    assert measure_around_target(make_neighbour(0.020, 0.66)).obstacles.tolist() == [[False, False]]  # too far
+    assert measure_around_target(make_neighbour(0.006, 0.66)).hidden_fraction.item() == 0
 
 
 def test_two_obstacles_are_too_many():
     right, left = plate((0.055, 0.15), (-0.05, 0.05), 0.7), plate((-0.15, -0.055), (-0.05, 0.05), 0.7)
-    assert measure(right).is_target_cleared.tolist() == [True]
-    assert measure(right, left).is_target_cleared.tolist() == [False]
-    assert measure(right, left, present=[True, True, False]).is_target_cleared.tolist() == [True]
+    assert measure_around_target(right).is_target_cleared.tolist() == [True]
+    assert measure_around_target(right, left).is_target_cleared.tolist() == [False]
+    assert measure_around_target(right, left, present=[True, True, False]).is_target_cleared.tolist() == [True]
 
 
 def test_obstacle_below_another_is_not_visible():
     low, high = plate((-0.05, 0.05), (-0.05, 0.05), 0.7), plate((-0.06, 0.06), (-0.06, 0.06), 0.75)
-    assert measure(low, high).obstacles.tolist() == [[False, False, True]]
+    assert measure_around_target(low, high).obstacles.tolist() == [[False, False, True]]
 
 
 def test_envs_are_independent():
@@ -127,7 +129,7 @@ def test_objects_beyond_the_motion_check_do_not_change_the_clutter():
     ball = torch.stack([x.flatten() for x in torch.meshgrid(side, side, indexing="ij")] + [torch.zeros(441)])
     ball = ball[:, torch.linalg.vector_norm(ball, dim=0) <= 0.05 + 1e-6]
 
-    def counted(x: float) -> bool:
+    def is_obstacle_at(x: float) -> bool:
         poses = torch.tensor([[[0.0, 0, 0.7, 1, 0, 0, 0], [x, 0, 0.8, 1, 0, 0, 0]]])
         found = measure_clutter(
             surface_points_in_world(poses, ball.expand(1, 2, 3, -1)),
@@ -137,25 +139,25 @@ def test_objects_beyond_the_motion_check_do_not_change_the_clutter():
         )
         return bool(found.obstacles[0, 1])
 
-    assert counted(0.108)
-    assert not counted(0.1151)
+    assert is_obstacle_at(0.108)
+    assert not is_obstacle_at(0.1151)
 
 
 def test_motion_far_away_is_ignored():
-    def at(*places: tuple[float, float]) -> torch.Tensor:
+    def make_poses(*places: tuple[float, float]) -> torch.Tensor:
         return torch.tensor([[[x, y, 0.7, 1, 0, 0, 0] for x, y in places]])
 
-    def moved(before: torch.Tensor, now: torch.Tensor) -> bool:
+    def has_moved(before: torch.Tensor, now: torch.Tensor) -> bool:
         return bool(has_clutter_moved(now, before, torch.full((1, 2), 0.05), torch.tensor([0]), HIGH_ABOVE))
 
-    still = at((0, 0), (0.11, 0))  # within two radii and three cells, along x and along y: 0.115 m
-    assert not moved(still, still + 5e-5)
-    assert moved(still, at((0, 0), (0.1102, 0)))
-    assert moved(at((0, 0), (0.11, 0.11)), at((0, 0), (0.11, 0.1102)))
-    assert moved(still, at((0.0002, 0), (0.11, 0)))  # the target
-    assert not moved(at((0, 0), (0.12, 0)), at((0, 0), (0.2, 0)))
-    assert moved(at((0, 0), (0.2, 0)), at((0, 0), (0.11, 0)))  # comes near
-    assert moved(at((0, 0), (0.11, 0)), at((0, 0), (0.2, 0)))  # leaves
+    still = make_poses((0, 0), (0.11, 0))  # within two radii and three cells, along x and along y: 0.115 m
+    assert not has_moved(still, still + 5e-5)
+    assert has_moved(still, make_poses((0, 0), (0.1102, 0)))
+    assert has_moved(make_poses((0, 0), (0.11, 0.11)), make_poses((0, 0), (0.11, 0.1102)))
+    assert has_moved(still, make_poses((0.0002, 0), (0.11, 0)))  # the target
+    assert not has_moved(make_poses((0, 0), (0.12, 0)), make_poses((0, 0), (0.2, 0)))
+    assert has_moved(make_poses((0, 0), (0.2, 0)), make_poses((0, 0), (0.11, 0)))  # comes near
+    assert has_moved(make_poses((0, 0), (0.11, 0)), make_poses((0, 0), (0.2, 0)))  # leaves
 
 
 def test_push_starts_between_the_target_and_the_highest_obstacle():
@@ -178,15 +180,15 @@ def test_push_point_of_an_obstacle_above_the_target_is_finite():
 def test_motion_near_the_target_in_the_image_counts():
     eye, radii = torch.tensor([0.0, 0.0, 1.0]), torch.full((1, 2), 0.02)
 
-    def moved(x: float, z: float) -> bool:
+    def has_moved(x: float, z: float) -> bool:
         before = torch.tensor([[[0.2, 0, 0.5, 1, 0, 0, 0], [x, 0, z, 1, 0, 0, 0]]])
         now = before.clone()
         now[0, 1, 0] += 1e-3
         return bool(has_clutter_moved(now, before, radii, torch.tensor([0]), eye))
 
-    assert moved(0.1, 0.75)  # between camera and target
-    assert not moved(0.1, 0.5)
-    assert not moved(0.2, 0.75)  # above it in the world, but seen at 0.4 m from it at the target's depth
+    assert has_moved(0.1, 0.75)  # between camera and target
+    assert not has_moved(0.1, 0.5)
+    assert not has_moved(0.2, 0.75)  # above it in the world, but seen at 0.4 m from it at the target's depth
 
 
 @pytest.mark.slow
@@ -217,7 +219,7 @@ def test_hidden_fractions_agree_with_ray_casting():
 
 
 def test_pairwise_occlusion_by_hand():
-    """A plate of 10 cm is half below a higher one, which is below a small one; another plate is next to them."""
+    """The lid hides half of the target, a small plate hides a quarter of the lid, and a fourth plate hides nothing."""
     target, lid = plate((0, 0.1), (0, 0.1), 0.5), plate((0.05, 0.15), (0, 0.1), 0.55)
     small, aside = plate((0.1, 0.15), (0, 0.05), 0.6), plate((0.4, 0.5), (0, 0.1), 0.9)
     points = torch.stack([target, lid, small, aside])[None].expand(2, -1, -1, -1)

@@ -52,8 +52,8 @@ def test_furniture_is_open_from_the_configured_fraction(name):
 
 
 @contextmanager
-def done_early():
-    """Accept episodes without success, since these tests end before it."""
+def accept_unfinished_episodes():
+    """Make the generator accept episodes without success, because these tests end before the task is solved."""
     flag = MotionExecutor.flag
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(MotionExecutor, "flag", lambda self, name: name == "success" or flag(self, name))
@@ -62,7 +62,7 @@ def done_early():
 
 
 @pytest.fixture(scope="module")
-def driven(tmp_path_factory):
+def drive_recording(tmp_path_factory):
     """Record an episode in which the base drives 0.2 m forward and 0.1 m right, and turns by 0.3 rad."""
     folder = tmp_path_factory.mktemp("driven")
     generator = EpisodeGenerator(EpisodeSettings("open_pick", "open_pick_cabinet_door", "builtin", max_attempts=1))
@@ -74,7 +74,7 @@ def driven(tmp_path_factory):
         seen["arm"], seen["base"] = arm.scene.arm_qpos - arm.qpos, arm.scene.arm_base_in_world
 
     generator.policy = policy
-    with done_early():
+    with accept_unfinished_episodes():
         result = generator.generate(0, folder, "driven")
     assert result.success
     seen["root"] = generator.env.unwrapped.model.robot_pose
@@ -82,8 +82,8 @@ def driven(tmp_path_factory):
     return folder / "driven.h5", seen
 
 
-def test_drive_is_in_the_actions_and_the_arm_is_still(driven):
-    path, seen = driven
+def test_drive_is_in_the_actions_and_the_arm_is_still(drive_recording):
+    path, seen = drive_recording
     with TrajectoryFile(path) as file:
         actions = file.read_recording(0).actions
     assert actions.shape[1] == 11
@@ -97,8 +97,8 @@ def test_drive_is_in_the_actions_and_the_arm_is_still(driven):
     assert moved == pytest.approx([0.2, -0.1], abs=0.01)
 
 
-def test_drive_is_in_the_base_motion_of_the_dataset(driven):
-    path, seen = driven
+def test_drive_is_in_the_base_motion_of_the_dataset(drive_recording):
+    path, seen = drive_recording
     with TrajectoryFile(path) as file:
         recording = file.read_recording(0)
     samples = sample_states(recording.control_steps, 4)
@@ -119,8 +119,8 @@ def test_drive_is_in_the_base_motion_of_the_dataset(driven):
     assert again.state_error == 0.0
 
 
-def watch(arm) -> dict[str, float]:
-    """Return a dictionary, filled in each step, of touched things and their greatest overlap with the robot, m."""
+def record_contacts(arm) -> dict[str, float]:
+    """Return a dictionary that later steps fill: name of a touched body -> greatest overlap with the robot, m."""
     touched: dict[str, float] = {}
     step = arm.executor._step
     robot = {link._objs[0].entity.name for link in arm.env.agent.robot.links}
@@ -142,7 +142,7 @@ def test_pull_opens_by_contact_and_releases_the_handle(tmp_path):
     generator = EpisodeGenerator(EpisodeSettings("open_pick", "open_pick_container", "builtin", max_attempts=1))
 
     def policy(arm) -> None:
-        part, touched = MovingPart.from_task(arm), watch(arm)
+        part, touched = MovingPart.from_task(arm), record_contacts(arm)
         assert part.joint_position(arm) == pytest.approx(0, abs=1e-3)
         open_furniture_part(arm)
         assert set(touched) == {part.handle.link}  # and nothing else in the scene
@@ -157,13 +157,13 @@ def test_pull_opens_by_contact_and_releases_the_handle(tmp_path):
         assert int(arm.env.evaluate()["disturbed"][0]) == 0
 
     generator.policy = policy
-    with done_early():
+    with accept_unfinished_episodes():
         assert generator.generate(0, tmp_path, "pulled").success
     generator.close()
 
 
-def farther_back(name: str, distance: float) -> dict:
-    """Return a bundled configuration with the robot farther away, and with base motion."""
+def move_robot_back(name: str, distance: float) -> dict:
+    """Return a bundled configuration with ``base_motion`` and the robot moved back by ``distance`` m."""
     config = load_task_config(name).model_dump(mode="json")
     robot = config["robot"]
     yaw = np.deg2rad(robot.get("yaw_deg", 0.0))
@@ -174,16 +174,16 @@ def farther_back(name: str, distance: float) -> dict:
 
 
 def test_robot_drives_to_a_handle_out_of_reach(tmp_path):
-    config = farther_back("open_pick_container", 0.5)
+    config = move_robot_back("open_pick_container", 0.5)
     generator = EpisodeGenerator(EpisodeSettings("open_pick", config, "builtin", max_attempts=1))
 
-    def share(arm) -> float:
+    def measure_pull(arm) -> float:
         part = MovingPart.from_task(arm)
         others = arm.scene.obstacles(exclude_link=(part.furniture, part.handle.link))
         return pull_fraction(arm, part, arm.scene.arm_base_in_world, others)
 
     def policy(arm) -> None:
-        assert share(arm) < 0.5
+        assert measure_pull(arm) < 0.5
         drive_to_handle(arm)
         assert current_base_pose(arm)[0] > 0.1
         stands = current_base_pose(arm)  # within comfortable reach, the base stops
@@ -191,13 +191,13 @@ def test_robot_drives_to_a_handle_out_of_reach(tmp_path):
         assert (current_base_pose(arm) == stands).all()
 
     generator.policy = policy
-    with done_early():
+    with accept_unfinished_episodes():
         assert generator.generate(0, tmp_path, "driven").success
     generator.close()
 
 
 def test_robot_drives_to_a_target_out_of_reach(tmp_path):
-    config = farther_back("pick_table_scattered", 0.4)
+    config = move_robot_back("pick_table_scattered", 0.4)
     settings = EpisodeSettings("pick", config, "builtin", max_attempts=4)
     generator = EpisodeGenerator(settings)
     pick = generator.policy

@@ -21,7 +21,7 @@ def env():
     env.close()
 
 
-def settle(env, steps: int = 20) -> dict:
+def hold_and_read_flags(env, steps: int = 20) -> dict:
     qpos = env.unwrapped.agent.robot.get_qpos()[0, 3:10].numpy()
     for _ in range(steps):
         *_, info = env.step(np.append(qpos, 1.0).astype(np.float32))
@@ -37,7 +37,7 @@ def put_target_into_basket(env) -> None:
 def test_object_that_was_never_lifted_is_no_success(env):
     env.reset(seed=0)
     put_target_into_basket(env)
-    flags = settle(env, 40)
+    flags = hold_and_read_flags(env, 40)
     assert flags["target_in_basket"]
     assert not flags["success"]
     assert not flags["reached_any"]
@@ -48,17 +48,17 @@ def test_success_needs_all_of_its_conditions(env):
     base = env.unwrapped
     put_target_into_basket(env)
     base.success_check.stages["target_lifted"][:] = True
-    assert settle(env, 40)["success"]
+    assert hold_and_read_flags(env, 40)["success"]
     base.objects[int(base.target_slot[0])].set_linear_velocity(torch.tensor([[0.0, 0.0, 0.5]]))
     assert not bool(base.success_conditions()["at_rest"][0])
-    assert settle(env, 40)["success"]
+    assert hold_and_read_flags(env, 40)["success"]
     # a basket that was pushed too far
     basket = base.fixtures.basket
     home = basket.pose.raw_pose.clone()
     target = base.objects[int(base.target_slot[0])]
     for actor in (basket, target):
         actor.set_pose(Pose.create_from_pq(actor.pose.p + torch.tensor([[0, 0.12, 0]]), actor.pose.q))
-    flags = settle(env, 10)
+    flags = hold_and_read_flags(env, 10)
     assert flags["target_in_basket"]
     assert not flags["success"]
     assert not bool(base.success_conditions()["basket_stands"][0])
@@ -68,23 +68,23 @@ def test_success_needs_all_of_its_conditions(env):
 def test_stages_are_sticky_until_the_next_reset(env):
     env.reset(seed=0)
     put_target_into_basket(env)
-    assert settle(env, 5)["target_in_basket"]
+    assert hold_and_read_flags(env, 5)["target_in_basket"]
     base = env.unwrapped
     target = base.objects[int(base.target_slot[0])]
     target.set_pose(Pose.create_from_pq(target.pose.p + torch.tensor([[0, 0, 1.0]]), target.pose.q))
-    assert settle(env, 1)["target_in_basket"]
+    assert hold_and_read_flags(env, 1)["target_in_basket"]
     _, info = env.reset(seed=0)
     assert not any(bool(info[stage][0]) for stage in STAGES)
 
 
 def test_reset_ignores_contacts_of_the_last_episode(env, monkeypatch):
-    """Until the first step the engine reports contacts of the last episode if the scene is not rebuilt."""
+    """If the scene is not built again, the engine reports contacts of the last episode until the first step."""
     base = env.unwrapped
     forces = np.full((1, 3, len(base.objects), 3), 5.0, np.float32)
     monkeypatch.setattr(Contacts, "forces", lambda *_: forces)
     _, info = env.reset(seed=0)
     assert not any(bool(info[stage][0]) for stage in STAGES)
-    assert settle(env, 1)["reached_target"]
+    assert hold_and_read_flags(env, 1)["reached_target"]
 
 
 def test_the_instruction_names_the_target(env):
@@ -98,11 +98,11 @@ def test_arm_starts_in_the_configured_pose():
         ("rest", [0, -1.02, 0, -2.51, 0, 1.35, 0.78]),
         ("evaluation", [-0.0276, 0.1581, 0, -1.8899, -0.0688, 2.7705, 0.7514]),
     ):
-        env = gym.make("RoboCASPick-v1", config=changed(robot_start=start), **STATE_ONLY)
+        env = gym.make("RoboCASPick-v1", config=make_config(robot_start=start), **STATE_ONLY)
         env.reset(seed=0)
         robot = env.unwrapped.agent.robot
         np.testing.assert_allclose(robot.get_qpos()[0], [0, 0, 0, *joints, 0.04, 0.04], atol=1e-6)
-        settle(env, 5)  # the controller holds this pose
+        hold_and_read_flags(env, 5)  # the controller holds this pose
         np.testing.assert_allclose(robot.get_qpos()[0, 3:10], joints, atol=2e-3)
         env.close()
 
@@ -121,12 +121,12 @@ def test_arm_starts_in_the_configured_pose():
 )
 def test_configurations_that_do_not_fit_the_assets(changes, words):
     with pytest.raises(ConfigError) as error:
-        gym.make("RoboCASPick-v1", config=changed(**changes), **STATE_ONLY)
+        gym.make("RoboCASPick-v1", config=make_config(**changes), **STATE_ONLY)
     for word in words:
         assert word in str(error.value)
 
 
-def changed(**changes) -> dict:
+def make_config(**changes) -> dict:
     from robocas_ms3.scenes.config import load_task_config
 
     return {**load_task_config("pick_table_scattered").model_dump(mode="json"), **changes}
@@ -135,9 +135,9 @@ def changed(**changes) -> dict:
 def test_result_is_reused_while_nothing_moves(env):
     env.reset(seed=0)
     base = env.unwrapped
-    settle(env, 60)  # wait until all objects are at rest
+    hold_and_read_flags(env, 60)  # wait until all objects are at rest
     before = base.success_check.state
-    flags = settle(env, 10)
+    flags = hold_and_read_flags(env, 10)
     assert base.success_check.state is before
     target = base.objects[int(base.target_slot[0])]
     target.set_pose(Pose.create_from_pq(target.pose.p + torch.tensor([[0, 0, 0.5]]), target.pose.q))

@@ -26,7 +26,7 @@ def env(request):
     env.close()
 
 
-def hold(env, gripper: float = 1.0) -> np.ndarray:
+def make_hold_action(env, gripper: float = 1.0) -> np.ndarray:
     return np.append(env.unwrapped.agent.robot.get_qpos()[0, 3:10].numpy(), gripper).astype(np.float32)
 
 
@@ -45,7 +45,7 @@ def test_observations_are_finite_and_batched(env):
     assert obs["extra"]["target"].sum() == 1
     assert obs["agent"]["qpos"].shape == (1, 12)
     assert obs["agent"]["tcp_in_arm_base"].shape == (1, 7)
-    obs, reward, terminated, truncated, info = env.step(hold(env))
+    obs, reward, terminated, truncated, info = env.step(make_hold_action(env))
     for value in [*obs["agent"].values(), *obs["extra"].values()]:
         assert torch.isfinite(value).all()
     assert {"reached_any", "picked_any", "reached_target", "target_grasped", "target_in_basket"} < set(base.STAGES)
@@ -54,7 +54,7 @@ def test_observations_are_finite_and_batched(env):
         assert info[name].dtype == torch.bool
         assert not info[name].any()
     assert (reward.dtype, reward.tolist()) == (torch.float32, [0.0])
-    won = base.compute_sparse_reward(obs, hold(env), {"success": torch.tensor([True])})
+    won = base.compute_sparse_reward(obs, make_hold_action(env), {"success": torch.tensor([True])})
     assert (won.dtype, won.tolist()) == (torch.float32, [1.0])
     assert not terminated.any()
     assert not truncated.any()
@@ -72,7 +72,7 @@ def test_same_seed_same_scene_other_seed_other_scene(env):
     for seed in (5, 6, 5):
         env.reset(seed=seed)
         for _ in range(3):
-            env.step(hold(env))
+            env.step(make_hold_action(env))
         states.append(env.unwrapped.get_state())
         words.append((env.unwrapped.get_language_instruction(), [a.asset.id for a in env.unwrapped.object_assets[0]]))
     assert torch.equal(states[0], states[2])
@@ -90,7 +90,7 @@ def test_layouts_are_settled_and_match_their_kind(env, seed):
     before = base.object_poses[0, :, :3].clone()
     for second in (0.5, 1.0):
         for _ in range(10):
-            env.step(hold(env))
+            env.step(make_hold_action(env))
         moved = (base.object_poses[0, :, :3] - before).norm(dim=1)
         # rows stand and heaps lie as they did in a bare scene; with a robot in it, a bottle may tip onto its next facet
         assert moved.max() < (0.002 if kind == "scattered" else 0.005)
@@ -116,8 +116,8 @@ def test_layouts_are_settled_and_match_their_kind(env, seed):
 
 
 @lru_cache
-def checker_messages(env_id: str, mode: str) -> tuple[str, list[str]]:
-    """Return the error and the warnings of gymnasium's checker, without the environment's name."""
+def collect_checker_messages(env_id: str, mode: str) -> tuple[str, list[str]]:
+    """Run gymnasium's environment checker; return its error and its warnings without the name of the environment."""
     size = dict(width=32, height=24)
     env = CPUGymWrapper(gym.make(env_id, control_mode="pd_joint_delta_pos", obs_mode=mode, sensor_configs=size))
     error = ""
@@ -135,7 +135,7 @@ def checker_messages(env_id: str, mode: str) -> tuple[str, list[str]]:
 def test_gymnasium_checker_finds_no_more_than_in_pick_cube(name, mode, needs_renderer):
     import mani_skill.envs  # noqa: F401  (registers PickCube-v1)
 
-    error, warned = checker_messages(TASKS[name].env_id, mode)
-    theirs = checker_messages("PickCube-v1", mode)
+    error, warned = collect_checker_messages(TASKS[name].env_id, mode)
+    theirs = collect_checker_messages("PickCube-v1", mode)
     assert error == theirs[0]
     assert set(warned) <= set(theirs[1])

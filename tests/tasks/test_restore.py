@@ -1,4 +1,4 @@
-"""Restoring a state in the middle of an episode, with the targets from which the next actions start."""
+"""A restored state in the middle of an episode has the last commanded pose and the reached stages."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def env(request):
     made.close()
 
 
-def actions(env, count: int, seed: int) -> list[np.ndarray]:
-    """Return small motions about the arm's rest pose for any control mode."""
+def make_small_motions(env, count: int, seed: int) -> list[np.ndarray]:
+    """Return ``count`` actions that move the arm a little, in the control mode of the environment."""
     rng, mode = np.random.default_rng(seed), env.unwrapped.control_mode
     size = env.action_space.shape[0]
     if mode == "pd_ee_pose":
@@ -39,7 +39,7 @@ def actions(env, count: int, seed: int) -> list[np.ndarray]:
     return list((rest + drift).astype(np.float32))
 
 
-def play(env, todo: list[np.ndarray]) -> tuple[torch.Tensor, dict, dict]:
+def run_actions(env, todo: list[np.ndarray]) -> tuple[torch.Tensor, dict, dict]:
     for action in todo:
         observation, *_, info = env.step(action)
     return env.unwrapped.agent.robot.get_qpos().clone(), observation, info
@@ -49,11 +49,11 @@ def play(env, todo: list[np.ndarray]) -> tuple[torch.Tensor, dict, dict]:
 def test_restored_state_repeats_the_motion(env):
     base = env.unwrapped
     env.reset(seed=0)
-    play(env, actions(env, 10, seed=1))
+    run_actions(env, make_small_motions(env, 10, seed=1))
     kept, seen = base.get_state_dict(), base.get_obs()
-    todo = actions(env, 10, seed=2)
-    after, observation, _ = play(env, todo)
-    play(env, actions(env, 7, seed=3))
+    todo = make_small_motions(env, 10, seed=2)
+    after, observation, _ = run_actions(env, todo)
+    run_actions(env, make_small_motions(env, 7, seed=3))
     base.set_state_dict(kept)
     again = base.get_obs()
     for part, value in seen["agent"].items():
@@ -62,7 +62,7 @@ def test_restored_state_repeats_the_motion(env):
     for name, targets in seen["agent"].get("controller", {}).items():  # equal to the controller's targets
         for what, value in targets.items():
             torch.testing.assert_close(again["agent"]["controller"][name][what], value, atol=1e-6, rtol=0)
-    restored, same, _ = play(env, todo)
+    restored, same, _ = run_actions(env, todo)
     assert (restored - after).abs().max() < FREE_FALL
     torch.testing.assert_close(
         same["agent"]["tcp_in_arm_base"], observation["agent"]["tcp_in_arm_base"], atol=1e-5, rtol=0

@@ -28,8 +28,8 @@ def env():
     env.close()
 
 
-def hold(env) -> bool:
-    """Hold the arm until the clutter has been measured again; return `obstacles_cleared`."""
+def hold_until_measured(env) -> bool:
+    """Hold the arm until the clutter has been measured again; return the stage ``obstacles_cleared``."""
     qpos = env.unwrapped.agent.robot.get_qpos()[0, 3:10].numpy()
     for _ in range(env.unwrapped.control_freq // MEASUREMENTS_PER_SECOND):
         *_, info = env.step(np.append(qpos, 1.0).astype(np.float32))
@@ -43,7 +43,7 @@ def remove_other_objects(base) -> None:
 
 
 def find_covered_seed(env) -> int:
-    """Return a seed whose target is not clear at the start."""
+    """Return a seed whose target is not cleared at the start."""
     for seed in range(20):
         _, info = env.reset(seed=seed)
         if not bool(info["obstacles_cleared"][0]):
@@ -66,12 +66,12 @@ def test_removing_other_objects_clears_the_target_until_the_next_reset(env):
     seed = find_covered_seed(env)
     base = env.unwrapped
     before = base.get_state()
-    assert not hold(env)
+    assert not hold_until_measured(env)
     remove_other_objects(base)
-    assert hold(env)
+    assert hold_until_measured(env)
     assert base.hidden_fraction.tolist() == [0]
     base.set_state(before)
-    assert hold(env)  # sticky
+    assert hold_until_measured(env)  # sticky
     _, info = env.reset(seed=seed)
     assert not bool(info["obstacles_cleared"][0])
 
@@ -106,7 +106,7 @@ def test_restored_heap_is_measured_in_the_next_step(env):
     base = env.unwrapped
     before, share = base.get_state_dict(), base.hidden_fraction.clone()
     remove_other_objects(base)
-    assert hold(env)
+    assert hold_until_measured(env)
     cleared = base.get_state_dict()
     base.set_state_dict(before)
     info = base.get_info()
@@ -127,11 +127,11 @@ def test_target_that_was_pulled_out_or_fell_is_not_cleared(env):
     base = env.unwrapped
     base.success_check.stages["target_grasped"][:] = True  # and was released since
     remove_other_objects(base)
-    assert not hold(env)
+    assert not hold_until_measured(env)
     env.reset(seed=seed)
     target = base.objects[int(base.target_slot[0])]
     target.set_pose(Pose.create_from_pq(torch.tensor([[-1.0, -1.0, 0.1]]), target.pose.q))
-    assert not hold(env)
+    assert not hold_until_measured(env)
 
 
 def test_policy_finds_the_target_and_reports_moved_objects(tmp_path):

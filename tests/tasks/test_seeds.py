@@ -1,4 +1,4 @@
-"""Seeds of episodes, layouts and appearance. Several envs run without a simulator, which has one env on a CPU."""
+"""Seeds of episodes, layouts and appearance. Batches are fake, because the simulator has only one env on a CPU."""
 
 from unittest.mock import Mock
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
-from several_envs import Thing, several
+from several_envs import FakeLayout, make_batch_env
 
 from robocas_ms3 import tasks
 from robocas_ms3.core.errors import ConfigError, LayoutError, RobocasError
@@ -19,8 +19,8 @@ from robocas_ms3.tasks.seeds import SEVERAL_ENVS_SEEDS, EpisodeSeeds
 STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos", "obs_mode": "none"}
 
 
-class FourEnvs(RoboCASEnv):
-    """Seeds and layouts of four envs, without a simulator."""
+class FakeBatchEnv(RoboCASEnv):
+    """Fake batch of four envs that has only seeds."""
 
     device = torch.device("cpu")
 
@@ -34,7 +34,7 @@ class FourEnvs(RoboCASEnv):
         self._set_episode_rng(self.seeds.start_reset(seeds, list(envs)), torch.tensor(envs))
 
 
-def states(env: FourEnvs) -> list[tuple]:
+def read_generator_states(env: FakeBatchEnv) -> list[tuple]:
     rng = env._batched_episode_rng
     assert isinstance(rng, BatchedRNG)
     return [tuple(one.get_state()[1]) + (one.get_state()[2],) for one in rng.rngs]
@@ -42,12 +42,12 @@ def states(env: FourEnvs) -> list[tuple]:
 
 @pytest.mark.parametrize("seeds", [[20, 21], None])
 def test_partial_reset_does_not_change_other_envs(seeds):
-    env = FourEnvs()
+    env = FakeBatchEnv()
     env.seed([7, 8, 9, 10])
     assert env.seeds.layout_seeds.tolist() == [7, 8, 9, 10]
-    before, layouts = states(env), env.seeds.layout_seeds.copy()
+    before, layouts = read_generator_states(env), env.seeds.layout_seeds.copy()
     env.seed(seeds, envs=(1, 3))
-    after = states(env)
+    after = read_generator_states(env)
     for other in (0, 2):
         assert after[other] == before[other]
         assert env.seeds.layout_seeds[other] == layouts[other]
@@ -60,7 +60,7 @@ def test_partial_reset_does_not_change_other_envs(seeds):
 
 
 def test_unseeded_resets_draw_from_the_given_range():
-    env = FourEnvs(seed_range=(100, 109))
+    env = FakeBatchEnv(seed_range=(100, 109))
     env.seed([7, 8, 9, 10])  # requested seeds are used unchanged
     assert env.seeds.layout_seeds.tolist() == [7, 8, 9, 10]
     seen = set()
@@ -84,8 +84,8 @@ def test_an_unseeded_reset_of_one_env_draws_its_episode_seed_from_the_range():
 
 
 def test_single_seed_of_several_envs_is_continued_within_the_range(monkeypatch):
-    monkeypatch.setattr(tasks.scene_env, "make_layout_source", lambda model, folder: Thing)
-    env, asked = several(None, monkeypatch, seeds=(10, 13))
+    monkeypatch.setattr(tasks.scene_env, "make_layout_source", lambda model, folder: FakeLayout)
+    env, asked = make_batch_env(None, monkeypatch, seeds=(10, 13))
     env.reset(seed=12)
     assert [seed for _, seed in asked[-1]] == [12, 13, 10, 11]
     env.reset(seed=500)
@@ -100,10 +100,10 @@ def test_only_a_requested_seed_must_have_a_layout(monkeypatch):
     def layouts(objects, seed):
         if seed in (2, 11):
             raise LayoutError("none", where="layout")
-        return Thing(objects, seed)
+        return FakeLayout(objects, seed)
 
     monkeypatch.setattr(tasks.scene_env, "make_layout_source", lambda model, folder: layouts)
-    env, asked = several(None, monkeypatch, seeds=(10, 13))
+    env, asked = make_batch_env(None, monkeypatch, seeds=(10, 13))
     env.reset(seed=10)
     drawn = [seed for _, seed in asked[-1]]
     assert drawn[0] == 10
@@ -125,8 +125,8 @@ def test_invalid_arguments():
 
 def test_several_envs_have_a_default_range_of_seeds(monkeypatch):
     low, high = SEVERAL_ENVS_SEEDS
-    monkeypatch.setattr(tasks.scene_env, "make_layout_source", lambda model, folder: Thing)
-    env, asked = several(None, monkeypatch, num_envs=high - low + 3)
+    monkeypatch.setattr(tasks.scene_env, "make_layout_source", lambda model, folder: FakeLayout)
+    env, asked = make_batch_env(None, monkeypatch, num_envs=high - low + 3)
     assert asked[0] == [(i, i) for i in [*range(low, high + 1), low, low + 1]]
     assert env.seeds.object_ids[0] == env.seeds.object_ids[high - low + 1] != env.seeds.object_ids[1]
     env.reset()
@@ -135,24 +135,24 @@ def test_several_envs_have_a_default_range_of_seeds(monkeypatch):
     assert asked[-1][5] == (5, 1005)
 
 
-def without(*pairs):
-    """Return a source without layouts for some seed pairs, and the list of requested pairs."""
+def make_source_without(*pairs):
+    """Return a layout source that has no layouts for ``pairs``, and the list of the pairs that were requested."""
     asked = []
 
     def source(objects, seed):
         asked.append((objects, seed))
         if (objects, seed) in pairs:
             raise LayoutError("no object qualifies as the target")
-        return Thing(objects, seed)
+        return FakeLayout(objects, seed)
 
     return source, asked
 
 
 def test_unseeded_reset_draws_until_a_seed_has_a_layout(monkeypatch, caplog):
     bad = [(objects, seed) for objects in (1, 2) for seed in range(100) if seed % 2 and seed != objects]
-    source, asked = without(*bad)
+    source, asked = make_source_without(*bad)
     monkeypatch.setattr(tasks.scene_env, "make_layout_source", lambda model, folder: source)
-    env, chosen = several(None, monkeypatch)
+    env, chosen = make_batch_env(None, monkeypatch)
     for _ in range(30):
         env.reset()
     assert not set(bad) & {pair for one in chosen for pair in one}
@@ -166,23 +166,23 @@ def test_unseeded_reset_draws_until_a_seed_has_a_layout(monkeypatch, caplog):
 
 
 def test_configuration_without_layouts_fails_early(monkeypatch):
-    source, asked = without(*((seed, seed) for seed in range(100)))
+    source, asked = make_source_without(*((seed, seed) for seed in range(100)))
     monkeypatch.setattr(tasks.scene_env, "make_layout_source", lambda model, folder: source)
     with pytest.raises(LayoutError, match="no object qualifies"):
-        several(None, monkeypatch)
+        make_batch_env(None, monkeypatch)
     assert len(asked) <= 3
 
 
 def test_one_env_replaces_a_seed_without_layout_unless_requested(monkeypatch, caplog):
     sample, failed = cache.sample_layout, []
 
-    def fussy(model, objects, seed, object_ids):
+    def sample_or_fail(model, objects, seed, object_ids):
         if len(failed) < 2 or seed == 5:
             failed.append(seed)
             raise LayoutError("no object qualifies as the target")
         return sample(model, objects, seed)
 
-    monkeypatch.setattr(cache, "sample_layout", fussy)
+    monkeypatch.setattr(cache, "sample_layout", sample_or_fail)
     env = gym.make("RoboCASPick-v1", layouts=None, **STATE_ONLY)
     assert failed[0] == 2022 and "drawing another seed" in caplog.text
     failed.clear()
@@ -216,14 +216,18 @@ def test_appearance_depends_on_the_seed_and_does_not_change_the_layout(needs_ren
     data = load_task_config("pick_table_scattered").model_dump(mode="json")
     blocks = {"room": ["wall", "floor"], "lights": {}, "cameras": {}}
 
-    def look(randomisation, seed):
+    def render_and_read_poses(randomisation, seed):
         env = gym.make("RoboCASPick-v1", config={**data, "randomisation": randomisation}, obs_mode="rgb")
         obs, _ = env.reset(seed=seed)
         poses = env.unwrapped.object_poses
         env.close()
         return obs["sensor_data"]["static_camera"]["rgb"].float(), poses
 
-    plain, random, again = look({}, 3), look(blocks, 3), look(blocks, 3)
+    plain, random, again = (
+        render_and_read_poses({}, 3),
+        render_and_read_poses(blocks, 3),
+        render_and_read_poses(blocks, 3),
+    )
     assert torch.equal(plain[1], random[1])
     assert (plain[0] - random[0]).abs().mean() > 5
     assert torch.equal(random[0], again[0])

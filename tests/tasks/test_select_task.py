@@ -21,7 +21,7 @@ from robocas_ms3.scenes.relations import MARGIN
 from robocas_ms3.scenes.sample import sample_layout
 
 
-def load(name):
+def load_scene(name):
     pack = load_pack("builtin")
     return SceneModel.load(load_task_config(name), pack, pack)
 
@@ -31,7 +31,7 @@ SELECT = sorted(name for name in bundled_configs() if name.startswith("select_")
 
 @pytest.mark.parametrize("name", [name for name in SELECT if load_task_config(name).target.relations])
 def test_relation_identifies_the_target(name):
-    model = load(name)
+    model = load_scene(name)
     layout = sample_layout(model, 3, 3)
     target = layout.object_ids[layout.target]
     alike = [i for i, object_id in enumerate(layout.object_ids) if object_id == target and i != layout.target]
@@ -47,7 +47,7 @@ def test_relation_identifies_the_target(name):
 
 @pytest.mark.parametrize("name", [name for name in SELECT if not load_task_config(name).target.relations])
 def test_target_without_relation_is_the_nearest_of_its_kind(name):
-    model = load(name)
+    model = load_scene(name)
     count = model.config.objects.count
     for seed in range(3):
         layout = sample_layout(model, seed, seed)

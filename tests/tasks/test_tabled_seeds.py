@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from several_envs import several
+from several_envs import make_batch_env
 
 from robocas_ms3.cli.layouts import Build, build
 from robocas_ms3.core.errors import LayoutError
@@ -21,8 +21,8 @@ STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos", "obs_mod
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory):
-    """Return a cache folder with a table of two objects seeds and three layout seeds."""
+def cache_with_table(tmp_path_factory):
+    """Return a cache folder with a layout table of two objects seeds and three layout seeds."""
     folder = tmp_path_factory.mktemp("layouts")
     command = Build("pick_table_scattered", objects="0:2", seeds="0:3", jobs=1, out=folder, engine="cpu")
     assert build(command) == 0
@@ -30,9 +30,9 @@ def built(tmp_path_factory):
 
 
 @pytest.fixture
-def tabled(built, tmp_path, monkeypatch):
-    """Return a cache folder with only an unchecked table of a GPU; sampling or reading a layout would fail."""
-    shutil.copytree(built, tmp_path, dirs_exist_ok=True)
+def cache_of_gpu_table(cache_with_table, tmp_path, monkeypatch):
+    """Return a cache folder with an unchecked layout table of a GPU; sampling a layout or reading its file fails."""
+    shutil.copytree(cache_with_table, tmp_path, dirs_exist_ok=True)
     assert cache.count_layouts(next(tmp_path.iterdir())) == 6
     table = next(tmp_path.glob("*/table-cpu.npy"))
     table.rename(table.with_name("table-gpu.npy"))
@@ -41,16 +41,16 @@ def tabled(built, tmp_path, monkeypatch):
     return tmp_path
 
 
-def assert_same(one: InitialStates, two: InitialStates) -> None:
+def assert_equal_states(one: InitialStates, two: InitialStates) -> None:
     for field in fields(InitialStates):
         torch.testing.assert_close(getattr(one, field.name), getattr(two, field.name), atol=1e-6, rtol=0)
 
 
-def test_several_envs_reset_from_a_table_built_for_them(tabled, monkeypatch):
-    env, asked = several(tabled, monkeypatch, seeds=(0, 1))
+def test_several_envs_reset_from_a_table_built_for_them(cache_of_gpu_table, monkeypatch):
+    env, asked = make_batch_env(cache_of_gpu_table, monkeypatch, seeds=(0, 1))
     everyone = np.arange(4)
     one_by_one = InitialStates.from_layouts([env.layout(i) for i in range(4)], "cpu")
-    assert_same(env.seeds.find_initial_states(everyone, env.device), one_by_one)
+    assert_equal_states(env.seeds.find_initial_states(everyone, env.device), one_by_one)
     assert asked == [[(0, 0), (1, 1), (0, 0), (1, 1)]]
     for _ in range(20):
         env.reset()
@@ -58,19 +58,19 @@ def test_several_envs_reset_from_a_table_built_for_them(tabled, monkeypatch):
     assert all([objects for objects, _ in one] == [0, 1, 0, 1] for one in asked)
     env.reset(options={"env_idx": torch.tensor([2])})
     assert [objects for objects, _ in asked[-1]] == [0]
-    assert_same(
+    assert_equal_states(
         env.seeds.find_initial_states(np.array([2]), env.device), InitialStates.from_layouts([env.layout(2)], "cpu")
     )
     assert env.layouts[0].object_ids == env.seeds.object_ids[2] == env.seeds.object_ids[0] != env.seeds.object_ids[1]
 
 
-def test_unstable_layouts_are_not_drawn_and_are_errors_when_requested(tabled, monkeypatch):
-    env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
+def test_unstable_layouts_are_not_drawn_and_are_errors_when_requested(cache_of_gpu_table, monkeypatch):
+    env, _ = make_batch_env(cache_of_gpu_table, monkeypatch, num_envs=2, seeds=(0, 2))
     layouts: Any = env.seeds.layouts
     layouts.write_statuses(
         "gpu", {(0, 1): LayoutStatus.UNSTABLE, (1, 1): LayoutStatus.UNSTABLE, (1, 2): LayoutStatus.STABLE}
     )
-    env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
+    env, _ = make_batch_env(cache_of_gpu_table, monkeypatch, num_envs=2, seeds=(0, 2))
     assert env.seeds.objects_seeds.tolist() == [0, 1]  # env 1 keeps its objects, and starts with another layout
     for _ in range(20):
         env.reset()
@@ -80,12 +80,12 @@ def test_unstable_layouts_are_not_drawn_and_are_errors_when_requested(tabled, mo
         env.reset(seed=[1, 0])
 
 
-def test_objects_without_stable_layout_are_not_used(tabled, monkeypatch, caplog):
-    env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
+def test_objects_without_stable_layout_are_not_used(cache_of_gpu_table, monkeypatch, caplog):
+    env, _ = make_batch_env(cache_of_gpu_table, monkeypatch, num_envs=2, seeds=(0, 2))
     layouts: Any = env.seeds.layouts
     layouts.write_statuses("gpu", {pair: LayoutStatus.UNSTABLE for pair in [(0, 0), (0, 2), (1, 0), (1, 1), (1, 2)]})
     for _ in range(10):
-        env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 1))
+        env, _ = make_batch_env(cache_of_gpu_table, monkeypatch, num_envs=2, seeds=(0, 1))
         assert env.seeds.objects_seeds.tolist() == [0, 0]
         for _ in range(10):
             env._set_episode_rng(None, torch.tensor([0, 1]))
@@ -94,11 +94,11 @@ def test_objects_without_stable_layout_are_not_used(tabled, monkeypatch, caplog)
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
 
 
-def test_failed_reset_does_not_change_the_envs(tabled, monkeypatch):
-    env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
+def test_failed_reset_does_not_change_the_envs(cache_of_gpu_table, monkeypatch):
+    env, _ = make_batch_env(cache_of_gpu_table, monkeypatch, num_envs=2, seeds=(0, 2))
     layouts: Any = env.seeds.layouts
     layouts.write_statuses("gpu", {(0, 1): LayoutStatus.UNSTABLE})
-    env, _ = several(tabled, monkeypatch, num_envs=2, seeds=(0, 2))
+    env, _ = make_batch_env(cache_of_gpu_table, monkeypatch, num_envs=2, seeds=(0, 2))
     env.reset(seed=[2, 0])
     before = [env.layout(i).object_poses for i in range(2)]
     for _ in range(3):
@@ -111,21 +111,21 @@ def test_failed_reset_does_not_change_the_envs(tabled, monkeypatch):
     env.reset(seed=[1, 2])  # the failed reset left no state
 
 
-def test_layouts_missing_in_the_table_come_from_the_cache(built, tmp_path, monkeypatch):
-    shutil.copytree(built, tmp_path, dirs_exist_ok=True)
+def test_layouts_missing_in_the_table_come_from_the_cache(cache_with_table, tmp_path, monkeypatch):
+    shutil.copytree(cache_with_table, tmp_path, dirs_exist_ok=True)
     table = next(tmp_path.glob("*/table-cpu.npy"))
     table.rename(table.with_name("table-gpu.npy"))
-    env, _ = several(tmp_path, monkeypatch, num_envs=2, seeds=(0, 1))
+    env, _ = make_batch_env(tmp_path, monkeypatch, num_envs=2, seeds=(0, 1))
     env.reset(seed=[1, 7])
     assert env.seeds.table is not None
     assert env.seeds.table.status((1, 7)) == LayoutStatus.MISSING
     found = env.seeds.find_initial_states(np.array([0, 1]), env.device)
-    assert_same(found, InitialStates.from_layouts([env.seeds.layouts(0, 1), env.seeds.layouts(1, 7)], "cpu"))
+    assert_equal_states(found, InitialStates.from_layouts([env.seeds.layouts(0, 1), env.seeds.layouts(1, 7)], "cpu"))
 
 
-def test_one_env_that_keeps_its_objects_resets_from_a_table(built, monkeypatch):
+def test_one_env_that_keeps_its_objects_resets_from_a_table(cache_with_table, monkeypatch):
     monkeypatch.setattr(cache, "sample_layout", None)
-    made = gym.make("RoboCASPick-v1", layouts=built, reconfiguration_freq=0, seeds=(0, 2), **STATE_ONLY)
+    made = gym.make("RoboCASPick-v1", layouts=cache_with_table, reconfiguration_freq=0, seeds=(0, 2), **STATE_ONLY)
     env: Any = made.unwrapped
     assert env.seeds.initial_state_table is not None
     for seed in (2, 0):

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from vector_envs import STATE_ONLY, with_gpu
+from vector_envs import STATE_ONLY, set_gpu_available
 
 import robocas_ms3
 from robocas_ms3.core.errors import VectorEnvError
@@ -24,7 +24,7 @@ from robocas_ms3.tasks.vector.worker import join_rows, split_rows
     ],
 )
 def test_backend_depends_on_arguments_and_devices(monkeypatch, backend, sim_backend, gpu, chosen):
-    with_gpu(monkeypatch, gpu)
+    set_gpu_available(monkeypatch, gpu)
     assert choose_backend(backend, sim_backend) == chosen
 
 
@@ -39,7 +39,7 @@ def test_backend_depends_on_arguments_and_devices(monkeypatch, backend, sim_back
     ],
 )
 def test_invalid_backend(monkeypatch, backend, sim_backend, gpu):
-    with_gpu(monkeypatch, gpu)
+    set_gpu_available(monkeypatch, gpu)
     with pytest.raises(VectorEnvError):
         choose_backend(backend, sim_backend)
 
@@ -63,13 +63,13 @@ def test_invalid_arguments(arguments):
 
 @pytest.mark.parametrize("arguments", [{}, {"sim_backend": "physx_cpu"}])
 def test_several_envs_in_one_process_on_a_cpu_point_to_make_vec(monkeypatch, arguments):
-    with_gpu(monkeypatch, bool(arguments))
+    set_gpu_available(monkeypatch, bool(arguments))
     with pytest.raises(VectorEnvError, match=r"num_envs=4.*robocas_ms3\.make_vec"):
         gym.make("RoboCASPick-v1", num_envs=4, **STATE_ONLY, **arguments)
 
 
 class FakeBatch(gym.Env):
-    """Three envs that count their steps: env i succeeds only at step i + 2, and each episode has four steps."""
+    """Fake batch of three envs: env i succeeds only at step i + 2, and each episode has four steps."""
 
     reconfiguration_freq, device, spec = 0, torch.device("cpu"), None
     single_action_space = gym.spaces.Box(-1, 1, (2,))

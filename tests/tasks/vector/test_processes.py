@@ -15,13 +15,13 @@ import torch
 from vector_envs import (
     HORIZON,
     CrashingWrapper,
+    CustomError,
     MisbehavingWrapper,
     MissingLayoutsWrapper,
-    OwnError,
     SucceedingWrapper,
-    have_ended,
-    make,
     make_actions,
+    make_short_vec,
+    wait_for_end,
 )
 
 from robocas_ms3.core.errors import ConfigError, ExtensionError, LayoutError, VectorEnvCrashError, VectorEnvError
@@ -34,7 +34,7 @@ slow = pytest.mark.slow
 @pytest.fixture(scope="module")
 def env():
     with closing(
-        make(3, 2, arrays="numpy", obs_mode="state_dict", reward_mode="dense", wrappers=[SucceedingWrapper])
+        make_short_vec(3, 2, arrays="numpy", obs_mode="state_dict", reward_mode="dense", wrappers=[SucceedingWrapper])
     ) as made:
         yield made
 
@@ -75,7 +75,7 @@ def test_terms_of_the_reward_are_batched(env):
 
 @slow
 def test_requested_seed_without_layout_is_an_error():
-    with closing(make(2, 1, wrappers=[MissingLayoutsWrapper], seeds=(4, 6))) as env:
+    with closing(make_short_vec(2, 1, wrappers=[MissingLayoutsWrapper], seeds=(4, 6))) as env:
         with pytest.raises(LayoutError, match="no object qualifies"):
             env.reset(seed=5)
         with pytest.raises(VectorEnvError, match="envs 0, 1.*failed.*Reset"):
@@ -91,17 +91,17 @@ def test_requested_seed_without_layout_is_an_error():
 
 @slow
 def test_errors_and_crashes_of_a_process(capfd):
-    with closing(make(4, 2, wrappers=[MisbehavingWrapper])) as env:
+    with closing(make_short_vec(4, 2, wrappers=[MisbehavingWrapper])) as env:
         first, _ = env.reset(seed=0)
-        with pytest.raises(OwnError) as error:
+        with pytest.raises(CustomError) as error:
             env.step(make_actions(0, 0, 2, 3))
         assert error.value.args == ("gripper fell off", 7)
         assert "env 2" in str(error.value.__cause__)
-        assert "in step\n    raise OwnError" in str(error.value.__cause__)
+        assert "in step\n    raise CustomError" in str(error.value.__cause__)
         with pytest.raises(VectorEnvError, match="Reset them first"):
             env.step(make_actions(0, 0, 0, 0))
         assert torch.equal(env.reset(seed=0)[0], first)
-        with pytest.raises(RuntimeError, match="Unsendable: lost somewhere"):
+        with pytest.raises(RuntimeError, match="UnpicklableError: lost somewhere"):
             env.step(make_actions(3, 0, 0, 0))
         env.reset(seed=0)
         with pytest.raises(TypeError, match="pickle.*lock"):
@@ -131,7 +131,7 @@ def test_errors_and_crashes_of_a_process(capfd):
         pids = env.unwrapped.pids
         with pytest.raises(VectorEnvCrashError, match=r"env 3: its worker process crashed \(found SIGKILL"):
             env.step(make_actions(7, 0, 0, 4))  # without waiting for the first one
-        assert have_ended(pids)
+        assert wait_for_end(pids)
         with pytest.raises(VectorEnvError, match="closed"):
             env.step(make_actions(0, 0, 0, 0))
         env.close()
@@ -141,14 +141,14 @@ def test_errors_and_crashes_of_a_process(capfd):
 
 @slow
 def test_process_killed_between_two_steps_is_not_replaced():
-    with closing(make(2, 2)) as env:
+    with closing(make_short_vec(2, 2)) as env:
         env.reset(seed=0)
         pids = env.unwrapped.pids
         os.kill(pids[1], signal.SIGKILL)
         with pytest.raises(VectorEnvCrashError, match="env 1: its worker process crashed") as died:
             env.step(make_actions(0, 0))
         assert died.value.envs == (1,)
-        assert have_ended(pids)
+        assert wait_for_end(pids)
 
 
 @slow
@@ -157,7 +157,7 @@ def test_process_killed_between_two_steps_is_not_replaced():
 )
 def test_a_process_that_exceeds_a_limit_is_ended(limits, found):
     raises = pytest.raises(VectorEnvCrashError, match="env 0")
-    with raises as died, closing(make(1, 1, wrappers=[MisbehavingWrapper], limits=limits)) as env:
+    with raises as died, closing(make_short_vec(1, 1, wrappers=[MisbehavingWrapper], limits=limits)) as env:
         env.reset(seed=0)
         env.step(make_actions(7))
     assert died.value.found == found
@@ -165,7 +165,7 @@ def test_a_process_that_exceeds_a_limit_is_ended(limits, found):
 
 @slow
 def test_close_does_not_wait_for_a_busy_process():
-    env = make(1, 1, wrappers=[MisbehavingWrapper])
+    env = make_short_vec(1, 1, wrappers=[MisbehavingWrapper])
     env.reset(seed=0)
     threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
     with pytest.raises(KeyboardInterrupt):
@@ -173,18 +173,18 @@ def test_close_does_not_wait_for_a_busy_process():
     started, pids = time.monotonic(), env.unwrapped.pids
     env.close()
     assert time.monotonic() - started < 2.5
-    assert have_ended(pids)
+    assert wait_for_end(pids)
 
 
 @slow
 def test_errors_of_making_environments_keep_their_type():
     with pytest.raises(ConfigError, match="no_such_config") as error:
-        make(2, 1, config="no_such_config")
+        make_short_vec(2, 1, config="no_such_config")
     assert "env 0" in str(error.value.__cause__)
     with pytest.raises(VectorEnvError, match="can't be sent"):
-        make(1, 1, config={"lock": threading.Lock()})
+        make_short_vec(1, 1, config={"lock": threading.Lock()})
     with pytest.raises(VectorEnvCrashError) as died:
-        make(1, 1, wrappers=[CrashingWrapper])
+        make_short_vec(1, 1, wrappers=[CrashingWrapper])
     assert died.value.envs == (0,)
     assert died.value.found == "SIGSEGV" and "robocas doctor" in died.value.fix
 
@@ -192,16 +192,16 @@ def test_errors_of_making_environments_keep_their_type():
 def test_env_registered_in_the_main_program_is_an_error(monkeypatch):
     monkeypatch.setattr(RoboCASPickEnv, "__module__", "__main__")
     with pytest.raises(VectorEnvError, match=r"RoboCASPick-v1.*my_module:"):
-        make(1, 1)
+        make_short_vec(1, 1)
 
 
 @slow
 def test_deleted_vector_environment_is_closed():
-    env = make(1, 1)
+    env = make_short_vec(1, 1)
     pids = env.unwrapped.pids
     del env
     gc.collect()
-    assert have_ended(pids)
+    assert wait_for_end(pids)
 
 
 PROGRAM = """
@@ -223,6 +223,6 @@ print(*env.unwrapped.pids, flush=True)
 def test_processes_end_with_a_program_that_was_read_from_a_pipe(end):
     done = subprocess.run([sys.executable, "-"], input=PROGRAM + end, capture_output=True, text=True, check=False)
     assert done.returncode == (-signal.SIGKILL if "SIGKILL" in end else -signal.SIGINT if end else 0), done.stderr
-    assert have_ended([int(pid) for pid in done.stdout.split()])
+    assert wait_for_end([int(pid) for pid in done.stdout.split()])
     assert len(done.stdout.split()) == 1
     assert done.stderr.count("Traceback") == ("SIGINT" in end)

@@ -16,24 +16,24 @@ STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_delta_pos", "o
 HORIZON = 4
 
 
-def with_gpu(monkeypatch, there: bool) -> None:
+def set_gpu_available(monkeypatch, there: bool) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
 
 
-def make(num_envs: int, workers: int, **kwargs):
+def make_short_vec(num_envs: int, workers: int, **kwargs):
     kwargs = {"backend": "processes", "max_episode_steps": HORIZON, **STATE_ONLY, **kwargs}
     return robocas_ms3.make_vec("RoboCASPick-v1", num_envs, workers=workers, **kwargs)
 
 
 def make_actions(*what: int) -> np.ndarray:
-    """Return actions that start with these numbers, one per env."""
+    """Return one action per env that has this number as its first component, and zeros."""
     actions = np.zeros((len(what), 8), np.float32)
     actions[:, 0] = what
     return actions
 
 
-def have_ended(pids: list[int]) -> bool:
-    """Return whether processes end within 5 s and leave no zombies."""
+def wait_for_end(pids: list[int]) -> bool:
+    """Wait for the end of processes; return whether all ended within 5 s, without zombies."""
     for _ in range(100):
         if not any(os.path.exists(f"/proc/{pid}") for pid in pids):
             return True
@@ -41,14 +41,14 @@ def have_ended(pids: list[int]) -> bool:
     return False
 
 
-class OwnError(Exception):
-    """Error of a user's wrapper, with two arguments."""
+class CustomError(Exception):
+    """Error of a custom wrapper, with two arguments."""
 
     def __init__(self, what: str, code: int) -> None:
         super().__init__(what, code)
 
 
-class Unsendable(Exception):
+class UnpicklableError(Exception):
     """Error that can be pickled but not unpickled."""
 
     def __init__(self, what: str, where: str) -> None:
@@ -56,17 +56,18 @@ class Unsendable(Exception):
 
 
 class MisbehavingWrapper(gym.Wrapper):
-    """Wrapper that reads the first number of an action: 2 an error, 3 an unsendable error, 4 a kill, 5 a delay of 3 s.
+    """Wrapper with a fault that the first number of the action selects.
 
-    6: a lock in the info; 7 takes an hour; 8 ends the process.
+    2: an error. 3: an error that can't be unpickled. 4: SIGKILL. 5: a delay of 3 s. 6: a lock in the info. 7: a delay
+    of an hour. 8: KeyboardInterrupt.
     """
 
     def step(self, action):
         what = round(float(action[0]))
         if what == 2:
-            raise OwnError("gripper fell off", 7)
+            raise CustomError("gripper fell off", 7)
         if what == 3:
-            raise Unsendable("lost", "somewhere")
+            raise UnpicklableError("lost", "somewhere")
         if what == 4:
             os.kill(os.getpid(), signal.SIGKILL)
         if what == 8:
@@ -83,7 +84,7 @@ class CrashingWrapper(gym.Wrapper):
 
 
 class SucceedingWrapper(gym.Wrapper):
-    """Wrapper that succeeds only at step 2 of an episode, if the first number of the action is positive."""
+    """Wrapper whose ``success`` is true only at step 2, if the first number of the action is positive."""
 
     def step(self, action):
         obs, _, _, truncated, info = self.env.step(action)
@@ -95,19 +96,19 @@ class SucceedingWrapper(gym.Wrapper):
 
 
 class MissingLayoutsWrapper(gym.Wrapper):
-    """Wrapper without a layout for seed 5, and for every other unseeded reset after the seed ``draws_none_after``."""
+    """Wrapper without a layout for seed 5, and for every second reset without a seed after ``draws_none_after``."""
 
     def __init__(self, env):
         super().__init__(env)
         self.times = 0
         base, layouts = env.unwrapped, env.unwrapped.seeds.layouts
 
-        def fussy(objects, seed):
+        def find_layout_or_fail(objects, seed):
             if seed == 5:
                 raise LayoutError("no object qualifies as the target", where="layout")
             return layouts(objects, seed)
 
-        base.seeds.layouts = fussy
+        base.seeds.layouts = find_layout_or_fail
 
     def reset(self, *, seed=None, options=None):
         if seed is None and self.unwrapped._main_seed[0] == options.get("draws_none_after"):
