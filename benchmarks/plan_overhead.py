@@ -68,7 +68,7 @@ def main(cfg: Benchmark) -> None:
         run_shard(LocalExecutor(folder, cfg.workers), (0, 1))
         cpu = time.process_time() - cpu
         units = [WorkUnit(0, block) for block in range(cfg.units)]
-        at = np.sort([one.at for unit in units for one in folder.outcomes(unit) or ()])
+        at = np.sort([one.at for unit in units for one in folder.read_outcomes(unit) or ()])
     # from the start of the last worker until the first worker is idle
     first, last = 2 * cfg.workers, cfg.units - cfg.workers
     rate = (last - first) / (at[last] - at[first])

@@ -23,7 +23,7 @@ import tyro
 import yaml
 
 from robocas_ms3.plans.folder import Outcome, read_plan
-from robocas_ms3.plans.progress import Progress
+from robocas_ms3.plans.progress import PlanProgress
 from robocas_ms3.plans.status import read_status
 
 LOOK = 5.0  # s between two samples of memory
@@ -108,10 +108,10 @@ def watch(process: subprocess.Popen[bytes], until: float) -> dict[int, Memory]:
 
 def report(cfg: Benchmark, out: Path, wall: float, ctrl_c: float, memory: dict[int, Memory]) -> dict[str, Any]:
     """Return the measurements."""
-    progress = Progress(read_plan(out))
+    progress = PlanProgress(read_plan(out))
     found: dict[str, list[Outcome]] = defaultdict(list)
     for unit, outcomes in [*progress.done.items(), *progress.partial.items()]:
-        found[progress.plan.name_of(unit.part).split("-")[0]] += outcomes
+        found[progress.plan.part_name(unit.part).split("-")[0]] += outcomes
     good = {task: [one for one in made if one.success] for task, made in found.items()}
     cpu = {
         task: sum(one.record_seconds + one.render_seconds for one in made) / max(1, len(good[task]))

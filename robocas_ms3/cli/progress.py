@@ -15,7 +15,7 @@ from robocas_ms3.cli.terminal import print_stderr, terminal_of_stderr
 from robocas_ms3.core.text import escape_controls, format_count
 
 if TYPE_CHECKING:
-    from robocas_ms3.plans.status import Status
+    from robocas_ms3.plans.status import PlanStatus
 
 LOG_INTERVAL = 60.0  # s between two lines of a log
 _MAX_PART_BARS = 12  # a plan with more parts has one bar
@@ -126,7 +126,7 @@ class ProgressBar:
         self._display.show([(self._description, self._total, done)], text, speed)
 
 
-def show_plan(display: ProgressDisplay, status: Status) -> None:
+def show_plan(display: ProgressDisplay, status: PlanStatus) -> None:
     """Show the status of a plan: one bar per part, and one for all."""
     bars = [(part.name, part.requested, part.done) for part in status.parts]
     total, done = sum(part.requested for part in status.parts), sum(part.done for part in status.parts)

@@ -1,9 +1,9 @@
 """The output folder of a plan: `plan.json`, and the files of its work units.
 
-`units/PART/BLOCK/SEED/` has the episode of a seed and `outcome.json`. Its files are written to a temporary folder,
-which is renamed when they are complete. So two workers may run the same work unit, even at the same time: the first
-folder of a seed is kept, and a second one would have the same content. `seeds.jsonl` has the outcomes of a complete
-work unit, one per line.
+`units/PART/BLOCK/SEED/` has the episode of a seed and `outcome.json`. A worker writes these files to a temporary folder
+and renames the folder when the files are complete. So two workers may run the same work unit, even at the same time:
+the folder that is complete first is kept, and the other one would have the same content. `seeds.jsonl` has the outcomes
+of a complete work unit, one per line.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Seconds = Annotated[float, Field(ge=0, le=1e12)]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a seed."""
+    """Outcome of one seed: success or failure, reasons of failures, times and size."""
 
     seed: Annotated[int, Field(ge=0, le=MAX_SEED)]
     success: bool  # whether the seed has an episode
@@ -60,53 +60,53 @@ _OUTCOME: TypeAdapter[Outcome] = TypeAdapter(Outcome)
 
 @dataclass(frozen=True)
 class SeedFiles:
-    """Paths of the files of one seed of a part."""
+    """Paths of the files of one seed of a plan part; ``part`` is the index of the plan part."""
 
     part: int
     seed: int
     folder: Path
 
     @property
-    def layout(self) -> Path:
-        """Layout file of the stage `layouts`."""
+    def layout_path(self) -> Path:
+        """Path of the layout that the stage `layouts` writes."""
         return self.folder / "layout.npy"
 
     @property
-    def recording(self) -> Path:
-        """HDF5 file of the recorded episode; its JSON file is next to it."""
+    def recording_path(self) -> Path:
+        """Path of the HDF5 file of the recorded episode; its JSON file is next to it."""
         return self.folder / "recording.h5"
 
     @property
-    def episode(self) -> Path:
-        """Folder of the rendered episode."""
+    def episode_path(self) -> Path:
+        """Path of the folder of the rendered episode."""
         return self.folder / episode_folder(0)
 
     def size(self) -> int:
-        """Return the size of all files without the outcome, bytes."""
+        """Return the size of all files except ``outcome.json``, bytes."""
         return sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file() and path.name != OUTCOME)
 
-    def outcome(self) -> Outcome | None:
-        """Read the outcome; return None if the seed is not complete or the file is damaged."""
+    def read_outcome(self) -> Outcome | None:
+        """Read ``outcome.json``; return None if the file is missing (the seed is not complete) or damaged."""
         with suppress(OSError, DocumentError, ValidationError):
             return validate_json(_OUTCOME, read_bytes(self.folder / OUTCOME, JSON_LIMIT))
 
-    def write(self, outcome: Outcome) -> None:
-        """Write the outcome."""
+    def write_outcome(self, outcome: Outcome) -> None:
+        """Write ``outcome.json``."""
         (self.folder / OUTCOME).write_bytes(_OUTCOME.dump_json(outcome))
 
     @contextmanager
     def temporary_files(self) -> Iterator[SeedFiles]:
-        """Yield files in a temporary folder, which is renamed to this folder at the end unless this folder exists."""
+        """Yield paths in a temporary folder; rename it to ``folder`` on success, unless ``folder`` is complete."""
         tmp = make_folder(self.folder.with_name(f".{self.folder.name}.{secrets.token_hex(8)}.tmp"))
         try:
             yield SeedFiles(self.part, self.seed, tmp)
             flush_to_disk(tmp)  # after a power cut, a folder with this name has complete files
-            if self.folder.is_dir() and self.outcome() is None:
+            if self.folder.is_dir() and self.read_outcome() is None:
                 shutil.rmtree(self.folder)  # damaged by a disk error
             try:
                 tmp.rename(self.folder)
             except OSError:
-                if self.outcome() is None:
+                if self.read_outcome() is None:
                     raise
         finally:
             shutil.rmtree(tmp, ignore_errors=True)
@@ -114,20 +114,20 @@ class SeedFiles:
 
 @dataclass(frozen=True, order=True)
 class WorkUnit:
-    """A block of consecutive seeds of a part, which one worker runs."""
+    """A block of consecutive seeds of a plan part, which one worker runs; both numbers are indices from 0."""
 
     part: int
     block: int
 
     def seeds(self, plan: Plan) -> range:
-        """Return the seeds of the unit."""
-        size = plan.block_of(self.part)
+        """Return the seeds of this work unit."""
+        size = plan.seeds_per_unit(self.part)
         first = plan.parts[self.part].seed + self.block * size
         return range(first, first + size)
 
 
-def _settings_of(record: dict[str, Any]) -> dict[str, Any]:
-    """Return the part of the content of `plan.json` that may not change between runs."""
+def _unchangeable_settings(record: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of `plan.json` without the keys that may change between runs."""
     plan = record["plan"]
     if isinstance(plan, dict):
         plan = {key: value for key, value in plan.items() if key not in CHANGEABLE_KEYS}
@@ -137,72 +137,74 @@ def _settings_of(record: dict[str, Any]) -> dict[str, Any]:
     return {**record, "plan": plan}
 
 
-_KIND = FolderKind("robocas plan run", (PLAN,), "plan", upgrade=_settings_of)
+_KIND = FolderKind("robocas plan run", (PLAN,), "plan", upgrade=_unchangeable_settings)
 
 
 @dataclass(frozen=True)
 class PlanFolder:
-    """The output folder of a plan."""
+    """Output folder of a plan: its paths, and the outcomes of its work units."""
 
     plan: Plan
     path: Path
 
-    def record(self) -> dict[str, Any]:
-        """Return the content of ``plan.json``: the plan and the versions of the packages."""
+    def make_record(self) -> dict[str, Any]:
+        """Return the content for ``plan.json``: the plan and the versions of the packages."""
         return {"plan": self.plan.model_dump(mode="json"), "versions": package_versions()}
 
-    def open(self, *, overwrite: bool = False, shared: bool = False) -> OutputFolder:
-        """Return a context manager that checks that the folder belongs to this plan and these versions."""
-        return OutputFolder(self.path, _KIND, _settings_of(self.record()), overwrite=overwrite, shared=shared)
+    def open_output(self, *, overwrite: bool = False, shared: bool = False) -> OutputFolder:
+        """Return the `OutputFolder`; on entry it checks that the folder belongs to this plan and these versions."""
+        return OutputFolder(
+            self.path, _KIND, _unchangeable_settings(self.make_record()), overwrite=overwrite, shared=shared
+        )
 
     def unit_folder(self, unit: WorkUnit) -> Path:
         """Return the folder of a work unit."""
-        return self.path / UNITS / self.plan.name_of(unit.part) / f"{unit.block:05d}"
+        return self.path / UNITS / self.plan.part_name(unit.part) / f"{unit.block:05d}"
 
-    def files(self, unit: WorkUnit, seed: int) -> SeedFiles:
-        """Return the files of a seed of a work unit."""
+    def seed_files(self, unit: WorkUnit, seed: int) -> SeedFiles:
+        """Return the paths of the files of a seed of a work unit."""
         return SeedFiles(unit.part, seed, self.unit_folder(unit) / f"{seed:010d}")
 
     def started_units(self) -> list[WorkUnit]:
-        """Return the work units that have a folder, in order."""
+        """Return the work units that have a folder, ordered by plan part and block."""
         units: list[WorkUnit] = []
         for part in range(len(self.plan.parts)):
             with suppress(FileNotFoundError):  # listing is up to date on NFS; a test of existence may be cached
-                names = os.listdir(self.path / UNITS / self.plan.name_of(part))
+                names = os.listdir(self.path / UNITS / self.plan.part_name(part))
                 units += sorted(WorkUnit(part, int(name)) for name in names if name.isascii() and name.isdecimal())
         return units
 
-    def outcomes(self, unit: WorkUnit) -> list[Outcome] | None:
-        """Read the outcomes of all seeds of a work unit, in order; return None if the unit is not complete."""
+    def read_outcomes(self, unit: WorkUnit) -> list[Outcome] | None:
+        """Read the outcomes of all seeds of a work unit, in seed order; return None if a seed is not complete."""
         found: dict[int, Outcome] = {}
         with suppress(OSError, DocumentError):
             found = {outcome.seed: outcome for outcome in self._outcome_lines(unit).read()}
         seeds = unit.seeds(self.plan)
         return [found[seed] for seed in seeds] if found.keys() >= set(seeds) else None
 
-    def partial_outcomes(self, unit: WorkUnit) -> list[Outcome]:
-        """Read the outcomes of the completed seeds of a work unit, in order."""
-        found = (self.files(unit, seed).outcome() for seed in unit.seeds(self.plan))
+    def read_partial_outcomes(self, unit: WorkUnit) -> list[Outcome]:
+        """Read the outcomes of the complete seeds of a work unit, in seed order."""
+        found = (self.seed_files(unit, seed).read_outcome() for seed in unit.seeds(self.plan))
         return [outcome for outcome in found if outcome is not None]
 
     def write_outcomes(self, unit: WorkUnit) -> None:
-        """Write ``seeds.jsonl`` of a work unit if all its seeds are complete."""
-        outcomes = self.partial_outcomes(unit)
+        """Write ``seeds.jsonl`` of a work unit if all seeds of the work unit are complete."""
+        outcomes = self.read_partial_outcomes(unit)
         if len(outcomes) == len(unit.seeds(self.plan)):
             self._outcome_lines(unit).rewrite(outcomes)
 
     def delete_seeds(self, unit: WorkUnit, seeds: Collection[int]) -> None:
-        """Delete seeds of a work unit, so that they run again."""
+        """Delete the folders of some seeds of a work unit, so that these seeds run again."""
         self._outcome_lines(unit).path.unlink(missing_ok=True)
         for seed in seeds:
-            shutil.rmtree(self.files(unit, seed).folder, ignore_errors=True)
+            shutil.rmtree(self.seed_files(unit, seed).folder, ignore_errors=True)
 
     def _outcome_lines(self, unit: WorkUnit) -> JsonLinesFile[Outcome]:
         return JsonLinesFile(self.unit_folder(unit) / OUTCOMES, Outcome)
 
 
 def read_plan(out: Path) -> PlanFolder:
-    """Read the plan of an output folder; raise PlanError if the folder has no plan."""
+    """Read ``plan.json`` of an output folder; raise PlanError if the file is missing or damaged."""
     path = out / PLAN
     try:
         record = load_json(path)
@@ -212,6 +214,8 @@ def read_plan(out: Path) -> PlanFolder:
             fix = "Pass the --out folder of robocas plan run."
             raise PlanError("not the output folder of a plan", where=out, found=found, fix=fix) from error
         found = error.strerror if isinstance(error, OSError) else error
-        raise PlanError("cannot read this plan", where=path, found=found) from error
+        raise PlanError(
+            "cannot read the plan of this run", where=path, found=found, fix="Pass --overwrite to start again."
+        ) from error
     plan = record.get("plan") if isinstance(record, dict) else None
     return PlanFolder(parse(Plan, plan, PlanError, where=path, about="invalid plan"), out)

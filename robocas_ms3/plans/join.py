@@ -1,4 +1,4 @@
-"""Join the episodes of work units: layouts and demonstrations per part, and the dataset of all parts."""
+"""Join the episodes of work units: layouts and demonstrations per plan part, and the dataset of all plan parts."""
 
 from __future__ import annotations
 
@@ -44,31 +44,31 @@ from robocas_ms3.scenes.layout_table import join_frozen_layouts
 
 TRAJECTORY = "trajectory.h5"
 ChosenEpisodes = Mapping[int, Sequence[tuple[WorkUnit, Outcome]]]
-"""Part -> its episodes, in the order of their seeds."""
+"""Index of a plan part -> (work unit, outcome) of each episode to join, in the order of their seeds."""
 EpisodeFiles = Mapping[int, Sequence[SeedFiles]]
 OnStage = Callable[[str], None]
 _log = logging.getLogger(__name__)
 
 
-def join(
+def join_episodes(
     folder: PlanFolder, chosen: ChosenEpisodes, *, jobs: int = 1, on_stage: OnStage = lambda text: None
 ) -> dict[str, Any]:
-    """Join all episodes and return the content of ``report.json``; after a kill, another call continues.
+    """Join all episodes and return the content of ``report.json``; continue a join that was interrupted.
 
-    The files of work units are deleted when the joined files are complete and flushed to disk.
+    When the joined files are complete and flushed to disk, the files of the work units are deleted.
 
     Args:
         folder: output folder of the plan.
         chosen: episodes to join.
-        jobs: number of processes that write the LeRobot dataset, at most one per core.
-        on_stage: called with the name of each stage.
+        jobs: number of processes that write the LeRobot dataset, at most one per CPU core.
+        on_stage: called with the name of each stage, such as "joining the dataset".
 
     Raises:
-        PlanError: a joined file is damaged and its sources are deleted, or the disk damages files.
+        PlanError: a joined file is damaged and its source files are deleted, or a file is damaged after writing.
     """
     plan, out = folder.plan, folder.path
-    report = _report(plan, chosen)
-    files = {part: [folder.files(unit, outcome.seed) for unit, outcome in found] for part, found in chosen.items()}
+    report = _make_report(plan, chosen)
+    files = {part: [folder.seed_files(unit, outcome.seed) for unit, outcome in found] for part, found in chosen.items()}
     finished = False
     with suppress(OSError, ValueError):
         finished = load_json(out / REPORT) == report
@@ -94,20 +94,22 @@ def _join_files(folder: PlanFolder, files: EpisodeFiles, on_stage: OnStage) -> N
     plan, out = folder.plan, folder.path
     seeds = {part: [each.seed for each in episodes] for part, episodes in files.items()}
     for part, episodes in files.items() if "layouts" in plan.stages else ():
-        path, layouts = out / LAYOUTS / f"{plan.name_of(part)}.npy", [each.layout for each in episodes]
+        path, layouts = out / LAYOUTS / f"{plan.part_name(part)}.npy", [each.layout_path for each in episodes]
         remove_leftovers(make_folder(path.parent))
-        damage, write = partial(_layouts_damage, path, seeds[part]), partial(join_frozen_layouts, path, layouts)
-        _join_file(path, layouts, damage, write, partial(on_stage, f"joining layouts, {plan.name_of(part)}"))
+        damage, write = partial(_find_layouts_damage, path, seeds[part]), partial(join_frozen_layouts, path, layouts)
+        _join_file(path, layouts, damage, write, partial(on_stage, f"joining layouts, {plan.part_name(part)}"))
     if "datasets" in plan.stages:
         root, count = out / DATASETS / "robocas", sum(map(len, files.values()))
         remove_leftovers(make_folder(root))
-        damage, write = partial(_dataset_damage, root, count), partial(_join_dataset, plan, root, files)
+        damage, write = partial(_find_dataset_damage, root, count), partial(_join_dataset, plan, root, files)
         _join_file(root, _dataset_sources(plan, root, files), damage, write, partial(on_stage, "joining the dataset"))
     for part, episodes in files.items() if "demonstrations" in plan.stages else ():
-        path, recordings = out / DEMOS / plan.name_of(part) / TRAJECTORY, [each.recording for each in episodes]
+        path, recordings = out / DEMOS / plan.part_name(part) / TRAJECTORY, [each.recording_path for each in episodes]
         remove_leftovers(make_folder(path.parent))
         damage, write = partial(find_violation, path, seeds[part]), partial(merge, recordings, path)
-        _join_file(path, recordings, damage, write, partial(on_stage, f"joining demonstrations, {plan.name_of(part)}"))
+        _join_file(
+            path, recordings, damage, write, partial(on_stage, f"joining demonstrations, {plan.part_name(part)}")
+        )
 
 
 def _join_file(
@@ -117,35 +119,45 @@ def _join_file(
     write: Callable[[], None],
     on_start: Callable[[], None],
 ) -> None:
-    """Write a joined file or folder unless it is complete, that is, ``damage`` returns an empty text."""
+    """Write a joined file or folder, unless it is complete.
+
+    Args:
+        path: of the joined file or folder.
+        sources: files to join, which must exist.
+        damage: returns how the joined file is damaged; empty if it is complete.
+        write: writes the joined file.
+        on_start: called before writing.
+    """
     if not (found := damage()):
         return
     if missing := next((source for source in sources if not source.exists()), None):
         found = f"{found}; {missing.parent.name}/{missing.name} is missing"
-        fix = "Restore one of the two from a copy, or start again with --overwrite."
-        raise PlanError("damaged, and its source files are missing", where=path, found=found, fix=fix)
+        fix = "Restore the file or its source files from a copy, or start again with --overwrite."
+        raise PlanError(
+            "this file or folder is damaged, and its source files are missing", where=path, found=found, fix=fix
+        )
     on_start()
     write()
     if found := damage():
         fix = "Check the disk; then run the command again."
-        raise PlanError("damaged after writing", where=path, found=found, fix=fix)
+        raise PlanError("this file or folder is damaged after writing", where=path, found=found, fix=fix)
 
 
-def _layouts_damage(path: Path, seeds: Sequence[int]) -> str:
+def _find_layouts_damage(path: Path, seeds: Sequence[int]) -> str:
     try:
         found = load_array(path)["seed"].tolist()
     except (*DAMAGED_FILE_ERRORS, IndexError, KeyError, TypeError) as error:
-        return _reason(error)
-    return "" if found == list(seeds) else f"{len(found)} layouts of other seeds"
+        return _describe_error(error)
+    return "" if found == list(seeds) else f"{format_count(len(found), 'layout')} of other seeds"
 
 
-def _dataset_damage(root: Path, count: int) -> str:
+def _find_dataset_damage(root: Path, count: int) -> str:
     try:
         load_json(root / schema.DATA_INFO_FILE)
         listed = len(load_json(root / schema.CONVERSION_FILE)["episodes"])
         names = set(os.listdir(root))
     except (OSError, ValueError, KeyError, TypeError) as error:
-        return _reason(error)
+        return _describe_error(error)
     missing = sorted({schema.episode_folder(number) for number in range(count)} - names)
     return (
         f"{missing[0]} is missing"
@@ -156,61 +168,66 @@ def _dataset_damage(root: Path, count: int) -> str:
     )
 
 
-def _reason(error: Exception) -> str:
+def _describe_error(error: Exception) -> str:
     return "it does not exist" if isinstance(error, FileNotFoundError) else one_line(error)
 
 
 def _dataset_sources(plan: Plan, root: Path, files: EpisodeFiles) -> Iterator[Path]:
     for part, episodes in files.items():
-        for number, each in enumerate(episodes, plan.first_episode(part)):
-            yield each.recording
+        for number, each in enumerate(episodes, plan.first_episode_index(part)):
+            yield each.recording_path
             if not (root / schema.episode_folder(number)).is_dir():
-                yield each.episode
+                yield each.episode_path
 
 
 def _join_dataset(plan: Plan, root: Path, files: EpisodeFiles) -> None:
     entries: dict[str, Any] = {}
     for part, episodes in files.items():
         trajectory = {
-            "trajectory": f"{DEMOS}/{plan.name_of(part)}/{TRAJECTORY}"
+            "trajectory": f"{DEMOS}/{plan.part_name(part)}/{TRAJECTORY}"
         }  # the recording of the unit is deleted
         for place, each in enumerate(episodes):
-            number = plan.first_episode(part) + place
+            number = plan.first_episode_index(part) + place
             folder = root / schema.episode_folder(number)
             if not folder.is_dir():
-                _set_source(each.episode / schema.SCENE_FILE, {**trajectory, "episode_id": place})
-                os.replace(each.episode, folder)
-            with TrajectoryFile(each.recording, pack=plan.parts[part].pack) as file:
+                _set_source(each.episode_path / schema.SCENE_FILE, {**trajectory, "episode_id": place})
+                os.replace(each.episode_path, folder)
+            with TrajectoryFile(each.recording_path, pack=plan.parts[part].pack) as file:
                 entry = recording_entry(file, 0)
             entries[str(number)] = {**entry, **trajectory, "trajectory_episode": place}
     settings = dataset_settings(plan.rate, plan.images.image_options(), plan.embeddings)
-    write_json(root / schema.CONVERSION_FILE, {**header(settings, split_rule(plan)), "episodes": entries}, sync=True)
+    write_json(
+        root / schema.CONVERSION_FILE, {**header(settings, describe_split(plan)), "episodes": entries}, sync=True
+    )
     flush_to_disk(root)  # episodes are on disk before the file that lists them
     write_info(root, split_episodes(plan, root))
 
 
 def _set_source(path: Path, source: dict[str, Any]) -> None:
-    """Set the final path of the recording in ``scene.json`` of an episode."""
+    """Write the path and the index of the joined recording (``source``) into ``scene.json`` of an episode."""
     scene = load_json(path)
     text = json_text({**scene, "source": {**scene["source"], **source}}, path, indent=1)
     with atomic_file(path, sync=True) as tmp:
         tmp.write_text(text + "\n", encoding="utf-8")
 
 
-def split_rule(plan: Plan) -> str:
-    """Return the text for ``conversion.json`` that describes the split."""
+def describe_split(plan: Plan) -> str:
+    """Return a text for ``conversion.json`` that describes how the validation episodes are chosen."""
     rule = SplitOptions(plan.split.val_fraction, plan.split.group_by).rule if plan.split else SPLIT_RULE
     named = [f"{part.name}: {part.split}" for part in plan.parts if part.split]
     return "; ".join([*named, *([rule] if len(named) < len(plan.parts) else [])])
 
 
 def split_episodes(plan: Plan, root: Path) -> tuple[list[int], list[int]]:
-    """Return the training and validation episodes; parts without `split` are split by the rule of the plan."""
+    """Return the numbers of the training episodes and of the validation episodes.
+
+    The episodes of plan parts without `split` are split by the rule `split` of the plan.
+    """
     train: list[int] = []
     val: list[int] = []
     free: list[int] = []
     for number, part in enumerate(plan.parts):
-        first = plan.first_episode(number)
+        first = plan.first_episode_index(number)
         chosen = {None: free, "train": train, "val": val}[part.split]
         chosen += range(first, first + part.episodes)
     by = plan.split.group_by if plan.split else "seed"
@@ -219,7 +236,7 @@ def split_episodes(plan: Plan, root: Path) -> tuple[list[int], list[int]]:
     if plan.split is None:
         by_rule = split_by_seed({number: int(group) for number, group in groups.items()})
     elif len(set(groups.values())) < 2:
-        _log.warning("%s: no validation episodes: all episodes have the same %s", root, by)
+        _log.warning("%s: there are no validation episodes, because all episodes have the same %s", root, by)
         by_rule = free, []
     else:
         by_rule = cut(groups, [1 - plan.split.val_fraction, plan.split.val_fraction])
@@ -231,7 +248,7 @@ def _convert_lerobot(plan: Plan, robocas: Path, out: Path, jobs: int) -> None:
     from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 
     seconds, memory_gb = plan.limits.render_seconds, plan.limits.memory_gb
-    jobs = min(jobs, os.cpu_count() or 1)  # jobs of a plan may run on a cluster
+    jobs = min(jobs, os.cpu_count() or 1)  # `--jobs` may be the number of jobs on a cluster
     version = plan.lerobot_version
     settings = ConversionSettings(
         robocas, out, jobs=jobs, episode_seconds=seconds, memory_gb=memory_gb, lerobot_version=version
@@ -247,12 +264,12 @@ def _write_statistics(out: Path) -> None:
     write_stats(replace(collect(out / dataset), path=dataset), out / STATISTICS)  # no absolute path in the statistics
 
 
-def _report(plan: Plan, chosen: ChosenEpisodes) -> dict[str, Any]:
-    """Return the report; it contains no times and no facts of the machine."""
+def _make_report(plan: Plan, chosen: ChosenEpisodes) -> dict[str, Any]:
+    """Return the content of ``report.json``; it does not depend on times and machines."""
     parts = {}
     for part, episodes in chosen.items():
         found = [outcome for _, outcome in episodes]
-        parts[plan.name_of(part)] = {
+        parts[plan.part_name(part)] = {
             "episodes": len(found),
             "seeds": [outcome.seed for outcome in found],
             "steps": sum(outcome.steps for outcome in found),

@@ -26,12 +26,12 @@ _FURNITURE_PACK = "builtin"
 
 
 def bundled_plans() -> dict[str, Path]:
-    """Return name -> file of the bundled plans."""
+    """Return the YAML files of the bundled plans by name."""
     return {path.stem: path for path in sorted(plans_dir().glob("*.yaml"))}
 
 
 def load_plan(plan: str | Path) -> Plan:
-    """Read a plan, and resolve the configurations, names and pack hashes of its parts.
+    """Read a plan, and fill in the configuration and name of each plan part, the cameras and the pack hashes.
 
     Args:
         plan: name of a bundled plan, or a YAML file.
@@ -49,35 +49,40 @@ def load_plan(plan: str | Path) -> Plan:
     try:
         data = load_yaml(path)
     except (OSError, DocumentError) as error:
-        raise PlanError("cannot read this plan", where=path, found=error) from error
+        raise PlanError("cannot read this plan", where=path, expected="a YAML file", found=error) from error
     loaded = parse(Plan, data, PlanError, where=path, about="invalid plan")
     _check_rates(loaded, path)
     resolved = [_resolve_part(part, number, path) for number, part in enumerate(loaded.parts)]
     parts = [part for part, _ in resolved]
     names = [part.name or "" for part in parts]
     if duplicates := sorted({name for name in names if names.count(name) > 1}):
-        what, fix = "two parts have the same name", "Set `name` of one of them."
+        what, fix = "two plan parts have the same name", "Set `name` of one of these parts."
         raise PlanError(what, where=f"{path}, parts", found=", ".join(duplicates), fix=fix)
     _check_seeds(parts, [scene for _, scene in resolved], loaded.block, path)
-    cameras = _cameras(loaded, [config for _, (_, config, _) in resolved], path)
+    cameras = _resolve_cameras(loaded, [config for _, (_, config, _) in resolved], path)
     images = loaded.images.model_copy(update={"cameras": cameras})
     packs = sorted({_FURNITURE_PACK, *(part.pack for part in parts)})
-    found = {pack: digest for pack in packs if (digest := _digest(pack))}
+    found = {pack: digest for pack in packs if (digest := _manifest_hash(pack))}
     check_packs(loaded, found)
     return loaded.model_copy(update={"parts": parts, "packs": found, "images": images})
 
 
 def max_seeds(episodes: int, block: int) -> int:
-    """Return the largest number of seeds that a part may use before the run ends because too few succeed."""
-    return episodes + max(20, 3 * episodes) + 2 * block  # the last work units are completed
+    """Return the largest number of seeds that a plan part can use before its run ends with too many failures.
+
+    Args:
+        episodes: number of episodes of the plan part.
+        block: number of seeds per work unit; workers complete the work units that have started.
+    """
+    return episodes + max(20, 3 * episodes) + 2 * block
 
 
 def check_packs(plan: Plan, packs: Iterable[str]) -> None:
-    """Raise PlanError if a pack, or the furniture pack, has changed since the plan was loaded."""
+    """Raise PlanError if one of these packs, or the furniture pack, has changed since the plan was loaded."""
     for pack in {_FURNITURE_PACK, *packs}:
-        expected, found = plan.packs.get(pack), _digest(pack)
+        expected, found = plan.packs.get(pack), _manifest_hash(pack)
         if expected and found and found != expected:
-            what, fix = "this pack has changed since the plan was started", "Restore the pack, or pass --overwrite."
+            what, fix = "this pack has changed since the run was started", "Restore the pack, or pass --overwrite."
             hashes = f"a manifest with sha256 {expected[:12]}...", f"{found[:12]}..."
             raise PlanError(what, where=pack, expected=hashes[0], found=hashes[1], fix=fix)
 
@@ -95,7 +100,7 @@ def check_plan(plan: Plan) -> None:
             if not str(error.where).startswith("--"):
                 raise
             # an option of `robocas generate` is a key of the plan here
-            where = f"part {part.name}, {str(error.where)[2:].replace('-', '_')}"
+            where = f"plan part {part.name}, {str(error.where)[2:].replace('-', '_')}"
             raise PlanError(
                 error.what, where=where, expected=error.expected, found=error.found, fix=error.fix
             ) from error
@@ -115,7 +120,7 @@ def check_plan(plan: Plan) -> None:
 
 
 def recording_settings(plan: Plan, part: int) -> EpisodeSettings:
-    """Return the settings with which the episodes of a part are recorded."""
+    """Return the settings of `robocas generate` with which the episodes of a plan part are recorded."""
     config = plan.parts[part]
     assert config.config is not None  # set by `load_plan`
     rate = int(plan.rate) if plan.rate == int(plan.rate) else 5  # the open-loop check uses the rate of the dataset
@@ -124,11 +129,11 @@ def recording_settings(plan: Plan, part: int) -> EpisodeSettings:
 
 
 @contextmanager
-def part_error_context(plan: Plan, part: int) -> Iterator[None]:
-    """Convert errors inside the context, which affect all seeds of a part, to PlanError.
+def convert_part_errors(plan: Plan, part: int) -> Iterator[None]:
+    """Convert errors inside the context, which affect all seeds of a plan part, to PlanError.
 
     Raises:
-        PlanError: the environment of the part cannot be opened on this machine, or its pack has changed.
+        PlanError: the environment of the plan part cannot be opened on this machine, or its pack has changed.
         MissingExtraError: an extra is missing.
         OSError: an error of the disk or the system.
     """
@@ -141,12 +146,16 @@ def part_error_context(plan: Plan, part: int) -> Iterator[None]:
     except Exception as error:
         if isinstance(error, OSError) and error.errno:
             raise
-        what, fix = "cannot open the environment of this part", "Fix the error, and run the command again."
-        raise PlanError(what, where=f"part {config.name}", found=format_error(error), fix=fix) from error
+        what, fix = "cannot open the environment of this plan part", "Fix the error, then run the command again."
+        raise PlanError(what, where=f"plan part {config.name}", found=format_error(error), fix=fix) from error
 
 
 def _resolve_part(part: PartConfig, number: int, path: Path) -> tuple[PartConfig, Any]:
-    """Return a part with its configuration, pack and name; and (task, configuration, pack), which decide its scenes."""
+    """Fill in configuration, pack and name of a plan part.
+
+    Returns:
+        The plan part, and (task, configuration, pack), which determine its scenes.
+    """
     if part.task not in TASKS:
         where, expected, fix = f"{path}, parts.{number}", ", ".join(TASKS), did_you_mean(part.task, list(TASKS))
         raise PlanError("unknown task", where=where, expected=expected, found=repr(part.task), fix=fix)
@@ -168,7 +177,7 @@ def _resolve_part(part: PartConfig, number: int, path: Path) -> tuple[PartConfig
     return part.model_copy(update=values), (part.task, loaded, pack)
 
 
-def _cameras(plan: Plan, configs: Sequence[TaskConfig], path: Path) -> list[str]:
+def _resolve_cameras(plan: Plan, configs: Sequence[TaskConfig], path: Path) -> list[str]:
     """Return the cameras of the dataset: `images.cameras`, or all cameras of the configurations."""
     robot, where = find_robot(plan.recording.robot).description, f"{path}, images.cameras"
     declared = [[camera.name for camera in config.cameras_of(robot)] for config in configs]
@@ -176,8 +185,8 @@ def _cameras(plan: Plan, configs: Sequence[TaskConfig], path: Path) -> list[str]
     if not plan.images.cameras:
         if "datasets" in plan.stages and any(len(names) > len(common) for names in declared):
             only_some = ", ".join(sorted({*chain(*declared)} - {*common}))
-            what, fix = "the parts have different cameras", f"Choose from {', '.join(common)}."
-            raise PlanError(what, where=where, found=f"{only_some} in some parts only", fix=fix)
+            what, fix = "the plan parts have different cameras", f"Set cameras to some of {', '.join(common)}."
+            raise PlanError(what, where=where, found=f"{only_some} in some plan parts only", fix=fix)
         return common
     if unknown := sorted({*plan.images.cameras} - {*common}):
         raise PlanError("unknown camera", where=where, expected=f"any of {', '.join(common)}", found=", ".join(unknown))
@@ -185,7 +194,7 @@ def _cameras(plan: Plan, configs: Sequence[TaskConfig], path: Path) -> list[str]
 
 
 def _check_rates(plan: Plan, path: Path) -> None:
-    """Check that the control rate divides the rate of physics, and the rate of the dataset the control rate."""
+    """Check that the control rate divides the physics rate, and that the dataset rate divides the control rate."""
     if SIM_FREQ % plan.control_freq:
         expected = f"a divisor of {SIM_FREQ}"
         what, where = "the control rate must divide the rate of physics", f"{path}, control_freq"
@@ -200,22 +209,27 @@ def _check_rates(plan: Plan, path: Path) -> None:
             raise PlanError(error.what, where=where, expected=error.expected, found=error.found) from error
 
 
-def _digest(pack: str) -> str:
-    """Return the hash of the manifest of a pack, or "" if there is no such pack."""
+def _manifest_hash(pack: str) -> str:
+    """Return the sha256 of the manifest of a pack as hex digits, or "" if there is no such pack."""
     path = find_packs().get(pack, Path(pack)) / MANIFEST
     return sha256(path) if path.is_file() else ""
 
 
 def _check_seeds(parts: Sequence[PartConfig], scenes: Sequence[Any], block: int, path: Path) -> None:
-    """Check that no two parts can use the same seed of the same scene: episodes of a dataset are unique."""
+    """Check that two plan parts with equal scenes use different seeds, since episodes of a dataset are unique."""
     for number, part in enumerate(parts):
         where, count = f"{path}, parts.{number}.seed", max_seeds(part.episodes, block)
         if part.seed + count > MAX_SEED:
             expected = f"at most {MAX_SEED - count}"
-            raise PlanError(f"seeds may not exceed {MAX_SEED}", where=where, expected=expected, found=part.seed)
+            raise PlanError(
+                "the seeds of this plan part may become too large", where=where, expected=expected, found=part.seed
+            )
         for other, scene in zip(parts[:number], scenes, strict=False):
             first, last = sorted((part, other), key=lambda each: each.seed)
             end = first.seed + max_seeds(first.episodes, block)
             if scenes[number] == scene and last.seed < end:
-                expected, found = f"one of them at least {end}", f"{part.seed}, and {other.seed} of part {other.name}"
-                raise PlanError("two parts may use the same seeds", where=where, expected=expected, found=found)
+                expected, found = (
+                    f"one of the two at least {end}",
+                    f"{part.seed}, and {other.seed} of plan part {other.name}",
+                )
+                raise PlanError("two plan parts may use the same seeds", where=where, expected=expected, found=found)

@@ -1,4 +1,4 @@
-"""The models of a plan, a YAML file that describes a dataset."""
+"""Models of a plan: a YAML file that describes a dataset and how to generate it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _NEEDS = {"datasets": "demonstrations", "statistics": "datasets"}
 
 
 class PartConfig(StrictModel):
-    """Episodes of one task configuration."""
+    """Plan part: episodes of one task configuration, an element of `parts`."""
 
     task: str
     config: str | dict[str, Any] | None = Field(
@@ -32,15 +32,15 @@ class PartConfig(StrictModel):
         default=0, description="first seed; the following seeds are used in order"
     )
     split: Split | None = Field(
-        default=None, description="split of all episodes of the part; default: by `split` of the plan"
+        default=None, description="split of all episodes of the plan part; default: chosen by `split` of the plan"
     )
     name: Annotated[str, Field(pattern=r"^[\w-]+$", max_length=60)] | None = Field(
-        default=None, description="name of the folders of the part"
+        default=None, description="name of the folders of the plan part"
     )
 
 
 class RecordingConfig(StrictModel):
-    """Options of `robocas generate` for all parts; a key that is missing has the default of `EpisodeSettings`."""
+    """Options of `robocas generate` for all plan parts; a missing key has the default of `EpisodeSettings`."""
 
     planner: str | None = None
     robot: str | None = None
@@ -56,12 +56,14 @@ class RecordingConfig(StrictModel):
 
 
 class ImagesConfig(StrictModel):
-    """Images of the dataset."""
+    """Size, format and cameras of the images of the dataset."""
 
     size: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] = (640, 480)
     depth: bool = True
     image_format: ImageFormat = "png"
-    cameras: list[str] | None = Field(default=None, description="default: all cameras of the configurations")
+    cameras: list[str] | None = Field(
+        default=None, description="names of cameras; default: all cameras of the configurations"
+    )
 
     def image_options(self) -> ImageOptions:
         """Return the settings as `ImageOptions` for dataset writers."""
@@ -72,15 +74,18 @@ class ImagesConfig(StrictModel):
 
 
 class LimitsConfig(StrictModel):
-    """Limits per episode; a process that exceeds a limit is killed, and its seed is retried once."""
+    """Limits of time (s) and memory per episode.
+
+    A process that exceeds a limit is killed. Its seed is retried once, then skipped.
+    """
 
     record_seconds: Annotated[float, Field(gt=0, le=10**7)] = 1800.0
     render_seconds: Annotated[float, Field(gt=0, le=10**7)] = 3600.0
-    memory_gb: Annotated[float, Field(gt=0, le=10**5)] = Field(default=8.0, description="memory of each process, GB")
+    memory_gb: Annotated[float, Field(gt=0, le=10**5)] = Field(default=8.0, description="memory of each process, GiB")
 
 
 class SplitConfig(StrictModel):
-    """Rule that chooses the validation episodes of the parts without `split`; as `robocas split`."""
+    """Rule that chooses the validation episodes of the plan parts without `split`, as `robocas split` does."""
 
     val_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.1
     group_by: Literal["seed", "target", "task"] = Field(
@@ -89,16 +94,16 @@ class SplitConfig(StrictModel):
 
 
 class Plan(StrictModel):
-    """A plan; the content of a YAML file."""
+    """Plan of a dataset; the content of its YAML file."""
 
     description: str = ""
     parts: Annotated[list[PartConfig], Field(min_length=1)]
     stages: Annotated[list[Stage], Field(min_length=1)] = ["demonstrations", "datasets", "statistics"]
     formats: list[Literal["robocas", "lerobot"]] = ["robocas"]
-    lerobot_version: Version = Field(default=NEWEST, description="reader of the LeRobot dataset")
+    lerobot_version: Version = Field(default=NEWEST, description="LeRobot version that reads the dataset")
     recording: RecordingConfig = RecordingConfig()
     images: ImagesConfig = ImagesConfig()
-    rate: Annotated[float, Field(gt=0, le=100)] = Field(default=5.0, description="dataset steps per second")
+    rate: Annotated[float, Field(gt=0, le=100)] = Field(default=5.0, description="rate of the dataset, Hz")
     control_freq: Annotated[int, Field(ge=1, le=100)] = 20
     embeddings: bool = True
     split: SplitConfig | None = Field(
@@ -110,31 +115,35 @@ class Plan(StrictModel):
 
     @field_validator("formats")
     @classmethod
-    def _robocas_first(cls, formats: list[str]) -> list[str]:
+    def _check_formats(cls, formats: list[str]) -> list[str]:
         if formats[:1] != ["robocas"]:
-            raise ValueError("expected robocas first: other formats are converted from it")
+            raise ValueError(
+                f"expected the first format to be robocas, found {formats}: other formats are converted from it"
+            )
         return formats
 
     @model_validator(mode="after")
-    def _stages_fit(self) -> Plan:
+    def _check_stages(self) -> Plan:
         for stage in self.stages:
             if _NEEDS.get(stage, stage) not in self.stages:
-                raise ValueError(f"stages: {stage} needs the stage {_NEEDS[stage]}")
+                raise ValueError(f"stages: {stage} needs the stage {_NEEDS[stage]}; add it")
         if "lerobot" in self.formats and "datasets" not in self.stages:
-            raise ValueError("formats: lerobot needs the stage datasets")
+            raise ValueError("formats: lerobot needs the stage datasets in stages; add it")
         tasks = {part.task for part in self.parts if part.split is None}
         if self.split and self.split.group_by == "task" and len(tasks) < 2:
-            raise ValueError("split: group_by task needs parts of two tasks without `split`")
+            raise ValueError(
+                f"split: group_by task needs plan parts of at least two tasks without `split`, found {len(tasks)}"
+            )
         return self
 
-    def name_of(self, part: int) -> str:
-        """Return the name of the folders of a part; `load_plan` sets it."""
+    def part_name(self, part: int) -> str:
+        """Return the folder name of a plan part, given by its index; `load_plan` sets the name."""
         return f"{self.parts[part].name}"
 
-    def block_of(self, part: int) -> int:
-        """Return the number of seeds per work unit of a part: `block`, or its number of episodes if that is smaller."""
+    def seeds_per_unit(self, part: int) -> int:
+        """Return the number of seeds per work unit of a plan part: the smaller of `block` and its `episodes`."""
         return min(self.block, self.parts[part].episodes)
 
-    def first_episode(self, part: int) -> int:
-        """Return the index of the first episode of a part in the dataset."""
+    def first_episode_index(self, part: int) -> int:
+        """Return the index in the dataset of the first episode of a plan part."""
         return sum(other.episodes for other in self.parts[:part])

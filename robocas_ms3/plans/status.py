@@ -9,43 +9,48 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from robocas_ms3.plans.folder import REPORT, Outcome, read_plan
-from robocas_ms3.plans.progress import Progress
+from robocas_ms3.plans.progress import PlanProgress
 
 _RATE_WINDOW = 600.0  # s before the last episode, over which the rate is measured
 
 
 @dataclass(frozen=True)
 class PartStatus:
-    """Status of a part."""
+    """Status of a plan part."""
 
     name: str
-    requested: int  # number of episodes in the plan
+    requested: int  # `episodes` of the plan part
     done: int  # number of complete episodes, at most `requested`
     tried: int  # number of seeds that have an outcome
     failed: dict[str, int]  # "stage: reason" of the last attempt -> number of failed seeds
-    record_seconds: float  # CPU time per episode
-    render_seconds: float  # CPU time per episode
+    record_seconds: float  # CPU time of recording per successful episode, including failed seeds
+    render_seconds: float  # CPU time of rendering per successful episode, including failed seeds
     bytes: int  # size of the complete episodes
 
 
 @dataclass(frozen=True)
-class Status:
+class PlanStatus:
     """Status of a plan; the content of ``robocas plan status --json``."""
 
     parts: list[PartStatus]
     episodes_per_hour: float  # in the ten minutes before the last episode
-    seconds_left: float | None  # estimated from the CPU time per episode of each part; None: unknown
+    seconds_left: float | None  # estimated from the CPU time per episode of each plan part; None: unknown
     idle_seconds: float | None  # since the last episode; None: no episode yet
     finished: bool  # whether all episodes are joined
 
 
-def read_status(out: Path) -> Status:
-    """Read the status of the plan in a folder; raise PlanError if the folder has no plan."""
-    return status_of(Progress(read_plan(out)), finished=(out / REPORT).is_file())
+def read_status(out: Path) -> PlanStatus:
+    """Return the status of the plan in an output folder; raise PlanError if the folder has no plan."""
+    return compute_status(PlanProgress(read_plan(out)), finished=(out / REPORT).is_file())
 
 
-def status_of(progress: Progress, *, finished: bool = False) -> Status:
-    """Return the status of a plan from the outcomes of its seeds."""
+def compute_status(progress: PlanProgress, *, finished: bool = False) -> PlanStatus:
+    """Compute the status of a plan from the outcomes of its seeds.
+
+    Args:
+        progress: outcomes of the work units.
+        finished: whether all episodes are joined.
+    """
     outcomes: list[list[Outcome]] = [[] for _ in progress.plan.parts]
     for unit, found in [*progress.done.items(), *progress.partial.items()]:
         outcomes[unit.part] += found
@@ -62,8 +67,8 @@ def status_of(progress: Progress, *, finished: bool = False) -> Status:
     )
     recent = [(at, part) for at, part in ends if at > ends[-1][0] - _RATE_WINDOW]
     seconds = recent[-1][0] - recent[0][0] if recent else 0.0
-    left = seconds_left(parts, [part for _, part in recent[1:]], seconds) if seconds else None
-    return Status(
+    left = estimate_seconds_left(parts, [part for _, part in recent[1:]], seconds) if seconds else None
+    return PlanStatus(
         parts,
         episodes_per_hour=round(3600 * (len(recent) - 1) / seconds, 1) if seconds else 0.0,
         seconds_left=None if left is None else round(left, 1),
@@ -87,12 +92,15 @@ def _part_status(name: str, requested: int, outcomes: Sequence[Outcome]) -> Part
     )
 
 
-def seconds_left(parts: Sequence[PartStatus], recent: Sequence[int], seconds: float) -> float:
-    """Estimate the time until all episodes are done.
+def estimate_seconds_left(parts: Sequence[PartStatus], recent: Sequence[int], seconds: float) -> float:
+    """Estimate the wall-clock time in s until all episodes are done.
+
+    The estimate scales the wall-clock time of recent episodes by CPU times. An episode takes the mean CPU time of its
+    plan part, or of all plan parts if its plan part has no episode yet.
 
     Args:
-        parts: status of each part. An episode takes the mean CPU time of its part, or of all parts if that is unknown.
-        recent: part of each recent episode, at least one.
+        parts: status of each plan part.
+        recent: index of the plan part of each recent episode, at least one.
         seconds: wall-clock time of the recent episodes.
     """
     spent = [(part.record_seconds + part.render_seconds) * part.done for part in parts]

@@ -11,7 +11,7 @@ from plan_stages import PLAN
 
 from robocas_ms3.cli import progress
 from robocas_ms3.cli.terminal import console
-from robocas_ms3.plans.status import PartStatus, Status
+from robocas_ms3.plans.status import PartStatus, PlanStatus
 
 SCRIPT = """
 from robocas_ms3.cli.progress import ProgressBar, spinner
@@ -119,7 +119,7 @@ def plan_status(*done):
         PartStatus(part.name, part.episodes, count, count, {}, 1.0, 1.0, 0)
         for part, count in zip(PLAN.parts, done, strict=True)
     ]
-    return Status(parts, 120.0, 5400.0, 1.0, False)
+    return PlanStatus(parts, 120.0, 5400.0, 1.0, False)
 
 
 def test_plan_in_a_log(clock, capsys):

@@ -59,4 +59,4 @@ def test_irregular_file_is_an_error(tmp_path, kind, make, name, read, error):
 @pytest.mark.parametrize("kind", KINDS)
 def test_irregular_outcome_file_of_a_plan_counts_as_missing(tmp_path, kind):
     replace_file(tmp_path / OUTCOME, kind)
-    assert SeedFiles(0, 1, tmp_path).outcome() is None
+    assert SeedFiles(0, 1, tmp_path).read_outcome() is None

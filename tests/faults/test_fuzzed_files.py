@@ -114,17 +114,17 @@ def plan_folder(root):
 
 def first_seed(folder):
     """Return the files of the first seed of the started work unit."""
-    return folder.files(STARTED, STARTED.seeds(folder.plan)[0]).folder
+    return folder.seed_files(STARTED, STARTED.seeds(folder.plan)[0]).folder
 
 
 def write_plan(root):
     folder = plan_folder(root)
     for unit in (COMPLETE, STARTED):
         for seed in unit.seeds(folder.plan):
-            with folder.files(unit, seed).temporary_files() as files:
-                files.write(Outcome(seed, True, 10, ["a: b"], ["c: d"], 1.0, 1.0, 5, 1e9))
+            with folder.seed_files(unit, seed).temporary_files() as files:
+                files.write_outcome(Outcome(seed, True, 10, ["a: b"], ["c: d"], 1.0, 1.0, 5, 1e9))
     folder.write_outcomes(COMPLETE)
-    (root / PLAN).write_text(json.dumps(folder.record()))
+    (root / PLAN).write_text(json.dumps(folder.make_record()))
     shutil.copy(folder.unit_folder(COMPLETE) / OUTCOMES, root)  # where the table below finds them
     shutil.copy(first_seed(folder) / OUTCOME, root)
 

@@ -39,7 +39,7 @@ def cluster(tmp_path_factory):
 def done(tmp_path_factory):
     out = tmp_path_factory.mktemp("done") / "out"
     with pytest.MonkeyPatch.context() as patch, pytest.raises(ZeroDivisionError):
-        patch.setattr("robocas_ms3.plans.run.join", lambda *_, **__: 1 / 0)
+        patch.setattr("robocas_ms3.plans.run.join_episodes", lambda *_, **__: 1 / 0)
         run_here(out)
     return out
 

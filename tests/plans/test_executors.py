@@ -81,7 +81,7 @@ def test_work_unit_that_kills_its_jobs_ends_the_run(jobs, tmp_path):
         pytest.skip("its jobs are threads of this process")
     out = tmp_path / "out"
     plan_faults(out, {11: ["kill job"] * 9})
-    with pytest.raises(PlanError, match="the jobs of this work unit were killed") as error:
+    with pytest.raises(PlanError, match="all jobs of this work unit were killed") as error:
         jobs.run(out, units_per_job="1")
     assert error.value.where == PlanFolder(PLAN, out).unit_folder(WorkUnit(0, 0))
     if jobs.name == "slurm":

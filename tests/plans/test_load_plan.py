@@ -12,9 +12,9 @@ from robocas_ms3.plans.folder import PLAN, PlanFolder, SeedFiles
 from robocas_ms3.plans.load import (
     bundled_plans,
     check_plan,
+    convert_part_errors,
     load_plan,
     max_seeds,
-    part_error_context,
     recording_settings,
 )
 from robocas_ms3.plans.worker import Renderer
@@ -76,14 +76,14 @@ def test_changed_pack_is_an_error(written, tmp_path):
     plan = load_plan(path)
     assert plan.packs.keys() == {str(pack), "builtin"}
     with PlanFolder(plan, out).open(shared=True) as output:
-        output.start(PlanFolder(plan, out).record())
+        output.start(PlanFolder(plan, out).make_record())
     PlanFolder(load_plan(path), out).open(shared=True).check_record()
-    with part_error_context(plan, 0):
+    with convert_part_errors(plan, 0):
         pass
     (pack / "manifest.json").write_text("{ }")
     with pytest.raises(OutputExistsError, match=r"packs\..*mine: "):
         PlanFolder(load_plan(path), out).open(shared=True).check_record()
-    with pytest.raises(PlanError) as error, part_error_context(plan, 0):
+    with pytest.raises(PlanError) as error, convert_part_errors(plan, 0):
         pass
     assert error.value.where == str(pack)
     path.write_text(f"{path.read_text()}packs: {{{pack}: 12ab}}\n")
@@ -121,19 +121,19 @@ def test_error_while_opening_a_part_ends_the_run(written, tmp_path, error, raise
         ("parts: []\n", "at least 1 item"),
         ("parts:\n  - {task: fly, episodes: 1}\n", "unknown task .expected pick, select, search, open_pick"),
         (GOOD + "block: 10\nblok: 3\n", "unknown key 'blok'.*Did you mean block"),
-        (GOOD + "formats: [lerobot]\n", "expected robocas first"),
+        (GOOD + "formats: [lerobot]\n", "expected the first format to be robocas"),
         (GOOD + "stages: [datasets]\n", "datasets needs the stage demonstrations"),
         (GOOD + "stages: [demonstrations]\nformats: [robocas, lerobot]\n", "lerobot needs the stage datasets"),
         (GOOD + "images: {cameras: [nose]}\n", "unknown camera"),
-        (GOOD + "split: {group_by: task}\n", "group_by task needs parts of two tasks"),
+        (GOOD + "split: {group_by: task}\n", "group_by task needs plan parts of at least two tasks"),
         ("parts:\n  - {task: pick, episodes: 1, name: ../up}\n", "parts.0.name"),
         (
             "parts:\n  - {task: pick, episodes: 1, name: a}\n  - {task: pick, episodes: 1, name: a}\n",
-            "two parts have the same name .found a",
+            "two plan parts have the same name .found a",
         ),
         (
             "parts:\n" + 2 * "  - {task: pick, episodes: 1}\n",
-            "two parts may use the same seeds .expected one of them at least",
+            "two plan parts may use the same seeds .expected one of the two at least",
         ),
         ("[", "cannot read this plan"),
         (GOOD + "control_freq: 7\n", "plan.yaml, control_freq: the control rate must divide the rate of physics"),

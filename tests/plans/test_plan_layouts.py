@@ -7,7 +7,7 @@ from plan_stages import PLAN
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.plans.folder import LAYOUTS, Outcome, PlanFolder, WorkUnit
-from robocas_ms3.plans.join import join
+from robocas_ms3.plans.join import join_episodes
 from robocas_ms3.plans.worker import Recorder
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.layout_table import FrozenLayouts
@@ -19,7 +19,7 @@ ALONE = PLAN.model_copy(update={"stages": ["layouts"], "parts": PLAN.parts[:1]})
 
 @pytest.fixture
 def files(tmp_path):
-    files = PlanFolder(ALONE, tmp_path).files(WorkUnit(0, 0), 11)
+    files = PlanFolder(ALONE, tmp_path).seed_files(WorkUnit(0, 0), 11)
     files.folder.mkdir(parents=True)
     return files
 
@@ -27,8 +27,8 @@ def files(tmp_path):
 def test_stage_layouts_alone(files, tmp_path):
     found = Recorder(ALONE).run(files)
     assert (found["success"], set(found)) == (True, {"success", "record_seconds"})
-    assert [path.name for path in files.folder.iterdir()] == [files.layout.name]
-    report = join(PlanFolder(ALONE, tmp_path), {0: [(WorkUnit(0, 0), Outcome(11, True, size=files.size()))]})
+    assert [path.name for path in files.folder.iterdir()] == [files.layout_path.name]
+    report = join_episodes(PlanFolder(ALONE, tmp_path), {0: [(WorkUnit(0, 0), Outcome(11, True, size=files.size()))]})
     assert report["parts"]["a"]["seeds"] == [11]
     pack = load_pack("builtin")
     kept = FrozenLayouts(tmp_path / LAYOUTS / "a.npy", pack.objects)(11, 11)

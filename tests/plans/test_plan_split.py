@@ -41,13 +41,13 @@ def test_default_is_the_split_of_convert(of):
     plan = plan_of(None, None, None)
     assert of(plan) == splits.split_by_seed({n: 7 * n for n in range(35)})
     assert len(of(plan)[1]) == 4  # round(3.5)
-    assert splits.split_rule(plan) == SPLIT_RULE
+    assert splits.describe_split(plan) == SPLIT_RULE
 
 
 def test_split_of_a_part(of):
     plan = plan_of("train", "val", "train")
     assert of(plan) == ([*range(20), *range(25, 35)], [*range(20, 25)])
-    assert splits.split_rule(plan) == "a: train; b: val; c: train"
+    assert splits.describe_split(plan) == "a: train; b: val; c: train"
 
 
 def test_other_parts_are_split_by_the_rule(of):
@@ -57,7 +57,7 @@ def test_other_parts_are_split_by_the_rule(of):
     assert set(range(20, 25)) < set(val)
     free = set(val) - set(range(20, 25))
     assert {n % 4 for n in free}.isdisjoint({n % 4 for n in train})  # a target is on one side
-    assert splits.split_rule(plan) == f"b: val; {split.SplitOptions(0.2, 'target').rule}"
+    assert splits.describe_split(plan) == f"b: val; {split.SplitOptions(0.2, 'target').rule}"
 
 
 def test_episodes_of_a_single_group_are_for_training(of, caplog):

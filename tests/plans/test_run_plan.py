@@ -98,12 +98,12 @@ def test_same_shard_may_run_twice_at_the_same_time(undisturbed, tmp_path):
 
 
 def test_first_folder_of_a_seed_is_kept(tmp_path):
-    files = PlanFolder(PLAN, tmp_path).files(WorkUnit(0, 0), 10)
+    files = PlanFolder(PLAN, tmp_path).seed_files(WorkUnit(0, 0), 10)
     with files.temporary_files() as late, files.temporary_files() as first:
         for tmp in (late, first):
-            tmp.recording.write_text("late" if tmp is late else "first")
-            tmp.write(Outcome(10, True))
-    assert files.recording.read_text() == "first"
+            tmp.recording_path.write_text("late" if tmp is late else "first")
+            tmp.write_outcome(Outcome(10, True))
+    assert files.recording_path.read_text() == "first"
     assert [path.name for path in files.folder.parent.iterdir()] == [files.folder.name]
 
 
@@ -163,7 +163,7 @@ def test_too_many_failures_are_an_error(tmp_path):
 
 
 def test_episodes_with_truncated_files_are_recorded_again(undisturbed, out):
-    folders = [PlanFolder(PLAN, out).files(WorkUnit(0, 0), seed).folder for seed in (10, 11, 12)]
+    folders = [PlanFolder(PLAN, out).seed_files(WorkUnit(0, 0), seed).folder for seed in (10, 11, 12)]
     image = sorted(folders[1].rglob("*.png"))[0]
     for path, length in ((folders[0] / "recording.h5", 1000), (image, 50), (folders[2] / "recording.json", 0)):
         os.truncate(path, length)
@@ -174,8 +174,10 @@ def test_episodes_with_truncated_files_are_recorded_again(undisturbed, out):
 
 
 def test_disk_that_damages_files_twice_ends_the_run(out, monkeypatch):
-    monkeypatch.setattr("robocas_ms3.plans.progress.Progress.delete_damaged", lambda _: {WorkUnit(1, 0): [4]})
-    with pytest.raises(PlanError, match="files change their size") as error:
+    monkeypatch.setattr(
+        "robocas_ms3.plans.progress.PlanProgress.delete_damaged_episodes", lambda _: {WorkUnit(1, 0): [4]}
+    )
+    with pytest.raises(PlanError, match="the size of files changes") as error:
         run_here(out)
     assert error.value.where == PlanFolder(PLAN, out).unit_folder(WorkUnit(1, 0))
     assert not (out / "datasets").exists()
@@ -205,7 +207,7 @@ def test_other_plan_needs_overwrite_except_for_limits_and_description(undisturbe
     run_here(out)  # nothing is left to do
     assert (out / "report.json").stat().st_mtime_ns == before
     run_here(out, other, overwrite=True)
-    assert PlanFolder(other, out).outcomes(WorkUnit(0, 1))[0].seed == 14
+    assert PlanFolder(other, out).read_outcomes(WorkUnit(0, 1))[0].seed == 14
 
 
 def record_other_versions(out):

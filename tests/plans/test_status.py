@@ -8,7 +8,7 @@ from robocas_ms3.cli.main import run
 from robocas_ms3.core.files import make_folder, write_json
 from robocas_ms3.plans.folder import PLAN, Outcome, PlanFolder, WorkUnit
 from robocas_ms3.plans.load import load_plan
-from robocas_ms3.plans.status import PartStatus, read_status, seconds_left
+from robocas_ms3.plans.status import PartStatus, estimate_seconds_left, read_status
 
 
 @pytest.fixture
@@ -17,13 +17,13 @@ def started(tmp_path):
     path, out = tmp_path / "plan.yaml", make_folder(tmp_path / "out")
     path.write_text("block: 4\nparts:\n  - {task: pick, episodes: 6, name: a}\n")
     folder = PlanFolder(load_plan(path), out)
-    write_json(out / PLAN, folder.record())
+    write_json(out / PLAN, folder.make_record())
 
     def write(*outcomes):
         for outcome in outcomes:
             unit = WorkUnit(0, outcome.seed // 4)
-            with folder.files(unit, outcome.seed).temporary_files() as files:
-                files.write(outcome)
+            with folder.seed_files(unit, outcome.seed).temporary_files() as files:
+                files.write_outcome(outcome)
             folder.write_outcomes(unit)
 
     return out, write
@@ -67,9 +67,9 @@ def test_seconds_left_use_the_cost_per_part():
     parts = [part("pick", 10, 10, 2.0), part("search", 5, 1, 20.0), part("select", 3, 0, 0.0)]
     # recent: ten picks and a search, 40 CPU s in 20 s; left: four searches, and three of a mean of 40 / 11
     left = 4 * 20.0 + 3 * 40.0 / 11
-    assert seconds_left(parts, [0] * 10 + [1], 20.0) == pytest.approx(left / 2)
+    assert estimate_seconds_left(parts, [0] * 10 + [1], 20.0) == pytest.approx(left / 2)
     free = [part("a", 10, 4, 0.0)]  # nothing says what they cost
-    assert seconds_left(free, [0, 0], 4.0) == pytest.approx(12.0)
+    assert estimate_seconds_left(free, [0, 0], 4.0) == pytest.approx(12.0)
 
 
 def test_rate_ignores_old_episodes_and_wrong_clocks(started):

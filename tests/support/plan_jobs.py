@@ -37,7 +37,7 @@ class Jobs:
         for process in psutil.process_iter(["cmdline", "environ"]):
             line = process.info["cmdline"] or [""]
             if self.name == "ray":
-                found += [process] * " ".join(line).startswith(("ray::run_units", "ray::send_units"))
+                found += [process] * " ".join(line).startswith(("ray::run_units", "ray::run_and_send_units"))
             elif (process.info["environ"] or {}).get("PLAN_OUT") == str(out) and not line[0].endswith("srun"):
                 found += [process] * (str(RUNNER) not in line)
         return found

@@ -48,7 +48,7 @@ class StubRecorder:
             raise DatasetError("this recording is damaged")
         elif fault == "fail":
             return {"success": False, "failures": ["grasp: slipped"]}
-        write_trajectory(files.recording, seeds=(files.seed,))
+        write_trajectory(files.recording_path, seeds=(files.seed,))
         return {"success": True, "steps": 22}
 
     def close(self):
@@ -164,7 +164,7 @@ def assert_same(one, other):
 def crashes_of(out, plan=PLAN):
     """Return (seed, reason) of the crashes in complete work units."""
     units = [WorkUnit(part, block) for part in range(len(plan.parts)) for block in range(9)]
-    found = (PlanFolder(plan, out).outcomes(unit) for unit in units)
+    found = (PlanFolder(plan, out).read_outcomes(unit) for unit in units)
     return [(one.seed, crash) for outcomes in found if outcomes for one in outcomes for crash in one.crashes]
 
 

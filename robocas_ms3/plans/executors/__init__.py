@@ -21,20 +21,22 @@ EXECUTORS = {
     "slurm": "robocas_ms3.plans.executors.slurm:SlurmExecutor",
     "ray": "robocas_ms3.plans.executors.ray:RayExecutor",
 }
-"""Name -> import path of the class; its module is imported when the executor is used."""
+"""Import path of each executor class by name; the module is imported when the executor is used."""
 
 
 class Executor(ABC):
-    """Run jobs of one or more work units; a context manager that cancels its jobs on exit.
+    """Base class of executors, which run jobs of one or more work units.
+
+    An executor is a context manager. On exit it cancels its jobs.
 
     Args:
         folder: output folder of the plan.
-        jobs: largest number of jobs that run at the same time.
-        options: name -> value of ``--executor-option``.
+        jobs: maximum number of jobs that run at the same time.
+        options: values of ``--executor-option`` by name.
 
     Raises:
         PlanError: an option is unknown or invalid, or the executor is not available on this machine.
-        MissingExtraError: an extra is missing.
+        MissingExtraError: an optional dependency of the executor is missing.
     """
 
     options_type: type[StrictModel] = StrictModel
@@ -58,14 +60,16 @@ class Executor(ABC):
 
     @abstractmethod
     def submit(self, groups: Sequence[Sequence[WorkUnit]]) -> Sequence[Any]:
-        """Submit one job per group of units; return the jobs, or the jobs of the first groups if there is no more room.
+        """Submit one job per group of work units.
 
-        ``done()`` of a job returns whether it has ended. ``result()`` raises an error that affects all seeds; a job
-        that was killed raises none.
+        Returns:
+            The jobs, in the order of the groups; fewer than groups if the cluster accepts no more jobs now. ``done()``
+            of a job returns whether the job has ended. ``result()`` raises the error of an ended job that affects all
+            seeds. It raises nothing for a job that was killed.
         """
 
     def describe_log(self, job: Any) -> str:
-        """Return where the log of a killed job is, for an error message."""
+        """Return where to find the log of a job, for an error message."""
         return "the log of the job"
 
 
@@ -81,11 +85,11 @@ class ThreadExecutor(Executor):
 
     @abstractmethod
     def run(self, units: Sequence[WorkUnit]) -> None:
-        """Run the work units of a job."""
+        """Run the work units of a job in the calling thread."""
 
 
 class LocalExecutor(ThreadExecutor):
-    """Run work units on this machine: two processes per job. There are no options."""
+    """Run work units on this machine, with two processes per job; there are no executor options."""
 
     def __enter__(self) -> LocalExecutor:
         self._workers = [WorkUnitWorker(self.folder) for _ in range(self.jobs)]
@@ -110,5 +114,5 @@ class LocalExecutor(ThreadExecutor):
 
 
 def open_executor(name: str, folder: PlanFolder, jobs: int, options: Mapping[str, str]) -> Executor:
-    """Create the executor with this name; raises the errors of `Executor`."""
+    """Create the executor with this name; raise the errors of `Executor`."""
     return load_object(EXECUTORS[name])(folder, jobs, options)

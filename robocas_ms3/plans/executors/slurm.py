@@ -1,7 +1,7 @@
 """Run work units as jobs of Slurm: job arrays, submitted by submitit.
 
-The folder of a work unit tells whether it is complete. Slurm requeues a job that is preempted, exceeds its time or
-loses its node. A job that ends otherwise, with incomplete units, is submitted again.
+The files in the folder of a work unit show whether the work unit is complete. Slurm requeues a job that is preempted,
+exceeds its time limit or loses its node. A job that ends for another reason, with incomplete work units, is submitted again.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ require_extra("slurm", "plans on Slurm", "submitit")
 submitit: Any = import_module("submitit")
 
 LOGS = "slurm"
-"""Folder in the folder of the plan, with the logs of the jobs and the files of submitit."""
+"""Subfolder of the output folder with the logs of the jobs and the files of submitit."""
 SBATCH_OPTIONS = (
     *("partition", "account", "qos", "constraint", "exclude", "nodelist", "gres", "gpus_per_node", "reservation"),
     *("licenses", "nice", "begin", "comment", "exclusive", "mem_per_cpu", "mail_type", "mail_user", "wckey"),
@@ -50,25 +50,26 @@ _HELD_REASONS = ("JobHoldMaxRequeue", "launch_failed_requeued_held", "launch fai
 _log = logging.getLogger(__name__)
 
 
-class _OwnOptions(StrictModel):
+class _SlurmOptions(StrictModel):
     cluster: Literal["slurm", "local"] = Field(default="slurm", description="local: jobs are processes of this machine")
     units_per_job: Annotated[int, Field(ge=1)] = Field(
         default=1, description="work units of a job, run one after the other"
     )
     time: Annotated[int, Field(ge=1)] = Field(default=240, description="time limit of a job, minutes")
     requeues: Annotated[int, Field(ge=0)] = Field(
-        default=3, description="number of times that a job that exceeded its time is requeued"
+        default=3, description="how often a job that exceeded its time limit is requeued"
     )
     mem_gb: Annotated[float, Field(gt=0)] | None = Field(
-        default=None, description="memory of a job, GB; None: 2 x limits.memory_gb of the plan, for two processes"
+        default=None,
+        description="memory of a job, GiB; default: 2 x limits.memory_gb of the plan, since a job has two processes",
     )
     cpus_per_task: Annotated[int, Field(ge=1)] = 1
 
 
 class SlurmExecutor(Executor):
-    """Run work units as jobs of Slurm; the folder of the plan has the same path on all nodes. See `Executor`."""
+    """Run work units as jobs of Slurm; the output folder must have the same path on all nodes."""
 
-    options_type = create_model("SlurmOptions", __base__=_OwnOptions, **_SBATCH_FIELDS)
+    options_type = create_model("SlurmOptions", __base__=_SlurmOptions, **_SBATCH_FIELDS)
 
     def __init__(self, folder: PlanFolder, jobs: int = 1, options: Mapping[str, str] | None = None) -> None:
         super().__init__(folder, jobs, options)
@@ -90,11 +91,11 @@ class SlurmExecutor(Executor):
             self._submitit.update_parameters(timeout_min=self.options.time, stderr_to_stdout=True)
         else:
             self._submitit = submitit.SlurmExecutor(folder, max_num_timeout=requeues)
-            self._submitit.update_parameters(**self._parameters())
-        self._cancel(_COMMAND_TIMEOUT)  # jobs that a killed run has left
+            self._submitit.update_parameters(**self._submitit_parameters())
+        self._cancel(_COMMAND_TIMEOUT)  # jobs of an earlier run that was killed
         return self
 
-    def _parameters(self) -> dict[str, Any]:
+    def _submitit_parameters(self) -> dict[str, Any]:
         options = self.options
         sbatch = options.model_dump(include=set(SBATCH_OPTIONS), exclude_none=True)
         mem_gb = options.mem_gb or 2 * self.folder.plan.limits.memory_gb
@@ -121,7 +122,7 @@ class SlurmExecutor(Executor):
             if not self._jobs or self._rejections > _MAX_REJECTIONS:
                 fix = "Check --executor-option partition, account, qos, time and mem_gb."
                 raise PlanError("Slurm rejects the jobs", where="sbatch", found=error, fix=fix) from error
-            _log.warning("Slurm rejects jobs; trying again in %g s: %s", _SUBMIT_INTERVAL, error)
+            _log.warning("Slurm rejects the jobs; they are submitted again in %g s: %s", _SUBMIT_INTERVAL, error)
             return []
         self._rejections, self._queue_time = 0, 0.0
         jobs = [_Job(handle, None if self._local else self._has_left_queue) for handle in handles]
@@ -130,15 +131,15 @@ class SlurmExecutor(Executor):
 
     def _has_left_queue(self, job_id: str) -> bool:
         if time.monotonic() - self._queue_time > _QUEUE_INTERVAL:
-            self._queued_jobs = self._queue()
+            self._queued_jobs = self._list_queued_jobs()
             self._queue_time = time.monotonic()
         return self._queued_jobs is not None and job_id not in self._queued_jobs
 
-    def _queue(self) -> set[str] | None:
+    def _list_queued_jobs(self) -> set[str] | None:
         """Return the ids of pending and running jobs, or None if Slurm does not answer."""
         answer = _run_command(["squeue", "--noheader", "--array", *self._job_filter(), "--format=%i|%r"])
         if answer is None:
-            _log.warning("squeue does not answer; trying again, jobs continue")
+            _log.warning("squeue does not answer and is called again; the jobs continue")
             return None
         reasons = dict(line.strip().split("|", 1) for line in answer.splitlines())
         held = {job for job, reason in reasons.items() if reason in _HELD_REASONS}
@@ -167,12 +168,12 @@ class SlurmExecutor(Executor):
         with suppress(OSError, subprocess.TimeoutExpired):  # a slow scancel continues after Ctrl-C
             process = subprocess.Popen(command, stdin=none, stdout=none, stderr=none, start_new_session=True)
             if process.wait(seconds):
-                _log.warning("jobs of this plan may still run: %s failed", " ".join(command))
+                _log.warning("jobs of this plan may still run, because this command failed: %s", " ".join(command))
 
 
 @dataclass(frozen=True)
 class _Job:
-    """A submitted job; its state comes from squeue, because not every cluster has the sacct that submitit uses."""
+    """A submitted job; squeue reports whether it has ended, because some clusters lack sacct, which submitit uses."""
 
     handle: Any
     has_left_queue: Callable[[str], bool] | None
@@ -189,14 +190,14 @@ class _Job:
 
 @dataclass(frozen=True)
 class WorkUnitJob:
-    """The function of a job, pickled by submitit; a requeued job continues its work units."""
+    """Function that a job runs, pickled by submitit; a requeued job continues its work units."""
 
     folder: PlanFolder
     units: tuple[WorkUnit, ...]
 
     def __call__(self) -> RemoteError | None:
-        """Run the work units; return an error that affects all seeds."""
-        signal.signal(signal.SIGTERM, _exit)  # submitit would ignore it, and Slurm would wait 30 s
+        """Run the work units; return the error that affects all seeds, if any."""
+        signal.signal(signal.SIGTERM, _exit_on_signal)  # submitit would ignore it, and Slurm would wait 30 s
         worker = WorkUnitWorker(self.folder)
         # Slurm signals the end of the time to all processes of a job: block the signals in the worker processes, which
         # inherit the mask of this thread
@@ -212,17 +213,17 @@ class WorkUnitJob:
         return None
 
     def checkpoint(self) -> Any:
-        """Return the job that submitit submits when the time is over: this one."""
+        """Return this job, so that submitit submits it again when its time limit is over."""
         return submitit.helpers.DelayedSubmission(self)
 
 
-def _exit(number: int, frame: object) -> None:
+def _exit_on_signal(number: int, frame: object) -> None:
     signal.signal(number, signal.SIG_IGN)
     sys.exit(128 + number)
 
 
 def _run_command(command: list[str]) -> str | None:
-    """Return the output of a command of Slurm, or None if it failed."""
+    """Run a command of Slurm; return its output, or None if it failed."""
     try:
         return subprocess.run(
             command, check=True, capture_output=True, text=True, timeout=_COMMAND_TIMEOUT, start_new_session=True
