@@ -6,7 +6,7 @@ ManiSkill and PyTorch are not imported before an environment is made.
 from importlib import import_module as _import_module
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 
-from robocas_ms3.core.lazy import lazy_exports as _lazy_exports
+from robocas_ms3.core.lazy import make_lazy_exports as _lazy_exports
 
 if _TYPE_CHECKING:
     from robocas_ms3.core.errors import AssetError as AssetError

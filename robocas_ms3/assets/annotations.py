@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from robocas_ms3.assets.hulls import Array
-from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, open_arrays
+from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, open_npz
 from robocas_ms3.core.errors import AssetError
 
 # One half of the open gripper of the annotated grasps in the TCP frame (z approach, y closing); the other half is
@@ -88,7 +88,7 @@ class Annotations:
     def load(cls, path: Path) -> Annotations:
         """Read ``annotations.npz``."""
         try:
-            with open_arrays(path) as file:
+            with open_npz(path) as file:
                 arrays = {f.name: file[f.name] for f in fields(cls)}
             for name, array in arrays.items():
                 array.setflags(write=False)

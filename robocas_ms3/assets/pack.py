@@ -17,7 +17,7 @@ from robocas_ms3.assets.annotations import Annotations
 from robocas_ms3.assets.hulls import Array, Hull, read_hulls, sample_surface
 from robocas_ms3.assets.kinematics import link_poses
 from robocas_ms3.assets.manifest import SCHEMA_VERSION, FurnitureAsset, ObjectAsset, PackManifest
-from robocas_ms3.core.documents import JSON_LIMIT, DocumentError, check_regular, read_bytes
+from robocas_ms3.core.documents import JSON_LIMIT, DocumentError, check_regular_file, read_bytes
 from robocas_ms3.core.errors import AssetError
 from robocas_ms3.core.paths import builtin_packs_dir, data_dir
 from robocas_ms3.core.poses import transform_points
@@ -195,7 +195,7 @@ def verify_pack(pack: Pack) -> None:
 
 def sha256(path: Path) -> str:
     """Return the sha256 of a file as 64 hex digits. The result is cached by size and modification time."""
-    check_regular(path, _FILE_LIMIT)
+    check_regular_file(path, _FILE_LIMIT)
     status = path.stat()
     key = (str(path), status.st_size, status.st_mtime_ns)
     if key not in _hashes:

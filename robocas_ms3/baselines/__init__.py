@@ -5,7 +5,7 @@ Public names are imported from this package at first use.
 
 from typing import TYPE_CHECKING
 
-from robocas_ms3.core.lazy import lazy_exports
+from robocas_ms3.core.lazy import make_lazy_exports
 
 if TYPE_CHECKING:
     from robocas_ms3.baselines.baseline import Baseline as Baseline
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from robocas_ms3.baselines.training.session import RunOptions as RunOptions
     from robocas_ms3.baselines.training.session import train_run as train_run
 
-__getattr__, __dir__, __all__ = lazy_exports(
+__getattr__, __dir__, __all__ = make_lazy_exports(
     __name__,
     {
         "robocas_ms3.baselines.baseline": ["Baseline", "BaselineConfig", "Progress", "Samples", "TrainSettings"],

@@ -59,7 +59,7 @@ def main(cfg: ImportRobocas) -> int:
         check_apart(cfg.out, [cfg.dataset])
         OutputFolder(
             cfg.out, DATASET, overwrite=cfg.overwrite
-        ).read()  # checked before the dataset is read, which takes minutes
+        ).read_record()  # checked before the dataset is read, which takes minutes
     embed = None
     if cfg.embeddings:
         from robocas_ms3.scenes.language.embed import TextEmbedder

@@ -46,7 +46,7 @@ def list_all() -> dict[str, list[dict[str, Any]]]:
     from robocas_ms3.assets.pack import find_packs, load_pack
     from robocas_ms3.baselines.registry import BASELINES
     from robocas_ms3.core.errors import AssetError
-    from robocas_ms3.core.extensions import package_of
+    from robocas_ms3.core.extensions import package_name
     from robocas_ms3.evaluation.policies import POLICIES
     from robocas_ms3.robots.registry import ROBOTS
     from robocas_ms3.scenes.config import bundled_configs, load_task_config
@@ -65,13 +65,15 @@ def list_all() -> dict[str, list[dict[str, Any]]]:
     robots = [{"name": name, "agent": robot.agent} for name, robot in ROBOTS.items()]
     policies = [{"name": name, "package": "robocas_ms3", "entry_point": ""} for name in POLICIES.builtin]
     for points in POLICIES.entry_points.values():
-        policies += [{"name": point.name, "package": package_of(point), "entry_point": point.value} for point in points]
+        policies += [
+            {"name": point.name, "package": package_name(point), "entry_point": point.value} for point in points
+        ]
     baselines = [
         {"name": name, "package": "robocas_ms3", "summary": getattr(row, "description", "")}
         for name, row in BASELINES.builtin.items()
     ]
     for points in BASELINES.entry_points.values():
-        baselines += [{"name": point.name, "package": package_of(point), "summary": ""} for point in points]
+        baselines += [{"name": point.name, "package": package_name(point), "summary": ""} for point in points]
     packs = []
     for name, folder in find_packs().items():
         row: dict[str, Any] = {"name": name, "folder": str(folder), "megabytes": round(_size(folder) / 1e6, 1)}

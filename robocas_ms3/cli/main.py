@@ -22,7 +22,7 @@ from robocas_ms3 import __version__
 from robocas_ms3.cli.options import METAVARS, check_inputs, with_absolute_paths
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.files import DISK_FULL_ERRNOS
-from robocas_ms3.core.paths import ensure_home, is_writable, temporary_cache, variable_of
+from robocas_ms3.core.paths import ensure_home, find_path_variable, is_writable, make_temporary_cache
 from robocas_ms3.core.signals import INTERRUPTED, exit_command, forbid_exit, handle_interrupts
 from robocas_ms3.core.text import did_you_mean, escape_controls, escape_log_lines, escape_tracebacks
 
@@ -232,13 +232,13 @@ def _set_library_folders() -> None:
         "MESA_SHADER_CACHE_DIR": platformdirs.user_cache_path("mesa_shader_cache"),
     }
     for variable, usual in places.items():
-        if variable not in os.environ and not is_writable(usual) and (folder := temporary_cache()):
+        if variable not in os.environ and not is_writable(usual) and (folder := make_temporary_cache()):
             os.environ[variable] = str(folder / usual.name)
 
 
 def _suggest_fix(error: OSError) -> str:
     """Return how to fix an error of the system, with the free space if the disk is full."""
-    variable = variable_of(error.filename) if error.filename else ""
+    variable = find_path_variable(error.filename) if error.filename else ""
     if error.errno not in DISK_FULL_ERRNOS:
         return f". Set {variable} to a folder that can be written to." if variable else ""
     folders = [folder for folder in Path(error.filename or "").absolute().parents if folder.is_dir()]

@@ -95,7 +95,10 @@ def _check(cfg: Split) -> None:
         if cfg.out is None:
             raise DatasetError("missing output folder", where="--fractions", expected="--out DIR")
     if len(chosen) != 1:
-        what, expected = "wrong number of output options", "one of --in-place, --out-train DIR --out-val DIR, or --out DIR"
+        what, expected = (
+            "wrong number of output options",
+            "one of --in-place, --out-train DIR --out-val DIR, or --out DIR",
+        )
         raise DatasetError(what, where="--out", expected=expected, found=", ".join(chosen) or "none")
     if train_val and (cfg.out_train is None or cfg.out_val is None):
         where, expected = ("--out-train", "--out-val DIR") if cfg.out_train else ("--out-val", "--out-train DIR")

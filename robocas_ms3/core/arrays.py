@@ -33,11 +33,11 @@ def where(condition: Array, yes: Array, no: Array) -> Array:
     return np.where(condition, yes, no)
 
 
-def as_float(values: Array) -> Array:
+def as_float32(values: Array) -> Array:
     return values.float() if isinstance(values, Tensor) else np.asarray(values, np.float32)
 
 
-def as_double(values: Array) -> Array:
+def as_float64(values: Array) -> Array:
     return values.double() if isinstance(values, Tensor) else np.asarray(values, np.float64)
 
 

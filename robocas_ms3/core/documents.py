@@ -54,7 +54,7 @@ class DocumentError(ValueError):
 
 
 @contextmanager
-def _reading(path: Path) -> Iterator[None]:
+def _add_filename(path: Path) -> Iterator[None]:
     try:
         yield
     except DocumentError as error:
@@ -64,7 +64,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 def load_json(path: Path) -> Any:
     """Read a JSON file of bounded size and depth; numbers must be finite, and integers fit in 64 bits."""
-    with _reading(path):
+    with _add_filename(path):
         return decode_json(read_text(path, JSON_LIMIT))
 
 
@@ -115,15 +115,15 @@ def _describe_invalid_scalar(value: Any) -> str:
 
 def load_yaml(path: Path) -> Any:
     """Read a YAML file of bounded size, depth and number of aliases; duplicate keys of a mapping are an error."""
-    with _reading(path):
+    with _add_filename(path):
         text = read_text(path, YAML_LIMIT)
         try:
-            return yaml.load(text, Loader=_Loader)  # noqa: S506  (a SafeLoader)
+            return yaml.load(text, Loader=_LimitedLoader)  # noqa: S506  (a SafeLoader)
         except (yaml.YAMLError, ValueError, AttributeError, LookupError, TypeError, OverflowError) as error:
             raise DocumentError(one_line(error)) from error
 
 
-def open_arrays(path: Path) -> Any:
+def open_npz(path: Path) -> Any:
     """Open an ``.npz`` file without pickled objects; return NumPy's reader, a context manager.
 
     Raises one of `DAMAGED_FILE_ERRORS`.
@@ -131,21 +131,21 @@ def open_arrays(path: Path) -> Any:
     import numpy as np  # slow to import, and not needed by every command
     from numpy.lib.npyio import NpzFile
 
-    check_regular(path)
+    check_regular_file(path)
     file = np.load(path, allow_pickle=False)
     if not isinstance(file, NpzFile):
         raise DocumentError("expected an .npz archive, found a single array")
     if file.zip is not None and sum(info.file_size for info in file.zip.infolist()) > ARRAYS_LIMIT:
         file.close()
-        raise DocumentError(_too_large(ARRAYS_LIMIT))
+        raise DocumentError(_describe_size(ARRAYS_LIMIT))
     return file
 
 
-def load_array(path: Path, limit: int = ARRAYS_LIMIT) -> Any:
+def load_npy(path: Path, limit: int = ARRAYS_LIMIT) -> Any:
     """Read an ``.npy`` file of at most ``limit`` bytes without pickled objects; raise one of `DAMAGED_FILE_ERRORS`."""
     import numpy as np  # slow to import, and not needed by every command
 
-    check_regular(path, limit)
+    check_regular_file(path, limit)
     array = np.load(path, allow_pickle=False)
     if not isinstance(array, np.ndarray):
         array.close()
@@ -153,39 +153,39 @@ def load_array(path: Path, limit: int = ARRAYS_LIMIT) -> Any:
     return array
 
 
-def check_regular(path: Path, limit: int | None = None) -> None:
+def check_regular_file(path: Path, limit: int | None = None) -> None:
     """Raise DocumentError for a file over ``limit`` bytes, and for pipes, devices and sockets, which may block."""
     status = path.stat()
     if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
         raise DocumentError("not a regular file")
     if limit is not None and status.st_size > limit:
-        raise DocumentError(_too_large(limit))
+        raise DocumentError(_describe_size(limit))
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
-    with _reading(path):
-        check_regular(path, limit)
+    with _add_filename(path):
+        check_regular_file(path, limit)
         with path.open("rb") as file:
             content = file.read(limit + 1)
         if len(content) > limit:  # another process appends to it
-            raise DocumentError(_too_large(limit))
+            raise DocumentError(_describe_size(limit))
         return content
 
 
 def read_text(path: Path, limit: int) -> str:
     """Read a UTF-8 text file of at most ``limit`` bytes."""
-    with _reading(path):
+    with _add_filename(path):
         try:
             return read_bytes(path, limit).decode("utf-8")
         except UnicodeDecodeError as error:
             raise DocumentError(str(error)) from error
 
 
-def _too_large(limit: int) -> str:
+def _describe_size(limit: int) -> str:
     return f"more than {limit >> 20} MB" if limit >= 2**20 else f"more than {limit} bytes"
 
 
-class _Loader(yaml.SafeLoader):
+class _LimitedLoader(yaml.SafeLoader):
     """YAML loader that limits the number and depth of values, and refuses duplicate keys."""
 
     def __init__(self, stream: Any) -> None:
@@ -225,4 +225,4 @@ class _Loader(yaml.SafeLoader):
         return number
 
 
-_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
+_LimitedLoader.add_constructor("tag:yaml.org,2002:int", _LimitedLoader.construct_yaml_int)

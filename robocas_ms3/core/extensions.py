@@ -68,7 +68,7 @@ class Registry(Mapping[str, T]):
     def entry_points(self) -> dict[str, list[EntryPoint]]:
         """Entry points of other packages by name, not loaded; several per name if packages conflict."""
         found: dict[str, list[EntryPoint]] = {}
-        for point in sorted(entry_points(group=self.group), key=lambda point: (point.name, package_of(point))):
+        for point in sorted(entry_points(group=self.group), key=lambda point: (point.name, package_name(point))):
             if point.name in self.builtin:
                 _log.warning("%s %r of %s is ignored: the name is builtin", self.kind, point.name, point.value)
             elif point.value not in {other.value for other in found.setdefault(point.name, [])}:
@@ -78,9 +78,12 @@ class Registry(Mapping[str, T]):
     def _load(self, points: list[EntryPoint]) -> T:
         point, where = points[0], f"{points[0].name} = {points[0].value}"
         if len(points) > 1:
-            what, packages = f"several packages define a {self.kind} with this name", ", ".join(map(package_of, points))
+            what, packages = (
+                f"several packages define a {self.kind} with this name",
+                ", ".join(map(package_name, points)),
+            )
             raise ExtensionError(what, where=point.name, found=packages, fix="Uninstall all but one.")
-        fix = f"Repair or uninstall {package_of(point)}."
+        fix = f"Repair or uninstall {package_name(point)}."
         try:
             with forbid_exit(f"{self.kind} {where}"):
                 found = point.load()
@@ -95,12 +98,12 @@ class Registry(Mapping[str, T]):
         return found
 
 
-def package_of(point: EntryPoint) -> str:
+def package_name(point: EntryPoint) -> str:
     """Return the name of the package that declares an entry point."""
     return point.dist.name if point.dist else point.module.partition(".")[0]
 
 
-def load_object(path: str) -> Any:
+def import_object(path: str) -> Any:
     """Import the object at ``package.module:name``; raise ExtensionError if that fails."""
     module, _, name = path.partition(":")
     try:

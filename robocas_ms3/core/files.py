@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.paths import variable_of
+from robocas_ms3.core.paths import find_path_variable
 
 _Error = TypeVar("_Error", bound=RobocasError)
 DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT})
@@ -65,13 +65,13 @@ def atomic_file(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
         with add_path_to_errors(path):
             yield tmp
             if sync:
-                _sync(tmp)
+                _flush_file(tmp)
             os.replace(tmp, path)
             if sync:
-                _sync(path.parent)
+                _flush_file(path.parent)
     finally:
         with suppress(FileNotFoundError):
-            remove(tmp)
+            delete_path(tmp)
 
 
 def open_for_append(path: Path) -> BufferedRandom:
@@ -91,7 +91,7 @@ def open_for_append(path: Path) -> BufferedRandom:
     raise RobocasError(what, where=path, expected="a regular file", found=found, fix=fix)
 
 
-def _sync(path: Path) -> None:
+def _flush_file(path: Path) -> None:
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -103,16 +103,16 @@ def _sync(path: Path) -> None:
 def atomic_folder(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
     """Yield a new folder next to ``path``; rename it to ``path`` on success, delete it on failure.
 
-    If ``path`` cannot be renamed (see `is_fixed`), the entries of the new folder are moved into it one by one.
+    If ``path`` cannot be renamed (see `cannot_be_renamed`), the entries of the new folder are moved into it one by one.
 
     Args:
         path: of the folder.
         sync: whether to flush the files to the disk before the rename: a power failure leaves no partial folder.
     """
     path = Path(path)
-    fixed = is_fixed(path)
+    fixed = cannot_be_renamed(path)
     home = make_folder(path if fixed else path.parent)
-    _restore_and_sweep(path)
+    _recover_killed_run(path)
     tmp = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".tmp", dir=home))
     tmp.chmod(0o755)
     try:
@@ -121,28 +121,28 @@ def atomic_folder(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
             if sync:
                 flush_to_disk(tmp)
             if fixed:
-                empty_folder(path, keep=tmp)
+                clear_folder(path, keep=tmp)
                 for entry in list(tmp.iterdir()):
                     os.replace(entry, path / entry.name)
             else:
-                _move_in(tmp, path)
+                _replace_folder(tmp, path)
     finally:
         shutil.rmtree(tmp, ignore_errors=True)
 
 
-def is_fixed(folder: Path) -> bool:
+def cannot_be_renamed(folder: Path) -> bool:
     """Return whether a folder cannot be renamed: a mount point, or a folder whose parent is read-only."""
     return folder.is_dir() and (os.path.ismount(folder) or not os.access(folder.resolve().parent, os.W_OK | os.X_OK))
 
 
-def empty_folder(folder: Path, keep: Path | None = None) -> None:
+def clear_folder(folder: Path, keep: Path | None = None) -> None:
     """Delete the content of a folder, except the entry ``keep``."""
     for entry in folder.iterdir():
         if entry != keep:
-            remove(entry)
+            delete_path(entry)
 
 
-def remove(path: Path) -> None:
+def delete_path(path: Path) -> None:
     """Delete a file, a folder or a symbolic link; the target of a link stays."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
@@ -150,7 +150,7 @@ def remove(path: Path) -> None:
         path.unlink()
 
 
-def _move_in(tmp: Path, path: Path) -> None:
+def _replace_folder(tmp: Path, path: Path) -> None:
     """Replace a folder by renaming; other processes may replace it at the same time."""
     for tries_left in reversed(range(_TRIES)):
         old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
@@ -167,8 +167,8 @@ def _move_in(tmp: Path, path: Path) -> None:
             shutil.rmtree(old, ignore_errors=True)
 
 
-def _restore_and_sweep(path: Path) -> None:
-    """Restore the folder if a run was killed between the two renames of `_move_in`; delete old temporary folders."""
+def _recover_killed_run(path: Path) -> None:
+    """Restore the folder if a run was killed between the two renames of `_replace_folder`; delete old temporary folders."""
     name = glob.escape(path.name)
     with suppress(OSError):  # another run may do the same at the same time
         for old in path.parent.glob(f".{name}.*.old/old"):
@@ -189,7 +189,7 @@ def make_folder(path: Path | str) -> Path:
         what, found = "folder is not writable", ""
     except OSError as error:
         what, found = "cannot create this folder", error.strerror or ""
-    variable = variable_of(path)
+    variable = find_path_variable(path)
     fix = f"Set {variable} to a writable folder." if variable else "Choose another folder."
     raise RobocasError(what, where=path, found=found, fix=fix)
 
@@ -209,13 +209,13 @@ def flush_to_disk(folder: Path | str) -> None:
 
 
 def write_json(path: Path | str, data: Any, *, sync: bool = False) -> None:
-    """Write a JSON file atomically; ``sync`` as in `atomic_file`, errors as in `json_text`."""
-    text = json_text(data, path, indent=2) + "\n"
+    """Write a JSON file atomically; ``sync`` as in `atomic_file`, errors as in `encode_json`."""
+    text = encode_json(data, path, indent=2) + "\n"
     with atomic_file(path, sync=sync) as tmp:
         tmp.write_text(text, encoding="utf-8")
 
 
-def json_text(
+def encode_json(
     data: Any, where: object, *, indent: int | None = None, ascii_only: bool = False, error: type[_Error] = RobocasError
 ) -> str:
     """Return values as JSON text that `documents.load_json` and pydantic accept, on one line if ``indent`` is None.

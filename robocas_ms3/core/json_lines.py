@@ -17,7 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from robocas_ms3.core.documents import read_bytes
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.files import add_path_to_errors, atomic_file, json_text, open_for_append
+from robocas_ms3.core.files import add_path_to_errors, atomic_file, encode_json, open_for_append
 from robocas_ms3.core.strict_model import error_from_validation, validate_json
 
 Record = TypeVar("Record")
@@ -35,7 +35,7 @@ class Line(Generic[Record]):
     cut_off: bool = False  # a damaged last line without a line end: the run was killed
 
 
-_form_of = lru_cache(TypeAdapter)
+_type_adapter = lru_cache(TypeAdapter)
 
 
 class JsonLinesFile(Generic[Record]):
@@ -48,23 +48,23 @@ class JsonLinesFile(Generic[Record]):
 
     def __init__(self, path: Path, record: Any) -> None:
         self.path = path
-        self._form: TypeAdapter[Record] = _form_of(record)
+        self._form: TypeAdapter[Record] = _type_adapter(record)
 
-    def lines(self) -> list[Line[Record]]:
+    def read_lines(self) -> list[Line[Record]]:
         """Return all lines except empty ones, including damaged lines; [] without a file. Raises as `read_bytes`."""
         try:
             pieces = read_bytes(self.path, _LIMIT).split(b"\n")
         except FileNotFoundError:
             return []
-        return [self._read(number, piece, len(pieces)) for number, piece in enumerate(pieces, 1) if piece.strip()]
+        return [self._parse_line(number, piece, len(pieces)) for number, piece in enumerate(pieces, 1) if piece.strip()]
 
     def read(self) -> list[Record]:
         """Return the records of all undamaged lines."""
-        return [line.record for line in self.lines() if line.record is not None]
+        return [line.record for line in self.read_lines() if line.record is not None]
 
     def append(self, records: Iterable[Record], *, sync: bool = False) -> None:
         """Append lines; ``sync`` flushes them to the disk. Without records the file is not touched."""
-        text = _text(records, self.path)
+        text = _encode_lines(records, self.path)
         if not text:
             return
         with add_path_to_errors(self.path), open_for_append(self.path) as file:
@@ -76,14 +76,14 @@ class JsonLinesFile(Generic[Record]):
 
     def rewrite(self, records: Iterable[Record]) -> None:
         with atomic_file(self.path) as tmp:
-            tmp.write_bytes(_text(records, self.path))
+            tmp.write_bytes(_encode_lines(records, self.path))
 
-    def line_error(self, line: Line[Record], error: type[_Error], about: str) -> _Error:
+    def make_line_error(self, line: Line[Record], error: type[_Error], about: str) -> _Error:
         """Return an ``error`` for a damaged line of this file; ``about`` is the start of its message."""
         assert line.problem is not None
         return error_from_validation(line.problem, self._form, error, where=f"{self.path}:{line.number}", about=about)
 
-    def _read(self, number: int, text: bytes, last: int) -> Line[Record]:
+    def _parse_line(self, number: int, text: bytes, last: int) -> Line[Record]:
         try:
             return Line(number, validate_json(self._form, text))
         except ValidationError as problem:
@@ -97,12 +97,12 @@ class JsonLinesFile(Generic[Record]):
             return
         file.seek(0)
         rest = file.read().rpartition(b"\n")[2]
-        if self._read(1, rest, 1).record is None:
+        if self._parse_line(1, rest, 1).record is None:
             file.truncate(file.tell() - len(rest))
         else:
             file.write(b"\n")
 
 
-def _text(records: Iterable[Any], path: Path) -> bytes:
+def _encode_lines(records: Iterable[Any], path: Path) -> bytes:
     plain = (asdict(record) if is_dataclass(record) and not isinstance(record, type) else record for record in records)
-    return "".join(json_text(record, path, ascii_only=True) + "\n" for record in plain).encode()
+    return "".join(encode_json(record, path, ascii_only=True) + "\n" for record in plain).encode()

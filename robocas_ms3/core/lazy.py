@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import Any
 
 
-def lazy_exports(
+def make_lazy_exports(
     package: str, names: Mapping[str, Sequence[str]]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Return `__getattr__`, `__dir__` and `__all__` of a package whose public names are imported at first use.

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.files import is_fixed, make_folder, open_for_append
+from robocas_ms3.core.files import cannot_be_renamed, make_folder, open_for_append
 
 LOCK = ".lock"
 """Name of the lock file inside a folder, for folders such as mount points; otherwise it is next to the folder."""
@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 
 @contextmanager
-def locked_folder(path: Path | str) -> Iterator[None]:
+def lock_folder(path: Path | str) -> Iterator[None]:
     """Lock a folder, which need not exist; errors as in `lock_file`.
 
     Parent folders created for the lock file are removed if the folder does not exist at the end.
@@ -34,9 +34,9 @@ def locked_folder(path: Path | str) -> Iterator[None]:
     real = (
         path.resolve()
     )  # one lock file for all links to the folder; next to the folder, since the folder may be replaced
-    lock = path / LOCK if is_fixed(path) else real.parent / f".{real.name}.lock"
+    lock = path / LOCK if cannot_be_renamed(path) else real.parent / f".{real.name}.lock"
     try:
-        with _open_locked(lock, path):
+        with _open_and_lock(lock, path):
             try:
                 yield
             finally:
@@ -74,7 +74,7 @@ def lock_file(file: IO[Any], path: Path, *, wait: bool) -> None:
             return
 
 
-def _open_locked(lock: Path, path: Path) -> IO[bytes]:
+def _open_and_lock(lock: Path, path: Path) -> IO[bytes]:
     """Open and lock a lock file; retry if the process that held the lock removed the file in between."""
     while True:
         make_folder(lock.parent)

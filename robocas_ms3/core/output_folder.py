@@ -19,8 +19,8 @@ from typing import Any
 
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import OutputExistsError, RobocasError
-from robocas_ms3.core.files import empty_folder, json_text, make_folder, remove, write_json
-from robocas_ms3.core.locks import LOCK, locked_folder
+from robocas_ms3.core.files import clear_folder, delete_path, encode_json, make_folder, write_json
+from robocas_ms3.core.locks import LOCK, lock_folder
 
 _LEFTOVERS = (".*.tmp*", ".*.old")  # of `files.atomic_file` and `files.atomic_folder` in a killed process
 _OVERWRITTEN = "overwritten"  # key of the record while the old content is moved away; a run that finds it starts again
@@ -84,8 +84,8 @@ class OutputFolder:
     def __enter__(self) -> OutputFolder:
         with ExitStack() as stack:
             if not self._shared:
-                stack.enter_context(locked_folder(self.path))
-            self.read()
+                stack.enter_context(lock_folder(self.path))
+            self.read_record()
             self._stack = stack.pop_all()
         return self
 
@@ -102,10 +102,10 @@ class OutputFolder:
                     raise removed from error
             with suppress(OSError):  # a mount point or a link stays
                 if not (self._shared or self._has_results()):
-                    empty_folder(self.path)
+                    clear_folder(self.path)
                     self.path.rmdir()
 
-    def read(self) -> None:
+    def read_record(self) -> None:
         """Read and check the record without locking the folder, for further processes of the same run."""
         self.recorded = self._load_matching()
         if self._settings is not None:
@@ -117,7 +117,7 @@ class OutputFolder:
             self._compare(self.recorded, settings)
 
     def _compare(self, record: dict[str, Any], settings: Mapping[str, Any]) -> None:
-        now = json.loads(json_text(settings, self.path))
+        now = json.loads(encode_json(settings, self.path))
         before = self._kind.upgrade(record)
         changes = [change for key, value in now.items() for change in list_setting_changes(before.get(key), value, key)]
         if changes:
@@ -153,9 +153,9 @@ class OutputFolder:
     def check_exists(self) -> None:
         """Raise RobocasError if the folder was removed, since writers would create it again and continue."""
         if not self._record_path().is_file():
-            raise self._removed_error()
+            raise self._make_removed_error()
 
-    def _removed_error(self) -> RobocasError:
+    def _make_removed_error(self) -> RobocasError:
         what, fix = "the output folder was removed or emptied during the run", "Start again."
         return RobocasError(what, where=self.path, expected=self._record_path().name, fix=fix)
 
@@ -163,7 +163,7 @@ class OutputFolder:
         """Raise RobocasError if the record was removed, or if another run started here with other settings."""
         record = self._load_record()
         if record is None:
-            raise self._removed_error()
+            raise self._make_removed_error()
         self._compare(record, self._settings or {})
 
     def _record_path(self) -> Path:
@@ -195,15 +195,15 @@ class OutputFolder:
 
     def _has_results(self) -> bool:
         records = {self.path / record for record in self._kind.records}
-        return any(path not in records and path.lstat().st_size for path in _iter_files(self.path))
+        return any(path not in records and path.lstat().st_size for path in _list_files(self.path))
 
 
-def _iter_files(folder: Path) -> Iterator[Path]:
+def _list_files(folder: Path) -> Iterator[Path]:
     for entry in folder.iterdir() if folder.is_dir() else ():
         if _is_hidden(entry):
             continue
         if entry.is_dir() and not entry.is_symlink():
-            yield from _iter_files(entry)
+            yield from _list_files(entry)
         else:
             yield entry
 
@@ -248,7 +248,7 @@ def remove_leftovers(folder: Path) -> None:
     """Remove temporary files and folders of killed runs; the folder must be locked."""
     for pattern in _LEFTOVERS:
         for leftover in folder.glob(pattern):
-            remove(leftover)
+            delete_path(leftover)
 
 
 def list_setting_changes(before: Any, now: Any, path: str, tolerance: float = 0.0) -> list[str]:
@@ -260,10 +260,10 @@ def list_setting_changes(before: Any, now: Any, path: str, tolerance: float = 0.
     elif isinstance(before, float) and isinstance(now, float) and abs(before - now) <= tolerance:
         return []
     else:
-        return [] if before == now else [f"{path}: {_shortened(before)} -> {_shortened(now)}"]
+        return [] if before == now else [f"{path}: {_shorten(before)} -> {_shorten(now)}"]
     return [change for key, old, new in pairs for change in list_setting_changes(old, new, f"{path}.{key}", tolerance)]
 
 
-def _shortened(value: Any) -> str:
+def _shorten(value: Any) -> str:
     text = json.dumps(value, ensure_ascii=False)
     return text if len(text) <= _SHOWN_VALUE else f"{text[: _SHOWN_VALUE - 3]}..."

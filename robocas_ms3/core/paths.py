@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 def data_dir() -> Path:
     """Return the folder of the user's asset packs: ``$ROBOCAS_DATA``, by default the user's data folder."""
-    return Path(os.environ.get(DATA) or _user_folder(platformdirs.user_data_path))
+    return Path(os.environ.get(DATA) or _find_user_folder(platformdirs.user_data_path))
 
 
 def cache_dir() -> Path:
@@ -34,10 +34,10 @@ def cache_dir() -> Path:
     If the variable is not set and the user's folder is not writable, it is a private folder in the temporary directory.
     """
     chosen = os.environ.get(CACHE)
-    return Path(chosen) if chosen else _user_cache(_user_folder(platformdirs.user_cache_path))
+    return Path(chosen) if chosen else _choose_cache(_find_user_folder(platformdirs.user_cache_path))
 
 
-def _user_folder(find: Callable[[str], Path]) -> Path:
+def _find_user_folder(find: Callable[[str], Path]) -> Path:
     folder = Path()
     with suppress(RuntimeError):  # without a home folder some versions raise, others return "~/.cache/robocas"
         folder = find("robocas")
@@ -60,14 +60,14 @@ def ensure_home() -> None:
 
 
 @lru_cache(maxsize=8)
-def _user_cache(usual: Path) -> Path:
-    if is_writable(usual) or (instead := temporary_cache()) is None:
+def _choose_cache(usual: Path) -> Path:
+    if is_writable(usual) or (instead := make_temporary_cache()) is None:
         return usual
     _log.warning("%s is not writable: the cache is %s. Set %s to choose another folder.", usual, instead, CACHE)
     return instead
 
 
-def temporary_cache() -> Path | None:
+def make_temporary_cache() -> Path | None:
     """Create and return a private cache folder in the temporary directory; None if another user owns the path."""
     folder = Path(tempfile.gettempdir()) / f"robocas-{os.getuid()}"
     try:
@@ -85,7 +85,7 @@ def is_writable(folder: Path) -> bool:
     return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
 
 
-def variable_of(path: Path | str) -> str:
+def find_path_variable(path: Path | str) -> str:
     """Return the environment variable that moves a path (cache or data folder); empty if there is none."""
     path = Path(path).absolute()
     for name, folder_of in ((CACHE, cache_dir), (DATA, data_dir)):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from traceback import format_exception
 from typing import NoReturn
 
-from robocas_ms3.core.signals import exit_error
+from robocas_ms3.core.signals import make_exit_error
 
 
 @dataclass(frozen=True)
@@ -20,13 +20,13 @@ class RemoteError:
     traceback: str
 
     @classmethod
-    def of(cls, error: BaseException, where: str) -> RemoteError:
+    def from_error(cls, error: BaseException, where: str) -> RemoteError:
         """Convert an error; an error that cannot be pickled becomes a RuntimeError.
 
         ``where`` names this process; an error that came from another process keeps the name of that process.
         """
         if isinstance(error, SystemExit):  # a SystemExit would end the receiving process without a message
-            error = exit_error(error, where).with_traceback(error.__traceback__)
+            error = make_exit_error(error, where).with_traceback(error.__traceback__)
         cause = error.__cause__
         place = cause.args if isinstance(cause, RemoteTraceback) else (where, "".join(format_exception(error)))
         with suppress(Exception):  # pickling may raise any error
@@ -34,13 +34,13 @@ class RemoteError:
                 return cls(error, *place)
         return cls(RuntimeError(f"{type(error).__name__}: {error}"), *place)
 
-    def with_traceback(self) -> BaseException:
+    def make_error(self) -> BaseException:
         """Return the error with a `RemoteTraceback` as its cause."""
         self.error.__cause__ = RemoteTraceback(self.where, self.traceback)
         return self.error
 
     def reraise(self) -> NoReturn:
-        raise self.with_traceback()
+        raise self.make_error()
 
 
 class RemoteTraceback(Exception):  # noqa: N818  (the cause of an error, as in `concurrent.futures`)

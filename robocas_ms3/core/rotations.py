@@ -14,12 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from robocas_ms3.core.arrays import Array, as_double, as_float, concatenate, matmul, where
+from robocas_ms3.core.arrays import Array, as_float32, as_float64, concatenate, matmul, where
 
 
 def from_euler(angles: Array) -> Array:
     """Convert intrinsic XYZ Euler angles (N, 3) in rad to unit quaternions (N, 4), w >= 0: R = Rx Ry Rz."""
-    half = 0.5 * as_double(angles)
+    half = 0.5 * as_float64(angles)
     library: Any = torch if isinstance(half, Tensor) else np
     (cx, cy, cz), (sx, sy, sz) = library.cos(half).T, library.sin(half).T
     yz = cy * cz, sy * sz, sy * cz, cy * sz
@@ -29,20 +29,20 @@ def from_euler(angles: Array) -> Array:
         cx * yz[2] - sx * yz[3],
         cx * yz[3] + sx * yz[2],
     ]
-    return standardize(as_float(library.stack(parts, 1)))
+    return standardize(as_float32(library.stack(parts, 1)))
 
 
 def multiply(first: Array, second: Array) -> Array:
     """Multiply unit quaternions (N, 4); return products (N, 4) with w >= 0."""
-    product = matmul(left_product_matrix(as_double(first)), as_double(second)[:, :, None])
-    return standardize(as_float(product[:, :, 0]))
+    product = matmul(left_product_matrix(as_float64(first)), as_float64(second)[:, :, None])
+    return standardize(as_float32(product[:, :, 0]))
 
 
 def rotate_float64(quaternion: Array, vector: Array) -> Array:
     """Rotate vectors (N, 3) by unit quaternions (N, 4), computed in float64 and returned in float32."""
-    left = left_product_matrix(as_double(quaternion))
-    half = matmul(left[:, :, 1:], as_double(vector)[:, :, None])
-    return as_float(matmul(left, concatenate([-half[:, :1], half[:, 1:]], axis=1))[:, 1:, 0])
+    left = left_product_matrix(as_float64(quaternion))
+    half = matmul(left[:, :, 1:], as_float64(vector)[:, :, None])
+    return as_float32(matmul(left, concatenate([-half[:, :1], half[:, 1:]], axis=1))[:, 1:, 0])
 
 
 def standardize(quaternion: Array) -> Array:
@@ -53,15 +53,15 @@ def standardize(quaternion: Array) -> Array:
 def left_product_matrix(quaternion: Array) -> Array:
     """Return matrices (N, 4, 4) of the product with a quaternion (N, 4) on the left: q * p = L(q) p."""
     if isinstance(quaternion, Tensor):
-        return torch.stack(_left_numbers(*quaternion.T), 1).reshape(-1, 4, 4)
+        return torch.stack(_left_product_elements(*quaternion.T), 1).reshape(-1, 4, 4)
     return (quaternion @ _LEFT).reshape(-1, 4, 4)
 
 
-def _left_numbers(w: Any, x: Any, y: Any, z: Any) -> list[Any]:
+def _left_product_elements(w: Any, x: Any, y: Any, z: Any) -> list[Any]:
     return [w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w]
 
 
-_LEFT = np.array([_left_numbers(*unit) for unit in np.eye(4)])
+_LEFT = np.array([_left_product_elements(*unit) for unit in np.eye(4)])
 
 # Coefficients of the rotation matrix (row-major) for the products ww, wx, wy, ..., zz of the quaternion's components
 _PRODUCTS = np.array(
@@ -82,7 +82,7 @@ _PRODUCTS = np.array(
 
 
 @cache
-def _products_on(device: torch.device) -> Tensor:
+def _product_table_on(device: torch.device) -> Tensor:
     return torch.from_numpy(_PRODUCTS).to(device)
 
 
@@ -90,7 +90,7 @@ def to_matrix(quaternion: Array) -> Array:
     """Convert unit quaternions (..., 4) to rotation matrices (..., 3, 3)."""
     # few array operations, since the overhead per operation dominates
     products = quaternion[..., :, None] * quaternion[..., None, :]
-    table = _products_on(quaternion.device) if isinstance(quaternion, Tensor) else _PRODUCTS
+    table = _product_table_on(quaternion.device) if isinstance(quaternion, Tensor) else _PRODUCTS
     shape = quaternion.shape[:-1]
     return (products.reshape(*shape, 16) @ table).reshape(*shape, 3, 3)
 

@@ -24,7 +24,7 @@ _SECOND = 0.5  # s; a SIGINT sooner after the first belongs to the same key pres
 _PR_SET_PDEATHSIG = 1
 
 
-class _CommandInterrupt:
+class _InterruptHandler:
     """Handler of Ctrl-C and SIGTERM in a command: the first signal ends the command within seconds.
 
     Python calls a signal handler only when native code returns or a deferral ends. Until then a second SIGINT ends the
@@ -85,7 +85,7 @@ class _CommandInterrupt:
             self._handled.wait(_SECOND)
 
 
-_command = _CommandInterrupt()
+_command = _InterruptHandler()
 
 
 def handle_interrupts() -> None:
@@ -101,7 +101,7 @@ def exit_command(code: int) -> NoReturn:
 
 
 @contextmanager
-def deferred_interrupts(*, second_ends: bool = True) -> Iterator[list[Any]]:
+def defer_interrupts(*, second_ends: bool = True) -> Iterator[list[Any]]:
     """Defer SIGINT and SIGTERM until the end of the block; yield the list of signals received so far.
 
     Only the first signal is handled. A signal mask does not suffice: the system delivers the signal to another thread,
@@ -154,10 +154,10 @@ def forbid_exit(source: str) -> Iterator[None]:
     except (SystemExit, KeyboardInterrupt) as error:
         if isinstance(error, KeyboardInterrupt) and not _command.is_armed():  # a signal may have raised it
             raise
-        raise exit_error(error, source) from error
+        raise make_exit_error(error, source) from error
 
 
-def exit_error(error: BaseException, source: str) -> ExtensionError:
+def make_exit_error(error: BaseException, source: str) -> ExtensionError:
     """Return an error with the line of an extension's code that tried to end the process."""
     frames = extract_tb(error.__traceback__)
     line = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""

@@ -49,17 +49,17 @@ class StrictModel(BaseModel):
     @model_validator(mode="after")
     def _check_numbers(self) -> StrictModel:
         for name, value in self:
-            if (wrong := _too_large(value)) is not None:
+            if (wrong := _find_large_number(value)) is not None:
                 raise ValueError(f"{name}: expected numbers of at most {MAX_NUMBER:g}, found {wrong:g}")
         return self
 
 
-def _too_large(value: Any) -> float | None:
+def _find_large_number(value: Any) -> float | None:
     """Return a number in a value whose magnitude exceeds `MAX_NUMBER`, or None; nested models check themselves."""
     if isinstance(value, int | float):
         return value if abs(value) > MAX_NUMBER else None
     inside = value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ()
-    return next((wrong for item in inside if (wrong := _too_large(item)) is not None), None)
+    return next((wrong for item in inside if (wrong := _find_large_number(item)) is not None), None)
 
 
 @dataclass(frozen=True)
@@ -160,8 +160,8 @@ def list_invalid_values(
         schema = form.json_schema() if isinstance(form, TypeAdapter) else form.model_json_schema()
     found: dict[str, list[Any]] = {}
     for details in problem.errors(include_url=False):
-        found.setdefault(".".join(_place(details["loc"], schema)[0]), []).append(details)
-    made = [_invalid_value(key, same, schema, {**_EXPECTED, **(words or {})}) for key, same in found.items()]
+        found.setdefault(".".join(_locate_value(details["loc"], schema)[0]), []).append(details)
+    made = [_make_invalid_value(key, same, schema, {**_EXPECTED, **(words or {})}) for key, same in found.items()]
     return sorted(
         made, key=lambda value: value.kind != "extra_forbidden"
     )  # a misspelled key is also reported as missing
@@ -187,17 +187,20 @@ FileName = Annotated[str, AfterValidator(_check_name)]
 """Type of a model's field that is used as a file name."""
 
 
-def _invalid_value(key: str, same: list[Any], schema: dict[str, Any], words: Mapping[str, str]) -> InvalidValue:
+def _make_invalid_value(key: str, same: list[Any], schema: dict[str, Any], words: Mapping[str, str]) -> InvalidValue:
     details = same[0]
     kind, value, context = details["type"], details["input"], details.get("ctx", {})
     what, expected, found, fix = f"invalid value for {key or '(top level)'!r}", "", "", ""
     if kind == "extra_forbidden":
         *outer, name = details["loc"]
-        name, known = one_line(name, _FOUND_LENGTH), sorted(_place(tuple(outer), schema)[1].get("properties", {}))
+        name, known = (
+            one_line(name, _FOUND_LENGTH),
+            sorted(_locate_value(tuple(outer), schema)[1].get("properties", {})),
+        )
         what, expected = f"unknown key {key!r}", f"one of {known}" if known else "no such key"
         found, fix = repr(name), did_you_mean(name, known)
     elif kind in {"union_tag_invalid", "union_tag_not_found"}:
-        discriminator = _place(details["loc"], schema)[1]["discriminator"]
+        discriminator = _locate_value(details["loc"], schema)[1]["discriminator"]
         tag, kinds = discriminator["propertyName"], sorted(discriminator["mapping"])
         name = one_line(context.get("tag", ""), _FOUND_LENGTH)
         what, expected = f"invalid value for '{f'{key}.{tag}' if key else tag}'", f"one of {kinds}"
@@ -209,13 +212,13 @@ def _invalid_value(key: str, same: list[Any], schema: dict[str, Any], words: Map
     elif kind == "json_invalid":
         what, found = "invalid JSON", one_line(context["error"])
     else:
-        expected = " or ".join(dict.fromkeys(_expected(details, words) for details in same))
+        expected = " or ".join(dict.fromkeys(_describe_expected(details, words) for details in same))
         found = "nothing" if kind == "missing" else repr(value)
         found = found if len(found) <= _FOUND_LENGTH else f"{found[:_FOUND_LENGTH]}..."
     return InvalidValue(key, kind, what, expected, found, fix, value, context)
 
 
-def _expected(details: Any, words: Mapping[str, str]) -> str:
+def _describe_expected(details: Any, words: Mapping[str, str]) -> str:
     kind, place = details["type"], details["loc"]
     if kind == "missing" and place and isinstance(place[-1], int):
         return f"at least {place[-1] + 1} items in this list"
@@ -225,12 +228,12 @@ def _expected(details: Any, words: Mapping[str, str]) -> str:
     return words.get(kind, one_line(message.replace(" after validation", "")))
 
 
-def _place(location: tuple[int | str, ...], schema: dict[str, Any]) -> tuple[list[str], dict[str, Any]]:
+def _locate_value(location: tuple[int | str, ...], schema: dict[str, Any]) -> tuple[list[str], dict[str, Any]]:
     """Return the keys of an invalid value as in the file, and the JSON schema of this value, or {}.
 
     The location of pydantic also has tags of tagged unions, types of values, and "[key]" for an invalid key.
     """
-    node = _resolved(schema, schema)
+    node = _resolve_reference(schema, schema)
     keys: list[str] = []
     for part in location:
         kinds = node.get("discriminator", {}).get("mapping", {})
@@ -245,11 +248,11 @@ def _place(location: tuple[int | str, ...], schema: dict[str, Any]) -> tuple[lis
             keys.append(one_line(part, _FOUND_LENGTH))
             inner = node.get("properties", {}).get(part) or node.get("additionalProperties") or node.get("items")
             node = inner if isinstance(inner, dict) else {}
-        node = _resolved(node, schema)
+        node = _resolve_reference(node, schema)
     return keys, node
 
 
-def _resolved(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
+def _resolve_reference(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
     real = [choice for choice in node.get("anyOf", ()) if choice.get("type") != "null"]
     node = real[0] if len(real) == 1 else node  # X | None
     return schema["$defs"][node["$ref"].rsplit("/", 1)[-1]] if "$ref" in node else node

@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from robocas_ms3.core.errors import RobocasError, WorkerCrashError, WorkerStartError
 from robocas_ms3.core.remote_errors import RemoteError
-from robocas_ms3.core.signals import die_with_parent, exit_error, exit_immediately
+from robocas_ms3.core.signals import die_with_parent, exit_immediately, make_exit_error
 from robocas_ms3.core.text import escape_log_lines, escape_tracebacks
 
 Task = TypeVar("Task")
@@ -201,9 +201,11 @@ class WorkerProcess(Generic[Task, Result]):
             self.connection = None
 
 
-def worker_error(error: BaseException, where: str) -> RemoteError:
+def make_worker_error(error: BaseException, where: str) -> RemoteError:
     """Convert an error of code in a worker, where KeyboardInterrupt cannot come from Ctrl-C."""
-    return RemoteError.of(exit_error(error, where) if isinstance(error, KeyboardInterrupt) else error, where)
+    return RemoteError.from_error(
+        make_exit_error(error, where) if isinstance(error, KeyboardInterrupt) else error, where
+    )
 
 
 def _exceeds_memory(pid: int, memory_gb: float) -> bool:
@@ -277,10 +279,10 @@ def _answer(connection: Connection, function: Callable[[Any], Any]) -> None:
     try:
         answer = function(pickle.loads(message))
     except BaseException as error:  # noqa: BLE001  (it is raised again in the pool's process)
-        answer = worker_error(error, "a worker")
+        answer = make_worker_error(error, "a worker")
     try:
         connection.send(answer)
     except OSError:
         raise
     except Exception as error:  # the result cannot be pickled
-        connection.send(RemoteError.of(error, "a worker"))
+        connection.send(RemoteError.from_error(error, "a worker"))

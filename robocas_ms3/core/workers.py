@@ -28,7 +28,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
 from robocas_ms3.core.errors import WorkerCrashError, WorkerStartError
-from robocas_ms3.core.signals import deferred_interrupts
+from robocas_ms3.core.signals import defer_interrupts
 from robocas_ms3.core.worker_process import NO_LIMITS, Limits, ProcessCrashError, Worker, WorkerProcess
 
 Task = TypeVar("Task")
@@ -75,7 +75,7 @@ class WorkerPool(Generic[Task, Result]):
         self._make_worker, self._num_workers, self._limits = make_worker, num_workers, limits
         self._retries, self._on_crash = retries, on_crash or _raise_crash
         self._worker: Worker[Task, Result] | None = None  # the worker of this process
-        self._jobs: SimpleQueue[_Job[Task, Result] | None] = SimpleQueue()
+        self._jobs: SimpleQueue[_PendingTask[Task, Result] | None] = SimpleQueue()
         self._threads: list[threading.Thread] = []  # each supervises one process
         self._owner = 0  # process id: a fork of this process has no threads
         self._stop_reader: Any = None  # a Connection; readable once the pool is stopped
@@ -95,7 +95,7 @@ class WorkerPool(Generic[Task, Result]):
             Exception: any error of a task, of ``make_worker`` or of ``on_crash``.
         """
         if self._num_workers == 0:
-            return self._map_here(tasks)
+            return self._map_in_this_process(tasks)
         return self._map_in_processes(tasks, ordered)
 
     def run(self, task: Task) -> Result:
@@ -103,7 +103,7 @@ class WorkerPool(Generic[Task, Result]):
         (result,) = self.map([task])
         return result
 
-    def _map_here(self, tasks: Iterable[Task]) -> Generator[Result, None, None]:
+    def _map_in_this_process(self, tasks: Iterable[Task]) -> Generator[Result, None, None]:
         for task in tasks:
             if self._worker is None:
                 self._worker = self._make_worker()
@@ -116,7 +116,7 @@ class WorkerPool(Generic[Task, Result]):
 
     def _map_in_processes(self, tasks: Iterable[Task], ordered: bool) -> Generator[Result, None, None]:
         remaining = iter(tasks)
-        pending: list[_Job[Task, Result]] = []  # in the order of the tasks
+        pending: list[_PendingTask[Task, Result]] = []  # in the order of the tasks
         finished: SimpleQueue[None] = SimpleQueue()
         most = (_TASKS_PER_WORKER + _RESULTS_PER_WORKER) * self._num_workers
         try:
@@ -124,7 +124,7 @@ class WorkerPool(Generic[Task, Result]):
                 unfinished = sum(not job.done for job in pending)
                 free = min(_TASKS_PER_WORKER * self._num_workers - unfinished, most - len(pending))
                 for task in islice(remaining, max(0, free)):
-                    pending.append(_Job(task, finished))
+                    pending.append(_PendingTask(task, finished))
                     self._submit(pending[-1])
                 if not pending:
                     return
@@ -140,7 +140,7 @@ class WorkerPool(Generic[Task, Result]):
             for job in pending:
                 job.cancelled = True
 
-    def _submit(self, job: _Job[Task, Result]) -> None:
+    def _submit(self, job: _PendingTask[Task, Result]) -> None:
         if self._owner != os.getpid():
             self._owner, self._jobs = os.getpid(), SimpleQueue()
             self._stop_reader, self._stop_writer = Pipe(duplex=False)
@@ -159,7 +159,7 @@ class WorkerPool(Generic[Task, Result]):
         while True:
             if self._stopped:
                 raise CancelledError
-            with suppress(Empty), deferred_interrupts():
+            with suppress(Empty), defer_interrupts():
                 finished.get(timeout=_POLL_SECONDS)
                 return
 
@@ -170,14 +170,14 @@ class WorkerPool(Generic[Task, Result]):
         while (job := self._jobs.get()) is not None and not self._stopped:
             if not job.cancelled:
                 try:
-                    job.result = self._run_job(process, job.task)
+                    job.result = self._run_with_retries(process, job.task)
                 except BaseException as error:  # noqa: BLE001  (`map` raises it)
                     job.error = error
                 job.done = True
                 job.finished.put(None)
         process.quit()
 
-    def _run_job(self, process: WorkerProcess[Task, Result], task: Task) -> Result:
+    def _run_with_retries(self, process: WorkerProcess[Task, Result], task: Task) -> Result:
         reason = ""
         for retries_left in reversed(range(self._retries + 1)):
             try:
@@ -220,7 +220,7 @@ class WorkerPool(Generic[Task, Result]):
         self.close()
 
 
-class _Job(Generic[Task, Result]):
+class _PendingTask(Generic[Task, Result]):
     """A task, its result, and a queue that is notified when the task is done."""
 
     def __init__(self, task: Task, finished: SimpleQueue[None]) -> None:

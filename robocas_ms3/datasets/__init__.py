@@ -5,7 +5,7 @@ Public names are imported from this package at first use; without the names of `
 
 from typing import TYPE_CHECKING
 
-from robocas_ms3.core.lazy import lazy_exports
+from robocas_ms3.core.lazy import make_lazy_exports
 
 if TYPE_CHECKING:
     from robocas_ms3.datasets.actions import ActionScale as ActionScale
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from robocas_ms3.datasets.training.options import SampleOptions as SampleOptions
     from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset as RoboCASDataset
 
-__getattr__, __dir__, __all__ = lazy_exports(
+__getattr__, __dir__, __all__ = make_lazy_exports(
     __name__,
     {
         "robocas_ms3.datasets.actions": ["ActionScale", "to_joint_positions"],

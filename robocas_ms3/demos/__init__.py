@@ -5,7 +5,7 @@ Public names are imported from this package at first use.
 
 from typing import TYPE_CHECKING
 
-from robocas_ms3.core.lazy import lazy_exports
+from robocas_ms3.core.lazy import make_lazy_exports
 
 if TYPE_CHECKING:
     from robocas_ms3.demos.generation import Summary as Summary
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from robocas_ms3.demos.trajectory_replay import ReplayResult as ReplayResult
     from robocas_ms3.demos.trajectory_replay import replay as replay
 
-__getattr__, __dir__, __all__ = lazy_exports(
+__getattr__, __dir__, __all__ = make_lazy_exports(
     __name__,
     {
         "robocas_ms3.demos.generation": ["Summary", "generate"],

@@ -153,7 +153,7 @@ class ForkedDecisions:
             succeeded = False
         except BaseException as error:
             if self._pipe is not None:
-                self._send_and_exit(RemoteError.of(error, "a branch"))
+                self._send_and_exit(RemoteError.from_error(error, "a branch"))
             raise
         if self._pipe is not None:
             self._send_and_exit(succeeded)
@@ -264,7 +264,7 @@ class ForkedDecisions:
         except PlanningError as error:
             self._send_and_exit(error)
         except BaseException as error:
-            self._send_and_exit(RemoteError.of(error, "a branch"))
+            self._send_and_exit(RemoteError.from_error(error, "a branch"))
         assert self._pipe is not None
         try:
             self._pipe.send((score, self._result))

@@ -242,7 +242,7 @@ class _Run:
     def _rewrite_failures(self, results: list[EpisodeResult]) -> None:
         """Rewrite ``failures.jsonl`` if its lines differ from these results, e.g. after a kill."""
         lines = [line for result in results for line in _failure_lines(result)]
-        if [line.record for line in self.failures.lines()] != lines:
+        if [line.record for line in self.failures.read_lines()] != lines:
             self.failures.rewrite(lines)
 
     def _read(self, path: Path) -> dict[int, EpisodeResult]:

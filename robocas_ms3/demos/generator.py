@@ -12,7 +12,7 @@ import numpy as np
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.core.errors import LayoutError, PlanningError, UnrecoverableError
-from robocas_ms3.core.extensions import load_object
+from robocas_ms3.core.extensions import import_object
 from robocas_ms3.demos.backtracking import ResimulatedDecisions
 from robocas_ms3.demos.branches import ForkedDecisions, reason_not_to_fork, warn_no_fork
 from robocas_ms3.demos.failures import EpisodeResult, Intervention
@@ -67,7 +67,7 @@ class EpisodeGenerator:
         self.planner: Planner = make_planner(settings.planner, robot, dt=base_env.control_timestep)
         self.inverse_kinematics = InverseKinematics(ArmChain(robot.files().arm_urdf, robot.description))
         # runs one attempt from the current state; raises PlanningError if it fails
-        self.policy: Callable[[Arm], None] = load_object(TASKS[settings.task].solver)
+        self.policy: Callable[[Arm], None] = import_object(TASKS[settings.task].solver)
         self.open_loop_envs: list[OpenLoopEnv] = []
         self.open_loop_checks: OpenLoopChecks | None = None
         if settings.check_rate and not config.base_motion:

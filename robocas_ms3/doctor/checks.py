@@ -135,7 +135,7 @@ def check_extra(extra: str) -> Finding:
 def check_folders() -> list[Finding]:
     """Check that the cache folder (required) and the folder of imported packs (optional) are writable."""
     cache = check_writable("cache folder", paths.cache_dir(), paths.CACHE, required=True)
-    if cache.status == "ok" and not os.environ.get(paths.CACHE) and paths.cache_dir() == paths.temporary_cache():
+    if cache.status == "ok" and not os.environ.get(paths.CACHE) and paths.cache_dir() == paths.make_temporary_cache():
         found = f"{cache.found} (temporary: the cache folder of the user is not writable)"
         cache = Finding(cache.name, "limited", found, f"Set ${paths.CACHE} to a permanent folder.")
     return [cache, check_writable("data folder", paths.data_dir(), paths.DATA, required=False)]

@@ -7,7 +7,7 @@ imported from this package at first use.
 
 from typing import TYPE_CHECKING
 
-from robocas_ms3.core.lazy import lazy_exports
+from robocas_ms3.core.lazy import make_lazy_exports
 
 if TYPE_CHECKING:
     from robocas_ms3.evaluation.outcomes import Outcome as Outcome
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from robocas_ms3.evaluation.session import EvaluationSession as EvaluationSession
     from robocas_ms3.evaluation.settings import EvaluationSettings as EvaluationSettings
 
-__getattr__, __dir__, __all__ = lazy_exports(
+__getattr__, __dir__, __all__ = make_lazy_exports(
     __name__,
     {
         "robocas_ms3.evaluation.outcomes": ["Outcome"],

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from robocas_ms3.core.arrays import as_float, as_tensor, known_all_false, maximum, norm, to_native, where
+from robocas_ms3.core.arrays import as_float32, as_tensor, known_all_false, maximum, norm, to_native, where
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.base import RoboCASEnv
 from robocas_ms3.tasks.bodies import link_poses
@@ -67,8 +67,8 @@ class EpisodeMetrics:
             self._last_state = state
             impulse = norm(state.gripper_forces).sum((1, 2)) * env.control_timestep
             sums[:, _IMPULSE] += impulse
-            sums[:, _DISTURBED] = maximum(sums[:, _DISTURBED], as_float(state.disturbed.sum(1)))
-            sums[:, _FALLEN] = maximum(sums[:, _FALLEN], as_float(env.success_check.fallen_objects().sum(1)))
+            sums[:, _DISTURBED] = maximum(sums[:, _DISTURBED], as_float32(state.disturbed.sum(1)))
+            sums[:, _FALLEN] = maximum(sums[:, _FALLEN], as_float32(env.success_check.fallen_objects().sum(1)))
             target = terms.select_target(state.object_states[..., :2], to_native(env.target_slot))
             if state.basket_pose is not None:  # without a basket the rule never holds
                 self._near = norm(target - state.basket_pose[:, :2]) <= V0_RADIUS

@@ -16,7 +16,7 @@ from pydantic import ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.core.files import json_text
+from robocas_ms3.core.files import encode_json
 from robocas_ms3.core.signals import forbid_exit
 from robocas_ms3.robots.cameras import CAMERA_NAME
 from robocas_ms3.robots.quantities import QUANTITIES
@@ -267,7 +267,7 @@ def describe_policy(policy: Policy) -> dict[str, Any]:
             "the description of the policy is invalid", where=where, expected="a dict", found=type(added).__name__
         )
     description = {"class": _class_name(policy), "spec": spec, **added}
-    return json.loads(json_text(description, where, error=EvaluationError))
+    return json.loads(encode_json(description, where, error=EvaluationError))
 
 
 def forbid_policy_exit(policy: Policy) -> AbstractContextManager[None]:

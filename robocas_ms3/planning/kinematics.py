@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.core.extensions import load_object
+from robocas_ms3.core.extensions import import_object
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.description_file import RobotXml
@@ -144,7 +144,7 @@ class InverseKinematics:
     def __init__(self, chain: ArmChain) -> None:
         self.chain = chain
         self.lower, self.upper = self.chain.lower, self.chain.upper
-        self._geometry = load_object(self.chain.robot.inverse_kinematics)(self.chain)
+        self._geometry = import_object(self.chain.robot.inverse_kinematics)(self.chain)
 
     def nearest_solutions(self, tcp_in_base: Array, near: Array) -> tuple[NDArray[np.bool_], Array]:
         """Find the solution nearest to a configuration (7,) for each pose (N, 4, 4).

@@ -13,9 +13,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, load_array, load_json
+from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, load_json, load_npy
 from robocas_ms3.core.errors import PlanError
-from robocas_ms3.core.files import atomic_file, flush_to_disk, json_text, make_folder, write_json
+from robocas_ms3.core.files import atomic_file, encode_json, flush_to_disk, make_folder, write_json
 from robocas_ms3.core.output_folder import remove_leftovers
 from robocas_ms3.core.text import format_count, one_line
 from robocas_ms3.datasets import schema
@@ -145,7 +145,7 @@ def _join_file(
 
 def _find_layouts_damage(path: Path, seeds: Sequence[int]) -> str:
     try:
-        found = load_array(path)["seed"].tolist()
+        found = load_npy(path)["seed"].tolist()
     except (*DAMAGED_FILE_ERRORS, IndexError, KeyError, TypeError) as error:
         return _describe_error(error)
     return "" if found == list(seeds) else f"{format_count(len(found), 'layout')} of other seeds"
@@ -206,7 +206,7 @@ def _join_dataset(plan: Plan, root: Path, files: EpisodeFiles) -> None:
 def _set_source(path: Path, source: dict[str, Any]) -> None:
     """Write the path and the index of the joined recording (``source``) into ``scene.json`` of an episode."""
     scene = load_json(path)
-    text = json_text({**scene, "source": {**scene["source"], **source}}, path, indent=1)
+    text = encode_json({**scene, "source": {**scene["source"], **source}}, path, indent=1)
     with atomic_file(path, sync=True) as tmp:
         tmp.write_text(text + "\n", encoding="utf-8")
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.output_folder import OutputFolder
-from robocas_ms3.core.signals import deferred_interrupts
+from robocas_ms3.core.signals import defer_interrupts
 from robocas_ms3.core.text import format_count
 from robocas_ms3.plans.executors import Executor
 from robocas_ms3.plans.folder import WorkUnit, read_plan
@@ -171,7 +171,7 @@ def _run_units(
 def _wait_for_jobs(running: dict[Any, Sequence[WorkUnit]], until: float) -> list[Any]:
     """Wait until a job has ended, or until the time ``until`` (`time.monotonic`); return the jobs that have ended."""
     while True:
-        with deferred_interrupts():  # Ctrl-C inside `done` could leave the lock of a future locked
+        with defer_interrupts():  # Ctrl-C inside `done` could leave the lock of a future locked
             ended = [job for job in running if job.done()]
         if ended or time.monotonic() > until:
             return ended

@@ -26,7 +26,7 @@ from robocas_ms3.core.errors import (
     WorkerCrashError,
     WorkerStartError,
 )
-from robocas_ms3.core.files import remove, write_json
+from robocas_ms3.core.files import delete_path, write_json
 from robocas_ms3.core.output_folder import remove_leftovers
 from robocas_ms3.core.text import format_error
 from robocas_ms3.core.workers import Limits, WorkerPool, use_one_torch_thread
@@ -213,7 +213,7 @@ class WorkUnitWorker:
                     outcome = self._run_seed(tmp)
                     if not outcome.success:
                         for path in tmp.folder.iterdir():
-                            remove(path)
+                            delete_path(path)
                     tmp.write_outcome(outcome)
                     self._output.check_record()  # a run with --overwrite may have replaced the plan
                 yield files

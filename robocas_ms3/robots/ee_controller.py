@@ -16,8 +16,8 @@ from mani_skill.utils.structs import Link, Pose
 
 from robocas_ms3.core import rotations
 from robocas_ms3.core.arrays import (
-    as_double,
-    as_float,
+    as_float32,
+    as_float64,
     as_tensor,
     clamp,
     concatenate,
@@ -78,7 +78,7 @@ class _ArmChainController(PDEEPoseController):
             expected = ", ".join(self._chain.joint_names)
             what = "the joints of the controller differ from the joints of the arm's URDF"
             raise RobocasError(what, where=self.config.urdf_path, expected=expected, found=", ".join(names))
-        limits = as_double(to_native(self.articulation.get_qlimits()[0, self.active_joint_indices]))
+        limits = as_float64(to_native(self.articulation.get_qlimits()[0, self.active_joint_indices]))
         self._lower, self._upper = limits[:, 0], limits[:, 1]
 
     def _solve(self, target: Any, qpos: Any) -> tuple[Any, Any]:
@@ -87,9 +87,9 @@ class _ArmChainController(PDEEPoseController):
         Returns:
             Joint positions (N, joints), and for each env (N,) whether they reach the target.
         """
-        target = as_double(target)
-        qpos, solved = self._chain.inverse(target[:, :3], target[:, 3:], as_double(qpos), self._lower, self._upper)
-        return as_float(qpos), solved
+        target = as_float64(target)
+        qpos, solved = self._chain.inverse(target[:, :3], target[:, 3:], as_float64(qpos), self._lower, self._upper)
+        return as_float32(qpos), solved
 
 
 class RoboCASEEPoseController(InterpolatedDrives, _ArmChainController):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import open_arrays
+from robocas_ms3.core.documents import open_npz
 from robocas_ms3.core.files import atomic_file
 
 Array = NDArray[np.float64]
@@ -92,7 +92,7 @@ def read_layout(path: Path) -> Layout:
     Raises:
         ValueError: the file is damaged; so do KeyError, TypeError and `documents.DAMAGED_FILE_ERRORS`.
     """
-    with open_arrays(path) as file:
+    with open_npz(path) as file:
         values = {f.name: file[_FILE_KEYS.get(f.name, f.name)] for f in fields(Layout)}
     return Layout(
         **{

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, check_regular, load_array
+from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, check_regular_file, load_npy
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.files import atomic_file
 from robocas_ms3.core.poses import from_wxyz, to_wxyz
@@ -146,7 +146,7 @@ class FrozenLayouts:
 
     def __init__(self, path: Path, names: Collection[str]) -> None:
         self._path, self._names = path, sorted(names)
-        self._records = _open(path, load_array, "not a file of frozen layouts", dimensions=1)
+        self._records = _open(path, load_npy, "not a file of frozen layouts", dimensions=1)
         self._places = {int(seed): i for i, seed in enumerate(self._records["seed"])}
 
     @property
@@ -180,7 +180,7 @@ def join_frozen_layouts(path: Path, parts: Sequence[Path]) -> None:
     Raises:
         LayoutError: a file is damaged, or belongs to another configuration.
     """
-    pieces = [_open(part, load_array, "not a file of frozen layouts", dimensions=1) for part in parts]
+    pieces = [_open(part, load_npy, "not a file of frozen layouts", dimensions=1) for part in parts]
     for part, piece in zip(parts, pieces, strict=True):
         if piece.dtype["objects"] != pieces[0].dtype["objects"]:
             what, expected = "frozen layouts of another configuration", f"the number of objects in {parts[0]}"
@@ -233,7 +233,7 @@ def _layout(record: Any, names: Sequence[str]) -> Layout:
 
 def _open(path: Path, load: Callable[[Path], Any], what: str, *, dimensions: int) -> NDArray[np.void]:
     try:
-        check_regular(path)
+        check_regular_file(path)
         rows = load(path)
         slots, words = rows.dtype["present"].itemsize, rows.dtype["relation"].itemsize // 4
         if rows.dtype != _record_type(slots, words) or rows.ndim != dimensions or not rows.size:

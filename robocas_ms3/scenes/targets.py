@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.assets.annotations import GRIPPER_RADIUS
 from robocas_ms3.assets.pack import LoadedObject
-from robocas_ms3.core.extensions import load_object
+from robocas_ms3.core.extensions import import_object
 from robocas_ms3.core.poses import transform_points
 from robocas_ms3.scenes.grasp_checks import PREGRASP_DISTANCE, has_free_grasps
 from robocas_ms3.scenes.model import SceneModel
@@ -134,7 +134,7 @@ class TargetRule:
 
 
 def find_target_rule(task: str) -> TargetRule:
-    return load_object(TASKS[task].target)
+    return import_object(TASKS[task].target)
 
 
 def choose_target(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:

@@ -5,7 +5,7 @@ from typing import Any
 
 from mani_skill.utils.registration import REGISTERED_ENVS, register
 
-from robocas_ms3.core.extensions import load_object
+from robocas_ms3.core.extensions import import_object
 from robocas_ms3.robots.registry import ROBOTS
 from robocas_ms3.scenes.task_specs import TASKS, TaskSpec
 from robocas_ms3.tasks.open_pick import RoboCASOpenPickEnv
@@ -21,7 +21,7 @@ def register_env_class(name: str) -> Any:
         ExtensionError: the task is unknown, or its environment can't be loaded.
     """
     task = TASKS.find(name)
-    env = load_object(task.env)
+    env = import_object(task.env)
     if task.env_id not in REGISTERED_ENVS:
         register(task.env_id, env, max_episode_steps=task.max_episode_steps)
     return env
@@ -30,7 +30,7 @@ def register_env_class(name: str) -> Any:
 for _name in TASKS.builtin:
     register_env_class(_name)
 for _robot in ROBOTS.builtin.values():
-    load_object(_robot.agent)
+    import_object(_robot.agent)
 
 # Without a GPU ManiSkill warns for each environment that rendering might be disabled; software renderers work.
 # The name of ManiSkill's logger ends with a blank.

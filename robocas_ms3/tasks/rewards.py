@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from robocas_ms3.core.arrays import Array, as_float, as_tensor, clamp, norm, to_native, where
+from robocas_ms3.core.arrays import Array, as_float32, as_tensor, clamp, norm, to_native, where
 from robocas_ms3.tasks.occlusion import MAX_HIDDEN_FRACTION, MAX_OBSTACLES
 from robocas_ms3.tasks.terms import BASKET_SHIFT
 
@@ -78,11 +78,11 @@ def weighted_reward(
     Returns:
         Rewards (N,) in [0, ``table.total``], and the values (N,) in [0, 1] by term name that the rewards count.
     """
-    none = 0.0 * as_float(stage)
+    none = 0.0 * as_float32(stage)
     kept = 1.0 - sum((fraction * penalties[name] for name, fraction in table.penalties.items()), none)
     counted, reward = {}, none
     for place, own in enumerate(table.stages.values()):
-        passed, here = as_float(stage > place), as_float(stage == place) * kept
+        passed, here = as_float32(stage > place), as_float32(stage == place) * kept
         for name, weight in own.items():
             counted[name] = passed + here * terms.get(name, none)
             reward = reward + weight * counted[name]
@@ -115,13 +115,13 @@ def change_fraction(value: Array, start: Array | float, full_change: float) -> A
 def clear_fraction(hidden_fraction: Array, obstacle_count: Array) -> Array:
     """Return (N,) in [0, 1]: 1 for a cleared target, less for a greater hidden fraction (N,) or more obstacles (N,)."""
     hidden = clamp((hidden_fraction - MAX_HIDDEN_FRACTION) / (1 - MAX_HIDDEN_FRACTION), 0.0, 1.0)
-    around = clamp((as_float(obstacle_count) - MAX_OBSTACLES) / _MANY_OBSTACLES, 0.0, 1.0)
+    around = clamp((as_float32(obstacle_count) - MAX_OBSTACLES) / _MANY_OBSTACLES, 0.0, 1.0)
     return 1 - (hidden + around) / 2
 
 
 def release_fraction(held: Array, touched: Array) -> Array:
     """Return (N,): 0 if the gripper holds the target, 0.5 if it only touches the target, 1 without contact."""
-    return 1 - (as_float(held) + as_float(held | touched)) / 2
+    return 1 - (as_float32(held) + as_float32(held | touched)) / 2
 
 
 def stillness(linear_velocity: Array, angular_velocity: Array) -> Array:
@@ -131,7 +131,7 @@ def stillness(linear_velocity: Array, angular_velocity: Array) -> Array:
 
 def disturbed_fraction(disturbed_count: Array) -> Array:
     """Return (N,) in [0, 1]: a third per disturbed object (N,), at most 1."""
-    return clamp(as_float(disturbed_count) / 3, 0.0, 1.0)
+    return clamp(as_float32(disturbed_count) / 3, 0.0, 1.0)
 
 
 def basket_shift_fraction(position: Array, start_position: Array) -> Array:

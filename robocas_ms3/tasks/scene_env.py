@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from robocas_ms3.assets.pack import LoadedObject, VisualLevel, load_pack
 from robocas_ms3.core.arrays import Array
 from robocas_ms3.core.errors import LayoutError
-from robocas_ms3.core.extensions import load_object
+from robocas_ms3.core.extensions import import_object
 from robocas_ms3.robots.agent import MobileManipulator
 from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
 from robocas_ms3.scenes import build
@@ -91,7 +91,7 @@ class SceneEnv(BaseEnv):
         engine.check_engine(num_envs, visual_level, **kwargs)
         self.task_config = load_config_for(self.SPEC, config)
         self.robot_spec = find_robot(robot_uids, where="robot_uids")
-        load_object(self.robot_spec.agent)  # registers it with ManiSkill
+        import_object(self.robot_spec.agent)  # registers it with ManiSkill
         robot = self.robot_spec.description
         self.cameras = self.task_config.cameras_of(robot)
         self.model = SceneModel.load(self.task_config, load_pack(pack), load_pack(furniture_pack), robot=robot)

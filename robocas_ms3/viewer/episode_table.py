@@ -57,7 +57,7 @@ class Failures:
     @classmethod
     def read(cls, folder: Path) -> Failures:
         try:
-            lines = JsonLinesFile[TaskFailedAttempt](folder / FAILURES_FILE, TaskFailedAttempt).lines()
+            lines = JsonLinesFile[TaskFailedAttempt](folder / FAILURES_FILE, TaskFailedAttempt).read_lines()
         except OSError as error:
             return cls(note=f"`{FAILURES_FILE}` can't be read: {error.strerror}.")
         found: dict[int, list[TaskFailedAttempt]] = defaultdict(list)

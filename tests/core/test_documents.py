@@ -10,10 +10,10 @@ from robocas_ms3.core.documents import (
     YAML_DEPTH,
     DocumentError,
     decode_json,
-    load_array,
     load_json,
+    load_npy,
     load_yaml,
-    open_arrays,
+    open_npz,
     read_bytes,
     read_text,
 )
@@ -93,7 +93,7 @@ def test_lone_surrogates_of_json_are_refused(file, text):
 
 @pytest.mark.parametrize(
     "load",
-    [load_json, load_yaml, open_arrays, load_array, lambda path: read_bytes(path, 9), lambda path: read_text(path, 9)],
+    [load_json, load_yaml, open_npz, load_npy, lambda path: read_bytes(path, 9), lambda path: read_text(path, 9)],
 )
 def test_only_regular_files_are_read(tmp_path, load):
     os.mkfifo(tmp_path / "pipe")

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from robocas_ms3.core.errors import ExtensionError
-from robocas_ms3.core.extensions import Registry, load_object
+from robocas_ms3.core.extensions import Registry, import_object
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def test_the_error_of_an_unknown_name_suggests_the_nearest_one():
 
 
 def test_load_object_by_import_path():
-    assert load_object("robocas_ms3.core.extensions:load_object") is load_object
+    assert import_object("robocas_ms3.core.extensions:import_object") is import_object
     for path in ("robocas_ms3.core.extensions:nothing", "robocas_ms3.nothing:load", "robocas_ms3.core.extensions"):
         with pytest.raises(ExtensionError, match=f"{path}: cannot import this object .expected package.module:name"):
-            load_object(path)
+            import_object(path)

@@ -43,7 +43,12 @@ def write_result(root):
         (write_result, results.RUN, results.read_result, EvaluationError),
         (write_result, results.OUTCOMES, results.read_result, EvaluationError),
         (Path.mkdir, PLAN, read_plan, PlanError),
-        (Path.mkdir, "ledger.jsonl", lambda root: JsonLinesFile(root / "ledger.jsonl", Outcome).lines(), DocumentError),
+        (
+            Path.mkdir,
+            "ledger.jsonl",
+            lambda root: JsonLinesFile(root / "ledger.jsonl", Outcome).read_lines(),
+            DocumentError,
+        ),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

@@ -12,7 +12,7 @@ import pytest
 
 from robocas_ms3.core.errors import OutputExistsError, RobocasError
 from robocas_ms3.core.files import atomic_folder
-from robocas_ms3.core.locks import locked_folder
+from robocas_ms3.core.locks import lock_folder
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, is_empty, remove_leftovers
 
 KIND = FolderKind("robocas test", ("run.json",), "rate", markers=("old_format",))
@@ -221,7 +221,7 @@ def mounted(tmp_path, monkeypatch):
 
 def test_mounted_folder_is_locked_and_emptied_in_place(mounted):
     write_run(mounted)
-    with locked_folder(mounted), pytest.raises(RobocasError):
+    with lock_folder(mounted), pytest.raises(RobocasError):
         write_run(mounted)
     write_run(mounted, episodes=0, overwrite=True)
     assert names(mounted) == ["run.json"]

@@ -31,7 +31,7 @@ def test_a_home_that_is_read_only_gives_a_private_cache_and_one_warning(home, ca
         cache = paths.cache_dir()
         assert paths.cache_dir() == cache == home.with_name("temporary") / f"robocas-{os.getuid()}"
     assert cache.stat().st_mode & 0o777 == 0o700
-    assert paths.variable_of(cache / "robots" / "x") == "ROBOCAS_CACHE"
+    assert paths.find_path_variable(cache / "robots" / "x") == "ROBOCAS_CACHE"
     (said,) = caplog.messages
     assert str(home) in said
     assert "ROBOCAS_CACHE" in said
@@ -78,7 +78,7 @@ def test_without_a_home_folder_both_variables_are_needed(no_home, monkeypatch, t
         with pytest.raises(RobocasError) as error:
             needed()
         assert error.value.where == "HOME"
-    assert paths.variable_of(tmp_path) == ""
+    assert paths.find_path_variable(tmp_path) == ""
     monkeypatch.setenv("ROBOCAS_DATA", str(tmp_path / "data"))
     assert paths.data_dir() == tmp_path / "data"
     with pytest.raises(RobocasError):
@@ -86,7 +86,7 @@ def test_without_a_home_folder_both_variables_are_needed(no_home, monkeypatch, t
     monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "cache"))
     paths.ensure_home()
     assert os.environ["HOME"] == str(tmp_path / "cache" / "home")
-    assert paths.variable_of(tmp_path / "data" / "packs") == "ROBOCAS_DATA"
+    assert paths.find_path_variable(tmp_path / "data" / "packs") == "ROBOCAS_DATA"
     assert not any(tmp_path.iterdir())
 
 

@@ -39,7 +39,7 @@ def received(sent: RemoteError) -> BaseException:
 
 
 def test_an_error_keeps_its_type_arguments_and_traceback():
-    error = received(RemoteError.of(raised(KeyError("seven")), "env 7"))
+    error = received(RemoteError.from_error(raised(KeyError("seven")), "env 7"))
     assert (type(error), error.args) == (KeyError, ("seven",))
     assert isinstance(error.__cause__, RemoteTraceback)
     assert str(error.__cause__).startswith("in env 7:\nTraceback")
@@ -47,18 +47,18 @@ def test_an_error_keeps_its_type_arguments_and_traceback():
 
 
 def test_an_error_sent_twice_keeps_the_first_traceback():
-    first = received(RemoteError.of(raised(KeyError("seven")), "env 7"))
-    second = received(RemoteError.of(first, "a branch"))
+    first = received(RemoteError.from_error(raised(KeyError("seven")), "env 7"))
+    second = received(RemoteError.from_error(first, "a branch"))
     assert str(second.__cause__) == str(first.__cause__)
 
 
 @pytest.mark.parametrize("error", [TwoWords("very", "odd"), Chameleon("very odd")])
 def test_an_error_that_cannot_be_pickled_is_replaced(error):
-    found = received(RemoteError.of(error, "a branch"))
+    found = received(RemoteError.from_error(error, "a branch"))
     assert (type(found), str(found)) == (RuntimeError, f"{type(error).__name__}: very odd")
 
 
 def test_an_exit_does_not_end_the_receiving_process():
-    assert type(received(RemoteError.of(KeyboardInterrupt(), "a branch"))) is KeyboardInterrupt
-    exited = received(RemoteError.of(SystemExit(3), "env 0"))
+    assert type(received(RemoteError.from_error(KeyboardInterrupt(), "a branch"))) is KeyboardInterrupt
+    exited = received(RemoteError.from_error(SystemExit(3), "env 0"))
     assert (type(exited), exited.where) == (ExtensionError, "env 0")

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from robocas_ms3.core.errors import ExtensionError
-from robocas_ms3.core.extensions import Registry, load_object
+from robocas_ms3.core.extensions import Registry, import_object
 from robocas_ms3.core.signals import forbid_exit
 from robocas_ms3.core.workers import FunctionWorker, WorkerPool
 
@@ -21,9 +21,9 @@ PYTHONS_OWN = "import signal; signal.signal(signal.SIGINT, signal.default_int_ha
 NATIVE = """
 import hashlib
 from contextlib import nullcontext
-from robocas_ms3.core.signals import deferred_interrupts, handle_interrupts
+from robocas_ms3.core.signals import defer_interrupts, handle_interrupts
 handle_interrupts()
-with deferred_interrupts(second_ends=False):
+with defer_interrupts(second_ends=False):
     pass
 with {around}:
     print("ready", flush=True)
@@ -33,17 +33,17 @@ with {around}:
 LONG_CALLS = {
     "with Python's lock": ("nullcontext()", "sum(range(2**62))"),
     "without it": ("nullcontext()", HASHING := "hashlib.pbkdf2_hmac('sha256', b'', b'', 2**31 - 1)"),
-    "deferred": ("deferred_interrupts()", HASHING),
+    "deferred": ("defer_interrupts()", HASHING),
 }
 STEP = """
 import hashlib, os, signal, threading
-from robocas_ms3.core.signals import deferred_interrupts, handle_interrupts
+from robocas_ms3.core.signals import defer_interrupts, handle_interrupts
 def interrupt():
     for _ in range(5):
         os.kill(os.getpid(), signal.SIGINT)
 handle_interrupts()
 try:
-    with deferred_interrupts() as came:
+    with defer_interrupts() as came:
         threading.Thread(target=interrupt).start()
         while not came:
             hashlib.pbkdf2_hmac("sha256", b"", b"", 100_000)
@@ -53,10 +53,10 @@ except KeyboardInterrupt:
 """
 WRITING = """
 import time
-from robocas_ms3.core.signals import deferred_interrupts, handle_interrupts
+from robocas_ms3.core.signals import defer_interrupts, handle_interrupts
 handle_interrupts()
 try:
-    with deferred_interrupts(second_ends=False):
+    with defer_interrupts(second_ends=False):
         print("ready", flush=True)
         time.sleep(3)
         print("written", flush=True)
@@ -65,7 +65,7 @@ except KeyboardInterrupt:
 """
 OTHER_THREAD = """
 import os, signal, threading, time
-from robocas_ms3.core.signals import deferred_interrupts
+from robocas_ms3.core.signals import defer_interrupts
 def wait():
     started.set()
     time.sleep(60)
@@ -74,7 +74,7 @@ started = threading.Event()
 threading.Thread(target=wait, daemon=True).start()
 started.wait()
 try:
-    with deferred_interrupts():
+    with defer_interrupts():
         os.kill(os.getpid(), signal.SIGTERM)  # the other thread gets it
         time.sleep(0.3)
         print("written", flush=True)
@@ -192,7 +192,7 @@ def test_the_import_of_an_extension_can_not_end_the_process(leaving):
     with pytest.raises(ExtensionError):
         numbers.find("bad")
     with pytest.raises(ExtensionError):
-        load_object("leaving_module:BAD")
+        import_object("leaving_module:BAD")
 
 
 def raise_exit(how: BaseException) -> None:

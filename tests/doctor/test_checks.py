@@ -97,7 +97,7 @@ def test_folders_that_are_not_writable(tmp_path, monkeypatch):
 def test_temporary_cache_folder_is_limited(tmp_path, monkeypatch):
     monkeypatch.delenv("ROBOCAS_CACHE", raising=False)
     monkeypatch.setattr(checks.paths, "cache_dir", lambda: tmp_path)
-    monkeypatch.setattr(checks.paths, "temporary_cache", lambda: tmp_path)
+    monkeypatch.setattr(checks.paths, "make_temporary_cache", lambda: tmp_path)
     cache = checks.check_folders()[0]
     assert cache.status == "limited"
     assert "ROBOCAS_CACHE" in cache.fix

@@ -16,7 +16,7 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.baselines.training.record import BUNDLED
 from robocas_ms3.cli.layouts import Info, info
 from robocas_ms3.core import documents
-from robocas_ms3.core.documents import DocumentError, open_arrays
+from robocas_ms3.core.documents import DocumentError, open_npz
 from robocas_ms3.core.errors import AssetError, DatasetError, TrainingError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.poses import from_xyz_yaw
@@ -83,9 +83,9 @@ def test_json_lines(tmp_path_factory, lines):
     ledger: JsonLinesFile[Try] = JsonLinesFile(tmp_path_factory.mktemp("ledger") / "tries.jsonl", Try)
     texts = [line if isinstance(line, bytes) else json.dumps(line).encode() for line in lines]
     ledger.path.write_bytes(b"\n".join(texts))
-    for line in ledger.lines():
+    for line in ledger.read_lines():
         if line.record is None:
-            assert "\n" not in str(ledger.line_error(line, DatasetError, "no try"))
+            assert "\n" not in str(ledger.make_line_error(line, DatasetError, "no try"))
         else:
             json.dumps([line.record.seconds, line.record.more], allow_nan=False)
     ledger.append([Try(1)])
@@ -106,7 +106,7 @@ def test_arrays_over_the_size_limit(tmp_path, monkeypatch):
     path = tmp_path / "annotations.npz"
     np.savez_compressed(path, zeros=np.zeros(2**20))
     assert path.stat().st_size < 2**14
-    for read, error in ((open_arrays, DocumentError), (Annotations.load, AssetError)):
+    for read, error in ((open_npz, DocumentError), (Annotations.load, AssetError)):
         with pytest.raises(error):
             read(path)
     with zipfile.ZipFile(path, "w") as archive:

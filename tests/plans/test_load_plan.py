@@ -75,14 +75,14 @@ def test_changed_pack_is_an_error(written, tmp_path):
     (pack / "manifest.json").write_text("{}")
     plan = load_plan(path)
     assert plan.packs.keys() == {str(pack), "builtin"}
-    with PlanFolder(plan, out).open(shared=True) as output:
+    with PlanFolder(plan, out).open_output(shared=True) as output:
         output.start(PlanFolder(plan, out).make_record())
-    PlanFolder(load_plan(path), out).open(shared=True).check_record()
+    PlanFolder(load_plan(path), out).open_output(shared=True).check_record()
     with convert_part_errors(plan, 0):
         pass
     (pack / "manifest.json").write_text("{ }")
     with pytest.raises(OutputExistsError, match=r"packs\..*mine: "):
-        PlanFolder(load_plan(path), out).open(shared=True).check_record()
+        PlanFolder(load_plan(path), out).open_output(shared=True).check_record()
     with pytest.raises(PlanError) as error, convert_part_errors(plan, 0):
         pass
     assert error.value.where == str(pack)

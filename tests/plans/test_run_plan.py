@@ -150,7 +150,7 @@ def test_machine_that_cannot_open_a_part_fails_no_seed(tmp_path):
     with stub_stages(Recorder), closing(WorkUnitWorker(PlanFolder(plan, tmp_path / "out"))) as worker:
         with pytest.raises(PlanError) as error:
             worker.run(WorkUnit(0, 0))
-        assert error.value.where == "part a"
+        assert error.value.where == "plan part a"
     assert seeds_done(tmp_path / "out") == 0
 
 

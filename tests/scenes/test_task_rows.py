@@ -5,7 +5,7 @@ import inspect
 import pytest
 
 from robocas_ms3.core.errors import ConfigError
-from robocas_ms3.core.extensions import load_object
+from robocas_ms3.core.extensions import import_object
 from robocas_ms3.scenes.config import load_config_for
 from robocas_ms3.scenes.language.texts import Templates
 from robocas_ms3.scenes.targets import TargetRule
@@ -16,11 +16,11 @@ from robocas_ms3.scenes.task_specs import TASKS
 def test_import_paths_of_a_task_spec_exist(spec):
     assert TASKS[spec.name] is spec
     assert load_config_for(spec).task == spec.name
-    assert isinstance(load_object(spec.target), TargetRule)
-    assert load_object(spec.env).SPEC is spec
-    assert list(inspect.signature(load_object(spec.solver)).parameters) == ["arm"]
+    assert isinstance(import_object(spec.target), TargetRule)
+    assert import_object(spec.env).SPEC is spec
+    assert list(inspect.signature(import_object(spec.solver)).parameters) == ["arm"]
     for check in spec.checks:
-        load_object(check)(load_config_for(spec))
+        import_object(check)(load_config_for(spec))
     assert Templates.for_task(spec).upstream
 
 

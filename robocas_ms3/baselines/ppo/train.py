@@ -17,7 +17,7 @@ from robocas_ms3.baselines.ppo.environments import FIRST_TEST_SEED, PpoEnvironme
 from robocas_ms3.baselines.training.checkpoints import Checkpoint, flatten_optimizer_state, join_state_dicts
 from robocas_ms3.baselines.training.run_folder import RunFolder
 from robocas_ms3.core.errors import TrainingError
-from robocas_ms3.core.signals import deferred_interrupts
+from robocas_ms3.core.signals import defer_interrupts
 
 OUTCOMES = ("return", "held", "lifted", "success")  # sum of rewards; then whether true at the last step of an episode
 _LAST_EPISODES = 100  # number of episodes that the log averages
@@ -55,7 +55,7 @@ def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: Ppo
         while state.step < settings.steps:
             collector = collector or RolloutCollector(environments.envs, agent, config, state.episodes, state.outcomes)
             rollout = collector.collect_rollout()
-            with deferred_interrupts():  # interrupt only after a complete update
+            with defer_interrupts():  # interrupt only after a complete update
                 losses = update_agent(agent, state.optimizer, rollout, config)
                 state.step += config.envs * steps_per_env(config)
                 _check_finite(run, losses, state.step)
@@ -68,7 +68,7 @@ def train_ppo(run: RunFolder, agent: Agent, config: PpoConfig, environments: Ppo
             run.progress.on_step(min(state.step, settings.steps), settings.steps)
         if config.test_episodes and not state.is_tested:
             outcomes = evaluate_agent(agent, environments, config.test_episodes)
-            with deferred_interrupts(second_ends=False):
+            with defer_interrupts(second_ends=False):
                 log("val", outcomes, {"noise": 0.0})
                 state.is_tested = True
                 save()

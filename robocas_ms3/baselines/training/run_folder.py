@@ -20,7 +20,7 @@ from robocas_ms3.baselines.training.metrics import MetricsLog
 from robocas_ms3.baselines.training.record import CHECKPOINT, WEIGHTS, RunRecord
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.output_folder import OutputFolder
-from robocas_ms3.core.signals import deferred_interrupts
+from robocas_ms3.core.signals import defer_interrupts
 
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of malloc.h
 
@@ -100,7 +100,7 @@ class RunFolder:
         if not self.accelerator.is_main_process:
             return
         self._output.check_exists()
-        with deferred_interrupts(second_ends=False):
+        with defer_interrupts(second_ends=False):
             checkpoints.save_tensors(self._output.path / WEIGHTS, weights, self.record.metadata, step)
             checkpoints.save_tensors(self._output.path / CHECKPOINT, state, self.record.metadata, step)
 

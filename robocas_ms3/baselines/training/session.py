@@ -238,7 +238,7 @@ def _open_output(options: RunOptions) -> Iterator[OutputFolder]:
         with output:
             yield output
     else:
-        output.read()
+        output.read_record()
         yield output
 
 

@@ -16,7 +16,7 @@ from robocas_ms3.baselines.baseline import Batch, Samples, TrainSettings
 from robocas_ms3.baselines.training.learner import Learner
 from robocas_ms3.baselines.training.run_folder import RunFolder
 from robocas_ms3.core.errors import RobocasError
-from robocas_ms3.core.signals import deferred_interrupts, exit_error
+from robocas_ms3.core.signals import defer_interrupts, make_exit_error
 
 
 def train_supervised(
@@ -52,7 +52,7 @@ def train_supervised(
         rank, world_size = accelerator.process_index, accelerator.num_processes
         indices = batch_indices(count, settings, learner.step, rank, world_size)
         for batch in _read_batches(run, samples, indices, settings.workers):
-            with deferred_interrupts():  # interrupt only after a complete step
+            with defer_interrupts():  # interrupt only after a complete step
                 learner.update(batch, learning_rate_at(learner.step, count, settings))
                 is_last = learner.step == settings.steps
                 if is_last or learner.step % settings.log_every == 0:
@@ -169,7 +169,7 @@ class _SamplesWithReturnedErrors:
         except RobocasError as error:
             return error
         except SystemExit as error:  # would end a worker process without a message
-            return exit_error(error, "samples of the dataset")
+            return make_exit_error(error, "samples of the dataset")
 
 
 def _identity(batch: Any) -> Any:

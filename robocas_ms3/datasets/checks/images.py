@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, load_array
+from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, load_npy
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.core.text import format_count, one_line
 from robocas_ms3.datasets import schema
@@ -46,7 +46,7 @@ def check_cameras(folder: Path, image_options: ImageOptions) -> Iterator[Violati
         for name in (schema.INTRINSIC_FILE, *pose_files):
             file = f"{folder.name}/{camera}/{name}"
             try:
-                found = load_array(folder / camera / name, CAMERA_LIMIT)
+                found = load_npy(folder / camera / name, CAMERA_LIMIT)
             except FileNotFoundError:
                 yield Violation(file, "", "this file", NO_FILE, "missing")
                 continue
@@ -126,7 +126,7 @@ def check_depth(folder: Path, stored: EpisodeArrays, image_options: ImageOptions
     parent_of: dict[str, Parent] = {camera: schema.camera_parent(folder / camera) for camera in image_options.cameras}
     cameras = {
         camera: [
-            np.asarray(load_array(folder / camera / name, CAMERA_LIMIT), np.float64)
+            np.asarray(load_npy(folder / camera / name, CAMERA_LIMIT), np.float64)
             for name in (schema.INTRINSIC_FILE, schema.pose_files(parent)[0])
         ]
         for camera, parent in parent_of.items()

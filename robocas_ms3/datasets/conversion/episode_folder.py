@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.files import json_text
+from robocas_ms3.core.files import encode_json
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.images import check_cameras, check_images
 from robocas_ms3.datasets.checks.violation import read_object
@@ -85,7 +85,7 @@ def write_episode_files(
         for name in schema.pose_files(model.parent):
             np.save(folder / camera / name, model.camera_in_parent)
     np.savez(folder / schema.EPISODE_FILE, **arrays)  # pyright: ignore[reportArgumentType]
-    text = json_text(dict(scene), folder, indent=1, error=DatasetError)
+    text = encode_json(dict(scene), folder, indent=1, error=DatasetError)
     (folder / schema.SCENE_FILE).write_text(text + "\n", encoding="utf-8")
 
 

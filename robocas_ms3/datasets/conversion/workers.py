@@ -112,7 +112,7 @@ def write_episodes(
             elif len(failures) == _MAX_FIRST_FAILURES:
                 break
     if failures and not (written or job.continued):
-        raise failures[0].sent.with_traceback()
+        raise failures[0].sent.make_error()
     written.sort(key=lambda episode: episode.number)
     return written, _incomplete(failures, job) if failures else None
 
@@ -132,7 +132,8 @@ class _Failure:
 def _crash_failure(task: Task, why: str) -> _Failure:
     episode = episode_folder(task[0])
     return _Failure(
-        episode, RemoteError.of(DatasetError(f"its worker process crashed twice: {why}", where=episode), "a worker")
+        episode,
+        RemoteError.from_error(DatasetError(f"its worker process crashed twice: {why}", where=episode), "a worker"),
     )
 
 
@@ -144,7 +145,7 @@ def _incomplete(failures: list[_Failure], job: PendingEpisodes) -> IncompleteDat
     error = IncompleteDatasetError(
         what, where=job.settings.out, found="; ".join(listed[:_MAX_LISTED]) + more, fix=job.fix
     )
-    error.reasons, error.__cause__ = reasons, failures[0].sent.with_traceback()
+    error.reasons, error.__cause__ = reasons, failures[0].sent.make_error()
     return error
 
 
@@ -168,7 +169,7 @@ class _EpisodeWorker:
             if _concerns_all(error):
                 raise
             self.close()
-            return _Failure(episode_folder(number), RemoteError.of(error, "a worker"))
+            return _Failure(episode_folder(number), RemoteError.from_error(error, "a worker"))
 
     def close(self) -> None:
         conversion_input, self._input = self._input, None

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
 
-from robocas_ms3.core.documents import DocumentError, check_regular, read_bytes
+from robocas_ms3.core.documents import DocumentError, check_regular_file, read_bytes
 from robocas_ms3.datasets.images.png import SIGNATURE
 
 LARGEST = 8192
@@ -49,7 +49,7 @@ def check_ends(path: Path) -> None:
 
 
 def _has_both_ends(path: Path) -> bool:
-    check_regular(path)
+    check_regular_file(path)
     with path.open("rb", buffering=0) as file:
         head, size = file.read(_END), os.fstat(file.fileno()).st_size
         file.seek(max(0, size - _END))

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.core.errors import DatasetError, IncompleteDatasetError, OutputExistsError
-from robocas_ms3.core.files import add_path_to_errors, flush_to_disk, make_folder, remove
+from robocas_ms3.core.files import add_path_to_errors, delete_path, flush_to_disk, make_folder
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder, remove_leftovers
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.core.text import format_count
@@ -86,7 +86,7 @@ def convert_lerobot(
                 output.start(plan)
                 for name in (_JOINED, *_FOLDERS):  # incomplete, from an interrupted conversion
                     if os.path.lexists(out / name):
-                        remove(out / name)
+                        delete_path(out / name)
                 remove_leftovers(out / _PARTS)
                 job = _missing_parts(settings, variant, plan["episodes"])
                 if on_start:

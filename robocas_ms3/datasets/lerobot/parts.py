@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict
 
 from robocas_ms3.core.documents import JSON_LIMIT, read_text
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.files import json_text
+from robocas_ms3.core.files import encode_json
 from robocas_ms3.datasets.conversion.workers import EpisodeWriter, InputEpisode
 from robocas_ms3.datasets.images.image_files import Box
 from robocas_ms3.datasets.lerobot import schema
@@ -113,7 +113,7 @@ class PartWriter(EpisodeWriter):
             levels={key: counted.counts.tolist() for key, counted in levels.items()},
             sizes=_sizes(folder),
         )
-        text = json_text(record.model_dump(), episode.where, error=DatasetError)
+        text = encode_json(record.model_dump(), episode.where, error=DatasetError)
         (folder / EPISODE_FILE).write_text(text, encoding="utf-8")
 
     def _table(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.core.documents import check_regular
+from robocas_ms3.core.documents import check_regular_file
 from robocas_ms3.core.errors import DatasetError, require_extra
 from robocas_ms3.datasets.lerobot.variants import Variant
 from robocas_ms3.robots.quantities import STATE, feature_columns
@@ -173,7 +173,7 @@ def require_lerobot() -> None:
 
 def checksum(path: Path) -> str:
     """Return the SHA-256 of a file."""
-    check_regular(path, _FILE_LIMIT)
+    check_regular_file(path, _FILE_LIMIT)
     digest = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(2**20):

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import check_regular
+from robocas_ms3.core.documents import check_regular_file
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
@@ -69,7 +69,7 @@ def open_table(path: Path, *, most_rows: float = np.inf) -> Iterator[pq.ParquetF
     A damaged file, too many rows, and errors of Arrow inside the ``with`` statement raise DatasetError.
     """
     try:
-        check_regular(path)
+        check_regular_file(path)
         footer, texts, _ = _footer(path, path.stat().st_mtime_ns)
         with pq.ParquetFile(path, metadata=footer, read_dictionary=texts) as file:
             names = file.schema_arrow.names

@@ -22,7 +22,7 @@ from av.error import FFmpegError
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from robocas_ms3.core.documents import DocumentError, check_regular
+from robocas_ms3.core.documents import DocumentError, check_regular_file
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.datasets.lerobot.schema import MAX_DEPTH_MM, check_video_size
@@ -214,7 +214,7 @@ def read_frames(path: Path, first: int, count: int, fps: int) -> Generator[NDArr
     """Yield frames, (H, W, 3) uint8 RGB or (H, W) uint16; close the generator to close the file."""
     given = 0
     try:
-        check_regular(path)
+        check_regular_file(path)
         with av.open(str(path)) as video:
             stream: Any = video.streams.video[0]
             stream.codec_context.options = {"max_pixels": str(_MAX_PIXELS)}
@@ -239,7 +239,7 @@ def read_frames(path: Path, first: int, count: int, fps: int) -> Generator[NDArr
 def packet_times(path: Path, most: int | None = None) -> tuple[list[Fraction], dict[str, Any]]:
     """Return the frame times of a video in s, at most ``most`` + 1, and its ``info`` for ``info.json``."""
     try:
-        check_regular(path)
+        check_regular_file(path)
         with av.open(str(path)) as video:
             stream: Any = video.streams.video[0]
             packets = (p.pts * p.time_base for p in video.demux(stream) if p.pts is not None)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import robocas_ms3
-from robocas_ms3.core.documents import check_regular
+from robocas_ms3.core.documents import check_regular_file
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import atomic_folder
 from robocas_ms3.core.output_folder import OutputFolder
@@ -143,7 +143,7 @@ def copy_episodes(
     records = {out: _record(members, split_rule) for out, members in outs.items()}
     for out, record in records.items():
         check_apart(out, list(numbers))
-        OutputFolder(out, DATASET, _settings_of(record), overwrite=options.overwrite).read()
+        OutputFolder(out, DATASET, _settings_of(record), overwrite=options.overwrite).read_record()
     for root, chosen in numbers.items():
         _check_episodes(root, chosen)
     if options.on_start:
@@ -249,7 +249,7 @@ class FilePlacer:
                 if error.errno not in _NO_LINKS:
                     raise
                 self.link = error.errno == errno.EMLINK  # limit of this file only
-        check_regular(source)
+        check_regular_file(source)
         shutil.copyfile(source, target)
         self.copied += 1
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import write_json
-from robocas_ms3.core.locks import locked_folder
+from robocas_ms3.core.locks import lock_folder
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import arrays as array_checks
 from robocas_ms3.datasets.conversion.data_info import build_info
@@ -115,7 +115,7 @@ def resplit(root: Path, options: SplitOptions | None = None) -> EpisodeSplit:
     Episodes that are not on disk are removed from ``conversion.json``. Without options each episode keeps its split,
     and unlisted episodes are split by seed.
     """
-    with locked_folder(root):
+    with lock_folder(root):
         dataset = Dataset(root)
         split = dataset.splits if options is None else _choose_split(dataset, options)
         for number in dataset.numbers:

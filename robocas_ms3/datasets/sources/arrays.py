@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, open_arrays
+from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, open_npz
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.core.text import one_line
@@ -81,7 +81,7 @@ def read_arrays(path: Path, keys: Container[str] | None = None) -> EpisodeArrays
     unreadable: dict[str, Exception] = {}
     ignored: list[str] = []
     try:
-        with open_arrays(path) as content:
+        with open_npz(path) as content:
             for key in content.files:
                 if keys is not None and key not in keys:
                     ignored.append(key)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, load_array, load_json
+from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, load_json, load_npy
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets import schema
@@ -55,7 +55,7 @@ def read_json(path: Path) -> dict[str, Any]:
 def read_array(path: Path) -> NDArray[np.float64]:
     """Read an array of numbers, such as intrinsics or a pose."""
     try:
-        array = load_array(path, CAMERA_LIMIT)
+        array = load_npy(path, CAMERA_LIMIT)
         if array.dtype.kind not in "fiu":
             raise ValueError("not an array of numbers")
     except DAMAGED_FILE_ERRORS as error:

@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import DocumentError, check_regular
+from robocas_ms3.core.documents import DocumentError, check_regular_file
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import atomic_file, write_json
 from robocas_ms3.core.text import one_line
@@ -69,7 +69,7 @@ def convert_read_errors(where: object, what: str = "damaged episode") -> Iterato
 
 def open_trajectory(path: Path) -> h5py.File:
     try:
-        check_regular(path)
+        check_regular_file(path)
         return h5py.File(path, "r")
     except FileNotFoundError as error:
         raise DatasetError("no such trajectory file", where=path) from error

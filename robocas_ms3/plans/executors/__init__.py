@@ -11,7 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from robocas_ms3.core.errors import PlanError
-from robocas_ms3.core.extensions import load_object
+from robocas_ms3.core.extensions import import_object
 from robocas_ms3.core.strict_model import StrictModel, error_from_validation
 from robocas_ms3.plans.folder import PlanFolder, WorkUnit
 from robocas_ms3.plans.worker import WorkUnitWorker
@@ -115,4 +115,4 @@ class LocalExecutor(ThreadExecutor):
 
 def open_executor(name: str, folder: PlanFolder, jobs: int, options: Mapping[str, str]) -> Executor:
     """Create the executor with this name; raise the errors of `Executor`."""
-    return load_object(EXECUTORS[name])(folder, jobs, options)
+    return import_object(EXECUTORS[name])(folder, jobs, options)

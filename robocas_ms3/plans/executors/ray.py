@@ -20,7 +20,7 @@ from pydantic import Field
 
 from robocas_ms3.core.errors import PlanError, RobocasError, require_extra
 from robocas_ms3.core.files import LEFTOVER_AGE, make_folder, write_json
-from robocas_ms3.core.signals import deferred_interrupts
+from robocas_ms3.core.signals import defer_interrupts
 from robocas_ms3.core.strict_model import StrictModel
 from robocas_ms3.core.text import one_line
 from robocas_ms3.plans.executors import ThreadExecutor
@@ -123,7 +123,7 @@ class RayExecutor(ThreadExecutor):
         return "the log of Ray on the node of the task"
 
     def __exit__(self, *error: object) -> None:
-        with deferred_interrupts(second_ends=False):
+        with defer_interrupts(second_ends=False):
             self.threads.shutdown(wait=False, cancel_futures=True)
             until = time.monotonic() + _CANCEL_TIMEOUT
             while self._tasks and time.monotonic() < until:  # Ray crashes if a thread still waits for a task

@@ -207,7 +207,7 @@ class WorkUnitJob:
             for unit in self.units:
                 thread.submit(worker.run, unit).result()
         except Exception as error:
-            return RemoteError.of(error, "a job")
+            return RemoteError.from_error(error, "a job")
         finally:
             worker.close()
         return None

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, StrictInt, model_validator
 
 from robocas_ms3.core.errors import ConfigError, ExtensionError
-from robocas_ms3.core.extensions import load_object
+from robocas_ms3.core.extensions import import_object
 from robocas_ms3.core.strict_model import StrictModel
 from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.robots.description import RobotDescription
@@ -287,7 +287,7 @@ class TaskConfig(StrictModel):
         if self.randomisation.basket is not None and self.basket is None:
             raise ValueError("randomisation.basket requires a `basket`")
         for check in spec.checks:
-            load_object(check)(self)
+            import_object(check)(self)
         undrawn = sorted(set(self.randomisation.finishes) - set(self.randomisation.room or ()))
         if undrawn:
             raise ValueError(f"randomisation.finishes: {undrawn} must be among randomisation.room")

@@ -14,7 +14,7 @@ from concurrent.futures import Future
 from multiprocessing import Pipe
 from typing import Any, Generic, TypeVar
 
-from robocas_ms3.core.signals import deferred_interrupts
+from robocas_ms3.core.signals import defer_interrupts
 from robocas_ms3.core.worker_process import START_SECONDS, Limits, ProcessCrashError, Worker, WorkerProcess
 
 Task = TypeVar("Task")
@@ -98,7 +98,7 @@ class PinnedWorkers(Generic[Task, Result]):
         errors: dict[int, Exception] = {}
         deadline = time.monotonic() + seconds
         while messages or self._unread:
-            with deferred_interrupts() as signals:  # no message is sent or read in part
+            with defer_interrupts() as signals:  # no message is sent or read in part
                 for number, message in enumerate(messages):
                     self._processes[number].send(message)
                     self._unread.add(number)

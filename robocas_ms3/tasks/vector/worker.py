@@ -18,7 +18,7 @@ import torch
 
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.remote_errors import RemoteError
-from robocas_ms3.core.worker_process import worker_error
+from robocas_ms3.core.worker_process import make_worker_error
 from robocas_ms3.core.workers import use_one_torch_thread
 from robocas_ms3.tasks.base import RoboCASEnv
 
@@ -103,7 +103,7 @@ class EnvWorker:
             try:
                 results.append(act(env))
             except BaseException as error:  # noqa: BLE001  (raised again in the main process)
-                failed = failed or worker_error(error, f"env {env}")
+                failed = failed or make_worker_error(error, f"env {env}")
             self._busy[env] = 0
         return results, failed
 

@@ -7,7 +7,7 @@ from synthetic import write_trajectory
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
-from robocas_ms3.core.locks import locked_folder
+from robocas_ms3.core.locks import lock_folder
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, FilePlacer
 from robocas_ms3.datasets.manage.merge import merge
@@ -214,7 +214,7 @@ def test_the_output(parts, tmp_path):
         with pytest.raises(OutputExistsError):
             merge([a, b], tmp_path / "mine", options=CopyOptions(overwrite=overwrite))
     assert (tmp_path / "mine" / "thesis.tex").exists()
-    with locked_folder(tmp_path / "locked"), pytest.raises(RobocasError, match="another process writes to this folder"):
+    with lock_folder(tmp_path / "locked"), pytest.raises(RobocasError, match="another process writes to this folder"):
         merge([a], tmp_path / "locked")
 
 

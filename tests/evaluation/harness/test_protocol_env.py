@@ -9,7 +9,7 @@ import pytest
 from short_protocols import shorten
 
 from robocas_ms3.core.errors import EvaluationError, RobocasError
-from robocas_ms3.core.locks import locked_folder
+from robocas_ms3.core.locks import lock_folder
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.harness.protocol_env import ProtocolVectorEnv
 from robocas_ms3.evaluation.policy import PolicySpec
@@ -131,7 +131,7 @@ def test_outcomes_are_written_once_per_episode(make, tmp_path):
 
 def test_the_folder_of_a_result_is_locked_until_the_environment_is_closed(make, tmp_path):
     first = make(1, out=tmp_path / "result")
-    for refused in (lambda: make(1, out=tmp_path / "result"), locked_folder(tmp_path / "result").__enter__):
+    for refused in (lambda: make(1, out=tmp_path / "result"), lock_folder(tmp_path / "result").__enter__):
         with pytest.raises(RobocasError, match="another process writes to this folder"):
             refused()
     first.close()
