@@ -168,7 +168,7 @@ def _replace_folder(tmp: Path, path: Path) -> None:
 
 
 def _recover_killed_run(path: Path) -> None:
-    """Restore the folder if a run was killed between the two renames of `_replace_folder`; delete old temporary folders."""
+    """Restore the folder if a run was killed within `_replace_folder`; delete old temporary folders."""
     name = glob.escape(path.name)
     with suppress(OSError):  # another run may do the same at the same time
         for old in path.parent.glob(f".{name}.*.old/old"):

@@ -21,9 +21,9 @@ def home(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     for name in ("ROBOCAS_CACHE", "ROBOCAS_DATA", "XDG_CACHE_HOME", "XDG_CONFIG_HOME"):
         monkeypatch.delenv(name, raising=False)
-    paths._user_cache.cache_clear()
+    paths._choose_cache.cache_clear()
     yield tmp_path / "home"
-    paths._user_cache.cache_clear()
+    paths._choose_cache.cache_clear()
 
 
 def test_a_home_that_is_read_only_gives_a_private_cache_and_one_warning(home, caplog):

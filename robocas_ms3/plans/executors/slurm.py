@@ -1,7 +1,8 @@
 """Run work units as jobs of Slurm: job arrays, submitted by submitit.
 
 The files in the folder of a work unit show whether the work unit is complete. Slurm requeues a job that is preempted,
-exceeds its time limit or loses its node. A job that ends for another reason, with incomplete work units, is submitted again.
+exceeds its time limit or loses its node. A job that ends for another reason, with incomplete work units, is submitted
+again.
 """
 
 from __future__ import annotations
