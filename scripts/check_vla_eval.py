@@ -50,7 +50,7 @@ from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH, STATE, feature_columns
 
-BENCHMARK = "robocas_ms3.evaluation.harness.vla_eval:RoboCASBenchmark"
+BENCHMARK = "robocas_ms3.evaluation.harness.vla_eval:RoboCAS"
 TASKS, EPISODES_PER_TASK, CHUNK = ["pick", "select"], 2, 4
 CAMERAS = {"gripper_camera": [64, 48], "base_camera": [32, 32]}
 PARAMS = {"protocol": "smoke", "convention": "robocas", "reference": "tcp", "rate_hz": 5, "cameras": CAMERAS}

@@ -1,4 +1,4 @@
-"""Benchmark for vla-eval 0.8: ``robocas_ms3.evaluation.harness.vla_eval:RoboCASBenchmark`` (docs/vla_eval.md).
+"""Benchmark for vla-eval 0.8: ``robocas_ms3.evaluation.harness.vla_eval:RoboCAS`` (docs/vla_eval.md).
 
 The class does not derive from vla-eval's base class, so that this package does not depend on vla-eval. A task of
 vla-eval is a configuration of the protocol, with its episodes in the order of the protocol.
@@ -34,8 +34,10 @@ _ROTATIONS = {
 }
 
 
-class RoboCASBenchmark:
+class RoboCAS:
     """Benchmark of vla-eval that runs the episodes of a protocol in mode ``sync``.
+
+    vla-eval uses the name of this class as the name of the benchmark in its result files.
 
     Args:
         protocol: name of a bundled protocol, or a protocol folder.
@@ -192,4 +194,4 @@ def _gripper_spec(dim_spec: Any) -> Any:
 if "vla_eval" in sys.modules:  # `vla-eval test` checks that benchmarks derive from its base class
     from vla_eval.benchmarks.base import Benchmark  # pyright: ignore[reportMissingImports]
 
-    Benchmark.register(RoboCASBenchmark)
+    Benchmark.register(RoboCAS)

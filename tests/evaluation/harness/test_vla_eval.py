@@ -13,7 +13,7 @@ pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
 from robocas_ms3.core.errors import EvaluationError, WireError
-from robocas_ms3.evaluation.harness.vla_eval import RoboCASBenchmark
+from robocas_ms3.evaluation.harness.vla_eval import RoboCAS
 from robocas_ms3.evaluation.protocol import load_protocol
 
 ACT = {"actions": np.array([1, 0, 0, 0, 0, 0, 1], np.float32)}
@@ -31,7 +31,7 @@ class Recorder:
 
 @pytest.fixture
 def benchmark(made):
-    benchmark = RoboCASBenchmark(cameras={"base_camera": [6, 4]}, rate_hz=5)
+    benchmark = RoboCAS(cameras={"base_camera": [6, 4]}, rate_hz=5)
     yield benchmark
     benchmark.cleanup()
 
@@ -119,4 +119,4 @@ def test_an_action_that_is_none_fails_its_episode_alone(benchmark, actions, monk
 @pytest.mark.parametrize("params", [{"protocol": "smok"}, {"convention": "euler"}, {"cameras": {"wrist": [4, 4]}}])
 def test_parameters_that_do_not_exist_are_refused(params):
     with pytest.raises(EvaluationError):
-        RoboCASBenchmark(**params)
+        RoboCAS(**params)
