@@ -108,7 +108,7 @@ class SerialChain:
             iteration += 1
 
     def _frames(self, qpos: Array) -> Array:
-        """Return two matrices for each joint and the tip, (n + 1, 2, N, 4, 4): pose, quaternion's left product matrix."""
+        """Return pose and left product matrix of the quaternion for each joint and the tip, (n + 1, 2, N, 4, 4)."""
         rows, count = len(qpos), qpos.shape[1] + 1
         angles = qpos @ self._angles + self._shift
         sines = torch.sin(angles) if isinstance(angles, Tensor) else np.sin(angles)

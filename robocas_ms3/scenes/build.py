@@ -23,7 +23,7 @@ _SHADOW_NEAR = -2.0  # m along the light from the origin; with less, ceiling and
 
 @dataclass(frozen=True)
 class Fixtures:
-    """Actors that all scenes of a configuration have in common."""
+    """Actors of room, furniture and basket, which all scenes of a configuration have in common."""
 
     room: Actor
     furniture: dict[str, Actor | Articulation]
@@ -33,7 +33,14 @@ class Fixtures:
 def build_fixtures(
     scene: ManiSkillScene, model: SceneModel, level: VisualLevel = "fast", seeds: Sequence[int] = (0,)
 ) -> Fixtures:
-    """Build room, furniture and basket in every sub-scene, with room finishes drawn by its seed."""
+    """Build room, furniture and basket in all sub-scenes.
+
+    Args:
+        scene: the ManiSkill scene.
+        model: configuration and assets.
+        level: level of detail of the visual meshes.
+        seeds: seed of each sub-scene, from which the finishes of its room are drawn.
+    """
     furniture: dict[str, Actor | Articulation] = {}
     for name, asset in model.furniture.items():
         build_one = spawn_articulation if asset.links else spawn
@@ -56,13 +63,13 @@ def _build_room(scene: ManiSkillScene, model: SceneModel, level: VisualLevel, se
 
 
 def build_lights(scene: ManiSkillScene, config: TaskConfig, seeds: Sequence[int], *, shadow: bool) -> None:
-    """Add lights to every sub-scene; its seed decides their intensity and direction.
+    """Add lights to all sub-scenes. The seed of a sub-scene decides the intensity and direction of its lights.
 
     Args:
         scene: the ManiSkill scene.
         config: the task configuration.
         seeds: seed of each sub-scene.
-        shadow: whether the slanted light casts shadows, even if the configuration has them off.
+        shadow: cast shadows also if ``lights.shadow`` of the configuration is false.
     """
     for i, seed in enumerate(seeds):
         lights = draw_lights(config, seed)
@@ -81,9 +88,12 @@ def build_lights(scene: ManiSkillScene, config: TaskConfig, seeds: Sequence[int]
 
 
 def shift_cameras(cameras: Sequence[RenderCamera], config: TaskConfig, seeds: Sequence[int]) -> None:
-    """Shift the cameras of every sub-scene by its seed.
+    """Move and turn the cameras at random, by ``randomisation.cameras`` of the configuration.
 
-    The order of the cameras matters: each camera has its own random stream.
+    Args:
+        cameras: cameras of the scene. Their order matters, because each index has its own random stream.
+        config: the task configuration.
+        seeds: seed of each sub-scene.
     """
     limits = config.randomisation.cameras
     if limits is None:
@@ -96,7 +106,14 @@ def shift_cameras(cameras: Sequence[RenderCamera], config: TaskConfig, seeds: Se
 def build_objects(
     scene: ManiSkillScene, config: TaskConfig, assets: Sequence[Sequence[LoadedObject]], level: VisualLevel
 ) -> list[Actor]:
-    """Build one actor per object slot from assets (one row per env), and the plane for unused slots."""
+    """Build the actor of each object slot, and the parking plane if slots may be unused.
+
+    Args:
+        scene: the ManiSkill scene.
+        config: the task configuration.
+        assets: objects of each env, one per slot.
+        level: level of detail of the visual meshes.
+    """
     columns = zip(*assets, strict=True)
     actors = [build_object_slot(scene, slot, column, level) for slot, column in enumerate(columns)]
     if config.has_unused_slots:
@@ -107,7 +124,7 @@ def build_objects(
 def build_object_slot(
     scene: ManiSkillScene, slot: int, assets: Sequence[LoadedObject], level: VisualLevel = "fast"
 ) -> Actor:
-    """Build an object slot as one actor, whose body in env i is ``assets[i]``."""
+    """Build the actor of one object slot, whose body in env i is ``assets[i]``."""
     name, waiting = f"object_{slot}", sapien.Pose([slot * 0.5, 0, 20.0])
     envs_of: dict[str, list[int]] = {}
     for env, asset in enumerate(assets):
@@ -130,7 +147,7 @@ def build_object_slot(
 
 
 def build_parking_plane(scene: ManiSkillScene, slots: int) -> Actor:
-    """Build the plane far below the floor on which the objects of unused slots are placed."""
+    """Build the plane far below the floor on which the objects of unused slots lie."""
     builder: Any = scene.create_actor_builder()
     half_size = [(slots + 1) / 2, 1.0, 0.1]
     center = sapien.Pose([(slots - 1) / 4, 0, PARKING_HEIGHT - half_size[2]])

@@ -55,12 +55,13 @@ _log = logging.getLogger(__name__)
 
 
 def make_layout_source(model: SceneModel, layouts: str | Path | LayoutSource | None = "auto") -> LayoutSource:
-    """Return the source of an environment's layouts.
+    """Return the source from which an environment gets its layouts.
 
     Args:
-        model: the scene's assets.
-        layouts: folder of all layout caches; ``auto``: the user's cache folder; None: no cache, each layout is
-            sampled when needed; path of a ``.npy`` file: frozen layouts; or a source itself.
+        model: configuration and assets.
+        layouts: ``auto`` or the folder of all layout caches: a `LayoutCache` in it (``auto``: in the cache folder of
+            the user). None: a `LayoutSampler`, without a cache. Path of a ``.npy`` file: `FrozenLayouts`. A
+            `LayoutSource` is returned unchanged.
     """
     if callable(layouts):
         return layouts
@@ -70,15 +71,15 @@ def make_layout_source(model: SceneModel, layouts: str | Path | LayoutSource | N
 
 
 def layout_caches_folder(root: str | Path = "auto") -> Path:
-    """Return the folder of all layout caches; ``auto``: the user's cache folder."""
+    """Return the folder of all layout caches: ``root``, or for ``auto`` ``layouts`` in the cache folder of the user."""
     return cache_dir() / "layouts" if root == "auto" else Path(root)
 
 
 class LayoutSampler:
-    """A `LayoutSource` that samples layouts without storing them; each process gets the same layouts.
+    """A `LayoutSource` that samples each layout when it is needed, and stores none.
 
-    A process that has enabled PhysX on a GPU cooks other hulls, so heaps settle in other poses. Such a process lets a
-    worker process sample the layouts. The worker ends when this object is deleted.
+    In a process that uses PhysX on a GPU, collision hulls differ, so heaps would settle in other poses. Such a process
+    therefore samples layouts in a worker process, which ends when this object is deleted.
     """
 
     def __init__(self, model: SceneModel) -> None:
@@ -94,16 +95,16 @@ class LayoutSampler:
         return self.make(objects_seed, seed, self._object_ids[objects_seed])
 
     def make(self, objects_seed: int, seed: int, object_ids: ObjectIds | None = None) -> Layout:
-        """Return the layout of an objects seed and a seed.
+        """Sample the layout of an objects seed and a seed.
 
         Args:
             objects_seed: decides the objects.
             seed: decides everything else.
-            object_ids: objects of the objects seed, if they are known.
+            object_ids: objects of ``objects_seed``; None: the sampler draws them.
 
         Raises:
             LayoutError: the seeds have no layout.
-            SimulationError: the worker process crashed, and so did its replacement.
+            SimulationError: the worker process crashed twice.
         """
         if not physx.is_gpu_enabled():
             return sample_layout(self._model, objects_seed, seed, object_ids)
@@ -123,17 +124,18 @@ def _sample(model: SceneModel, task: tuple[int, int, ObjectIds | None]) -> Layou
 
 def _raise_crash(task: tuple[int, int, ObjectIds | None], reason: str) -> NoReturn:
     # not a `LayoutError`: another seed would not help
-    raise SimulationError("the process that samples layouts crashed", where=f"seed {task[1]}", found=reason)
+    fix = "Free some memory and try again."
+    raise SimulationError("the process that samples layouts crashed", where=f"seed {task[1]}", found=reason, fix=fix)
 
 
 class LayoutCache:
-    """A `LayoutSource` that stores layouts of one configuration and its packs, one file per layout.
+    """A `LayoutSource` that stores the layouts of one configuration in a folder, one file per layout.
 
-    Several processes may use a cache at once: files are written atomically, and equal seeds give equal files.
+    Several processes may use a cache at the same time: files are written atomically, and equal seeds give equal files.
 
     Args:
-        model: the scene's assets.
-        root: folder of all caches; see `layout_caches_folder`.
+        model: configuration and assets.
+        root: folder of all caches, or ``auto`` (see `layout_caches_folder`).
 
     Attributes:
         folder: folder of this cache.
@@ -143,12 +145,12 @@ class LayoutCache:
         self.model = model
         self._sample = LayoutSampler(model)
         self._names = sorted(model.object_pack.objects)
-        self._about = _about(model)
+        self._about = _describe_inputs(model)
         key = hashlib.sha256(json.dumps(self._about, sort_keys=True).encode()).hexdigest()[:16]
         self.folder = layout_caches_folder(root) / f"{model.config.task}-{key}"
 
     def load_table(self, engine: Engine) -> LayoutTable | None:
-        """Return the layout table of an engine, mapped into memory; None if it is missing or damaged."""
+        """Load the layout table of an engine, mapped into memory. Return None if the file is missing or damaged."""
         path = self.table_path(engine)
         if not path.is_file():
             return None
@@ -162,9 +164,10 @@ class LayoutCache:
         return self.folder / f"table-{engine}.npy"
 
     def write_table(self, engine: Engine, pairs: Iterable[SeedPair]) -> LayoutTable | None:
-        """Write the stored layouts of some seed pairs to the table of an engine, and return the table.
+        """Write the stored layouts of seed pairs to the table of an engine, and return the table.
 
-        Layouts of an earlier table are kept. No table is written, and None returned, if no pair has a layout.
+        The table keeps the layouts that it already has. If there is no layout at all, no table is written, and the
+        result is None.
         """
         with self._locked():
             before = self.load_table(engine)
@@ -194,10 +197,10 @@ class LayoutCache:
         return self.folder / f"{seed // _FOLDER_SIZE:07d}" / f"{name}.npz"
 
     def get(self, objects_seed: int, seed: int) -> Layout:
-        """Return the layout of two seeds (see `sample_layout`): read its file, or sample and store the layout.
+        """Return the layout of an objects seed and a seed, from its file if it exists; otherwise sample and store it.
 
         Raises:
-            LayoutError: the seeds have no layout. The failure is not stored.
+            LayoutError: the seeds have no layout; this result is not stored.
         """
         path = self.layout_path(objects_seed, seed)
         if path.is_file():
@@ -222,21 +225,23 @@ class LayoutCache:
         return [pair for pair in pairs if not self.layout_path(*pair).is_file()]
 
     def fill(self, pairs: Iterable[SeedPair], jobs: int = 1) -> Generator[tuple[SeedPair, str], None, None]:
-        """Sample and store the missing layouts.
+        """Sample and store the layouts of those seed pairs that have no file yet.
 
-        Layouts with equal seeds come first, because the others take their objects from them.
+        Pairs of equal seeds come first, because they decide the objects of the other pairs.
 
         Args:
-            pairs: seed pairs.
-            jobs: number of processes; it has no effect on the layouts.
+            pairs: pairs (objects seed, seed).
+            jobs: number of processes, which has no effect on the layouts.
 
         Yields:
-            Each seed pair when it is done, in any order, and the reason why it has no layout (empty if it has one).
+            Each finished pair, in any order, and the reason why it has no layout; the reason is empty on success.
         """
         missing = self.missing_pairs(pairs)
         without: dict[int, str] = {}  # objects seeds without objects, and why
         workers = jobs if min(jobs, len(missing)) > 1 else 0
-        with WorkerPool(partial(FunctionWorker, partial(_make, self)), workers, on_crash=_crashed) as pool:
+        with WorkerPool(
+            partial(FunctionWorker, partial(_store_layout, self)), workers, on_crash=_describe_crash
+        ) as pool:
             for pair, problem in pool.map((pair for pair in missing if pair[0] == pair[1]), ordered=False):
                 if problem:
                     without[pair[0]] = problem
@@ -246,7 +251,7 @@ class LayoutCache:
             yield from pool.map((pair for pair in others if pair[0] not in without), ordered=False)
 
 
-def _make(cache: LayoutCache, pair: SeedPair) -> tuple[SeedPair, str]:
+def _store_layout(cache: LayoutCache, pair: SeedPair) -> tuple[SeedPair, str]:
     try:
         cache.get(*pair)
     except LayoutError as error:
@@ -254,17 +259,18 @@ def _make(cache: LayoutCache, pair: SeedPair) -> tuple[SeedPair, str]:
     return pair, ""
 
 
-def _crashed(pair: SeedPair, why: str) -> tuple[SeedPair, str]:
+def _describe_crash(pair: SeedPair, why: str) -> tuple[SeedPair, str]:
     return pair, f"the process that sampled the layout crashed ({why}); check the available memory"
 
 
 def seed_pairs(seeds: Iterable[int], objects: Iterable[int] | None = None) -> list[SeedPair]:
-    """Return the (objects seed, seed) pairs of the layouts that environments need.
+    """Return the pairs (objects seed, seed) of the layouts that a vector environment or a single env needs.
 
     Args:
-        seeds: layout seeds.
-        objects: objects seeds of several envs. Each is paired with itself, which is the layout that its env is built
-            with, and with all ``seeds``. None: one env, whose objects seed is its layout seed.
+        seeds: seeds of the layouts.
+        objects: objects seed of each env of a vector environment. The result has each objects seed S with all
+            ``seeds``, and the pair (S, S), with which the env is built. None: a single env, which needs (S, S) for
+            each S of ``seeds``.
     """
     if objects is None:
         return [(seed, seed) for seed in seeds]
@@ -276,7 +282,7 @@ def count_layouts(folder: Path) -> int:
     return sum(1 for path in folder.glob("*/*.npz") if not path.name.startswith("."))
 
 
-def _about(model: SceneModel) -> dict[str, Any]:
+def _describe_inputs(model: SceneModel) -> dict[str, Any]:
     config = model.config.model_dump(mode="json", exclude=_KEYS_WITHOUT_EFFECT)
     config["randomisation"] = {k: v for k, v in config["randomisation"].items() if k not in _APPEARANCE_KEYS}
     parts: dict[str, LoadedFurniture] = {**model.furniture, **({"basket": model.basket} if model.basket else {})}

@@ -24,14 +24,14 @@ _STEP, _ALONG = 0.05, 0.01  # m between sampled positions of the base, and betwe
 
 @dataclass(frozen=True)
 class CollisionBody:
-    """Furniture, basket, room or robot: its key in the configuration, and its hulls in the world, m."""
+    """Furniture, basket, room or robot: key in the configuration, and convex hulls in the world frame, m."""
 
     key: str
     hulls: list[Hull]
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """Least and greatest corners of the bounding boxes of the N hulls, (N, 3) each."""
+        """Least and greatest corner of the bounding box of each of the N hulls: two arrays (N, 3), m."""
         corners = [(hull.vertices.min(axis=0), hull.vertices.max(axis=0)) for hull in self.hulls]
         return np.array([low for low, _ in corners]), np.array([high for _, high in corners])
 
@@ -43,19 +43,20 @@ def check_clearance(
     robot_pose: Array,
     robot: RobotDescription,
 ) -> None:
-    """Check furniture, basket and robot for overlaps, and basket and objects for reachability.
+    """Check that furniture, basket and robot do not overlap, and that the arm reaches basket and objects.
 
-    `robot_placement` checks randomised poses when they are drawn. The reach includes the range of randomisation.
+    A randomised pose of robot or basket is not checked for overlaps here, but when it is drawn (`robot_placement`). The
+    reach is increased by the range of randomisation.
 
     Args:
-        config: the configuration.
-        placed: assets and their 4x4 poses in the world by key: ``furniture.NAME``, ``room``, and optionally ``basket``.
-        region: region of the objects, and its 4x4 frame in the world while the furniture is open.
-        robot_pose: 4x4 in the world.
-        robot: its body and reach are checked if it has an envelope.
+        config: the task configuration.
+        placed: asset and pose (4, 4) in the world by key: ``furniture.NAME``, ``room``, and optionally ``basket``.
+        region: region of the objects, and the pose (4, 4) of its frame in the world while the furniture is open.
+        robot_pose: (4, 4) pose of the robot's root in the world.
+        robot: description of the robot. Without an envelope, body and reach of the robot are not checked.
 
     Raises:
-        ConfigError: two things overlap, or something is out of reach; the message has the distance.
+        ConfigError: two bodies overlap, or something is out of reach; the message has the distance.
     """
     joints = {f"furniture.{name}": item.joints for name, item in config.furniture.items()}
     around = {key: CollisionBody(key, _world_hulls(*at, joints.get(key, {}))) for key, at in placed.items()}
@@ -67,22 +68,24 @@ def check_clearance(
         fixed.append(basket)
     envelope = robot.envelope
     if envelope is not None and config.randomisation.robot is None:
-        pairs += [(_body(envelope, robot_pose), other) for other in fixed]
+        pairs += [(_robot_body(envelope, robot_pose), other) for other in fixed]
     for one, other in pairs:
-        deep = max((overlap_depth(a, b) for a, b in _near(one, other)), default=0.0)
+        deep = max((overlap_depth(a, b) for a, b in _near_hulls(one, other)), default=0.0)
         if deep > _TOUCHING:
             fix = f"Move one of them by more than {deep:.2f} m" + ("." if other is room else ", or leave one out.")
-            what, found = f"{one.key} and {other.key} overlap", f"an overlap of {deep:.3f} m"
+            what, found = f"{one.key} and {other.key} overlap", f"overlap of {deep:.3f} m"
             raise ConfigError(what, expected="no overlap", found=found, fix=fix)
     if envelope is not None:
         if config.randomisation.robot is None:
             arm = np.array(envelope.arm_at_start[config.robot_start])
             _check_arm(transform_points(robot_pose, _interpolate(arm)), fixed)
-        _check_reach(config, placed.get("basket"), region, _shoulders(config, robot_pose, robot, envelope), envelope)
+        _check_reach(
+            config, placed.get("basket"), region, _shoulder_positions(config, robot_pose, robot, envelope), envelope
+        )
 
 
 def overlap_depth(one: Hull, other: Hull) -> float:
-    """Return the least distance, m, that separates two hulls; 0 if they don't overlap.
+    """Return the least translation in m that separates two convex hulls; 0 if they do not overlap.
 
     The result is exact (separating axis theorem).
     """
@@ -109,7 +112,7 @@ def _normals(hull: Hull) -> Array:
 
 
 def _edges(hull: Hull) -> Array:
-    """Return the directions (E, 3) of a hull's edges, without duplicates."""
+    """Return the directions (E, 3) of the edges of a hull, without duplicates."""
     pairs = np.sort(np.concatenate([hull.faces[:, [0, 1]], hull.faces[:, [1, 2]], hull.faces[:, [2, 0]]]), axis=1)
     ways = np.diff(hull.vertices[np.unique(pairs, axis=0)], axis=1)[:, 0]
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
@@ -117,7 +120,7 @@ def _edges(hull: Hull) -> Array:
     return np.unique(ways.round(6), axis=0)
 
 
-def _near(one: CollisionBody, other: CollisionBody) -> list[tuple[Hull, Hull]]:
+def _near_hulls(one: CollisionBody, other: CollisionBody) -> list[tuple[Hull, Hull]]:
     (low, high), (other_low, other_high) = one.bounds, other.bounds
     gap = np.minimum(high[:, None] - other_low[None], other_high[None] - low[:, None]).min(axis=2)
     return [(one.hulls[i], other.hulls[j]) for i, j in np.argwhere(gap > _TOUCHING)]
@@ -132,7 +135,7 @@ def _world_hulls(part: LoadedFurniture, pose: Array, joints: Mapping[str, float]
     return hulls
 
 
-def _body(envelope: Envelope, robot_pose: Array) -> CollisionBody:
+def _robot_body(envelope: Envelope, robot_pose: Array) -> CollisionBody:
     corners = np.array(list(product((-1.0, 1.0), (-1.0, 1.0), (0.0, 1.0))))
     sides = np.array([(0, 1, 2), (0, 1, 4), (0, 2, 4)])  # one face per axis: opposite faces add no separating axes
     hulls = [Hull(transform_points(robot_pose, corners * box), sides) for box in envelope.body_boxes]
@@ -145,7 +148,7 @@ def _interpolate(corners: Array) -> Array:
 
 
 def _check_arm(points: Array, others: list[CollisionBody]) -> None:
-    """Check that no point (P, 3) of the arm's start pose is inside of another body."""
+    """Check that no point (P, 3) of the arm in its start pose is inside of another body."""
     for other in others:
         for hull, low, high in zip(other.hulls, *other.bounds, strict=True):
             close = points[np.all((points > low) & (points < high), axis=1)]
@@ -155,12 +158,12 @@ def _check_arm(points: Array, others: list[CollisionBody]) -> None:
             along, spans = close @ normals.T, hull.vertices @ normals.T
             if ((along > spans.min(axis=0)) & (along < spans.max(axis=0))).all(axis=1).any():
                 fix = f"Move or turn the robot or {other.key}, or choose another robot_start."
-                what = "the robot's arm starts inside of another body"
+                what = "the start pose of the arm is inside of another body"
                 raise ConfigError(what, where="robot", found=other.key, fix=fix)
 
 
-def _shoulders(config: TaskConfig, robot_pose: Array, robot: RobotDescription, envelope: Envelope) -> Array:
-    """Return possible positions (P, 3) of the arm's shoulder, world, m; a grid if the base can drive."""
+def _shoulder_positions(config: TaskConfig, robot_pose: Array, robot: RobotDescription, envelope: Envelope) -> Array:
+    """Return the possible positions (P, 3) of the arm's shoulder in the world, m: a grid if the base may drive."""
     ranges = robot.base_limits[:2] if config.base_motion else ((0.0, 0.0),) * 2
     spans = [np.arange(low, high + _STEP, _STEP) for low, high in ranges]
     x, y = (grid.ravel() for grid in np.meshgrid(*spans))
@@ -175,21 +178,29 @@ def _check_reach(
     shoulders: Array,
     envelope: Envelope,
 ) -> None:
-    """Check that the nearest points of region and basket are within reach of arm and base."""
+    """Check that region and basket are each within reach of at least one position of the shoulder.
+
+    Args:
+        config: the task configuration.
+        basket: asset and pose (4, 4) of the basket; None: no basket.
+        region: region of the objects, and the pose (4, 4) of its frame.
+        shoulders: (P, 3) possible positions of the shoulder in the world, m.
+        envelope: envelope of the robot.
+    """
     moved = config.randomisation.robot
     reach = envelope.reach + _STEP + (np.sqrt(2) * moved.position if moved else 0.0)
     area, frame = region
     low, high = np.array([*area.min_xy, area.z]), np.array([*area.max_xy, area.z])
     fix = "Move it or the robot" if config.base_motion else "Move it or the robot, or set base_motion"
-    _within(_distance(shoulders, frame, low, high), reach, f"surface {config.surface.name!r}", fix)
+    _check_distance(_distance_to_box(shoulders, frame, low, high), reach, f"surface {config.surface.name!r}", fix)
     if basket is not None:
         by = config.randomisation.basket
         corners = np.concatenate(basket[0].hulls)
-        far = _distance(shoulders, basket[1], corners.min(axis=0), corners.max(axis=0))
-        _within(far, reach + (np.sqrt(2) * by.position if by else 0.0), "the basket", fix)
+        far = _distance_to_box(shoulders, basket[1], corners.min(axis=0), corners.max(axis=0))
+        _check_distance(far, reach + (np.sqrt(2) * by.position if by else 0.0), "the basket", fix)
 
 
-def _within(distance: float, limit: float, what: str, fix: str) -> None:
+def _check_distance(distance: float, limit: float, what: str, fix: str) -> None:
     if distance > limit:
         raise ConfigError(
             f"{what} is out of the arm's reach",
@@ -199,7 +210,7 @@ def _within(distance: float, limit: float, what: str, fix: str) -> None:
         )
 
 
-def _distance(points: Array, frame: Array, low: Array, high: Array) -> float:
-    """Return the least distance in m between points (P, 3) in the world and a box given in a frame."""
+def _distance_to_box(points: Array, frame: Array, low: Array, high: Array) -> float:
+    """Return the least distance in m between points (P, 3) in the world and the box ``low`` to ``high`` in a frame."""
     local = transform_points(np.asarray(np.linalg.inv(frame), dtype=np.float64), points)
     return float(np.linalg.norm(local - np.clip(local, low, high), axis=1).min())

@@ -33,16 +33,18 @@ HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # half a turn about the approach ax
 def grasp_direction_tests(
     tcp_in_world: Array, base_to_object: Array, approach: Approach = "top"
 ) -> dict[str, NDArray[np.bool_]]:
-    """Test the approach and closing directions of grasps relative to gravity and the robot.
+    """Test the approach direction and the closing direction of G grasps.
 
     Args:
-        tcp_in_world: (G, 4, 4) grasps.
-        base_to_object: (3,) or (2,) vector in the world; only its horizontal part is used. Approaches may deviate
-            from it by at most `MAX_SIDEWAYS_DEG`; nearly vertical ones (`FREE_LEAN_DEG`) have no such limit.
-        approach: allowed direction of the gripper's approach.
+        tcp_in_world: (G, 4, 4) TCP poses of the grasps.
+        base_to_object: (2,) or (3,) vector from the arm's base to the object in the world; z is ignored. The approach
+            may deviate from its direction by at most `MAX_SIDEWAYS_DEG`, unless it is nearly vertical
+            (`FREE_LEAN_DEG`).
+        approach: allowed approach: ``top`` from above, ``front`` horizontal.
 
     Returns:
-        Three tests, each (G,): ``from_above`` or ``from_the_front``, ``from_the_robots_side``, ``closing_is_level``.
+        Three tests by name, each (G,) bool: ``from_above`` or ``from_the_front``; ``from_the_robots_side``;
+        ``closing_is_level``.
     """
     axis, closing = tcp_in_world[:, :3, 2], tcp_in_world[:, :3, 1]
     lean = np.linalg.norm(axis[:, :2], axis=1)  # sine of the angle from the vertical
@@ -60,12 +62,12 @@ def grasp_direction_tests(
 
 
 def is_gripper_clear(tcp_in_world: Array, points_in_world: Array, side_clearance: float = 0.0) -> NDArray[np.bool_]:
-    """Return (G,) whether the open gripper is free of points on its way from pre-grasp to grasp.
+    """Return for each grasp (G,) whether the open gripper touches no point on its way from pre-grasp to grasp.
 
     Args:
-        tcp_in_world: (G, 4, 4) grasps.
-        points_in_world: (P, 3) m.
-        side_clearance: least distance of points from the gripper's sides (along x and y of the TCP), m.
+        tcp_in_world: (G, 4, 4) TCP poses of the grasps.
+        points_in_world: (P, 3) points on obstacles, m.
+        side_clearance: least distance of the points from the sides of the gripper (along x and y of the TCP), m.
     """
     clear = np.ones(len(tcp_in_world), dtype=bool)
     if len(points_in_world) == 0 or len(tcp_in_world) == 0:
@@ -89,7 +91,7 @@ def is_gripper_clear(tcp_in_world: Array, points_in_world: Array, side_clearance
 
 
 def _bounds_around(tcp_in_world: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return bounds (G, 3) of the box ``low`` to ``high`` and its mirror image about y = 0, for each TCP."""
+    """Return bounds (G, 3) in the world of a box in each TCP frame, together with its mirror image about y = 0."""
     low = np.array([low[0], -high[1], low[2]])
     rotations = tcp_in_world[:, :3, :3]
     centers = rotations @ ((low + high) / 2) + tcp_in_world[:, :3, 3]
@@ -98,7 +100,7 @@ def _bounds_around(tcp_in_world: Array, low: Array, high: Array) -> tuple[Array,
 
 
 def _any_inside(tcp: Array, points: Array, low: Array, high: Array) -> NDArray[np.bool_]:
-    """Return (G,) whether a point (P, 3) is inside a box (B, 3) or its mirror image, for each TCP."""
+    """Return for each TCP (G,) whether any point (P, 3) is inside one of B boxes or its mirror image about y = 0."""
     x, y, z = to_tcp_frames(tcp, points)
     y = np.abs(y)
     inside = np.zeros(len(tcp), dtype=bool)
@@ -108,7 +110,7 @@ def _any_inside(tcp: Array, points: Array, low: Array, high: Array) -> NDArray[n
 
 
 def to_tcp_frames(tcp: Array, points: Array) -> Iterator[Array]:
-    """Yield the coordinates x, y and z (G, P) of points (P, 3) in the frames of TCPs (G, 4, 4)."""
+    """Yield x, then y, then z (G, P) of points (P, 3) in the frames of TCP poses (G, 4, 4)."""
     # without BLAS, whose threads may change the last bits
     a, b, c = (points[:, i] - tcp[:, i, 3, None] for i in range(3))
     for axis in range(3):
@@ -124,15 +126,15 @@ def has_free_grasps(
     *,
     min_count: int,
 ) -> bool:
-    """Return whether enough of an object's grasps have an allowed direction and are free of collisions.
+    """Return whether at least ``min_count`` grasps of an object have an allowed direction and are collision-free.
 
     Args:
         asset: the object.
-        object_in_world: 4x4.
-        scene_points_in_world: (P, 3) samples of all other surfaces, m.
-        robot_xy: (2,) position of the arm's base, m.
-        approach: allowed direction of the gripper's approach.
-        min_count: number of grasps that are enough.
+        object_in_world: (4, 4) pose of the object.
+        scene_points_in_world: (P, 3) points on all other surfaces of the scene, m.
+        robot_xy: (2,) position of the arm's base in the world, m.
+        approach: allowed approach: ``top`` from above, ``front`` horizontal.
+        min_count: least number of such grasps.
     """
     notes, center = asset.annotations, object_in_world[:3, 3]
     grasps = object_in_world @ notes.grasps_tcp_in_object
@@ -153,7 +155,7 @@ def has_free_grasps(
 
 
 def _swept_bounds(tcp_in_world: Array) -> tuple[Array, Array]:
-    """Return bounds (3,) of the volume that the open gripper sweeps on its way to grasps (G, 4, 4)."""
+    """Return bounds, two arrays (3,), of the volume that the open gripper sweeps on its way to G grasps (G, 4, 4)."""
     high = GRIPPER_BOXES[:, 1].max(axis=0) + (SIDE_CLEARANCE, SIDE_CLEARANCE, 0)
     low = np.array([-high[0], -high[1], GRIPPER_BOXES[:, 0, 2].min() - PREGRASP_DISTANCE])
     corners = np.array(list(itertools.product(*zip(low, high, strict=True))))

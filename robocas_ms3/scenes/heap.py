@@ -50,27 +50,27 @@ def drop_heap(
     *,
     headroom: float = np.inf,
 ) -> Array:
-    """Drop objects into a frictionless bucket on a plane, then remove the bucket (docs/layouts.md).
+    """Make a heap: drop objects into a frictionless bucket on a plane, then remove the bucket (docs/layouts.md).
 
-    Each object falls as one convex hull. Then the heap spreads with all hulls of its objects, first within a fence that
-    stops rolling objects, then without it.
+    During the drop, the collision shape of each object is one convex hull. Then each object gets all of its hulls, and
+    the heap spreads, first within a fence around the region, which stops rolling objects, then without the fence.
 
     Args:
-        rng: source of all randomness.
+        rng: random generator.
         assets: K objects.
-        region: region of a horizontal plane.
-        layout: parameters of the drop.
+        region: region of the objects on a horizontal plane.
+        layout: configuration of the heap.
         headroom: greatest height of the heap, m.
 
     Returns:
-        (K, 4, 4) objects at rest in the region's frame, in the order of ``assets``.
+        (K, 4, 4) poses of the objects at rest in the region's frame, in the order of ``assets``.
 
     Raises:
-        LayoutError: each of several heaps spread over the region's edges or was too high.
+        LayoutError: all of several heaps extended over the edges of the region or were too high.
     """
     for _ in range(_TRIES):
         with engine_settings():
-            poses = _spread(assets, _fill_bucket(rng, assets, region, layout), region)
+            poses = _spread_heap(assets, _fill_bucket(rng, assets, region, layout), region)
         centers = np.stack(
             [transform_points(p, np.array([a.asset.center_of_mass]))[0] for a, p in zip(assets, poses, strict=True)]
         )
@@ -81,9 +81,9 @@ def drop_heap(
         if inside.all() and top - region.z < headroom:
             return poses
     raise LayoutError(
-        f"no heap of {format_count(len(assets), 'object')}",
+        f"a heap of {format_count(len(assets), 'object')} does not fit on the surface",
         where="layout",
-        found=f"{_TRIES} heaps spread over the edges"
+        found=f"{_TRIES} heaps that extend over the edges"
         + (f" or were higher than {headroom:.3f} m" if np.isfinite(headroom) else ""),
         fix="Lower objects.count or enlarge the surface.",
     )
@@ -92,9 +92,9 @@ def drop_heap(
 def _fill_bucket(
     rng: np.random.Generator, assets: Sequence[LoadedObject], region: Region, layout: StackedLayout
 ) -> Array:
-    """Return poses (K, 4, 4) of objects after they have fallen into the bucket, each as one convex hull."""
+    """Drop K objects into the bucket, each as one convex hull; return their poses (K, 4, 4) in the bucket."""
     # a narrower bucket makes a higher heap, which spreads when the walls are removed
-    middle, half = _middle(region), layout.bucket * np.subtract(region.max_xy, region.min_xy) / 2
+    middle, half = _region_center(region), layout.bucket * np.subtract(region.max_xy, region.min_xy) / 2
     scene = make_scene()
     add_ground(scene, np.array([*middle, region.z]))
     _add_walls(scene, middle, half, region.z)
@@ -102,7 +102,7 @@ def _fill_bucket(
     outlines = [outline_points(asset) for asset in assets]
     for index in draw_drop_order(rng, assets, layout.order_noise).tolist():
         asset = assets[index]
-        pose = _falling_pose(rng, asset, layout.tumble_probability)
+        pose = _draw_falling_pose(rng, asset, layout.tumble_probability)
         points = transform_points(pose, outlines[index])
         room = np.maximum(half - np.abs(points[:, :2]).max(axis=0), 0)
         x, y = middle + rng.uniform(-1, 1, 2) * room * layout.drop_spread
@@ -111,45 +111,45 @@ def _fill_bucket(
         )
         pose = from_xyz_yaw(x, y, top + layout.drop_height - points[:, 2].min(), 0) @ pose
         bodies[index] = add_body(scene, replace(make_rigid_body(asset), hulls=[outlines[index]]), pose)
-        _run(scene, layout.fall_seconds, list(bodies.values()))
-    _run(scene, BUCKET_SECONDS, list(bodies.values()))
+        _simulate(scene, layout.fall_seconds, list(bodies.values()))
+    _simulate(scene, BUCKET_SECONDS, list(bodies.values()))
     return np.stack([pose_matrix(bodies[i]) for i in range(len(assets))])
 
 
-def _spread(assets: Sequence[LoadedObject], poses: Array, region: Region) -> Array:
-    """Return poses (K, 4, 4) of objects after bucket and fence have been removed."""
-    middle = _middle(region)
+def _spread_heap(assets: Sequence[LoadedObject], poses: Array, region: Region) -> Array:
+    """Let a heap spread, first within a fence, then without it; return the poses (K, 4, 4) of the objects."""
+    middle = _region_center(region)
     scene = make_scene()
     add_ground(scene, np.array([*middle, region.z]))
     fence = _add_walls(scene, middle, np.subtract(region.max_xy, region.min_xy) / 2, region.z)
     bodies = [add_body(scene, make_rigid_body(asset), pose) for asset, pose in zip(assets, poses, strict=True)]
-    _run(scene, SPREAD_SECONDS, bodies)
+    _simulate(scene, SPREAD_SECONDS, bodies)
     for wall in fence:
         wall.remove_from_scene()
     for body in bodies:
         body.wake_up()
-    _run(scene, OPEN_SECONDS, bodies)
+    _simulate(scene, OPEN_SECONDS, bodies)
     return np.stack([pose_matrix(body) for body in bodies])
 
 
 def outline_points(asset: LoadedObject) -> Array:
-    """Return at most 64 points (V, 3), m, asset frame, whose convex hull approximates the object's."""
+    """Return at most 64 hull vertices (V, 3) of an object, m, whose convex hull approximates that of the object."""
     points = np.concatenate(asset.hulls)
     return points[np.unique(np.argmax(points @ _DIRECTIONS.T, axis=0))]
 
 
-def _middle(region: Region) -> Array:
+def _region_center(region: Region) -> Array:
     return np.add(region.min_xy, region.max_xy) / 2
 
 
 def draw_drop_order(rng: np.random.Generator, assets: Sequence[LoadedObject], noise: float | None) -> NDArray[np.intp]:
-    """Draw the order in which objects fall.
+    """Draw the order (K,) in which objects fall, as indices of ``assets``.
 
     Args:
-        rng: source of randomness.
+        rng: random generator.
         assets: K objects.
-        noise: standard deviation of the logarithm of the random factor on the sizes by which objects are sorted,
-            smallest first; None: any order.
+        noise: objects are sorted by size times a random factor, smallest first; ``noise`` is the standard deviation of
+            the logarithm of this factor. None: random order.
     """
     if noise is None:
         return rng.permutation(len(assets))
@@ -157,7 +157,7 @@ def draw_drop_order(rng: np.random.Generator, assets: Sequence[LoadedObject], no
     return np.argsort(np.log(sizes) + rng.normal(scale=noise, size=len(assets)))
 
 
-def _falling_pose(rng: np.random.Generator, asset: LoadedObject, tumble: float) -> Array:
+def _draw_falling_pose(rng: np.random.Generator, asset: LoadedObject, tumble: float) -> Array:
     notes = asset.annotations
     if rng.uniform() < tumble:
         pose = np.eye(4)
@@ -183,7 +183,7 @@ def _add_walls(scene: sapien.Scene, middle: Array, half: Array, z: float) -> lis
     return walls
 
 
-def _run(scene: sapien.Scene, seconds: float, bodies: Sequence[physx.PhysxRigidDynamicComponent]) -> None:
+def _simulate(scene: sapien.Scene, seconds: float, bodies: Sequence[physx.PhysxRigidDynamicComponent]) -> None:
     for step in range(round(seconds / TIME_STEP)):
         scene.step()
         if step >= 2 * _CHECK_STEPS and step % _CHECK_STEPS == 0:

@@ -26,17 +26,18 @@ PARKING_HEIGHT = -5.0  # z in m of the plane on which the objects of unused slot
 
 @dataclass(frozen=True)
 class Layout:
-    """Settled objects, robot, basket and target of a scene. K object slots; world frame, metres.
+    """Poses of objects, robot and basket at the start of an episode, and the target. K object slots; world frame, m.
 
     Attributes:
-        object_ids: K ids of the object pack.
-        object_poses: (K, 4, 4) objects at rest; objects that are not present are parked below the floor.
+        object_ids: K ids of the object pack, one per slot.
+        object_poses: (K, 4, 4) poses of the objects at rest. Objects of unused slots are below the floor.
         robot_pose: (4, 4) pose of the robot's root on the floor.
         basket_pose: (4, 4) pose of the basket's frame; None if the scene has no basket.
-        target: slot of the target.
-        relation: relation that distinguishes the target from identical objects, e.g. ``nearest``; empty: no relation.
-        present: (K,) which slots are used; default: all. The number of slots is the same for every seed.
-        visible_fractions: (K,) visible fraction (p_vis) of each object from the selection camera; NaN: not computed.
+        target: index of the target's slot.
+        relation: relation that distinguishes the target from identical objects, such as ``nearest``; empty: none.
+        present: (K,) bool, whether each slot is used; default: all. K is equal for all seeds of a configuration.
+        visible_fractions: (K,) visible fraction (p_vis in the paper) of each object, seen from the selection camera;
+            NaN: not computed.
     """
 
     object_ids: ObjectIds
@@ -55,15 +56,20 @@ class Layout:
             object.__setattr__(self, "visible_fractions", np.full(len(self.object_ids), np.nan))
 
     def check(self, names: Collection[str]) -> None:
-        """Raise ValueError if the layout is invalid, or has objects that are not among these names."""
+        """Raise ValueError if shapes or poses are invalid, or an object is not in ``names``, the ids of a pack."""
         count = len(self.object_ids)
         shapes = self.object_poses.shape, self.present.shape, self.visible_fractions.shape
         if shapes != ((count, 4, 4), (count,), (count,)) or not set(self.object_ids) <= set(names):
-            raise ValueError("objects that the pack does not have, or numbers of poses and objects that differ")
+            unknown = sorted(set(self.object_ids) - set(names))
+            raise ValueError(
+                f"expected {count} poses of objects in the pack, found {len(self.object_poses)} poses"
+                f" and {unknown or 'no'} unknown objects"
+            )
         fixtures = [self.robot_pose] if self.basket_pose is None else [self.robot_pose, self.basket_pose]
         if any(pose.shape != (4, 4) for pose in fixtures) or not 0 <= self.target < count:
             raise ValueError(
-                f"a robot or basket pose that is not 4 x 4, or target index {self.target} of {count} objects"
+                f"expected 4 x 4 poses of robot and basket and a target index below {count}, found shapes"
+                f" {[pose.shape for pose in fixtures]} and target {self.target}"
             )
         poses = np.concatenate([self.object_poses, fixtures])
         turns = poses[:, :3, :3]
@@ -87,10 +93,10 @@ def write_layout(layout: Layout, path: Path) -> None:
 
 
 def read_layout(path: Path) -> Layout:
-    """Read a layout.
+    """Read a layout file.
 
     Raises:
-        ValueError: the file is damaged; so do KeyError, TypeError and `documents.DAMAGED_FILE_ERRORS`.
+        ValueError, KeyError, TypeError, or one of `documents.DAMAGED_FILE_ERRORS`: the file is damaged.
     """
     with open_npz(path) as file:
         values = {f.name: file[_FILE_KEYS.get(f.name, f.name)] for f in fields(Layout)}

@@ -32,7 +32,7 @@ _FIX = "Build the table again: robocas layouts build."
 
 
 class LayoutStatus(IntEnum):
-    """Status of a layout in a table."""
+    """Status of a layout in a layout table."""
 
     MISSING = 0
     UNCHECKED = 1  # stable in the engine that sampled it, not yet checked in the engine of the table
@@ -41,19 +41,19 @@ class LayoutStatus(IntEnum):
 
 
 def is_usable(statuses: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return whether layouts with these statuses may start an episode."""
+    """Return for each status whether an episode may start with the layout: unchecked or stable."""
     return (statuses == LayoutStatus.UNCHECKED) | (statuses == LayoutStatus.STABLE)
 
 
 class LayoutTable:
-    """Layouts of a table file.
+    """A layout table that is mapped into memory.
 
     Args:
         path: the file.
-        names: sorted ids of the object pack's objects.
+        names: sorted ids of all objects in the object pack.
 
     Attributes:
-        rows: (S, L) records, mapped into memory.
+        rows: (S, L) records: a row for each of S objects seeds, a column for each of L seeds.
 
     Raises:
         LayoutError: the file is damaged.
@@ -61,14 +61,18 @@ class LayoutTable:
 
     def __init__(self, path: Path, names: Sequence[str]) -> None:
         self._names = list(names)
-        self.rows = _open(path, partial(np.lib.format.open_memmap, mode="r"), "not a layout table", dimensions=2)
+        self.rows = _open_array(path, partial(np.lib.format.open_memmap, mode="r"), "not a layout table", dimensions=2)
         self._sets, self._seeds = self.rows["objects_seed"][:, 0].copy(), self.rows["seed"][0].copy()  # rising
         self._statuses = self.rows["state"].copy()
 
     def find_records(
         self, objects_seeds: NDArray[np.int64], seeds: NDArray[np.int64]
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Return `LayoutStatus`, row and column (E,) each of E seed pairs; absent pairs are `MISSING`."""
+        """Find E seed pairs in the table.
+
+        Returns:
+            `LayoutStatus`, row and column of each pair, (E,) each. The status of a pair without a layout is `MISSING`.
+        """
         rows = np.minimum(np.searchsorted(self._sets, objects_seeds), len(self._sets) - 1)
         columns = np.minimum(np.searchsorted(self._seeds, seeds), len(self._seeds) - 1)
         there = (self._sets[rows] == objects_seeds) & (self._seeds[columns] == seeds)
@@ -78,7 +82,7 @@ class LayoutTable:
         return LayoutStatus(int(self.find_records(np.array([pair[0]]), np.array([pair[1]]))[0][0]))
 
     def find_pairs(self, *statuses: LayoutStatus) -> list[SeedPair]:
-        """Return the seed pairs of the layouts with these statuses; default: of all layouts in the table."""
+        """Return the seed pairs whose layouts have one of the statuses; without arguments, those of all layouts."""
         rows, columns = np.nonzero(np.isin(self._statuses, statuses) if statuses else self._statuses)
         return [*zip(self._sets[rows].tolist(), self._seeds[columns].tolist(), strict=True)]
 
@@ -86,7 +90,7 @@ class LayoutTable:
         return bool(is_usable(self._statuses[self._sets == objects_seed]).any())
 
     def object_ids(self, objects_seed: int) -> ObjectIds | None:
-        """Return the objects of an objects seed; None if the table has no layout of them."""
+        """Return the object ids of an objects seed; None if the table has no row for it."""
         row = int(np.searchsorted(self._sets, objects_seed))
         if row == len(self._sets) or self._sets[row] != objects_seed:
             return None
@@ -94,9 +98,9 @@ class LayoutTable:
         return tuple(str(self._names[i]) for i in self.rows["objects"][row, column].tolist())
 
     def layout(self, pair: SeedPair) -> Layout | None:
-        """Return a layout in single precision; None if the table does not have it."""
+        """Return the layout of a seed pair, in single precision; None if the table does not have it."""
         state, rows, columns = self.find_records(np.array([pair[0]]), np.array([pair[1]]))
-        return _layout(self.rows[rows[0], columns[0]], self._names) if state[0] != LayoutStatus.MISSING else None
+        return _to_layout(self.rows[rows[0], columns[0]], self._names) if state[0] != LayoutStatus.MISSING else None
 
 
 def write_table(
@@ -105,15 +109,15 @@ def write_table(
     layouts: Mapping[SeedPair, Layout],
     statuses: Mapping[SeedPair, LayoutStatus] = MappingProxyType({}),
 ) -> None:
-    """Write layouts as a table.
+    """Write a layout table.
 
     Args:
         path: the file.
-        names: sorted ids of the object pack's objects.
-        layouts: layouts by seed pair; other pairs of the same seeds become `LayoutStatus.MISSING`.
-        statuses: statuses by seed pair; default: `LayoutStatus.UNCHECKED`.
+        names: sorted ids of all objects in the object pack.
+        layouts: layout of each seed pair. Other pairs of these objects seeds and seeds get `LayoutStatus.MISSING`.
+        statuses: status of each seed pair; default: `LayoutStatus.UNCHECKED`.
     """
-    records = _records(names, layouts, statuses)
+    records = _to_records(names, layouts, statuses)
     sets, row = np.unique(records["objects_seed"], return_inverse=True)
     seeds, column = np.unique(records["seed"], return_inverse=True)
     rows = np.zeros((len(sets), len(seeds)), records.dtype)
@@ -123,7 +127,7 @@ def write_table(
 
 
 def write_statuses(path: Path, names: Sequence[str], statuses: Mapping[SeedPair, LayoutStatus]) -> None:
-    """Write the statuses of some layouts into a table; pairs without a layout stay `LayoutStatus.MISSING`."""
+    """Change the statuses of seed pairs in a table file. A pair without a layout stays `LayoutStatus.MISSING`."""
     table = LayoutTable(path, names)
     rows = np.array(table.rows)
     for pair, state in statuses.items():
@@ -134,11 +138,11 @@ def write_statuses(path: Path, names: Sequence[str], statuses: Mapping[SeedPair,
 
 
 class FrozenLayouts:
-    """A `LayoutSource` of frozen layouts.
+    """A `LayoutSource` that reads the frozen layouts of a protocol.
 
     Args:
         path: the file.
-        names: ids of the object pack's objects.
+        names: ids of all objects in the object pack.
 
     Raises:
         LayoutError: the file is damaged.
@@ -146,49 +150,55 @@ class FrozenLayouts:
 
     def __init__(self, path: Path, names: Collection[str]) -> None:
         self._path, self._names = path, sorted(names)
-        self._records = _open(path, load_npy, "not a file of frozen layouts", dimensions=1)
+        self._records = _open_array(path, load_npy, "not a file of frozen layouts", dimensions=1)
         self._places = {int(seed): i for i, seed in enumerate(self._records["seed"])}
 
     @property
     def seed_range(self) -> tuple[int, int]:
-        """First and last of the consecutive seeds that start with the least seed."""
+        """First and last seed of the range without gaps that starts with the least seed."""
         first = last = min(self._places)
         while last + 1 in self._places:
             last += 1
         return first, last
 
     def __call__(self, objects_seed: int, seed: int) -> Layout:
-        """Return the layout of a seed, which is also its objects seed.
+        """Return the layout of a seed. Objects seed and seed must be equal.
 
         Raises:
-            LayoutError: the file has no layout of the seed, or the seeds differ.
+            LayoutError: the file has no layout of the seed, or the two seeds differ.
         """
         if objects_seed != seed or seed not in self._places:
             found = seed if objects_seed == seed else f"objects of {objects_seed}, layout of {seed}"
             expected = f"one of {len(self._places)} seeds from {min(self._places)} to {max(self._places)}"
             raise LayoutError("no frozen layout of this seed", where=self._path, expected=expected, found=found)
-        return _layout(self._records[self._places[seed]], self._names)
+        return _to_layout(self._records[self._places[seed]], self._names)
 
 
 def write_frozen_layouts(path: Path, names: Collection[str], layouts: Mapping[int, Layout]) -> None:
-    _save(path, _records(sorted(names), {(seed, seed): layout for seed, layout in layouts.items()}))
+    _save(path, _to_records(sorted(names), {(seed, seed): layout for seed, layout in layouts.items()}))
 
 
 def join_frozen_layouts(path: Path, parts: Sequence[Path]) -> None:
-    """Join several files of frozen layouts of one configuration, in the given order.
+    """Join files of frozen layouts of one configuration into one file.
+
+    Args:
+        path: the written file.
+        parts: the files, in the order of the layouts.
 
     Raises:
         LayoutError: a file is damaged, or belongs to another configuration.
     """
-    pieces = [_open(part, load_npy, "not a file of frozen layouts", dimensions=1) for part in parts]
+    pieces = [_open_array(part, load_npy, "not a file of frozen layouts", dimensions=1) for part in parts]
     for part, piece in zip(parts, pieces, strict=True):
         if piece.dtype["objects"] != pieces[0].dtype["objects"]:
-            what, expected = "frozen layouts of another configuration", f"the number of objects in {parts[0]}"
-            raise LayoutError(what, where=part, expected=expected)
+            what = "frozen layouts of another configuration"
+            expected = f"{pieces[0]['objects'].shape[-1]} objects per layout, as in {parts[0]}"
+            found = f"{piece['objects'].shape[-1]} objects"
+            raise LayoutError(what, where=part, expected=expected, found=found)
     _save(path, np.concatenate(pieces))
 
 
-def _records(
+def _to_records(
     names: Sequence[str],
     layouts: Mapping[SeedPair, Layout],
     statuses: Mapping[SeedPair, LayoutStatus] = MappingProxyType({}),
@@ -213,7 +223,7 @@ def _records(
     return records
 
 
-def _layout(record: Any, names: Sequence[str]) -> Layout:
+def _to_layout(record: Any, names: Sequence[str]) -> Layout:
     try:
         layout = Layout(
             object_ids=tuple(str(names[i]) for i in record["objects"].tolist()),
@@ -227,17 +237,17 @@ def _layout(record: Any, names: Sequence[str]) -> Layout:
         )
         layout.check(names)
     except (ValueError, IndexError) as error:
-        raise LayoutError("damaged layout", found=error, fix=_FIX) from error
+        raise LayoutError("damaged layout in a layout table", found=error, fix=_FIX) from error
     return layout
 
 
-def _open(path: Path, load: Callable[[Path], Any], what: str, *, dimensions: int) -> NDArray[np.void]:
+def _open_array(path: Path, load: Callable[[Path], Any], what: str, *, dimensions: int) -> NDArray[np.void]:
     try:
         check_regular_file(path)
         rows = load(path)
         slots, words = rows.dtype["present"].itemsize, rows.dtype["relation"].itemsize // 4
         if rows.dtype != _record_type(slots, words) or rows.ndim != dimensions or not rows.size:
-            raise ValueError("an array without the fields of layouts")
+            raise ValueError("the array does not have the fields of layouts")
     except (*DAMAGED_FILE_ERRORS, KeyError, TypeError) as error:
         raise LayoutError(what, where=path, found=error, fix=_FIX if dimensions == 2 else "") from error
     return rows

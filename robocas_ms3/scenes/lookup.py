@@ -25,7 +25,7 @@ def fixture_pose(config: PoseConfig) -> Array:
 
 
 def furniture_pose(config: PlacedConfig, furniture: LoadedFurniture) -> Array:
-    """Return the 4x4 pose of a furniture frame from the configured position of its lowest point."""
+    """Return the pose (4, 4) of a furniture's frame in the world; the configuration has that of its lowest point."""
     pose = fixture_pose(config.pose)
     pose[2, 3] += furniture.asset.origin_height
     return pose
@@ -37,7 +37,12 @@ def _check_known(what: str, found: str, known: Collection[str]) -> None:
 
 
 def find_furniture(pack: Pack, asset_id: str, *, key: str) -> LoadedFurniture:
-    """Return a piece of furniture by its id in the pack, or by ``pack/id`` in another pack.
+    """Return a piece of furniture of a pack.
+
+    Args:
+        pack: the furniture pack.
+        asset_id: id in this pack, or ``PACK/ID`` in another pack.
+        key: key of the configuration, for messages.
 
     Raises:
         ConfigError: the pack has no such furniture.
@@ -67,8 +72,8 @@ def find_room(pack: Pack, config: TaskConfig) -> LoadedFurniture:
 def find_container(pack: Pack, config: PlacedConfig) -> LoadedFurniture:
     basket = find_furniture(pack, config.asset, key="basket.asset")
     if basket.asset.inner is None or basket.asset.mass is None:
-        expected = "furniture with a mass and an inner volume"
-        raise ConfigError("basket.asset: not a movable container", expected=expected, found=config.asset)
+        expected = "an asset with the keys mass and inner in the manifest"
+        raise ConfigError("basket.asset: the asset is not a basket", expected=expected, found=config.asset)
     return basket
 
 
@@ -86,9 +91,9 @@ def find_objects(pack: Pack, config: TaskConfig) -> list[str]:
 
 
 def _check_relations(pack: Pack, config: TaskConfig, ids: list[str]) -> None:
-    """Check that layouts can have enough objects of one name for each relation.
+    """Check that layouts can have three objects of one name if a relation needs them, such as ``middle``.
 
-    The complete list of relations is always valid: it means all relations that the layout allows.
+    The complete list of relations is always valid: it stands for all relations that the layout allows.
     """
     asked, layout, random = config.target.relations, config.layout, config.randomisation
     named = "relation" in TASKS[config.task].slots
@@ -96,19 +101,19 @@ def _check_relations(pack: Pack, config: TaskConfig, ids: list[str]) -> None:
         return
     wrong = [relation for relation in asked if relation in THREE_OBJECT_RELATIONS]
     sets = [resolve_ids(pack, names, key="randomisation.object_sets") for names in random.object_sets or ()] or [ids]
-    most = max(_most_alike(pack, names, config, layout.copies) for names in sets)
+    most = max(_max_of_one_name(pack, names, config, layout.copies) for names in sets)
     if random.distractors and random.distractors.count[1]:  # may be of the same name
         most += random.distractors.count[1]
     if wrong and most < 3:
         raise ConfigError(
-            f"target.relations: {', '.join(wrong)} needs at least three objects of one name",
-            expected="layout.copies and objects.count of 3 or more",
+            f"target.relations: {', '.join(wrong)} needs three objects of one name",
+            expected="layout.copies and objects.count of at least 3",
             found=f"layout.copies {layout.copies}, objects.count {config.objects.count}",
             fix="Raise layout.copies, or remove these relations.",
         )
 
 
-def _most_alike(pack: Pack, ids: list[str], config: TaskConfig, copies: int) -> int:
+def _max_of_one_name(pack: Pack, ids: list[str], config: TaskConfig, copies: int) -> int:
     count = config.objects.count
     if config.objects.repeats:
         return count
@@ -118,16 +123,21 @@ def _most_alike(pack: Pack, ids: list[str], config: TaskConfig, copies: int) -> 
     return min(count, copies * rounds * max(names.values()))
 
 
-def resolve_ids(pack: Pack, wanted: list[str | int] | list[str], *, key: str) -> list[str]:
-    """Return ids of a pack's objects from ids or numbers in GraspNet-1Billion.
+def resolve_ids(pack: Pack, ids_or_numbers: list[str | int] | list[str], *, key: str) -> list[str]:
+    """Return the ids of objects in a pack; replace numbers in GraspNet-1Billion by ids.
+
+    Args:
+        pack: the object pack.
+        ids_or_numbers: ids, or numbers in GraspNet-1Billion.
+        key: key of the configuration, for messages.
 
     Raises:
-        ConfigError: the pack has no such object; the message names ``key``.
+        ConfigError: the pack has no such object.
     """
     numbers = {
         loaded.asset.graspnet_id: i for i, loaded in pack.objects.items() if loaded.asset.graspnet_id is not None
     }
-    ids = [numbers.get(i, str(i)) if isinstance(i, int) else i for i in wanted]
+    ids = [numbers.get(i, str(i)) if isinstance(i, int) else i for i in ids_or_numbers]
     unknown = [i for i in ids if i not in pack.objects]
     if unknown:
         expected = f"one of {sorted(pack.objects)}" + (
@@ -149,23 +159,23 @@ def find_region(config: SurfaceConfig, furniture: LoadedFurniture) -> Region:
         return Region(whole.min_xy, whole.max_xy, whole.z)
     if not (np.greater_equal(config.min_xy, whole.min_xy) & np.less_equal(config.max_xy, whole.max_xy)).all():
         raise ConfigError(
-            f"surface: the rectangle is outside surface {config.name!r} of {furniture.asset.id!r}",
-            expected=f"within {whole.min_xy}..{whole.max_xy}",
-            found=f"{config.min_xy}..{config.max_xy}",
+            f"surface: the rectangle is not within surface {config.name!r} of {furniture.asset.id!r}",
+            expected=f"min_xy at least {whole.min_xy}, max_xy at most {whole.max_xy}",
+            found=f"min_xy {config.min_xy}, max_xy {config.max_xy}",
         )
     return Region(config.min_xy, config.max_xy, whole.z)
 
 
 def check_joints(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> None:
-    """Check joint positions, and that the part to open starts closed and can be pulled open."""
+    """Check that joint positions are within limits, and that the part to open starts closed and can be opened."""
     for name, item in config.furniture.items():
         known = {link.joint.name: link.joint.limits for link in furniture[name].asset.links}
         for joint, position in item.joints.items():
             _check_known(f"furniture.{name}.joints: no such joint", joint, known)
             low, high = known[joint]
             if not low <= position <= high:
-                where = f"furniture.{name}.joints.{joint}: outside of the joint's limits"
-                raise ConfigError(where, expected=f"{low}..{high}", found=position)
+                what = f"furniture.{name}.joints.{joint}: position outside of the limits of the joint"
+                raise ConfigError(what, expected=f"{low} to {high}", found=position)
     opening = config.opening
     if opening is None:
         return
@@ -174,7 +184,7 @@ def check_joints(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> N
     limit = MAX_OPENED_FRACTION[joint.kind]
     if opening.opened_at >= limit:
         raise ConfigError(
-            f"opening.opened_at: scripted pulls open the {joint.kind} joint {joint.name!r} up to {limit} of its range",
+            f"opening.opened_at: the scripted policy opens a {joint.kind} joint only to {limit} of its range",
             expected=f"below {limit}",
             found=opening.opened_at,
             fix="Lower opening.opened_at.",
@@ -183,10 +193,10 @@ def check_joints(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> N
     position = config.furniture[opening.furniture].joints.get(joint.name, 0.0)
     if position / end >= opening.opened_at:
         raise ConfigError(
-            f"furniture.{opening.furniture}.joints.{joint.name}: the part to open starts open",
-            expected=f"less than opening.opened_at of its range, {opening.opened_at * end:g}",
+            f"furniture.{opening.furniture}.joints.{joint.name}: the part to open is open at the start",
+            expected=f"{'less' if end > 0 else 'greater'} than {opening.opened_at * end:g} (opening.opened_at)",
             found=position,
-            fix="Remove the joint from `joints`, which closes it, or use the task pick.",
+            fix="Remove the joint from `joints`, so that it starts closed, or use the task pick.",
         )
 
 

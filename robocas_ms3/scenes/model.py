@@ -30,19 +30,19 @@ from robocas_ms3.scenes.placement import Array, Region
 
 @dataclass(frozen=True)
 class SceneModel:
-    """A configuration with its assets. Poses are 4x4 in the world, before randomisation.
+    """A task configuration with its assets. Poses are (4, 4) in the world frame, before randomisation.
 
     Attributes:
-        config: the configuration.
+        config: the task configuration.
         object_pack: pack of the objects.
         object_ids: ids from which objects are drawn.
         room: the room.
-        furniture: furniture by its name in the configuration.
-        furniture_poses: poses of the furniture's frames.
-        basket: the container; None if the scene has none.
-        basket_pose: pose of the basket's frame.
+        furniture: furniture by name in the configuration.
+        furniture_poses: pose of the frame of each piece of furniture, by name.
+        basket: the basket; None if the scene has none.
+        basket_pose: pose of the basket's frame; None if the scene has no basket.
         robot_pose: pose of the robot's root on the floor.
-        region: rectangle for objects, in the frame of its furniture.
+        region: rectangle on which objects are placed, in the frame of the supporting furniture.
     """
 
     config: TaskConfig
@@ -65,10 +65,16 @@ class SceneModel:
         *,
         robot: RobotDescription = MOBILE_PANDA,
     ) -> SceneModel:
-        """Look up all assets of a configuration.
+        """Look up all assets of a configuration, and check overlaps and reach.
+
+        Args:
+            config: the task configuration.
+            object_pack: pack of the objects.
+            furniture_pack: pack of room, furniture and basket.
+            robot: description of the robot whose body and reach are checked.
 
         Raises:
-            ConfigError: an asset is unknown or unsuitable, or things overlap or are out of the robot's reach.
+            ConfigError: an asset is unknown or unsuitable, bodies overlap, or the arm does not reach basket or objects.
         """
         furniture = {
             name: find_furniture(furniture_pack, item.asset, key=f"furniture.{name}.asset")
@@ -98,35 +104,41 @@ class SceneModel:
 
     @property
     def support_pose(self) -> Array:
-        """4x4 pose of the furniture on which objects stand."""
+        """Pose (4, 4) in the world of the furniture on which objects are placed."""
         return self.furniture_poses[self.config.surface.furniture]
 
     @property
     def headroom(self) -> float:
-        """Free height above the surface, m; infinite if nothing is above it."""
+        """Free height above the surface of the objects, m; infinite if nothing is above it."""
         surface = self.config.surface
         return self.furniture[surface.furniture].asset.surfaces[surface.name].headroom or np.inf
 
     @property
     def support_link(self) -> str:
-        """Moving part on which objects stand; empty: the body of the furniture."""
+        """Name of the moving part on which objects are placed; empty: the fixed body of the furniture."""
         surface = self.config.surface
         return self.furniture[surface.furniture].asset.surfaces[surface.name].link
 
     @property
     def joint_to_open(self) -> Joint | None:
+        """Joint of the door or drawer that the task opens; None for other tasks."""
         return find_joint_to_open(self.config, self.furniture) if self.config.opening else None
 
     @property
     def open_threshold(self) -> float:
-        """Joint position, m or rad, from which the joint to open counts as open; signed."""
+        """Position of `joint_to_open` from which it counts as open, m or rad; negative if it opens that way."""
         joint, opening = self.joint_to_open, self.config.opening
         assert joint is not None
         assert opening is not None
         return opening.opened_at * max(joint.limits, key=abs)
 
     def joint_positions(self, name: str, *, opened: bool) -> dict[str, float]:
-        """Return joint positions of a piece of furniture by name, at the start or opened; others are 0."""
+        """Return the joint positions of a piece of furniture, m or rad, by joint name; all other joints are at 0.
+
+        Args:
+            name: name of the furniture in the configuration.
+            opened: whether the door or drawer of the task is open; false: positions at the start of an episode.
+        """
         positions = dict(self.config.furniture[name].joints)
         joint, opening = self.joint_to_open, self.config.opening
         if opened and joint is not None and opening is not None and opening.furniture == name:
@@ -134,7 +146,11 @@ class SceneModel:
         return positions
 
     def support_motion(self, *, opened: bool) -> Array:
-        """Return the 4x4 motion of the surface from its closed pose, in the support's frame."""
+        """Return the motion (4, 4) of the objects' surface from its pose with closed joints, in the furniture's frame.
+
+        Args:
+            opened: whether the door or drawer of the task is open; false: positions at the start of an episode.
+        """
         name = self.config.surface.furniture
         if not self.support_link:
             return np.eye(4)
@@ -142,11 +158,11 @@ class SceneModel:
         return link_poses(self.furniture[name].asset.links, positions)[self.support_link]
 
     def fixture_points(self, basket_pose: Array | None, *, opened: bool = False) -> Array:
-        """Return samples (P, 3) of the collision surfaces of furniture and basket, world, m.
+        """Return points (P, 3) on the collision surfaces of furniture and basket, world frame, m.
 
         Args:
-            basket_pose: 4x4; None if the scene has no basket.
-            opened: whether the door or drawer of the task is open.
+            basket_pose: (4, 4) pose of the basket in the world; None if the scene has no basket.
+            opened: whether the door or drawer of the task is open; false: positions at the start of an episode.
         """
         furniture = self._opened_points if opened else self.furniture_points
         if self.basket is None or basket_pose is None:
@@ -155,7 +171,7 @@ class SceneModel:
 
     @cached_property
     def furniture_points(self) -> Array:
-        """Samples (P, 3) of the collision surfaces of furniture, doors and drawers at their start, world, m."""
+        """Points (P, 3) on the collision surfaces of the furniture at the start of an episode, world frame, m."""
         return self._furniture_points(opened=False)
 
     @cached_property
@@ -174,7 +190,7 @@ class SceneModel:
 
     @property
     def front(self) -> Array:
-        """Unit vector (2,) from the region to the robot, along the nearest axis of the support's frame."""
+        """Direction (2,) in which columns of objects face: the axis of the furniture's frame nearest to the robot."""
         middle = np.add(self.region.min_xy, self.region.max_xy) / 2
         to_robot = (np.linalg.inv(self.support_pose) @ self.robot_pose)[:2, 3] - middle
         axis = int(np.argmax(np.abs(to_robot)))

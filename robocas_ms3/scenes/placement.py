@@ -25,7 +25,15 @@ _LABEL_YAW = -np.pi / 2
 
 @dataclass(frozen=True)
 class PlaceableObject:
-    """An object to place; its arrays are those of `assets.annotations.Annotations`."""
+    """Object to place on a surface.
+
+    Attributes:
+        name: kind of the object; objects of one kind have equal names.
+        resting_poses: (S, 4, 4), as in `assets.annotations.Annotations`.
+        probabilities: (S,) probability of each resting pose.
+        footprints: corners (K, 2) of the footprint in each resting pose, m.
+        display_pose: index of the upright resting pose, or -1.
+    """
 
     name: str
     resting_poses: Array
@@ -36,7 +44,7 @@ class PlaceableObject:
 
 @dataclass(frozen=True)
 class Region:
-    """An axis-aligned rectangle on a horizontal surface, in the frame of its furniture, m."""
+    """Axis-aligned rectangle on a horizontal surface of furniture, in the frame of the furniture, m."""
 
     min_xy: tuple[float, float]
     max_xy: tuple[float, float]
@@ -46,12 +54,18 @@ class Region:
 def sample_scattered(
     rng: np.random.Generator, placeables: list[PlaceableObject], region: Region, layout: ScatteredLayout
 ) -> Array:
-    """Place objects apart from each other, each in one of its resting poses at a random yaw.
+    """Draw poses of objects that do not touch each other, each in a random resting pose with a random yaw.
 
-    Large objects are placed first. If an object finds no free position, the layout starts again.
+    Large objects are placed first. If there is no free position for an object, all objects are placed again.
+
+    Args:
+        rng: random generator.
+        placeables: K objects.
+        region: rectangle that contains all footprints.
+        layout: least distance between objects, and number of tries.
 
     Returns:
-        (K, 4, 4) objects in the region's frame, in the order of ``placeables``.
+        (K, 4, 4) poses of the objects in the region's frame, in the order of ``placeables``.
 
     Raises:
         LayoutError: the objects don't fit.
@@ -68,14 +82,14 @@ def sample_scattered(
         for index in np.argsort([areas[c] for areas, c in zip(all_areas, choices, strict=True)])[::-1]:
             placeable, choice = placeables[index], choices[index]
             tries += _TRIES_AT_ONCE
-            yaws, positions, outlines = _candidates(rng, placeable.footprints[choice], region)
+            yaws, positions, outlines = _draw_candidates(rng, placeable.footprints[choice], region)
             if placed and len(yaws):
                 free = ~shapely.dwithin(np.array(placed), outlines[:, None], min_gap).any(axis=1)
                 yaws, positions, outlines = (values[free] for values in (yaws, positions, outlines))
             if not len(yaws):
                 break  # no free position: start again
             # and they are placed in corners or close to each other, which leaves room for the rest
-            best = 0 if tightness < _TIGHT else _snuggest(outlines, placed, region)
+            best = 0 if tightness < _TIGHT else _find_tightest(outlines, placed, region)
             shapely.prepare(outlines[best])
             placed.append(outlines[best])
             x, y = positions[best]
@@ -84,15 +98,15 @@ def sample_scattered(
             return poses
     size, things = np.subtract(region.max_xy, region.min_xy), format_count(len(placeables), "object")
     raise LayoutError(
-        f"no room for {things} {min_gap * 100:.1f} cm apart on {size[0]:.2f} x {size[1]:.2f} m",
+        f"{things}, {min_gap * 100:.1f} cm apart, do not fit on {size[0]:.2f} x {size[1]:.2f} m",
         where="layout",
-        found=f"no layout after {max_tries} tries",
+        found=f"{max_tries} tries without a layout",
         fix="Lower objects.count or layout.min_gap, enlarge the surface, or raise layout.max_tries.",
     )
 
 
-def _snuggest(outlines: NDArray, placed: list[shapely.Polygon], region: Region) -> int:
-    """Return the index of the outline nearest to its two nearest neighbours, including the region's edges."""
+def _find_tightest(outlines: NDArray, placed: list[shapely.Polygon], region: Region) -> int:
+    """Return the index of the outline with the least sum of distances to the two nearest objects or region edges."""
     low, high = shapely.bounds(outlines)[:, :2], shapely.bounds(outlines)[:, 2:]
     gaps = [low - region.min_xy, np.subtract(region.max_xy, high)]
     if placed:
@@ -100,8 +114,8 @@ def _snuggest(outlines: NDArray, placed: list[shapely.Polygon], region: Region) 
     return int(np.sort(np.concatenate(gaps, axis=1), axis=1)[:, :2].sum(axis=1).argmin())
 
 
-def _candidates(rng: np.random.Generator, footprint: Array, region: Region) -> tuple[Array, Array, NDArray]:
-    """Draw yaws (n,), positions (n, 2) and outlines (n,) of a footprint inside a region."""
+def _draw_candidates(rng: np.random.Generator, footprint: Array, region: Region) -> tuple[Array, Array, NDArray]:
+    """Draw n poses of a footprint inside a region: yaws (n,), positions (n, 2) and polygons (n,)."""
     yaws = rng.uniform(-np.pi, np.pi, _TRIES_AT_ONCE)
     fractions = rng.uniform(0, 1, (_TRIES_AT_ONCE, 2))
     cos, sin = np.cos(yaws), np.sin(yaws)
@@ -122,27 +136,28 @@ def _choose_pose(rng: np.random.Generator, placeable: PlaceableObject, areas: Ar
 def sample_orderly(
     rng: np.random.Generator, placeables: list[PlaceableObject], region: Region, layout: OrderlyLayout, front: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Place objects in columns that start at the front edge, with their labels to the front.
+    """Draw poses of objects in columns that start at the front edge of a region, with labels to the front.
 
-    Objects stand in their display pose or, without one, in their most probable resting pose. The distance of
-    neighbouring columns is the mean of their widths times ``column_spacing``. Two things are random: the order of the
-    kinds of objects, whose columns stay together, and the position of the block along the edge.
+    An object is in its display pose or, if it has none, in its most probable resting pose. The distance of two
+    neighbouring columns is ``column_spacing`` times the mean of their widths. The random generator decides the order of
+    the kinds (columns of one kind stay together), and the position of all columns along the edge.
 
     Args:
-        rng: source of all randomness.
+        rng: random generator.
         placeables: K objects.
-        region: rectangle that contains every footprint.
-        layout: sizes of columns and gaps. ``keep_what_fits`` omits the first column that doesn't fit, all columns
-            after it, and objects behind the region.
-        front: (2,) unit vector along an axis of the region's frame that points out of the front edge.
+        region: rectangle that contains all footprints.
+        layout: sizes of columns and gaps. With ``keep_what_fits``, the first column that doesn't fit, all columns after
+            it, and objects beyond the back of the region are left out.
+        front: (2,) unit vector in the region's frame, along an axis, that points out of the front edge.
 
     Returns:
-        (K, 4, 4) objects in the region's frame, in the order of ``placeables``; (K,) whether there is room for each.
+        (K, 4, 4) poses of the objects in the region's frame, in the order of ``placeables``. (K,) bool, whether there
+        is room for each object.
 
     Raises:
-        LayoutError: the columns don't fit side by side, a column is too long, or nothing fits.
+        LayoutError: the columns don't fit side by side, a column is too long, or no object fits.
     """
-    columns = _columns(placeables, layout.rows)
+    columns = _assign_columns(placeables, layout.rows)
     along = np.array([-front[1], front[0]])  # direction of the front edge
     jitter = np.deg2rad(layout.yaw_jitter_deg)
     yaws = np.arctan2(front[1], front[0]) - _LABEL_YAW + rng.uniform(-jitter, jitter, len(placeables))
@@ -155,7 +170,7 @@ def sample_orderly(
         turned = placeable.footprints[choice] @ from_xyz_yaw(0, 0, 0, yaw)[:2, :2].T @ np.column_stack([along, front])
         low[i], high[i] = turned.min(axis=0), turned.max(axis=0)
 
-    members = _ordered(rng, columns)
+    members = _shuffle_kinds(rng, columns)
     widths = np.array([max(high[i, 0] - low[i, 0] for i in column) for column in members])
     centers = np.concatenate([[0.0], np.cumsum(layout.column_spacing * (widths[1:] + widths[:-1]) / 2)])
     taken = centers + (widths[0] + widths) / 2  # by the columns up to each
@@ -163,7 +178,7 @@ def sample_orderly(
     (left, back), (right, edge) = corners.min(axis=0), corners.max(axis=0)
     count = int((taken <= right - left).sum()) if layout.keep_what_fits else len(members)
     if count == 0 or taken[count - 1] > right - left:
-        raise _does_not_fit(f"{format_count(len(members), 'column')} side by side", taken[count - 1], right - left)
+        raise _make_size_error(f"{format_count(len(members), 'column')} side by side", taken[count - 1], right - left)
     start = left + widths[0] / 2 + rng.uniform() * (right - left - taken[count - 1])
 
     poses, there = np.tile(np.eye(4), (len(placeables), 1, 1)), np.zeros(len(placeables), dtype=bool)
@@ -176,14 +191,14 @@ def sample_orderly(
             depth = edge - free - layout.row_gap
             there[i] = depth <= edge - back
         if not there[column].all() and not layout.keep_what_fits:
-            raise _does_not_fit(f"{len(column)} x {placeables[column[0]].name} in a column", depth, edge - back)
+            raise _make_size_error(f"{len(column)} x {placeables[column[0]].name} in a column", depth, edge - back)
     if not there.any():
-        raise _does_not_fit("the first objects of all columns", min(high[:, 1] - low[:, 1]), edge - back)
+        raise _make_size_error("the first objects of all columns", min(high[:, 1] - low[:, 1]), edge - back)
     return poses, there
 
 
-def _columns(placeables: list[PlaceableObject], rows: int) -> list[tuple[str, int]]:
-    """Return the column (kind, number) of each object; a column has at most ``rows`` objects of one kind."""
+def _assign_columns(placeables: list[PlaceableObject], rows: int) -> list[tuple[str, int]]:
+    """Return the column (kind, index within the kind) of each object; a column has at most ``rows`` objects."""
     seen: Counter[str] = Counter()
     columns = []
     for placeable in placeables:
@@ -192,8 +207,8 @@ def _columns(placeables: list[PlaceableObject], rows: int) -> list[tuple[str, in
     return columns
 
 
-def _ordered(rng: np.random.Generator, columns: list[tuple[str, int]]) -> list[list[int]]:
-    """Return the objects of each column in their order along the edge, with shuffled kinds."""
+def _shuffle_kinds(rng: np.random.Generator, columns: list[tuple[str, int]]) -> list[list[int]]:
+    """Return the indices of the objects of each column, with the columns in a random order of their kinds."""
     kinds: dict[str, dict[int, list[int]]] = {}
     for i, (kind, number) in enumerate(columns):
         kinds.setdefault(kind, {}).setdefault(number, []).append(i)
@@ -201,7 +216,7 @@ def _ordered(rng: np.random.Generator, columns: list[tuple[str, int]]) -> list[l
     return [column for k in rng.permutation(len(names)) for column in kinds[names[k]].values()]
 
 
-def _does_not_fit(what: str, needed: float, room: float) -> LayoutError:
+def _make_size_error(what: str, needed: float, room: float) -> LayoutError:
     return LayoutError(
         f"{what} don't fit on the surface",
         where="layout",
@@ -212,9 +227,14 @@ def _does_not_fit(what: str, needed: float, room: float) -> LayoutError:
 
 
 def draw_object_ids(rng: np.random.Generator, ids: list[str], count: int, *, repeats: bool = False) -> list[str]:
-    """Draw ``count`` ids without repetition or, if there are fewer ids, as evenly as possible.
+    """Draw ``count`` object ids.
 
-    With ``repeats``, each id is drawn independently from all of them.
+    Args:
+        rng: random generator.
+        ids: ids to draw from.
+        count: number of drawn ids.
+        repeats: whether each id is drawn independently of the others. False: an id is drawn again only after all ids
+            have been drawn equally often.
     """
     if repeats:
         return [ids[i] for i in rng.integers(len(ids), size=count)]

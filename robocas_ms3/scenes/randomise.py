@@ -17,7 +17,13 @@ _ROOM, _LIGHTS, _CAMERAS = range(200, 203)  # random streams; sample.py has the 
 
 @dataclass(frozen=True)
 class Lights:
-    """Intensities of the lights; ``direction`` is the unit vector of the slanted light, world frame."""
+    """Lights of an episode.
+
+    Attributes:
+        ambient: intensity of the ambient light.
+        directional: intensity of both directional lights.
+        direction: (3,) unit vector along the slanted light, world frame.
+    """
 
     ambient: float
     directional: float
@@ -34,27 +40,37 @@ def draw_finishes(config: TaskConfig, room: LoadedFurniture, seed: int) -> dict[
 
 
 def draw_lights(config: TaskConfig, seed: int) -> Lights:
-    lights, by = config.lights, config.randomisation.lights
+    lights, limits = config.lights, config.randomisation.lights
     direction = np.array(lights.direction) / np.linalg.norm(lights.direction)
-    if by is None:
+    if limits is None:
         return Lights(lights.ambient, lights.directional, direction)
     rng = np.random.default_rng([seed, _LIGHTS])
-    ambient, directional = rng.uniform(*by.ambient), rng.uniform(*by.directional)
+    ambient, directional = rng.uniform(*limits.ambient), rng.uniform(*limits.directional)
     vector = rng.normal(size=3)
-    turn = Rotation.from_rotvec(vector / np.linalg.norm(vector) * rng.uniform() * np.deg2rad(by.direction_deg))
+    turn = Rotation.from_rotvec(vector / np.linalg.norm(vector) * rng.uniform() * np.deg2rad(limits.direction_deg))
     return Lights(float(ambient), float(directional), turn.apply(direction))
 
 
-def draw_camera_shift(by: CameraRandomisation, camera: int, seed: int) -> Array:
-    """Draw the 4x4 pose of a shifted camera in its original frame; ``camera`` is the camera's index."""
+def draw_camera_shift(limits: CameraRandomisation, camera: int, seed: int) -> Array:
+    """Draw the random motion (4, 4) of a camera in the camera frame.
+
+    Args:
+        limits: ranges of shift and rotation.
+        camera: index of the camera, which selects the random stream.
+        seed: seed of the episode.
+    """
     rng = np.random.default_rng([seed, _CAMERAS, camera])
     shift = np.eye(4)
-    shift[:3, 3] = _either_way(rng.uniform(-by.position, by.position, 3), by.min_position, by.position)
-    angles = _either_way(rng.uniform(-by.rotation_deg, by.rotation_deg, 3), by.min_rotation_deg, by.rotation_deg)
+    shift[:3, 3] = _scale_magnitudes(
+        rng.uniform(-limits.position, limits.position, 3), limits.min_position, limits.position
+    )
+    angles = _scale_magnitudes(
+        rng.uniform(-limits.rotation_deg, limits.rotation_deg, 3), limits.min_rotation_deg, limits.rotation_deg
+    )
     shift[:3, :3] = Rotation.from_euler("xyz", np.deg2rad(angles)).as_matrix()
     return shift
 
 
-def _either_way(drawn: Array, least: float, most: float) -> Array:
-    """Scale values in [-most, most] to magnitudes between ``least`` and ``most``; signs stay."""
+def _scale_magnitudes(drawn: Array, least: float, most: float) -> Array:
+    """Map values in [-most, most] to magnitudes in [least, most] with the same signs."""
     return drawn if least == 0 else np.copysign(least + np.abs(drawn) * (1 - least / most), drawn)

@@ -26,11 +26,15 @@ MARGIN = 0.03  # m, least difference between the named object and every other in
 
 
 def select_by_relation(relation: Relation, xy_in_robot: NDArray[np.float64]) -> int | None:
-    """Return the index of the object that a relation names; None if the answer is not clear by `MARGIN`.
+    """Return the index of the object to which a relation refers.
 
     Args:
-        relation: the relation of the instruction.
-        xy_in_robot: (n, 2) m, centres of the identical objects in the robot's frame: x forward, y left.
+        relation: relation of the instruction, such as ``leftmost``.
+        xy_in_robot: (n, 2) centres of n identical objects in the robot's frame, m: x forward, y left.
+
+    Returns:
+        Index of the object. None if there are too few objects, or if another object is closer than `MARGIN` in the
+        compared quantity.
     """
     by_distance = relation in {"nearest", "second_nearest", "farthest"}
     key = np.linalg.norm(xy_in_robot, axis=1) if by_distance else -xy_in_robot[:, 1]

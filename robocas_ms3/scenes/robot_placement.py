@@ -32,58 +32,72 @@ _BODY_BOXES = PANDA_ENVELOPE.body_boxes  # for every robot, so that a layout dep
 
 
 def place_robot(model: SceneModel, rng: np.random.Generator) -> Array:
-    """Return the robot's 4x4 root pose: as configured, or drawn until its body is clear of furniture."""
-    by = model.config.randomisation.robot
-    points = np.zeros((0, 3)) if by is None else model.furniture_points
-    return _place("robot", model.robot_pose, by, rng, lambda pose: is_body_clear(pose, points))
+    """Return the pose (4, 4) of the robot's root in the world.
+
+    With ``randomisation.robot``, poses are drawn until the body of the robot is clear of furniture. Without it, the
+    result is the configured pose.
+    """
+    limits = model.config.randomisation.robot
+    points = np.zeros((0, 3)) if limits is None else model.furniture_points
+    return _draw_valid_pose("robot", model.robot_pose, limits, rng, lambda pose: is_body_clear(pose, points))
 
 
 def place_basket(model: SceneModel, robot_pose: Array, rng: np.random.Generator) -> Array | None:
-    """Return the basket's 4x4 pose: as configured, or drawn until it is stable and clear of the robot.
+    """Return the pose (4, 4) of the basket in the world; None if the scene has no basket.
 
-    Returns:
-        The pose; None if the scene has no basket.
+    With ``randomisation.basket``, poses are drawn until the basket is stable and clear of the robot. Without it, the
+    result is the configured pose.
     """
     if model.basket is None or model.basket_pose is None:
         return None
     points = model.basket.surface_points()
 
-    def good(pose: Array) -> bool:
+    def is_valid(pose: Array) -> bool:
         return is_body_clear(robot_pose, transform_points(pose, points)) and is_basket_stable(model, pose)
 
-    return _place("basket", model.basket_pose, model.config.randomisation.basket, rng, good)
+    return _draw_valid_pose("basket", model.basket_pose, model.config.randomisation.basket, rng, is_valid)
 
 
-def _place(
-    name: str, pose: Array, by: PoseRandomisation | None, rng: np.random.Generator, good: Callable[[Array], bool]
+def _draw_valid_pose(
+    name: str,
+    pose: Array,
+    limits: PoseRandomisation | None,
+    rng: np.random.Generator,
+    is_valid: Callable[[Array], bool],
 ) -> Array:
-    if by is None:
+    if limits is None:
         return pose
     for _ in range(_TRIES):
-        moved = _moved(pose, by, rng)
-        if good(moved):
+        moved = _draw_pose_near(pose, limits, rng)
+        if is_valid(moved):
             return moved
     raise LayoutError(
-        f"no valid pose of the {name} near its configured pose",
+        f"no valid random pose of the {name}",
         where=f"randomisation.{name}",
-        found=f"{_TRIES} poses tried",
+        found=f"{_TRIES} poses that are not stable or not clear of other bodies",
         fix=f"Lower randomisation.{name}.position, or move the {name} farther from furniture and edges.",
     )
 
 
-def _moved(pose: Array, by: PoseRandomisation, rng: np.random.Generator) -> Array:
-    """Shift a pose in x and y and turn it about its vertical axis."""
-    shift, yaw = rng.uniform(-by.position, by.position, 2), np.deg2rad(rng.uniform(-by.yaw_deg, by.yaw_deg))
+def _draw_pose_near(pose: Array, limits: PoseRandomisation, rng: np.random.Generator) -> Array:
+    """Draw a pose (4, 4) near ``pose``, with random shifts in x and y and a random turn about the vertical axis."""
+    shift, yaw = (
+        rng.uniform(-limits.position, limits.position, 2),
+        np.deg2rad(rng.uniform(-limits.yaw_deg, limits.yaw_deg)),
+    )
     moved = pose @ from_xyz_yaw(0, 0, 0, yaw)
     moved[:2, 3] += shift
     return moved
 
 
 def is_body_clear(base_in_world: Array, cloud: Array) -> bool:
-    """Return whether no point is inside the robot's body; points below the floor are ignored.
+    """Return whether no point is inside the body of the Panda; points below the floor are ignored.
+
+    The body of the Panda is used for every robot, so that a layout depends on configuration and seeds only.
 
     Args:
-        base_in_world: 4x4 frame on the floor with the heading of the mobile base (the robot's root for base joints 0).
+        base_in_world: (4, 4) pose of the mobile base: position on the floor, and heading. With all base joints at 0 it
+            is the pose of the robot's root.
         cloud: (P, 3) points in the world, m.
     """
     local = transform_points(np.asarray(np.linalg.inv(base_in_world), dtype=np.float64), cloud)
@@ -93,7 +107,10 @@ def is_body_clear(base_in_world: Array, cloud: Array) -> bool:
 
 
 def is_basket_stable(model: SceneModel, basket_pose: Array) -> bool:
-    """Simulate (30 ms) whether the basket is stable at a 4x4 pose, with a load in each of its corners."""
+    """Return whether the basket stays at a pose (4, 4) in the world, with a load in any of its corners.
+
+    This is simulated, which takes about 30 ms.
+    """
     assert model.basket is not None
     facts = model.basket.asset
     assert facts.inner is not None
@@ -104,14 +121,14 @@ def is_basket_stable(model: SceneModel, basket_pose: Array) -> bool:
         for corner in itertools.product(*zip(facts.inner.min[:2], facts.inner.max[:2], strict=True)):
             load = np.array([*corner, facts.inner.min[2]])
             center = (facts.mass * own_center + LOAD * load) / mass
-            if not _stands(
+            if not _is_stable(
                 RigidBody(model.basket.hulls, mass, center, inertia, axes, facts.friction), model, basket_pose
             ):
                 return False
     return True
 
 
-def _stands(solid: RigidBody, model: SceneModel, pose: Array) -> bool:
+def _is_stable(solid: RigidBody, model: SceneModel, pose: Array) -> bool:
     scene = make_scene()
     add_furniture(scene, model)
     add_static_body(scene, model.room.hulls, np.eye(4), model.room.asset.friction)

@@ -31,7 +31,12 @@ _log = logging.getLogger(__name__)
 
 
 def draw_object_set(model: SceneModel, objects_seed: int, number: int = 0) -> ObjectIds:
-    """Draw the ``number``-th set of objects of a seed, one id per slot; distractors come last.
+    """Draw a set of objects: one id per slot, the distractors last.
+
+    Args:
+        model: configuration and assets.
+        objects_seed: seed of the objects.
+        number: 0 for the first set of this seed, 1 for the second set, ...
 
     Raises:
         LayoutError: no object or no column of objects fits on the surface.
@@ -43,43 +48,48 @@ def draw_object_set(model: SceneModel, objects_seed: int, number: int = 0) -> Ob
         wanted = config.randomisation.object_sets[rng.integers(len(config.randomisation.object_sets))]
         ids = resolve_ids(model.object_pack, wanted, key="randomisation.object_sets")
     if isinstance(config.layout, OrderlyLayout):
-        chosen = _kinds_that_fit(rng, model, _usable(model, ids, columns=True), config.layout.copies)
+        chosen = _draw_kinds_that_fit(rng, model, _find_usable_ids(model, ids, columns=True), config.layout.copies)
     else:
-        chosen = draw_object_ids(rng, _usable(model, ids), config.objects.count, repeats=config.objects.repeats)
+        chosen = draw_object_ids(
+            rng, _find_usable_ids(model, ids), config.objects.count, repeats=config.objects.repeats
+        )
     distractors = config.randomisation.distractors
     if distractors is not None:
-        others = _usable(model, resolve_ids(model.object_pack, distractors.ids, key="randomisation.distractors.ids"))
+        others = _find_usable_ids(
+            model, resolve_ids(model.object_pack, distractors.ids, key="randomisation.distractors.ids")
+        )
         chosen += draw_object_ids(rng, [i for i in others if i not in chosen] or others, distractors.count[1])
     return tuple(chosen)
 
 
 def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: ObjectIds | None = None) -> Layout:
-    """Draw a layout, let it settle, and choose its target; the same seeds give the same layout.
+    """Draw a layout, let the objects settle, and choose the target. Equal seeds give equal layouts.
 
-    The objects of a seed are the first drawn set (`draw_object_set`) for which this seed gives a layout. Some sets have
-    none: side by side on a shelf, no object of them can be grasped in any order.
+    Several sets of objects are drawn (`draw_object_set`), because some sets have no valid layout. The first set with a
+    valid layout is used.
 
     Args:
-        model: the scene's assets.
-        objects_seed: decides the objects; for a single env equal to ``seed``.
+        model: configuration and assets.
+        objects_seed: decides the objects. For a single env it equals ``seed``.
         seed: decides everything else.
-        object_ids: the objects of ``objects_seed``; None: they are taken from its own layout, which is sampled first.
+        object_ids: objects of ``objects_seed``. None: if the seeds differ, the layout with both seeds equal to
+            ``objects_seed`` is sampled first, and its objects are used.
 
     Raises:
-        LayoutError: the objects don't fit, don't come to rest, or none qualifies as the target; or robot or basket
-            have no valid pose.
+        LayoutError: the objects don't fit, don't come to rest, or no object qualifies as the target; or there is no
+            valid pose of robot or basket.
     """
 
-    def rng(stream: int) -> np.random.Generator:
+    def make_rng(stream: int) -> np.random.Generator:
         return np.random.default_rng([seed, stream])
 
     if object_ids is None and objects_seed != seed:
         object_ids = sample_layout(model, objects_seed, objects_seed).object_ids
     config = model.config
-    basket_rng = rng(_BASKET)
-    robot_pose = place_robot(model, rng(_ROBOT))
+    basket_rng = make_rng(_BASKET)
+    robot_pose = place_robot(model, make_rng(_ROBOT))
     basket_pose = place_basket(model, robot_pose, basket_rng)
-    layout_rng, target_rng = rng(_LAYOUT), rng(_TARGET)
+    layout_rng, target_rng = make_rng(_LAYOUT), make_rng(_TARGET)
     unsettled, untargeted, unarranged = 0, 0, []
     for number in range(_SETS):
         try:
@@ -88,11 +98,11 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
             unarranged += [error] * _TRIES
             continue
         assets = [model.object_pack.objects[i] for i in ids]
-        wanted, candidate = _presence(model, len(ids), rng(_COUNT))
+        wanted, candidate = _draw_used_slots(model, len(ids), make_rng(_COUNT))
         for _ in range(_TRIES):
-            poses = np.stack([_parked(slot, asset) for slot, asset in enumerate(assets)])
+            poses = np.stack([_parking_pose(slot, asset) for slot, asset in enumerate(assets)])
             try:
-                arranged, fits = _arrange(layout_rng, model, [assets[slot] for slot in np.flatnonzero(wanted)])
+                arranged, fits = _draw_poses(layout_rng, model, [assets[slot] for slot in np.flatnonzero(wanted)])
             except LayoutError as error:
                 if isinstance(config.layout, OrderlyLayout):
                     unarranged.append(error)  # in another order the columns may fit
@@ -120,13 +130,20 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
                     ids, poses, robot_pose, basket_pose, choice.slot, choice.relation, present, choice.visible_fractions
                 )
             untargeted += 1
-    raise _failure(model, unarranged, unsettled, untargeted)
+    raise _make_layout_error(model, unarranged, unsettled, untargeted)
 
 
 def overlaps_basket(
     assets: list[LoadedObject], poses: Array, basket: LoadedFurniture | None, basket_pose: Array | None
 ) -> bool:
-    """Return whether an object's bounding box, at its pose (K, 4, 4), overlaps the basket's."""
+    """Return whether the bounding box of any object overlaps the bounding box of the basket, in the basket's frame.
+
+    Args:
+        assets: K objects.
+        poses: (K, 4, 4) poses of the objects in the world.
+        basket: the basket; None: no overlap.
+        basket_pose: (4, 4) pose of the basket in the world.
+    """
     if basket is None or basket_pose is None:
         return False
     walls = np.concatenate(basket.hulls)
@@ -138,8 +155,10 @@ def overlaps_basket(
     return False
 
 
-def _failure(model: SceneModel, unarranged: list[LayoutError], unsettled: int, untargeted: int) -> LayoutError:
-    """Return the error of seeds without a layout, with the most likely reason."""
+def _make_layout_error(
+    model: SceneModel, unarranged: list[LayoutError], unsettled: int, untargeted: int
+) -> LayoutError:
+    """Return the error for seeds without a layout. It names the most likely reason."""
     if untargeted < _SEVERAL and len(unarranged) > _SETS * _TRIES // 2:
         return unarranged[-1]
     found = (
@@ -159,29 +178,33 @@ def _failure(model: SceneModel, unarranged: list[LayoutError], unsettled: int, u
     return LayoutError("no object qualifies as the target", where="target", found=found, fix=fix)
 
 
-def _kinds_that_fit(rng: np.random.Generator, model: SceneModel, ids: list[str], copies: int) -> list[str]:
+def _draw_kinds_that_fit(rng: np.random.Generator, model: SceneModel, ids: list[str], copies: int) -> list[str]:
     objects, count = model.object_pack.objects, model.config.objects.count
     failure = LayoutError("no kinds fit", where="objects.ids")
     for attempt in range(_KINDS):
         kinds = draw_object_ids(rng, ids, -(-count // copies), repeats=model.config.objects.repeats)
         chosen = [kind for kind in kinds for _ in range(copies)][:count]
         try:
-            _arrange(np.random.default_rng(attempt), model, [objects[i] for i in chosen])
+            _draw_poses(np.random.default_rng(attempt), model, [objects[i] for i in chosen])
             return chosen
         except LayoutError as error:
             failure = error
     raise failure
 
 
-def _usable(model: SceneModel, ids: list[str], *, columns: bool = False) -> list[str]:
-    """Return the ids of objects that fit below the headroom; for columns those with a display pose."""
+def _find_usable_ids(model: SceneModel, ids: list[str], *, columns: bool = False) -> list[str]:
+    """Return the ids of objects that are low enough for the surface; with ``columns``, only those that can stand.
+
+    If no object has a display pose, ``columns`` has no effect.
+    """
     if not columns and model.headroom == np.inf:
         return ids
     things = {i: make_placeable(model.object_pack.objects[i], model.headroom) for i in ids}
     usable = [i for i in ids if len(things[i].resting_poses)]
     if not usable:
-        room = f"objects lower than {model.headroom:.3f} m"
-        raise LayoutError("every object is too high for the surface", where="objects.ids", expected=room)
+        what, room = "all objects are too high for the surface", f"an object lower than {model.headroom:.3f} m"
+        fix = "Add lower objects to objects.ids, or choose another surface."
+        raise LayoutError(what, where="objects.ids", expected=room, fix=fix)
     if columns:
         usable = [i for i in usable if things[i].display_pose >= 0] or usable
     if model.config.objects.ids != "all" and len(usable) < len(ids):
@@ -192,14 +215,14 @@ def _usable(model: SceneModel, ids: list[str], *, columns: bool = False) -> list
 @lru_cache  # once each
 def _warn_excluded(ids: tuple[str, ...]) -> None:
     _log.warning(
-        "objects excluded, because no resting pose (in an orderly layout: no display pose) fits below the surface's "
-        "headroom: %s",
+        "objects excluded, because they are too high for the surface or, in an orderly layout, have no display pose: "
+        "%s",
         ", ".join(ids),
     )
 
 
 def make_placeable(asset: LoadedObject, headroom: float = np.inf) -> PlaceableObject:
-    """Return an object with those of its resting poses that are lower than ``headroom``, m."""
+    """Return an object for placement, with only those resting poses in which it is lower than ``headroom``, m."""
     notes = asset.annotations
     low = np.arange(len(notes.resting_poses))
     if np.isfinite(headroom):
@@ -214,10 +237,10 @@ def make_placeable(asset: LoadedObject, headroom: float = np.inf) -> PlaceableOb
     )
 
 
-def _arrange(
+def _draw_poses(
     rng: np.random.Generator, model: SceneModel, assets: list[LoadedObject]
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return (K, 4, 4) objects in the support's frame, and (K,) whether there is room for each."""
+    """Draw the poses (K, 4, 4) of objects in the furniture's frame, and (K,) whether there is room for each."""
     layout, region, everything = model.config.layout, model.region, np.ones(len(assets), dtype=bool)
     if isinstance(layout, StackedLayout):
         return drop_heap(rng, assets, region, layout, headroom=model.headroom), everything
@@ -227,8 +250,8 @@ def _arrange(
     return sample_orderly(rng, placeables, region, layout, model.front)
 
 
-def _presence(model: SceneModel, slots: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Draw (K,) which slots are used, and (K,) which of them may be the target."""
+def _draw_used_slots(model: SceneModel, slots: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Draw which slots are used (K,), and which of them may be the target (K,): all except distractors."""
     config = model.config
     count, random = config.objects.count, config.randomisation
     used = int(rng.integers(random.count[0], random.count[1] + 1)) if random.count else count
@@ -238,5 +261,5 @@ def _presence(model: SceneModel, slots: int, rng: np.random.Generator) -> tuple[
     return candidate | ((slot >= count) & (slot < count + extra)), candidate
 
 
-def _parked(slot: int, asset: LoadedObject) -> Array:
+def _parking_pose(slot: int, asset: LoadedObject) -> Array:
     return from_xyz_yaw(slot * 0.5, 0, PARKING_HEIGHT, 0) @ asset.annotations.resting_poses[0]

@@ -31,24 +31,24 @@ MAX_LINEAR, MAX_ANGULAR = 0.01, 0.1  # m/s and rad/s, of an object at rest
 def settle(
     assets: Sequence[LoadedObject], poses: Array, model: SceneModel, basket_pose: Array | None, *, heap: bool = False
 ) -> tuple[Array, bool]:
-    """Let objects settle among furniture and basket, then check that the settled poses are stable.
+    """Simulate objects until they settle among furniture and basket, then check that the settled poses are stable.
 
-    Each check starts in a new scene, as a reset does: an engine without known contacts may kick a narrow object that
-    would otherwise keep standing. If objects move in a check, the next check starts from their new poses, since heaps
-    creep for a while.
+    Each check builds a new scene, as a reset does. The reason: without contacts from an earlier step, PhysX may push a
+    narrow object over. If objects move in a check, the next check starts from their new poses, since heaps creep for a
+    while.
 
-    PhysX solves contacts in an order that depends on the order in which bodies are created. So a heap must be stable
-    for both orders of its objects.
+    PhysX solves contacts in the order in which bodies are created. So a heap is checked with its objects created in
+    forward and in reverse order.
 
     Args:
         assets: K objects.
-        poses: (K, 4, 4) in the world.
-        model: poses of the furniture; doors and drawers keep their start positions.
-        basket_pose: 4x4 in the world; None if the scene has no basket.
+        poses: (K, 4, 4) poses in the world.
+        model: configuration and furniture; doors and drawers keep their start positions.
+        basket_pose: (4, 4) pose in the world; None if the scene has no basket.
         heap: whether objects may rest on each other and tip over while settling.
 
     Returns:
-        (K, 4, 4) settled poses in the world; whether all objects are stable and near their original poses.
+        (K, 4, 4) settled poses in the world. Whether all objects are stable and near their original poses.
     """
     max_tilt = np.inf if heap else np.deg2rad(MAX_TILT_DEG)
     with engine_settings():
@@ -59,9 +59,11 @@ def settle(
             tilted = np.arccos(np.clip(upright, -1, 1))
             if not ((moved <= MAX_MOVE) & (tilted <= max_tilt)).all():
                 return settled, False
-            for backwards in (False, True) if heap else (False,):
-                after, at_rest = _simulate(assets, settled, model, basket_pose, CHECK_SECONDS, backwards=backwards)
-                if not (at_rest and _stay(settled, after)):
+            for reverse_order in (False, True) if heap else (False,):
+                after, at_rest = _simulate(
+                    assets, settled, model, basket_pose, CHECK_SECONDS, reverse_order=reverse_order
+                )
+                if not (at_rest and _has_not_moved(settled, after)):
                     break
             else:
                 return settled, True
@@ -69,7 +71,7 @@ def settle(
     return settled, False
 
 
-def _stay(before: Array, after: Array) -> bool:
+def _has_not_moved(before: Array, after: Array) -> bool:
     shift = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
     cosine = (np.einsum("kij,kij->k", before[:, :3, :3], after[:, :3, :3]) - 1) / 2
     turn = np.arccos(np.clip(cosine, -1, 1))
@@ -83,18 +85,23 @@ def _simulate(
     basket_pose: Array | None,
     seconds: float,
     *,
-    backwards: bool = False,
+    reverse_order: bool = False,
 ) -> tuple[Array, bool]:
-    """Simulate objects in a new scene; with ``backwards`` the objects are created in reverse order.
+    """Simulate K objects in a new scene for some seconds.
+
+    Args:
+        assets, poses, model, basket_pose: as in `settle`.
+        seconds: simulated time.
+        reverse_order: whether the objects are created in reverse order.
 
     Returns:
-        Poses (K, 4, 4) at the end; whether all objects are at rest half-way and at the end.
+        Poses (K, 4, 4) at the end. Whether all objects are at rest at half of the time and at the end.
     """
     scene = make_scene()
     add_furniture(scene, model)
     if model.basket is not None and basket_pose is not None:
         add_static_body(scene, model.basket.hulls, basket_pose, model.basket.asset.friction)
-    order = -1 if backwards else 1
+    order = -1 if reverse_order else 1
     placed = list(zip(assets, poses, strict=True))[::order]
     bodies = [add_body(scene, make_rigid_body(asset), pose) for asset, pose in placed][::order]
     at_rest = True
@@ -108,7 +115,7 @@ def _simulate(
 
 
 def add_furniture(scene: sapien.Scene, model: SceneModel) -> None:
-    """Add the furniture as fixed bodies, with doors and drawers at their start positions."""
+    """Add the furniture of a configuration as static bodies, with doors and drawers at their start positions."""
     for name, asset in model.furniture.items():
         frame = model.furniture_poses[name]
         add_static_body(scene, asset.hulls, frame, asset.asset.friction)

@@ -26,9 +26,9 @@ class TargetChoice:
     """The chosen target.
 
     Attributes:
-        slot: slot of the target.
-        relation: relation that distinguishes it from objects of the same name; empty: no relation.
-        visible_fractions: (K,) p_vis of the objects; empty if the rule does not use it.
+        slot: index of the target's slot.
+        relation: relation that distinguishes the target from objects of the same name; empty: no relation.
+        visible_fractions: (K,) visible fraction of each object; empty if the rule does not use it.
     """
 
     slot: int
@@ -38,14 +38,14 @@ class TargetChoice:
 
 @dataclass(frozen=True)
 class SettledScene:
-    """Settled objects before a target is chosen. K slots; poses 4x4 in the world, m.
+    """Settled objects, from which a target is chosen. K slots; poses (4, 4) in the world frame, m.
 
     Attributes:
         model: configuration and assets.
-        assets: assets of the K slots.
-        poses: (K, 4, 4) object poses.
-        present: (K,) which slots are used.
-        candidate: (K,) which objects may be the target: present, and no distractor.
+        assets: objects of the K slots.
+        poses: (K, 4, 4) poses of the objects.
+        present: (K,) bool, whether each slot is used.
+        candidate: (K,) bool, whether each object may be the target: it is present and not a distractor.
         robot_pose: pose of the robot's root.
         basket_pose: pose of the basket; None if the scene has none.
     """
@@ -64,7 +64,7 @@ class SettledScene:
 
     @cached_property
     def opened_poses(self) -> Array:
-        """(K, 4, 4) poses of the objects after the furniture has been opened."""
+        """(K, 4, 4) poses of the objects after the door or drawer of the task has been opened; a drawer moves them."""
         frame = self.model.support_pose
         before, after = (self.model.support_motion(opened=opened) for opened in (False, True))
         moved = frame @ after @ np.linalg.inv(frame @ before)
@@ -72,12 +72,12 @@ class SettledScene:
 
     @property
     def xy_in_robot(self) -> Array:
-        """(K, 2) m, positions of the objects in the robot's frame: x forward, y left."""
+        """(K, 2) positions of the objects in the robot's frame after opening, m: x forward, y left."""
         return (np.linalg.inv(self.robot_pose) @ self.opened_poses)[:, :2, 3]
 
     @property
-    def eligible(self) -> NDArray[np.bool_]:
-        """(K,) candidates that have enough grasps and are near enough to the robot."""
+    def is_eligible(self) -> NDArray[np.bool_]:
+        """(K,) bool, whether each object is a candidate with enough grasps, near enough to the robot."""
         rules = self.model.config.target
         near = np.linalg.norm(self.xy_in_robot, axis=1) <= rules.max_distance
         graspable = np.array([asset.asset.grasp_count >= rules.min_grasps for asset in self.assets])
@@ -85,11 +85,11 @@ class SettledScene:
 
     @cached_property
     def fixture_points(self) -> Array:
-        """(P, 3) samples of the surfaces of opened furniture and basket, world, m."""
+        """(P, 3) points on the surfaces of opened furniture and basket, world frame, m."""
         return self.model.fixture_points(self.basket_pose, opened=True)
 
     def has_free_grasps(self, slot: int) -> bool:
-        """Return whether enough grasps of an object are free of collisions."""
+        """Return whether an object has ``target.min_free_grasps`` collision-free grasps."""
         others = [
             transform_points(self.opened_poses[other], self.assets[other].surface_points())
             for other in np.flatnonzero(self.present)
@@ -98,7 +98,7 @@ class SettledScene:
         return self._has_grasps(slot, others, self.model.config.target.min_free_grasps)
 
     def has_uncovered_grasps(self, slot: int) -> bool:
-        """Return whether enough grasps of an object would be free of collisions without the other objects."""
+        """Return whether an object would have ``target.min_uncovered_grasps`` free grasps without the other objects."""
         return self._has_grasps(slot, [], self.model.config.target.min_uncovered_grasps)
 
     def _has_grasps(self, slot: int, others: list[Array], min_count: int) -> bool:
@@ -112,7 +112,7 @@ class SettledScene:
         )
 
     def _within_reach(self, slot: int, other: int) -> bool:
-        """Return False if an object is too far from another to block its grasps."""
+        """Return whether the object ``other`` is near enough to block grasps of the object ``slot``."""
         centers = self.opened_poses[[slot, other], :3, 3]
         radius = np.linalg.norm(np.concatenate(self.assets[other].hulls), axis=1).max()
         grasps = self.assets[slot].annotations.grasps_tcp_in_object[:, :3, 3]
@@ -125,8 +125,9 @@ class TargetRule:
     """A rule that chooses the target.
 
     Attributes:
-        choose: function of a random generator and a `SettledScene`; returns None if no object qualifies.
-        keys: keys of ``target`` in a configuration whose higher values let fewer objects qualify.
+        choose: function of a random generator and a `SettledScene` that returns a `TargetChoice`, or None if no object
+            qualifies.
+        keys: keys of ``target`` in a configuration that should be lowered if no object qualifies.
     """
 
     choose: Callable[[np.random.Generator, SettledScene], TargetChoice | None]
@@ -141,43 +142,47 @@ def choose_target(rng: np.random.Generator, scene: SettledScene) -> TargetChoice
     return find_target_rule(scene.model.config.task).choose(rng, scene)
 
 
-def _by_name(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
-    """Choose any object; of objects with the same name only the nearest one can be the target."""
+def _choose_by_name(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
+    """Choose any object; if several objects have the same name, only the nearest of them may be the target."""
     nearest: dict[str, int] = {}
     for slot in np.argsort(np.linalg.norm(scene.xy_in_robot, axis=1), kind="stable"):
         if scene.present[slot]:
             nearest.setdefault(scene.names[slot], int(slot))
-    slots = sorted(slot for slot in nearest.values() if scene.eligible[slot])
+    slots = sorted(slot for slot in nearest.values() if scene.is_eligible[slot])
     shuffled = rng.permutation(np.array(slots, dtype=int)).tolist()
     return next((TargetChoice(slot) for slot in shuffled if scene.has_free_grasps(slot)), None)
 
 
-def _by_relation(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
-    """Choose one of several identical objects by a relation; without configured relations, as `_by_name`."""
+def _choose_by_relation(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
+    """Choose an object and a relation that distinguishes it from identical objects.
+
+    If ``target.relations`` is empty, choose like `_choose_by_name`.
+    """
     if not scene.model.config.target.relations:
-        return _by_name(rng, scene)
+        return _choose_by_name(rng, scene)
     pairs = [(name, relation) for name in sorted(set(scene.names)) for relation in scene.model.config.target.relations]
     for index in rng.permutation(len(pairs)):
         name, relation = pairs[index]
         slots = [s for s, n in enumerate(scene.names) if n == name and scene.present[s]]
         found = select_by_relation(relation, scene.xy_in_robot[slots])
-        if found is not None and scene.eligible[slots[found]] and scene.has_free_grasps(slots[found]):
+        if found is not None and scene.is_eligible[slots[found]] and scene.has_free_grasps(slots[found]):
             return TargetChoice(slots[found], relation)
     return None
 
 
 def selection_camera(model: SceneModel) -> PinholeCamera:
-    """Return the camera that measures p_vis, above the middle of the objects' region."""
+    """Return the camera that measures visible fractions, above the middle of the objects' region."""
     region = model.region
     middle = np.append(np.add(region.min_xy, region.max_xy) / 2, region.z)
     center = transform_points(model.support_pose, middle[None])[0]
     return top_down_camera(center[:2], center[2])
 
 
-def _by_visibility(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
-    """Choose a hidden object with a weight of 1 / distance to the robot, as in RoboCAS-v0's data.
+def _choose_by_visibility(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
+    """Choose an object with a small visible fraction, with a probability proportional to 1 / distance to the robot.
 
-    An object whose grasps are blocked by furniture or basket does not qualify, e.g. a flat can on its broad side.
+    RoboCAS-v0's data has this rule. An object does not qualify if furniture or basket block its grasps, even without
+    the other objects. Example: a flat can that lies on its flat side.
     """
     rules = scene.model.config.target
     slots = np.flatnonzero(scene.present)
@@ -185,7 +190,7 @@ def _by_visibility(rng: np.random.Generator, scene: SettledScene) -> TargetChoic
     scenery = MeshScene([load_visual_mesh(scene.assets[s]) for s in slots], scene.poses[slots])
     fractions[slots] = scenery.visible_fractions(selection_camera(scene.model))
     unique = np.array([scene.names.count(name) == 1 for name in scene.names])
-    fits = scene.eligible & unique
+    fits = scene.is_eligible & unique
     if rules.max_visible_share is not None:
         fits &= fractions < rules.max_visible_share
     likely = 1 / np.linalg.norm(scene.xy_in_robot, axis=1) if rules.weight == "nearness" else np.ones(len(fits))
@@ -198,6 +203,6 @@ def _by_visibility(rng: np.random.Generator, scene: SettledScene) -> TargetChoic
     return None
 
 
-BY_NAME = TargetRule(_by_name)
-BY_RELATION = TargetRule(_by_relation)
-BY_VISIBILITY = TargetRule(_by_visibility, ("min_grasps", "min_uncovered_grasps"))
+BY_NAME = TargetRule(_choose_by_name)
+BY_RELATION = TargetRule(_choose_by_relation)
+BY_VISIBILITY = TargetRule(_choose_by_visibility, ("min_grasps", "min_uncovered_grasps"))

@@ -14,22 +14,23 @@ STAGES = ("furniture_opened", "reached_any", "obstacles_cleared", "reached_targe
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """Specification of a task. Import paths ``package.module:name`` avoid importing the simulator.
+    """Specification of a task. Code is named by import path ``package.module:name``, so no simulator is imported.
 
     Attributes:
-        name: short name, as in ``robocas generate pick``.
+        name: name of the task in commands, such as ``robocas generate pick``.
         env_id: gymnasium id.
-        env: import path of the environment class, a `tasks.base.RoboCASEnv` with this specification as ``SPEC``.
+        env: import path of the environment class, a subclass of `tasks.base.RoboCASEnv` whose ``SPEC`` is this object.
         default_config: name of a bundled task configuration, or path of a YAML file.
         target: import path of a `scenes.targets.TargetRule`.
-        solver: import path of the scripted policy, a function of an `Arm` that makes one attempt.
-        seconds: horizon in s; RoboCAS-v0 allows 200 steps at 5 Hz.
+        solver: import path of the scripted policy, a function that makes one attempt with an `Arm`.
+        seconds: horizon in s. RoboCAS-v0 allows 200 steps at 5 Hz, which is 40 s.
         training_seconds: horizon in s for training with a fixed base (`rl_kwargs`).
         summary: one line for `robocas list`.
-        slots: slots of its instructions in addition to object and support: ``relation`` (optional) and ``part``.
+        slots: slots of the instructions in addition to object and support: ``relation``, which an instruction may leave
+            empty, and ``part``.
         checks: import paths of functions that raise ValueError if a `TaskConfig` does not suit the task.
         instructions: instruction templates by split; default: those of ``language/instructions.yaml``.
-        stages: stages of an episode in their order; an evaluation reports the first stage not reached.
+        stages: stages of an episode, in order. An evaluation reports the first stage not reached.
     """
 
     name: str
@@ -47,12 +48,12 @@ class TaskSpec:
     stages: tuple[str, ...] = STAGES
 
     def horizon_steps(self, control_freq: int) -> int:
-        """Return the horizon in control steps at a control rate in Hz."""
+        """Return the horizon in control steps; ``control_freq`` is the control rate in Hz."""
         return self.seconds * control_freq
 
     @property
     def max_episode_steps(self) -> int:
-        """Horizon in control steps at the standard rate, as registered with gymnasium."""
+        """Horizon in control steps at `STANDARD_FREQ`, as registered with gymnasium."""
         return self.horizon_steps(STANDARD_FREQ)
 
 

@@ -27,10 +27,10 @@ _scenes: WeakKeyDictionary[trimesh.Trimesh, EmbreeScene] = WeakKeyDictionary()
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """A camera of ``width`` x ``height`` pixels.
+    """A camera of ``width`` x ``height`` pixels without distortion.
 
     Attributes:
-        pose: (4, 4) in the world, SAPIEN's convention: x forward, y left, z up; m.
+        pose: (4, 4) pose in the world in SAPIEN's convention (x forward, y left, z up), m.
         fov_y: vertical field of view, rad.
     """
 
@@ -44,14 +44,14 @@ class PinholeCamera:
         return self.height / 2 / np.tan(self.fov_y / 2)
 
     def ray_directions(self, box: PixelBox) -> Array:
-        """Return ray directions (rows, columns, 3) through pixel centres in the camera's frame, with x = 1."""
+        """Return directions (rows, columns, 3) of the rays through pixel centres, in the camera frame, with x = 1."""
         rows, columns = np.mgrid[box]
         left = (self.width / 2 - columns - 0.5) / self.focal_length
         up = (self.height / 2 - rows - 0.5) / self.focal_length
         return np.stack([np.ones(rows.shape), left, up], axis=-1)
 
     def pixel_box(self, points: Array) -> PixelBox:
-        """Return the rows and columns in which points (P, 3) in the world appear; empty if none does."""
+        """Return the rows and columns that contain the images of points (P, 3) in the world; empty if out of view."""
         local = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
         if local[:, 0].min() <= 1e-3:  # partly behind the camera: the whole image
             return slice(0, self.height), slice(0, self.width)
@@ -64,7 +64,13 @@ class PinholeCamera:
 
 
 def top_down_camera(center_xy: Array, support_z: float, *, size: int = 512) -> PinholeCamera:
-    """Return RoboCAS-v0's selection camera, which looks down on (x, y) from `SELECTION_CAMERA_HEIGHT`."""
+    """Return RoboCAS-v0's selection camera, which looks down from `SELECTION_CAMERA_HEIGHT` above a support.
+
+    Args:
+        center_xy: (2,) point below the camera in the world, m.
+        support_z: height of the support in the world, m.
+        size: width and height of the image, pixels.
+    """
     pose = np.eye(4)
     pose[:3, :3] = np.column_stack([(0, 0, -1.0), (0, 1.0, 0), (1.0, 0, 0)])
     pose[:3, 3] = *center_xy, support_z + SELECTION_CAMERA_HEIGHT
@@ -72,45 +78,49 @@ def top_down_camera(center_xy: Array, support_z: float, *, size: int = 512) -> P
 
 
 @lru_cache(maxsize=512)
-def _mesh_of(path: Path, _changed_ns: int) -> trimesh.Trimesh:
+def _load_mesh(path: Path, _changed_ns: int) -> trimesh.Trimesh:
     mesh = trimesh.load(path, force="mesh", process=False)
     assert isinstance(mesh, trimesh.Trimesh)
     return mesh
 
 
 def load_visual_mesh(asset: BodyFiles, level: VisualLevel = "fast") -> trimesh.Trimesh:
-    """Return the visual mesh in the asset's frame; it is shared between callers, so don't change it."""
+    """Load the visual mesh of an asset in the asset's frame. All callers get the same object, so do not change it."""
     path = asset.visual_path(level)
-    return _mesh_of(path, path.stat().st_mtime_ns)
+    return _load_mesh(path, path.stat().st_mtime_ns)
 
 
 class MeshScene:
-    """Meshes at their poses, for ray casting from any number of cameras.
+    """Scene of meshes in which cameras cast rays.
 
     Args:
         meshes: K meshes.
-        poses: (K, 4, 4) in the world, rigid.
+        poses: (K, 4, 4) poses of the meshes in the world.
     """
 
     def __init__(self, meshes: Sequence[trimesh.Trimesh], poses: Array) -> None:
         self._placed = list(zip(meshes, poses, strict=True))
 
     def visible_fractions(self, camera: PinholeCamera) -> Array:
-        """Return p_vis = visible / full projected area of each mesh (K,), in [0, 1]; NaN if it is out of view."""
+        """Return the visible fraction (p_vis in the paper) of each mesh (K,): visible area / whole projected area.
+
+        The fraction is in [0, 1]; NaN if the mesh is out of view.
+        """
         ids, full = self.segmentation(camera)
         visible = np.bincount(ids[ids >= 0], minlength=len(full))
         return visible / np.where(full > 0, full, np.nan)
 
     def segmentation(self, camera: PinholeCamera) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-        """Return the segmentation image, and the number of pixels of each mesh without occlusion.
+        """Render a segmentation image, and count the pixels of each mesh without occlusion by other meshes.
 
         Returns:
-            (height, width) mesh index, or -1 for the background; (K,) number of pixels of each mesh on its own.
+            Image (height, width) of mesh indices, -1 for the background. Number of pixels (K,) that each mesh would
+            have without the other meshes.
         """
         nearest = np.full((camera.height, camera.width), np.inf)
         ids, full = np.full(nearest.shape, -1), np.zeros(len(self._placed), dtype=int)
         for i, (mesh, pose) in enumerate(self._placed):
-            box, depths = _depths(camera, mesh, pose)
+            box, depths = _cast_rays(camera, mesh, pose)
             closer = depths < nearest[box]
             nearest[box][closer] = depths[closer]
             ids[box][closer] = i
@@ -118,8 +128,8 @@ class MeshScene:
         return ids, full
 
 
-def _depths(camera: PinholeCamera, mesh: trimesh.Trimesh, pose: Array) -> tuple[PixelBox, Array]:
-    """Return the pixel box of a mesh, and its depth in m in this box; infinite without a hit."""
+def _cast_rays(camera: PinholeCamera, mesh: trimesh.Trimesh, pose: Array) -> tuple[PixelBox, Array]:
+    """Return the pixel box that contains a mesh, and the depth (rows, columns) in it, m; infinite without a hit."""
     box = camera.pixel_box(transform_points(pose, mesh.vertices))
     # rays are cast in the mesh's frame: its search tree is built once, and single precision is sufficient
     to_mesh = pose[:3, :3].T
@@ -135,7 +145,7 @@ def _depths(camera: PinholeCamera, mesh: trimesh.Trimesh, pose: Array) -> tuple[
 
 
 def make_ray_scene(mesh: trimesh.Trimesh) -> EmbreeScene:
-    """Return the ray casting scene of a mesh; it is built once per process."""
+    """Return the ray casting scene of a mesh. Each process builds it only once."""
     if mesh not in _scenes:
         scene = EmbreeScene(robust=True)  # no ray passes between two adjacent triangles
         TriangleMesh(scene, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))

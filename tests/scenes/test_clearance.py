@@ -53,7 +53,9 @@ def test_impossible_scenes_are_errors(changes, message):
 
 def test_arm_that_starts_inside_of_furniture_is_an_error():
     above = {"asset": "side_table", "pose": at(0.7, 0.15, 0.62)}
-    with pytest.raises(ConfigError, match=r"arm starts inside of another body \(found furniture.above\). Move or turn"):
+    with pytest.raises(
+        ConfigError, match=r"start pose of the arm is inside of another body \(found furniture.above\). Move or turn"
+    ):
         load_scene(furniture={"table": TABLE, "above": above})
 
 

@@ -54,7 +54,7 @@ def test_objects_rest_on_the_plane_and_on_each_other():
 
 def test_heap_over_the_edges_is_an_error():
     pack = load_pack("builtin")
-    with pytest.raises(LayoutError, match="no heap of 2 objects"):
+    with pytest.raises(LayoutError, match="a heap of 2 objects does not fit"):
         tiny = Region((0.0, 0.0), (0.001, 0.001), 0.0)
         assets = [pack.objects["power_drill"], pack.objects["sugar_box"]]
         drop_heap(np.random.default_rng(0), assets, tiny, LAYOUT)

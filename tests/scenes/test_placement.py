@@ -54,7 +54,9 @@ def test_scattered_objects_keep_their_distance_and_stay_inside(seed, count):
 
 
 def test_objects_that_do_not_fit_are_an_error_with_the_fix():
-    with pytest.raises(LayoutError, match=r"no room for 10 objects 2.0 cm apart on 0.20 x 0.20 m.*Lower objects.count"):
+    with pytest.raises(
+        LayoutError, match=r"10 objects, 2.0 cm apart, do not fit on 0.20 x 0.20 m.*Lower objects.count"
+    ):
         scatter([box(0.1, 0.1)] * 10, Region((0, 0), (0.2, 0.2), 0), max_tries=300)
 
 

@@ -7,7 +7,13 @@ from scene_models import load_scene
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.poses import from_xyz_yaw
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.scenes.robot_placement import _moved, is_basket_stable, is_body_clear, place_basket, place_robot
+from robocas_ms3.scenes.robot_placement import (
+    _draw_pose_near,
+    is_basket_stable,
+    is_body_clear,
+    place_basket,
+    place_robot,
+)
 from robocas_ms3.scenes.sample import sample_layout
 
 
@@ -37,7 +43,7 @@ def test_basket_pose_over_the_edge_is_drawn_again():
     by = scene.config.randomisation.basket
     redrawn = 0
     for seed in range(8):
-        first = _moved(scene.basket_pose, by, np.random.default_rng(seed))
+        first = _draw_pose_near(scene.basket_pose, by, np.random.default_rng(seed))
         pose = place_basket(scene, scene.robot_pose, np.random.default_rng(seed))
         assert is_basket_stable(scene, pose)
         redrawn += not np.array_equal(pose, first)
@@ -51,7 +57,7 @@ def test_basket_pose_over_the_edge_is_drawn_again():
 def test_error_of_an_unstable_basket_has_the_fix():
     scene = load_scene(randomisation={"basket": {"position": 0.0}})
     air = SceneModel(**{**scene.__dict__, "basket_pose": shifted(scene.basket_pose, z=0.5)})
-    with pytest.raises(LayoutError, match=r"randomisation.basket: no valid pose of the basket.*50 poses.*Lower random"):
+    with pytest.raises(LayoutError, match=r"randomisation.basket: no valid random pose.*50 poses.*Lower random"):
         place_basket(air, scene.robot_pose, np.random.default_rng(0))
 
 
@@ -59,7 +65,7 @@ def test_robot_pose_inside_furniture_is_drawn_again():
     scene = load_scene(randomisation={"robot": {"position": 0.5, "yaw_deg": 10}})
     redrawn = 0
     for seed in range(30):
-        first = _moved(scene.robot_pose, scene.config.randomisation.robot, np.random.default_rng(seed))
+        first = _draw_pose_near(scene.robot_pose, scene.config.randomisation.robot, np.random.default_rng(seed))
         pose = place_robot(scene, np.random.default_rng(seed))
         assert is_body_clear(pose, scene.furniture_points)
         redrawn += not np.array_equal(pose, first)

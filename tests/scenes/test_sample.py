@@ -41,7 +41,7 @@ def test_objects_without_a_target_are_replaced(monkeypatch):
 
 
 def test_objects_that_do_not_fit_are_replaced(monkeypatch):
-    scene, arrange, tried = load_scene(), sample._arrange, []
+    scene, arrange, tried = load_scene(), sample._draw_poses, []
 
     def fussy(rng, model, assets):
         tried.append({asset.asset.id for asset in assets})
@@ -49,7 +49,7 @@ def test_objects_that_do_not_fit_are_replaced(monkeypatch):
             raise LayoutError("no room", where="layout")
         return arrange(rng, model, assets)
 
-    monkeypatch.setattr(sample, "_arrange", fussy)
+    monkeypatch.setattr(sample, "_draw_poses", fussy)
     assert sample_layout(scene, 4, 4).object_ids == draw_object_set(scene, 4, 1)
     assert len(tried) == 2  # the function tries many times itself
     tried[:] = []
@@ -244,10 +244,10 @@ def test_invalid_randomisation_blocks_are_errors(changes, key, words):
     ("name", "opening", "joints", "words"),
     [
         ("open_pick_container", {}, {"flap": 0.1}, r"no such joint.*found flap"),
-        ("open_pick_container", {}, {"door_slide": 9.0}, r"door_slide: outside of the joint.*found 9.0"),
-        ("open_pick_container", {"opened_at": 0.95}, {}, r"opening.opened_at: .* 'door_slide' up to 0.95"),
+        ("open_pick_container", {}, {"door_slide": 9.0}, r"door_slide: position outside of the limits.*found 9.0"),
+        ("open_pick_container", {"opened_at": 0.95}, {}, r"opening.opened_at: .* joint only to 0.95"),
         ("open_pick_refrigerator", {"opened_at": 0.85}, {}, r"opened_at: .*revolute.*below 0.8, found 0.85.*Lower"),
-        ("open_pick_container", {}, {"door_slide": 0.45}, "door_slide: the part to open starts open"),
+        ("open_pick_container", {}, {"door_slide": 0.45}, "door_slide: the part to open is open at the start"),
         ("open_pick_container", {"opened_at": 0.8}, {"door_slide": 0.43}, ""),
     ],
 )

@@ -42,7 +42,7 @@ class CameraConfig(StrictModel):
     height: _Pixels | None = Field(default=None, description="image height, pixels; default: 480")
 
     @model_validator(mode="after")
-    def _one_direction(self) -> CameraConfig:
+    def _check_direction(self) -> CameraConfig:
         if self.rotation_deg is not None and self.look_at is not None:
             raise ValueError("expected only one of the keys rotation_deg and look_at, found both")
         return self

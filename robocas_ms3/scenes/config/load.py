@@ -104,7 +104,7 @@ def check_no_extends(path: Path) -> None:
 
 def _merge_file(composition: Composition, config: str | Path) -> str:
     """Merge a file over the files that it extends; return the name of the file for messages."""
-    chain = _chain(_find(config))
+    chain = _read_chain(_find_file(config))
     first = str(chain[0][0])
     for number, (path, data) in reversed(list(enumerate(chain))):
         source = f"{path} (extended by {chain[number - 1][0]})" if number else first
@@ -113,7 +113,7 @@ def _merge_file(composition: Composition, config: str | Path) -> str:
     return f"{first} (extends {bases})" if bases else first
 
 
-def _chain(path: Path) -> list[tuple[Path, dict[Any, Any]]]:
+def _read_chain(path: Path) -> list[tuple[Path, dict[Any, Any]]]:
     """Read a file, the file that it extends, and so on, in this order; keys ``extends`` are removed."""
     chain: list[tuple[Path, dict[Any, Any]]] = []
     found: Path | None = path
@@ -144,7 +144,7 @@ def _chain(path: Path) -> list[tuple[Path, dict[Any, Any]]]:
             if not isinstance(named, str) or not named:
                 what, expected = f"invalid value for {EXTENDS!r}", "the name of a bundled configuration or a YAML file"
                 raise ConfigError(what, where=where, expected=expected, found=repr(named)[:80])
-            found = _find(named, path.parent, where)
+            found = _find_file(named, path.parent, where)
         chain.append((path, data))
     return chain
 
@@ -166,7 +166,7 @@ def _read(path: Path) -> dict[Any, Any]:
     return data
 
 
-def _find(config: str | Path, folder: Path | None = None, where: str = "") -> Path:
+def _find_file(config: str | Path, folder: Path | None = None, where: str = "") -> Path:
     """Return the file of a bundled configuration or of a path, which is relative to ``folder`` if given."""
     shipped, name = bundled_configs(), str(config)
     if name in shipped:

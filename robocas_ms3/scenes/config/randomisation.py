@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field, StrictInt, model_validator
 from robocas_ms3.core.strict_model import StrictModel
 
 
-def _rising(values: tuple[float, float]) -> tuple[float, float]:
+def _check_range(values: tuple[float, float]) -> tuple[float, float]:
     if values[0] > values[1]:
         raise ValueError(f"invalid range {list(values)}: expected [least, greatest]")
     return values
@@ -18,7 +18,7 @@ def _rising(values: tuple[float, float]) -> tuple[float, float]:
 Range = Annotated[
     tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]],
     Field(description="least and greatest value"),
-    AfterValidator(_rising),
+    AfterValidator(_check_range),
 ]
 Ids = Annotated[list[str | StrictInt], Field(min_length=1)]
 
@@ -46,7 +46,7 @@ class CameraRandomisation(StrictModel):
     min_rotation_deg: Annotated[float, Field(ge=0)] = Field(default=0.0, description="least rotation about each axis")
 
     @model_validator(mode="after")
-    def _ordered(self) -> CameraRandomisation:
+    def _check_order(self) -> CameraRandomisation:
         for key in ("position", "rotation_deg"):
             least, most = getattr(self, f"min_{key}"), getattr(self, key)
             if least > most:
@@ -68,7 +68,7 @@ class DistractorConfig(StrictModel):
 
     ids: Ids = Field(description="asset ids of the object pack, or their numbers in GraspNet-1Billion")
     count: Annotated[
-        tuple[Annotated[int, Field(ge=0, le=16)], Annotated[int, Field(ge=0, le=16)]], AfterValidator(_rising)
+        tuple[Annotated[int, Field(ge=0, le=16)], Annotated[int, Field(ge=0, le=16)]], AfterValidator(_check_range)
     ] = Field(default=(1, 3), description="least and greatest number of distractors")
 
 

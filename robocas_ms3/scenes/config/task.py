@@ -89,7 +89,7 @@ class SurfaceConfig(StrictModel):
     max_xy: Vec2 | None = Field(default=None, description="greatest corner of the rectangle, m")
 
     @model_validator(mode="after")
-    def _ordered(self) -> SurfaceConfig:
+    def _check_corners(self) -> SurfaceConfig:
         if (self.min_xy is None) != (self.max_xy is None):
             raise ValueError("expected both min_xy and max_xy, or neither")
         if self.min_xy and self.max_xy and not all(a < b for a, b in zip(self.min_xy, self.max_xy, strict=True)):
@@ -270,7 +270,7 @@ class TaskConfig(StrictModel):
     randomisation: RandomisationConfig = RandomisationConfig()
 
     @model_validator(mode="after")
-    def _parts_fit(self) -> TaskConfig:
+    def _check_references(self) -> TaskConfig:
         for name, part in (("surface", self.surface), ("opening", self.opening)):
             if part is not None and part.furniture not in self.furniture:
                 raise ValueError(

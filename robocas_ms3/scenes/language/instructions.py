@@ -25,18 +25,18 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class InstructionSlots:
-    """The content of an instruction, in plain names.
+    """Values that are inserted into an instruction template, before synonyms replace them.
 
     Attributes:
-        task: name of the task, ``pick``.
-        object: name of the target, ``sugar box``.
-        support: place of the objects, ``table``.
-        relation: relation that distinguishes the target from identical objects, if the task has this slot; None: the
-            instruction has no relation, and the nearest object is the target.
-        part: part that must be opened, ``left door``, if the task has this slot; see `part_name`.
+        task: name of the task, such as ``pick``.
+        object: name of the target, such as ``sugar box``.
+        support: place of the objects, such as ``table``.
+        relation: relation that distinguishes the target from identical objects, for tasks with the slot ``relation``.
+            None: the instruction has no relation; then the nearest object is the target.
+        part: part to open, such as ``left door``, for tasks with the slot ``part``; see `part_name`.
 
     Raises:
-        RobocasError: the task is unknown, the part is missing, or the task has no slot for relation or part.
+        RobocasError: the task is unknown, has no slot for the relation or the part, or needs a part.
     """
 
     task: str
@@ -48,27 +48,27 @@ class InstructionSlots:
     def __post_init__(self) -> None:
         slots = TASKS.find(self.task).slots
         if self.relation and "relation" not in slots:
-            what = f"only the task {_tasks_with('relation')} may have a relation"
-            raise RobocasError(what, where=self.task, expected="no relation", found=repr(self.relation))
+            what = "instructions of this task have no relation"
+            expected = f"no relation, or task {_tasks_with('relation')}"
+            raise RobocasError(what, where=self.task, expected=expected, found=repr(self.relation))
         if bool(self.part) != ("part" in slots):
-            what, found = (
-                f"the task {_tasks_with('part')} needs a part, and other tasks may not have one",
-                repr(self.part) if self.part else "none",
-            )
-            raise RobocasError(what, where=self.task, found=found)
+            what = f"instructions of this task {'need a' if 'part' in slots else 'have no'} furniture part"
+            expected = "a name such as left door" if "part" in slots else f"no part, or task {_tasks_with('part')}"
+            raise RobocasError(what, where=self.task, expected=expected, found=repr(self.part) if self.part else "none")
 
 
 @dataclass(frozen=True)
 class Instruction:
-    """An instruction with its template and words.
+    """An instruction, with the template and the words from which it was made.
 
     Attributes:
         text: the instruction.
-        template_id: task, split and index in the split's list: ``pick/train/07``. Added templates don't change it.
-        split: split of the template and of the synonyms.
-        object_word: name of the target or a synonym.
-        support_word: name of the support or a synonym; not every template contains it.
-        relation_phrase: phrase of the relation, ``closest {object}``; empty without a relation.
+        template_id: task, split and index of the template in the list of this split, such as ``pick/train/07``. New
+            templates are added at the end, so the id of a template never changes.
+        split: split of template and synonyms.
+        object_word: name of the target, or a synonym of it.
+        support_word: name of the support, or a synonym of it. Some templates do not contain it.
+        relation_phrase: phrase of the relation, such as ``closest {object}``; empty without a relation.
     """
 
     text: str
@@ -80,7 +80,11 @@ class Instruction:
 
 
 def make_instruction(slots: InstructionSlots, template_id: str = "") -> Instruction:
-    """Return the instruction of a template with plain names; default: RoboCAS-v0's template.
+    """Return the instruction of one template, without synonyms.
+
+    Args:
+        slots: values that are inserted into the template.
+        template_id: task, split and index of the template, such as ``pick/train/07``; empty: RoboCAS-v0's template.
 
     Raises:
         RobocasError: the template does not exist.
@@ -90,8 +94,9 @@ def make_instruction(slots: InstructionSlots, template_id: str = "") -> Instruct
         if template_id in (ids := template_ids(slots.task, split)):
             phrase = load_instruction_texts().relations[slots.relation].plain if slots.relation else ""
             return _render(slots, split, ids.index(template_id), (slots.object, slots.support, phrase))
-    expected = f"{slots.task}/SPLIT/NN with SPLIT one of {list(SPLITS)}, NN below their counts"
-    raise RobocasError("no such template", where=template_id, expected=expected)
+    known = [ids for split in SPLITS if (ids := template_ids(slots.task, split))]
+    expected = ", ".join(f"{ids[0]} to {ids[-1]}" for ids in known)
+    raise RobocasError("no such instruction template", where=template_id, expected=expected)
 
 
 def draw_instruction(
@@ -102,16 +107,16 @@ def draw_instruction(
     others: Iterable[str] = (),
     synonyms: bool = True,
 ) -> Instruction:
-    """Draw an instruction: a template of the split, and words for object, support and relation.
+    """Draw an instruction: a template of a split, and the name or a synonym for object, support and relation.
 
-    The splits ``train`` and ``held_out`` have no template and no synonym in common; both contain plain names.
+    The splits ``train`` and ``held_out`` have no template and no synonym in common. Both may use the names themselves.
 
     Args:
-        rng: random generator; each call makes four draws.
-        slots: content of the instruction.
-        split: ``upstream`` (RoboCAS-v0's template with plain names), ``train`` or ``held_out``.
-        others: names of the other objects in the scene; synonyms that fit one of them are not used.
-        synonyms: whether synonyms may replace plain names and relations.
+        rng: random generator, from which each call draws four numbers.
+        slots: values that are inserted into the template.
+        split: ``upstream`` (RoboCAS-v0's template without synonyms), ``train`` or ``held_out``.
+        others: names of the other objects in the scene. A synonym that may mean one of them is not used.
+        synonyms: whether synonyms may replace names and relations.
 
     Raises:
         RobocasError: the task has no templates of the split.
@@ -123,7 +128,9 @@ def draw_instruction(
     )
     templates = _templates(slots.task, split)
     if not templates:
-        raise RobocasError("this task has no templates of this split", where=slots.task, found=split)
+        known = [name for name in SPLITS if _templates(slots.task, name)]
+        what = f"no instruction templates in the split {split!r}"
+        raise RobocasError(what, where=f"task {slots.task}", expected=f"one of {known}")
     objects, supports, phrases = [slots.object], [slots.support], [relation.plain if relation else ""]
     if synonyms:
         known = words.objects[slots.object].for_split(split) if slots.object in words.objects else ()
@@ -131,12 +138,12 @@ def draw_instruction(
         objects += [word for word in known if not any(fits_name(word, name) for name in others)]
         supports += words.supports[slots.support].for_split(split) if slots.support in words.supports else ()
         phrases += relation.for_split(split) if relation else ()
-    drawn = _pick(objects, draws[1]), _pick(supports, draws[2]), _pick(phrases, draws[3])
-    return _render(slots, split, _pick(range(len(templates)), draws[0]), drawn)
+    drawn = _choose(objects, draws[1]), _choose(supports, draws[2]), _choose(phrases, draws[3])
+    return _render(slots, split, _choose(range(len(templates)), draws[0]), drawn)
 
 
 def episode_instruction(config: TaskConfig, layout: Layout, seed: int, name: str, names: Iterable[str]) -> Instruction:
-    """Return the instruction of an episode, drawn with the seed of its layout.
+    """Draw the instruction of an episode; equal seeds of the layout give equal instructions.
 
     Args:
         config: the task configuration.
@@ -162,9 +169,9 @@ def template_ids(task: str, split: Split) -> list[str]:
 
 
 def part_name(link: str) -> str:
-    """Return the name of a furniture part in instructions, from the name of its link in a bundled pack.
+    """Return the name that instructions use for a part of furniture, from the name of the handle or link.
 
-    ``door_left`` is the 'left door', seen from the front; ``freezer_door`` is the 'freezer door'.
+    ``door_left`` gives 'left door' (left as seen from the front), ``freezer_door`` gives 'freezer door'.
     """
     *noun, last = link.split("_")
     sided = noun and last in {"left", "right", "top", "middle", "bottom", "upper", "lower"}
@@ -172,12 +179,12 @@ def part_name(link: str) -> str:
 
 
 def fits_name(word: str, name: str) -> bool:
-    """Return whether a word fits an object's name: 'shampoo bottle' fits 'white shampoo bottle'."""
+    """Return whether all words of ``word`` are in an object's name: 'shampoo bottle' fits 'white shampoo bottle'."""
     return set(word.lower().split()) <= set(name.lower().split())
 
 
 def is_plural(word: str) -> bool:
-    """Return whether the pronoun of a word is 'them': 'scissors', but not 'pair of scissors'."""
+    """Return whether a word needs the pronoun 'them': 'scissors' does, 'pair of scissors' does not."""
     return word.partition(" of ")[0].split()[-1] in load_synonym_texts().plurals
 
 
@@ -202,5 +209,5 @@ def _tasks_with(slot: str) -> str:
     return ", ".join(name for name, spec in TASKS.items() if slot in spec.slots)
 
 
-def _pick(options: Sequence[_T], draw: float) -> _T:
+def _choose(options: Sequence[_T], draw: float) -> _T:
     return options[int(draw * len(options))]

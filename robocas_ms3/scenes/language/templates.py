@@ -18,11 +18,11 @@ GOAL_TYPES = tuple(SUBGOALS)
 
 
 def subgoal(goal_type: str, object: str, support: str) -> dict[str, str]:
-    """Return the ``goal_type`` and ``goal_description`` of a sub-goal, as recorded in episodes.
+    """Return a sub-goal as episodes record it: a dict with ``goal_type`` and ``goal_description``.
 
     Args:
         goal_type: one of ``GOAL_TYPES``.
-        object: the target's plain name.
-        support: plain name of the support, or of the furniture that is opened.
+        object: name of the target.
+        support: name of the place of the objects, or of the furniture that is opened.
     """
     return {"goal_type": goal_type, "goal_description": SUBGOALS[goal_type].format(object=object, support=support)}

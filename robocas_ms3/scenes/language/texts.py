@@ -27,24 +27,24 @@ _REPEATABLE = {"it", "on"}
 
 
 class Synonyms(StrictModel):
-    """Synonyms of a name, by split."""
+    """Synonyms of one name, by split. The split ``upstream`` has none."""
 
     train: Words = ()
     held_out: Words = ()
 
     def for_split(self, split: Split) -> Words:
-        """Return the words of a split; the split ``upstream`` has no synonyms."""
+        """Return the texts of a split; empty if it has none."""
         return getattr(self, split, ())
 
 
 class Templates(Synonyms):
-    """Instruction templates of a task, by split; ``upstream`` is the default."""
+    """Instruction templates of one task, by split. ``upstream`` is the default split."""
 
     upstream: Annotated[Words, Field(min_length=1)]
 
     @classmethod
     def for_task(cls, spec: TaskSpec) -> Templates:
-        """Return the templates of a task from its `TaskSpec` or from ``instructions.yaml``.
+        """Return the templates of a task: those of the `TaskSpec` if it has any, else those of ``instructions.yaml``.
 
         Raises:
             ConfigError: a template is invalid.
@@ -55,7 +55,8 @@ class Templates(Synonyms):
             templates = cls.model_validate(spec.instructions)
             templates.check(spec)
         except ValueError as error:  # also pydantic's ValidationError
-            raise ConfigError("invalid instructions", where=f"task {spec.name}", found=one_line(error)) from error
+            what = "invalid instruction templates"
+            raise ConfigError(what, where=f"task {spec.name}", found=one_line(error)) from error
         return templates
 
     def check(self, spec: TaskSpec) -> None:
@@ -66,18 +67,18 @@ class Templates(Synonyms):
 
 
 class SupportWords(Synonyms):
-    """Synonyms of a support, and whether objects are inside of it (cabinet) or on it (table)."""
+    """Synonyms of a support, and whether objects are inside of it (such as a cabinet) or on it (such as a table)."""
 
     inside: bool = False
 
 
 class RelationPhrases(Synonyms):
-    """Phrases of a relation, by split; each phrase has the field ``{object}`` once."""
+    """Phrases of one relation, by split. Each phrase contains ``{object}`` once."""
 
     plain: str
 
     @model_validator(mode="after")
-    def _fields(self) -> RelationPhrases:
+    def _check_texts(self) -> RelationPhrases:
         for phrase in (self.plain, *self.train, *self.held_out):
             _check_fields(phrase, needed={"object"}, allowed={"object"})
         return self
@@ -90,7 +91,7 @@ class InstructionTexts(StrictModel):
     relations: dict[Relation, RelationPhrases]
 
     @model_validator(mode="after")
-    def _fields(self) -> InstructionTexts:
+    def _check_texts(self) -> InstructionTexts:
         for task, templates in self.tasks.items():
             templates.check(TASKS.builtin[task])
         return self
@@ -119,9 +120,14 @@ def read_texts(path: Path, model: type[_Model]) -> _Model:
 
 
 def _check_fields(template: str, *, needed: set[str], allowed: set[str]) -> None:
-    """Raise ValueError if a field is missing, unknown or repeated; {it} and {on} may repeat."""
+    """Raise ValueError if a field is missing, unknown or repeated. Only {it} and {on} may occur several times."""
     fields = [field for _, field, _, _ in Formatter().parse(template) if field is not None]
-    wrong = (set(fields) - allowed) | (needed - set(fields))
-    wrong |= {field for field in fields if fields.count(field) > 1} - _REPEATABLE
-    if wrong:
-        raise ValueError(f"{template!r}: unknown, missing or repeated fields {sorted(wrong)}")
+    wrong = {
+        "unknown": set(fields) - allowed,
+        "missing": needed - set(fields),
+        "repeated": {field for field in fields if fields.count(field) > 1} - _REPEATABLE,
+    }
+    for fault, names in wrong.items():
+        if names:
+            expected = f"each of {sorted(needed)} once, and other fields only of {sorted(allowed - needed)}"
+            raise ValueError(f"{template!r}: {fault} fields {sorted(names)}, expected {expected}")
