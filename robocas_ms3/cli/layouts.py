@@ -125,12 +125,12 @@ def check_stability(cache: LayoutCache, engine: Engine, **packs: str) -> int:
     """Simulate the unchecked layouts of the table; return the number of layouts whose objects move."""
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.scenes.layout_table import LayoutStatus
-    from robocas_ms3.tasks.layout_stability import check_layouts, find_unchecked_layouts, status_from_shift
+    from robocas_ms3.tasks.layout_stability import find_unchecked_layouts, measure_layout_shifts, status_from_shift
 
     seeds = find_unchecked_layouts(cache, engine)
     if seeds:
         found: dict[SeedPair, LayoutStatus] = {}
-        checks = check_layouts(cache, engine, seeds, **packs)
+        checks = measure_layout_shifts(cache, engine, seeds, **packs)
         try:
             with ProgressBar("layouts simulated") as bar:
                 bar.start(sum(map(len, seeds.values())))

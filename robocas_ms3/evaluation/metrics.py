@@ -11,7 +11,7 @@ from torch import Tensor
 from robocas_ms3.core.arrays import as_float32, as_tensor, known_all_false, maximum, norm, to_native, where
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.base import RoboCASEnv
-from robocas_ms3.tasks.bodies import link_poses
+from robocas_ms3.tasks.bodies import read_link_poses
 from robocas_ms3.tasks.goals import TaskState
 from robocas_ms3.tasks.search import ENVS_AT_ONCE, RoboCASSearchEnv
 
@@ -80,7 +80,8 @@ class EpisodeMetrics:
         self._in_v0 = self._near & open_command
 
     def _read_tcp_positions(self) -> Any:
-        return link_poses(self._env.scene, [self._env.agent.tcp])[:, 0, :3]  # takes a fourth of the time of `tcp.pose`
+        # takes a fourth of the time of `tcp.pose`
+        return read_link_poses(self._env.scene, [self._env.agent.tcp])[:, 0, :3]
 
     def end_step(self) -> None:
         """Count the policy step for RoboCAS-v0's rule and for the retrieval order."""
@@ -136,7 +137,7 @@ class RetrievalTracker:
 
     def _reset(self, envs: Tensor) -> None:
         env = self._env
-        over = env.pairwise_occlusion(envs) >= COVER_THRESHOLD
+        over = env.measure_pairwise_occlusion(envs) >= COVER_THRESHOLD
         rows = torch.arange(len(over), device=env.device)
         over[rows, env.target_slot[envs]] = False  # objects under the target may be moved before it
         blocking = env.measure_clutter(envs).obstacles | over[rows, :, env.target_slot[envs]]

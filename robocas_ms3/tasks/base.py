@@ -10,7 +10,7 @@ import torch
 from robocas_ms3.core.arrays import Array, as_tensor
 from robocas_ms3.scenes.language.instructions import Instruction, episode_instruction
 from robocas_ms3.tasks import engine
-from robocas_ms3.tasks.bodies import Contacts
+from robocas_ms3.tasks.bodies import ContactForceReader
 from robocas_ms3.tasks.goals import Goal, InBasketGoal
 from robocas_ms3.tasks.observations import privileged_observations
 from robocas_ms3.tasks.rewards import DENSE_MODES, TRANSFER, DenseReward, RewardTable, disturbed_fraction
@@ -49,7 +49,7 @@ class RoboCASEnv(SceneEnv):
     def _after_reconfigure(self, options: dict) -> None:
         super()._after_reconfigure(options)
         gripper = [self.agent.finger1_link, self.agent.finger2_link, self.agent.hand_link]
-        self.gripper_contacts = Contacts(self.scene, gripper, self.objects)
+        self.gripper_contacts = ContactForceReader(self.scene, gripper, self.objects)
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         super()._initialize_episode(env_idx, options)
@@ -79,11 +79,11 @@ class RoboCASEnv(SceneEnv):
 
     def gripper_forces(self) -> torch.Tensor:
         """Return the force (N, 3, K, 3) of each object on left finger, right finger and hand; newtons, world frame."""
-        return as_tensor(self.gripper_contacts.forces())
+        return as_tensor(self.gripper_contacts.read_forces())
 
     def is_object_grasped(self) -> torch.Tensor:
         """Return (N, K) bool, whether both fingers hold each object."""
-        return as_tensor(self.success_check.is_object_grasped(self.gripper_contacts.forces()))
+        return as_tensor(self.success_check.is_object_grasped(self.gripper_contacts.read_forces()))
 
     def step(self, action: Any) -> tuple[Any, torch.Tensor, torch.Tensor, torch.Tensor, dict]:
         """Execute an action, and return the values of ``BaseEnv.step``.

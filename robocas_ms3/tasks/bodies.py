@@ -27,7 +27,7 @@ _Boxes = tuple[NDArray[np.float32], NDArray[np.float32]]
 _Batch = TypeVar("_Batch", torch.Tensor, NDArray[np.float32])
 
 
-class Bodies:
+class BodyStateReader:
     """Reader of the states of all bodies of a scene, in the format of ManiSkill's flat states.
 
     The flat state (N, D) of N envs has ``BODY`` numbers for each of the A movable actors, then root state (``BODY``
@@ -83,7 +83,7 @@ class Bodies:
     def read(self) -> torch.Tensor:
         """Return the states (N, D) float32 of all envs; read only, not changed by later steps."""
         if self._scene.gpu_sim_enabled:
-            return self._gather()
+            return self._gather_on_gpu()
         packed = self._px.pack()
         if packed != self._packed:
             self._packed = packed
@@ -156,7 +156,7 @@ class Bodies:
         for articulation in self._articulations:
             self._px.cuda_articulation_qvel.torch()[articulation._data_index[envs], : articulation.max_dof] = 0.0
 
-    def _gather(self) -> torch.Tensor:
+    def _gather_on_gpu(self) -> torch.Tensor:
         bodies = self._px.cuda_rigid_body_data.torch()[self._rows, :BODY]
         if self._scene.parallel_in_single_scene:
             bodies[..., :3] -= self._scene.scene_offsets[:, None]
@@ -166,7 +166,7 @@ class Bodies:
         return torch.cat(parts, dim=1)
 
 
-def link_poses(scene: ManiSkillScene, links: Sequence[Link]) -> Array:
+def read_link_poses(scene: ManiSkillScene, links: Sequence[Link]) -> Array:
     """Return world poses (N, L, 7) of L links, position m and quaternion wxyz, as a native array (`core.arrays`)."""
     if scene.gpu_sim_enabled:
         return torch.stack([link.pose.raw_pose for link in links], dim=1)
@@ -174,7 +174,7 @@ def link_poses(scene: ManiSkillScene, links: Sequence[Link]) -> Array:
     return np.array([[[*pose.p, *pose.q] for pose in poses]], np.float32)
 
 
-class Contacts:
+class ContactForceReader:
     """Reader of the contact forces between bodies and objects, for all pairs in one pass.
 
     ManiSkill reads one pair at a time and, on a CPU, iterates over all contacts of the scene for each pair.
@@ -202,12 +202,12 @@ class Contacts:
             self._rows: dict[Any, int] = {body: i for i, body in enumerate(self._bodies)}
             self._columns: dict[Any, int] = {body: i for i, body in enumerate(self._objects)}
 
-    def forces(self, object_state: object = None) -> Array:
+    def read_forces(self, object_state: object = None) -> Array:
         """Return the force of each object on each body in the last physics step, summed over contact points.
 
         Args:
-            object_state: a value that differs after an object has moved, such as `Bodies.state_except_robot`. While
-                it stays equal, bounding boxes of the objects are reused. None: read them again.
+            object_state: a value that differs after an object has moved, such as `BodyStateReader.state_except_robot`.
+                While it stays equal, bounding boxes of the objects are reused. None: read them again.
 
         Returns:
             (N, B, K, 3) in newtons, world frame; a native array (`core.arrays`), read only.
@@ -247,8 +247,8 @@ def _bounding_boxes(bodies: list[Any]) -> _Boxes:
     return boxes[:, 0], boxes[:, 1]
 
 
-def contact_forces(
+def read_contact_forces(
     scene: ManiSkillScene, bodies: Sequence[Actor | Link], objects: Sequence[Actor | Link]
 ) -> torch.Tensor:
     """Return the force (N, B, K, 3) of each object on each body in the last physics step; newtons, world frame."""
-    return as_tensor(Contacts(scene, bodies, objects).forces())
+    return as_tensor(ContactForceReader(scene, bodies, objects).read_forces())

@@ -42,7 +42,7 @@ _FIX = (
 )
 
 
-def check_engine(
+def check_engine_arguments(
     num_envs: int,
     visual_level: str,
     sim_backend: str = "auto",
@@ -98,11 +98,11 @@ def make_sim_config(num_envs: int, config: TaskConfig) -> SimConfig:
     )
 
 
-def gpu_memory_limits(num_envs: int, objects: int) -> GPUMemoryConfig:
-    """Return PhysX's limits of GPU memory for ``objects`` objects per env; never below ManiSkill's defaults."""
+def gpu_memory_limits(num_envs: int, objects_per_env: int) -> GPUMemoryConfig:
+    """Return PhysX's limits of GPU memory; at least ManiSkill's defaults."""
     defaults = GPUMemoryConfig()
-    contacts = num_envs * (CONTACTS_PER_OBJECT * objects + BASE_CONTACTS)
-    patches = num_envs * (PATCHES_PER_OBJECT * objects + BASE_PATCHES)
+    contacts = num_envs * (CONTACTS_PER_OBJECT * objects_per_env + BASE_CONTACTS)
+    patches = num_envs * (PATCHES_PER_OBJECT * objects_per_env + BASE_PATCHES)
     return GPUMemoryConfig(
         temp_buffer_capacity=max(defaults.temp_buffer_capacity, _next_power_of_2(TEMPORARY_PER_CONTACT * contacts)),
         max_rigid_contact_count=max(defaults.max_rigid_contact_count, _next_power_of_2(contacts)),

@@ -143,7 +143,7 @@ class InBasketGoal(Goal):
         return {"basket_stands": terms.is_basket_standing(*_split_pose(basket_pose), *_split_pose(start))}
 
     def is_unreachable(self, basket_pose: Array | None, conditions: dict[str, Array]) -> Array | None:
-        if known_all_true(conditions["basket_stands"]):  # as nearly always
+        if known_all_true(conditions["basket_stands"]):  # the usual case
             return None
         start = to_native(self.env.basket_start_poses)
         over = terms.has_basket_fallen(*_split_pose(basket_pose), *_split_pose(start))

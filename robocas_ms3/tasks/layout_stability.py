@@ -26,7 +26,7 @@ def find_unchecked_layouts(cache: LayoutCache, engine: Engine) -> dict[int, list
     return seeds
 
 
-def check_layouts(
+def measure_layout_shifts(
     cache: LayoutCache, engine: Engine, seeds: dict[int, list[int]], **kwargs: Any
 ) -> Generator[tuple[SeedPair, float]]:
     """Simulate each layout for 1 s with a robot that does not move, and yield how far its objects shift.

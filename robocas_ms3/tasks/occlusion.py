@@ -67,7 +67,7 @@ def surface_points_in_world(poses: Tensor, points: Tensor) -> Tensor:
     return rotation @ points + poses[..., :3, None]
 
 
-def project_down(points: Tensor, eye: Tensor, depth: Tensor) -> Tensor:
+def project_to_horizontal_plane(points: Tensor, eye: Tensor, depth: Tensor) -> Tensor:
     """Project points to a horizontal plane, as seen by a camera that looks straight down.
 
     Args:
@@ -82,17 +82,17 @@ def project_down(points: Tensor, eye: Tensor, depth: Tensor) -> Tensor:
     return (points[:, :, :2] - eye[:2, None]) * (depth[:, None, None] / below)[:, :, None]
 
 
-def has_clutter_moved(poses: Tensor, earlier_poses: Tensor, radii: Tensor, target: Tensor, eye: Tensor) -> Tensor:
+def has_clutter_moved(poses: Tensor, earlier_poses: Tensor, radii: Tensor, target_slot: Tensor, eye: Tensor) -> Tensor:
     """Return (N,) bool, whether the target or an object near it has moved, so that its clutter may have changed.
 
     Args:
         poses: (N, K, 7) current world poses of the objects.
         earlier_poses: (N, K, 7) their poses at the last measurement.
         radii: (N, K) radii of bounding spheres about the objects' origins, m.
-        target: (N,) slot of each target.
+        target_slot: (N,) slot of each target.
         eye: (3,) position of the camera in the world frame, m.
     """
-    env = torch.arange(len(target), device=poses.device)
+    env = torch.arange(len(target_slot), device=poses.device)
     near = torch.zeros_like(radii, dtype=torch.bool)
     for at in (poses, earlier_poses):
         aside, below = at[..., :2] - eye[:2], (eye[2] - at[..., 2]).clamp(min=NEAREST)
@@ -100,12 +100,12 @@ def has_clutter_moved(poses: Tensor, earlier_poses: Tensor, radii: Tensor, targe
         seen = aside / below[..., None]
         size = (aside.abs() + radii[..., None]) / above[..., None] - seen.abs()
         # the target's outline, the cells around it, and one cell for rounding
-        reach = size + size[env, target][:, None] + ((REACH + 1) * CELL / above[env, target])[:, None, None]
-        near |= ((seen - seen[env, target][:, None]).abs() <= reach).all(dim=-1)
+        reach = size + size[env, target_slot][:, None] + ((REACH + 1) * CELL / above[env, target_slot])[:, None, None]
+        near |= ((seen - seen[env, target_slot][:, None]).abs() <= reach).all(dim=-1)
     return (((poses - earlier_poses).abs() > LEAST_MOTION).any(dim=-1) & near).any(dim=-1)
 
 
-def measure_clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor) -> Clutter:
+def measure_clutter(points: Tensor, present: Tensor, target_slot: Tensor, eye: Tensor) -> Clutter:
     """Measure the hidden fraction of each target, and find the obstacles around it.
 
     A cell of the target is hidden if another object has a higher point in this cell. Gaps of one cell between the
@@ -114,21 +114,21 @@ def measure_clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor
     Args:
         points: (N, K, 3, P) points on the objects' surfaces, world frame, m.
         present: (N, K) bool, whether each slot has an object.
-        target: (N,) slot of each target.
+        target_slot: (N,) slot of each target.
         eye: (3,) position of the camera in the world frame, m.
     """
-    env = torch.arange(len(target), device=points.device)
-    own = points[env, target]  # (N, 3, P)
+    env = torch.arange(len(target_slot), device=points.device)
+    own = points[env, target_slot]  # (N, 3, P)
     depth = (eye[2] - own[:, 2].mean(dim=-1)).clamp(min=NEAREST)
-    seen = project_down(points, eye, depth)
-    outline = seen[env, target]
+    seen = project_to_horizontal_plane(points, eye, depth)
+    outline = seen[env, target_slot]
     middle = (outline.amin(dim=-1) + outline.amax(dim=-1)) / 2
     cells, heights = _cell_indices(seen, middle), points[:, :, 2]
-    others = present.scatter(1, target[:, None], False)  # assigning by index would synchronise with a GPU
+    others = present.scatter(1, target_slot[:, None], False)  # assigning by index would synchronise with a GPU
     others_cells = torch.where(others[..., None], cells, _OUTSIDE).flatten(1)
     top = _height_map(others_cells, heights.flatten(1))
 
-    closed = _close_gaps(torch.stack([_height_map(cells[env, target], own[:, 2]), top], dim=1))
+    closed = _close_gaps(torch.stack([_height_map(cells[env, target_slot], own[:, 2]), top], dim=1))
     at_target, above_it = closed[:, 0], closed[:, 1] > closed[:, 0]
     filled = at_target > _NOTHING
     hidden_fraction = (filled & above_it).sum(dim=(1, 2)) / filled.sum(dim=(1, 2)).clamp(min=1)
@@ -142,7 +142,7 @@ def measure_clutter(points: Tensor, present: Tensor, target: Tensor, eye: Tensor
     return Clutter(hidden_fraction, highest.any(dim=-1))
 
 
-def pairwise_occlusion(points: Tensor, present: Tensor, eye: Tensor) -> Tensor:
+def measure_pairwise_occlusion(points: Tensor, present: Tensor, eye: Tensor) -> Tensor:
     """Return the fraction of each object that each other object hides on its own, seen from above.
 
     Args:
@@ -157,7 +157,7 @@ def pairwise_occlusion(points: Tensor, present: Tensor, eye: Tensor) -> Tensor:
     heights, fractions = points[:, :, 2], []
     for slot in range(slots):
         own = points[:, slot]
-        seen = project_down(points, eye, (eye[2] - own[:, 2].mean(dim=-1)).clamp(min=NEAREST))
+        seen = project_to_horizontal_plane(points, eye, (eye[2] - own[:, 2].mean(dim=-1)).clamp(min=NEAREST))
         outline = seen[:, slot]
         cells = _cell_indices(seen, (outline.amin(dim=-1) + outline.amax(dim=-1)) / 2)
         maps = _close_gaps(_height_map(cells.flatten(0, 1), heights.flatten(0, 1)).unflatten(0, (count, slots)))
@@ -168,20 +168,20 @@ def pairwise_occlusion(points: Tensor, present: Tensor, eye: Tensor) -> Tensor:
     return torch.stack(fractions, dim=2) * both
 
 
-def push_point(points: Tensor, obstacles: Tensor, target: Tensor) -> Tensor:
+def find_push_point(points: Tensor, obstacles: Tensor, target_slot: Tensor) -> Tensor:
     """Return the point where the paper's push of the highest obstacle starts: 2 cm from it, on the target's side.
 
     Args:
         points: (N, K, 3, P) points on the objects' surfaces, world frame, m.
         obstacles: (N, K) bool, whether each object is an obstacle (`Clutter`).
-        target: (N,) slot of each target.
+        target_slot: (N,) slot of each target.
 
     Returns:
         (N, 3) points in the world frame, m; the middle of the target in envs without obstacles.
     """
-    env = torch.arange(len(target), device=points.device)
+    env = torch.arange(len(target_slot), device=points.device)
     tops = points[:, :, 2].amax(dim=-1).masked_fill(~obstacles, -torch.inf)
-    highest, goal = points[env, tops.argmax(dim=1)], points[env, target].mean(dim=-1)
+    highest, goal = points[env, tops.argmax(dim=1)], points[env, target_slot].mean(dim=-1)
     middle = highest.mean(dim=-1)
     away = (middle - goal)[:, :2]
     away = away / torch.linalg.vector_norm(away, dim=-1, keepdim=True).clamp(min=1e-6)

@@ -12,7 +12,7 @@ from robocas_ms3.core.arrays import Array, as_tensor, known_all_false, to_native
 from robocas_ms3.scenes.task_specs import OPEN_PICK
 from robocas_ms3.tasks import rewards
 from robocas_ms3.tasks.base import STAGES, RoboCASEnv
-from robocas_ms3.tasks.bodies import link_poses
+from robocas_ms3.tasks.bodies import read_link_poses
 from robocas_ms3.tasks.observations import rotate_to_tcp_frame
 
 
@@ -62,7 +62,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
     def handle_position(self) -> Array:
         """Return the position (N, 3) of the handle in the world frame, m, as a native array (`core.arrays`)."""
         link, position = self._handle
-        pose = link_poses(self.scene, [link])[:, 0]
+        pose = read_link_poses(self.scene, [link])[:, 0]
         return pose[:, :3] + rotations.rotate(pose[:, 3:], position)
 
     def is_furniture_open(self) -> torch.Tensor:

@@ -28,7 +28,7 @@ from robocas_ms3.scenes.layout import Layout, LayoutSource
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.scenes.task_specs import TaskSpec
 from robocas_ms3.tasks import engine
-from robocas_ms3.tasks.bodies import Bodies, link_poses
+from robocas_ms3.tasks.bodies import BodyStateReader, read_link_poses
 from robocas_ms3.tasks.initial_states import set_initial_states
 from robocas_ms3.tasks.observations import over_shoulder_viewpoint, place_overview_camera
 from robocas_ms3.tasks.seeds import EpisodeSeeds, parse_reset_options
@@ -88,7 +88,7 @@ class SceneEnv(BaseEnv):
         num_envs: int = 1,
         **kwargs: Any,
     ) -> None:
-        engine.check_engine(num_envs, visual_level, **kwargs)
+        engine.check_engine_arguments(num_envs, visual_level, **kwargs)
         self.task_config = load_config_for(self.SPEC, config)
         self.robot_spec = find_robot(robot_uids, where="robot_uids")
         import_object(self.robot_spec.agent)  # registers it with ManiSkill
@@ -120,10 +120,12 @@ class SceneEnv(BaseEnv):
     def _setup_sensors(self, options: dict) -> None:
         super()._setup_sensors(options)
         sensors = cast("dict[str, Any]", self._sensors)
-        build.shift_cameras([sensors[spec.name].camera for spec in self.cameras], self.task_config, self.scene_seeds)
+        build.shift_cameras(
+            [sensors[spec.name].camera for spec in self.cameras], self.task_config, self.appearance_seeds
+        )
 
     @property
-    def scene_seeds(self) -> list[int]:
+    def appearance_seeds(self) -> list[int]:
         """Seed of the appearance of each env; it changes only when the scene is built again."""
         return [int(seed) for seed in cast("NDArray[np.int64]", self._episode_seed)]
 
@@ -153,7 +155,7 @@ class SceneEnv(BaseEnv):
         self.agent.cameras = tuple(place_overview_camera(camera, self.overview_viewpoint()) for camera in self.cameras)
 
     def _load_scene(self, options: dict) -> None:
-        self.fixtures = build.build_fixtures(self.scene, self.model, self._visual_level, self.scene_seeds)
+        self.fixtures = build.build_fixtures(self.scene, self.model, self._visual_level, self.appearance_seeds)
         assets, ids = self.model.object_pack.objects, self.seeds.object_ids
         self.object_assets: list[list[LoadedObject]] = [[assets[i] for i in row] for row in ids]
         self.objects = build.build_objects(self.scene, self.task_config, self.object_assets, self._visual_level)
@@ -165,13 +167,13 @@ class SceneEnv(BaseEnv):
         self.basket_start_poses = torch.zeros(self.num_envs, 7, device=self.device)
 
     def _load_lighting(self, options: dict) -> None:
-        build.build_lights(self.scene, self.task_config, self.scene_seeds, shadow=self.enable_shadow)
+        build.build_lights(self.scene, self.task_config, self.appearance_seeds, shadow=self.enable_shadow)
 
     def _after_reconfigure(self, options: dict) -> None:
         super()._after_reconfigure(options)
         if self.gpu_sim_enabled:
             self._engine_error_monitor.open()
-        self.bodies = Bodies(self.scene, self.agent.robot, self.objects, self.fixtures.basket)
+        self.bodies = BodyStateReader(self.scene, self.agent.robot, self.objects, self.fixtures.basket)
 
     def reset(self, seed: int | list[int] | None = None, options: dict | None = None) -> tuple[Any, dict]:
         """Reset all envs, or only the envs ``options["env_idx"]``; a seed always gives the same layout.
@@ -261,7 +263,7 @@ class SceneEnv(BaseEnv):
 
     def tcp_in_world(self) -> Array:
         """Return the TCP pose (N, 7) in the world frame as a native array (`core.arrays`)."""
-        return link_poses(self.scene, [self.agent.tcp])[:, 0]
+        return read_link_poses(self.scene, [self.agent.tcp])[:, 0]
 
     def target_asset(self, env: int = 0) -> LoadedObject:
         """Return the asset of the target of an env."""

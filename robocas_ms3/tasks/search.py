@@ -88,10 +88,10 @@ class RoboCASSearchEnv(RoboCASEnv):
         points = occlusion.surface_points_in_world(self.object_states[envs, :, :7], self._surface_points[envs])
         return occlusion.measure_clutter(points, self.present[envs], self.target_slot[envs], self._eye)
 
-    def pairwise_occlusion(self, envs: Any = slice(None)) -> torch.Tensor:
+    def measure_pairwise_occlusion(self, envs: Any = slice(None)) -> torch.Tensor:
         """Return fractions (E, K, K) for some envs: entry [e, i, j] is the fraction of object j that object i hides."""
         points = occlusion.surface_points_in_world(self.object_states[envs, :, :7], self._surface_points[envs])
-        return occlusion.pairwise_occlusion(points, self.present[envs], self._eye)
+        return occlusion.measure_pairwise_occlusion(points, self.present[envs], self._eye)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
         """Return the result of `RoboCASEnv.evaluate`, ``obstacles_cleared`` and ``cleared_at_reset``, (N,) bool."""
@@ -151,7 +151,7 @@ class RoboCASSearchEnv(RoboCASEnv):
             self._obstacles[envs] = torch.where(taken[:, None], found.obstacles, self._obstacles[envs])
             if self._reward_mode in DENSE_MODES:
                 points = occlusion.surface_points_in_world(poses[envs], self._surface_points[envs])
-                push_point = occlusion.push_point(points, found.obstacles, self.target_slot[envs])
+                push_point = occlusion.find_push_point(points, found.obstacles, self.target_slot[envs])
                 self._push_point[envs] = torch.where(taken[:, None], push_point, self._push_point[envs])
         self._last_measurement, self._measure_now = _Measurement(others, poses, cleared), self._measure_now & ~due
         return cleared
@@ -182,7 +182,7 @@ class _Measurement(NamedTuple):
     """Measurement of the clutter.
 
     Attributes:
-        state_except_robot: `Bodies.state_except_robot` at the measurement.
+        state_except_robot: `BodyStateReader.state_except_robot` at the measurement.
         poses: (N, K, 7) world poses of the objects at the measurement.
         cleared: (N,) bool, whether the target was cleared.
     """

@@ -170,9 +170,9 @@ class EpisodeSeeds:
         """
         self._generators = generators
         for i, env in enumerate(envs):
-            self.layout_seeds[env] = self._draw(env) if seeds is None else seeds[i]
+            self.layout_seeds[env] = self._draw_seed(env) if seeds is None else seeds[i]
 
-    def _draw(self, env: int) -> int:
+    def _draw_seed(self, env: int) -> int:
         """Draw a seed from the range with the random generator of an env."""
         drawn = int(self._generators[env].randint(2**31))
         low, high = self.range or (0, 2**31 - 1)
@@ -278,7 +278,7 @@ class EpisodeSeeds:
                     raise
                 message = "env %d: no layout for seed %d; drawing another seed: %s"
                 _log.log(_log_level(error), message, env, seeds[env], error)
-                seeds[env] = self._draw(env)
+                seeds[env] = self._draw_seed(env)
         return make(int(seeds[env]))
 
 

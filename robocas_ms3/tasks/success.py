@@ -14,7 +14,7 @@ from robocas_ms3.assets.manifest import BODY
 from robocas_ms3.core import rotations
 from robocas_ms3.core.arrays import Array, arange, as_tensor, known_all_false, to_native
 from robocas_ms3.tasks import terms
-from robocas_ms3.tasks.bodies import link_poses
+from robocas_ms3.tasks.bodies import read_link_poses
 from robocas_ms3.tasks.goals import TaskState
 
 
@@ -78,7 +78,7 @@ class SuccessCheck:
         """Return the current stages, ``success`` and ``fail`` (N,) bool, and ``disturbed`` (N,) int; read only."""
         env = self._env
         state = env.bodies.read()
-        forces = env.gripper_contacts.forces(env.bodies.state_except_robot)
+        forces = env.gripper_contacts.read_forces(env.bodies.state_except_robot)
         depends_on = self._reuse_key(forces)
         if self._last is not None and depends_on is not None and self._last[0] == depends_on:
             return dict(self._last[1])
@@ -105,7 +105,7 @@ class SuccessCheck:
         slot, goal = to_native(env.target_slot), env.goal
         grasped, touched = self.is_object_grasped(forces), terms.is_touched(forces)
         lifted = terms.is_lifted(objects[..., 2], to_native(env.start_poses)[..., 2], grasped)
-        conditions = self._conditions(touched, objects, basket)
+        conditions = self._compute_conditions(touched, objects, basket)
         held = terms.select_target(grasped, slot)
         now = {
             "reached_any": touched.any(1),
@@ -144,15 +144,15 @@ class SuccessCheck:
         pressed = terms.presses_both_fingers(forces[:, 0], forces[:, 1])
         if known_all_false(pressed):  # the usual case: the directions need not be checked
             return pressed
-        finger = link_poses(self._env.scene, [self._env.agent.finger1_link])[:, 0]
+        finger = read_link_poses(self._env.scene, [self._env.agent.finger1_link])[:, 0]
         # the left finger opens along its own +y
         opening = rotations.rotate(finger[:, 3:], self._sideways)
         return terms.is_grasped(forces[:, 0], forces[:, 1], opening)
 
     def success_conditions(self) -> dict[str, torch.Tensor]:
         """Return the success conditions that must hold at the same time, by name, (N,) bool each; without the lift."""
-        touched = terms.is_touched(self._env.gripper_contacts.forces())
-        found = self._conditions(touched, *self._objects_and_basket(self._env.bodies.read()))
+        touched = terms.is_touched(self._env.gripper_contacts.read_forces())
+        found = self._compute_conditions(touched, *self._objects_and_basket(self._env.bodies.read()))
         return {name: as_tensor(measure) for name, measure in found.items()}
 
     def _objects_and_basket(self, state: torch.Tensor) -> tuple[Array, Array | None]:
@@ -160,7 +160,7 @@ class SuccessCheck:
         basket = self._env.bodies.basket_pose(state)
         return to_native(self._env.bodies.object_states(state)), None if basket is None else to_native(basket)
 
-    def _conditions(self, touched: Array, objects: Array, basket: Array | None) -> dict[str, Array]:
+    def _compute_conditions(self, touched: Array, objects: Array, basket: Array | None) -> dict[str, Array]:
         """Return `success_conditions` as native arrays, from touched objects (N, K) bool and the current state."""
         goal, slot = self._env.goal, to_native(self._env.target_slot)
         target = terms.select_target(objects, slot)
@@ -179,7 +179,7 @@ class SuccessCheck:
         """
         env, objects = self._env, self.state.object_states
         low = (objects[..., 2] < self.fallen_below) & to_native(env.present & ~env.is_target)
-        if known_all_false(low):  # as nearly always
+        if known_all_false(low):  # the usual case
             return low
         return low & ~env.goal.is_at_goal(self.centers_of_mass(objects), self.state.basket_pose)
 
@@ -188,7 +188,7 @@ class SuccessCheck:
         goal, slot = self._env.goal, to_native(self._env.target_slot)
         height = terms.select_target(objects[..., 2], slot)
         low, lost = height < self.fallen_below, goal.is_unreachable(basket, conditions)
-        if lost is None and known_all_false(low):  # as nearly always
+        if lost is None and known_all_false(low):  # the usual case
             return low
         caught = goal.is_above_goal(terms.select_target(objects[..., :3], slot), basket)
         fell = terms.has_target_fallen(
@@ -202,7 +202,7 @@ class SuccessCheck:
         support = env.fixtures.furniture[env.task_config.surface.furniture]
         if isinstance(support, Articulation) and env.model.support_link:
             links = [support.links_map[name] for name in (BODY, env.model.support_link)]
-            body, part = link_poses(env.scene, links).swapaxes(0, 1)
+            body, part = read_link_poses(env.scene, links).swapaxes(0, 1)
             undo = terms.inverse_part_motion(body, part, self._support_shut)
         moved = terms.is_disturbed(poses, to_native(env.start_poses), undo) & to_native(env.present)
         return moved & (arange(moved.shape[1], moved) != to_native(env.target_slot)[:, None])

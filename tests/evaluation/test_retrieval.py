@@ -29,7 +29,7 @@ class Heaps:
     def make_state(self, *, held: bool = False):
         return SimpleNamespace(disturbed=self.disturbed.numpy(), target_held=np.array([held] * len(self.disturbed)))
 
-    def pairwise_occlusion(self, envs):
+    def measure_pairwise_occlusion(self, envs):
         return OVER.repeat(len(envs), 1, 1)
 
     def measure_clutter(self, envs):

@@ -1,4 +1,4 @@
-"""States that `Bodies` reads equal the states that ManiSkill reads, also directly after setting a state."""
+"""States that `BodyStateReader` reads equal the states that ManiSkill reads, also directly after setting a state."""
 
 from types import SimpleNamespace
 
@@ -12,7 +12,7 @@ from mani_skill.utils.structs import Articulation, Pose
 import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.tasks.bodies import Bodies
+from robocas_ms3.tasks.bodies import BodyStateReader
 
 pytestmark = pytest.mark.slow
 
@@ -110,4 +110,4 @@ def test_unexpected_packed_state_is_an_error(env, monkeypatch):
     )
     monkeypatch.setattr(scene, "px", system)
     with pytest.raises(RobocasError, match="SAPIEN.s packed state"):
-        Bodies(scene, env.unwrapped.agent.robot)
+        BodyStateReader(scene, env.unwrapped.agent.robot)

@@ -16,7 +16,7 @@ import torch
 from mani_skill.utils.structs.types import GPUMemoryConfig
 
 from robocas_ms3.core.errors import SimulationError, VectorEnvError
-from robocas_ms3.tasks.engine import EngineErrorMonitor, check_engine, gpu_memory_limits
+from robocas_ms3.tasks.engine import EngineErrorMonitor, check_engine_arguments, gpu_memory_limits
 
 COMPLAINT = "[2026-01-01 00:00:00.000] [SAPIEN] [error] Contact buffer overflow detected, please increase its size to 9"
 OTHERS = (
@@ -40,9 +40,9 @@ def test_failed_download_of_the_gpu_library_is_an_error(monkeypatch, num_envs, s
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr("sapien.physx.enable_gpu", fail_to_enable)
-    check_engine(1, "full")
+    check_engine_arguments(1, "full")
     with pytest.raises(VectorEnvError, match="ConnectionError.*github.*copy ~/.sapien/physx"):
-        check_engine(num_envs, "full", sim_backend)
+        check_engine_arguments(num_envs, "full", sim_backend)
 
 
 def test_few_envs_have_the_limits_of_maniskill():

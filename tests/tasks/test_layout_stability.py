@@ -13,7 +13,7 @@ from robocas_ms3.scenes.layout import write_layout
 from robocas_ms3.scenes.layout_table import LayoutStatus
 from robocas_ms3.scenes.model import SceneModel
 from robocas_ms3.tasks import layout_stability
-from robocas_ms3.tasks.layout_stability import check_layouts, find_unchecked_layouts, status_from_shift
+from robocas_ms3.tasks.layout_stability import find_unchecked_layouts, measure_layout_shifts, status_from_shift
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def test_unstable_heap_is_found(cache):
     assert find_unchecked_layouts(cache, "gpu") == {}
     seeds = find_unchecked_layouts(cache, "cpu")
     assert seeds == {0: [0, 1], 1: [0, 1]}
-    moved = dict(check_layouts(cache, "cpu", seeds))
+    moved = dict(measure_layout_shifts(cache, "cpu", seeds))
     assert moved.keys() == {(0, 0), (0, 1), (1, 0), (1, 1)}
     assert moved.pop((1, 0)) > 0.02
     assert max(moved.values()) < 0.003
@@ -55,7 +55,7 @@ def test_statuses_found_before_an_interruption_are_stored(cache, monkeypatch):
         yield (0, 1), 0.02
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(layout_stability, "check_layouts", check_until_interrupted)
+    monkeypatch.setattr(layout_stability, "measure_layout_shifts", check_until_interrupted)
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
             check_stability(cache, "cpu")

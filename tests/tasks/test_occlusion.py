@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from robocas_ms3.core.poses import to_wxyz
 from robocas_ms3.tasks.occlusion import (
     Clutter,
+    find_push_point,
     has_clutter_moved,
     measure_clutter,
-    pairwise_occlusion,
-    project_down,
-    push_point,
+    measure_pairwise_occlusion,
+    project_to_horizontal_plane,
     surface_points_in_world,
 )
 
@@ -64,7 +64,7 @@ def test_object_nearer_to_the_camera_hides_more():
 
 def test_projected_points_by_hand():
     points = torch.tensor([[0.1, 0.2, 0.6], [0.1, 0.2, 0.8], [0.1, 0.2, 2.0]]).T[None, None]
-    seen = project_down(points, torch.tensor([0.0, 0.1, 1.0]), torch.tensor([0.4]))
+    seen = project_to_horizontal_plane(points, torch.tensor([0.0, 0.1, 1.0]), torch.tensor([0.4]))
     expected = torch.tensor([[0.1, 0.1], [0.2, 0.2], [0.8, 0.8]])  # the last is above the camera: 5 cm below it
     assert torch.allclose(seen[0, 0].T, expected)
 
@@ -164,7 +164,7 @@ def test_push_starts_between_the_target_and_the_highest_obstacle():
     low, high = plate((0.06, 0.10), (-0.05, 0.05), 0.66), plate((-0.14, -0.06), (-0.05, 0.05), 0.7)
     points = torch.stack([TARGET, low, high, FAR])[None].repeat(3, 1, 1, 1)
     obstacles = torch.tensor([[False, True, True, False], [False, True, False, False], [False] * 4])
-    found = push_point(points, obstacles, torch.zeros(3, dtype=torch.long))
+    found = find_push_point(points, obstacles, torch.zeros(3, dtype=torch.long))
     # 2 cm inside of the edges at x = -0.06 and 0.06; the target itself
     expected = torch.tensor([[-0.04, 0, 0.7], [0.04, 0, 0.66], [0, 0, 0.65]])
     assert torch.allclose(found, expected, atol=1e-5)
@@ -172,7 +172,7 @@ def test_push_starts_between_the_target_and_the_highest_obstacle():
 
 def test_push_point_of_an_obstacle_above_the_target_is_finite():
     points = torch.stack([TARGET, TARGET + torch.tensor([[0.0], [0.0], [0.1]])])[None]
-    found = push_point(points, torch.tensor([[False, True]]), torch.tensor([0]))
+    found = find_push_point(points, torch.tensor([[False, True]]), torch.tensor([0]))
     assert torch.isfinite(found).all()
     assert found[0, 2] == pytest.approx(0.75)
 
@@ -224,7 +224,7 @@ def test_pairwise_occlusion_by_hand():
     small, aside = plate((0.1, 0.15), (0, 0.05), 0.6), plate((0.4, 0.5), (0, 0.1), 0.9)
     points = torch.stack([target, lid, small, aside])[None].expand(2, -1, -1, -1)
     present = torch.tensor([[True] * 4, [True, True, False, True]])
-    shares = pairwise_occlusion(points, present, HIGH_ABOVE)
+    shares = measure_pairwise_occlusion(points, present, HIGH_ABOVE)
     wanted = torch.zeros(4, 4)
     wanted[1, 0], wanted[2, 1] = 0.5, 0.25
     torch.testing.assert_close(shares[0], wanted, atol=0.06, rtol=0)

@@ -9,7 +9,7 @@ from mani_skill.utils.structs import Pose
 import robocas_ms3  # noqa: F401
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.tasks.base import STAGES
-from robocas_ms3.tasks.bodies import Contacts
+from robocas_ms3.tasks.bodies import ContactForceReader
 
 STATE_ONLY = {"render_backend": "none", "control_mode": "pd_joint_pos", "obs_mode": "none"}
 
@@ -81,7 +81,7 @@ def test_reset_ignores_contacts_of_the_last_episode(env, monkeypatch):
     """If the scene is not built again, the engine reports contacts of the last episode until the first step."""
     base = env.unwrapped
     forces = np.full((1, 3, len(base.objects), 3), 5.0, np.float32)
-    monkeypatch.setattr(Contacts, "forces", lambda *_: forces)
+    monkeypatch.setattr(ContactForceReader, "read_forces", lambda *_: forces)
     _, info = env.reset(seed=0)
     assert not any(bool(info[stage][0]) for stage in STAGES)
     assert hold_and_read_flags(env, 1)["reached_target"]

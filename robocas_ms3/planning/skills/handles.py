@@ -25,7 +25,7 @@ from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.scenes.grasp_checks import HALF_TURN
 from robocas_ms3.scenes.lookup import MAX_OPENED_FRACTION
 from robocas_ms3.tasks import terms
-from robocas_ms3.tasks.bodies import contact_forces
+from robocas_ms3.tasks.bodies import read_contact_forces
 from robocas_ms3.tasks.open_pick import RoboCASOpenPickEnv
 
 MAX_PULLS = 3  # pulls, each with a new grasp of the handle
@@ -112,7 +112,7 @@ class MovingPart:
         assert isinstance(furniture, Articulation)
         link = furniture.links_map[self.handle.link]
         left, right = env.agent.finger1_link, env.agent.finger2_link
-        forces = contact_forces(env.scene, [left, right], [link])
+        forces = read_contact_forces(env.scene, [left, right], [link])
         closing = left.pose.to_transformation_matrix()[:, :3, 1]
         return bool(terms.is_grasped(forces[:, 0], forces[:, 1], closing)[0, 0])
 

@@ -86,7 +86,7 @@ def _camera_shift(arm: Arm) -> Array:
     randomisation = arm.env.task_config.randomisation.cameras
     if randomisation is None:
         return np.eye(4)
-    return draw_camera_shift(randomisation, arm.env.agent.cameras.index(_hand_camera(arm)), arm.env.scene_seeds[0])
+    return draw_camera_shift(randomisation, arm.env.agent.cameras.index(_hand_camera(arm)), arm.env.appearance_seeds[0])
 
 
 def _hand_camera(arm: Arm) -> CameraSpec:
