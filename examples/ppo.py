@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 import tyro
 
-from robocas_ms3.baselines import Progress, RunOptions, train_run
+from robocas_ms3.baselines import ProgressCallbacks, RunOptions, train_run
 
 
 @dataclass
@@ -38,7 +38,9 @@ def main(args: Args) -> None:
     torch.set_num_threads(1)
     train = {"seed": args.seed, "steps": args.steps, "batch_size": args.batch}
     config = {"envs": args.envs, "workers": args.workers, "layouts": args.layouts, "test_episodes": args.test_episodes}
-    train_run(RunOptions("ppo", None, args.out, {**config, "train": train}, overwrite=True), Progress(message=print))
+    train_run(
+        RunOptions("ppo", None, args.out, {**config, "train": train}, overwrite=True), ProgressCallbacks(message=print)
+    )
 
 
 if __name__ == "__main__":

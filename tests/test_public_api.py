@@ -35,7 +35,7 @@ PUBLIC = {
     "robocas_ms3.baselines": [
         "Baseline",
         "BaselineConfig",
-        "Progress",
+        "ProgressCallbacks",
         "RunOptions",
         "RunPolicy",
         "RunRecord",

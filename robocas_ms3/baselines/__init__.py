@@ -10,7 +10,7 @@ from robocas_ms3.core.lazy import make_lazy_exports
 if TYPE_CHECKING:
     from robocas_ms3.baselines.baseline import Baseline as Baseline
     from robocas_ms3.baselines.baseline import BaselineConfig as BaselineConfig
-    from robocas_ms3.baselines.baseline import Progress as Progress
+    from robocas_ms3.baselines.baseline import ProgressCallbacks as ProgressCallbacks
     from robocas_ms3.baselines.baseline import Samples as Samples
     from robocas_ms3.baselines.baseline import TrainSettings as TrainSettings
     from robocas_ms3.baselines.policy import RunPolicy as RunPolicy
@@ -23,7 +23,13 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = make_lazy_exports(
     __name__,
     {
-        "robocas_ms3.baselines.baseline": ["Baseline", "BaselineConfig", "Progress", "Samples", "TrainSettings"],
+        "robocas_ms3.baselines.baseline": [
+            "Baseline",
+            "BaselineConfig",
+            "ProgressCallbacks",
+            "Samples",
+            "TrainSettings",
+        ],
         "robocas_ms3.baselines.policy": ["RunPolicy"],
         "robocas_ms3.baselines.registry": ["find_baseline"],
         "robocas_ms3.baselines.training.record": ["RunRecord", "read_run"],

@@ -23,7 +23,7 @@ Fraction = Annotated[float, Field(ge=0, lt=1)]
 
 
 @dataclass
-class Progress:
+class ProgressCallbacks:
     """Callbacks of `train_run` that report its progress; by default they do nothing.
 
     Attributes:

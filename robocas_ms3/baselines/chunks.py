@@ -39,12 +39,12 @@ def encode_proprioception(poses: NDArray[np.floating], widths: NDArray[np.floati
     return _encode_rows(poses, widths / 0.08)
 
 
-def encode_chunks(poses: Array, gripper: NDArray[Any], steps: int) -> NDArray[np.float32]:
+def encode_chunks(poses: Array, gripper_commands: NDArray[Any], steps: int) -> NDArray[np.float32]:
     """Encode a chunk for each of the T steps of an episode.
 
     Args:
         poses: (T, 4, 4) TCP poses in the arm's base frame.
-        gripper: (T,) gripper commands as in ``gripper_status``: 1 = open; row t is the command that led to step t.
+        gripper_commands: (T,) as in ``gripper_status``: 1 = open; row t is the command that led to step t.
         steps: number of steps per chunk, K.
 
     Returns:
@@ -52,17 +52,17 @@ def encode_chunks(poses: Array, gripper: NDArray[Any], steps: int) -> NDArray[np
     """
     length = len(poses)
     ahead = np.minimum(np.arange(length)[:, None] + np.arange(1, steps + 1), length - 1)  # (T, K)
-    return _encode_rows(inverse(poses)[:, None] @ poses[ahead], np.asarray(gripper, np.float64)[ahead])
+    return _encode_rows(inverse(poses)[:, None] @ poses[ahead], np.asarray(gripper_commands, np.float64)[ahead])
 
 
-def encode_next_key_poses(poses: Array, gripper: NDArray[Any]) -> NDArray[np.float32]:
+def encode_next_key_poses(poses: Array, gripper_commands: NDArray[Any]) -> NDArray[np.float32]:
     """Encode the next key pose of each step of an episode, (T, 9): a row of a chunk without gripper command.
 
     The next key pose of a step is the TCP pose at the next change of the gripper command, or at the end of the episode
-    if there is no change. ``poses`` and ``gripper`` are those of `encode_chunks`.
+    if there is no change. The arguments are those of `encode_chunks`.
     """
     length = len(poses)
-    changes = np.flatnonzero(np.diff(np.asarray(gripper, np.int8))).tolist()  # last steps before a change
+    changes = np.flatnonzero(np.diff(np.asarray(gripper_commands, np.int8))).tolist()  # last steps before a change
     key_steps = np.array([next((change for change in changes if change >= t), length - 1) for t in range(length)])
     return _encode_rows(inverse(poses) @ poses[key_steps], np.zeros(length))[:, :9]
 
@@ -106,13 +106,13 @@ class Normalizer(torch.nn.Module):
         return (values - self.mean) / self.deviation
 
     def inverse(self, values: torch.Tensor) -> torch.Tensor:
-        """Return values from normalised values."""
+        """Undo the normalisation: return the values in their own units."""
         return values * self.deviation + self.mean
 
 
-def compute_normalizer_statistics(motions: NDArray[np.floating]) -> dict[str, Any]:
+def compute_normalizer_statistics(poses: NDArray[np.floating]) -> dict[str, Any]:
     """Return ``mean`` and ``deviation`` of a `Normalizer` for encoded poses (N, ..., 9), computed over N."""
-    return {"mean": motions.mean(0).tolist(), "deviation": np.maximum(motions.std(0), _MIN_DEVIATION).tolist()}
+    return {"mean": poses.mean(0).tolist(), "deviation": np.maximum(poses.std(0), _MIN_DEVIATION).tolist()}
 
 
 class ChunkModel(Protocol):
@@ -239,7 +239,9 @@ class ChunkPolicy:
                 )  # one env at a time: in a batch, rounding depends on the other rows
                 chunks.insert(0, _Chunk(*decode_chunk(rows, tcp[row])))
                 if self._update_stuck(env, tcp[row, :3, 3], float(observations.robot[GRIPPER_WIDTH].reshape(-1)[row])):
-                    chunks = [replace(one, gripper=np.ones_like(one.gripper)) for one in chunks]  # else outvoted
+                    chunks = [
+                        replace(one, open_probabilities=np.ones_like(one.open_probabilities)) for one in chunks
+                    ]  # else outvoted
             self._chunks[env] = chunks
         return np.stack([self._make_action(self._chunks[env], here) for env, here in zip(envs, tcp, strict=True)])
 
@@ -257,7 +259,7 @@ class ChunkPolicy:
         weights = np.exp(-self._ensemble_coeff * np.array([one.age for one in chunks]))
         weights /= weights.sum()
         poses = np.stack([one.poses[one.age] for one in chunks])
-        probability = float(weights @ [one.gripper[one.age] for one in chunks])
+        probability = float(weights @ [one.open_probabilities[one.age] for one in chunks])
         rotation = Rotation.from_matrix(poses[:, :3, :3]).mean(weights)
         now = Rotation.from_matrix(here[:3, :3]).inv()
         motion = now.apply(weights @ poses[:, :3, 3] - here[:3, 3])
@@ -270,10 +272,10 @@ class _Chunk:
 
     Attributes:
         poses: (K, 4, 4) TCP poses in the arm's base frame.
-        gripper: (K,) probabilities of the command to open the gripper.
+        open_probabilities: (K,) probabilities of the command to open the gripper.
         age: policy steps since the prediction; the index of the row for the present step.
     """
 
     poses: Array
-    gripper: NDArray[np.float64]
+    open_probabilities: NDArray[np.float64]
     age: int = 0

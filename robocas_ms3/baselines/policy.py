@@ -63,7 +63,7 @@ class RunPolicy:
             "version": record.version,
             "steps": weights.step,
             "data": record.data.model_dump(exclude={"scenes"}),
-            "trained_in": record.data.scenes.summary(),
+            "trained_in": record.data.scenes.summarize(),
             "config": record.config,
             "init_from": record.init_from,
             "trained_with": record.versions,
@@ -89,12 +89,12 @@ class RunPolicy:
         Returns:
             One warning; empty if there is nothing to warn about, or if this object has warned before.
         """
-        differences = [] if self._has_warned else self._scenes.differences(configs, self.spec.cameras)
+        differences = [] if self._has_warned else self._scenes.list_differences(configs, self.spec.cameras)
         if not differences:
             return []
         self._has_warned = True
         what = f"{self._name} was not trained for {', '.join(configs)}: expect a low success rate"
-        return [f"{what}. Not in the training data: {'; '.join(differences)}. Trained for: {self._scenes.summary()}."]
+        return [f"{what}. Not in the training data: {'; '.join(differences)}. Trained for: {self._scenes.summarize()}."]
 
     def act(self, observations: Observations) -> Any:
         """Return one action per env (E, A), or one chunk of H actions per env (E, H, A)."""
@@ -103,7 +103,7 @@ class RunPolicy:
 
 @contextmanager
 def _convert_fact_errors(path: Path) -> Iterator[None]:
-    """Convert errors of damaged values in ``run.json``, which make no network, to a TrainingError."""
+    """Raise TrainingError in place of the errors that damaged values in ``run.json`` cause; ``path`` is its path."""
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:

@@ -116,14 +116,14 @@ DEFAULT = "small"
 
 @resumable
 def train(baseline: str, cfg: Training) -> int:
-    from robocas_ms3.baselines.training.record import find_run
-    from robocas_ms3.baselines.training.session import Progress, RunOptions, train_run
+    from robocas_ms3.baselines.training.record import find_run_folder
+    from robocas_ms3.baselines.training.session import ProgressCallbacks, RunOptions, train_run
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
 
     data = getattr(cfg, "data", None)
     out = cfg.out or _default_out(baseline, data)
-    init_from = None if cfg.init_from is None else find_run(Path(cfg.init_from)).absolute()
+    init_from = None if cfg.init_from is None else find_run_folder(Path(cfg.init_from)).absolute()
     with ProgressBar("episodes read", transient=True) as reading, ProgressBar("steps trained") as stepping:
 
         def step(done: int, of: int) -> None:
@@ -131,7 +131,7 @@ def train(baseline: str, cfg: Training) -> int:
             stepping.update(done, of)
 
         first = os.environ.get("RANK", "0") == "0"  # only one process prints
-        progress = Progress(stepping.add_note, reading.update, step) if first else Progress()
+        progress = ProgressCallbacks(stepping.add_note, reading.update, step) if first else ProgressCallbacks()
         options = RunOptions(
             baseline,
             data,

@@ -6,7 +6,7 @@ import json
 import torch
 from safetensors.torch import load_file
 
-from robocas_ms3.baselines.training.session import Progress, RunOptions, train_run
+from robocas_ms3.baselines.training.session import ProgressCallbacks, RunOptions, train_run
 
 
 def train(name, data, out, changes=None, *, progress=None, device="cpu", **options):
@@ -20,7 +20,7 @@ def stop_at(step, error):
         if done == step:
             raise error
 
-    return Progress(on_step=report)
+    return ProgressCallbacks(on_step=report)
 
 
 def read_log(folder, split=None):

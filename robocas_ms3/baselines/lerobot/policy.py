@@ -91,9 +91,10 @@ class LeRobotPolicy:
             elif {STATE: (len(STATE_NAMES),), EMBEDDING: (DIMENSIONS,)}.get(key) != tuple(shape):
                 fix = "Train on a dataset written by `python -m robocas_ms3.baselines.lerobot.prepare`."
                 raise EvaluationError(
-                    "the policy has other inputs than prepared datasets",
+                    "unexpected input of the LeRobot policy",
                     where=key,
-                    found=f"shape {list(shape)}",
+                    expected=f"{_IMAGES}CAMERA (3, H, W), {STATE} ({len(STATE_NAMES)},) or {EMBEDDING} ({DIMENSIONS},)",
+                    found=f"shape {tuple(shape)}",
                     fix=fix,
                 )
         self.spec = PolicySpec(
@@ -128,7 +129,7 @@ class LeRobotPolicy:
         return action.reshape(-1).to("cpu", torch.float32).numpy()
 
     def _make_item(self, observations: Observations, row: int) -> dict[str, Any]:
-        """Return the observation of a row as LeRobot's datasets do: without batch axis, images (3, H, W) in 0..1."""
+        """Return the observation of a row as an item of a LeRobot dataset: no batch axis, images (3, H, W) in 0..1."""
         one = slice(row, row + 1)
         tcp = observations.tcp_in_base[one]
         joints = observations.qpos[one, RobotDescription.arm_slice]

@@ -51,7 +51,7 @@ _NOT_COPIED = ("data", "episodes", "robocas", "depth", ".parts", STAGING)
 
 
 def prepare_dataset(source: Path, out: Path, embed: Embed | None) -> None:
-    """Write the reduced dataset to a new folder, completely or not at all.
+    """Write a LeRobot dataset, reduced to the data that the policy socket sends; the folder is complete or absent.
 
     Args:
         source: dataset folder of ``robocas convert --to lerobot``.

@@ -69,11 +69,13 @@ def read_dataset_rate(info: Path) -> float:
     try:
         rate_hz = load_json(info)["fps"]
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise EvaluationError("cannot read the rate", where=info, found=repr(error), fix="Pass --rate HZ.") from error
+        raise EvaluationError(
+            "cannot read the rate (fps) of the dataset", where=info, found=repr(error), fix="Pass --rate HZ."
+        ) from error
     if type(rate_hz) not in (int, float) or not 0 < rate_hz <= 1000:
         found, fix = str(rate_hz)[:80], "Pass --rate HZ."
         expected = "fps above 0 and at most 1000"
-        raise EvaluationError("invalid rate", where=info, expected=expected, found=found, fix=fix)
+        raise EvaluationError("invalid rate of the dataset", where=info, expected=expected, found=found, fix=fix)
     return float(rate_hz)
 
 

@@ -84,7 +84,7 @@ def _make_layers(inputs: int, width: int, outputs: int, gain: float) -> nn.Seque
 
 
 class PpoPolicy:
-    """Policy of `ppo`: executes the mean action of the agent, as ``pd_ee_delta_pose`` in the training would."""
+    """Policy of `ppo`: executes the mean action of the agent. An action commands the same motion as in the training."""
 
     def __init__(self, config: PpoConfig, facts: dict[str, Any], agent: Agent) -> None:
         # Rotations are about one axis: Euler angles and rotation vectors are equal
@@ -97,7 +97,7 @@ class PpoPolicy:
         pass
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Return one action per env (E, 7): translation in m, axis-angle rotation in rad, gripper command."""
+        """Return one action per env (E, 7): translation in m, axis-angle rotation in rad, gripper (1 = open)."""
         assert observations.state is not None
         width = observations.robot[GRIPPER_WIDTH]
         obs = join_observation(observations.qpos, observations.tcp_in_base, width, observations.state)

@@ -17,7 +17,7 @@ ONE_FRUIT: dict[str, Any] = {  # changes of pick_table_scattered: one small frui
 ONE_FRUIT_STEPS = 15  # per episode, 0.2 s each
 
 
-class PpoSettings(StrictModel):
+class PpoTrainSettings(StrictModel):
     """Training settings of `ppo`.
 
     Attributes:
@@ -60,7 +60,7 @@ class PpoConfig(StrictModel):
         entropy_coeff: weight of the entropy in the loss.
         width: size of the two hidden layers.
         test_episodes: number of test episodes after the training, in new layouts and with mean actions; 0: no test.
-        train: see `PpoSettings`.
+        train: see `PpoTrainSettings`.
     """
 
     task: str = "pick"
@@ -77,4 +77,4 @@ class PpoConfig(StrictModel):
     entropy_coeff: float = Field(default=1e-3, ge=0)
     width: int = Field(default=128, ge=1, le=16384)
     test_episodes: int = Field(default=50, ge=0)
-    train: PpoSettings = PpoSettings()
+    train: PpoTrainSettings = PpoTrainSettings()

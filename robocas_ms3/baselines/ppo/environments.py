@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space
 
 import robocas_ms3
 from robocas_ms3.baselines.ppo.config import ONE_FRUIT, ONE_FRUIT_STEPS, PpoConfig
-from robocas_ms3.baselines.training.scenes import TrainingScenes, scene_settings
+from robocas_ms3.baselines.training.scenes import TrainingScenes, select_scene_settings
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 from robocas_ms3.scenes.config import TaskConfig, load_task_config
@@ -60,7 +60,7 @@ class TopDownActionWrapper(gym.Wrapper):
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
         base: Any = env.unwrapped
-        size = _observation(base.get_obs(base.get_info())).shape[1]
+        size = _make_observation(base.get_obs(base.get_info())).shape[1]
         self.single_action_space = gym.spaces.Box(-1, 1, (ACTION_SIZE,), np.float32)
         self.action_space = batch_space(self.single_action_space, base.num_envs)
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
@@ -68,22 +68,22 @@ class TopDownActionWrapper(gym.Wrapper):
 
     def reset(self, **kwargs: Any) -> tuple[torch.Tensor, dict[str, Any]]:
         obs, info = self.env.reset(**kwargs)
-        return _observation(obs), info
+        return _make_observation(obs), info
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         base: Any = self.unwrapped
         obs, *rest = self.env.step(expand_action(torch.as_tensor(action, device=base.device)))
-        return (_observation(obs), *rest)  # pyright: ignore[reportReturnType]
+        return (_make_observation(obs), *rest)  # pyright: ignore[reportReturnType]
 
 
-def _observation(obs: dict[str, Any]) -> torch.Tensor:
+def _make_observation(obs: dict[str, Any]) -> torch.Tensor:
     agent = obs["agent"]
     state = [value for name, value in obs["extra"].items() if name != "tcp_pose"]  # as in `privileged`
     return join_observation(agent["qpos"], agent["tcp_in_arm_base"], agent[GRIPPER_WIDTH], torch.cat(state, dim=1))
 
 
 class PpoEnvironments:
-    """Vector environment in which `ppo` trains, and makes further ones for tests.
+    """Training environments of `ppo`: the vector environment ``envs``, and `make_envs` for others such as tests.
 
     All episodes have the same length: a success does not end an episode. Each env keeps its objects; only the layout
     changes at a reset.
@@ -105,7 +105,7 @@ class PpoEnvironments:
         self.hash = hashlib.sha256(json.dumps(scene, sort_keys=True).encode()).hexdigest()
         self.episodes = config.layouts
         name = Path(config.scenes).stem if config.scenes else "one fruit"
-        self.scenes = TrainingScenes(tasks=[config.task], configs={name: scene_settings(scenes)})
+        self.scenes = TrainingScenes(tasks=[config.task], configs={name: select_scene_settings(scenes)})
         self.envs = self.make_envs(config.envs, 0, config.layouts - 1)
         shape = self.envs.single_observation_space.shape
         assert shape is not None

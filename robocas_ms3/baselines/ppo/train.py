@@ -178,7 +178,7 @@ class Rollout:
         normalized: (B, O) normalised observations, from which the actions were sampled.
         action: (B, A) actions.
         log_prob: (B,) log probabilities of the actions.
-        advantage: (B,) compute_advantages.
+        advantage: (B,) generalised advantage estimates.
         returns: (B,) targets of the value network.
     """
 

@@ -19,7 +19,7 @@ _KERAS_STD = (0.47853944, 0.4732864, 0.47434163)
 """Standard deviations of EfficientNet's published weights: the square roots of ImageNet's; transformers uses them."""
 
 
-class RT1Train(TrainSettings):
+class RT1TrainSettings(TrainSettings):
     """Training settings of RT-1.
 
     140 000 steps of 24 samples are 20 epochs, as in RoboCAS-v0's code, of 2800 episodes with about 60 steps, as in the
@@ -94,7 +94,7 @@ class RT1Config(BaselineConfig):
     dropout: float = Field(0.1, ge=0, lt=1)
     bins: int = Field(256, ge=2, le=65536)
     terminate_steps: int = Field(1, ge=1, le=1000)
-    train: RT1Train = RT1Train()
+    train: RT1TrainSettings = RT1TrainSettings()
 
     @model_validator(mode="after")
     def _check(self) -> RT1Config:
@@ -106,12 +106,12 @@ class RT1Config(BaselineConfig):
             raise ValueError(
                 f"crop_height {self.crop_height}: expected at most the {self.image_size[1]} rows of image_size"
             )
-        if min(self.std) <= 0:
-            raise ValueError(f"image_std {list(self.std)}: expected values above 0")
+        if min(self.used_image_std) <= 0:
+            raise ValueError(f"image_std {list(self.used_image_std)}: expected values above 0")
         return self
 
     @property
-    def std(self) -> tuple[float, float, float]:
+    def used_image_std(self) -> tuple[float, float, float]:
         """Return the standard deviation per colour that divides images in 0..1: ``image_std`` or its default."""
         if self.image_std is not None:
             return self.image_std

@@ -17,6 +17,7 @@ from robocas_ms3.scenes.language.embed import DIMENSIONS
 _SQUARE_PADDED = (5, 18)
 """EfficientNet-B3's blocks that halve an odd number of rows: 75 and 19 of 300 rows; 59 and 15 of 236 rows."""
 _EXPECTED = "weights of transformers' EfficientNetModel"
+_FIX = "Set image_weights to model.safetensors of google/efficientnet-b3."
 
 
 class FiLM(nn.Module):
@@ -138,9 +139,12 @@ def _read_weights(path: Path) -> dict[str, Any]:
             found = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, SafetensorError, pickle.UnpicklingError, RuntimeError, EOFError, ValueError) as error:
         reason = str(error).partition("\n")[0]
-        raise TrainingError("unreadable file of image_weights", where=path, expected=_EXPECTED, found=reason) from error
+        raise TrainingError(
+            "unreadable file of image_weights", where=path, expected=_EXPECTED, found=reason, fix=_FIX
+        ) from error
     if not isinstance(found, dict):
-        raise TrainingError("invalid file of image_weights", where=path, expected=_EXPECTED, found=type(found).__name__)
+        found = type(found).__name__
+        raise TrainingError("invalid file of image_weights", where=path, expected=_EXPECTED, found=found, fix=_FIX)
     return found
 
 

@@ -132,7 +132,7 @@ class RT1Model(nn.Module):
         encoders = [ImageEncoder(config) for _ in config.cameras]
         self.encoders = nn.ModuleList(encoders)
         self.transformer = Transformer(config)
-        for name, value in (("mean", config.image_mean), ("std", config.std)):
+        for name, value in (("mean", config.image_mean), ("std", config.used_image_std)):
             self.register_buffer(name, 255 * torch.tensor(value).view(3, 1, 1), persistent=False)
         has_weights = config.image_weights is not None and config.image_weights.is_file()
         if config.image_weights is not None and has_weights:

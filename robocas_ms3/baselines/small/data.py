@@ -80,8 +80,8 @@ class SmallSamples:
         # threads decode images only: NumPy reads arrays with `ast`, which is not thread-safe in Python 3.11 (gh-106905)
         with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
             image_sizes = pool.map(self._read_images, numbers, starts)
-            for number, start, stored in zip(numbers, starts, image_sizes, strict=True):
-                scenes.append(self._read_arrays(len(scenes), number, start, stored))
+            for number, start, sizes in zip(numbers, starts, image_sizes, strict=True):
+                scenes.append(self._read_arrays(len(scenes), number, start, sizes))
                 on_read(len(scenes), len(numbers))
         self._choose_object_texts(scenes if config.language else [replace(objects, target="") for objects in scenes])
         if config.language and split == "train" and not (self._classes >= 0).any():
@@ -133,25 +133,25 @@ class SmallSamples:
         }
 
     def _read_images(self, number: int, start: int) -> dict[str, tuple[int, int]]:
-        """Store the images of an episode in the rows from ``start`` on.
+        """Decode the images of an episode, and store them in the sample tensors from row ``start`` on.
 
         Returns:
             Width and height of the images in the dataset, by camera.
         """
-        episode, stored = self._source.episode(number), {}
+        episode, sizes = self._source.episode(number), {}
         for camera, view in self._config.views.items():
             with closing(episode.frames(camera, "rgb", 0, self._source.lengths[number])) as images:
                 for row, image in enumerate(images, start=start):
                     self._images[camera][row] = torch.from_numpy(crop_image(image, view, self._source.root))
-                    stored[camera] = image.shape[1], image.shape[0]
-        return stored
+                    sizes[camera] = image.shape[1], image.shape[0]
+        return sizes
 
-    def _read_arrays(self, index: int, number: int, start: int, stored: dict[str, tuple[int, int]]) -> SceneObjects:
-        """Store the state and the labels of an episode in the rows from ``start`` on.
+    def _read_arrays(self, index: int, number: int, start: int, sizes: dict[str, tuple[int, int]]) -> SceneObjects:
+        """Read the states and the labels of an episode, and store them in the sample tensors from row ``start`` on.
 
         Args:
             index: number of the episode among these samples; ``number`` is its number in the dataset.
-            stored: result of `_read_images`.
+            sizes: result of `_read_images`.
 
         Returns:
             Objects of the episode.
@@ -174,13 +174,13 @@ class SmallSamples:
             self._texts[index] = torch.from_numpy(arrays["language_embedding"])
         projections: dict[str, Callable[[Array], NDArray[np.float32]]] = {}
         for camera, view in config.views.items():
-            found = read_calibration(episode, camera, arrays, stored[camera], view)
+            found = read_calibration(episode, camera, arrays, sizes[camera], view)
             self._check_calibration(camera, found, episode.where)
             projections[camera] = partial(
                 project_points_to_view,
                 camera_in_parent=episode.camera_in_parent(camera),
                 intrinsic=episode.intrinsic(camera),
-                stored=stored[camera],
+                stored_size=sizes[camera],
                 view=view,
             )
             points = to_camera_parent_frame(episode.camera_parent(camera), key_points[:, None], poses, arrays)[:, 0]
@@ -263,7 +263,8 @@ def crop_image(image: NDArray[Any], view: CameraView, where: object = "") -> NDA
     """Crop an image (H, W, 3) and scale it to the size of a view (h, w, 3).
 
     Raises:
-        DatasetError: the image has another aspect ratio than ``view.image_size`` or is smaller; ``where`` is its place.
+        DatasetError: the image has another aspect ratio than ``view.image_size`` or is smaller; ``where`` is in the
+            message.
     """
     width, height = view.image_size
     if image.shape[1::-1] != (width, height):

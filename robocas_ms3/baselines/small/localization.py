@@ -34,7 +34,11 @@ _FLATTEST = 0.03  # smallest downward component of a ray's direction; flatter ra
 
 
 def project_points_to_view(
-    points: NDArray[np.floating], camera_in_parent: Array, intrinsic: Array, stored: tuple[int, int], view: CameraView
+    points: NDArray[np.floating],
+    camera_in_parent: Array,
+    intrinsic: Array,
+    stored_size: tuple[int, int],
+    view: CameraView,
 ) -> NDArray[np.float32]:
     """Project points to pixel coordinates in the view of a camera.
 
@@ -42,7 +46,7 @@ def project_points_to_view(
         points: (..., 3) points in the frame of the camera's parent, m.
         camera_in_parent: (4, 4) pose of the OpenCV camera frame in the frame of the parent.
         intrinsic: (4,) fx, fy, cx, cy of the images in the dataset, pixels.
-        stored: width and height of the images in the dataset, pixels.
+        stored_size: width and height of the images in the dataset, pixels.
         view: view of the camera.
 
     Returns:
@@ -50,7 +54,7 @@ def project_points_to_view(
     """
     in_camera = transform_points(inverse(camera_in_parent), np.asarray(points, np.float64))
     depth = np.maximum(in_camera[..., 2:], _NEAREST)
-    fraction = (in_camera[..., :2] / depth * intrinsic[:2] + intrinsic[2:]) / np.array(stored)
+    fraction = (in_camera[..., :2] / depth * intrinsic[:2] + intrinsic[2:]) / np.array(stored_size)
     left, top, right, bottom = np.array(view.crop_box()) / np.tile(view.image_size, 2)
     inside = (fraction - (left, top)) / (right - left, bottom - top)
     return np.where(in_camera[..., 2:] > _NEAREST, inside * view.size, np.nan).astype(np.float32)
@@ -212,7 +216,8 @@ class Unproject(nn.Module):
     ) -> torch.Tensor:
         """Return the unprojection loss (): the mean error over the queries that have a label in the view.
 
-        The error is the L1 distance between predicted and labelled pixel in cells, plus the height error in 5 cm.
+        The error is the L1 distance between predicted and labelled pixel, in cells, plus the height error in units of
+        5 cm.
 
         Args:
             features: (B, C, h, w) feature maps.
@@ -236,7 +241,7 @@ def _rotate(rotations: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
     return (rotations * vectors[:, None]).sum(dim=-1)
 
 
-def heights_in_base(points: torch.Tensor, tcp: torch.Tensor) -> torch.Tensor:
+def compute_heights_in_base(points: torch.Tensor, tcp: torch.Tensor) -> torch.Tensor:
     """Return the heights (B,) of points in the arm's base frame, m.
 
     points: (B, 3) points in the TCP frame, m. tcp: (B, 4, 4) TCP pose in the arm's base frame.
@@ -244,7 +249,7 @@ def heights_in_base(points: torch.Tensor, tcp: torch.Tensor) -> torch.Tensor:
     return _rotate(tcp[:, :3, :3], points)[:, 2] + tcp[:, 2, 3]
 
 
-def tcp_from_state(state: torch.Tensor) -> torch.Tensor:
+def decode_tcp_pose(state: torch.Tensor) -> torch.Tensor:
     """Return the TCP poses (B, 4, 4) in the arm's base frame, decoded from proprioception (B, 10)."""
     first, second = state[:, 3:6], state[:, 6:9]
     rotation = torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)

@@ -25,15 +25,15 @@ from robocas_ms3.baselines.small.localization import (
     CellAttention,
     Unproject,
     compute_cell_losses,
-    heights_in_base,
+    compute_heights_in_base,
+    decode_tcp_pose,
     pixel_to_cell,
-    tcp_from_state,
 )
 from robocas_ms3.baselines.training.metrics import mean_of_sum_and_count
 
 _TEXT, _STATE = 384, 10  # sizes of an instruction embedding and of proprioception
 _NEAR = 0.15  # m; `unproject_mm` averages key poses closer than this to the TCP
-Maps = dict[str, tuple[torch.Tensor, torch.Tensor]]
+FeatureMaps = dict[str, tuple[torch.Tensor, torch.Tensor]]
 """Coarse and fine feature maps of `ImageEncoder`, by camera."""
 
 
@@ -214,7 +214,7 @@ class SmallModel(nn.Module):
         self,
         batch: Batch,
         camera: str,
-        maps: Maps,
+        maps: FeatureMaps,
         predicted: Prediction,
         object_texts: torch.Tensor,
         pixels: tuple[torch.Tensor, torch.Tensor],
@@ -227,7 +227,7 @@ class SmallModel(nn.Module):
         key: Any = self.key_unprojectors[camera]
         objects: Any = self.object_unprojectors[camera]
         fine = maps[camera][1]
-        next_height = heights_in_base(batch["key"][:, :3], tcp_from_state(batch["state"]))
+        next_height = compute_heights_in_base(batch["key"][:, :3], decode_tcp_pose(batch["state"]))
         key_loss = key.loss(fine, predicted.query[:, None], pixels[0][:, None], next_height[:, None])
         known = batch["object_classes"] >= 0
         object_pixels = pixels[1].where(known[..., None], torch.nan)
@@ -243,10 +243,10 @@ class SmallModel(nn.Module):
     def _encode_text(self, embeddings: torch.Tensor) -> torch.Tensor:
         return self.text_encoder(self.text_scale(embeddings).clamp(-3, 3))
 
-    def _encode_images(self, images: Batch) -> Maps:
+    def _encode_images(self, images: Batch) -> FeatureMaps:
         return {camera: encoder(images[camera]) for camera, encoder in self.image_encoders.items()}
 
-    def _predict(self, maps: Maps, text: torch.Tensor, state: torch.Tensor, shifts: Batch) -> Prediction:
+    def _predict(self, maps: FeatureMaps, text: torch.Tensor, state: torch.Tensor, shifts: Batch) -> Prediction:
         """Return the outputs for encoded inputs.
 
         Args:
@@ -263,7 +263,7 @@ class SmallModel(nn.Module):
             tokens[camera], cells[camera] = encoder.make_tokens((coarse, fine), query)
             if self.config.unproject:
                 object_logits = encoder.object_attention.logits(fine, text[:, None])[:, 0]
-                tcp, shift = tcp_from_state(state), shifts[camera]
+                tcp, shift = decode_tcp_pose(state), shifts[camera]
                 points[camera], key_features = self.key_unprojectors[camera](fine, query, cells[camera], tcp, shift)
                 _, object_features = self.object_unprojectors[camera](fine, text, object_logits, tcp, shift)
                 features += [key_features, object_features]

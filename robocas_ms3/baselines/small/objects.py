@@ -91,7 +91,11 @@ def locate_objects(
 
 
 def read_calibration(
-    episode: SourceEpisode, camera: str, arrays: Mapping[str, NDArray[Any]], stored: tuple[int, int], view: CameraView
+    episode: SourceEpisode,
+    camera: str,
+    arrays: Mapping[str, NDArray[Any]],
+    stored_size: tuple[int, int],
+    view: CameraView,
 ) -> dict[str, Any]:
     """Return the calibration of a camera, the argument ``camera`` of `Unproject`.
 
@@ -101,7 +105,7 @@ def read_calibration(
         episode: an episode of the dataset.
         camera: name of the camera.
         arrays: ``base_pos`` and ``base_orn`` of the episode.
-        stored: width and height of the images in the dataset, pixels.
+        stored_size: width and height of the images in the dataset, pixels.
         view: view of the camera.
     """
     mount, parent = episode.camera_in_parent(camera), episode.camera_parent(camera)
@@ -109,7 +113,7 @@ def read_calibration(
         mount = inverse(_base_poses(arrays))[0] @ mount
     left, top, right, bottom = np.array(view.crop_box()) / np.tile(view.image_size, 2)
     scale, intrinsic = np.array(view.size) / (right - left, bottom - top), episode.intrinsic(camera)
-    focal, center = intrinsic[:2] / stored * scale, (intrinsic[2:] / stored - (left, top)) * scale
+    focal, center = intrinsic[:2] / stored_size * scale, (intrinsic[2:] / stored_size - (left, top)) * scale
     return {"on_hand": parent == "ee", "mount": mount.tolist(), "intrinsic": [*focal.tolist(), *center.tolist()]}
 
 

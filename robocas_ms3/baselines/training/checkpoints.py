@@ -39,7 +39,7 @@ class Checkpoint:
     tensors: dict[str, torch.Tensor]
 
     def state_dict(self, name: str) -> dict[str, torch.Tensor]:
-        """Return one of the state dicts that `join_state_dicts` joined."""
+        """Return the state dict with a name, such as ``optimizer``; see `join_state_dicts`."""
         prefix = f"{name}."
         return {key.removeprefix(prefix): value for key, value in self.tensors.items() if key.startswith(prefix)}
 
@@ -115,7 +115,10 @@ def load_checkpoint(path: Path, expected: Mapping[str, str]) -> Checkpoint:
             for key, value in expected.items():
                 if metadata.get(key) != value:
                     found = metadata.get(key, "none")[:80]
-                    raise TrainingError(f"the file belongs to another {key}", where=path, expected=value, found=found)
+                    fix = "Restore the files of the run, or train again."
+                    raise TrainingError(
+                        f"the file belongs to another {key}", where=path, expected=value, found=found, fix=fix
+                    )
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  (no mapping)
     except (SafetensorError, OSError) as error:
         is_weights = path.name == WEIGHTS
@@ -129,5 +132,7 @@ def load_checkpoint(path: Path, expected: Mapping[str, str]) -> Checkpoint:
     if not re.fullmatch(r"[0-9]{1,12}", step):
         fix = "Start the run again: `robocas train` with --overwrite."
         found = repr(step[:40])
-        raise TrainingError("invalid step in the metadata", where=path, expected="an integer", found=found, fix=fix)
+        raise TrainingError(
+            "invalid training step in the metadata", where=path, expected="an integer", found=found, fix=fix
+        )
     return Checkpoint(path, int(step), tensors)

@@ -65,7 +65,10 @@ class MetricsLog:
         return (step, split) in self._written
 
     def add(self, step: int, split: str, schedule: Mapping[str, float], metrics: Mapping[str, float]) -> None:
-        """Write a line and an event; ``schedule`` has ``epoch``, ``seconds`` and ``learning_rate``."""
+        """Write the metrics of a step as a line of the CSV file and as a TensorBoard event.
+
+        schedule: ``epoch``, ``seconds`` and ``learning_rate`` of the step.
+        """
         row = {"step": step, "split": split, **schedule, **metrics}
         is_first = not self._columns
         if is_first:
@@ -136,7 +139,7 @@ class TensorBoardWriter:
 
 
 def _parse_number(text: Any, default: float) -> float:
-    """Parse a number; return the default for a text that is none, such as the last one of a killed process."""
+    """Parse a number. Return the default for an invalid text, such as one that a killed process wrote in part."""
     try:
         return float(text)
     except (TypeError, ValueError):

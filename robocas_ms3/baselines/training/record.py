@@ -82,7 +82,7 @@ class RunRecord(StrictModel):
         return {"baseline": self.baseline, "version": str(self.version), "dataset": self.data.hash}
 
 
-def find_run(run: Path) -> Path:
+def find_run_folder(run: Path) -> Path:
     """Return the folder of a run: of the bundled run if ``run`` is its name, otherwise ``run`` itself."""
     return BUNDLED / run if len(run.parts) == 1 and (BUNDLED / run).is_dir() else run
 
@@ -100,7 +100,8 @@ def read_run(folder: Path) -> RunRecord:
     try:
         record = load_json(path)
     except ValueError as error:
-        raise TrainingError("unreadable JSON file", where=path, found=error) from error
+        fix = "Restore the file, or train again."
+        raise TrainingError("unreadable JSON file", where=path, found=error, fix=fix) from error
     if not isinstance(record, dict) or record.get("kind") != RunRecord.model_fields["kind"].default:
         kind = f'"kind": "{RunRecord.model_fields["kind"].default}"'
         raise TrainingError("not the run.json of a training run", where=path, expected=kind, found="another kind")

@@ -13,7 +13,7 @@ from accelerate import Accelerator
 from accelerate.state import AcceleratorState
 from accelerate.utils import DataLoaderConfiguration, broadcast_object_list
 
-from robocas_ms3.baselines.baseline import Precision, Progress
+from robocas_ms3.baselines.baseline import Precision, ProgressCallbacks
 from robocas_ms3.baselines.training import checkpoints
 from robocas_ms3.baselines.training.checkpoints import Checkpoint, Tensors
 from robocas_ms3.baselines.training.metrics import MetricsLog
@@ -35,7 +35,9 @@ class RunFolder:
         checkpoint: checkpoint from which the run continues; None: the run starts at step 0.
     """
 
-    def __init__(self, output: OutputFolder, record: RunRecord, accelerator: Accelerator, progress: Progress) -> None:
+    def __init__(
+        self, output: OutputFolder, record: RunRecord, accelerator: Accelerator, progress: ProgressCallbacks
+    ) -> None:
         self.record, self.accelerator, self.progress = record, accelerator, progress
         self._output = output
         self._log: MetricsLog | None = None
@@ -50,7 +52,7 @@ class RunFolder:
         if self._log is not None:
             self._log.close()
 
-    def start(self, step: int, model: torch.nn.Module, weights: Tensors, size: str) -> None:
+    def start(self, step: int, model: torch.nn.Module, weights: Tensors, data_size: str) -> None:
         """Write the record, report the size of the training, and open the log.
 
         If the weights file and the checkpoint have different steps, the weights file is written again.
@@ -59,10 +61,10 @@ class RunFolder:
             step: number of training steps that are done.
             model: the network.
             weights: weights of the policy at this step.
-            size: text with the number of samples, for the progress message.
+            data_size: text with the number of samples, for the progress message.
         """
         accelerator, record = self.accelerator, self.record
-        changes = _hardware_changes(record, accelerator)
+        changes = _list_hardware_changes(record, accelerator)
         if self._output.recorded is not None and changes:
             record.hardware_changes.append(f"from step {step}: {changes}")
             what = "the result will differ from that of an uninterrupted run"
@@ -75,7 +77,7 @@ class RunFolder:
         parameters = sum(parameter.numel() for parameter in model.parameters()) / 1e6
         precision = "bf16" if accelerator.mixed_precision == "bf16" else "fp32"
         device = accelerator.device.type
-        self.progress.message(f"{record.baseline}: {parameters:.2f} M parameters, {size}, {device}, {precision}")
+        self.progress.message(f"{record.baseline}: {parameters:.2f} M parameters, {data_size}, {device}, {precision}")
         if accelerator.is_main_process:
             self._log = MetricsLog(self._output.path, step)
         self._started_at = time.monotonic() - (self._log.seconds if self._log else 0.0)
@@ -120,7 +122,7 @@ class RunFolder:
             checkpoints.save_tensors(path, weights, self.record.metadata, step)
 
 
-def _hardware_changes(record: RunRecord, accelerator: Accelerator) -> str:
+def _list_hardware_changes(record: RunRecord, accelerator: Accelerator) -> str:
     """Return the recorded hardware values that have changed, such as ``threads 4``; empty: none has changed."""
     now = describe_hardware(accelerator) | ({} if record.threads else {"threads": 0})
     return ", ".join(f"{name} {value}" for name, value in now.items() if getattr(record, name) != value)

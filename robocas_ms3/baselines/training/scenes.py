@@ -25,14 +25,14 @@ class TrainingScenes(StrictModel):
     Attributes:
         tasks: short names of the tasks.
         objects: asset ids of the objects.
-        configs: by name of a task configuration, its values that change the scene, see `scene_settings`.
+        configs: by name of a task configuration, its values that change the scene, see `select_scene_settings`.
     """
 
     tasks: list[str] = []
     objects: list[str] = []
     configs: dict[str, dict[str, Any]] = {}
 
-    def differences(self, configs: Mapping[str, TaskConfig], cameras: Collection[str]) -> list[str]:
+    def list_differences(self, configs: Mapping[str, TaskConfig], cameras: Collection[str]) -> list[str]:
         """List the tasks, scene settings, objects and cameras of task configurations that the training data lacks.
 
         Args:
@@ -45,7 +45,7 @@ class TrainingScenes(StrictModel):
         settings, objects = set[str](), set[str]()
         trained = [_select_cameras(values, cameras) for values in self.configs.values()]
         for config in configs.values():
-            values = scene_settings(config, cameras)
+            values = select_scene_settings(config, cameras)
             changes = [{key for key in {*values, *known} if values.get(key) != known.get(key)} for known in trained]
             settings |= min(changes, key=len, default=set())
             objects |= _object_ids(config) if self.objects else set()
@@ -59,7 +59,7 @@ class TrainingScenes(StrictModel):
         }
         return [f"{kind} {_join_names(names)}" for kind, names in found.items() if names]
 
-    def summary(self) -> str:
+    def summarize(self) -> str:
         """Return the tasks, configurations and objects in one line of text."""
         parts = {"": self.tasks, "in ": list(self.configs), "objects ": self.objects}
         return ", ".join(f"{word}{_join_names(names)}" for word, names in parts.items() if names)
@@ -78,7 +78,7 @@ def read_training_scenes(source: EpisodeSource, numbers: Iterable[int]) -> Train
             continue
         known.add(text)
         try:
-            settings = scene_settings(load_task_config(dict(config)))
+            settings = select_scene_settings(load_task_config(dict(config)))
         except ConfigError:  # written by a version with other keys
             continue
         if settings not in configs.values():
@@ -86,7 +86,7 @@ def read_training_scenes(source: EpisodeSource, numbers: Iterable[int]) -> Train
     return TrainingScenes(tasks=sorted(tasks), objects=sorted(objects), configs=configs)
 
 
-def scene_settings(config: TaskConfig, cameras: Collection[str] | None = None) -> dict[str, Any]:
+def select_scene_settings(config: TaskConfig, cameras: Collection[str] | None = None) -> dict[str, Any]:
     """Return the values of a task configuration that change the scene or the images.
 
     Keys: those of the configuration; ``randomisation.KEY``; ``objects.count``; ``static_camera`` and ``cameras.NAME``,
@@ -114,7 +114,7 @@ def _select_cameras(settings: Mapping[str, Any], cameras: Collection[str]) -> di
 
 
 def _object_ids(config: TaskConfig) -> set[str]:
-    """Return the asset ids of the objects of a configuration; for ids of another pack, the ids as written."""
+    """Return the asset ids of the objects of a configuration; ids of other packs as in ``objects.ids``."""
     try:
         return set(find_objects(load_pack("builtin"), config))
     except ConfigError:  # ids of another pack

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from robocas_ms3.baselines.baseline import Baseline, OnRead, Precision, Progress, Samples, Split
+from robocas_ms3.baselines.baseline import Baseline, OnRead, Precision, ProgressCallbacks, Samples, Split
 from robocas_ms3.baselines.registry import find_baseline
 from robocas_ms3.baselines.training.record import (
     CHECKPOINT,
@@ -21,7 +21,7 @@ from robocas_ms3.baselines.training.record import (
     WEIGHTS,
     DataRecord,
     RunRecord,
-    find_run,
+    find_run_folder,
     hash_dataset,
     hash_weights,
     package_versions,
@@ -84,7 +84,7 @@ class InitialWeights:
     weights: Checkpoint | None
 
 
-def train_run(options: RunOptions, progress: Progress | None = None) -> RunRecord:
+def train_run(options: RunOptions, progress: ProgressCallbacks | None = None) -> RunRecord:
     """Train a baseline and return the record of the run; continue the run in ``options.out`` if there is one.
 
     Raises:
@@ -98,7 +98,7 @@ def train_run(options: RunOptions, progress: Progress | None = None) -> RunRecor
     from robocas_ms3.baselines.training.supervised import train_supervised
 
     baseline: Any = find_baseline(options.baseline)
-    progress, data = progress or Progress(), options.data
+    progress, data = progress or ProgressCallbacks(), options.data
     _check_data(baseline, data)
     with forbid_exit(f"baseline {options.baseline}"), _open_output(options) as output, ExitStack() as stack:
         recorded = _read_recorded(output, baseline)
@@ -131,7 +131,7 @@ def train_run(options: RunOptions, progress: Progress | None = None) -> RunRecor
             baseline=baseline.name,
             version=baseline.version,
             config=config.model_dump(mode="json"),
-            facts=combine_facts(source.facts, initial, data),
+            facts=choose_facts(source.facts, initial, data),
             data=DataRecord(
                 name=name,
                 hash=data_hash,
@@ -188,20 +188,20 @@ def load_initial_weights(
                 "missing initial weights of a run without a checkpoint",
                 "Pass --init-from as in the first call.",
             )
-            raise TrainingError(what, where=out, expected=recorded.init_from, fix=fix)
+            raise TrainingError(what, where=out, expected=f"the weights of {recorded.init_from}", fix=fix)
         return None
-    folder = find_run(init_from)
+    folder = find_run_folder(init_from)
     record = read_run(folder)
     expected = {"baseline": baseline.name, "version": str(baseline.version)}
     weights = None if has_checkpoint else checkpoints.load_checkpoint(folder / WEIGHTS, expected)
     return InitialWeights(record, f"{folder.resolve().name}, {hash_weights(folder)[:12]}", weights)
 
 
-def combine_facts(own: dict[str, Any], initial: InitialWeights | None, data: Path | None) -> dict[str, Any]:
-    """Return the facts that a run uses: of its own data, or with initial weights of the run they come from.
+def choose_facts(own_facts: dict[str, Any], initial: InitialWeights | None, data: Path | None) -> dict[str, Any]:
+    """Return the facts of a run: those of its own data, or those that belong to its initial weights.
 
     Args:
-        own: facts of the data of this run.
+        own_facts: facts of the data of this run.
         initial: initial weights; None: random weights.
         data: dataset of this run, for errors; None: a baseline that learns in simulation, which uses its own facts.
 
@@ -209,16 +209,16 @@ def combine_facts(own: dict[str, Any], initial: InitialWeights | None, data: Pat
         TrainingError: rate, image sizes, cameras, calibration or sizes of the two runs differ.
     """
     if initial is None:
-        return own
+        return own_facts
     others = initial.record.facts
-    scales = () if data is None else (key for key in own if key in others and key not in _INPUTS)
+    scales = () if data is None else (key for key in own_facts if key in others and key not in _INPUTS)
     for key in (*_INPUTS, *scales):
         tolerance = _TOLERANCE if key in _INPUTS else math.inf
-        if changes := list_setting_changes(others.get(key), own.get(key), key, tolerance):
+        if changes := list_setting_changes(others.get(key), own_facts.get(key), key, tolerance):
             what, where = f"the data has another {key} than the run of --init-from", data or initial.name
             fix = "Convert the data as for that run, choose another run, or omit --init-from."
             raise TrainingError(what, where=where, found=changes[0], fix=fix)
-    return own if data is None else others
+    return own_facts if data is None else others
 
 
 def _check_data(baseline: Baseline, data: Path | None) -> None:
@@ -266,7 +266,7 @@ def _choose_precision(precision: Precision, recorded: RunRecord | None) -> Preci
     return "bf16" if recorded.precision == "bf16" else "fp32"
 
 
-def _read_validation(read: Callable[[Split, OnRead], Samples], progress: Progress) -> Samples | None:
+def _read_validation(read: Callable[[Split, OnRead], Samples], progress: ProgressCallbacks) -> Samples | None:
     """Read the validation samples; None if the dataset has no validation episodes."""
     try:
         return read("val", progress.on_read)

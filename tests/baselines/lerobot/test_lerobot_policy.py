@@ -81,7 +81,7 @@ def test_the_spec_follows_from_the_checkpoint():
 
 @pytest.mark.parametrize("key, shape", [(STATE, (18,)), (EMBEDDING, (7,)), ("observation.images.wrist", (3, 2, 4))])
 def test_other_inputs_are_refused(key, shape):
-    with pytest.raises(EvaluationError, match=f"{key}: the policy has other inputs"):
+    with pytest.raises(EvaluationError, match=f"{key}: unexpected input"):
         made(inputs={**INPUTS, key: shape})
 
 

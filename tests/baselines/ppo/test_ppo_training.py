@@ -11,7 +11,7 @@ from training_runs import read_log, stop_at, train
 from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.ppo import BASELINE
 from robocas_ms3.baselines.registry import BASELINES
-from robocas_ms3.baselines.training.session import Progress
+from robocas_ms3.baselines.training.session import ProgressCallbacks
 from robocas_ms3.core.errors import OutputExistsError, TrainingError
 
 SMALL = {"width": 16, "envs": 4, "test_episodes": 20, "layouts": 10, "train": {"steps": 1280, "batch_size": 64}}
@@ -47,7 +47,7 @@ def test_run_continues_after_ctrl_c(stub, tmp_path):
     again, steps = load_file(run / "checkpoint.safetensors"), []
     assert kept.keys() == again.keys() and any(name.startswith("optimizer.") for name in kept)
     assert all(torch.equal(kept[name], again[name]) for name in kept)
-    train("ppo", None, run, progress=Progress(on_step=lambda done, of: steps.append(done)))
+    train("ppo", None, run, progress=ProgressCallbacks(on_step=lambda done, of: steps.append(done)))
     assert steps == list(range(640, 1281, 64))
     assert [int(row["step"]) for row in read_log(run, "train")] == list(range(64, 1281, 64))
     assert load_file(run / "weights.safetensors")["count"].item() == pytest.approx(1280, abs=1e-3)

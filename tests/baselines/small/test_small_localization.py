@@ -14,7 +14,7 @@ from robocas_ms3.baselines.small.localization import (
     CellAttention,
     Unproject,
     compute_cell_losses,
-    heights_in_base,
+    compute_heights_in_base,
     pixel_to_cell,
     project_points_to_view,
 )
@@ -162,6 +162,6 @@ def test_loss_counts_objects_in_the_image():
 
 def test_heights_are_in_the_base_frame():
     tcp = torch.from_numpy(turned()).float()
-    assert float(heights_in_base(torch.zeros(1, 3), tcp)) == pytest.approx(float(tcp[0, 2, 3]))
+    assert float(compute_heights_in_base(torch.zeros(1, 3), tcp)) == pytest.approx(float(tcp[0, 2, 3]))
     above = tcp[:, :3, :3].transpose(1, 2) @ torch.tensor([0.0, 0.0, 0.1])
-    assert float(heights_in_base(above, tcp)) == pytest.approx(float(tcp[0, 2, 3]) + 0.1)
+    assert float(compute_heights_in_base(above, tcp)) == pytest.approx(float(tcp[0, 2, 3]) + 0.1)

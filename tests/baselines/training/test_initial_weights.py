@@ -10,7 +10,7 @@ from safetensors.torch import load_file
 from stub_baseline import STUB
 from training_runs import assert_same, change_record, stop_at, train
 
-from robocas_ms3.baselines.training.session import Progress, combine_facts, load_initial_weights
+from robocas_ms3.baselines.training.session import ProgressCallbacks, choose_facts, load_initial_weights
 from robocas_ms3.core.errors import OutputExistsError, TrainingError
 from robocas_ms3.evaluation.policies import make_policy
 
@@ -22,7 +22,7 @@ SIMULATION = {"observation_size": 30, "horizon": 100}
 def combine(whole, facts, own):
     change_record(whole, facts=facts)
     initial = load_initial_weights(STUB, whole, None, whole)
-    return combine_facts(own, initial, None if facts is SIMULATION else Path("data"))
+    return choose_facts(own, initial, None if facts is SIMULATION else Path("data"))
 
 
 @pytest.mark.parametrize(
@@ -144,6 +144,6 @@ def test_hardware_changes_are_recorded(whole, data, recorded, changes):
     changes = [change.format(threads=torch.get_num_threads()) for change in changes]  # other tests change it
     change_record(whole, **recorded)
     messages = []
-    train("stub", data, whole, progress=Progress(message=messages.append))
+    train("stub", data, whole, progress=ProgressCallbacks(message=messages.append))
     assert json.loads((whole / "run.json").read_text())["hardware_changes"] == changes
     assert all(any(change in message for message in messages) for change in changes)

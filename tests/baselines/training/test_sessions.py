@@ -20,7 +20,7 @@ from training_runs import assert_finite, assert_same, change_record, read_log, s
 from robocas_ms3.baselines.policy import RunPolicy
 from robocas_ms3.baselines.training import checkpoints, run_folder
 from robocas_ms3.baselines.training.learner import Learner
-from robocas_ms3.baselines.training.session import Progress, merge_configs
+from robocas_ms3.baselines.training.session import ProgressCallbacks, merge_configs
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError, ExtensionError, OutputExistsError, RobocasError, TrainingError
 from robocas_ms3.evaluation.policies import make_policy
@@ -60,7 +60,7 @@ def test_a_stopped_run_continues_bit_identically(whole, data, tmp_path, step, er
     out, steps = tmp_path / "again", []
     with pytest.raises(error):
         train("stub", data, out, progress=stop_at(step, error("stopped")))
-    train("stub", data, out, progress=Progress(on_step=lambda done, total: steps.append(done)))
+    train("stub", data, out, progress=ProgressCallbacks(on_step=lambda done, total: steps.append(done)))
     assert steps[0] == continued_at
     assert_same(whole, out)
 
@@ -155,7 +155,7 @@ def test_a_nan_ends_the_run_and_the_last_checkpoint_stays(stub, data, tmp_path, 
     """A NaN in the loss, or in the gradient alone."""
     out, done = tmp_path / "run", []
     changes = merge_configs(changes, {"train": {"save_every": 1}})
-    progress = Progress(on_step=lambda step, _: done.append(step))
+    progress = ProgressCallbacks(on_step=lambda step, _: done.append(step))
     with pytest.raises(TrainingError):
         train("stub", data, out, changes, progress=progress)
     assert_finite(out)
@@ -185,7 +185,7 @@ def test_a_removed_folder_is_an_error(stub, data, tmp_path, monkeypatch):
         save(path, *what)
 
     with pytest.raises(RobocasError) as caught:
-        train("stub", data, out, progress=Progress(on_step=remove))
+        train("stub", data, out, progress=ProgressCallbacks(on_step=remove))
     assert caught.value.where == out
     monkeypatch.setattr(checkpoints, "save_tensors", remove_and_save)
     with pytest.raises(RobocasError) as caught:
