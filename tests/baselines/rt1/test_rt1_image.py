@@ -129,7 +129,9 @@ def test_both_encoders_start_from_the_weights_of_a_file(weights, prefix, kind, f
 
 def test_images_are_normalised_as_for_the_weights(tmp_path, config, facts):
     assert RT1Config().used_image_std == (0.229, 0.224, 0.225)
-    assert RT1Config(image_weights=tmp_path).used_image_std == pytest.approx([0.229**0.5, 0.224**0.5, 0.225**0.5], abs=1e-5)
+    assert RT1Config(image_weights=tmp_path).used_image_std == pytest.approx(
+        [0.229**0.5, 0.224**0.5, 0.225**0.5], abs=1e-5
+    )
     assert RT1Config(image_weights=tmp_path, image_std=(0.5, 0.5, 0.5)).used_image_std == (0.5, 0.5, 0.5)
     policy = BASELINE.policy(config, facts, BASELINE.model(config, facts))
     assert describe_policy(policy)["image_weights"] == "from scratch"
