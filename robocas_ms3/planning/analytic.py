@@ -1,7 +1,7 @@
 """Batched closed-form inverse kinematics of the Panda for given positions of joint 7.
 
-An arm with another kinematic structure needs a class with the same ``solve``, named by ``inverse_kinematics`` of its
-description.
+An arm with another kinematic structure needs another class with the method ``solve``. Its robot description names the
+class (`RobotDescription.inverse_kinematics`).
 
 The geometry follows Y. He and S. Liu, "Analytical Inverse Kinematics for Franka Emika Panda" (2021). Joint 7 determines
 the wrist. The elbow then has up to two positions on a circle, and each of them has two shoulder configurations.
@@ -19,7 +19,14 @@ UPRIGHT = 1 - 1e-9  # cosine between upper arm and vertical; above it joints 1 a
 
 
 class PandaInverseKinematics:
-    """Link lengths of the Panda from its chain; RobocasError if the chain has another structure."""
+    """Closed-form inverse kinematics of an arm with the joint axes of the Panda.
+
+    Args:
+        chain: chain of the arm, from which the link lengths are read.
+
+    Raises:
+        RobocasError: the chain has other joint axes than the Panda.
+    """
 
     def __init__(self, chain: ArmChain) -> None:
         one, two, three, four, five, six, seven, tcp = chain.links
@@ -44,10 +51,15 @@ class PandaInverseKinematics:
         self.lower, self.upper = chain.lower, chain.upper
 
     def solve(self, tcp_in_base: Array, joint7: Array) -> Array:
-        """Return all configurations that reach TCP poses (M, 4, 4) with given positions of joint 7 (M,), rad.
+        """Return all configurations that reach TCP poses with given positions of joint 7.
+
+        Args:
+            tcp_in_base: (M, 4, 4) TCP poses in the arm's base frame.
+            joint7: (M,) positions of joint 7, rad.
 
         Returns:
-            (M, 4, 7) rad, one configuration per branch; NaN if a branch does not exist or violates a joint limit.
+            (M, 4, 7) rad: four configurations per pose, two positions of the elbow with two configurations of the
+            shoulder each. NaN marks a configuration that does not exist or violates a joint limit.
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             return self._solve(

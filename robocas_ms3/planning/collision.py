@@ -30,12 +30,12 @@ CHUNK = 128  # configurations of a path per batch
 class CollisionChecker:
     """Collision model of the arm, the obstacles and the held object.
 
-    `protocol.Planner` documents the methods without a docstring. Each instance owns its FCL objects, so instances in
-    different threads are independent.
+    Poses and points are in the arm's base frame. `protocol.Planner` documents the methods without a docstring. Each
+    instance owns its FCL objects, so instances in different threads are independent.
 
     Args:
-        urdf: URDF of the arm alone, rooted at its base.
-        srdf: SRDF with the link pairs that need no check.
+        urdf: URDF of the arm alone, with the arm's base as its root link.
+        srdf: SRDF with the pairs of links that need no collision check.
         robot: description of the robot.
 
     Raises:
@@ -104,7 +104,7 @@ class CollisionChecker:
         self._low, self._high = np.concatenate(low), np.concatenate(high)
 
     def is_obstacle_point(self, points: Array) -> NDArray[np.bool_]:
-        """Return a mask (P,) of points (P, 3) that are obstacles: in reach and outside the robot base."""
+        """Return which points (P, 3) of a cloud are obstacles, as a mask (P,): in reach and outside the robot base."""
         keep = np.einsum("ij,ij->i", points, points) <= REACH**2
         for low, high in self._closed_bounds[self._frames == BASE]:
             keep &= ~np.all((points >= low - BASE_MARGIN) & (points <= high + BASE_MARGIN), axis=1)
@@ -128,7 +128,10 @@ class CollisionChecker:
         return np.array([next(found, None) is None for found in self._pairs_in_contact(qpos, width, True)], dtype=bool)
 
     def count_leading_free(self, qpos: Array, *, obstacles: bool = True) -> int:
-        """Return the number of collision-free configurations of a path (M, 7) before the first collision."""
+        """Return the number of configurations of a path (M, 7) before the first one that collides.
+
+        Without ``obstacles`` only self-collisions are checked.
+        """
         for first in range(0, len(qpos), CHUNK):
             chunk = qpos[first : first + CHUNK]
             for row, found in enumerate(self._pairs_in_contact(chunk, self.finger_width, obstacles)):
@@ -137,7 +140,11 @@ class CollisionChecker:
         return len(qpos)
 
     def is_path_free(self, qpos: Array, *, obstacles: bool = True) -> bool:
-        """Return whether a path (M, 7) is collision-free; every SPARSE-th configuration is checked first."""
+        """Return whether all configurations of a path (M, 7) are collision-free.
+
+        Every SPARSE-th configuration is checked first, since most collisions span several configurations. Without
+        ``obstacles`` only self-collisions are checked.
+        """
         if len(qpos) > 2 * SPARSE:
             qpos = np.concatenate([qpos[i::SPARSE] for i in (SPARSE - 1, *range(SPARSE - 1))])
             first = len(qpos) // SPARSE
@@ -152,7 +159,7 @@ class CollisionChecker:
         return sorted({name for pair in found for name in pair})
 
     def _pairs_in_contact(self, qpos: Array, width: float, obstacles: bool) -> Iterator[Iterator[tuple[str, str]]]:
-        """Yield for each configuration (M, 7) a lazy iterator over the names of its colliding pairs."""
+        """Yield one lazy iterator per configuration (M, 7) over the pairs of names that collide there."""
         assert np.isfinite(qpos).all(), "NaN would compare as collision-free"
         if not len(qpos):
             return

@@ -29,9 +29,11 @@ class CollisionPart:
     """One convex collision geometry of a link.
 
     Attributes:
-        frame: frame that the part moves with: ``BASE``, 0 to 6 (links 1 to 7), or ``TCP``.
-        pose: (4, 4) pose of the part in that frame with closed fingers.
-        slide: (3,) displacement in that frame per metre of the finger joint; zero for parts that no finger moves.
+        link: name of the link.
+        frame: frame to which the part is fixed: ``BASE``, 0 to 6 (links 1 to 7), or ``TCP``.
+        pose: (4x4) pose of the part in ``frame`` with closed fingers.
+        slide: (3,) displacement in ``frame`` per metre of finger position; zero for parts that no finger joint moves.
+        geometry: FCL geometry.
         corners: (V, 3) points whose convex hull contains the part, in the part's frame, m.
     """
 
@@ -42,16 +44,22 @@ class CollisionPart:
     geometry: Any
     corners: Array
 
-    def bounds(self, finger: float) -> Array:
-        """Return the bounding box (2, 3) of the part in its frame for a finger position in m."""
-        points = self.corners @ self.pose[:3, :3].T + self.pose[:3, 3] + finger * self.slide
+    def bounds(self, finger_position: float) -> Array:
+        """Return the lower and upper corner (2, 3) of the part's bounding box in ``frame``, m.
+
+        ``finger_position`` is the position of both finger joints, m; 0: closed.
+        """
+        points = self.corners @ self.pose[:3, :3].T + self.pose[:3, 3] + finger_position * self.slide
         return np.array([points.min(axis=0), points.max(axis=0)])
 
 
 def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPart]:
-    """Read the collision parts of all links below the arm's base link; raise RobotDescriptionError.
+    """Read the collision parts of the arm's base link and of all links that descend from it.
 
-    Joints other than arm and finger joints are at their zero position.
+    Joints other than arm and finger joints are at position 0.
+
+    Raises:
+        RobotDescriptionError: a link or mesh is missing or unusable, or a geometry is not supported.
     """
     robot, file = chain.robot, RobotXml(urdf)
     links = {file.read_attribute(link, "name"): link for link in file.root.iterfind("link")}
@@ -83,7 +91,10 @@ def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPar
 
 
 def read_link_pairs(urdf: Path | str, srdf: Path | str, parts: list[CollisionPart]) -> list[tuple[int, int]]:
-    """Return pairs of part indices (i < j) to check: not adjacent and not disabled in the SRDF."""
+    """Return the pairs (i, j), i < j, of indices of ``parts`` that need a collision check.
+
+    Pairs of the same link, of adjacent links, and of links that the SRDF disables are omitted.
+    """
     ignored = {frozenset((joint.parent, joint.child)) for joint in RobotXml(urdf).joints()}
     file = RobotXml(srdf)
     for pair in file.root.iterfind("disable_collisions"):

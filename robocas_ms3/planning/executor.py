@@ -1,4 +1,4 @@
-"""Run planned motions in an environment and store the actions since the reset."""
+"""Execute planned motions in an environment and store the actions since the reset."""
 
 from __future__ import annotations
 
@@ -18,7 +18,13 @@ OPEN, CLOSED = 1.0, -1.0
 
 @dataclass
 class Segment:
-    """A sub-goal of the demonstration, valid from action index ``first`` on."""
+    """Segment of the demonstration with one sub-goal.
+
+    Attributes:
+        goal_type: type of the sub-goal, e.g. ``transfer object``.
+        goal_description: sub-goal as a sentence.
+        first: index of the first action of the segment.
+    """
 
     goal_type: str
     goal_description: str
@@ -27,17 +33,22 @@ class Segment:
 
 @dataclass
 class MotionExecutor:
-    """MotionExecutor of motions in one environment with control mode ``pd_joint_pos`` or ``pd_joint_pos_base``.
+    """Executor that sends planned motions to one environment as joint targets.
 
     Attributes:
-        env: environment with ``num_envs`` = 1, possibly wrapped by a recorder.
-        actions: actions since the reset, (8,) each, or (11,) with base joints.
-        segments: sub-goals since the reset.
+        env: environment with ``num_envs`` = 1 and control mode ``pd_joint_pos`` or ``pd_joint_pos_base``, possibly
+            wrapped by a recorder.
+        seed: seed of the episode.
+        actions: actions since the reset, (8,) each: 7 arm joints in rad and the gripper command; with
+            ``pd_joint_pos_base`` (11,): also x in m, y in m and yaw in rad of the base.
+        segments: segments since the reset, one per sub-goal.
         info: info of the last step or reset.
-        gripper: last gripper command.
+        gripper: last gripper command, 1 open or -1 closed.
         base: (3,) last command of the base joints: x m, y m, yaw rad.
-        facts: counters of the policy that are recorded, e.g. ``pushes``.
-        check_open_loop: replays the actions so far open loop; raises UnrecoverableError if the result differs.
+        seconds: CPU seconds of the episode.
+        facts: counters that the policy sets and the recording stores, e.g. ``pushes``.
+        check_open_loop: function that replays the actions since the reset open loop; it raises UnrecoverableError if
+            the target deviates from the recording.
     """
 
     env: gym.Env
@@ -68,9 +79,14 @@ class MotionExecutor:
         self.facts = {}
 
     def follow(self, trajectory: Trajectory, *, until: str | None = None) -> bool:
-        """Send the rows of a trajectory to the arm with the last gripper command.
+        """Send the rows of a trajectory to the arm, one per control step, with the last gripper command.
 
-        Stop as soon as the flag ``until`` of ``info`` is set; return whether it is set, or True without ``until``.
+        Args:
+            trajectory: motion of the arm.
+            until: key of ``info``, e.g. ``success``; the motion stops as soon as this flag is set.
+
+        Returns:
+            Whether the flag is set after the last step; True without ``until``.
         """
         for qpos in trajectory.qpos:
             if until and self.flag(until):
@@ -78,32 +94,32 @@ class MotionExecutor:
             self._step(self._action(qpos))
         return until is None or self.flag(until)
 
-    def move_gripper(self, command: float, hold: Array, *, seconds: float) -> None:
-        """Command the gripper (``OPEN`` or ``CLOSED``) for some seconds; the arm holds a configuration (7,)."""
+    def move_gripper(self, command: float, arm_qpos: Array, *, seconds: float) -> None:
+        """Command the gripper (``OPEN`` or ``CLOSED``) for some seconds; the arm stays at ``arm_qpos`` (7,)."""
         self.gripper = command
         for _ in range(max(1, round(seconds / self.dt))):
-            self._step(self._action(hold))
+            self._step(self._action(arm_qpos))
 
     @property
     def drives_base(self) -> bool:
-        """Whether actions include the base joints."""
+        """Whether actions contain targets of the base joints."""
         return self.base_env.control_mode.endswith("_base")
 
-    def drive(self, waypoints: Array, hold: Array) -> None:
-        """Send base joint targets (T, 3), one per control step, while the arm holds a configuration (7,).
+    def drive(self, waypoints: Array, arm_qpos: Array) -> None:
+        """Send targets of the base joints, one per control step; the arm stays at ``arm_qpos`` (7,).
 
-        Targets are x m, y m, yaw rad.
+        ``waypoints`` (T, 3) contains x m, y m, yaw rad.
         """
         for base in waypoints:
             self.base = base
-            self._step(self._action(hold))
+            self._step(self._action(arm_qpos))
 
     def _action(self, qpos: Array) -> np.ndarray:
         base = self.base if self.drives_base else ()
         return np.concatenate([qpos, [self.gripper], base]).astype(np.float32)
 
     def start_subgoal(self, goal_type: str, goal_description: str) -> None:
-        """Start a sub-goal with the next action; starting the current sub-goal again has no effect."""
+        """Start a segment with a sub-goal at the next action, unless the current segment has the same sub-goal."""
         if self.segments and self.segments[-1].first == len(self.actions):
             self.segments.pop()
         if not self.segments or (self.segments[-1].goal_type, self.segments[-1].goal_description) != (
@@ -113,7 +129,7 @@ class MotionExecutor:
             self.segments.append(Segment(goal_type, goal_description, len(self.actions)))
 
     def flag(self, name: str) -> bool:
-        """Return a flag of the last ``info``, e.g. ``success``."""
+        """Return a boolean value of ``info`` of the last step by its key, e.g. ``success``."""
         return bool(self.info[name][0])
 
     def _step(self, action: np.ndarray) -> None:

@@ -31,13 +31,13 @@ TEMPERATURE = 0.15
 
 @dataclass(frozen=True)
 class Grasps:
-    """Candidate grasps; the second half repeats the first half with the wrist turned by 180 deg.
+    """Candidate grasps of an object: K annotated grasps, then the same grasps with the wrist turned by 180 deg.
 
     Attributes:
         tcp_in_world: (2K, 4, 4) TCP poses.
-        widths: (2K,) gripper opening at the object, m.
+        widths: (2K,) distance between the finger pads when they touch the object, m.
         qualities: (2K,) annotated qualities, greater is better.
-        index: (2K,) indices of the annotated grasps.
+        index: (2K,) indices of the grasps in the annotations.
     """
 
     tcp_in_world: Array
@@ -52,7 +52,14 @@ class Grasps:
 def filter_grasps(
     annotations: Annotations, object_in_world: Array, arm_base_in_world: Array, approach: Approach = "top"
 ) -> Grasps:
-    """Return the annotated grasps that a robot with this base pose can try, from above or from the front."""
+    """Return the annotated grasps that are narrow enough and have a suitable direction.
+
+    Args:
+        annotations: annotations of the object.
+        object_in_world: (4x4) pose of the object.
+        arm_base_in_world: (4x4) pose of the arm's base.
+        approach: direction of the approach, from above (``top``) or from the front (``front``).
+    """
     poses = object_in_world @ annotations.grasps_tcp_in_object
     base_to_object = object_in_world[:3, 3] - arm_base_in_world[:3, 3]
     passed = annotations.grasp_widths <= MAX_WIDTH
@@ -66,9 +73,9 @@ def filter_grasps(
 
 
 def grip_margins(tcp: Array, widths: Array, surface: Array) -> Array:
-    """Return the margin (N,) of grasps against position errors, 0 to 1.
+    """Return the robustness (N,) of grasps against position errors, 0 to 1.
 
-    A grasp has margin 1 if at least ``PAD_POINTS`` surface points are between the pads for each offset in
+    The value is 1 if at least ``PAD_POINTS`` surface points are between the pads for each offset in
     ``GRIP_SHIFTS``, and each open finger has at least ``FINGER_CLEARANCE`` to the object.
 
     Args:
@@ -98,15 +105,17 @@ def score_grasps(
 ) -> Array:
     """Return scores (N,) of grasps; greater is better.
 
-    The score is the weighted sum of the quality relative to the best, the proximity of the TCP to the object's centre
-    (falls by a factor e per 3 cm), the steepness (1 straight down, 0 horizontal; reversed for a front approach), the
-    proximity in joint space and the margin.
+    The score is a weighted sum of five terms: the quality relative to the best quality; the proximity of the TCP to the
+    object's centre, which falls by a factor e per 3 cm; the steepness (approach from above: 1 straight down, 0
+    horizontal; from the front: 0 straight down, 1 horizontal); minus the joint displacement; and the margin.
 
     Args:
         tcp: (N, 4, 4) TCP poses in any frame with a vertical z axis.
-        qualities, margins: (N,), greater is better.
+        qualities: (N,) annotated qualities.
+        margins: (N,) result of `grip_margins`.
         turns: (N,) largest joint displacement on the way to the grasp, rad, which determines the duration.
         object_center: (3,) centre of the object in the frame of ``tcp``.
+        approach: direction of the approach.
     """
     quality = qualities / max(float(np.abs(qualities).max()), 1e-9)
     distance = np.linalg.norm(tcp[:, :3, 3] - object_center, axis=1)
@@ -116,9 +125,9 @@ def score_grasps(
 
 
 def sample_order(rng: np.random.Generator, scores: Array) -> NDArray[np.int_]:
-    """Order grasps randomly by scores (N,).
+    """Sample an order (N,) of grasp indices in which grasps with greater scores (N,) tend to come first.
 
-    A grasp precedes another one with a score 0.15 greater with probability 0.27.
+    If the score of a grasp is 0.15 below that of another grasp, it comes before the other with probability 0.27.
     """
     # Gumbel noise gives draws without replacement, weighted by exp(score / TEMPERATURE)
     return np.argsort(-(scores + TEMPERATURE * rng.gumbel(size=len(scores))), kind="stable")

@@ -36,15 +36,19 @@ DAMPING = 1e-8  # added to the diagonal of J J^T, so that it is invertible at si
 
 
 class ArmChain:
-    """Chain of seven revolute joints about z of their links, with the TCP fixed to the last link.
+    """Forward kinematics of an arm with seven revolute joints about the z axes of their links.
 
     The class computes the frames of all links in NumPy without BLAS, so that plans are reproducible to the bit.
     Controllers on a GPU use `robots.kinematics.SerialChain` instead.
 
     Attributes:
-        links: eight fixed transforms (4x4): from each link to the next one at 0 rad, the last one to the TCP.
+        robot: description of the robot.
+        links: eight fixed transforms (4x4): the pose of each link in the previous link at 0 rad, and the pose of the
+            TCP in link 7.
         hand_in_tcp: (4x4) pose of the hand link in the TCP frame.
-        limits: (7, 2) lower and upper joint limits, rad; ``lower`` and ``upper`` (7,) include ``LIMIT_MARGIN``.
+        limits: (7, 2) lower and upper joint limits, rad.
+        lower: (7,) lower joint limits plus ``LIMIT_MARGIN``, rad.
+        upper: (7,) upper joint limits minus ``LIMIT_MARGIN``, rad.
 
     Raises:
         RobotDescriptionError: the URDF is missing or malformed, or describes another arm.
@@ -79,16 +83,17 @@ class ArmChain:
         self.lower, self.upper = self.limits[:, 0] + LIMIT_MARGIN, self.limits[:, 1] - LIMIT_MARGIN
 
     def with_tool_offset(self, distance: float) -> ArmChain:
-        """Return a copy whose end is shifted from the TCP by ``distance`` (m) against the approach axis."""
+        """Return a copy of the chain with the TCP shifted by ``distance`` (m) against the approach axis."""
         chain, back = copy(self), np.eye(4)
         back[2, 3] = -distance
         chain.links = [*self.links[:-1], self.links[-1] @ back]
         return chain
 
     def link_frames(self, qpos: Array) -> tuple[Array, Array]:
-        """Compute rotations (8, M, 3, 3) and positions (8, M, 3) of links 1 to 7 and the TCP at (M, 7).
+        """Compute the poses of links 1 to 7 and of the TCP at configurations (M, 7).
 
-        They are in the arm's base frame.
+        Returns:
+            Rotation matrices (8, M, 3, 3) and positions (8, M, 3) m, in the arm's base frame.
         """
         count, qpos = len(qpos), np.ascontiguousarray(qpos)
         rotations, positions = np.empty((8, count, 3, 3)), np.empty((8, count, 3))
@@ -107,12 +112,15 @@ class ArmChain:
         return rotations, positions
 
     def tcp(self, qpos: Array) -> Array:
-        """Compute TCP poses (M, 4, 4) in the base frame at configurations (M, 7)."""
+        """Compute the TCP poses (M, 4, 4) in the arm's base frame at configurations (M, 7)."""
         rotations, positions = self.link_frames(qpos)
         return _poses(rotations[7], positions[7])
 
     def jacobian(self, qpos: Array) -> tuple[Array, Array]:
-        """Compute TCP poses (M, 4, 4) and Jacobians (M, 6, 7) in the base frame, linear rows first."""
+        """Compute the TCP poses (M, 4, 4) and Jacobians (M, 6, 7) at configurations (M, 7), in the arm's base frame.
+
+        The first three rows of a Jacobian are linear, the last three angular.
+        """
         rotations, positions = self.link_frames(qpos)
         axes = rotations[:7, :, :, 2].transpose(1, 2, 0)
         arm = (positions[7] - positions[:7]).transpose(1, 2, 0)
@@ -124,9 +132,9 @@ class ArmChain:
 
 
 def joint_distance(qpos: Array, near: Array) -> Array:
-    """Return the distance of configurations (..., 7): the largest joint displacement plus 0.2 of the norm.
+    """Return the distance (...) of configurations (..., 7) to the configuration ``near`` (7,), rad.
 
-    The largest displacement determines the duration of a motion.
+    The distance is the largest joint displacement, which determines the duration of a motion, plus 0.2 of the norm.
     """
     away = np.abs(qpos - near)
     return away.max(axis=-1) + 0.2 * np.sqrt((away * away).sum(axis=-1))
@@ -139,7 +147,13 @@ def _poses(rotation: Array, position: Array) -> Array:
 
 
 class InverseKinematics:
-    """Inverse kinematics of an arm by the closed form in its description, without collision checks."""
+    """Inverse kinematics of an arm for batches of TCP poses in the arm's base frame, without collision checks.
+
+    The class samples positions of joint 7 and calls the closed-form solver that the robot description names.
+
+    Args:
+        chain: forward kinematics of the arm.
+    """
 
     def __init__(self, chain: ArmChain) -> None:
         self.chain = chain
@@ -147,10 +161,11 @@ class InverseKinematics:
         self._geometry = import_object(self.chain.robot.inverse_kinematics)(self.chain)
 
     def nearest_solutions(self, tcp_in_base: Array, near: Array) -> tuple[NDArray[np.bool_], Array]:
-        """Find the solution nearest to a configuration (7,) for each pose (N, 4, 4).
+        """Find the solution nearest to the configuration ``near`` (7,) for each TCP pose (N, 4, 4).
 
         Returns:
-            A mask (N,) of the poses with a solution within the joint limits, and the solutions (N, 7), NaN elsewhere.
+            Mask (N,) of the poses that have a solution within the joint limits; solutions (N, 7), NaN where the mask is
+            False.
         """
         poses, near = np.asarray(tcp_in_base, dtype=np.float64).reshape(-1, 4, 4), np.asarray(near, dtype=np.float64)
         if len(poses) == 0:
@@ -162,13 +177,17 @@ class InverseKinematics:
         return np.isfinite(qpos[:, 0]), qpos
 
     def all_solutions(self, tcp_in_base: Array, near: Array) -> tuple[Array, NDArray[np.intp]]:
-        """Find all solutions (M, 7) for poses (N, 4, 4), and the index of the pose of each solution (M,)."""
+        """Find all solutions for TCP poses (N, 4, 4), with positions of joint 7 sampled from ``near`` (7,).
+
+        Returns:
+            Configurations (M, 7) of all poses; index (M,) of the pose of each configuration.
+        """
         found = self._solve(np.asarray(tcp_in_base, dtype=np.float64), np.asarray(near, dtype=np.float64), JOINT7_STEP)
         exists = np.isfinite(found[..., 0])
         return found[exists], np.nonzero(exists)[0]
 
     def distinct_solutions(self, tcp_in_base: Array, near: Array) -> list[Array]:
-        """Find distinct solutions (7,) for one pose (4x4), the nearest to ``near`` first."""
+        """Find distinct solutions (7,) for one TCP pose (4x4), the solution nearest to ``near`` (7,) first."""
         found = self._solve(np.asarray(tcp_in_base, dtype=np.float64)[None], near, JOINT7_FINE_STEP)[0]
         found = found[np.isfinite(found[:, 0])]
         kept: list[Array] = []
@@ -178,7 +197,7 @@ class InverseKinematics:
         return kept[:MAX_SOLUTIONS]
 
     def _solve(self, poses: Array, near: Array, step: float) -> Array:
-        """Solve poses (N, 4, 4) for sampled positions of joint 7, including ``near``; return (N, K, 7)."""
+        """Return the solutions (N, K, 7) of poses (N, 4, 4) for positions of joint 7 ``step`` rad apart."""
         first, last = np.ceil((self.lower[6] - near[6]) / step), np.floor((self.upper[6] - near[6]) / step)
         turns = np.clip(near[6] + step * np.arange(first, last + 1), self.lower[6], self.upper[6])
         solved = self._geometry.solve(np.repeat(poses, len(turns), axis=0), np.tile(turns, len(poses)))
@@ -186,7 +205,7 @@ class InverseKinematics:
 
 
 def to_rotation_vectors(rotations: Array) -> Array:
-    """Return rotation vectors (M, 3), rad, of norm at most pi, for rotation matrices (M, 3, 3)."""
+    """Convert rotation matrices (M, 3, 3) to rotation vectors (M, 3), rad, of norm at most pi."""
     twice_sine_axis = rotations[:, (2, 0, 1), (1, 2, 0)] - rotations[:, (1, 2, 0), (2, 0, 1)]
     sine = np.sqrt(np.einsum("mi,mi->m", twice_sine_axis, twice_sine_axis)) / 2
     cosine = (np.einsum("mii->m", rotations) - 1) / 2
@@ -199,17 +218,18 @@ def to_rotation_vectors(rotations: Array) -> Array:
 
 
 def apply_newton_step(chain: ArmChain, qpos: Array, goals: Array) -> tuple[Array, Array]:
-    """Apply one damped Newton step towards a TCP pose to each configuration, within the joint limits.
+    """Move each configuration by one damped Newton step towards a TCP pose, within the joint limits.
 
     The step has minimum norm. It is computed without BLAS and LAPACK, since the last bits of their results depend on
     the processor and on the number of threads.
 
     Args:
-        qpos: (M, 7) rad.
-        goals: (M, 4, 4) TCP poses in the base frame.
+        chain: forward kinematics of the arm.
+        qpos: (M, 7) configurations, rad.
+        goals: (M, 4, 4) TCP poses in the arm's base frame.
 
     Returns:
-        The next configurations (M, 7), and the pose errors (M,) of ``qpos``: norm over m and rad.
+        Configurations (M, 7) after the step; pose errors (M,) before the step, norm over m and rad.
     """
     poses, jacobian = chain.jacobian(qpos)
     error = np.empty((len(qpos), 6))
@@ -222,7 +242,7 @@ def apply_newton_step(chain: ArmChain, qpos: Array, goals: Array) -> tuple[Array
 
 
 def solve_positive_definite(matrices: Array, values: Array) -> Array:
-    """Solve positive definite systems (M, N, N) with right-hand sides (M, N) by Gauss-Jordan elimination."""
+    """Return the solutions (M, N) of positive definite systems (M, N, N) with right-hand sides (M, N)."""
     rows = np.concatenate([matrices, values[:, :, None]], axis=2)
     for pivot in range(rows.shape[1]):
         rows[:, pivot] /= rows[:, pivot, pivot, None]
@@ -233,15 +253,22 @@ def solve_positive_definite(matrices: Array, values: Array) -> Array:
 
 
 def solve_straight_line(chain: ArmChain, start: Array, tcp_in_base: Array, *, stage: str) -> Array:
-    """Compute configurations along a straight line of the TCP from a configuration (7,) to a pose (4x4).
+    """Compute configurations with the TCP on a straight line from its pose at ``start`` to another pose.
 
     The position is interpolated linearly, the orientation along the shortest rotation.
 
+    Args:
+        chain: forward kinematics of the arm.
+        start: (7,) first configuration.
+        tcp_in_base: (4x4) last TCP pose in the arm's base frame.
+        stage: stage of a ``PlanningError``.
+
     Returns:
-        (n, 7) configurations whose TCP poses are at most 1 cm and 3 deg apart; the first one is ``start``.
+        (n, 7) configurations; the TCP poses of neighbours are at most 1 cm and 3 deg apart.
 
     Raises:
-        PlanningError: reason ``line_unreachable`` or ``line_joint_jump``.
+        PlanningError: reason ``line_unreachable`` (a pose is out of reach) or ``line_joint_jump`` (a joint would have
+            to jump).
     """
     start = np.asarray(start, dtype=np.float64)
     goals = _interpolate_poses(chain.tcp(start[None])[0], tcp_in_base)
@@ -256,7 +283,7 @@ def solve_straight_line(chain: ArmChain, start: Array, tcp_in_base: Array, *, st
 
 
 def _solve_simultaneously(chain: ArmChain, start: Array, goals: Array) -> Array | None:
-    """Solve all poses (n, 4, 4) of a line at once; return a path (n + 1, 7), or None.
+    """Return a path (n + 1, 7) from ``start`` through all poses (n, 4, 4) of a line, solved at once, or None.
 
     Initial estimates come from one Newton step to every ``ESTIMATE_STRIDE``-th pose.
     """

@@ -52,9 +52,10 @@ class PandaArmMotionPlanningSolver:
             ManiSkill's ``panda`` or ``panda_wristcam`` or a robot of this package; wrappers are stepped too.
         base_pose: pose of the robot's root link; default: the pose in the simulation at each call.
         vis: whether to show every step in ManiSkill's viewer, which needs a display.
-        joint_vel_limits, joint_acc_limits: limits of each arm joint, rad/s and rad/s^2.
-        backend: name of the motion planner.
-        ignored: arguments of ManiSkill's solver that have no effect here, see ``IGNORED``.
+        joint_vel_limits: velocity limit of each arm joint, rad/s.
+        joint_acc_limits: acceleration limit of each arm joint, rad/s^2.
+        backend: name of the motion planner, e.g. ``rrt_connect``.
+        ignored: the arguments in ``IGNORED``, which ManiSkill's solver has and which have no effect here.
 
     Attributes:
         planner: the motion planner; its poses are in the frame of the arm's base.
@@ -82,7 +83,7 @@ class PandaArmMotionPlanningSolver:
             raise TypeError(f"unexpected arguments: {', '.join(sorted(unknown))}")
         self.env, self.base_env, self.vis = env, cast("BaseEnv", env.unwrapped), vis
         if self.base_env.num_envs != 1:
-            what, fix = "the solver supports one environment only", "Create the environment with num_envs=1."
+            what, fix = "unsupported number of environments", "Create the environment with num_envs=1."
             raise RobocasError(what, where="num_envs", expected=1, found=self.base_env.num_envs, fix=fix)
         self.control_mode = str(self.base_env.control_mode)
         if self.control_mode not in CONTROL_MODES:
@@ -114,37 +115,62 @@ class PandaArmMotionPlanningSolver:
     def move_to_pose_with_RRTConnect(
         self, pose: sapien.Pose | Pose, dry_run: bool = False, refine_steps: int = 0
     ) -> Any:
-        """Move the TCP to a pose on a collision-free path; repeat the last target for ``refine_steps`` steps.
+        """Move the TCP to a pose in the world frame on a collision-free path.
+
+        Args:
+            pose: final pose of the TCP.
+            dry_run: whether to return the planned `Trajectory` without stepping the environment.
+            refine_steps: number of control steps for which the last joint targets are repeated.
 
         Returns:
-            The last step; with ``dry_run`` the planned trajectory, and the environment is not stepped.
+            Result of the last ``env.step``, or the planned `Trajectory`.
         """
         start, goal = self._prepare(pose)
         result = self.planner.plan_to_pose(start, goal, stage="move_to_pose_with_RRTConnect")
         return result if dry_run else self.follow_path(result, refine_steps)
 
     def move_to_pose_with_screw(self, pose: sapien.Pose | Pose, dry_run: bool = False, refine_steps: int = 0) -> Any:
-        """Move the TCP to a pose on a straight line with the shortest rotation; see the RRT-Connect method."""
+        """Move the TCP to a pose in the world frame on a straight line, with the shortest rotation.
+
+        Args:
+            pose: final pose of the TCP.
+            dry_run: whether to return the planned `Trajectory` without stepping the environment.
+            refine_steps: number of control steps for which the last joint targets are repeated.
+
+        Returns:
+            Result of the last ``env.step``, or the planned `Trajectory`.
+        """
         start, goal = self._prepare(pose)
         result = self.planner.plan_straight(start, goal, stage="move_to_pose_with_screw")
         return result if dry_run else self.follow_path(result, refine_steps)
 
     def follow_path(self, result: Trajectory, refine_steps: int = 0) -> Step:
-        """Send the joint targets of a trajectory, one per control step, with the last gripper command."""
+        """Send the rows of a trajectory as joint targets, one per control step, with the last gripper command.
+
+        The last row is sent for ``refine_steps`` more control steps. Returns the result of the last ``env.step``.
+        """
         qpos = np.concatenate([result.qpos, np.repeat(result.qpos[-1:], refine_steps, axis=0)])
         qvel = np.gradient(np.concatenate([self._arm_qpos[None], qpos]), result.dt, axis=0)[1:]
         qvel[len(result.qpos) - 1 :] = 0
         return self._run(qpos, qvel)
 
     def open_gripper(self, t: int = 6, gripper_state: float = OPEN) -> Step:
-        """Command the gripper to open for ``t`` control steps; later motions keep the command."""
+        """Send a gripper command, by default open, for ``t`` control steps; later motions keep the command.
+
+        Returns the result of the last ``env.step``.
+        """
         return self._move_gripper(t, gripper_state)
 
     def close_gripper(self, t: int = 6, gripper_state: float = CLOSED) -> Step:
         return self._move_gripper(t, gripper_state)
 
     def add_box_collision(self, extents: Array, pose: sapien.Pose | Pose) -> None:
-        """Add a box to the obstacles: edge lengths (3,) m, pose of its centre."""
+        """Add a box to the obstacles.
+
+        Args:
+            extents: (3,) edge lengths, m.
+            pose: pose of the box's centre in the world frame.
+        """
         edges = np.asarray(extents, dtype=np.float64)
         if not ((edges > 0) & (edges < np.inf)).all():
             what, expected = "invalid box extents", "three positive edge lengths in m"
@@ -154,7 +180,7 @@ class PandaArmMotionPlanningSolver:
         self.add_obstacles([Obstacle("box", Shape(hulls=(corners,)), _matrix(pose, "add_box_collision"))])
 
     def add_collision_pts(self, pts: Array) -> None:
-        """Add surface points (P, 3) m, about 5 mm apart, to the obstacles; an empty array adds nothing."""
+        """Add surface points (P, 3) in the world frame, about 5 mm apart, to the obstacles."""
         points = np.asarray(pts, dtype=np.float64)
         if points.size and points.shape[-1] != 3:  # a transposed array would be reshaped to wrong points
             what, where = "invalid shape of points", "add_collision_pts"
@@ -165,7 +191,7 @@ class PandaArmMotionPlanningSolver:
             self.add_obstacles([Obstacle("points", Shape(points=points), np.eye(4))])
 
     def add_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
-        """Add obstacles with world poses, as returned by ``PlanningScene.obstacles_in_world``."""
+        """Add obstacles whose poses are in the world frame, such as those of `PlanningScene.obstacles_in_world`."""
         self._obstacles += obstacles
 
     def clear_collisions(self) -> None:
@@ -184,7 +210,7 @@ class PandaArmMotionPlanningSolver:
         return qpos[[self._joints.index(name) for name in joints]]
 
     def _prepare(self, pose: sapien.Pose | Pose) -> tuple[Array, Array]:
-        """Update the planner's scene; return the start (7,) and the goal (4x4) in the arm's base frame."""
+        """Set the planner's obstacles; return the arm's configuration (7,) and ``pose`` (4x4) in its base frame."""
         base = self.arm_base_in_world
         goal = inverse(base) @ _matrix(pose, "pose")
         self.planner.set_scene(to_arm_base_frame(self._obstacles, base))
@@ -225,7 +251,7 @@ def _require_finite(values: Array, where: str, fix: str = "Check the computation
 
 
 def _robot_spec(agent: BaseAgent) -> RobotSpec:
-    """Return the robot specification of an agent; for ManiSkill's fixed Pandas, with ManiSkill's URDF."""
+    """Return the robot specification of an agent; make one from ManiSkill's URDF for its fixed-base Pandas."""
     if isinstance(agent, MobileManipulator):
         return agent.spec
     uid, description = str(agent.uid), replace(MOBILE_PANDA, uid=str(agent.uid), finger_extension=0.0, envelope=None)

@@ -18,11 +18,11 @@ SPARSE = 8  # every SPARSE-th configuration of an edge is checked first
 
 
 class BudgetExceededError(Exception):
-    """The budget of collision checks is used up."""
+    """The path search has used its budget of collision checks."""
 
 
 class _Tree:
-    """Search tree of configurations."""
+    """Search tree of configurations (n,), with the index of the parent of each node."""
 
     def __init__(self, roots: list[Array]) -> None:
         self.qpos = np.empty((256, len(roots[0])))
@@ -54,10 +54,11 @@ class PathSearch:
     """RRT-Connect path search in joint space.
 
     Args:
-        count_leading_free: function that returns the number of free configurations (M, n) before the first collision.
-        lower, upper: (n,) joint limits, rad.
-        step: maximum extension of a tree, rad (norm over joints).
-        spacing: distance between checks along an edge, rad (norm over joints).
+        count_leading_free: function that returns the number of configurations (M, n) before the first collision.
+        lower: (n,) lower joint limits, rad.
+        upper: (n,) upper joint limits, rad.
+        step: maximum extension of a tree per sample, rad (norm over joints).
+        spacing: distance between collision checks along an edge, rad (norm over joints).
     """
 
     def __init__(
@@ -68,7 +69,11 @@ class PathSearch:
         self._remaining_checks = 0
 
     def _edge_points(self, a: Array, b: Array) -> Array:
-        """Return configurations (M, n) on the edge from ``a`` (free) to ``b``; charge the budget."""
+        """Return configurations (M, n) to check on the edge from ``a`` to ``b``, without ``a``; reduce the budget by M.
+
+        Raises:
+            BudgetExceededError: the budget is smaller than M.
+        """
         count = max(1, int(np.ceil(np.linalg.norm(b - a) / self.spacing)))
         if self._remaining_checks < count:
             raise BudgetExceededError
@@ -76,7 +81,10 @@ class PathSearch:
         return a + (b - a) * (np.arange(1, count + 1) / count)[:, None]
 
     def is_edge_free(self, a: Array, b: Array) -> bool:
-        """Check the edge from ``a`` (assumed free) to ``b``, every SPARSE-th configuration first."""
+        """Return whether the edge from ``a`` (collision-free) to ``b`` is collision-free.
+
+        Every SPARSE-th configuration is checked first. Raises BudgetExceededError.
+        """
         points = self._edge_points(a, b)
         points = np.concatenate([points[i::SPARSE] for i in (SPARSE - 1, *range(SPARSE - 1))])
         return self._free_until(points) == len(points)
@@ -84,7 +92,10 @@ class PathSearch:
     def connect(
         self, start: Array, goals: list[Array], rng: np.random.Generator, *, max_checks: int
     ) -> list[Array] | None:
-        """Return waypoints from ``start`` to one of ``goals`` (all free), or None if the budget is used up."""
+        """Return waypoints (n,) from ``start`` to one of ``goals``, or None after ``max_checks`` collision checks.
+
+        ``start`` and ``goals`` are collision-free configurations (n,).
+        """
         self._remaining_checks = max_checks
         trees = (_Tree([start]), _Tree(goals))
         grow, other = 0, 1
@@ -104,7 +115,10 @@ class PathSearch:
             return None
 
     def _sample(self, start: Array, goals: list[Array], rng: np.random.Generator) -> Array:
-        """Sample a configuration; half of the samples are near start and goal, since most detours are small."""
+        """Sample a configuration (n,) within the joint limits.
+
+        Half of the samples are near the straight motion from ``start`` to a goal, since most detours are small.
+        """
         if rng.random() < 0.5:
             return rng.uniform(self._lower, self._upper)
         goal = goals[int(rng.integers(len(goals)))]
@@ -112,10 +126,10 @@ class PathSearch:
         return rng.uniform(np.maximum(low, self._lower), np.minimum(high, self._upper))
 
     def _extend(self, tree: _Tree, target: Array, *, greedy: bool) -> tuple[int | None, bool]:
-        """Extend a tree towards ``target``, by one step or (``greedy``) as far as the edge is free.
+        """Extend a tree towards ``target`` by one step, or with ``greedy`` as far as the edge is collision-free.
 
         Returns:
-            Index of the last new node, None without one; and whether the target is reached.
+            Index of the last new node, or None if the first configuration collides; whether the target is reached.
         """
         node = tree.nearest(target)
         here = tree.qpos[node].copy()
@@ -131,7 +145,11 @@ class PathSearch:
         return (node if free else None), arrives and free == len(points)
 
     def shorten(self, path: list[Array], rng: np.random.Generator, *, tries: int, max_checks: int) -> list[Array]:
-        """Shorten a path: drop waypoints greedily, then connect random points of the path by straight edges."""
+        """Shorten a path of waypoints (n,); the result is as good as ``max_checks`` collision checks allow.
+
+        First waypoints are dropped greedily. Then random points of the path are connected by straight edges, ``tries``
+        times.
+        """
         self._remaining_checks = max_checks
         try:
             path = self._drop_waypoints(path)
@@ -144,7 +162,7 @@ class PathSearch:
         return path
 
     def _drop_waypoints(self, path: list[Array]) -> list[Array]:
-        """Connect each waypoint to the furthest one with a free straight edge, found by halving."""
+        """Connect each waypoint to a far waypoint by a free straight edge; bisection finds the far waypoint."""
         kept, index = [path[0]], 0
         while index < len(path) - 1:
             reach = len(path) - 1

@@ -19,7 +19,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Joint positions (T, 7) in rad at times ``dt``, 2 ``dt``, ... in s; the last row is the goal."""
+    """Motion of the arm.
+
+    Attributes:
+        qpos: (T, 7) joint positions, rad; row i is at time ``(i + 1) * dt``, and the last row is the goal.
+        dt: time between rows, s.
+    """
 
     qpos: Array
     dt: float
@@ -32,7 +37,12 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class AttachedBody:
-    """Object in the gripper: vertices (V, 3) of its convex hull, m, and its pose (4x4) in the TCP frame."""
+    """Object in the gripper, which moves with the TCP in collision checks.
+
+    Attributes:
+        vertices: (V, 3) vertices of the object's convex hull in the object's frame, m.
+        object_in_tcp: (4x4) pose of the object in the TCP frame.
+    """
 
     vertices: Array
     object_in_tcp: Array
@@ -40,11 +50,13 @@ class AttachedBody:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Shape of a rigid body in its own frame: convex hulls or points. Backends cache geometries per shape.
+    """Shape of a rigid body in the body's frame: convex hulls or surface points.
+
+    Planners cache collision geometries per `Shape` object.
 
     Attributes:
-        hulls: vertices (V, 3) of the convex pieces, m.
-        points: (P, 3) surface points 5 mm apart, m, for surfaces without hulls.
+        hulls: vertices (V, 3) of each convex piece, m.
+        points: (P, 3) surface points, 5 mm apart, m, of a body without hulls.
     """
 
     hulls: tuple[Array, ...] = ()
@@ -53,7 +65,14 @@ class Shape:
 
 @dataclass(frozen=True)
 class Obstacle:
-    """Obstacle: name, shape, pose (4x4) of its frame, and clearance to keep, m."""
+    """Body that the arm must not touch.
+
+    Attributes:
+        name: name of the body, reported by `Planner.find_collisions`.
+        shape: shape in the body's frame.
+        pose_in_base: (4x4) pose of the body's frame in the arm's base frame.
+        clearance: minimum distance to the arm, m.
+    """
 
     name: str
     shape: Shape
@@ -62,32 +81,35 @@ class Obstacle:
 
 
 class Planner(Protocol):
-    """Interface of a motion planner. Planning methods raise ``PlanningError(stage, reason)`` if they fail.
+    """Interface of a motion planner for one arm.
 
-    ``RRTConnectPlanner`` documents its reasons at each method.
+    The methods ``plan_*`` raise ``PlanningError(stage, reason)`` if they find no motion. ``stage`` is an argument of
+    the method; docs/policies.md lists the reasons of `RRTConnectPlanner`.
     """
 
     @property
     def finger_width(self) -> float:
-        """Distance between the pads in all collision checks, m."""
+        """Distance between the finger pads in the collision checks of plans, m."""
         ...
 
     @finger_width.setter
     def finger_width(self, width: float) -> None: ...
 
     def seed(self, seed: int) -> None:
-        """Set the seed; the same seed and calls give the same results."""
+        """Set the seed of the random generator; equal seeds and calls give equal results."""
         ...
 
     def set_scene(self, obstacles: Sequence[Obstacle] | Array) -> None:
-        """Replace the obstacles by rigid bodies (fast), or by a cloud (P, 3) of surface points 5 mm apart.
+        """Replace all obstacles.
 
-        Points inside the robot base are ignored.
+        Args:
+            obstacles: rigid bodies (fast), or a cloud (P, 3) of surface points in the arm's base frame, 5 mm apart, m.
+                Points inside the robot's base are ignored.
         """
         ...
 
     def attach(self, body: AttachedBody | None) -> None:
-        """Attach a held object to the TCP; None detaches it."""
+        """Attach a held object to the TCP for collision checks; None detaches the present object."""
         ...
 
     def tcp(self, qpos: Array) -> Array:
@@ -95,52 +117,71 @@ class Planner(Protocol):
         ...
 
     def find_collisions(self, qpos: Array, finger_width: float | None = None) -> list[str]:
-        """Return the names of colliding bodies at a configuration (7,); an empty list means free.
+        """Return the names of the bodies that collide at a configuration (7,), or an empty list.
 
-        Names are links, obstacles, 'cloud' (points) and 'attached' (the held object). ``finger_width`` is in m;
-        default: open gripper.
+        Names are those of links and obstacles, ``cloud`` for surface points and ``attached`` for the held object.
+
+        Args:
+            qpos: (7,) configuration, rad.
+            finger_width: distance between the finger pads, m; default: open gripper.
         """
         ...
 
     def is_free(self, qpos: Array, finger_width: float | None = None) -> NDArray[np.bool_]:
-        """Return a mask (M,) of the collision-free configurations (M, 7); much faster than single checks."""
+        """Return which configurations (M, 7) are collision-free, as a mask (M,).
+
+        A single call is much faster than one call per configuration. ``finger_width`` is the distance between the
+        finger pads, m; default: open gripper.
+        """
         ...
 
     def ik(self, tcp_in_base: Array, near: Array, *, avoid_collisions: bool = True) -> list[Array]:
-        """Return distinct configurations (7,) for a TCP pose (4x4), the nearest to ``near`` (7,) first.
+        """Return distinct configurations (7,) that reach a TCP pose (4x4), or an empty list.
 
-        With ``avoid_collisions``, only collision-free configurations. The list may be empty.
+        Args:
+            tcp_in_base: (4x4) pose of the TCP.
+            near: (7,) reference configuration; the solution nearest to it comes first.
+            avoid_collisions: whether to omit configurations that collide.
         """
         ...
 
     def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str, straight_only: bool = False) -> Trajectory:
-        """Plan a collision-free motion to one of several configurations.
+        """Plan a collision-free motion to one of several goal configurations.
 
-        Without ``search``, only straight motions in joint space are tried.
+        Args:
+            start: (7,) initial configuration.
+            goals: configurations (7,); the planner chooses one.
+            stage: stage of a ``PlanningError``.
+            straight_only: whether to try only motions that are straight in joint space, without a path search.
         """
         ...
 
     def plan_to_pose(self, start: Array, tcp_in_base: Array, *, stage: str) -> Trajectory:
-        """Plan a collision-free motion of the TCP to a pose (4x4)."""
+        """Plan a collision-free motion from ``start`` (7,) that ends with the TCP at a pose (4x4)."""
         ...
 
     def plan_straight(
         self, start: Array, tcp_in_base: Array, *, stage: str, check_collisions: bool = True, speed: float = 1.0
     ) -> Trajectory:
-        """Plan a straight line of the TCP, with the shortest rotation, from ``start`` (7,) to a pose (4x4).
+        """Plan a motion of the TCP on a straight line, with the shortest rotation, to a pose (4x4).
 
         Args:
-            start: initial configuration.
-            tcp_in_base: goal of the TCP.
+            start: (7,) initial configuration.
+            tcp_in_base: (4x4) final pose of the TCP.
             stage: stage of a ``PlanningError``.
             check_collisions: whether to check obstacles; self-collisions are always checked.
-            speed: fraction of the velocity and acceleration limits.
+            speed: scale of the velocity and acceleration limits, above 0 and at most 1.
         """
         ...
 
     def join(self, start: Array, first: Trajectory, second: Trajectory) -> Trajectory:
-        """Join two motions, the first from ``start`` (7,), without a stop if that is collision-free.
+        """Join two motions to one motion, without a stop between them if the rounded corner is collision-free.
 
-        The blend starts in the last second of the first motion and ends in the first second of the second one.
+        The corner starts in the last second of the first motion and ends in the first second of the second motion.
+
+        Args:
+            start: (7,) initial configuration of the first motion.
+            first: first motion.
+            second: second motion, which starts at the last row of the first motion.
         """
         ...

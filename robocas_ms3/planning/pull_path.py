@@ -24,7 +24,7 @@ _BLAS = ThreadpoolController()
 
 
 def rotate_about_bar(tcp: Array, angle: float) -> Array:
-    """Rotate TCP poses (..., 4, 4) about their x axis by an angle in rad."""
+    """Rotate TCP poses (..., 4, 4) about the bar, which is their x axis, by an angle in rad."""
     turn = np.eye(4)
     turn[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     return tcp @ turn
@@ -32,14 +32,19 @@ def rotate_about_bar(tcp: Array, angle: float) -> Array:
 
 @_BLAS.wrap(limits=1, user_api="blas")
 def track_handle(chain: ArmChain, starts: Array, goals: Array) -> Array:
-    """Track poses of a bar with the TCP, which may rotate about the bar by up to ``MAX_SLIP``.
+    """Compute N paths of the arm that move a bar through T poses.
+
+    The gripper may rotate about the bar by up to ``MAX_SLIP`` from the goal poses.
 
     Args:
+        chain: forward kinematics of the arm.
         starts: (N, 7) configurations at or near the first pose.
-        goals: (T, 4, 4) or (T, N, 4, 4) TCP poses in the arm's base frame that hold the bar squarely, about 1 cm apart.
+        goals: (T, 4, 4) or (T, N, 4, 4) TCP poses in the arm's base frame, about 1 cm apart, with the gripper
+            perpendicular to the bar.
 
     Returns:
-        (T, N, 7) rad; NaN after a pose that is out of reach, violates a joint limit or needs a jump.
+        (T, N, 7) rad. A path is NaN from the first pose on that is out of reach, violates a joint limit or needs a
+        joint jump.
     """
     qpos = np.array(starts, dtype=np.float64)
     path = np.full((len(goals), len(qpos), 7), np.nan)
@@ -56,12 +61,12 @@ def track_handle(chain: ArmChain, starts: Array, goals: Array) -> Array:
 
 
 def count_reached_poses(path: Array) -> NDArray[np.int_]:
-    """Count the poses (N,) reached by paths (T, N, 7) of `track_handle`."""
+    """Return the number of poses (N,) that each path of `track_handle` (T, N, 7) reaches."""
     return np.isfinite(path[:, :, 0]).sum(axis=0)
 
 
 def _solve(chain: ArmChain, starts: Array, goals: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Solve poses (M, 4, 4) by damped least squares; return configurations (M, 7) and a success mask (M,)."""
+    """Solve TCP poses (M, 4, 4) by damped least squares; return configurations (M, 7) and a success mask (M,)."""
     qpos, lower, upper = starts.copy(), chain.lower, chain.upper
     middle, half = (lower + upper) / 2, (upper - lower) / 2
     solved = np.zeros(len(qpos), dtype=bool)
@@ -91,7 +96,10 @@ def _solve(chain: ArmChain, starts: Array, goals: Array) -> tuple[Array, NDArray
 
 
 def pose_difference(pose: Array, goal: Array) -> Array:
-    """Return the differences (M, 6) from poses to goals (M, 4, 4): position, rotation vector; base frame."""
+    """Return the differences (M, 6) from poses to goals (M, 4, 4) in the arm's base frame.
+
+    The first three columns are the translation in m, the last three the rotation vector in rad.
+    """
     turn = np.einsum("mij,mkj->mik", goal[:, :3, :3], pose[:, :3, :3])
     axis = 0.5 * np.stack(
         [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=1

@@ -28,7 +28,13 @@ YAWS = 4  # yaw angles of the tool, over half a turn
 
 @dataclass(frozen=True)
 class Push:
-    """Candidate push: start pose of the TCP (4x4), horizontal unit direction (3,) and length, m."""
+    """Candidate push on a straight horizontal line.
+
+    Attributes:
+        start: (4x4) pose of the TCP at the start.
+        direction: (3,) horizontal unit vector.
+        length: length of the line, m.
+    """
 
     start: Array
     direction: Array
@@ -36,7 +42,7 @@ class Push:
 
     @property
     def end(self) -> Array:
-        """End pose (4x4) of the TCP."""
+        """(4x4) pose of the TCP at the end."""
         pose = self.start.copy()
         pose[:3, 3] += self.length * self.direction
         return pose
@@ -51,18 +57,20 @@ def generate_push_candidates(
     fixed: Array,
     turn_deg: float = 0.0,
 ) -> Iterator[Push]:
-    """Yield pushes that start collision-free and end on the surface, the paper's direction first.
+    """Yield pushes of an obstacle away from the target, the paper's direction first.
 
-    The object may be pushed against other objects, but not over the edge or against furniture or basket. The tool
-    touches the object at the height of the target, or at the nearest free height above it.
+    The closed fingers (the tool) are collision-free at the start of a push, and the obstacle ends on the surface. The
+    obstacle may touch other objects during the push, but neither furniture nor basket. The tool touches the obstacle at
+    the height of the target, or at the lowest free height above.
 
     Args:
-        points: (P, 3) surface points of the object, m; z is up.
-        target: (3,) centre of the target.
-        others: (Q, 3) surface points of all other bodies.
-        surface: frame and half size of the surface, see `surface_in_base`.
-        fixed: (R, 3) surface points of furniture and basket.
-        turn_deg: rotation of the paper's direction about the vertical.
+        rng: random generator, for the direction if target and obstacle have the same centre.
+        points: (P, 3) surface points of the obstacle, m; z is up.
+        target: (3,) centre of the target, m.
+        others: (Q, 3) surface points of all other bodies, m.
+        surface: pose (4x4) of the centre of the surface, and its half size (2,) in m.
+        fixed: (R, 3) surface points of furniture and basket, m.
+        turn_deg: angle by which all directions are rotated about the vertical, deg.
     """
     frame, half = surface
     walls = fixed[(fixed[:, 2] > frame[2, 3] + 0.01) & (fixed[:, 2] < points[:, 2].max())][:, :2]
@@ -102,10 +110,15 @@ _DOWN = Rotation.from_euler("x", np.pi)
 
 
 def compute_push_direction(rng: np.random.Generator, center: Array, target: Array) -> Array:
-    """Return v_push of the paper: (3,) horizontal unit vector from the target to the obstacle.
+    """Return the push direction of the paper, v_push: horizontal unit vector (3,) from target to obstacle.
 
-    If their centres are less than 1 cm apart, return a random direction within 30 deg of the direction to the robot at
-    the origin.
+    If the centres are less than 1 cm apart, the direction is random, within 30 deg of the direction to the origin (the
+    arm's base).
+
+    Args:
+        rng: random generator.
+        center: (3,) centre of the obstacle, m.
+        target: (3,) centre of the target, m.
     """
     away = np.append((center - target)[:2], 0.0)
     if np.linalg.norm(away) < COINCIDENT_DISTANCE:
@@ -115,10 +128,16 @@ def compute_push_direction(rng: np.random.Generator, center: Array, target: Arra
 
 
 def measure_extent_behind(points: Array, center: Array, direction: Array, height: float) -> float | None:
-    """Return d_ext of the paper: extent of an object from its centre against the push, m, or None.
+    """Return the extent d_ext of the paper: from an object's centre to its side that the tool touches, m.
 
-    Only points that the tool can touch count: within the tool radius of the line and 1 cm of the height. None: there is
-    no such point.
+    Only points that the tool can touch count: at most the tool radius from the line of the push and 1 cm from its
+    height. The result is None if there is no such point.
+
+    Args:
+        points: (P, 3) surface points of the object, m.
+        center: (3,) centre of the object, m.
+        direction: (3,) horizontal unit vector of the push.
+        height: height of the push, m.
     """
     relative = points - center
     across = np.abs(relative[:, :2] @ np.array([-direction[1], direction[0]]))

@@ -44,12 +44,14 @@ Timed = TypeVar("Timed", Trajectory, Trajectory | None)
 
 
 class RRTConnectPlanner(CollisionChecker):
-    """Motion planner for an arm: RRT-Connect, straight lines and TOPP-RA, in the arm's base frame.
+    """Motion planner for an arm: RRT-Connect, straight lines and TOPP-RA.
 
-    `protocol.Planner` documents the methods without a docstring.
+    Poses are in the arm's base frame. `protocol.Planner` documents the methods without a docstring.
 
     Args:
-        urdf, srdf, robot: see `CollisionChecker`.
+        urdf: URDF of the arm alone, with the arm's base as its root link.
+        srdf: SRDF with the pairs of links that need no collision check.
+        robot: description of the robot.
         dt: time between rows of a trajectory, s.
     """
 
@@ -75,10 +77,10 @@ class RRTConnectPlanner(CollisionChecker):
         return [qpos for qpos, ok in zip(found, self.is_free(np.array(found), self.finger_width), strict=True) if ok]
 
     def plan_to_pose(self, start: Array, tcp_in_base: Array, *, stage: str) -> Trajectory:
-        """Plan a collision-free motion of the TCP to a pose (4x4).
+        """Plan a collision-free motion from ``start`` (7,) that ends with the TCP at a pose (4x4).
 
         Raises:
-            PlanningError: ``no_ik``, or a reason of `plan_to_qpos`.
+            PlanningError: ``no_ik`` (the pose is out of reach), or a reason of `plan_to_qpos`.
         """
         goals = self.ik(tcp_in_base, start, avoid_collisions=False)
         if not goals:
@@ -86,12 +88,19 @@ class RRTConnectPlanner(CollisionChecker):
         return self.plan_to_qpos(start, goals, stage=stage)
 
     def plan_to_qpos(self, start: Array, goals: list[Array], *, stage: str, straight_only: bool = False) -> Trajectory:
-        """Plan a collision-free motion to the nearest reachable configuration of several.
+        """Plan a collision-free motion to one of several goal configurations (7,).
+
+        The planner first tries straight motions in joint space, nearest goal first. Then it searches paths by
+        RRT-Connect, unless ``straight_only`` is set.
 
         Raises:
-            PlanningError: ``start_in_collision``, ``start_outside_limits``, ``no_goals`` (the list is empty),
-                ``goal_outside_limits`` (all goals are), ``goal_in_collision`` (all goals within the limits are),
-                ``not_straight``, ``rrt_timeout``, ``path_blocked``, ``no_time_parameterization``.
+            PlanningError: one of these reasons.
+                ``start_in_collision``, ``start_outside_limits``: the start is unusable.
+                ``no_goals``, ``goal_outside_limits``, ``goal_in_collision``: no goal is given, all goals violate the
+                joint limits, or all remaining goals collide.
+                ``not_straight``: all straight motions collide, and ``straight_only`` is set.
+                ``rrt_timeout``: no path found with ``BUDGET`` collision checks.
+                ``path_blocked``: the path found collides after rounding its corners.
         """
         start = self._checked_start(start, stage)
         candidates = np.array(goals, dtype=np.float64).reshape(-1, 7)
@@ -137,11 +146,15 @@ class RRTConnectPlanner(CollisionChecker):
     def plan_straight(
         self, start: Array, tcp_in_base: Array, *, stage: str, check_collisions: bool = True, speed: float = 1.0
     ) -> Trajectory:
-        """Plan a straight line of the TCP.
+        """Plan a motion of the TCP on a straight line, with the shortest rotation, to a pose (4x4).
 
         Raises:
-            PlanningError: ``start_in_collision``, ``start_outside_limits``, ``line_unreachable``, ``line_joint_jump``,
-                ``straight_line_blocked``, ``no_time_parameterization``.
+            PlanningError: one of these reasons.
+                ``start_in_collision``, ``start_outside_limits``: the start is unusable.
+                ``line_unreachable``: a pose on the line is out of reach.
+                ``line_joint_jump``: a joint would have to jump on the line.
+                ``straight_line_blocked``: the line collides.
+                ``no_time_parameterization``: TOPP-RA finds no timing within the limits.
         """
         start = self._checked_start(start, stage, obstacles=check_collisions)
         waypoints = solve_straight_line(self.chain, start, np.asarray(tcp_in_base, dtype=np.float64), stage=stage)
@@ -166,7 +179,7 @@ class RRTConnectPlanner(CollisionChecker):
             path = fit_spline(thin_path(points, BLEND_SPACING))
             samples, end = path.sample(FINE_SPACING), points[min(len(a), len(points) - 1)]
             lower, upper = self.chain.limits.T  # the sum of two motions may exceed the limits
-            # check up to the end of the corner; the rest was planned with other obstacles
+            # check up to the end of the corner; the rest of the second motion was planned with other obstacles
             corner = int(np.linalg.norm(samples - end, axis=1).argmin()) + 1
             if not np.all((lower <= samples) & (samples <= upper)) or not self.is_path_free(samples[:corner]):
                 continue
@@ -191,7 +204,7 @@ class RRTConnectPlanner(CollisionChecker):
         return self.is_path_free(path.sample(FINE_SPACING), obstacles=obstacles)
 
     def _smooth_and_time(self, waypoints: list[Array]) -> Trajectory | None:
-        """Round the corners of a path, check the rounded path, and time it; None if it collides."""
+        """Round the corners of a path and return it as a trajectory; None if the rounded path collides."""
         points = [waypoints[0]]
         points += [b for a, b in zip(waypoints[:-1], waypoints[1:], strict=True) if np.linalg.norm(b - a) > 1e-4]
         points[-1] = waypoints[-1]
@@ -207,7 +220,7 @@ class RRTConnectPlanner(CollisionChecker):
         return self._time_motion(partial(time_with_stops, corners)) if self.is_path_free(_densify(corners)) else None
 
     def _time_motion(self, time: Callable[..., Timed], speed: float = 1.0) -> Timed:
-        """Time a motion within a fraction of the limits; slow it down if the TCP exceeds its speed limit."""
+        """Call ``time`` with the joint limits times ``speed``; repeat with lower limits if the TCP is too fast."""
         limits = {name: value * speed for name, value in self._limits.items()}
         trajectory = time(**limits, dt=self._dt)
         if trajectory is not None and len(trajectory.qpos) > 1:
@@ -237,6 +250,15 @@ PLANNERS: Registry[Callable[..., Planner]] = Registry(
 
 
 def make_planner(name: str, robot: RobotSpec, *, dt: float) -> Planner:
-    """Create a registered planner for the arm of a robot, with trajectories of time step ``dt`` in s."""
+    """Create the registered planner ``name`` for the arm of a robot.
+
+    Args:
+        name: name of the planner in `PLANNERS`.
+        robot: specification of the robot.
+        dt: time between rows of the planned trajectories, s.
+
+    Raises:
+        ExtensionError: unknown planner.
+    """
     backend, files = PLANNERS.find(name, where="planner"), robot.files()
     return backend(files.arm_urdf, files.arm_srdf, robot=robot.description, dt=dt)

@@ -1,4 +1,4 @@
-"""Read obstacles (as bodies and as point clouds) and poses of an environment for a planner."""
+"""Read obstacles and poses of an environment for motion planning; obstacles are bodies or point clouds."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SHAPES: dict[int, tuple[BodyFiles, Shape]] = {}  # by id of the body, which is 
 
 
 def get_body_shape(part: BodyFiles) -> Shape:
-    """Return the shape of a body; the same object for each call in a process."""
+    """Return the shape of a body; repeated calls return the same object, so that planners can cache it."""
     if id(part) not in _SHAPES:
         _SHAPES[id(part)] = part, Shape(tuple(part.hulls))
     return _SHAPES[id(part)][1]
@@ -39,15 +39,20 @@ def _size(part: BodyFiles) -> float:
 
 
 def to_arm_base_frame(obstacles_in_world: Iterable[Obstacle], arm_base_in_world: Array) -> list[Obstacle]:
-    """Transform obstacles with world poses to the frame of an arm's base (4x4)."""
+    """Transform the poses of obstacles from the world frame to the frame of an arm's base.
+
+    Args:
+        obstacles_in_world: obstacles whose ``pose_in_base`` is a pose in the world frame.
+        arm_base_in_world: (4x4) pose of the arm's base in the world frame.
+    """
     to_base = inverse(arm_base_in_world)
     return [replace(body, pose_in_base=to_base @ body.pose_in_base) for body in obstacles_in_world]
 
 
 class PlanningScene:
-    """View of one environment for planning: poses (4x4) and clouds in the arm's base frame.
+    """Current poses (4x4) and bodies of one environment, in the arm's base frame unless the name says otherwise.
 
-    Planners use bodies (`obstacles`); geometric tests use clouds of surface points (`points_in_base`).
+    Planners use bodies (`obstacles`); geometric tests use surface points (`points_in_base`).
     """
 
     def __init__(self, env: RoboCASEnv) -> None:
@@ -56,7 +61,12 @@ class PlanningScene:
     def _bodies(
         self, excluded: Collection[int], exclude_link: tuple[str, str] | None
     ) -> Iterator[tuple[str, BodyFiles, float, Array]]:
-        """Yield name, body, spacing of its surface points (m) and world pose (4x4) of all bodies."""
+        """Yield name, files, spacing of the surface points (m) and world pose (4x4) of each body.
+
+        Args:
+            excluded: slots of objects to omit.
+            exclude_link: names of a piece of furniture and of its link to omit.
+        """
         for name, asset in self.env.model.furniture.items():
             frame = self.env.model.furniture_poses[name]
             yield name, asset, FURNITURE_SPACING, frame
@@ -71,7 +81,7 @@ class PlanningScene:
                 yield asset.asset.id, asset, SPACING, from_wxyz(poses[slot])
 
     def sample_surfaces(self) -> None:
-        """Sample surface points of all bodies before the first fork; a forked process loses samples."""
+        """Sample and cache surface points of all bodies; a forked process would sample them again."""
         for _, part, spacing, _ in self._bodies((), None):
             part.surface_points(spacing)
 
@@ -97,7 +107,7 @@ class PlanningScene:
         return inverse(self.arm_base_in_world) @ from_wxyz(self.env.object_states[0, slot, :7])
 
     def object_points(self, slot: int) -> Array:
-        """Return surface points (P, 3) of an object."""
+        """Return surface points (P, 3) of the object in a slot, m."""
         return transform_points(self.object_in_base(slot), self.env.object_assets[0][slot].surface_points(SPACING))
 
     @property
@@ -111,12 +121,12 @@ class PlanningScene:
         exclude_link: tuple[str, str] | None = None,
         clearance: float = 0.0,
     ) -> list[Obstacle]:
-        """Return furniture, basket and present objects as obstacles.
+        """Return furniture, basket and objects of the episode as obstacles.
 
         Args:
-            exclude: slots of objects to leave out.
-            exclude_link: furniture and link to leave out.
-            clearance: clearance to furniture and basket, m.
+            exclude: slots of objects to omit.
+            exclude_link: names of a piece of furniture and of its link to omit.
+            clearance: minimum distance of the arm to furniture and basket, m; to objects it is 0.
         """
         bodies = self.obstacles_in_world(exclude=exclude, exclude_link=exclude_link)
         objects = {asset.asset.id for asset in self.env.object_assets[0]}
@@ -129,7 +139,14 @@ class PlanningScene:
         exclude: int | Collection[int] = (),
         exclude_link: tuple[str, str] | None = None,
     ) -> list[Obstacle]:
-        """Return the bodies of `obstacles` with poses in the world frame; see `to_arm_base_frame`."""
+        """Return furniture, basket and objects of the episode, with ``pose_in_base`` in the world frame.
+
+        `to_arm_base_frame` converts the poses.
+
+        Args:
+            exclude: slots of objects to omit.
+            exclude_link: names of a piece of furniture and of its link to omit.
+        """
         excluded = {exclude} if isinstance(exclude, int) else exclude
         return [
             Obstacle(name, get_body_shape(part), pose) for name, part, _, pose in self._bodies(excluded, exclude_link)
@@ -142,9 +159,12 @@ class PlanningScene:
         radius: float = RADIUS,
         around: Array | None = None,
     ) -> Array:
-        """Return surface points (P, 3) of furniture, basket and present objects, without the excluded objects.
+        """Return surface points (P, 3) of furniture, basket and objects of the episode, m.
 
-        Points are within ``radius`` m of ``around`` (3,), by default of the arm's base.
+        Args:
+            exclude: slots of objects to omit.
+            radius: maximum distance of points from ``around``, m.
+            around: (3,) centre; default: the origin of the arm's base frame.
         """
         to_base = inverse(self.arm_base_in_world)
         center = np.zeros(3) if around is None else around

@@ -26,12 +26,13 @@ OCCUPIED, INNER = 2, 3  # bits per child in a stream of octomap; 0: unknown
 
 @dataclass(frozen=True)
 class ConvexPieces:
-    """The convex pieces of a shape.
+    """FCL geometries of the H pieces of a shape; a piece is a convex hull or an octree.
 
     Attributes:
-        vertices: (V, 3) of all pieces, in the shape's frame, m.
-        first: (H,) index of each piece's first vertex.
-        unused: unused FCL objects of each piece, kept for reuse because python-fcl leaks memory per object.
+        geometries: H FCL geometries.
+        vertices: (V, 3) vertices of all pieces in the shape's frame, m; for an octree, those of its bounding box.
+        first: (H,) index of the first vertex of each piece.
+        unused: FCL objects that no scene uses, by index of the piece; kept since python-fcl leaks memory per object.
     """
 
     geometries: list[Any]
@@ -41,21 +42,21 @@ class ConvexPieces:
 
 
 class CollisionShapes:
-    """Factory and cache of FCL geometries."""
+    """Factory and cache of the FCL geometries of shapes, point clouds and held objects."""
 
     def __init__(self) -> None:
         self._shapes: WeakKeyDictionary[Shape, dict[float, ConvexPieces]] = WeakKeyDictionary()
         self._recent: OrderedDict[bytes, ConvexPieces] = OrderedDict()
 
     def obstacle_pieces(self, shape: Shape, clearance: float) -> ConvexPieces:
-        """Return the pieces of a shape, with hulls enlarged by ``clearance`` (m) and the margin."""
+        """Return the pieces of a shape; the faces of hulls are moved out by ``clearance`` plus ``MARGIN``, m."""
         sizes = self._shapes.setdefault(shape, {})
         if clearance not in sizes:
             sizes[clearance] = self._pieces(shape, clearance)
         return sizes[clearance]
 
     def cloud_pieces(self, points: Array) -> ConvexPieces:
-        """Return an octree of points (P, 3); no piece if all points are outside its range."""
+        """Return one piece, an octree of points (P, 3), or no piece if all points are outside the octree's range."""
         return self._get_cached(points, self._tree)
 
     def hull_pieces(self, vertices: Array) -> ConvexPieces:
@@ -96,9 +97,11 @@ def make_fcl_convex(corners: Array, faces: NDArray[np.integer]) -> Any:
 
 
 def convex_hull(vertices: Array) -> tuple[Array, NDArray[np.int32], Array]:
-    """Return corners (V, 3), triangles (F, 3) and outward normals (F, 3) of the convex hull of points.
+    """Compute the convex hull of points (P, 3).
 
-    The corners of a triangle are in counter-clockwise order seen from outside.
+    Returns:
+        Corners (V, 3); triangles (F, 3) as indices of corners, counter-clockwise seen from outside; outward unit
+        normals (F, 3) of the triangles.
     """
     hull = ConvexHull(vertices)
     outward = np.einsum("ij,ij->i", _normals(vertices, hull.simplices), hull.equations[:, :3]) > 0
@@ -108,9 +111,10 @@ def convex_hull(vertices: Array) -> tuple[Array, NDArray[np.int32], Array]:
 
 
 def inflate_hull(vertices: Array, margin: float) -> tuple[Array, NDArray[np.int32]]:
-    """Return corners and triangles of a hull with faces moved out by ``margin`` (m).
+    """Move the faces of the convex hull of points (P, 3) out by ``margin`` m; corners move at most twice as far.
 
-    Corners at sharp edges move at most twice the margin.
+    Returns:
+        Corners (V, 3); triangles (F, 3) as indices of corners, counter-clockwise seen from outside.
     """
     corners, faces, normals = convex_hull(vertices)
     square, total = np.tile(1e-3 * np.eye(3), (len(corners), 1, 1)), np.zeros((len(corners), 3))
@@ -129,10 +133,10 @@ def _normals(vertices: Array, faces: NDArray[np.integer]) -> NDArray[np.floating
 
 
 def encode_octree(points: Array, voxel: float) -> list[int]:
-    """Encode the voxels that contain points (P, 3) as a stream of octomap, in signed bytes for python-fcl.
+    """Encode the voxels that contain points (P, 3) as an octomap stream of signed bytes, as python-fcl expects.
 
-    A tree has 2^16 voxels per axis and is centred at the origin; points outside are dropped. The stream lists the inner
-    nodes depth first, each with 16 bits: two per child.
+    The octree has 2^16 voxels of edge ``voxel`` (m) per axis and is centred at the origin; points outside are dropped.
+    The stream lists the inner nodes depth first with 16 bits per node: two bits per child.
     """
     keys = np.floor(points / voxel) + (1 << (DEPTH - 1))
     keys = keys[np.all((keys >= 0) & (keys < 1 << DEPTH), axis=1)].astype(np.int64)

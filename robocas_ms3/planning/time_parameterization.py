@@ -20,18 +20,20 @@ SAFETY = 0.98  # fraction of the limits at grid points, so that they also hold i
 
 
 class JointPath:
-    """Path in joint space parameterised by (nearly) its length, an `AbstractGeometricPath` of TOPP-RA.
+    """Path in joint space, with the interface of TOPP-RA's `AbstractGeometricPath`.
+
+    The path parameter is nearly the length of the path in rad (norm over joints).
 
     Args:
-        curve: piecewise polynomial over [0, length] with values (n,).
-        goal: (n,) exact last configuration.
+        curve: piecewise polynomial from the path parameter in [0, length] to configurations (n,).
+        goal: (n,) last configuration, without rounding errors.
     """
 
     def __init__(self, curve: PPoly, goal: Array) -> None:
         self._curve, self.goal = curve, goal
 
     def __call__(self, path_positions: Array | float, order: int = 0) -> Array:
-        """Evaluate the path, or its derivative of an order, at one or more positions (m,)."""
+        """Return configurations (m, n), or derivatives of an order, at one or more path parameters (m,)."""
         return self._curve(path_positions, order)
 
     @property
@@ -51,11 +53,11 @@ class JointPath:
         return float(self._curve.x[-1])
 
     def sample(self, spacing: float) -> Array:
-        """Sample configurations (m, n) at most ``spacing`` rad apart, both ends included."""
+        """Return configurations (m, n) at most ``spacing`` rad apart, with both ends of the path."""
         return self(np.linspace(0, self.length, max(2, int(np.ceil(self.length / spacing)) + 1), dtype=np.float64))
 
     def grid(self) -> Array:
-        """Return grid points for TOPP-RA: evenly spaced ones, and both sides of each breakpoint."""
+        """Return path parameters (m,) for TOPP-RA: evenly spaced, and on both sides of each breakpoint."""
         even = np.linspace(0, self.length, max(20, int(np.ceil(self.length / GRID))) + 1, dtype=np.float64)
         inner = self._curve.x[1:-1] if len(self._curve.x) < 40 else self._curve.x[:0]
         near_breaks = np.concatenate([inner - 1e-4 * self.length, inner + 1e-4 * self.length])
@@ -64,7 +66,7 @@ class JointPath:
 
 
 def round_corners(waypoints: Array, radius: float) -> JointPath:
-    """Round corners of a polyline (m, n) by parabolas that start at most ``radius`` rad before them."""
+    """Round the corners of a polyline (m, n) by parabolas that start at most ``radius`` rad before a corner."""
     points = np.asarray(waypoints, dtype=np.float64)
     steps = np.diff(points, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
@@ -86,22 +88,22 @@ def round_corners(waypoints: Array, radius: float) -> JointPath:
 
 
 def fit_spline(waypoints: Array) -> JointPath:
-    """Fit a cubic spline to dense configurations (m, n) of a smooth motion."""
+    """Fit a cubic spline to closely spaced configurations (m, n) of a smooth motion."""
     points = np.asarray(waypoints, dtype=np.float64)
     ends = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     return JointPath(CubicSpline(ends, points, bc_type="not-a-knot" if len(points) > 3 else "natural"), points[-1])
 
 
 def blend_motions(first: Array, second: Array, rows: int) -> Array:
-    """Blend the end of a motion with the start of the next one, which cuts the corner between them.
+    """Overlap the end of a motion with the start of the next motion, which rounds the corner between them.
 
     Args:
-        first: (T, n) configurations at equal time steps, at rest where the second motion starts.
+        first: (T, n) configurations of the first motion at equal time steps; its last row is the start of the second.
         second: (U, n) configurations of the second motion at the same time step.
         rows: number of overlapping rows.
 
     Returns:
-        (T + U - rows, n) configurations, those of the two motions outside of the overlap.
+        (T + U - rows, n) configurations; outside of the overlap they are those of the two motions.
     """
     if not rows:
         return np.concatenate([first, second])
@@ -109,16 +111,22 @@ def blend_motions(first: Array, second: Array, rows: int) -> Array:
 
 
 def thin_path(points: Array, spacing: float) -> Array:
-    """Select configurations of (T, n) about ``spacing`` rad apart, first and last included."""
+    """Return configurations of a path (T, n) about ``spacing`` rad apart, with the first and the last."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     kept = np.unique(np.searchsorted(along, np.arange(0, max(along[-1] - spacing / 2, spacing / 2), spacing)))
     return points[[*kept, len(points) - 1]]
 
 
 def time_path(path: JointPath, *, velocity: float, acceleration: float, dt: float) -> Trajectory | None:
-    """Time a path as fast as the joint limits allow, from rest to rest; return None if TOPP-RA fails.
+    """Compute the fastest trajectory along a path from rest to rest; return None if TOPP-RA fails.
 
-    The motion is stretched to a whole number of steps, so that row i is at time ``(i + 1) * dt`` s.
+    The trajectory is slowed down to a whole number of time steps.
+
+    Args:
+        path: path in joint space.
+        velocity: velocity limit of each joint, rad/s.
+        acceleration: acceleration limit of each joint, rad/s^2.
+        dt: time between rows, s.
     """
     from toppra.algorithm import TOPPRA  # imports matplotlib (0.2 s)
 
@@ -143,7 +151,14 @@ def _bounds(dof: int, velocity: float, acceleration: float) -> list[Any]:
 
 
 def time_with_stops(waypoints: Array, *, velocity: float, acceleration: float, dt: float) -> Trajectory:
-    """Time a polyline (m, n) with a stop at each waypoint: slow, but exactly on the path."""
+    """Compute a trajectory along a polyline (m, n) that stops at each waypoint and stays exactly on the lines.
+
+    Args:
+        waypoints: (m, n) configurations, rad, or other positions with equal limits.
+        velocity: velocity limit of each joint, rad/s.
+        acceleration: acceleration limit of each joint, rad/s^2.
+        dt: time between rows, s.
+    """
     points = np.asarray(waypoints, dtype=np.float64)
     steps = np.diff(points, axis=0)
     largest = np.abs(steps).max(axis=1)  # the joint with the largest displacement determines the time
@@ -167,7 +182,14 @@ def time_with_stops(waypoints: Array, *, velocity: float, acceleration: float, d
 
 
 def sample_motion(motion: Callable[[Array], Array], duration: float, goal: Array, dt: float) -> Trajectory:
-    """Sample a motion at time steps ``dt``; the last row is ``goal``."""
+    """Sample a motion at a whole number of time steps ``dt``, slowed down if necessary.
+
+    Args:
+        motion: function from times (T,) s to configurations (T, n).
+        duration: duration of the motion, s.
+        goal: (n,) last configuration, which replaces the last row.
+        dt: time between rows, s.
+    """
     count = max(1, int(np.ceil(duration / dt - 1e-9)))
     qpos = np.array(motion(np.arange(1, count + 1, dtype=np.float64) * (duration / count)), dtype=np.float64)
     qpos[-1] = goal

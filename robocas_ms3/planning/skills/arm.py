@@ -1,4 +1,4 @@
-"""Context of the skills (`Arm`): environment, planner, executor, and basic motions."""
+"""Context of the skills, `Arm`: environment, planner, motion executor and decisions; basic motions."""
 
 from __future__ import annotations
 
@@ -32,14 +32,19 @@ MAX_TOP_APPROACH_Z = -0.7  # z component of the approach axis below which a gras
 
 @dataclass
 class Arm:
-    """Context of one attempt: the arm with planner and executor. Poses are in the arm's base frame.
+    """Context of one attempt: the arm with its planner, motion executor and decisions.
+
+    Poses are in the arm's base frame.
 
     Attributes:
-        reachability: batched inverse kinematics of the arm.
-        decisions: search that plays the candidates of `choose`.
-        path: number of the attempt, and the index of the candidate taken at each decision since.
-        rng: random generator, seeded from ``path``, so that results do not depend on earlier candidates.
-        qpos: (7,) last commanded configuration, rad; initially the actual one.
+        planner: motion planner.
+        inverse_kinematics: inverse kinematics of the arm for batches of poses.
+        executor: motion executor, which steps the environment.
+        decisions: search that runs the candidates of `choose`.
+        decision_path: number of the attempt, followed by the index of the chosen candidate of each decision.
+        scene: poses and obstacles of the environment.
+        rng: random generator, seeded from ``decision_path``, so that results do not depend on rejected candidates.
+        qpos: (7,) last commanded configuration, rad; initially the actual configuration.
     """
 
     planner: Planner
@@ -68,7 +73,7 @@ class Arm:
     def choose(
         self, candidates: Iterable[T], run_candidate: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE
     ) -> T:
-        """Choose a candidate, see `Decisions.choose`; each candidate gets its own random seed."""
+        """Choose a candidate with `Decisions.choose`; each candidate has its own random seed."""
         decision_path = self.decision_path
 
         def run_numbered(numbered: tuple[int, T]) -> float:
@@ -80,12 +85,12 @@ class Arm:
         return self.decisions.choose(enumerate(candidates), run_numbered, limits)[1]
 
     def add_backtracking_point(self) -> None:
-        """Add a decision whose candidates differ in the random seed only; later failures backtrack to it."""
+        """Make a decision whose candidates differ only in their random seed; later failures return to this state."""
         self.choose(range(MAX_CONTINUED_CANDIDATES), lambda _: 0.0)
 
     @property
     def env(self) -> RoboCASEnv:
-        """Control mode ``pd_joint_pos``, one env."""
+        """Environment with ``num_envs`` = 1."""
         return self.executor.base_env
 
     @property
@@ -94,6 +99,7 @@ class Arm:
 
     @property
     def target(self) -> int:
+        """Slot of the target object."""
         return int(self.env.target_slot[0])
 
     @property
@@ -101,16 +107,19 @@ class Arm:
         return self.env.task_config.target.approach
 
     def start_subgoal(self, goal_type: str) -> None:
-        """Start a sub-goal of a type, with its text for the target."""
+        """Start a sub-goal of a type, e.g. ``transfer object``, with the text for the target of the episode."""
         words = self.env.target_asset().asset.name, self.env.task_config.support
         self.executor.start_subgoal(**subgoal(goal_type, *words))
 
     def planning_time(self):
-        """Count the CPU time of a ``with`` block as planning."""
+        """Return a context manager that counts the CPU time of its block as planning."""
         return self.executor.seconds.measure("planning")
 
     def follow(self, *motions: Trajectory, until: str | None = None) -> bool:
-        """Run motions one after the other, see `MotionExecutor.follow`."""
+        """Execute motions one after the other until the flag ``until`` of ``info`` is set.
+
+        Returns whether the flag is set after the last step, or True without ``until``.
+        """
         reached = True
         for motion in motions:
             reached = self.executor.follow(motion, until=until)
@@ -124,18 +133,22 @@ class Arm:
         self.executor.move_gripper(CLOSED, self.qpos, seconds=GRIPPER_SECONDS)
 
     def clear_attached(self) -> None:
-        """Detach the held object in the planner and set the fingers to open."""
+        """Detach the held object in the planner, and plan with open fingers."""
         self.planner.attach(None)
         self.planner.finger_width = self.robot.open_width
 
     def is_holding(self, slot: int) -> bool:
-        """Return whether both fingers press on an object."""
+        """Return whether both fingers press on the object in a slot."""
         return bool(self.env.is_object_grasped()[0, slot])
 
     def plan_first_line(
         self, start: Array, goals: Iterable[Array], *, stage: str, check_collisions: bool = True
     ) -> Trajectory:
-        """Plan a straight line to the first feasible TCP pose of ``goals``."""
+        """Plan a straight line of the TCP to the first feasible pose (4x4) of ``goals``.
+
+        Raises:
+            PlanningError: no pose is feasible; the error of the last pose, or reason ``no_goals``.
+        """
         return plan_first_feasible(
             goals,
             lambda goal: self.planner.plan_straight(start, goal, stage=stage, check_collisions=check_collisions),
@@ -146,7 +159,14 @@ class Arm:
         return self.planner.plan_to_qpos(start, [np.array(self.robot.arm_rest)], stage="home")
 
     def rise_until_free(self, *, exclude: int | Collection[int] = ()) -> None:
-        """Rise in small steps until the arm and the held object (``exclude``) are collision-free."""
+        """Rise in steps of ``RISE`` until the arm and the held object are collision-free.
+
+        Args:
+            exclude: slot of the held object, which is no obstacle.
+
+        Raises:
+            PlanningError: reason ``in_contact`` after ``MAX_RISES`` steps, or a reason of the planner.
+        """
         for rises in range(MAX_RISES + 1):
             with self.planning_time():
                 self.planner.set_scene(self.scene.obstacles(exclude=exclude))
@@ -158,7 +178,10 @@ class Arm:
             self.follow(motion)
 
     def plan_rise(self, tcp_in_base: Array, height: float, *, stage: str) -> Trajectory:
-        """Plan a line straight up, or up and towards the robot at the limit of reach; obstacles are ignored."""
+        """Plan a straight line up by ``height`` m, or up and towards the robot if straight up is out of reach.
+
+        Obstacles are ignored. ``tcp_in_base`` (4x4) is the present pose of the TCP.
+        """
         up = shift_up(tcp_in_base, height)
         inward = up.copy()
         inward[:2, 3] *= 1 - height / np.linalg.norm(up[:2, 3])
@@ -166,7 +189,11 @@ class Arm:
 
 
 def plan_first_feasible(candidates: Iterable[T], plan: Callable[[T], Plan], failure: PlanningError) -> Plan:
-    """Return the plan of the first feasible candidate; raise the last error, or ``failure``."""
+    """Return ``plan(candidate)`` of the first candidate for which planning succeeds.
+
+    Raises:
+        PlanningError: planning fails for all candidates; the error of the last one, or ``failure`` without candidates.
+    """
     for candidate in candidates:
         try:
             return plan(candidate)
@@ -176,26 +203,32 @@ def plan_first_feasible(candidates: Iterable[T], plan: Callable[[T], Plan], fail
 
 
 def shift_up(tcp_in_base: Array, height: float) -> Array:
-    """Shift poses (..., 4, 4) straight up by ``height`` m."""
+    """Return poses (..., 4, 4) shifted up by ``height`` m."""
     result = tcp_in_base.copy()
     result[..., 2, 3] += height
     return result
 
 
 def shift_back(tcp_in_base: Array, distance: float) -> Array:
-    """Shift poses (..., 4, 4) by ``distance`` m against their approach axis."""
+    """Return TCP poses (..., 4, 4) shifted by ``distance`` m against their approach axis."""
     result = tcp_in_base.copy()
     result[..., :3, 3] -= distance * tcp_in_base[..., :3, 2]
     return result
 
 
 def plan_retreat(arm: Arm, start: Array, goals: list[Array]) -> Trajectory:
-    """Plan a straight line to the first feasible TCP pose (best first); obstacles are ignored."""
+    """Plan a straight line from ``start`` (7,) to the first feasible TCP pose (4x4) of ``goals``, through obstacles.
+
+    Only self-collisions are checked, since the gripper touches an object at the start.
+    """
     return arm.plan_first_line(start, goals, stage="retreat", check_collisions=False)
 
 
 def plan_free_retreat(arm: Arm, goals: list[Array]) -> Trajectory:
-    """Plan a straight line to the first feasible TCP pose (best first); only the target may be touched."""
+    """Plan a straight collision-free line to the first feasible TCP pose (4x4) of ``goals``.
+
+    If all lines collide, the target is no obstacle.
+    """
     try:
         return arm.plan_first_line(arm.qpos, goals, stage="retreat")
     except PlanningError:
@@ -207,7 +240,10 @@ def recover(arm: Arm) -> None:
     """Open the gripper and retreat after a failed attempt that stays in the recording.
 
     After an approach from above the arm rises, and obstacles are ignored. After a horizontal approach, as into a shelf
-    or to a handle, it moves straight back on a line that may touch only the target.
+    or to a handle, the arm moves straight back on a line that may touch only the target.
+
+    Raises:
+        PlanningError: no retreat is possible.
     """
     arm.clear_attached()
     arm.open_gripper()

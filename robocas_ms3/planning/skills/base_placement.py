@@ -53,7 +53,10 @@ MIN_GRASP_FRACTION, MIN_PULL_FRACTION, MIN_DROP_FRACTION = 0.3, 1.0, 0.1
 
 
 def drive_and_grasp(arm: Arm, slot: int) -> None:
-    """Drive within comfortable reach of an object and grasp it; try other base poses if planning fails."""
+    """Drive to a base pose from which an object can be grasped, and grasp it.
+
+    If no grasp can be planned, the robot drives to another base pose, up to ``MAX_BASE_POSES`` times.
+    """
     kind = arm.decision_path[-1] % GRASP_KINDS  # skip the kinds of earlier attempts
     _try_base_poses(
         arm,
@@ -63,12 +66,18 @@ def drive_and_grasp(arm: Arm, slot: int) -> None:
 
 
 def drive_and_open(arm: Arm) -> None:
-    """Drive to where the handle is reachable during the whole pull, and open the door or drawer."""
+    """Drive to a base pose from which the arm reaches the handle during a whole pull, and open the door or drawer."""
     _try_base_poses(arm, lambda relocate: drive_to_handle(arm, relocate=relocate), lambda: open_furniture_part(arm))
 
 
 def _try_base_poses(arm: Arm, drive_to: Callable[[bool], None], act: Callable[[], None]) -> None:
-    """Drive and act; if acting fails before anything moves, drive to another base pose and act again."""
+    """Drive to a base pose and act there; if ``act`` fails before it moves anything, repeat at another base pose.
+
+    Args:
+        arm: context of the attempt.
+        drive_to: function that drives the base; its argument says whether another base pose is required.
+        act: function that grasps or pulls; it raises PlanningError if it fails.
+    """
     for number in range(MAX_BASE_POSES):
         drive_to(number > 0)
         length = len(arm.executor.actions)
@@ -81,7 +90,10 @@ def _try_base_poses(arm: Arm, drive_to: Callable[[bool], None], act: Callable[[]
 
 
 def drive_to_object(arm: Arm, slot: int, *, relocate: bool = False) -> None:
-    """Drive with a folded arm to where an object is in reach; stay if it is, unless ``relocate``."""
+    """Drive with a folded arm to a base pose from which an object can be grasped.
+
+    The robot stays where it is if the object is within reach, unless ``relocate`` is set.
+    """
     if not arm.executor.drives_base:
         return
     with arm.planning_time():
@@ -110,7 +122,10 @@ def drive_to_object(arm: Arm, slot: int, *, relocate: bool = False) -> None:
 
 
 def drive_to_handle(arm: Arm, *, relocate: bool = False) -> None:
-    """Drive with a folded arm to a base pose for the pull, if needed or if ``relocate`` is set."""
+    """Drive with a folded arm to a base pose from which the handle can be pulled.
+
+    The robot stays where it is if the pull is possible there, unless ``relocate`` is set.
+    """
     if not arm.executor.drives_base:
         return
     part = MovingPart.from_task(arm)
@@ -137,7 +152,7 @@ def drive_to_handle(arm: Arm, *, relocate: bool = False) -> None:
 
 
 def place_in_basket(arm: Arm, slot: int) -> None:
-    """Carry a held object to the basket, driving if necessary, and release it there."""
+    """Carry a held object to the basket, with a drive if necessary, and release it there."""
     arm.start_subgoal("transfer object")
     drive_to_basket(arm, slot)
     carry_to_basket(arm, slot)
@@ -145,9 +160,10 @@ def place_in_basket(arm: Arm, slot: int) -> None:
 
 
 def drive_to_basket(arm: Arm, slot: int) -> None:
-    """Drive with a held object to where the basket is in reach.
+    """Drive with a held object to a base pose from which the arm reaches the basket.
 
-    The first choice is the base pose at the start of the episode, then the current one, then any other.
+    The robot prefers the base pose at the start of the episode, then the present base pose, then the best of sampled
+    base poses.
     """
     if not arm.executor.drives_base:
         return
@@ -185,7 +201,10 @@ def _fold_arm(arm: Arm) -> Surroundings:
 
 
 def find_clear_grasps(arm: Arm, slot: int) -> Array:
-    """Return grasps (G, 4, 4) of an object in the world, from all sides, whose gripper approach is clear."""
+    """Return annotated grasps (G, 4, 4) of an object in the world whose gripper touches nothing on its approach.
+
+    The robot's base pose is not taken into account.
+    """
     base, object_in_base = arm.scene.arm_base_in_world, arm.scene.object_in_base(slot)
     object_in_world = base @ object_in_base
     notes = arm.env.object_assets[0][slot].annotations
@@ -199,14 +218,14 @@ def find_clear_grasps(arm: Arm, slot: int) -> Array:
 def reachable_fraction(
     arm: Arm, base: Array, grasps: Array, others: list[Obstacle], *, thorough: bool = False
 ) -> float:
-    """Return the fraction of grasps (with pre-grasps) that are reachable from a base pose.
+    """Estimate the fraction of grasps that the arm reaches from a base pose, together with their pre-grasp poses.
 
     Args:
         arm: context of the attempt.
-        base: (3,) base pose.
-        grasps: (G, 4, 4) grasps of ``find_clear_grasps``; grasps from the far side count as unreachable.
-        others: all other bodies, in the world frame.
-        thorough: evaluate more grasps and all configurations instead of the nearest ones; much slower.
+        base: (3,) base pose: x m, y m, yaw rad.
+        grasps: (G, 4, 4) TCP poses of `find_clear_grasps`; grasps from the side opposite to the robot are ignored.
+        others: all other bodies, with poses in the world frame.
+        thorough: whether to evaluate more grasps, and all configurations instead of the nearest; much slower.
     """
     frame = arm_base_in_world(arm, base)
     poses = _sample_grasp_poses(arm, frame, grasps, GRASPS_THOROUGH if thorough else GRASPS_SAMPLED)
@@ -224,7 +243,10 @@ def reachable_fraction(
 
 
 def _sample_grasp_poses(arm: Arm, frame: Array, grasps: Array, count: int) -> Array:
-    """Return poses (4K, 4, 4) of K <= ``count`` grasps, their half turns, and pre-grasps."""
+    """Return TCP poses (4K, 4, 4) in the arm's base frame: K grasps, their half turns, and the pre-grasps of both.
+
+    The K <= ``count`` grasps are evenly spaced in ``grasps``.
+    """
     chosen = _graspable_from(arm, frame, grasps)
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(count, len(chosen))).round().astype(int)]
     poses = inverse(frame) @ np.concatenate([chosen, chosen @ HALF_TURN])

@@ -34,7 +34,12 @@ BACK_DISTANCES = (0.15, 0.30)  # m straight back before or after the rest of the
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Obstacles of a drive in the world frame: bodies for the arm, points (P, 3) for the mobile base, m."""
+    """Obstacles of a drive, in the world frame.
+
+    Attributes:
+        obstacles: bodies for the collision checks of the arm.
+        cloud: (P, 3) surface points for the collision checks of the mobile base, m.
+    """
 
     obstacles: list[Obstacle]
     cloud: Array
@@ -51,13 +56,17 @@ def current_base_pose(arm: Arm) -> Array:
 
 
 def arm_base_in_world(arm: Arm, base: Array) -> Array:
-    """Return the world pose (4x4) of the arm's base for a base pose (3,)."""
+    """Return the pose (4x4) of the arm's base in the world for a base pose (3,)."""
     root = from_wxyz(arm.env.agent.robot.pose.raw_pose[0])
     return root @ from_xyz_yaw(float(base[0]), float(base[1]), arm.robot.arm_base_height, float(base[2]))
 
 
 def drive(arm: Arm, *goals: Array) -> None:
-    """Drive straight to base poses one after the other and wait until the base settles."""
+    """Drive straight to base poses (3,), one after the other, and wait at each pose until the base settles.
+
+    Raises:
+        PlanningError: reason ``blocked``: the base did not reach its goal.
+    """
     for goal in goals:
         if np.abs(goal - current_base_pose(arm)).max() < 1e-6:
             continue
@@ -72,7 +81,7 @@ def drive(arm: Arm, *goals: Array) -> None:
 
 
 def sample_base_poses(arm: Arm, center: Array) -> Array:
-    """Sample base poses (N, 3) that face a point (3,) in the world, the most promising first."""
+    """Sample base poses (N, 3) that face a point (3,) in the world at a comfortable distance, the best first."""
     low, high = np.array(arm.robot.base_limits).T + np.array([[LIMIT_MARGIN], [-LIMIT_MARGIN]])
     high[2], low[2] = MAX_YAW, -MAX_YAW
     goals = arm.rng.uniform(low, high, (SAMPLES, 3))
@@ -87,14 +96,20 @@ def sample_base_poses(arm: Arm, center: Array) -> Array:
 def find_best_route(
     arm: Arm, goals: Array, around: Surroundings, score_pose: Callable[[Array], float], *, enough: float
 ) -> list[Array]:
-    """Return a route to the best of the first collision-free base poses in ``goals`` (N, 3).
+    """Return the route to the base pose with the greatest score of the first ``POSES_SCORED`` free base poses.
 
     Args:
         arm: context of the attempt.
-        goals: candidate base poses, the most promising first.
+        goals: (N, 3) candidate base poses, the most promising first.
         around: obstacles.
         score_pose: function that returns the score of a base pose (3,); 0 means unusable.
-        enough: score from which on no further pose is evaluated.
+        enough: a reachable pose with at least this score ends the evaluation.
+
+    Returns:
+        Base poses (3,) of the route, without the present base pose.
+
+    Raises:
+        PlanningError: reason ``no_base_pose``.
     """
     best: tuple[float, list[Array]] = (0.0, [])
     scored = 0
@@ -153,7 +168,7 @@ def _leg_is_free(arm: Arm, start: Array, goal: Array, around: Surroundings) -> b
 
 
 def is_body_clear(robot: RobotDescription, arm_base_in_world: Array, cloud: Array) -> bool:
-    """Return whether no point (P, 3) in the world is inside the mobile base."""
+    """Return whether no point of ``cloud`` (P, 3), in the world frame, is inside the mobile base."""
     root = arm_base_in_world.copy()
     root[2, 3] -= robot.arm_base_height  # on the floor
     return robot_placement.is_body_clear(root, cloud)

@@ -35,11 +35,19 @@ ExitMotions = tuple[Trajectory, ...]
 
 
 def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, skip_kinds: int = 0) -> None:
-    """Plan and run a grasp of an object, then lift it (front approach: lift and withdraw).
+    """Grasp an object and move it out of its surroundings.
+
+    After an approach from above the arm lifts the object. After an approach from the front it lifts the object slightly
+    and withdraws straight back.
 
     Args:
+        arm: context of the attempt.
+        slot: slot of the object.
         lift_height: lift after a grasp from above, m (RoboCAS-v0: 0.10 for pick, 0.15 for search).
-        skip_kinds: number of kinds of grasps to skip, the best first.
+        skip_kinds: number of kinds of similar grasps to skip, from the best kind on.
+
+    Raises:
+        PlanningError: no grasp can be planned, the fingers miss the object, or the object slips out.
     """
     with arm.planning_time():
         approach, out = plan_grasp(arm, slot, lift_height, skip_kinds)
@@ -53,7 +61,17 @@ def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, skip_kinds: int = 0
 
 
 def plan_grasp(arm: Arm, slot: int, lift_height: float, skip_kinds: int = 0) -> tuple[Trajectory, ExitMotions]:
-    """Plan the approach to the best feasible grasp and the exit from the object's surroundings."""
+    """Plan the approach to the best feasible grasp, and the motions that move the object out of its surroundings.
+
+    Args:
+        arm: context of the attempt.
+        slot: slot of the object.
+        lift_height: lift after a grasp from above, m.
+        skip_kinds: number of kinds of similar grasps to skip, from the best kind on.
+
+    Returns:
+        Motion to the grasp; motions with the grasped object.
+    """
     planner, failure = arm.planner, PlanningError("grasp_sampling", "no_feasible_grasp")
     everything, others = arm.scene.obstacles(), arm.scene.obstacles(exclude=slot)
     with_room = arm.scene.obstacles(clearance=CLEARANCE)
@@ -101,7 +119,10 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, skip_kinds: int = 0) -> 
 
 
 def grasp_candidates(arm: Arm, slot: int, skip_kinds: int) -> Iterator[Array]:
-    """Yield promising grasps as TCP poses (4x4), best first, without the best ``skip_kinds`` kinds."""
+    """Yield TCP poses (4x4) of reachable grasps whose gripper touches nothing, the best first.
+
+    The best ``skip_kinds`` kinds of similar grasps are omitted. Each pose is in the arm's base frame.
+    """
     notes = arm.env.object_assets[0][slot].annotations
     base, object_in_base = arm.scene.arm_base_in_world, arm.scene.object_in_base(slot)
     kept = filter_grasps(notes, base @ object_in_base, base, arm.approach)
@@ -143,7 +164,10 @@ def grasp_candidates(arm: Arm, slot: int, skip_kinds: int) -> Iterator[Array]:
 
 
 def _skip_kinds(tcp: Array, count: int) -> list[int]:
-    """Return the indices of grasps (N, 4, 4) without the first ``count`` kinds; see ``KIND_TOLERANCES``."""
+    """Return indices of grasps (N, 4, 4) without the first ``count`` kinds.
+
+    Grasps are of the same kind if their TCP poses differ by at most ``KIND_TOLERANCES``.
+    """
     left = np.ones(len(tcp), dtype=bool)
     for _ in range(count):
         if not left.any():
@@ -156,7 +180,7 @@ def _skip_kinds(tcp: Array, count: int) -> list[int]:
 
 
 def _filter_clear(tcp_in_base: Array, order: NDArray[np.int_], points_in_base: Array) -> Iterator[int]:
-    """Yield grasps in ``order`` whose gripper touches no point during the approach."""
+    """Yield indices of grasps, in ``order``, whose gripper touches no point (P, 3) during the approach."""
     for first in range(0, len(order), CLEARED_AT_ONCE):
         some = order[first : first + CLEARED_AT_ONCE]
         yield from some[is_gripper_clear(tcp_in_base[some], points_in_base)].tolist()
@@ -172,7 +196,7 @@ def _plan_approach_and_exit(
 
 
 def _plan_withdrawal(arm: Arm, slot: int, start: Array, tcp_in_base: Array) -> tuple[Trajectory, Trajectory]:
-    """Plan the smallest lift with a free exit, and a horizontal line straight back with the object."""
+    """Plan a lift and a horizontal line straight back with the object, with the smallest lift that allows the line."""
     failure = PlanningError("withdraw", "no_exit")
     vertices = np.concatenate(arm.env.object_assets[0][slot].hulls)
     held = AttachedBody(vertices, inverse(tcp_in_base) @ arm.scene.object_in_base(slot))
@@ -197,7 +221,7 @@ def _plan_withdrawal(arm: Arm, slot: int, start: Array, tcp_in_base: Array) -> t
 
 
 def _lift_poses(tcp_in_base: Array, lift_height: float) -> list[Array]:
-    """Return lift goals: straight up, back along the approach, and halfway between."""
+    """Return TCP poses (4x4) after a lift: straight up, back along the approach axis, and between the two."""
     up, back = np.array([0, 0, 1.0]), -tcp_in_base[:3, 2]
     goals = []
     for fraction in (0.0, 0.5, 1.0):

@@ -49,7 +49,13 @@ STEP = {"prismatic": 0.015, "revolute": 0.03}  # m, rad between poses of a pull
 
 @dataclass(frozen=True)
 class MovingPart:
-    """The moving part of furniture that a task opens: a door or a drawer, with its handle and joint."""
+    """Door or drawer that the task opens.
+
+    Attributes:
+        furniture: name of the piece of furniture.
+        handle: handle of the door or drawer.
+        joint: joint of the door or drawer.
+    """
 
     furniture: str
     handle: Handle
@@ -57,6 +63,7 @@ class MovingPart:
 
     @classmethod
     def from_task(cls, arm: Arm) -> MovingPart:
+        """Return the door or drawer that the task of the arm's environment opens."""
         model = arm.env.model
         opening, joint = model.config.opening, model.joint_to_open
         assert opening is not None  # required by the task
@@ -73,7 +80,11 @@ class MovingPart:
         return arm.scene.joint_positions(self.furniture)[self.joint.name]
 
     def pull_positions(self, arm: Arm) -> Array:
-        """Return joint positions (T,) of a pull, from the current position to the maximum of a pull."""
+        """Return joint positions (T,) of the longest pull, from the present position on, m or rad.
+
+        Raises:
+            PlanningError: reason ``already_open``: the longest pull is shorter than one step.
+        """
         start, far = self.joint_position(arm), MAX_OPENED_FRACTION[self.joint.kind] * self.open_limit
         left = (far - start) * np.sign(far)
         if left < STEP[self.joint.kind]:
@@ -81,7 +92,7 @@ class MovingPart:
         return np.linspace(start, far, int(np.ceil(left / STEP[self.joint.kind])) + 1, dtype=np.float64)
 
     def min_pull(self, arm: Arm) -> float:
-        """Return the minimum length of a pull, m or rad."""
+        """Return the minimum useful length of a pull, m or rad."""
         positions = self.pull_positions(arm)
         return min(MIN_RANGE_FRACTION * abs(self.open_limit), abs(positions[-1] - positions[0]))
 
@@ -99,7 +110,7 @@ class MovingPart:
 
     @property
     def grasp_in_part(self) -> Array:
-        """TCP pose (4x4) in the part's frame that holds the handle squarely."""
+        """TCP pose (4x4) in the part's frame with the gripper perpendicular to the handle."""
         w, x, y, z = self.handle.wxyz
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), self.handle.position
@@ -118,7 +129,11 @@ class MovingPart:
 
 
 def open_furniture_part(arm: Arm) -> None:
-    """Open the door or drawer of the task, with up to ``MAX_PULLS`` pulls."""
+    """Open the door or drawer of the task by up to ``MAX_PULLS`` pulls.
+
+    Raises:
+        PlanningError: a pull fails, or the door or drawer is not open after the last pull.
+    """
     part = MovingPart.from_task(arm)
     for _ in range(MAX_PULLS):
         pull_handle(arm, part)
@@ -128,14 +143,14 @@ def open_furniture_part(arm: Arm) -> None:
 
 
 def is_opened(arm: Arm) -> bool:
-    """Return whether the door or drawer of the task is open."""
+    """Return whether the door or drawer of the task is open far enough."""
     env = arm.env
     assert isinstance(env, RoboCASOpenPickEnv)
     return bool(env.is_furniture_open()[0])
 
 
 def pull_handle(arm: Arm, part: MovingPart) -> None:
-    """Grasp the handle, pull as far as the arm reaches, release it and retreat."""
+    """Grasp the handle, pull it as far as the arm reaches, release it and retreat."""
     with arm.planning_time():
         approach, opening = plan_pull(arm, part)
         before, least = part.joint_position(arm), 0.5 * part.min_pull(arm)
@@ -161,7 +176,13 @@ def pull_handle(arm: Arm, part: MovingPart) -> None:
 
 
 def plan_pull(arm: Arm, part: MovingPart) -> tuple[Trajectory, Trajectory]:
-    """Plan the approach to the handle and the longest pull, with the bar deep in the gripper if possible."""
+    """Plan the motion to a grasp of the handle, and the longest pull.
+
+    The bar of the handle is ``DEPTH_OFFSET`` behind the TCP, towards the palm, if possible.
+
+    Returns:
+        Motion to the grasp; pull.
+    """
     failure = PlanningError("pull", "no_plan")
     return plan_first_feasible((DEPTH_OFFSET, 0.0), lambda depth_offset: _plan_pull(arm, part, depth_offset), failure)
 
@@ -199,7 +220,16 @@ def _plan_pull(arm: Arm, part: MovingPart, depth_offset: float) -> tuple[Traject
 
 
 def pull_fraction(arm: Arm, part: MovingPart, arm_base_in_world: Array, others: list[Obstacle]) -> float:
-    """Return the fraction of a pull that the arm can make from another base pose; 1: opened with a margin."""
+    """Estimate how far the arm can pull the handle from another base pose, 0 to 1.
+
+    1 means that the pull opens the door or drawer with a margin (``COMFORT_FRACTION``).
+
+    Args:
+        arm: context of the attempt.
+        part: door or drawer.
+        arm_base_in_world: (4x4) pose of the arm's base at the other base pose.
+        others: all other bodies, in the frame of that arm's base.
+    """
     positions = part.pull_positions(arm)
     opened = arm.env.model.open_threshold
     enough = 1 + int(np.sum(np.abs(positions) < abs(opened + COMFORT_FRACTION * (positions[-1] - opened))))
@@ -220,11 +250,17 @@ def pull_fraction(arm: Arm, part: MovingPart, arm_base_in_world: Array, others: 
 def _compute_paths(
     arm: Arm, part: MovingPart, frames: Array, depth_offset: float = 0.0
 ) -> tuple[Array, NDArray[np.int_], Array]:
-    """Compute paths of the arm for N grasps of the handle.
+    """Compute N paths of the arm that move the part through its poses, one path per grasp of the handle.
+
+    Args:
+        arm: context of the attempt.
+        part: door or drawer.
+        frames: (T, 4, 4) poses of the part during the pull, in the arm's base frame.
+        depth_offset: distance of the bar behind the TCP, towards the palm, m.
 
     Returns:
-        Configurations (T, N, 7); the number of poses (N,) of the part that each path reaches; the rotation (N,) about
-        the bar, rad.
+        Configurations (T, N, 7); number of poses (N,) that each path reaches; rotation (N,) of the gripper about the
+        bar in each grasp, rad.
     """
     goals, starts, beyond = [], [], np.eye(4)
     beyond[2, 3] = depth_offset
@@ -253,7 +289,10 @@ def _filter_grasps(
     others: list[Obstacle],
     depth_offset: float = 0.0,
 ) -> list[int]:
-    """Return the grasps of ``order`` with the handle between the open fingers and without collisions."""
+    """Return the indices from ``order`` of grasps that are collision-free with the handle between the open fingers.
+
+    ``starts`` (N, 7) has the configurations of all grasps; ``order`` has indices of ``starts``, the best first.
+    """
     surface = transform_points(frames[0], part.surface_points(arm))
     near = surface[np.linalg.norm(surface - (frames[0] @ part.grasp_in_part)[:3, 3], axis=1) < HANDLE_RADIUS]
     arm.planner.set_scene([*others, part.obstacle(arm, frames[0])])
@@ -270,7 +309,10 @@ def _filter_grasps(
 
 
 def _count_free_poses(arm: Arm, part: MovingPart, path: Array, frames: Array, others: list[Obstacle]) -> int:
-    """Return the length of the collision-free start of a path (T, 7), with the part at poses (T, 4, 4)."""
+    """Return the number of configurations of a path (T, 7) before the first collision.
+
+    At each configuration the part is at the pose in ``frames`` (T, 4, 4).
+    """
     planner, width = arm.planner, part.handle.width
     planner.set_scene(others)
     blocked = np.flatnonzero(~planner.is_free(path[::3], width))
@@ -287,7 +329,11 @@ def _count_free_poses(arm: Arm, part: MovingPart, path: Array, frames: Array, ot
 
 
 def _find_retreatable_length(arm: Arm, path: Array, least: int) -> int:
-    """Return the longest start of a pull (T, 7), at least ``least``, after which the gripper can retreat."""
+    """Return the greatest length of a pull, at most that of ``path`` (T, 7), after which the gripper can retreat.
+
+    Raises:
+        PlanningError: reason ``no_retreat``: there is no such length of at least ``least`` configurations.
+    """
     for length in range(len(path), max(least, 1) - 1, -3):
         tcp = arm.planner.tcp(path[length - 1])
         try:

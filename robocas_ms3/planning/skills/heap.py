@@ -33,7 +33,13 @@ COST_PER_PUSH = 8.0  # s; the result of a push is less repeatable than that of a
 
 @dataclass(frozen=True)
 class Move:
-    """Candidate move of an obstacle; ``turn_deg`` rotates a push from the paper's direction."""
+    """Candidate move of an obstacle.
+
+    Attributes:
+        skill: ``push``, or ``lift`` (lift the obstacle and place it elsewhere).
+        slot: slot of the obstacle.
+        turn_deg: rotation of a push from the paper's direction, deg.
+    """
 
     skill: Literal["push", "lift"]
     slot: int
@@ -42,7 +48,12 @@ class Move:
 
 @dataclass(frozen=True)
 class Heap:
-    """Current state of the objects around a target."""
+    """Present state of the objects around a target.
+
+    Attributes:
+        arm: context of the attempt.
+        target: slot of the target.
+    """
 
     arm: Arm
     target: int
@@ -55,12 +66,12 @@ class Heap:
 
     @property
     def moves_made(self) -> int:
-        """Number of pushes and removals so far."""
+        """Number of pushes and removals since the reset."""
         return sum(self.arm.executor.facts[fact] for fact in COUNTERS)
 
     @property
     def target_visible(self) -> bool:
-        """Whether the gripper camera sees most of the target."""
+        """Whether the gripper camera sees at least four fifths of the target."""
         with self.arm.planning_time():
             return hidden_fraction(self.arm, self.target) <= MAX_HIDDEN_FRACTION
 
@@ -75,7 +86,11 @@ class Heap:
         return self.target_uncovered and self.target_visible
 
     def candidate_moves(self) -> Iterator[Move]:
-        """Yield moves of the highest obstacles, then of those that block grasps; pushes first (faster)."""
+        """Yield candidate moves of the obstacles, the most promising first; docs/policies.md describes the order.
+
+        Raises:
+            UnrecoverableError: reason ``too_many_obstacles``: ``MAX_MOVES`` moves have been made.
+        """
         if self.moves_made >= MAX_MOVES:
             raise UnrecoverableError("horizon", "too_many_obstacles")
         with self.arm.planning_time():
@@ -88,7 +103,10 @@ class Heap:
             yield from (Move("push", self.target, turn) for turn in (0.0, 90.0, -90.0, 180.0))
 
     def _find_obstacles(self) -> list[int]:
-        """Return slots of objects that hide or surround the target, the highest first, then of grasp blockers."""
+        """Return slots of at most ``MAX_OBSTACLES`` obstacles, the first to move first.
+
+        First come objects that hide or surround the target, the highest first, then objects that block grasps.
+        """
         obstacles = np.flatnonzero(self.env.measure_clutter().obstacles[0].cpu().numpy()).tolist()
         obstacles.sort(key=lambda slot: -self.arm.scene.object_points(slot)[:, 2].max())
         order = dict.fromkeys(obstacles[:MAX_OBSTACLES])
@@ -98,7 +116,11 @@ class Heap:
         return [slot for slot in order if slot != self.target][:MAX_OBSTACLES]
 
     def execute(self, move: Move) -> float:
-        """Run a move and return its score: minus the cost in s."""
+        """Run the motions of a move and return its score, minus the cost in s.
+
+        Raises:
+            PlanningError: a motion cannot be planned or has no effect, or an object is at the edge of the surface.
+        """
         arm, facts = self.arm, self.arm.executor.facts
         before, target, start = self.centroid(move.slot), self.centroid(self.target), len(arm.executor.actions)
         arm.rise_until_free()
@@ -120,7 +142,7 @@ class Heap:
         )
 
     def remaining_cost(self) -> float:
-        """Return the estimated cost of the remaining work, s."""
+        """Estimate the cost of the moves that are still necessary, s."""
         with self.arm.planning_time():
             clutter = self.env.measure_clutter()
             hidden, obstacles = float(clutter.hidden_fraction[0]), int(clutter.obstacles[0].sum())
@@ -129,7 +151,7 @@ class Heap:
             return cost + COST_WITHOUT_GRASP * (not count_clear_grasps(self.arm, self.target))
 
     def check_objects_on_surface(self) -> None:
-        """Raise an error if an object is at the edge of the surface or has fallen off."""
+        """Raise PlanningError if an object is at the edge of the surface, UnrecoverableError if one has fallen off."""
         frame, half = surface_in_base(self.arm)
         present = np.flatnonzero(self.env.present[0].cpu().numpy()).tolist()
         positions = np.stack([self.arm.scene.object_in_base(slot)[:3, 3] for slot in present])
@@ -140,5 +162,5 @@ class Heap:
             raise PlanningError("clear", "object_at_edge")
 
     def centroid(self, slot: int) -> Array:
-        """Return the mean (3,) of the surface points of an object."""
+        """Return the mean (3,) of the surface points of an object in the arm's base frame, m."""
         return self.arm.scene.object_points(slot).mean(axis=0)

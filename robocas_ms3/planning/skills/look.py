@@ -20,7 +20,13 @@ VIEWS_SAMPLED, VIEWS_PLANNED = 96, 6
 
 
 def look_at(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> None:
-    """Move the gripper camera to a view of a point (3,) from above, within a range of distances, m."""
+    """Move the gripper camera to a pose from which it views a point from above.
+
+    Args:
+        arm: context of the attempt.
+        point_in_base: (3,) point in the arm's base frame, m.
+        distance: minimum and maximum distance of the camera from the point, m.
+    """
     arm.rise_until_free()
     with arm.planning_time():
         motion = plan_view(arm, point_in_base, distance)
@@ -28,7 +34,14 @@ def look_at(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> No
 
 
 def plan_view(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> Trajectory:
-    """Plan a motion to one of the nearest views of a point; arguments as in `look_at`."""
+    """Plan a motion to one of the nearest camera poses that view a point from above.
+
+    Args:
+        arm: context of the attempt.
+        point_in_base: (3,) point in the arm's base frame, m.
+        distance: minimum and maximum distance of the camera from the point, m. If the arm reaches no such camera pose,
+            all distances from ``NEAR[0]`` to ``FAR[1]`` are tried.
+    """
     tcp_in_camera = inverse(inverse(arm.scene.tcp_in_base) @ camera_in_base(arm))
     for least, greatest in (distance, (NEAR[0], FAR[1])):  # any distance, if a high table allows no such view
         views = sample_views(arm.rng, point_in_base, (least, greatest), VIEWS_SAMPLED)
@@ -48,16 +61,16 @@ def plan_view(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> 
 
 
 def load_object_meshes(arm: Arm) -> None:
-    """Load the object meshes before the first decision; otherwise each forked process loads them again."""
+    """Load the meshes of all objects of the episode into the cache, which forked processes then share."""
     for asset, present in zip(arm.env.object_assets[0], arm.env.present[0].tolist(), strict=True):
         if present:
             make_ray_scene(load_visual_mesh(asset))
 
 
 def hidden_fraction(arm: Arm, slot: int) -> float:
-    """Return the fraction of an object hidden from the gripper camera by other objects.
+    """Return the fraction of an object that other objects hide from the gripper camera; 1 for an object out of view.
 
-    It is 1 for an object out of view. Ray casting without the robot computes it, so that no renderer is needed.
+    The fraction is computed by ray casting without the robot, so that no renderer is needed.
     """
     env = arm.env
     config = _camera_config(arm)
@@ -72,9 +85,9 @@ def hidden_fraction(arm: Arm, slot: int) -> float:
 
 
 def camera_in_base(arm: Arm) -> Array:
-    """Return the pose (4x4) of the gripper camera in the arm's base frame: x forward, y left, z up.
+    """Return the pose (4x4) of the gripper camera in the arm's base frame, with its random shift.
 
-    The pose includes the random shift of the camera.
+    The axes of the camera are x forward, y left, z up.
     """
     config = _camera_config(arm)
     link = arm.env.agent.robot.links_map[str(config.entity_uid)]
@@ -98,9 +111,10 @@ def _camera_config(arm: Arm) -> CameraConfig:
 
 
 def sample_views(rng: np.random.Generator, point: Array, distance: tuple[float, float], count: int) -> Array:
-    """Sample camera poses (count, 4, 4) that view a point (3,) from above: x forward, y left, z up.
+    """Sample camera poses (count, 4, 4) that view a point (3,) from above, with a random roll.
 
-    The roll about the line of sight is random. ``distance`` is the minimum and maximum distance, m.
+    The axes of the camera are x forward, y left, z up. ``distance`` is the minimum and maximum distance of the camera
+    from the point, m.
     """
     elevation = np.deg2rad(rng.uniform(*ELEVATION_DEG, count))
     azimuth, roll = rng.uniform(-np.pi, np.pi, (2, count))

@@ -33,7 +33,13 @@ MAX_OFFSET_FRACTION = 0.25  # maximum offset of the centre of mass from the midd
 
 @dataclass(frozen=True)
 class ContainerInterior:
-    """Interior box of a container: corners ``low`` and ``high`` (3,), m, in the container's frame."""
+    """Interior of a container, a box in the container's frame.
+
+    Attributes:
+        container_in_base: (4x4) pose of the container in the arm's base frame.
+        low: (3,) corner of the box with the smallest coordinates, m.
+        high: (3,) corner of the box with the greatest coordinates, m.
+    """
 
     container_in_base: Array
     low: Array
@@ -41,7 +47,11 @@ class ContainerInterior:
 
 
 def carry_to_basket(arm: Arm, slot: int) -> None:
-    """Carry a held object to a pose above the basket."""
+    """Carry a held object to a pose above the basket.
+
+    Raises:
+        PlanningError: no motion is found, or the gripper loses the object.
+    """
     with arm.planning_time():
         motion = plan_carry(arm, slot)
     arm.follow(motion)
@@ -50,7 +60,11 @@ def carry_to_basket(arm: Arm, slot: int) -> None:
 
 
 def release_into_basket(arm: Arm, slot: int) -> None:
-    """Release the object above the basket, retreat, and move home until the task succeeds."""
+    """Release the object above the basket, retreat, and move the arm home until the task succeeds.
+
+    Raises:
+        PlanningError: the task does not succeed; the reason is the first condition of success that does not hold.
+    """
     start = arm.qpos
     arm.open_gripper()
     with arm.planning_time():
@@ -65,9 +79,9 @@ def release_into_basket(arm: Arm, slot: int) -> None:
 
 
 def plan_carry(arm: Arm, slot: int) -> Trajectory:
-    """Plan a motion to a pose above the basket from which the arm can retreat.
+    """Plan a motion of a held object to a pose above the basket from which the arm can retreat.
 
-    If possible, the motion keeps ``CARRY_CLEARANCE`` to basket and furniture.
+    The motion keeps ``CARRY_CLEARANCE`` to basket and furniture if possible.
     """
     drops = sample_drop_poses(arm, slot, arm.scene.arm_base_in_world)
     solved, qpos = arm.inverse_kinematics.nearest_solutions(drops, arm.qpos)
@@ -85,9 +99,16 @@ def plan_carry(arm: Arm, slot: int) -> Trajectory:
 
 
 def _rank_drops(arm: Arm, slot: int, drops: Array, qpos: Array) -> NDArray[np.int_]:
-    """Rank drop poses (N, 4, 4) with configurations (N, 7): objects that fit through the opening first.
+    """Return the order (N,) of drop poses, the best first.
 
-    Next come poses near the current configuration, with a bent arm and a steep gripper, off which objects do not slide.
+    The object's overhang over the rim of the basket counts first, in steps of 15 mm. Next come the distance from the
+    present configuration, the tilt of the gripper, off which an object slides, and the stretch of the arm.
+
+    Args:
+        arm: context of the attempt.
+        slot: slot of the held object.
+        drops: (N, 4, 4) TCP poses above the basket.
+        qpos: (N, 7) configurations of the arm at these poses.
     """
     inside = _basket_interior(arm, arm.scene.arm_base_in_world)
     overhang = compute_overhang(drops, inside, transform_points(*read_held_object(arm, slot)), DROP_MARGIN)
@@ -98,7 +119,7 @@ def _rank_drops(arm: Arm, slot: int, drops: Array, qpos: Array) -> NDArray[np.in
 
 
 def _plan_to_first_feasible(arm: Arm, drops: Array, qpos: Array) -> Trajectory:
-    """Plan a motion to the first feasible drop pose (N, 4, 4) with configurations (N, 7)."""
+    """Plan a motion to the first feasible pose of ``drops`` (N, 4, 4), with configurations ``qpos`` (N, 7)."""
     start = arm.qpos
     chosen = np.flatnonzero(arm.planner.is_free(qpos[:DROPS_CHECKED], arm.planner.finger_width))[:DROPS_PLANNED]
     if not len(chosen):
@@ -124,20 +145,27 @@ def _plan_to_first_feasible(arm: Arm, drops: Array, qpos: Array) -> Trajectory:
 
 
 def read_held_object(arm: Arm, slot: int) -> tuple[Array, Array]:
-    """Return the pose (4x4) of a held object in the TCP frame and the vertices (V, 3) of its hulls, m."""
+    """Read the geometry of a held object.
+
+    Returns:
+        Pose (4x4) of the object in the TCP frame; vertices (V, 3) of its convex hulls in the object's frame, m.
+    """
     vertices = np.concatenate(arm.env.object_assets[0][slot].hulls)
     return inverse(arm.scene.tcp_in_base) @ arm.scene.object_in_base(slot), vertices
 
 
 def attach_held_object(arm: Arm, slot: int) -> None:
-    """Attach a held object to the arm in the planner, with the current finger width."""
+    """Attach a held object to the TCP in the planner, and plan with the present width of the fingers."""
     object_in_tcp, vertices = read_held_object(arm, slot)
     arm.planner.attach(AttachedBody(vertices, object_in_tcp))
     arm.planner.finger_width = float(arm.env.agent.gripper_width[0])
 
 
 def sample_drop_poses(arm: Arm, slot: int, arm_base_in_world: Array) -> Array:
-    """Sample TCP poses (N, 4, 4) that hold an object above the basket, in the arm's base frame."""
+    """Sample TCP poses (N, 4, 4), in the arm's base frame, with the held object above the basket.
+
+    ``arm_base_in_world`` (4x4) is the pose of the arm's base, which may differ from the present pose.
+    """
     object_in_tcp, vertices = read_held_object(arm, slot)
     center_of_mass = np.array([arm.env.object_assets[0][slot].asset.center_of_mass])
     return sample_poses_above_container(
@@ -173,7 +201,7 @@ def _failure_reason(arm: Arm) -> str:
 def sample_poses_above_container(
     rng: np.random.Generator, count: int, inside: ContainerInterior, vertices: Array, center_of_mass: Array
 ) -> Array:
-    """Sample TCP poses (count, 4, 4) with a held object above a container, clear of its rim.
+    """Sample TCP poses (count, 4, 4), in the arm's base frame, with a held object above the rim of a container.
 
     The approach axis is tilted away from the arm, so that far containers are within reach; half of the samples are
     steep, for near containers.
@@ -183,7 +211,7 @@ def sample_poses_above_container(
         count: number of poses.
         inside: interior of the container.
         vertices: (V, 3) vertices of the object's hulls in the TCP frame, m.
-        center_of_mass: (3,) of the object in the TCP frame, m.
+        center_of_mass: (3,) centre of mass of the object in the TCP frame, m.
     """
     middle, half = (inside.low + inside.high) / 2, (inside.high - inside.low) / 2
     local = np.column_stack(
@@ -210,13 +238,16 @@ def sample_poses_above_container(
 
 
 def compute_overhang(tcp_in_base: Array, inside: ContainerInterior, vertices: Array, margin: float = 0.0) -> Array:
-    """Compute how far (n,) a held object extends sideways beyond the opening below it, m; 0: it fits.
+    """Compute how far a held object extends sideways beyond the opening of a container, m.
 
     Args:
-        tcp_in_base: (n, 4, 4) TCP poses.
+        tcp_in_base: (n, 4, 4) TCP poses in the arm's base frame.
         inside: interior of the container.
         vertices: (V, 3) vertices of the object's hulls in the TCP frame, m.
         margin: reduction of the opening on each side, m.
+
+    Returns:
+        Overhang (n,), m; 0 where the object fits through the opening.
     """
     rotation, origin = inside.container_in_base[:3, :3], inside.container_in_base[:3, 3]
     points = np.einsum("nij,vj->nvi", tcp_in_base[:, :3, :3], vertices) + tcp_in_base[:, None, :3, 3]

@@ -26,7 +26,14 @@ SETTLE_SECONDS = 0.3
 
 @dataclass(frozen=True)
 class PushPlan:
-    """Motions of a push: approach, push and lift, with the push direction (3,)."""
+    """Motions of a push.
+
+    Attributes:
+        approach: motion to the start of the push.
+        push: straight horizontal motion along the object.
+        lift: motion up and away from the object.
+        direction: (3,) horizontal unit vector of the push in the arm's base frame.
+    """
 
     approach: Trajectory
     push: Trajectory
@@ -35,7 +42,17 @@ class PushPlan:
 
 
 def push_away(arm: Arm, slot: int, target: int, *, turn_deg: float = 0.0) -> None:
-    """Push an object away from the target, stop early if it resists, then rise."""
+    """Push an object away from the target, and rise; the push stops early if the contact force is too great.
+
+    Args:
+        arm: context of the attempt.
+        slot: slot of the object to push.
+        target: slot of the target.
+        turn_deg: rotation of the push from the paper's direction, deg.
+
+    Raises:
+        PlanningError: no push can be planned.
+    """
     arm.rise_until_free()
     with arm.planning_time():
         plan = plan_push(arm, slot, target, turn_deg)
@@ -47,7 +64,7 @@ def push_away(arm: Arm, slot: int, target: int, *, turn_deg: float = 0.0) -> Non
 
 
 def _execute_push(arm: Arm, push: Trajectory, direction: Array) -> bool:
-    """Run a push step by step; return False if it was stopped because the object resisted."""
+    """Execute a push; return False if it was stopped because the force exceeded ``MAX_FORCE``."""
     resisted = 0
     ahead = torch.as_tensor(arm.scene.arm_base_in_world[:3, :3] @ direction, dtype=torch.float32)
     for qpos in push.qpos:
@@ -60,7 +77,7 @@ def _execute_push(arm: Arm, push: Trajectory, direction: Array) -> bool:
 
 
 def _plan_lift(arm: Arm, direction: Array) -> Trajectory:
-    """Plan up and back, or straight up, after a stopped push, clear of furniture and basket."""
+    """Plan a lift after a stopped push, up and back or straight up, that avoids furniture and basket."""
     width, arm.planner.finger_width = arm.planner.finger_width, 0.0
     try:
         arm.planner.set_scene(_fixed_bodies(arm))
@@ -81,10 +98,10 @@ def _fixed_bodies(arm: Arm) -> list[Obstacle]:
 
 
 def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPlan:
-    """Plan the first feasible push; pushes that move other objects are the second choice.
+    """Plan the first feasible push of an object.
 
-    The approach avoids all bodies, the push avoids furniture, basket and target, and the lift avoids furniture and
-    basket.
+    The approach avoids all bodies. The push avoids all bodies except the pushed object; if no such push is feasible, it
+    avoids only furniture, basket and target. The lift avoids furniture and basket.
     """
     planner = arm.planner
     width, planner.finger_width = planner.finger_width, 0.0
@@ -99,7 +116,11 @@ def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPl
 
 
 def _plan_starts(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tuple[Push, Array, Trajectory]]:
-    """Return pushes with a free line down to their start: push, configuration (7,) above, and line."""
+    """Return pushes with a collision-free straight line down to their start.
+
+    Returns:
+        For each push: the push, the configuration (7,) above its start, and the line down.
+    """
     arm.planner.set_scene(arm.scene.obstacles())
     failure, starts = PlanningError("push", "no_free_push"), []
     for push, qpos in reachable_pushes(arm, slot, target, arm.scene.points_in_base(exclude=slot), turn_deg):
@@ -115,7 +136,10 @@ def _plan_starts(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tupl
 
 
 def _plan_push_and_lift(arm: Arm, starts: list[tuple[Push, Array, Trajectory]], movable: set[int]) -> PushPlan:
-    """Plan push and lift for the first direction with a feasible push; ``movable`` objects may be touched."""
+    """Plan approach, push and lift for the first direction in which a push is feasible.
+
+    ``movable`` contains the slots of objects that the push may touch.
+    """
     planner, failure = arm.planner, PlanningError("push", "no_free_push")
     along_scene, fixed = arm.scene.obstacles(exclude=movable), _fixed_bodies(arm)
     ways: list[tuple[Array, Trajectory, Trajectory, Trajectory]] = []
@@ -144,7 +168,10 @@ def _plan_push_and_lift(arm: Arm, starts: list[tuple[Push, Array, Trajectory]], 
 def reachable_pushes(
     arm: Arm, slot: int, target: int, others: Array, turn_deg: float = 0.0
 ) -> Iterator[tuple[Push, Array]]:
-    """Yield reachable pushes with a configuration (7,) above the start, the paper's direction first."""
+    """Yield pushes that the arm reaches, with the configuration (7,) above their start, the paper's direction first.
+
+    ``others`` (Q, 3) has surface points of all bodies except the pushed object.
+    """
     points, middle = arm.scene.object_points(slot), arm.scene.object_points(target).mean(axis=0)
     fixed = arm.scene.points_in_base(exclude=range(len(arm.env.objects)))
     pushes = list(generate_push_candidates(arm.rng, points, middle, others, surface_in_base(arm), fixed, turn_deg))
@@ -160,7 +187,7 @@ def reachable_pushes(
 
 
 def surface_in_base(arm: Arm) -> tuple[Array, Array]:
-    """Return the pose (4x4) of the centre of the objects' surface and its half size (2,), m."""
+    """Return the surface on which the objects stand: pose (4x4) of its centre and half size (2,) in m."""
     model = arm.env.model
     config = model.config.surface
     surface = model.furniture[config.furniture].asset.surfaces[config.name]

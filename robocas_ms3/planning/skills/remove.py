@@ -34,7 +34,11 @@ PLACES_SOLVED, PLACES_PLANNED = 96, 12
 
 
 def remove_object(arm: Arm, slot: int) -> None:
-    """Grasp an object, place it at a free position on the surface, and retreat."""
+    """Grasp an object, place it at a free position on the surface, and retreat.
+
+    Raises:
+        PlanningError: a motion cannot be planned, or the gripper loses the object.
+    """
     grasp(arm, slot, lift_height=compute_lift_height(arm, slot))
     raise_held_object(arm, slot)
     with arm.planning_time():
@@ -50,13 +54,13 @@ def remove_object(arm: Arm, slot: int) -> None:
 
 
 def raise_held_object(arm: Arm, slot: int) -> None:
-    """Raise a held object until it is collision-free."""
+    """Raise a held object in small steps until arm and object are collision-free."""
     attach_held_object(arm, slot)
     arm.rise_until_free(exclude=slot)
 
 
 def compute_lift_height(arm: Arm, slot: int) -> float:
-    """Return the lift after which an object is above all bodies around it, m."""
+    """Return the lift height after which an object is above all bodies around it, m, within ``LIFT_RANGE``."""
     points = transform_points(arm.scene.object_in_base(slot), np.concatenate(arm.env.object_assets[0][slot].hulls))
     middle = points.mean(axis=0)
     radius = float(np.linalg.norm((points - middle)[:, :2], axis=1).max())
@@ -66,14 +70,17 @@ def compute_lift_height(arm: Arm, slot: int) -> float:
 
 
 def count_clear_grasps(arm: Arm, slot: int) -> int:
-    """Count the sampled grasps from above of an object whose gripper is collision-free."""
+    """Return the number of grasps of an object from above whose gripper touches no other body, of a sample."""
     grasps = _grasps_from_above(arm, slot)
     near = arm.scene.points_in_base(exclude=slot)
     return int(is_gripper_clear(grasps, near).sum())
 
 
 def find_grasp_blockers(arm: Arm, slot: int) -> list[int]:
-    """Return slots of objects that block grasps from above, first those that alone block most grasps."""
+    """Return slots of the objects that block grasps of an object from above.
+
+    Objects that alone block many grasps come first; a grasp that n objects block counts 1 / n^2 for each of them.
+    """
     grasps, blocked_by = _grasps_from_above(arm, slot), {}
     for other, used in enumerate(arm.env.present[0].tolist()):
         if used and other != slot:
@@ -93,10 +100,10 @@ def _grasps_from_above(arm: Arm, slot: int) -> Array:
 
 
 def plan_placement(arm: Arm, slot: int) -> Trajectory:
-    """Plan a motion to above a free position and down to it.
+    """Plan a motion that carries a held object to a free position on the surface and down to the surface.
 
-    Objects in a heap are tilted and would fall over. The object is rotated to its nearest stable orientation, or placed
-    as it is held if that is not feasible.
+    The object is placed in its nearest stable orientation, since objects in a heap are tilted and would fall over. If
+    this is not feasible, the object is placed in the orientation in which it is held.
     """
     scene, asset, held = arm.scene, arm.env.object_assets[0][slot], arm.scene.object_in_base(slot)
     vertices = transform_points(held, np.concatenate(asset.hulls))
@@ -116,7 +123,7 @@ def plan_placement(arm: Arm, slot: int) -> Trajectory:
 
 
 def _plan_to_first_feasible(arm: Arm, places: Array) -> Trajectory:
-    """Plan a motion to above one of several TCP poses (N, 4, 4) and down to it."""
+    """Plan a motion to above the first feasible TCP pose of ``places`` (N, 4, 4) and down to this pose."""
     start = arm.qpos
     nearest = np.argsort(np.linalg.norm(places[:, :2, 3] - arm.scene.tcp_in_base[:2, 3], axis=1), kind="stable")
     # near and far poses; inverse kinematics of all poses would take seconds
@@ -136,7 +143,12 @@ def _plan_to_first_feasible(arm: Arm, places: Array) -> Trajectory:
 
 
 def compute_upright_rotation(vertices: Array, center_of_mass: Array) -> Array:
-    """Return the smallest rotation (4x4) to a stable orientation of a body with vertices (V, 3), z up."""
+    """Return the smallest rotation (4x4) that turns a body to a stable orientation.
+
+    Args:
+        vertices: (V, 3) vertices of the body in a frame with z up, m.
+        center_of_mass: (3,) centre of mass in this frame, m.
+    """
     corners, faces, normals = convex_hull(vertices)
     a, b, c = corners[faces.T]
     # a face is stable if the centre of mass is above it
@@ -154,13 +166,14 @@ def compute_upright_rotation(vertices: Array, center_of_mass: Array) -> Array:
 def find_free_places(
     vertices: Array, others: Array, frame: Array, half: Array, margin: float = EDGE_MARGINS[-1]
 ) -> Array:
-    """Return transforms (n, 4, 4) of a held object to free positions on a surface.
+    """Return transforms (n, 4, 4), in the arm's base frame, that move a held object to free positions on a surface.
 
     Args:
         vertices: (V, 3) vertices of the held object in the arm's base frame, m.
-        others: (P, 3) surface points of all other bodies.
-        frame, half: pose (4x4) of the centre and half size (2,) of the surface, m.
-        margin: distance to the edge, m.
+        others: (P, 3) surface points of all other bodies, m.
+        frame: (4x4) pose of the centre of the surface.
+        half: (2,) half size of the surface, m.
+        margin: minimum distance of the object to the edge of the surface, m.
     """
     middle = (vertices.max(axis=0) + vertices.min(axis=0)) / 2
     outline = (vertices - middle)[:, :2]
@@ -191,7 +204,7 @@ def find_free_places(
 
 
 def _outline_points(outline: Array) -> Array:
-    """Return points (n, 2) along the convex hull of an outline (V, 2), and its centre."""
+    """Return points (n, 2) along the convex hull of points (V, 2), and the origin as the first point."""
     corners = outline[ConvexHull(outline).vertices]
     points = [np.zeros((1, 2))]
     for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):

@@ -9,6 +9,7 @@ from robocas_ms3.planning.solvers import pick
 
 
 def attempt(arm: Arm) -> None:
+    """Make one attempt at open_pick from the present state; raise PlanningError if it fails."""
     if not is_opened(arm):
         arm.start_subgoal("operate the target")
         drive_and_open(arm)

@@ -7,6 +7,7 @@ from robocas_ms3.planning.skills.base_placement import drive_and_grasp, place_in
 
 
 def attempt(arm: Arm) -> None:
+    """Make one attempt at pick from the present state; raise PlanningError if it fails."""
     arm.start_subgoal("move and grasp")
     drive_and_grasp(arm, arm.target)
     arm.executor.check_open_loop()

@@ -1,6 +1,6 @@
 """Scripted policy of search: look, clear obstacles, grasp the target, carry it to the basket.
 
-The policy plays several candidate moves and continues from the move with the lowest remaining cost.
+The policy runs several candidate moves and continues from the move with the lowest cost.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ GRASP_KINDS = 3  # kinds of grasps of the target to try
 
 
 def attempt(arm: Arm) -> None:
+    """Make one attempt at search from the present state; raise PlanningError if it fails."""
     slot, heap = arm.target, Heap(arm, arm.target)
     for fact in COUNTERS:
         arm.executor.facts.setdefault(fact, 0)
@@ -58,12 +59,15 @@ def attempt(arm: Arm) -> None:
 
 
 def max_continued_moves(moves_made: int) -> int:
-    """Return the number of moves to continue from; fewer later on, when failures have earlier causes."""
+    """Return the number of candidate moves to continue from before the search backtracks to the previous decision.
+
+    The number decreases with the moves made, since later failures have earlier causes.
+    """
     return max(1, 3 - moves_made // 2)
 
 
 def _grasp(arm: Arm, slot: int) -> bool:
-    """Grasp the target and lift it; return False if planning fails before anything moves."""
+    """Grasp the target and lift it; return False if no grasp is feasible and the arm has not moved."""
     done = len(arm.executor.actions)
 
     def execute_grasp(kind: int) -> float:
