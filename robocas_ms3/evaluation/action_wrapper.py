@@ -150,11 +150,11 @@ class PolicyActionWrapper(gym.Wrapper):
         return result
 
     def _tcp_pose(self) -> tuple[np.ndarray, Rotation]:
-        return _to_numpy(self._base.agent.tcp_in_arm_base)
+        return _to_position_and_rotation(self._base.agent.tcp_in_arm_base)
 
     def _commanded_pose(self) -> tuple[np.ndarray, Rotation]:
         """Return the last commanded TCP poses in the frame of the arm's base: (N, 3) m and N rotations."""
-        return _to_numpy(self._base.agent.controller.controllers["arm"].reference_pose())
+        return _to_position_and_rotation(self._base.agent.controller.controllers["arm"].reference_pose())
 
     def _gripper_width(self) -> np.ndarray:
         return self._base.agent.gripper_width.cpu().numpy()
@@ -191,7 +191,7 @@ class Weld:
         raised = env.object_poses[..., 2] - env.start_poses[..., 2] >= RAISED_HEIGHT
         found = (touched & raised & env.present)[0].nonzero()
         if len(found):
-            self._fix(env.objects[int(found[0])]._bodies[0])
+            self._attach_to_hand(env.objects[int(found[0])]._bodies[0])
 
     def release(self) -> None:
         """Release the welded object, if there is one."""
@@ -216,7 +216,7 @@ class Weld:
         welded = torch.tensor([self._welded is not None])
         return {"welds": torch.tensor([float(self._count)]), "success": info["success"] & ~welded}
 
-    def _fix(self, body: Any) -> None:
+    def _attach_to_hand(self, body: Any) -> None:
         hand = self._env.agent.hand_link._bodies[0]
         drive = sapien.physx.PhysxDriveComponent(body)
         drive.parent = hand
@@ -229,7 +229,7 @@ class Weld:
         self._count += 1
 
 
-def check_weld(stepping: str, backend: str) -> None:
+def check_weld_available(stepping: str, backend: str) -> None:
     """Raise `EvaluationError` if the weld is not available with this stepping of a protocol and this backend."""
     if stepping != "upstream":
         what, fix = "the weld needs a protocol with RoboCAS-v0's steps", "Omit --weld, or pass --protocol paper-v1."
@@ -267,7 +267,7 @@ def make_env_kwargs(spec: PolicySpec, rate: int, *, renders: bool = False) -> di
     return {**common, "obs_mode": "+".join(modes), "sensor_configs": {**others, **cameras}}
 
 
-def _to_numpy(pose: Pose) -> tuple[np.ndarray, Rotation]:
+def _to_position_and_rotation(pose: Pose) -> tuple[np.ndarray, Rotation]:
     raw = pose.raw_pose.cpu().numpy().astype(np.float64)
     return raw[:, :3], Rotation.from_quat(raw[:, [4, 5, 6, 3]])
 

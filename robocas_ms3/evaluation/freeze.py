@@ -51,7 +51,7 @@ class ConfigVariant(StrictModel):
     )
     change: dict[str, Any] = Field(default={}, description="changed keys, in the format of the configuration")
 
-    def load(self, overrides: Sequence[str] = ()) -> TaskConfig:
+    def load_config(self, overrides: Sequence[str] = ()) -> TaskConfig:
         """Load the configuration, and apply ``change`` and then ``overrides`` (``KEY=VALUE`` texts)."""
         return load_task_config(self.config, self.change, overrides)
 
@@ -137,7 +137,7 @@ def freeze_protocol(source: ProtocolSource, folder: Path, overrides: Sequence[st
 def _load_configs(variants: Sequence[ConfigVariant], overrides: Sequence[str]) -> dict[str, TaskConfig]:
     found: dict[str, TaskConfig] = {}
     for variant in variants:
-        config, name = variant.load(overrides), variant.file_stem
+        config, name = variant.load_config(overrides), variant.file_stem
         if not re.fullmatch(CONFIG_NAME, name) or len(name) > MAX_NAME_BYTES:
             what, fix = "invalid file name of a configuration", "Set `name`, and use a `split` of letters and digits."
             expected = f"at most {MAX_NAME_BYTES} letters, digits, _ and -"

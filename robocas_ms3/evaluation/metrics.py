@@ -114,8 +114,8 @@ class RetrievalTracker:
     Call `update` after each control step and `end_step` after each policy step.
 
     An object counts as moved if it is displaced by more than 3 cm or has fallen over (``disturbed``) before the target
-    is first held. An object is needed if at the reset it is an obstacle of `occlusion.measure_clutter`, if it hides at least
-    10 % of the target, or if it is on top of a needed object.
+    is first held. An object is needed if at the reset it is an obstacle of `occlusion.measure_clutter`, if it hides at
+    least 10 % of the target, or if it is on top of a needed object.
     """
 
     def __init__(self, env: RoboCASSearchEnv) -> None:

@@ -74,16 +74,16 @@ class Retrieval:
         return cls(moved, needed, left, compute_order_score(moved, left, held_at))
 
 
-def compute_order_score(moved: Sequence[MovedObject], left: int, held_at: int | None) -> float | None:
-    """Return the order score, 0..1; 1 if no object was moved or left; None if the target was never held.
+def compute_order_score(moved: Sequence[MovedObject], unmoved: int, held_at: int | None) -> float | None:
+    """Return the order score, 0..1; 1 if ``moved`` is empty and ``unmoved`` is 0; None if the target was never held.
 
     The score is the number of needed objects that were moved in order, divided by the number of moved objects plus
-    ``left``, the number of needed objects that were not moved. ``held_at``: policy step after which the target was
+    ``unmoved``, the number of needed objects that were not moved. ``held_at``: policy step after which the target was
     first held.
     """
     if held_at is None:
         return None
-    right, total = sum(move.needed and move.in_order for move in moved), len(moved) + left
+    right, total = sum(move.needed and move.in_order for move in moved), len(moved) + unmoved
     return round(right / total, 4) if total else 1.0
 
 

@@ -66,7 +66,7 @@ def _make_decoder(to_rotation: Callable[[Array], Rotation], open_above: float = 
     return decode
 
 
-def _from_quaternions(wxyz: Array) -> Rotation:
+def _rotations_from_quaternions(wxyz: Array) -> Rotation:
     xyzw = wxyz[:, [1, 2, 3, 0]]
     lengths = np.linalg.norm(xyzw, axis=1, keepdims=True)
     return Rotation.from_quat(np.where(lengths > 1e-9, xyzw / np.maximum(lengths, 1e-9), [0.0, 0.0, 0.0, 1.0]))
@@ -79,7 +79,7 @@ CONVENTIONS: dict[str, ActionConvention] = {
     "robocas": ActionConvention(7, _make_decoder(_euler, 0.5)),
     "delta_euler": ActionConvention(7, _make_decoder(_euler)),
     "delta_axis_angle": ActionConvention(7, _make_decoder(Rotation.from_rotvec)),
-    "delta_quaternion": ActionConvention(8, _make_decoder(_from_quaternions)),
+    "delta_quaternion": ActionConvention(8, _make_decoder(_rotations_from_quaternions)),
     "joint_positions": ActionConvention(8, None),  # seven joint targets, rad; gripper, -1 closed to 1 open
 }
 """Action conventions by name."""

@@ -80,7 +80,7 @@ class Protocol(StrictModel):
         for key, found, known in named:
             unknown = sorted(set(found) - set(known))
             if unknown:
-                raise ValueError(f"{key}: expected some of {', '.join(known)}, found {', '.join(unknown)}")
+                raise ValueError(f"{key}: expected names among {', '.join(known)}, found {', '.join(unknown)}")
         if self.stepping == "upstream" and self.max_steps is None:
             raise ValueError(
                 "max_steps: missing; stepping: upstream needs it, because the duration of its steps varies"

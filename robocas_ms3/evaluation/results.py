@@ -26,7 +26,7 @@ from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, list_setting_changes
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.evaluation.outcomes import Outcome
-from robocas_ms3.evaluation.statistics import SuccessRate, success_rate
+from robocas_ms3.evaluation.statistics import SuccessRate, compute_success_rate
 
 RUN, OUTCOMES = "run.json", "episodes.jsonl"
 _PACKAGES = ("robocas_ms3", "mani_skill", "sapien", "gymnasium", "numpy", "torch")
@@ -139,17 +139,17 @@ class Result:
     run: RunRecord
     outcomes: dict[int, Outcome]
 
-    def rate(self, name: str = "success", outcomes: Iterable[Outcome] | None = None) -> SuccessRate:
+    def compute_rate(self, flag: str = "success", outcomes: Iterable[Outcome] | None = None) -> SuccessRate:
         """Return the fraction of episodes in which a stage or success rule held, with its 95 % interval.
 
         Args:
-            name: key of `Outcome.flags`, which counts if it held at some step; or a field of `Outcome`, such as
+            flag: key of `Outcome.flags`, which counts if it held at some step; or a field of `Outcome`, such as
                 ``success_at_end``.
             outcomes: the episodes, at least one; None: all episodes of the result.
         """
         chosen = list(self.outcomes.values() if outcomes is None else outcomes)
-        held = [getattr(one, name) if hasattr(one, name) else one.flags.get(name) is not None for one in chosen]
-        return success_rate(sum(held), len(held))
+        held = [getattr(one, flag) if hasattr(one, flag) else one.flags.get(flag) is not None for one in chosen]
+        return compute_success_rate(sum(held), len(held))
 
     def has_repeated_scenes(self) -> bool:
         """Return whether two episodes have the same scene, as in some splits; such episodes must not be pooled."""
@@ -258,7 +258,7 @@ def merge_results(folders: Sequence[Path], out: Path) -> Result:
     return read_result(out)
 
 
-def package_versions() -> dict[str, str]:
+def get_package_versions() -> dict[str, str]:
     """Return the installed versions, by name, of the packages that can change a result."""
     return {name: version(name) for name in _PACKAGES}
 
@@ -280,11 +280,11 @@ def _read_folder(folder: Path) -> Result:
 def _read_outcomes(folder: Path) -> dict[int, Outcome]:
     """Read the outcomes of a result by episode number; another process may be writing the file."""
     file, found = _outcomes_file(folder), dict[int, Outcome]()
-    for line in file.lines():
+    for line in file.read_lines():
         if line.record is not None:
             _add_outcome(found, line.record, f"{file.path}:{line.number}")
         elif not line.cut_off:
-            raise file.line_error(line, EvaluationError, "invalid outcome of an episode") from line.problem
+            raise file.make_line_error(line, EvaluationError, "invalid outcome of an episode") from line.problem
     return found
 
 

@@ -127,7 +127,7 @@ class EpisodeBatch:
         self._held = np.zeros((0, self.num_envs), dtype=bool)  # (flags, N) whether a flag has held
         self._embed = TextEmbedder() if spec.language == "embedding" else None
 
-    def start(self, pairs: list[tuple[int, EpisodeSpec]]) -> list[EpisodeSpec]:
+    def start_episodes(self, pairs: list[tuple[int, EpisodeSpec]]) -> list[EpisodeSpec]:
         """Reset envs to the initial states of episodes, given as (index of the env, episode).
 
         Returns the episodes with ``env`` set.
@@ -230,7 +230,7 @@ def run_rollouts(batch: EpisodeBatch, policy: Policy, episodes: Sequence[Episode
     while waiting or batch.running:
         free = [env for env in range(batch.num_envs) if env not in batch.running]
         if waiting and free and (batch.refill or not batch.running):
-            starts = batch.start([(env, waiting.pop()) for env in free[: len(waiting)]])
+            starts = batch.start_episodes([(env, waiting.pop()) for env in free[: len(waiting)]])
             chunks.update({start.env: [] for start in starts})
             with forbid_policy_exit(policy):
                 policy.reset(starts)
@@ -270,7 +270,7 @@ def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list
             "the chunk length of the policy does not fit its observe_every",
             where=type(policy).__name__,
             expected=f"a multiple of {period} actions, so that each chunk starts with images",
-            found=new.shape[1],
+            found=f"{new.shape[1]} actions",
         )
     for env, chunk in zip(envs, new, strict=True):
         if not np.isfinite(chunk).all():

@@ -20,7 +20,12 @@ from robocas_ms3.core.errors import EvaluationError, VectorEnvCrashError
 from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.action_wrapper import V0_CONTROL_HZ, PolicyActionWrapper, check_weld, make_env_kwargs
+from robocas_ms3.evaluation.action_wrapper import (
+    V0_CONTROL_HZ,
+    PolicyActionWrapper,
+    check_weld_available,
+    make_env_kwargs,
+)
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import (
     EpisodeSpec,
@@ -82,7 +87,7 @@ class EvaluationSession:
         self.rate = V0_CONTROL_HZ if rules.stepping == "upstream" else rules.choose_action_rate(self.spec)
         backend = choose_backend(settings.backend)
         if settings.weld:
-            check_weld(rules.stepping, backend)
+            check_weld_available(rules.stepping, backend)
         self.played_as = self.protocol.find_task_aliases(settings.tasks)
         self.episodes = self.protocol.select_episodes(settings)
         if self.spec.cameras:
@@ -180,7 +185,7 @@ class EvaluationSession:
         self._current, self.outcomes = episodes, {}
         batch = self.open_batch(episodes[0], count)
         try:
-            batch.start([(env, self.make_episode_spec(episode)) for env, episode in enumerate(episodes)])
+            batch.start_episodes([(env, self.make_episode_spec(episode)) for env, episode in enumerate(episodes)])
         except Exception:
             self.close()
             raise
@@ -336,7 +341,9 @@ class EvaluationSession:
                 f"the object pack {rules.pack} differs from the pack of the protocol",
                 "Install the pack of the protocol.",
             )
-            raise EvaluationError(what, where=rules.name, expected=rules.pack_hash, found=pack, fix=fix)
+            raise EvaluationError(
+                what, where=rules.name, expected=f"hash {rules.pack_hash}", found=f"hash {pack}", fix=fix
+            )
         values = {
             "protocol": rules.name,
             "protocol_hash": self.protocol.hash,
@@ -344,7 +351,7 @@ class EvaluationSession:
             "weld": self.settings.weld,
             **({"played_as": self.played_as} if self.played_as else {}),
             "backend": backend,
-            "versions": results.package_versions(),
+            "versions": results.get_package_versions(),
             "pack_hashes": {rules.pack: pack},
             "machine": {"processor": platform.machine(), "python": platform.python_version()},
         }

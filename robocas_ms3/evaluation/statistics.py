@@ -36,7 +36,7 @@ class Comparison:
     Attributes:
         both, only_a, only_b, neither: numbers of scenes in which both runs, only A, only B or neither succeeded.
         p_value: two-sided p-value of the hypothesis that A and B have equal success rates (`mcnemar_p_value`).
-        low, high: 95 % interval of the difference of the rates, A - B, -1..1 (`paired_interval`).
+        low, high: 95 % interval of the difference of the rates, A - B, -1..1 (`compute_paired_interval`).
     """
 
     both: int
@@ -50,7 +50,7 @@ class Comparison:
     @classmethod
     def from_counts(cls, both: int, only_a: int, only_b: int, neither: int) -> Comparison:
         """Return the comparison for these numbers of scenes (fields of `Comparison`), with p-value and interval."""
-        limits = paired_interval(only_a, only_b, both + only_a + only_b + neither)
+        limits = compute_paired_interval(only_a, only_b, both + only_a + only_b + neither)
         return cls(both, only_a, only_b, neither, mcnemar_p_value(only_a, only_b), *limits)
 
     @property
@@ -74,7 +74,7 @@ class Comparison:
         return (self.only_a - self.only_b) / self.n
 
 
-def success_rate(k: int, n: int) -> SuccessRate:
+def compute_success_rate(k: int, n: int) -> SuccessRate:
     """Return a success rate with its exact 95 % interval.
 
     Clopper and Pearson, Biometrika 26 (1934) 404-413, by quantiles of beta distributions. The interval contains the
@@ -95,7 +95,7 @@ def mcnemar_p_value(only_a: int, only_b: int) -> float:
     return min(1.0, 2 * float(binom.cdf(min(only_a, only_b), only_a + only_b, 0.5)))
 
 
-def paired_interval(only_a: int, only_b: int, n: int) -> tuple[float, float]:
+def compute_paired_interval(only_a: int, only_b: int, n: int) -> tuple[float, float]:
     """Return Tango's 95 % score interval of the difference of two rates over the same n scenes, A - B.
 
     The differences d that the score test of paired data does not reject (Tango, Statistics in Medicine 17 (1998)
@@ -147,7 +147,7 @@ def adjust_p_values(p_values: Sequence[float]) -> list[float]:
     return adjusted.tolist()
 
 
-def success_rates_by_bin(values: ArrayLike, successes: ArrayLike, edges: Sequence[float]) -> list[SuccessRate | None]:
+def bin_success_rates(values: ArrayLike, successes: ArrayLike, edges: Sequence[float]) -> list[SuccessRate | None]:
     """Return the success rate of each bin of a value per episode, such as p_vis; None for an empty bin.
 
     Args:
@@ -158,7 +158,7 @@ def success_rates_by_bin(values: ArrayLike, successes: ArrayLike, edges: Sequenc
     done, ends = np.asarray(successes, dtype=bool), np.asarray(edges, dtype=float)
     place = np.minimum(np.searchsorted(ends, np.asarray(values), side="right") - 1, len(ends) - 2)
     groups = [done[place == number] for number in range(len(ends) - 1)]
-    return [success_rate(int(group.sum()), group.size) if group.size else None for group in groups]
+    return [compute_success_rate(int(group.sum()), group.size) if group.size else None for group in groups]
 
 
 def mcnemar_power(n: int, difference: float, discordant: float, *, alpha: float = 0.05) -> float:
@@ -181,7 +181,7 @@ def mcnemar_power(n: int, difference: float, discordant: float, *, alpha: float 
     return float(binom.pmf(m, n, discordant) @ detected)
 
 
-def smallest_paired_difference(n: int, discordant: float, *, alpha: float = 0.05) -> float | None:
+def find_smallest_difference(n: int, discordant: float, *, alpha: float = 0.05) -> float | None:
     """Return the smallest difference of two success rates that a comparison over n scenes detects with 80 % power.
 
     Returns None if n is too small for any difference: a p-value below 0.05 needs at least six scenes that only one run
@@ -200,7 +200,7 @@ def smallest_paired_difference(n: int, discordant: float, *, alpha: float = 0.05
     return None if missing_power(1.0) > 0 else float(root_scalar(missing_power, bracket=(0.0, 1.0)).root)
 
 
-def power_warning(comparison: Comparison, *, alpha: float = 0.05) -> str | None:
+def make_power_warning(comparison: Comparison, *, alpha: float = 0.05) -> str | None:
     """Return a warning if the p-value of a comparison is above ``alpha``; None otherwise.
 
     The warning names the smallest difference that this number of scenes detects with 80 % power. This is an estimate,
@@ -209,7 +209,7 @@ def power_warning(comparison: Comparison, *, alpha: float = 0.05) -> str | None:
     c = comparison
     if c.p_value <= alpha:
         return None
-    shown = smallest_paired_difference(c.n, (c.only_a + c.only_b) / c.n, alpha=alpha)
+    shown = find_smallest_difference(c.n, (c.only_a + c.only_b) / c.n, alpha=alpha)
     difference = (
         "no difference, however large" if shown is None else f"differences of {np.ceil(100 * shown):.0f} points or more"
     )

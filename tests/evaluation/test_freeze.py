@@ -75,7 +75,7 @@ def test_a_configuration_is_found_next_to_the_source(tmp_path, monkeypatch):
     (tmp_path / "sources" / "source.yaml").write_text(yaml.safe_dump(source))
     read = read_protocol_source(tmp_path / "sources" / "source.yaml")
     assert [part.file_stem for part in read.parts] == ["mine-mine", "pick_table_scattered-mine"]
-    assert [scene.load().task for scene in (*read.parts, *read.train)] == ["pick"] * 4
+    assert [scene.load_config().task for scene in (*read.parts, *read.train)] == ["pick"] * 4
 
 
 @pytest.mark.parametrize("text", ["parts: []", "rules: [", "rules: {}\nparts: [{config: x}]"])

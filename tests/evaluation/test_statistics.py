@@ -11,14 +11,14 @@ from scipy.stats import binom, multinomial, norm
 from robocas_ms3.evaluation.statistics import (
     Comparison,
     adjust_p_values,
+    bin_success_rates,
     compare_successes,
+    compute_paired_interval,
+    compute_success_rate,
+    find_smallest_difference,
+    make_power_warning,
     mcnemar_p_value,
     mcnemar_power,
-    paired_interval,
-    power_warning,
-    smallest_paired_difference,
-    success_rate,
-    success_rates_by_bin,
 )
 
 Z2 = norm.isf(0.025) ** 2
@@ -43,7 +43,7 @@ def k_of_n(draw) -> tuple[int, int]:
     ],
 )
 def test_exact_interval_equals_published_values(k, n, low, high):
-    found = success_rate(k, n)
+    found = compute_success_rate(k, n)
     assert (found.k, found.n, found.rate) == (k, n, k / n)
     assert (found.low, found.high) == pytest.approx((low, high), abs=5e-5)
 
@@ -51,7 +51,7 @@ def test_exact_interval_equals_published_values(k, n, low, high):
 @given(k_of_n())
 def test_exact_interval_leaves_half_the_error_at_each_end(counts):
     k, n = counts
-    found = success_rate(k, n)
+    found = compute_success_rate(k, n)
     assert 0 <= found.low <= k / n <= found.high <= 1
     if k > 0:
         assert binom.sf(k - 1, n, found.low) == pytest.approx(0.025, rel=1e-6)
@@ -78,20 +78,20 @@ def test_mcnemar_equals_published_values(only_a, only_b, p_value):
 
 def test_paired_interval_equals_published_values():
     # Fagerland et al. (2017), ch. 8: its limits by Tango's method
-    assert paired_interval(6, 16, 161) == pytest.approx((-0.1240, -0.0054), abs=5e-5)
+    assert compute_paired_interval(6, 16, 161) == pytest.approx((-0.1240, -0.0054), abs=5e-5)
 
 
 @pytest.mark.parametrize("n", [1, 7, 40])
 def test_paired_interval_of_runs_that_always_or_never_agree_has_a_closed_form(n):
-    assert paired_interval(0, 0, n) == pytest.approx((-Z2 / (n + Z2), Z2 / (n + Z2)), abs=1e-9)
-    assert paired_interval(n, 0, n) == pytest.approx(((n - Z2) / (n + Z2), 1), abs=1e-9)
-    assert paired_interval(0, n, n) == pytest.approx((-1, -(n - Z2) / (n + Z2)), abs=1e-9)
+    assert compute_paired_interval(0, 0, n) == pytest.approx((-Z2 / (n + Z2), Z2 / (n + Z2)), abs=1e-9)
+    assert compute_paired_interval(n, 0, n) == pytest.approx(((n - Z2) / (n + Z2), 1), abs=1e-9)
+    assert compute_paired_interval(0, n, n) == pytest.approx((-1, -(n - Z2) / (n + Z2)), abs=1e-9)
 
 
 @pytest.mark.parametrize(("n", "worst"), [(7, 0.835), (22, 0.89)])
 def test_coverage_of_the_paired_interval(n, worst):
     tables = np.array([(a, b, n - a - b) for a in range(n + 1) for b in range(n + 1 - a)])
-    low, high = np.array([paired_interval(a, b, n) for a, b, _ in tables.tolist()]).T
+    low, high = np.array([compute_paired_interval(a, b, n) for a, b, _ in tables.tolist()]).T
     coverage = []
     for discordant in np.linspace(0.02, 1, 50):
         for difference in discordant * np.linspace(0, 1, 21):
@@ -138,8 +138,8 @@ def test_holm_equals_values_computed_by_hand():
 def test_bins_contain_their_lower_edge_and_the_last_bin_both_edges():
     values = [0.0, 0.2, 0.5, 0.5, 0.9, 1.0]
     successes = [False, True, True, False, True, True]
-    found = success_rates_by_bin(values, successes, [0, 0.5, 0.75, 0.8, 1])
-    assert found == [success_rate(1, 2), success_rate(1, 2), None, success_rate(2, 2)]
+    found = bin_success_rates(values, successes, [0, 0.5, 0.75, 0.8, 1])
+    assert found == [compute_success_rate(1, 2), compute_success_rate(1, 2), None, compute_success_rate(2, 2)]
 
 
 @pytest.mark.parametrize(("difference", "discordant"), [(0, 0.4), (0.3, 0.4), (0.4, 0.4), (0.6, 1)])
@@ -155,24 +155,26 @@ def test_power_equals_the_sum_over_all_outcomes(difference, discordant):
 
 
 def test_fewer_than_six_scenes_show_no_difference():
-    assert smallest_paired_difference(5, 0) is None
-    assert smallest_paired_difference(6, 0) == pytest.approx(0.8 ** (1 / 6))  # A solves all six
+    assert find_smallest_difference(5, 0) is None
+    assert find_smallest_difference(6, 0) == pytest.approx(0.8 ** (1 / 6))  # A solves all six
 
 
 @given(st.integers(6, 120), FRACTIONS)
 def test_smallest_difference_has_80_percent_power(n, discordant):
-    found = smallest_paired_difference(n, discordant)
+    found = find_smallest_difference(n, discordant)
     assert found is not None
     assert mcnemar_power(n, found, max(found, discordant)) == pytest.approx(0.8, abs=1e-6)
 
 
 def test_warning_names_the_detectable_difference():
-    assert power_warning(Comparison.from_counts(20, 8, 5, 7)) == (
+    assert make_power_warning(Comparison.from_counts(20, 8, 5, 7)) == (
         "no significant difference: 40 episodes show differences of 26 points or more (80 % power)"
     )
-    assert "5 episodes show no difference, however large" in (power_warning(Comparison.from_counts(0, 5, 0, 0)) or "")
-    assert power_warning(Comparison.from_counts(0, 6, 0, 0)) is None  # p = 1/32
-    assert power_warning(Comparison.from_counts(0, 6, 0, 0), alpha=0.05 / 2) is not None  # one of two comparisons
+    assert "5 episodes show no difference, however large" in (
+        make_power_warning(Comparison.from_counts(0, 5, 0, 0)) or ""
+    )
+    assert make_power_warning(Comparison.from_counts(0, 6, 0, 0)) is None  # p = 1/32
+    assert make_power_warning(Comparison.from_counts(0, 6, 0, 0), alpha=0.05 / 2) is not None  # one of two comparisons
 
 
 def test_statistics_equal_those_of_robostats():
@@ -181,7 +183,7 @@ def test_statistics_equal_those_of_robostats():
     for n in (1, 2, 10, 39, 200):
         for k in {0, 1, n // 3, n - 1, n}:
             theirs = robostats.clopper_pearson(k, n)
-            assert (success_rate(k, n).low, success_rate(k, n).high) == pytest.approx(
+            assert (compute_success_rate(k, n).low, compute_success_rate(k, n).high) == pytest.approx(
                 (theirs.lower, theirs.upper), abs=1e-12
             )
     for counts in [(20, 8, 5, 7), (59, 6, 16, 80), (0, 12, 0, 0), (9, 0, 0, 4), (3, 0, 6, 1), (0, 4, 4, 0)]:

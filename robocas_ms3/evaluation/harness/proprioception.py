@@ -29,7 +29,7 @@ def depth_key(camera: str) -> str:
 
 
 class Proprioception:
-    """Robot state of N envs in the columns of LeRobot datasets; call `compute` once per step and env."""
+    """Robot state of N envs in the columns of LeRobot datasets; call `compute_columns` once per step and env."""
 
     def __init__(self, robot: str) -> None:
         self._spec = find_robot(robot)
@@ -48,7 +48,7 @@ class Proprioception:
         self._widths = qpos[:, robot.finger_slice].sum(axis=1)  # initial gripper widths, m
         self._last: dict[int, dict[str, NDArray[np.float32]]] = {}  # by env
 
-    def compute(self, env: int, obs: dict[str, Any], gripper: float | None) -> dict[str, NDArray[np.float32]]:
+    def compute_columns(self, env: int, obs: dict[str, Any], gripper: float | None) -> dict[str, NDArray[np.float32]]:
         """Return the values (D,) float32 of an env for each key in `KEYS`.
 
         Args:

@@ -109,15 +109,15 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
             raise ValueError(f"actions: expected shape {self.action_space.shape}, found {acts.shape}")
         if not self._obs:
             raise EvaluationError("no episode is running", fix="Call reset before step.")
-        before = self._ended_with(lambda outcome: True)
+        before = self._has_ended(lambda outcome: True)
         if running := np.flatnonzero(~before).tolist():
             self._session.step(acts)
             for env, command in zip(running, self._gripper_commands(acts[running]), strict=True):
                 self._grippers[env] = command
             self._update_observations(running)
-        ended = self._ended_with(lambda outcome: True)
+        ended = self._has_ended(lambda outcome: True)
         self._write_outcomes(np.flatnonzero(ended & ~before).tolist())
-        truncated = self._ended_with(lambda outcome: not outcome.success and outcome.steps >= self._max_steps)
+        truncated = self._has_ended(lambda outcome: not outcome.success and outcome.steps >= self._max_steps)
         info = self._make_info(ended & ~before)
         reward = (info["is_success"] & ~before).astype(np.float64)
         return deepcopy(self._obs), reward, ended & ~truncated, truncated, info
@@ -148,7 +148,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         opened = self._convention.decode(np.nan_to_num(actions.astype(np.float64))).open
         return np.where(opened, 1.0, -1.0).tolist()
 
-    def _ended_with(self, condition: Callable[[Outcome], bool]) -> NDArray[np.bool_]:
+    def _has_ended(self, condition: Callable[[Outcome], bool]) -> NDArray[np.bool_]:
         """Return (N,) bool, whether the episode of each env has ended and its outcome satisfies ``condition``."""
         outcomes = [self._session.outcomes.get(env) for env in range(self.num_envs)]
         return np.array([outcome is not None and condition(outcome) for outcome in outcomes])
@@ -163,7 +163,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
     def _update_observations(self, envs: list[int]) -> None:
         obs = self._session.observation
         for env in envs:
-            for name, values in self._proprioception.compute(env, obs, self._grippers[env]).items():
+            for name, values in self._proprioception.compute_columns(env, obs, self._grippers[env]).items():
                 self._obs[name][env] = values
         for camera, pixels in self._obs["pixels"].items():
             images = obs["sensor_data"][camera]
@@ -172,7 +172,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
                 self._obs[depth_key(camera)][envs] = images["depth"][envs].transpose(0, 3, 1, 2)
 
     def _make_info(self, just_ended: NDArray[np.bool_]) -> dict[str, Any]:
-        success = self._ended_with(lambda outcome: outcome.success)
+        success = self._has_ended(lambda outcome: outcome.success)
         info: dict[str, Any] = {"is_success": success, "_is_success": np.ones(self.num_envs, bool)}
         if just_ended.any():
             info["final_info"] = {"is_success": success.copy(), "_is_success": just_ended}

@@ -145,7 +145,7 @@ class RoboCAS:
         assert observations is not None  # vla-eval requests no observation after the end of an episode
         return {
             "images": {name: images[0] for name, images in observations.images.items()},
-            "state": self._proprioception.compute(0, self._session.observation, None)["agent_pos"],
+            "state": self._proprioception.compute_columns(0, self._session.observation, None)["agent_pos"],
             "task_description": observations.instructions[0],
         }
 

@@ -42,9 +42,9 @@ class RandomPolicy:
             self._open[episode.env] = True
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        return np.stack([self._draw(env) for env in observations.envs.tolist()])
+        return np.stack([self._draw_action(env) for env in observations.envs.tolist()])
 
-    def _draw(self, env: int) -> NDArray[np.floating]:
+    def _draw_action(self, env: int) -> NDArray[np.floating]:
         rng = self._generators[env]
         self._open[env] ^= bool(rng.random() < _CHANGE)
         return np.append(rng.uniform(-1, 1, 6) * np.repeat([_REACH, _TURN], 3), float(self._open[env]))

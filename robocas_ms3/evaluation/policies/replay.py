@@ -61,18 +61,18 @@ class PoseTrack:
     step: int = 0
 
     @classmethod
-    def from_recording(cls, robot: RobotSpec, robot_states: Array, gripper: Array, stride: int) -> PoseTrack:
+    def from_recording(cls, robot: RobotSpec, robot_states: Array, gripper_commands: Array, stride: int) -> PoseTrack:
         """Return the TCP poses of a recording, one pose per ``stride`` control steps.
 
         Args:
             robot: specification of the recorded robot.
             robot_states: (S + 1, 37) ManiSkill states of the robot after the reset and after each of S control steps.
-            gripper: (S,) gripper commands, -1 closed to 1 open.
+            gripper_commands: (S,) gripper commands, -1 closed to 1 open.
             stride: control steps per pose.
         """
-        if not len(gripper):
+        if not len(gripper_commands):
             return cls(np.zeros((0, 4, 4)), np.zeros(0, dtype=bool))
-        motion = Motion.from_states(robot, robot_states, gripper, sample_states(len(gripper), stride))
+        motion = Motion.from_states(robot, robot_states, gripper_commands, sample_states(len(gripper_commands), stride))
         return cls(motion.tcp_in_base[1:], motion.gripper_open[1:])
 
     def next_action(self, observations: Observations, row: int) -> Array:
@@ -147,5 +147,7 @@ class ReplayPolicy(TrackPolicy):
             actions = read_actions(open_episode(file, number))
         if (found := actions.shape[1]) != 8:
             where, expected = f"{self._trajectory}, traj_{number}", "8 numbers per action, without the base"
-            raise EvaluationError("cannot replay actions of this size", where=where, expected=expected, found=found)
+            raise EvaluationError(
+                "cannot replay actions of this size", where=where, expected=expected, found=f"{found} numbers"
+            )
         return JointTrack(actions)

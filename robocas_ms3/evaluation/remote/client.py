@@ -160,7 +160,7 @@ class RemotePolicy:
         self._chunk_length = self._chunk_length or len(chunk)
         if len(chunk) != self._chunk_length:
             what, expected = "the length of the action chunks has changed", f"{self._chunk_length} actions"
-            raise WireError(what, expected=expected, found=len(chunk))
+            raise WireError(what, expected=expected, found=f"{len(chunk)} actions")
         return chunk
 
     def _drop_episode(self, env: int) -> None:

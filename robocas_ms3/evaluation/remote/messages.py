@@ -150,7 +150,7 @@ def make_observation_message(
     message |= {PREFIX + name: array for name, array in arrays.items()}
     if start is not None:
         values = {name: value for name, value in vars(start).items() if name != "env"}
-        values |= {name: file_name(values[name]) for name in ("config_file", "layouts_file")}
+        values |= {name: message_file_name(values[name]) for name in ("config_file", "layouts_file")}
         if start.robot == DEFAULT_ROBOT:  # the default robot is left out
             del values["robot"]
         message[START] = values
@@ -197,7 +197,7 @@ def parse_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int
     )
 
 
-def file_name(path: str) -> str:
+def message_file_name(path: str) -> str:
     """Return PROTOCOL/FOLDER/FILE as the name of a protocol file in messages.
 
     Returns the whole path if the name would mean a file of a bundled protocol, but the path is another file.
@@ -239,9 +239,11 @@ def parse_batch(message: Any, min_size: int, max_size: int) -> list[dict[str, An
     """
     batch = message.get(BATCH) if isinstance(message, dict) else None
     if not isinstance(batch, list) or not all(isinstance(one, dict) for one in batch):
-        raise WireError("invalid batch", where=BATCH, expected="a list of maps", found=type(batch).__name__)
+        raise WireError("invalid batch of messages", where=BATCH, expected="a list of maps", found=type(batch).__name__)
     if not min_size <= len(batch) <= max_size:
-        raise WireError("invalid batch", where=BATCH, expected=f"{min_size} to {max_size} maps", found=len(batch))
+        raise WireError(
+            "invalid batch of messages", where=BATCH, expected=f"{min_size} to {max_size} maps", found=len(batch)
+        )
     return batch
 
 
@@ -250,7 +252,7 @@ def request_size_limit(spec: PolicySpec, max_batch: int = 1) -> int:
     return min(MAX_BYTES, _OTHER_BYTES + max(4, max_batch) * _image_bytes(spec))
 
 
-def batch_limit(spec: PolicySpec, envs: int) -> int:
+def max_envs_per_request(spec: PolicySpec, envs: int) -> int:
     """Return the maximum number of envs per request: so many that the images fit in `MAX_BYTES`, from 1 to ``envs``."""
     return max(1, min(envs, LARGEST_BATCH, (MAX_BYTES - _OTHER_BYTES) // max(1, _image_bytes(spec))))
 

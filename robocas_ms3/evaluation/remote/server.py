@@ -43,7 +43,7 @@ from robocas_ms3.evaluation.remote.messages import (
     FILE_NAME_PARTS,
     RESET,
     ServerMetadata,
-    batch_limit,
+    max_envs_per_request,
     parse_batch,
     parse_observations,
     parse_request,
@@ -127,7 +127,7 @@ class PolicyServer:
         self._host, self._port = strip_brackets(host), port
         with forbid_policy_exit(policy):
             spec = policy.spec
-        max_batch = batch_limit(spec, max_batch)
+        max_batch = max_envs_per_request(spec, max_batch)
         self._max_bytes = request_size_limit(spec, max_batch)
         metadata = ServerMetadata(
             robocas_spec=policy_spec_to_dict(spec),
@@ -193,10 +193,10 @@ class PolicyServer:
             running = await server
         except (OSError, UnicodeError) as error:
             raise EvaluationError(
-                "cannot listen on this address", where=_netloc(self._host, self._port), found=error
+                "cannot listen on this address", where=_format_address(self._host, self._port), found=error
             ) from error
         async with running:
-            url = f"ws://{_netloc(self._host, next(iter(running.sockets)).getsockname()[1])}"
+            url = f"ws://{_format_address(self._host, next(iter(running.sockets)).getsockname()[1])}"
             started.set_result((url, lambda: loop.call_soon_threadsafe(ended.set)))
             await ended.wait()
 
@@ -337,7 +337,7 @@ def strip_brackets(host: str) -> str:
     return host[1:-1] if host.startswith("[") and host.endswith("]") else host
 
 
-def _netloc(host: str, port: int) -> str:
+def _format_address(host: str, port: int) -> str:
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 

@@ -31,9 +31,10 @@ def encode_message(value: Any) -> bytes:
         WireError: the value contains another type.
     """
     try:
-        return msgpack.Packer(default=_encode).pack(value)
+        return msgpack.Packer(default=_encode_array).pack(value)
     except (TypeError, ValueError, OverflowError) as error:
-        raise WireError("cannot encode the message", found=error) from error
+        expected = "maps, lists, texts, bytes, numbers, None and numeric arrays"
+        raise WireError("cannot encode the message", expected=expected, found=error) from error
 
 
 def decode_message(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
@@ -45,7 +46,7 @@ def decode_message(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
         WireError: the message is invalid, or exceeds a limit.
     """
     if len(data) > max_bytes:
-        raise WireError("message too large", expected=f"at most {max_bytes} bytes", found=len(data))
+        raise WireError("message too large", expected=f"at most {max_bytes} bytes", found=f"{len(data)} bytes")
     items = 0
 
     def count_items(container: Any) -> Any:
@@ -67,10 +68,10 @@ def decode_message(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
         )
     except (ValueError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise WireError("invalid message", found=one_line(error, 200)) from error
-    return _decode(value, 0)
+    return _decode_value(value, 0)
 
 
-def _encode(value: Any) -> dict[bytes, Any]:
+def _encode_array(value: Any) -> dict[bytes, Any]:
     if not isinstance(value, np.ndarray | np.generic):
         raise TypeError(f"a {type(value).__name__}")
     if not _DTYPE.fullmatch(value.dtype.str):
@@ -80,11 +81,11 @@ def _encode(value: Any) -> dict[bytes, Any]:
     return {_ARRAY: True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
 
 
-def _decode(value: Any, depth: int) -> Any:
+def _decode_value(value: Any, depth: int) -> Any:
     if depth > MAX_DEPTH:
         raise WireError("too many levels of maps and lists in a message", expected=f"at most {MAX_DEPTH}")
     if isinstance(value, list):
-        return [_decode(one, depth + 1) for one in value]
+        return [_decode_value(one, depth + 1) for one in value]
     if not isinstance(value, dict):
         if isinstance(value, msgpack.ExtType):
             raise WireError("invalid message", found=one_line(value, 200))
@@ -95,7 +96,7 @@ def _decode(value: Any, depth: int) -> Any:
         return _decode_scalar(value)
     if not all(isinstance(key, str) for key in value):
         raise WireError("invalid keys of a map", expected="texts", found=one_line(list(value), 200))
-    return {key: _decode(one, depth + 1) for key, one in value.items()}
+    return {key: _decode_value(one, depth + 1) for key, one in value.items()}
 
 
 def _decode_array(value: dict[Any, Any]) -> NDArray[Any]:
@@ -129,4 +130,6 @@ def _decode_scalar(value: dict[Any, Any]) -> bool | int | float:
 def _parse_dtype(text: Any) -> np.dtype:
     if isinstance(text, str) and _DTYPE.fullmatch(text):
         return np.dtype(text)
-    raise WireError("invalid dtype", expected="such as <f4 or |u1", found=one_line(repr(text), 200))
+    raise WireError(
+        "invalid dtype", expected="bool, integers or floats, such as <f4 or |u1", found=one_line(repr(text), 200)
+    )

@@ -10,7 +10,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.text import escape_markdown, format_count
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.statistics import Comparison, adjust_p_values, compare_successes, power_warning
+from robocas_ms3.evaluation.statistics import Comparison, adjust_p_values, compare_successes, make_power_warning
 
 _ALPHA = 0.05
 ALL = "all"
@@ -140,7 +140,7 @@ def _render_table(head: str, where: str, rows: list[ComparisonRow]) -> str:
         counts = (c.n, c.successes_b, c.successes_a, c.only_b, c.only_a, change, f"{c.p_value:.3g}", f"{p:.3g}")
         names = (escape_markdown(row.where), escape_markdown(", ".join(row.pair)))
         lines.append(f"| {' | '.join(map(str, (*names, *counts)))} |")
-        warning = None if p <= _ALPHA else power_warning(c, alpha=_ALPHA / claims)
+        warning = None if p <= _ALPHA else make_power_warning(c, alpha=_ALPHA / claims)
         if warning:
             pair = "" if len({row.pair for row in rows}) == 1 else f", {', '.join(row.pair)}"
             warnings.append(f"- {escape_markdown(f'{row.where}{pair}')}: {warning}")

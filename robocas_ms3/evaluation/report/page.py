@@ -29,7 +29,7 @@ from robocas_ms3.evaluation.report.tables import (
     mean,
 )
 from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.statistics import SuccessRate, success_rate
+from robocas_ms3.evaluation.statistics import SuccessRate, compute_success_rate
 
 VIDEOS = "videos"
 
@@ -57,7 +57,7 @@ def render_page(result: Result, folder: Path | None = None, protocol: LoadedProt
             _render_stages(result),
             *others,
             _render_seconds(result),
-            _render_table_section(_effort_table(result)),
+            _render_table_section(_make_effort_table(result)),
         ]
     parts += [_render_settings(result, protocol), _render_failed_episodes(result, folder)]
     return (
@@ -89,8 +89,8 @@ def _render_stages(result: Result) -> str:
         rows = []
         for stage, name in get_stage_names(outcomes[0].task).items():
             if any(stage in outcome.flags for outcome in outcomes):
-                rate = result.rate(stage, outcomes)
-                shown = _rate_bar(rate, "good" if stage == "success" else "")
+                rate = result.compute_rate(stage, outcomes)
+                shown = _render_rate_bar(rate, "good" if stage == "success" else "")
                 rows.append(
                     f'<div class="row"><span>{escape(name)}</span>{shown}<b>{100 * rate.rate:.0f} %</b></div>\n'
                 )
@@ -110,13 +110,15 @@ def _render_seconds(result: Result) -> str:
     rows = []
     for config, values in taken.items():
         cells = [f"{value:.1f}" for value in np.quantile(values, (0, 0.25, 0.5, 0.75, 1))] if values else [""] * 5
-        rows.append([escape(config), str(len(values)), *cells, _distribution_bar(values, axis_end) if values else ""])
+        rows.append(
+            [escape(config), str(len(values)), *cells, _render_distribution(values, axis_end) if values else ""]
+        )
     heads = ("configuration", "succeeded#", "min#", "25 %#", "median#", "75 %#", "max#", _render_axis(axis_end, "s"))
     note = "Simulated seconds of the successful episodes. A tick is an episode; the box contains half of them."
     return _render_section("Seconds to success", note, _render_table(heads, rows))
 
 
-def _effort_table(result: Result) -> Table:
+def _make_effort_table(result: Result) -> Table:
     rows = []
     for config, outcomes in result.group_by("config").items():
 
@@ -126,9 +128,9 @@ def _effort_table(result: Result) -> Table:
         disturbed, fallen, n = get_measures("disturbed_most"), get_measures("fallen"), len(outcomes)
         rows.append(
             (
-                *(config, success_rate(sum(x > 0 for x in disturbed), n), f"{mean(disturbed):.2f}"),
+                *(config, compute_success_rate(sum(x > 0 for x in disturbed), n), f"{mean(disturbed):.2f}"),
                 *(
-                    success_rate(sum(x > 0 for x in fallen), n),
+                    compute_success_rate(sum(x > 0 for x in fallen), n),
                     f"{mean(fallen):.2f}",
                     f"{mean(get_measures('path_length')):.2f}",
                 ),
@@ -194,7 +196,7 @@ def _render_failed_episodes(result: Result, folder: Path | None) -> str:
         options = "".join(f"<option>{escape(value)}</option>" for value in sorted(values))
         choices = f'<option value="">all</option>{options}'
         filters += f'<label>{label} <select data-column="{column}">{choices}</select></label>\n'
-    rows = [_failed_episode_row(outcome, folder) for outcome in failed]
+    rows = [_render_failed_episode(outcome, folder) for outcome in failed]
     heads = (
         *("episode#", "configuration", "seed#", "split", "first stage not reached", "ended by"),
         *("steps#", "s#", "p_vis#", "disturbed#", "error"),
@@ -210,7 +212,7 @@ def _render_failed_episodes(result: Result, folder: Path | None) -> str:
     return _render_section("Failed episodes", note, f'<form class="filters">{filters}</form>\n{table}')
 
 
-def _failed_episode_row(outcome: Outcome, folder: Path | None) -> list[str]:
+def _render_failed_episode(outcome: Outcome, folder: Path | None) -> list[str]:
     video = f"{VIDEOS}/{video_file_name(outcome.episode)}"
     linked = folder is not None and (folder / video).is_file()
     return [
@@ -257,7 +259,7 @@ def _render_table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str
     return f'<div class="wide"><table{kinds}><thead><tr>{head}</tr></thead>\n<tbody>\n{body}</tbody></table></div>\n'
 
 
-def _rate_bar(rate: SuccessRate, kind: str = "") -> str:
+def _render_rate_bar(rate: SuccessRate, kind: str = "") -> str:
     """Return an SVG bar of a success rate and its interval, on an axis of 0 to 100 %."""
     low, high, here = 100 * rate.low, 100 * rate.high, 100 * rate.rate
     label = f"{rate.k} of {rate.n}: {here:.1f} %, {low:.1f} to {high:.1f}"
@@ -269,7 +271,7 @@ def _rate_bar(rate: SuccessRate, kind: str = "") -> str:
     )
 
 
-def _distribution_bar(values: Sequence[float], axis_end: float) -> str:
+def _render_distribution(values: Sequence[float], axis_end: float) -> str:
     """Return an SVG of a distribution on an axis from 0 to ``axis_end``: a tick per value, quartile box and median."""
     low, middle, high = (100 * np.quantile(values, (0.25, 0.5, 0.75)) / axis_end).tolist()
     ticks = "".join(f"M{100 * value / axis_end:.2f} 10V16" for value in values)
@@ -303,7 +305,7 @@ def _render_cells(cell: Cell, head: str) -> list[str]:
     """Return the HTML cells of a value; a rate in a ``%`` column takes two cells: text and bar."""
     if isinstance(cell, SuccessRate):
         rate = f"{100 * cell.rate:.0f} %<small>{100 * cell.low:.0f} to {100 * cell.high:.0f}</small>"
-        return [rate, _rate_bar(cell, "good")] if head.endswith("%") else [rate]
+        return [rate, _render_rate_bar(cell, "good")] if head.endswith("%") else [rate]
     if isinstance(cell, FailureCount):
         return [f'<span class="heat" style="--fraction: {100 * cell.count / cell.n:.0f}%">{cell.count or ""}</span>']
     if cell is None:

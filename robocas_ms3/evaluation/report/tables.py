@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from robocas_ms3.core.text import escape_markdown, format_count
 from robocas_ms3.evaluation.outcomes import PAPER_STAGES, Outcome
 from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.statistics import SuccessRate, success_rates_by_bin
+from robocas_ms3.evaluation.statistics import SuccessRate, bin_success_rates
 from robocas_ms3.scenes.task_specs import STAGES as DEFAULT_STAGES
 from robocas_ms3.scenes.task_specs import TASKS
 
@@ -73,14 +73,14 @@ class Table:
 
 def make_tables(result: Result) -> Iterator[Table]:
     """Yield the tables of a report; the result must have at least one episode."""
-    yield _success_table(result)
+    yield _make_success_table(result)
     if len(result.group_by("split")) > 1:
-        yield _split_table(result)
-    yield _failure_table(result)
+        yield _make_split_table(result)
+    yield _make_failure_table(result)
     hidden = [one for one in select_first_split(result) if one.p_vis is not None]
     if hidden:
-        yield _occlusion_table(hidden)
-    yield from _retrieval_table(result)
+        yield _make_occlusion_table(hidden)
+    yield from _make_retrieval_table(result)
 
 
 def render_markdown(result: Result) -> str:
@@ -100,7 +100,7 @@ def render_markdown(result: Result) -> str:
         heads = " | ".join(escape_markdown(head.rstrip("#%")) for head in table.heads)
         lines += ["", f"## {table.title}", "", f"| {heads} |", "|" + "---|" * len(table.heads)]
         for row in table.rows:
-            cells = (_markdown_cell(cell, head) for cell, head in zip(row, table.heads, strict=True))
+            cells = (_render_cell(cell, head) for cell, head in zip(row, table.heads, strict=True))
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
@@ -152,18 +152,18 @@ def mean(values: Sequence[float]) -> float:
     return sum(values) / len(values)
 
 
-def _success_table(result: Result) -> Table:
-    def rate(flag: str, outcomes: list[Outcome]) -> SuccessRate | None:
+def _make_success_table(result: Result) -> Table:
+    def stage_rate(flag: str, outcomes: list[Outcome]) -> SuccessRate | None:
         known = [one for one in outcomes if flag in one.flags]  # tasks without obstacles lack the stage CO
         error_count = [one for one in outcomes if one.error and not one.flags]
-        return result.rate(flag, known + error_count) if known else None
+        return result.compute_rate(flag, known + error_count) if known else None
 
     groups, rows = result.group_by("config"), []
     for config, outcomes in groups.items() if result.has_repeated_scenes() else _add_pooled_group(groups):
-        ends = (result.rate("success_at_end", outcomes), rate("success_v0", outcomes))
-        stages = (rate(stage, outcomes) for stage in PAPER_STAGES.values())
+        ends = (result.compute_rate("success_at_end", outcomes), stage_rate("success_v0", outcomes))
+        stages = (stage_rate(stage, outcomes) for stage in PAPER_STAGES.values())
         steps, seconds = mean([one.steps for one in outcomes]), mean([one.seconds for one in outcomes])
-        overall = result.rate("success", outcomes)
+        overall = result.compute_rate("success", outcomes)
         rows.append((config, str(overall.n), overall, *ends, *stages, f"{steps:.0f}", f"{seconds:.1f}"))
     note = (
         "success: success at some step; at the end: success after the last step; RoboCAS-v0: success by the rule of "
@@ -175,19 +175,19 @@ def _success_table(result: Result) -> Table:
     return Table("Success", note, (*heads, "steps#", "s#"), rows)
 
 
-def _split_table(result: Result) -> Table:
+def _make_split_table(result: Result) -> Table:
     splits, rows = result.group_by("split"), []
     for task, outcomes in _add_pooled_group(result.group_by("task")):
         row: list[Cell] = [task]
         for split in splits:
             chosen = [outcome for outcome in outcomes if outcome.split == split]
-            row += [str(len(chosen)), result.rate("success", chosen) if chosen else None]
+            row += [str(len(chosen)), result.compute_rate("success", chosen) if chosen else None]
         rows.append(row)
     heads = [head for split in splits for head in (f"{split}, n#", f"{split}%")]
     return Table("Splits", "Success rates by split.", ["task", *heads], rows)
 
 
-def _failure_table(result: Result) -> Table:
+def _make_failure_table(result: Result) -> Table:
     groups = result.group_by("config")
     counts = {config: Counter(one.failure_stage for one in outcomes) for config, outcomes in groups.items()}
     found = {stage for count in counts.values() for stage in count} - {""}
@@ -202,8 +202,8 @@ def _failure_table(result: Result) -> Table:
     return Table("Where episodes failed", note, heads, rows)
 
 
-def _occlusion_table(hidden: list[Outcome]) -> Table:
-    bins = success_rates_by_bin([one.p_vis or 0.0 for one in hidden], [one.success for one in hidden], P_VIS_EDGES)
+def _make_occlusion_table(hidden: list[Outcome]) -> Table:
+    bins = bin_success_rates([one.p_vis or 0.0 for one in hidden], [one.success for one in hidden], P_VIS_EDGES)
     edges = zip(P_VIS_EDGES[:-1], P_VIS_EDGES[1:], bins, strict=True)
     rows = [(f"{low:g} to {high:g}", str(rate.n if rate else 0), rate) for low, high, rate in edges]
     configs = ", ".join(sorted({outcome.config for outcome in hidden}))
@@ -211,7 +211,7 @@ def _occlusion_table(hidden: list[Outcome]) -> Table:
     return Table("Success by occlusion", note, ("p_vis", "n#", "success%"), rows)
 
 
-def _retrieval_table(result: Result) -> Iterator[Table]:
+def _make_retrieval_table(result: Result) -> Iterator[Table]:
     rows = []
     for config, outcomes in result.group_by("config").items():
         orders = [one.retrieval for one in outcomes if one.retrieval is not None]
@@ -238,7 +238,7 @@ def _add_pooled_group(groups: dict[str, list[Outcome]]) -> list[tuple[str, list[
     return [*groups.items(), *([("all", every)] if len(groups) > 1 else [])]
 
 
-def _markdown_cell(cell: Cell, head: str) -> str:
+def _render_cell(cell: Cell, head: str) -> str:
     if isinstance(cell, SuccessRate):
         text = f"{100 * cell.rate:.0f} %"
         return f"{text} ({100 * cell.low:.0f} to {100 * cell.high:.0f})" if head.endswith("%") else text

@@ -54,7 +54,7 @@ def test_proprioception_equals_dataset_columns_at_each_step():
     for step in range(STEPS):
         for env in range(2):
             command = None if step == 0 else float(COMMANDS[step - 1])
-            read[env].append(state.compute(env, observed(robots, step), command))
+            read[env].append(state.compute_columns(env, observed(robots, step), command))
     for env, robot in enumerate(robots):
         columns = frame_columns(episode_arrays(robot, "", []))
         for name, column in KEYS.items():

@@ -17,7 +17,7 @@ from websockets.sync.client import connect
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
 from robocas_ms3.evaluation.policy import PolicySpec
-from robocas_ms3.evaluation.remote.messages import file_name, make_observation_message
+from robocas_ms3.evaluation.remote.messages import make_observation_message, message_file_name
 from robocas_ms3.evaluation.remote.server import ServedFiles
 from robocas_ms3.evaluation.remote.wire import encode_message
 
@@ -91,12 +91,12 @@ def test_files_of_bundled_and_passed_protocols_are_served(tmp_path):
     assert Path(ours.layouts_file) == tmp_path / theirs.layouts_file
     assert ours.pack == "packs/own"
     assert ServedFiles.collect().resolve_episode(theirs) == replace(theirs, config_file="", layouts_file="", pack="")
-    assert file_name(make_episode().config_file) == "smoke/configs/pick_table_scattered.yaml"
+    assert message_file_name(make_episode().config_file) == "smoke/configs/pick_table_scattered.yaml"
     (tmp_path / "smoke").mkdir()
     with pytest.raises(EvaluationError):
         ServedFiles.collect([tmp_path / "smoke"])
     like_a_shipped_one = str(tmp_path / "smoke/configs/pick_table_scattered.yaml")
-    assert file_name(like_a_shipped_one) == like_a_shipped_one
+    assert message_file_name(like_a_shipped_one) == like_a_shipped_one
 
 
 @pytest.mark.parametrize("name", ["task", "robot"])

@@ -23,8 +23,8 @@ from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.connection import PolicyAddress, parse_address
 from robocas_ms3.evaluation.remote.messages import (
-    batch_limit,
     make_observation_message,
+    max_envs_per_request,
     parse_request,
     request_size_limit,
 )
@@ -98,10 +98,10 @@ def test_remote_run_equals_local_run_bit_for_bit():
 def test_batch_of_the_announced_size_fits_in_a_message():
     for camera in ((8, 8), (224, 224), (640, 480), (4096, 4096)):
         spec = PolicySpec(cameras=dict.fromkeys(("base_camera", "gripper_camera", "static_camera"), camera), depth=True)
-        envs = batch_limit(spec, 256)
+        envs = max_envs_per_request(spec, 256)
         images = 3 * camera[0] * camera[1] * 5
         assert envs == 1 or envs * images + 4 * 2**20 <= request_size_limit(spec, envs) <= MAX_BYTES
-        assert batch_limit(spec, 1) == 1
+        assert max_envs_per_request(spec, 1) == 1
 
 
 class FailingInEnvs(RecordingPolicy):

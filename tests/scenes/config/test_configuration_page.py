@@ -60,7 +60,7 @@ def test_commands_of_the_page_set_existing_keys():
         assert overrides
         if words[0] == "eval":
             source = read_protocol_source(ROOT / words[2])
-            assert {part.load(overrides).language.split for part in source.parts} == {"held_out"}
+            assert {part.load_config(overrides).language.split for part in source.parts} == {"held_out"}
         else:
             name = words[words.index("--config") + 1] if "--config" in words else words[words.index("--set") - 1]
             name = words[2] if words[0] == "layouts" else name

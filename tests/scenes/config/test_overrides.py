@@ -52,7 +52,7 @@ def test_overrides_are_merged_over_a_file_in_order(tmp_path):
     source = ProtocolSource.model_validate(
         {"rules": {}, "parts": [{"config": NAME, "count": 1, "first_seed": 0, "change": {"objects": {"count": 3}}}]}
     )
-    assert source.parts[0].load(["objects.count=4"]).objects.count == 4
+    assert source.parts[0].load_config(["objects.count=4"]).objects.count == 4
 
 
 @pytest.mark.parametrize(
