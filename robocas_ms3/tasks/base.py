@@ -23,8 +23,9 @@ STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "targ
 class RoboCASEnv(SceneEnv):
     """Base class of the environments of all tasks: move the target to the goal.
 
-    A task is a subclass with ``SPEC``, its `TaskSpec`. It may set the class attributes below, and override `evaluate`,
-    `reward_stage_and_terms` and `privileged_observations`. `SceneEnv` has the arguments. N envs, K object slots.
+    The environment class of a task is a subclass that sets ``SPEC`` to its `TaskSpec`. It may set ``STAGES``, ``GOAL``
+    and ``REWARDS``, and override `evaluate`, `reward_stage_and_terms` and `privileged_observations`. The arguments are
+    those of `SceneEnv`. N envs, K object slots.
 
     Attributes:
         STAGES: names of the stages that `evaluate` reports.
@@ -57,7 +58,7 @@ class RoboCASEnv(SceneEnv):
         self.dense_reward.reset(env_idx)
 
     def extra_state(self) -> dict:
-        """Return the extra state of `SceneEnv`, and the reached ``stages`` (N, stages) bool under ``task``."""
+        """Return the last commanded pose of the controllers, and the reached ``stages`` (N, stages) bool."""
         return {**super().extra_state(), "task": {"stages": self.success_check.reached.T.clone()}}
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
@@ -150,7 +151,7 @@ class RoboCASEnv(SceneEnv):
         return self.dense_reward.compute(self.reward_stage_and_terms(), penalties, action, info)
 
     def reward_stage_and_terms(self) -> tuple[Array, dict[str, Array]]:
-        """Return reward stages (N,) and reward terms by name, (N,) each, in the form of `Goal.stage_and_terms`."""
+        """Return the index (N,) of the current reward stage, and reward terms by name, (N,) in [0, 1] each."""
         return self.goal.stage_and_terms(
             self.success_check.state, self.success_check.stages["target_lifted"], self.REWARDS
         )

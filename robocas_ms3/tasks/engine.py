@@ -129,7 +129,7 @@ def step_without_observation(env: Any, action: NDArray[Any]) -> None:
 
 
 def is_garbage_collection_due(device: sapien.Device | None, resets: int) -> bool:
-    """Return whether to collect garbage at this reset. An old scene keeps 8 MB, or 0.5 MB without a renderer."""
+    """Return whether to collect garbage at this reset: an unused scene holds 8 MB, or 0.5 MB without a renderer."""
     return resets % (20 if can_render(device) else 30) == 0
 
 

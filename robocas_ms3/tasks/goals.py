@@ -43,7 +43,7 @@ class TaskState(NamedTuple):
 
 
 class Goal(ABC):
-    """Goal of the target in an environment. A goal with sparse rewards only needs only `is_at_goal`.
+    """Base class of goals: where the target must be. Without dense rewards, a goal must define only `is_at_goal`.
 
     Args:
         env: the `base.RoboCASEnv`, with a loaded scene.
@@ -71,7 +71,7 @@ class Goal(ABC):
         """Return (N,) bool, whether the goal can't be reached any more; None: it can be reached in every env.
 
         Args:
-            basket_pose: see the module.
+            basket_pose: (N, 7) world pose of the basket, or None.
             conditions: success conditions by name, (N,) bool each.
         """
         return None
@@ -156,7 +156,7 @@ class InBasketGoal(Goal):
     def stage_and_terms(
         self, state: TaskState, was_lifted: Array, table: rewards.RewardTable
     ) -> tuple[Array, dict[str, Array]]:
-        """Return the reward stage (grasp, lift, carry, place, release or rest) and the terms; see `Goal`."""
+        """Return the index (N,) of the reward stage, from grasp to rest, and the terms by name, (N,) in [0, 1] each."""
         env = self.env
         slot = to_native(env.target_slot)
         target, center = terms.select_target(state.object_states, slot), env.target_center(state.object_states)

@@ -51,7 +51,7 @@ class InitialStates:
         )
 
     def interleave(self, from_self: NDArray[np.bool_], others: InitialStates) -> InitialStates:
-        """Merge with other states: row i is the next row of self if ``from_self[i]``, otherwise the next of others."""
+        """Merge two sets of states: row i is the next row of self if ``from_self[i]``, otherwise of ``others``."""
         order = torch.from_numpy(np.argsort(np.argsort(~from_self, kind="stable"))).to(self.targets.device)
         return InitialStates(
             **{
@@ -81,7 +81,7 @@ class InitialStateTable:
         self._columns = [torch.from_numpy(np.ascontiguousarray(taken[name])).to(device) for name in names]
 
     def has_usable_layout(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return (E,) bool, whether envs (E,) have a layout for seeds (E,) that is not marked unstable."""
+        """Return (E,) bool, whether the table has layouts for envs (E,) and seeds (E,), not marked unstable."""
         return is_usable(self._table.find_records(self._objects_seeds[envs], seeds)[0])
 
     def gather_states(self, envs: NDArray[np.int64], seeds: NDArray[np.int64]) -> InitialStates:
@@ -93,7 +93,7 @@ class InitialStateTable:
 
 
 def set_initial_states(env: Any, states: InitialStates, envs: torch.Tensor) -> None:
-    """Put robot, furniture, basket and objects of envs (E,) into initial states, and store these in the env."""
+    """Put robot, furniture, basket and objects of envs (E,) into initial states; store the start poses in the env."""
     with torch.device(env.device):
         qpos: Any = torch.as_tensor(env.agent.keyframes[env.task_config.robot_start].qpos, dtype=torch.float32)
         env.agent.reset(qpos.repeat(len(envs), 1))

@@ -77,7 +77,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
         return {**found, "furniture_opened": opened}
 
     def reward_stage_and_terms(self) -> tuple[Array, dict[str, Array]]:
-        """Return reward stage and terms of each env; the stage ``open`` comes before the stage ``grasp``."""
+        """Return reward stages (N,) and terms (N,) by name; the stage ``open`` comes before the stage ``grasp``."""
         stage, found = super().reward_stage_and_terms()
         shut = (stage == self.REWARDS.stage_index("grasp")) & ~self.success_check.stages["furniture_opened"]
         if not known_all_false(shut):
@@ -90,7 +90,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
         return rewards.change_fraction(to_native(self.opening_joint_position()), 0.0, self.model.open_threshold)
 
     def privileged_observations(self) -> dict[str, torch.Tensor]:
-        """Return the observations of `RoboCASEnv`, ``opened_fraction`` (N, 1) and ``tcp_to_handle`` (N, 3), m."""
+        """Return the observations of all tasks, ``opened_fraction`` (N, 1) and ``tcp_to_handle`` (N, 3), m."""
         tcp = self.tcp_in_world()
         return {
             **super().privileged_observations(),

@@ -45,8 +45,8 @@ class SceneEnv(BaseEnv):
         pack: name or folder of the object pack.
         furniture_pack: name or folder of the pack that has room, furniture and basket.
         visual_level: level of detail of the rendered meshes, ``fast`` or ``full``.
-        layouts: source of the layouts: ``auto`` for the layout cache, its folder, None for no cache, or a function
-            (`scenes.cache.make_layout_source`).
+        layouts: source of the layouts (`scenes.cache.make_layout_source`): ``auto`` for the user's layout cache,
+            another folder of layout caches, None for no cache, a ``.npy`` file of frozen layouts, or a function.
         seeds: least and greatest seed of resets without a seed (`EpisodeSeeds`).
         robot_uids: name of the robot in `robots.registry`.
         num_envs: N; more than 1 needs a GPU.
@@ -223,7 +223,7 @@ class SceneEnv(BaseEnv):
         set_initial_states(self, self.seeds.find_initial_states(env_idx.cpu().numpy(), self.device), env_idx)
 
     def layout(self, env: int = 0) -> Layout:
-        """Return the layout of the current episode of an env."""
+        """Return the layout of the current episode in env number ``env``."""
         return self.seeds.layout(env)
 
     def get_state_dict(self) -> dict:
@@ -231,7 +231,7 @@ class SceneEnv(BaseEnv):
         return {**self.bodies.to_state_dict(self.bodies.read().clone()), **self.extra_state()}
 
     def extra_state(self) -> dict:
-        """Return the state that ManiSkill's state lacks: the last commanded pose of the controllers."""
+        """Return state that ManiSkill's state dictionary lacks: the last commanded pose of the controllers."""
         return {"controller": self.agent.controller.targets()}
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
@@ -266,11 +266,11 @@ class SceneEnv(BaseEnv):
         return read_link_poses(self.scene, [self.agent.tcp])[:, 0]
 
     def target_asset(self, env: int = 0) -> LoadedObject:
-        """Return the asset of the target of an env."""
+        """Return the asset of the target in env number ``env``."""
         return self.object_assets[env][int(self.target_slot[env])]
 
     def object_names(self, env: int = 0) -> set[str]:
-        """Return the names of all objects of an env."""
+        """Return the names of all objects in env number ``env``."""
         present = self.layout(env).present
         return {asset.asset.name for asset, used in zip(self.object_assets[env], present, strict=True) if used}
 

@@ -71,7 +71,7 @@ class RoboCASSearchEnv(RoboCASEnv):
         return {**state, "task": {**state["task"], **{name: value[:, None].clone() for name, value in own.items()}}}
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
-        """Set the state of some envs; see `RoboCASEnv.set_state_dict`. Their clutter is measured in the next step."""
+        """Set the state of some envs as `RoboCASEnv` does; the clutter of these envs is measured in the next step."""
         super().set_state_dict(state, env_idx)
         envs = slice(None) if env_idx is None else env_idx
         self._schedule.make_always_due(slice(None) if env_idx is None else env_idx.cpu().numpy())
@@ -84,7 +84,7 @@ class RoboCASSearchEnv(RoboCASEnv):
                 own[name][envs] = torch.as_tensor(value).to(own[name]).reshape(-1)
 
     def measure_clutter(self, envs: Any = slice(None)) -> occlusion.Clutter:
-        """Measure the current clutter around the targets of some envs; default: all envs."""
+        """Measure the current clutter around the targets of some envs (indices or a slice)."""
         points = occlusion.surface_points_in_world(self.object_states[envs, :, :7], self._surface_points[envs])
         return occlusion.measure_clutter(points, self.present[envs], self.target_slot[envs], self._eye)
 
@@ -160,7 +160,7 @@ class RoboCASSearchEnv(RoboCASEnv):
         return bool(occlusion.has_clutter_moved(poses, earlier_poses, self._radii, self.target_slot, self._eye).any())
 
     def reward_stage_and_terms(self) -> tuple[Array, dict[str, Array]]:
-        """Return reward stage and terms of each env; the stage ``clear`` lasts until the target is cleared or held."""
+        """Return reward stages (N,) and terms (N,) by name; ``clear`` lasts until the target is cleared or held."""
         stage, found = super().reward_stage_and_terms()
         stages = self.success_check.stages
         settled = stages["obstacles_cleared"] | stages["target_grasped"]
@@ -174,7 +174,7 @@ class RoboCASSearchEnv(RoboCASEnv):
         return stage, found
 
     def privileged_observations(self) -> dict[str, torch.Tensor]:
-        """Return the observations of `RoboCASEnv`, and the last measured ``hidden_fraction`` (N, 1)."""
+        """Return the observations of all tasks, and the last measured ``hidden_fraction`` (N, 1)."""
         return {**super().privileged_observations(), "hidden_fraction": self.hidden_fraction[:, None].clone()}
 
 
@@ -198,11 +198,11 @@ def _sample_points(points: np.ndarray) -> np.ndarray:
 
 
 class PeriodicSchedule:
-    """Schedule of a measurement that is due in an env before its first step and then once per period.
+    """Schedule of a measurement that is due in each env before the first step of an episode, then once per period.
 
     Args:
         num_envs: N.
-        period: number of control steps.
+        period: control steps from one measurement to the next.
         device: device of the envs.
     """
 

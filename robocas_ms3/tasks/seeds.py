@@ -44,7 +44,7 @@ def consecutive_seeds(first: int, count: int, seed_range: tuple[int, int] | None
 def parse_reset_options(
     options: dict[str, Any] | None, num_envs: int, device: torch.device
 ) -> tuple[dict[str, Any], list[int]]:
-    """Return options of ``BaseEnv.reset``, in which ``env_idx`` has indices, and the indices of the envs to reset.
+    """Return the options with ``env_idx`` as indices instead of flags, and the indices of the envs to reset.
 
     Raises:
         RobocasError: the options contain ``reset_to_env_states``.
@@ -219,7 +219,7 @@ class EpisodeSeeds:
             self._found.pop(env, None)
 
     def layout(self, env: int) -> Layout:
-        """Return the layout of an env; if its seed has none and was not requested, draw another layout seed."""
+        """Return the layout of an env; draw another layout seed if this seed has no layout and was not requested."""
         if env not in self._found:
             objects_seed = int(self.objects_seeds[env])
             self._found[env] = self._call_with_usable_seed(

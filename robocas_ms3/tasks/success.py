@@ -56,7 +56,7 @@ class SuccessCheck:
         self.fallen_below = self.surface - terms.FALLEN
 
     def reset(self, envs: torch.Tensor) -> None:
-        """Start an episode in envs (E,): no stage is reached, and the target may be another object."""
+        """Start an episode in envs (E,): clear the reached stages, and read the size of the new target."""
         self.reached[:, envs] = False
         self.target_extents = self._extents[torch.arange(len(self._extents), device=envs.device), self._env.target_slot]
         self._last = None
@@ -69,7 +69,7 @@ class SuccessCheck:
         self._last = None
 
     def mark_reached(self, stage: str, is_reached: Array) -> torch.Tensor:
-        """Mark a stage as reached where ``is_reached`` (N,) is true; return (N,) bool, reached since the reset."""
+        """Mark a stage as reached in envs where ``is_reached`` (N,) is true; return all its flags (N,) bool."""
         row = self.stages[stage]
         row |= is_reached
         return as_tensor(row).clone()
@@ -89,7 +89,7 @@ class SuccessCheck:
         return dict(found)
 
     def _reuse_key(self, forces: Array) -> object:
-        """Return a value on which the result depends; None if it can't be reused (GPU, or contact of the gripper)."""
+        """Return a value that determines the result; None if the result must be computed (GPU, or gripper contact)."""
         others = self._env.bodies.state_except_robot
         return None if others is None or forces.any() else (others, self.reached.numpy().tobytes())
 
