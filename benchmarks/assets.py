@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 from asset_tools.build import write_visuals
-from asset_tools.builtin.catalogue import products
+from asset_tools.builtin.catalogue import load_builtin_products
 from asset_tools.decompose import decompose
 from asset_tools.grasps import sample_grasps
 from asset_tools.inertia import compute_principal_inertia
@@ -40,7 +40,7 @@ class Benchmark:
 def main(cfg: Benchmark) -> None:
     """Run the benchmark."""
     seconds: dict[str, dict[str, float]] = defaultdict(dict)
-    for spec in products().values():
+    for spec in load_builtin_products().values():
         if cfg.ids and spec.id not in cfg.ids:
             continue
 

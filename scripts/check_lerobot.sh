@@ -1,14 +1,14 @@
 #!/usr/bin/env bash
-# Checks a LeRobot dataset with LeRobot itself: loads it, indexes and iterates it. With LeRobot 0.6 also: sub-goal and depth
-# of frames, lerobot-annotate against a stub server, ten steps of lerobot-train.
+# Check a LeRobot dataset with LeRobot: load the dataset, read frames by index, and iterate over all frames. With LeRobot
+# 0.6, also check sub-goals and depth, run lerobot-annotate with a stub server, and run ten steps of lerobot-train.
 #
 #   bash scripts/check_lerobot.sh [--version 0.6|0.5|2.1] DATASET [ROBOCAS_DATASET]
 #
-# --version        the --lerobot-version that the dataset was converted with (default: 0.6); it names the LeRobot that reads
-#                  it: 0.6.1, 0.5.1 or 0.3.3
-# ROBOCAS_DATASET  RoboCAS folder of the same recordings: sub-goals and depth are compared with it
+# --version        value of --lerobot-version with which the dataset was converted (default: 0.6). The dataset is read with
+#                  LeRobot 0.6.1, 0.5.1 or 0.3.3.
+# ROBOCAS_DATASET  RoboCAS folder of the same recordings, with which sub-goals and depth are compared
 #
-# Runs in LeRobot's environment, see lerobot_environment.sh. Nothing is fetched from a model hub.
+# The check runs in the virtual environment of LeRobot, see lerobot_environment.sh. It downloads nothing from a model hub.
 set -euo pipefail
 
 usage() { sed -n '5p' "$0" >&2; exit 2; }

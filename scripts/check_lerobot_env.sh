@@ -1,17 +1,17 @@
 #!/usr/bin/env bash
-# Checks that RoboCAS and LeRobot 0.6 work in one environment, made by `setup.sh --lerobot`.
+# Check that RoboCAS and LeRobot 0.6 work in one virtual environment, which `setup.sh --lerobot` creates.
 #
 #   bash scripts/check_lerobot_env.sh
 #
-# Runs `pip check`, the tests that need LeRobot or read its datasets, and scripts/check_lerobot_env.py: lerobot-eval with
-# untrained weights of ACT on two tasks of the protocol `smoke`, recorded actions of the demonstrator in LeRobot's loop against
-# `robocas eval`, and an env.py from a cache of the Hub. The first run downloads several gigabytes (torch with its CUDA
-# libraries). Needs a renderer (scripts/setup.sh installs one) but no GPU, and no model hub. Takes about 15 minutes on two
-# cores.
+# The script runs `pip check`, the tests that need LeRobot or read its datasets, and scripts/check_lerobot_env.py. This
+# program runs lerobot-eval with untrained weights of ACT on two tasks of the protocol `smoke`, compares recorded actions of
+# the scripted policy in LeRobot's loop with `robocas eval`, and loads an env.py from a cache of the Hub. The first run
+# downloads several gigabytes (torch with CUDA libraries). The script needs a renderer (scripts/setup.sh installs one), but
+# no GPU and no model hub. It takes about 15 minutes on two cores.
 #
-# ROBOCAS_LEROBOT_VENV    folder of the environment (default: .venv-lerobot in the checkout); name one that does not exist
-#                         to check the installation from nothing
-# ROBOCAS_LEROBOT_PYTHON  interpreter to create it with (default: python3.12)
+# ROBOCAS_LEROBOT_VENV    folder of the environment (default: .venv-lerobot in the checkout). A new folder checks the
+#                         installation from scratch.
+# ROBOCAS_LEROBOT_PYTHON  Python interpreter that creates the environment (default: python3.12)
 set -euo pipefail
 [ $# = 0 ] || { echo "usage: bash scripts/check_lerobot_env.sh" >&2; exit 2; }
 cd "$(dirname "${BASH_SOURCE[0]}")/.."

@@ -1,14 +1,14 @@
 #!/usr/bin/env bash
-# Compare with other packages: vla-eval runs the episodes of a protocol and must report the outcomes of `robocas eval` for the
-# same policy; robostats must compute the same intervals and tests.
+# Compare the package with two other packages. vla-eval runs the episodes of a protocol, and must report the outcomes that
+# `robocas eval` reports for the same policy. robostats must compute equal intervals and tests.
 #
 #   bash scripts/check_others.sh
 #
-# They are not dependencies of the package or its tests; this script installs them with the checkout in a separate environment.
-# Needs a render device (scripts/setup.sh installs one) and a few minutes.
+# The two packages are not dependencies. This script installs them and the checkout in a separate virtual environment. It
+# needs a render device (scripts/setup.sh installs one) and takes a few minutes.
 #
-# ROBOCAS_OTHERS_VENV    folder of that environment (default: .venv-others in the checkout)
-# ROBOCAS_OTHERS_PYTHON  interpreter to create it with (default: python3.11, the oldest that robostats supports)
+# ROBOCAS_OTHERS_VENV    folder of the environment (default: .venv-others in the checkout)
+# ROBOCAS_OTHERS_PYTHON  Python interpreter that creates it (default: python3.11, the oldest version for robostats)
 set -euo pipefail
 [ $# = 0 ] || { echo "usage: bash scripts/check_others.sh" >&2; exit 2; }
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -18,7 +18,7 @@ venv=${ROBOCAS_OTHERS_VENV:-.venv-others}
 stamp="${PACKAGES[*]} $(cat pyproject.toml requirements.lock | sha256sum) $PWD"
 
 if [ "$(cat "$venv/.packages" 2>/dev/null)" != "$stamp" ]; then
-    echo "environment $venv: ${PACKAGES[*]} (minutes the first time)"
+    echo "check_others: installing ${PACKAGES[*]} in $venv (the first time this takes minutes)"
     "${ROBOCAS_OTHERS_PYTHON:-python3.11}" -m venv --clear "$venv"
     pip=("$venv/bin/python" -m pip --disable-pip-version-check install -qq -c requirements.lock)
     "${pip[@]}" torch==2.13.0 # first and alone: pip takes a CPU build if it finds one
@@ -29,4 +29,4 @@ export OMP_NUM_THREADS=1
 "$venv/bin/python" -W ignore scripts/check_vla_eval.py
 "$venv/bin/python" -m pytest -q tests/evaluation/test_statistics.py -k another_package -W error::pytest.PytestWarning \
     -o addopts= -rs | tee "$venv/robostats.txt"
-! grep -q skipped "$venv/robostats.txt" || { echo "the comparison with robostats was skipped" >&2; exit 1; }
+! grep -q skipped "$venv/robostats.txt" || { echo "check_others: error: the comparison with robostats was skipped, see $venv/robostats.txt" >&2; exit 1; }

@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
-# Set up, record three pick episodes, convert them to a dataset with videos, validate it, and print where the files are.
+# Install the packages, record three pick episodes, convert them to a dataset with videos, and validate the dataset. At the
+# end, print the paths of the files.
 #
-#   bash scripts/demo.sh [OUT]      # OUT: output folder (default: demo_output); an earlier demo in it is overwritten
+#   bash scripts/demo.sh [OUT]      # OUT: output folder (default: demo_output); files of an earlier demo are overwritten
 set -euo pipefail
 out=$(realpath -m "${1:-"$(dirname "${BASH_SOURCE[0]}")/../demo_output"}")
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -10,7 +11,7 @@ bash scripts/setup.sh
 robocas=${ROBOCAS_VENV:-.venv}/bin/robocas
 "$robocas" generate pick -n 3 --seed 0 --out "$out/demonstrations" --overwrite
 if ! "${robocas%robocas}python" robocas_ms3/doctor/probes.py render >/dev/null 2>&1; then
-    echo "No render device: the demonstrations are recorded but cannot be converted to images. See robocas doctor."
+    echo "demo: no render device, so the demonstrations cannot be converted to images. Run robocas doctor for advice."
     echo "demonstrations  $out/demonstrations/trajectory.h5"
     exit 0
 fi

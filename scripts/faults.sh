@@ -1,14 +1,14 @@
 #!/usr/bin/env bash
-# Inject faults into generation, conversion, plans and evaluation with real episodes: crashes, endless loops, exhausted
-# memory, kill -9 at random times, full disks. Print a table of the faults and their outcomes in Markdown.
+# Inject faults into generate, convert, plan run and eval with real episodes: crashes, endless loops, exhausted memory,
+# kill -9 at random times, full disks. Print a Markdown table of the faults and their outcomes.
 #
 #   bash scripts/faults.sh [FOLDER] [PYTEST_ARGUMENTS...]   # writes faults.md and faults.json to FOLDER (default: faults)
 #
 # ROBOCAS_FAULT_KILLS  number of times that each command is killed (default: 20)
-# ROBOCAS_FAULT_SEED   seed of the random times; the table states the seed that was used
-# PYTHON               interpreter (default: that of scripts/setup.sh)
+# ROBOCAS_FAULT_SEED   seed of the random times (default: random); the table contains the seed
+# PYTHON               Python interpreter (default: .venv/bin/python, which scripts/setup.sh creates)
 #
-# Takes an hour or more on two cores.
+# The script takes an hour or more on two cores.
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 

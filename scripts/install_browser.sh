@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# Install Debian's Chromium, in which the tests of `robocas view` open its page. A failure is no error: only those tests need
-# it, and they are skipped without it. After a failure it is not tried again, except on CI (the variable `CI` is set).
+# Install Debian's Chromium, in which the tests of `robocas view` open the page. The exit status is 0 even if the
+# installation fails: without Chromium these tests are skipped. After a failure, later calls do not try again, unless the
+# variable `CI` is set.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -21,4 +22,4 @@ if ! grep -qsx 'ID=debian' /etc/os-release || [ "$(id -u)" != 0 ] || [ -e "$trie
 say "installing chromium for the tests of robocas view"
 if { apt-get update -qq && apt-get install -y -qq --no-install-recommends chromium; } >/dev/null 2>&1; then exit 0; fi
 touch "$tried"
-say "Chromium could not be installed: the tests of the page are skipped. Remove $tried to try again."
+say "Chromium could not be installed: the tests of robocas view are skipped. Remove $tried to try again."

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Install Mesa's software Vulkan driver if SAPIEN finds no render device, so that rendering works without a GPU.
 #
-# SAPIEN 3 needs VK_KHR_external_semaphore_fd, which this driver (lavapipe) has since Mesa 24.3. A failure is no error:
-# without a renderer the package simulates and records state-only data, so the exit status is 0.
+# SAPIEN 3 needs VK_KHR_external_semaphore_fd, which this driver (lavapipe) has since Mesa 24.3. The exit status is 0 even
+# if the installation fails: without a renderer, the package can simulate and record, but not render images.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -13,12 +13,11 @@ export DEBIAN_FRONTEND=noninteractive
 say() { printf 'setup: %s\n' "$*"; }
 renders() { "$python" robocas_ms3/doctor/probes.py render >/dev/null 2>&1; }
 advise() {
-    say "no render device: $1. Without one, everything but images works."
+    say "no render device: $1. Without a render device, everything except images works."
     exit 0
 }
 
-# Print "URI<tab>signing key or -" of the distribution's archive, from the apt sources in either of their two formats.
-# The suite distinguishes it from the security archive and others.
+# Print the line "URI<tab>signing key or -" of the archive of a suite, such as bookworm, from the apt sources in both formats.
 archive_of() {
     local suite=$1 files=()
     shopt -s nullglob
@@ -83,7 +82,7 @@ install_plain() {
 
 if renders; then exit 0; fi
 
-NEEDED="Vulkan driver with Mesa >= 24.3 (mesa-vulkan-drivers and libvulkan1), or a GPU's own"
+NEEDED="Vulkan driver: Mesa >= 24.3 (packages mesa-vulkan-drivers and libvulkan1), or the driver of a GPU"
 # shellcheck source=/dev/null
 system=$(. /etc/os-release 2>/dev/null && echo "${ID:-}-${VERSION_ID:-}") || system=
 case $system in

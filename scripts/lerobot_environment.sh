@@ -1,23 +1,23 @@
-# Sourced by check_lerobot.sh, check_lerobot_env.sh, train_lerobot.sh and serve_lerobot.sh, in the checkout's folder: creates
-# an environment with LeRobot and sets $venv. The first call downloads gigabytes (torch with its CUDA libraries); no GPU is
-# needed.
+# Sourced by check_lerobot.sh, check_lerobot_env.sh, train_lerobot.sh and serve_lerobot.sh in the folder of the checkout.
+# Creates a virtual environment with LeRobot and sets $venv to its folder. The first call downloads gigabytes (torch with
+# CUDA libraries); no GPU is needed.
 #
-# lerobot_version         of the dataset: 0.6 (default), 0.5 or 2.1; see docs/lerobot.md
+# lerobot_version         version of the dataset: 0.6 (default), 0.5 or 2.1; see docs/lerobot.md
 # test_packages           array of further packages to install with LeRobot 0.6 (default: none)
-# needs_renderer          1: install a software renderer too (default: 0)
-# ROBOCAS_LEROBOT_VENV    folder of the environment (default: .venv-lerobot, as of `setup.sh --lerobot`; for older versions
-#                         .venv-lerobot-0.5 and .venv-lerobot-2.1)
-# ROBOCAS_LEROBOT_PYTHON  interpreter to create it with (default: python3.12)
+# needs_renderer          1: also install a software renderer (default: 0)
+# ROBOCAS_LEROBOT_VENV    folder of the environment (default: .venv-lerobot, which `setup.sh --lerobot` creates; for older
+#                         versions .venv-lerobot-0.5 and .venv-lerobot-2.1)
+# ROBOCAS_LEROBOT_PYTHON  Python interpreter that creates the environment (default: python3.12)
 
 lerobot_version=${lerobot_version:-0.6}
 packages=()
 case $lerobot_version in
 0.6) ;;
 0.5) packages=(lerobot==0.5.1 torch==2.10.0 torchvision==0.25.0) ;;
-# The last release that reads format v2.1. It sets no upper bound on PyAV, and torchvision 0.22 needs one of 15 or less.
+# LeRobot 0.3.3 is the last release that reads format v2.1. It allows any PyAV, but torchvision 0.22 needs PyAV 15 or older.
 2.1) packages=(lerobot==0.3.3 torch==2.7.1 torchvision==0.22.1 av==15.1.0) ;;
 *)
-    echo "unknown LeRobot version '$lerobot_version': expected 0.6, 0.5 or 2.1" >&2
+    echo "error: unknown version '$lerobot_version' of LeRobot datasets: expected 0.6, 0.5 or 2.1" >&2
     exit 2
     ;;
 esac
@@ -32,10 +32,10 @@ if [ "$lerobot_version" = 0.6 ]; then
         "$venv/bin/python" -m pip --disable-pip-version-check install -qq "${test_packages[@]}"
     fi
 elif [ "$(cat "$venv/.packages" 2>/dev/null)" != "${packages[*]}" ]; then
-    echo "environment $venv: ${packages[*]} (minutes and gigabytes the first time)"
+    echo "installing ${packages[*]} in $venv (the first time this takes minutes and downloads gigabytes)"
     "$base" -m venv --clear "$venv"
     "$venv/bin/python" -m pip --disable-pip-version-check install -qq "${packages[@]}"
     echo "${packages[*]}" >"$venv/.packages"
 fi
 venv=$(cd "$venv" && pwd)
-export HF_HUB_OFFLINE=${HF_HUB_OFFLINE:-1} HF_HOME=${HF_HOME:-$venv/hub} # tables are cached there; models are not downloaded
+export HF_HUB_OFFLINE=${HF_HUB_OFFLINE:-1} HF_HOME=${HF_HOME:-$venv/hub} # the cache of tables; no model is downloaded

@@ -1,45 +1,50 @@
 #!/usr/bin/env bash
-# Reproduces a result of `small`: records demonstrations, converts them, trains, and evaluates on all episodes of paper-v1.
+# Reproduce a result of `small`: record demonstrations, convert them, train, and evaluate on all episodes of paper-v1.
 #
 #   bash scripts/reproduce_small.sh pick|select|search [FOLDER]
 #
-# An interrupted script continues when it is called again. docs/baselines.md has the results.
+# After an interruption, run the script again to continue. docs/baselines.md contains the results. FOLDER is the output
+# folder (default: reproduced/TASK).
 #
-# EPISODES, SEED, STEPS   number of demonstrations (default: 800; search: 920), seed of the first one, training steps
-# INIT_FROM               run with the initial weights; `small`: the bundled weights for pick. Default: small for search,
-#                         random weights for pick and select; INIT_FROM= for random weights
-# JOBS                    processes that record, convert and evaluate (default: one per core)
-# ROBOCAS                 robocas command (default: that of the checkout's virtual environment)
+# EPISODES   number of demonstrations (default: 800; search: 920)
+# SEED       first seed (default: 510000)
+# STEPS      training steps (default: 3500; search: 3000)
+# INIT_FROM  run folder with the initial weights, or `small` for the bundled weights for pick, or empty for random weights
+#            (default: small for search, random weights for pick and select)
+# JOBS       number of processes that record, convert and evaluate (default: one per core)
+# ROBOCAS    robocas command (default: .venv/bin/robocas)
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 source scripts/timed.sh
 
 fail() { printf 'reproduce_small: error: %s\n' "$*" >&2; exit 2; }
 
-# Parts of the demonstrations: percent, offset of the seed, task, configuration, policy that acts first. RoboCAS-v0
-# evaluates select in the scenes of pick; columns teach to choose among equal objects, but only two kinds of these fruits
-# can stand in columns, so the others are scattered. A search ends with a pick from the heap: picks of visible objects are
-# faster to record than searches, and perturbed grasps teach recovery.
+# Each part of the demonstrations: percent of all episodes, offset of the seed, task, configuration, and (optional) the policy
+# that acts before the scripted policy.
+# select: RoboCAS-v0 evaluates select in the scenes of pick. Scenes in columns teach the policy to choose one of several
+# identical objects. Only two of the four fruits can be placed in columns, so the other scenes are scattered.
+# search: a search ends with a pick from the heap. Picks of visible objects are faster to record than searches, and perturbed
+# grasps teach the policy to recover.
 task=${1:-}
 attempts=20 played=pick count=800 steps=3500 init_from=
 case $task in
     pick) parts=("100 0 pick pick_upstream_eval") ;;
     select) parts=("30 0 select select_fruits_orderly" "70 0 pick pick_fruits_alike") ;;
-    search) # one heap in ten takes half of the time, unless it is skipped early
+    search) # one of ten heaps would take half of the time, so it is skipped after three attempts
         parts=("65 0 pick pick_heap" "13 80000 pick pick_heap scripted-perturbed" "22 10000 search search_upstream_eval")
         played=search attempts=3 count=920 steps=3000 init_from=small ;;
-    *) fail "invalid task '$task': expected pick, select or search; bash scripts/reproduce_small.sh TASK [FOLDER]" ;;
+    *) fail "invalid task '$task': expected pick, select or search. Usage: bash scripts/reproduce_small.sh TASK [FOLDER]" ;;
 esac
 out=${2:-reproduced/$task}
 episodes=${EPISODES:-$count} seed=${SEED:-510000} steps=${STEPS:-$steps} init_from=${INIT_FROM-$init_from}
 jobs=${JOBS:-$(env -u OMP_NUM_THREADS nproc)}
 robocas=${ROBOCAS:-.venv/bin/robocas}
-command -v "$robocas" >/dev/null || fail "$robocas: no such command; install it: bash scripts/setup.sh"
+command -v "$robocas" >/dev/null || fail "no such command: $robocas. Run bash scripts/setup.sh, or set ROBOCAS."
 
 mkdir -p "$out"
 settings="EPISODES=$episodes SEED=$seed" # recordings with other settings must not be mixed
 [[ -f $out/settings.txt ]] || echo "$settings" >"$out/settings.txt"
-[[ $(<"$out/settings.txt") == "$settings" ]] || fail "$out: expected $(<"$out/settings.txt"), found $settings; choose another FOLDER"
+[[ $(<"$out/settings.txt") == "$settings" ]] || fail "$out was recorded with other settings: expected $(<"$out/settings.txt"), found $settings. Choose another FOLDER."
 data=() left=$episodes
 for part in "${parts[@]}"; do
     read -r percent offset of config first <<<"$part"

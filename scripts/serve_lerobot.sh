@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
-# Serves a policy of train_lerobot.sh, for `robocas eval pick --policy ws://127.0.0.1:8000 --protocol paper-v1`.
+# Serve a policy of train_lerobot.sh, for `robocas eval pick --policy ws://127.0.0.1:8000 --protocol paper-v1`.
 #
 #   bash scripts/serve_lerobot.sh OUT [--port 8000] [--device cpu] [--n-action-steps N]
 #
-# Runs in LeRobot's environment, see lerobot_environment.sh; no simulator runs here. Ctrl-C ends the server.
+# The server runs in the virtual environment of LeRobot, see lerobot_environment.sh, without a simulator. Ctrl-C ends it.
 set -euo pipefail
 [ $# -ge 1 ] && [ -d "$1" ] || { sed -n '4p' "$0" >&2; exit 2; }
 run=$(cd "$1" && pwd)

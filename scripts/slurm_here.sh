@@ -7,9 +7,9 @@
 #
 # Jobs go to the partition `here`. Jobs of a second partition, `first`, preempt them: they return to the queue.
 #
-# It needs no systemd and works in a container. A second start changes nothing. A slurm.conf that this script did not write
-# is kept, and then nothing is started. Logs are in /var/log/robocas-slurm, the state is in /var/lib/robocas-slurm. Slurm
-# does not manage memory here: a job may request any amount.
+# The script needs no systemd and works in a container. A second start changes nothing. If there is a slurm.conf of another
+# origin, the script keeps it and starts nothing. Logs are in /var/log/robocas-slurm, the state is in
+# /var/lib/robocas-slurm. Slurm does not manage memory here: a job may request any amount.
 set -euo pipefail
 
 conf=/etc/slurm/slurm.conf
@@ -44,14 +44,14 @@ wait_until() {
 install_packages() {
     command -v slurmctld >/dev/null && command -v slurmd >/dev/null && command -v sbatch >/dev/null \
         && command -v munged >/dev/null && return
-    command -v apt-get >/dev/null || refuse "there is no apt-get: install slurmctld, slurmd, sbatch and munge"
+    command -v apt-get >/dev/null || refuse "no apt-get on this machine. Install slurmctld, slurmd, sbatch and munge."
     say "installing slurmctld, slurmd, slurm-client and munge"
     local log
     log=$(mktemp)
     if ! { apt-get update -qq && apt-get install -y -qq --no-install-recommends \
         slurmctld slurmd slurm-client munge; } >"$log" 2>&1; then
         tail -n 5 "$log" >&2
-        refuse "could not install them; the output of apt is in $log"
+        refuse "slurmctld, slurmd, slurm-client and munge could not be installed; the output of apt is in $log"
     fi
     rm -f "$log"
 }
@@ -116,7 +116,7 @@ start() {
         return
     fi
     [ "$(id -u)" = 0 ] || refuse "run this as root"
-    if [ -e "$conf" ] && ! ours; then refuse "$conf was not written by this script: start that Slurm, or move the file"; fi
+    if [ -e "$conf" ] && ! ours; then refuse "$conf was not written by this script. Start that Slurm, or move the file."; fi
     install_packages
     mkdir -p "$logs" "$state/ctld" "$state/d"
     write_conf
@@ -130,7 +130,7 @@ start() {
 
 stop() {
     if ! ours; then
-        say "no Slurm of this script is running"
+        say "no Slurm that this script started is running"
         return
     fi
     [ "$(id -u)" = 0 ] || refuse "run this as root"

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Run a plan of three tasks with images for an hour, one job per core. Print as JSON: the time per episode, the memory of
-# the processes over time, and the time that Ctrl-C takes to end the plan.
+# Run a plan of three tasks with images for an hour, with one job per core. Print JSON: time per episode, memory of each
+# process over time, and time from Ctrl-C to the end of the plan.
 #
-#   bash scripts/soak.sh [ARGUMENTS]     # of benchmarks/soak.py, for example --minutes 10 --jobs 1
+#   bash scripts/soak.sh [ARGUMENTS]     # ARGUMENTS of benchmarks/soak.py, for example --minutes 10 --jobs 1
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bin=${ROBOCAS_VENV:-.venv}/bin

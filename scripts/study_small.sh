@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Ablation study of `small`: trains on subsets of the demonstrations of `scripts/reproduce_small.sh pick`, or on all of them
-# without language or without the gripper camera, with the same number of steps, and evaluates on paper-v1.
+# Run an ablation study of `small` after `scripts/reproduce_small.sh pick`: train on subsets of the demonstrations, or on all
+# demonstrations without language or without the gripper camera, and evaluate on paper-v1. All runs have equal steps.
 #
 #   bash scripts/study_small.sh [FOLDER [VARIANT ...]]
 #
 # FOLDER                  folder of reproduce_small.sh (default: reproduced/pick); output: FOLDER/study/VARIANT
-# VARIANT                 a number of demonstrations, all, no-language or no-gripper-camera (default: 50 200 all no-language
-#                         no-gripper-camera)
+# VARIANT                 a number of demonstrations, all, no-language or no-gripper-camera (default: the five variants
+#                         50 200 all no-language no-gripper-camera)
 # STEPS, EPISODES         training steps (default: 1500), episodes of paper-v1 to evaluate (default: 200, all)
 # JOBS, ROBOCAS           as in reproduce_small.sh
 set -euo pipefail
@@ -21,14 +21,14 @@ variants=("${@:2}")
 steps=${STEPS:-1500} episodes=${EPISODES:-200} jobs=${JOBS:-$(env -u OMP_NUM_THREADS nproc)}
 robocas=${ROBOCAS:-.venv/bin/robocas}
 dataset=$from/data
-[[ -f $dataset/data_info.json ]] || fail "$from: no dataset; make it: bash scripts/reproduce_small.sh pick $from"
+[[ -f $dataset/data_info.json ]] || fail "$from: no dataset. Run: bash scripts/reproduce_small.sh pick $from"
 count=$(find "$dataset" -maxdepth 1 -name 'episode_*' | wc -l)
 
 for variant in "${variants[@]}"; do  # check all before the first training
     case $variant in
         all | no-language | no-gripper-camera) ;;
         *[!0-9]* | 0*) fail "invalid variant '$variant': expected a number of demonstrations, all, no-language or no-gripper-camera" ;;
-        *) ((variant < count)) || fail "invalid variant '$variant': $dataset has $count demonstrations" ;;
+        *) ((variant < count)) || fail "invalid variant '$variant': expected a number below $count, the number of demonstrations in $dataset" ;;
     esac
 done
 

@@ -1,9 +1,10 @@
-# Sourced by other scripts: `timed COMMAND VERB ...` runs the command and prints its minutes, or its exit status.
+# Sourced by other scripts: `timed COMMAND VERB ...` runs the command and prints its duration in minutes. If the command
+# fails, it prints an error and exits with the exit status of the command.
 timed() {
     local start=$SECONDS status=0
     "$@" || status=$?
     if ((status)); then
-        printf '%s: error: %s exited with status %d; call the script again to continue\n' "$(basename "$0" .sh)" "$2" "$status" >&2
+        printf '%s: error: robocas %s exited with status %d. Run this script again to continue.\n' "$(basename "$0" .sh)" "$2" "$status" >&2
         exit "$status"
     fi
     printf '%s: %s: %d min\n' "$(basename "$0" .sh)" "$2" $(((SECONDS - start + 30) / 60))

@@ -1,17 +1,17 @@
 #!/usr/bin/env bash
-# Trains LeRobot's ACT or diffusion policy with lerobot-train on a dataset of `robocas convert --to lerobot`.
+# Train LeRobot's ACT or diffusion policy with lerobot-train on a dataset of `robocas convert --to lerobot`.
 #
 #   bash scripts/train_lerobot.sh act|diffusion DATASET OUT [STEPS] [--OPTION=VALUE ...]
 #
-# Options are passed to lerobot-train and override the sizes below, which suit a CPU: --policy.device=cuda,
-# --batch_size=64, --policy.dim_model=512 ... With --no-language as the first option the policy gets no instruction.
-# If OUT has a checkpoint, the training continues from it to STEPS, with the settings that it was started with.
+# Options are passed to lerobot-train. They override the small sizes below, which are for a CPU: --policy.device=cuda,
+# --batch_size=64, --policy.dim_model=512 and others. With --no-language as the first option, the policy gets no instruction.
+# If OUT has a checkpoint, the training continues from this checkpoint to STEPS (default: 20000), with its first settings.
 #
-#   OUT/settings.txt   policy, dataset and language of the training; others are refused
-#   OUT/dataset        dataset reduced to what the policy socket sends (robocas_ms3.baselines.lerobot.prepare)
-#   OUT/train          output of lerobot-train; scripts/serve_lerobot.sh OUT serves its last checkpoint
+#   OUT/settings.txt   policy, dataset and language of the training; a call with other values is an error
+#   OUT/dataset        dataset with only the features that a remote policy gets (robocas_ms3.baselines.lerobot.prepare)
+#   OUT/train          output of lerobot-train; scripts/serve_lerobot.sh OUT serves the last checkpoint
 #
-# Runs in LeRobot's environment, see lerobot_environment.sh.
+# The training runs in the virtual environment of LeRobot, see lerobot_environment.sh.
 set -euo pipefail
 
 usage() { sed -n '4p' "$0" >&2; exit 2; }
@@ -41,11 +41,12 @@ esac
 
 settings="$kind $(sha256sum <"$dataset/meta/info.json" | cut -c 1-16) ${language[*]}"
 if [ -f "$out/settings.txt" ] && [ "$(cat "$out/settings.txt")" != "$settings" ]; then
-    echo "$out: expected '$(cat "$out/settings.txt")' (policy, dataset, language), found '$settings'; choose another OUT" >&2
+    echo "error: $out has a training with other settings (policy, dataset hash, language): expected" \
+        "'$(cat "$out/settings.txt")', found '$settings'. Choose another OUT." >&2
     exit 2
 fi
 if [ -d "$out/dataset" ] && [ ! -f "$out/settings.txt" ]; then
-    echo "$out/dataset: unknown dataset without settings.txt; remove it, or choose another OUT" >&2
+    echo "error: $out/dataset exists, but $out/settings.txt is missing. Remove the dataset, or choose another OUT." >&2
     exit 2
 fi
 echo "$settings" >"$out/settings.txt"
@@ -59,7 +60,7 @@ if [ -f "$started" ]; then
     exec "$venv/bin/lerobot-train" "--config_path=$started" --resume=true "--steps=$steps" "$@"
 fi
 if [ -e "$out/train" ]; then # lerobot-train creates this folder
-    echo "$out/train: exists without a checkpoint; remove it, or choose another OUT" >&2
+    echo "error: $out/train exists, but has no checkpoint. Remove it, or choose another OUT." >&2
     exit 2
 fi
 exec "$venv/bin/lerobot-train" "--policy.type=$kind" "${sizes[@]}" --policy.device=cpu --policy.push_to_hub=false \

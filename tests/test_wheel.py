@@ -119,4 +119,4 @@ def test_mesh_tools_work_without_the_formulas_of_the_builtin_pack(installed, tmp
     assert not [name for name in names if name.startswith("asset_tools.builtin")]
     done = call(installed, str(installed.with_name("robocas")), "assets", "build", cwd=tmp_path)
     assert done.returncode == 1
-    assert done.stderr.startswith("error: the formulas of the builtin pack are not installed")
+    assert done.stderr.startswith("error: the code that builds the builtin pack is not installed")

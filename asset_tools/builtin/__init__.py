@@ -1,1 +1,1 @@
-"""The builtin pack: everyday objects and furniture made of formulas, so that the package needs no downloads."""
+"""Generate the builtin pack: everyday objects and furniture from Python code, so that no download is needed."""

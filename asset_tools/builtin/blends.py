@@ -1,7 +1,7 @@
-"""Solids as signed distance fields: primitives, smooth unions, and a closed mesh of a field.
+"""Model solids as signed distance fields: primitives, smooth unions, and conversion to a closed mesh.
 
-A field maps points (n, 3) to distances (n,), negative inside; it needs to be right near the surface only. Lengths are
-in millimetres, the unit that such things are drawn in. Turns are degrees about x, then y, then z.
+A field is a function from points (n, 3) to signed distances (n,), negative inside. Distances must be accurate only near
+the surface. Lengths are in millimetres. A ``turn`` is a rotation in degrees about x, then y, then z.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from skimage.measure import marching_cubes
 Field = Callable[[np.ndarray], np.ndarray]
 Point = tuple[float, float, float]
 
-BLOCK = 8  # cells a side of the blocks that are left out where the surface can't be
-LEAST = 0.08  # of a grid step: closer to a grid point the surface doesn't come
-SLACK = 1.6  # fields may grow this much faster or slower than a distance
+BLOCK = 8  # cells per side of a block; a block is skipped if the surface cannot be in it
+LEAST = 0.08  # of a grid step: minimum distance of the surface from a grid point
+SLACK = 1.6  # largest ratio of the growth of a field to that of a distance
 
 AXES = {"x": (1, 2, 0), "y": (2, 0, 1), "z": (0, 1, 2)}  # two axes across, and the axis
 
 
 def ellipsoid(center: Point, radii: Point, turn: Point = (0, 0, 0)) -> Field:
-    """Make an ellipsoid, turned about its centre."""
+    """Return the field of an ellipsoid, rotated about its centre."""
     scale = np.asarray(radii, np.float32)
 
     def field(points: np.ndarray) -> np.ndarray:
@@ -38,7 +38,7 @@ def ellipsoid(center: Point, radii: Point, turn: Point = (0, 0, 0)) -> Field:
 
 
 def chain(*knots: tuple[float, float, float, float]) -> Field:
-    """Balls (x, y, z, radius), the hull of each two neighbours."""
+    """Return the field of a chain: the convex hulls of consecutive balls (x, y, z, radius)."""
     rows = np.asarray(knots, np.float32)
 
     def link(start: np.ndarray, end: np.ndarray) -> Field:
@@ -55,7 +55,12 @@ def chain(*knots: tuple[float, float, float, float]) -> Field:
 
 
 def curve(*knots: tuple[float, float, float, float], steps: int = 5) -> Field:
-    """A tube along a smooth (Catmull-Rom) curve through (x, y, z, radius)."""
+    """Return the field of a tube along a smooth (Catmull-Rom) curve through balls (x, y, z, radius).
+
+    Args:
+        knots: x, y, z and radius of each ball.
+        steps: number of straight segments between two balls.
+    """
     rows = np.asarray(knots, float)
     ends = np.vstack([2 * rows[:1] - rows[1:2], rows, 2 * rows[-1:] - rows[-2:-1]])
     t = np.linspace(0, 1, steps, endpoint=False)[:, None]
@@ -67,7 +72,7 @@ def curve(*knots: tuple[float, float, float, float], steps: int = 5) -> Field:
 
 
 def box(center: Point, size: Point, radius: float = 0.0, turn: Point = (0, 0, 0)) -> Field:
-    """A box with rounded edges."""
+    """Return the field of a box with edges of a radius, rotated about its centre."""
     half = np.asarray(size, np.float32) / 2 - radius
 
     def field(points: np.ndarray) -> np.ndarray:
@@ -77,15 +82,16 @@ def box(center: Point, size: Point, radius: float = 0.0, turn: Point = (0, 0, 0)
     return field
 
 
-def turned(axis: str, center: Point, profile: Sequence[tuple[float, float]], radius: float = 0.0) -> Field:
-    """A body of revolution about an axis ('x', 'y', 'z') through ``center``.
+def revolve(axis: str, center: Point, profile: Sequence[tuple[float, float]], radius: float = 0.0) -> Field:
+    """Return the field of a body of revolution about an axis.
 
     Args:
-        axis: of revolution. center: a point on it.
-        profile: (along, radius) from one end to the other.
-        radius: of its rounded edges.
+        axis: direction of the axis: "x", "y" or "z".
+        center: a point on the axis.
+        profile: (position along the axis, radius) from one end to the other.
+        radius: radius of rounded edges.
     """
-    # The closing edge is on the axis and gives no surface.
+    # the edge on the axis is not a part of the surface
     line = polygon([(profile[0][0], 0.0), *profile, (profile[-1][0], 0.0)], closed=False)
 
     def field(points: np.ndarray) -> np.ndarray:
@@ -96,7 +102,7 @@ def turned(axis: str, center: Point, profile: Sequence[tuple[float, float]], rad
 
 
 def cylinder(axis: str, center: Point, length: float, radius: float, edge: float = 0.0) -> Field:
-    """A cylinder along an axis, its rims rounded."""
+    """Return the field of a cylinder along an axis, with rims of the radius ``edge``."""
 
     def field(points: np.ndarray) -> np.ndarray:
         across = _local(points, center)[:, AXES[axis]]
@@ -111,13 +117,14 @@ def cylinder(axis: str, center: Point, length: float, radius: float, edge: float
 def plate(
     axis: str, level: float, thickness: float, outline: Sequence[tuple[float, float]], *, edge: float = 0.0
 ) -> Field:
-    """A flat plate with rounded rims.
+    """Return the field of a flat plate with rounded rims.
 
     Args:
-        axis: across the plate. level: of its middle on that axis.
-        thickness: of it.
-        outline: corners in the two other axes, in the order x, y, z.
-        edge: radius of the rims; the outline is drawn in by it, then grown again, so convex corners get round.
+        axis: axis perpendicular to the plate: "x", "y" or "z".
+        level: position of the middle of the plate on this axis.
+        thickness: thickness of the plate.
+        outline: corners of the plate, as coordinates on the two other axes in the order x, y, z.
+        edge: radius of the rims and of convex corners of the outline.
     """
     plane = [i for i in range(3) if i != AXES[axis][2]]
     inside = polygon(outline)
@@ -132,7 +139,14 @@ def plate(
 
 
 def hoop(center: tuple[float, float], radii: tuple[float, float], half_width: float, half_height: float) -> Field:
-    """A flat ring in the plane z = 0 along an ellipse; the ring's section is an ellipse too."""
+    """Return the field of a ring in the plane z = 0 along an ellipse; the section of the ring is also an ellipse.
+
+    Args:
+        center: x and y of the centre of the ring.
+        radii: radii of the ellipse along x and y.
+        half_width: half of the horizontal width of the section.
+        half_height: half of the height of the section.
+    """
     line = ellipsoid((*center, 0), (*radii, 1))
 
     def field(points: np.ndarray) -> np.ndarray:
@@ -143,7 +157,12 @@ def hoop(center: tuple[float, float], radii: tuple[float, float], half_width: fl
 
 
 def polygon(corners: Sequence[tuple[float, float]], *, closed: bool = True) -> Field:
-    """Signed distance of points (n, 2) to the outline of a polygon; not ``closed``: to all but its last edge."""
+    """Return the field of a polygon: signed distances (n,) of points (n, 2) from the outline.
+
+    Args:
+        corners: corners of the polygon.
+        closed: whether distances from the edge between the last and the first corner also count.
+    """
     vertices = np.asarray(corners, np.float32)
 
     def field(points: np.ndarray) -> np.ndarray:
@@ -163,56 +182,60 @@ def polygon(corners: Sequence[tuple[float, float]], *, closed: bool = True) -> F
     return field
 
 
-def both_sides(field: Field) -> Field:
-    """Return the part at y > 0 and its mirror image."""
+def mirror_y(field: Field) -> Field:
+    """Return the field of the part at y > 0 and its mirror image."""
     return lambda points: field(np.column_stack([points[:, 0], np.abs(points[:, 1]), points[:, 2]]))
 
 
-def moved(field: Field, offset: Point, turn: Point = (0, 0, 0)) -> Field:
-    """A field turned about the origin, then moved."""
+def transform(field: Field, offset: Point, turn: Point = (0, 0, 0)) -> Field:
+    """Return the field of a solid that is rotated about the origin and then moved by ``offset``."""
     return lambda points: field(_local(points, offset, turn))
 
 
 def union(*fields: Field) -> Field:
-    """All of them, creased where they meet."""
+    """Return the field of the union of solids, with sharp creases."""
     return lambda points: reduce(np.minimum, (field(points) for field in fields))
 
 
-def common(*fields: Field, reach: float = 0.0) -> Field:
-    """What is inside all of them; ``reach`` rounds their edges, see ``smooth_min``."""
+def intersect(*fields: Field, reach: float = 0.0) -> Field:
+    """Return the field of the intersection of solids; ``reach`` rounds the edges, see `smooth_min`."""
     return lambda points: -reduce(lambda a, b: smooth_min(a, b, reach), (-field(points) for field in fields))
 
 
-def cut(field: Field, *tools: Field) -> Field:
-    """A field without the tools."""
+def subtract(field: Field, *tools: Field) -> Field:
+    """Return the field of a solid without the volume of the solids ``tools``."""
     return lambda points: reduce(np.maximum, (-tool(points) for tool in tools), field(points))
 
 
 def smooth_min(first: np.ndarray, second: np.ndarray, reach: float) -> np.ndarray:
-    """The lesser of two distances, rounded where they differ by less than ``reach``; it adds up to a quarter of it."""
+    """Return the smooth minimum (n,) of two distances (n,).
+
+    If the distances differ by less than ``reach``, the result is lower than the minimum, by at most ``reach / 4``.
+    """
     if reach <= 0:
         return np.minimum(first, second)
     share = np.maximum(reach - np.abs(first - second), 0) / reach
     return np.minimum(first, second) - share * share * reach / 4
 
 
-def mesh_of(field: Field, low: Point, high: Point, *, step: float, triangles: int) -> trimesh.Trimesh:
-    """The closed surface of a field, simplified; the same field gives the same mesh.
+def mesh_field(field: Field, low: Point, high: Point, *, step: float, triangles: int) -> trimesh.Trimesh:
+    """Convert a field to a simplified, closed mesh; deterministic.
 
     Args:
-        field: positive on the faces of the box from ``low`` to ``high``.
-        low, high: what to look at.
-        step: grid spacing; half of the thinnest part's thickness.
-        triangles: about how many the mesh has.
+        field: field of a solid inside the box.
+        low: lower corner of the box, mm.
+        high: upper corner of the box, mm.
+        step: grid spacing, at most half of the smallest thickness, mm.
+        triangles: approximate number of triangles of the mesh.
 
     Raises:
-        ValueError: the body sticks out of the box, is empty, or isn't closed when simplified.
+        ValueError: the solid is not inside the box, is empty, or cannot be simplified to a closed mesh.
     """
     values, corner = _sampled(field, np.asarray(low, float), np.asarray(high, float), step)
     border = [values[[0, -1]], values[:, [0, -1]], values[:, :, [0, -1]]]
     if min(float(face.min()) for face in border) <= 0 or values.min() >= 0:
-        raise ValueError(f"the body is not inside of {low} to {high}")
-    # A surface right through a grid point would give slivers that simplifying can't remove.
+        raise ValueError(f"the solid is empty or not inside the box from {low} to {high}: enlarge the box")
+    # a surface through a grid point would give slivers that simplification cannot remove
     least = LEAST * step
     values = np.where(np.abs(values) < least, np.where(values < 0, -least, least), values)
     vertices, faces = marching_cubes(values, 0.0, spacing=(step, step, step), gradient_direction="ascent")[:2]
@@ -224,15 +247,20 @@ def mesh_of(field: Field, low: Point, high: Point, *, step: float, triangles: in
         if mesh.is_watertight and mesh.is_winding_consistent and len(mesh.faces) < 1.3 * triangles:
             break
     else:
-        raise ValueError(f"simplified to {len(mesh.faces)} triangles, closed: {mesh.is_watertight}")
+        limit = f"a watertight mesh with fewer than {1.3 * triangles:.0f} triangles"
+        found = f"{len(mesh.faces)} triangles, watertight: {mesh.is_watertight}"
+        raise ValueError(f"cannot simplify the mesh: expected {limit}, found {found}. Increase `triangles`.")
     if mesh.volume < 0:
         mesh.invert()
     return mesh
 
 
 def _sampled(field: Field, low: np.ndarray, high: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Values on a grid and the grid's corner; blocks far from the surface get their middle's value."""
-    # Level 0, where feet are cut off, falls between two levels of the grid: on one it would give slivers.
+    """Sample a field on a grid; return the values (x, y, z) and the position (3,) of the first value.
+
+    All values of a block far from the surface are the value at its centre.
+    """
+    # z = 0, where models are cut off, is between two grid planes, since a surface on a grid plane gives slivers
     corner = (np.floor(low / step) - 0.5) * step
     blocks = np.ceil((high - corner) / (step * BLOCK)).astype(int)
     middles = corner + (np.indices(tuple(blocks.tolist())).reshape(3, -1).T + 0.5) * (BLOCK * step)

@@ -1,6 +1,7 @@
-"""Parametric bottles and tubes, see ``shapes``. Those with a lid have the regions side, shoulder, cap, lid, bottom.
+"""Make bottles and tubes of a given size, as in ``shapes``.
 
-Rings are (half_x, half_y, z, exponent, corner cut) in metres, see ``surfaces``.
+If a docstring names no regions of the texture, they are side, shoulder, cap, lid, bottom. A ring is
+(half_x, half_y, z, exponent, length that is cut off to round the corner) in metres, see ``surfaces``.
 """
 
 from __future__ import annotations
@@ -12,15 +13,15 @@ import numpy as np
 from pydantic import Field
 from scipy.optimize import root_scalar
 
-from asset_tools.builtin.mesh import Patch, Shape, Size, fitted
+from asset_tools.builtin.mesh import Patch, Shape, Size, build_fitted_shape
 from asset_tools.builtin.surfaces import (
     Section,
-    chained_pieces,
     loft,
-    oval_rings,
-    prism_piece,
-    round_rings,
-    stacked_pieces,
+    make_chained_pieces,
+    make_circular_rings,
+    make_oval_rings,
+    make_prism_piece,
+    make_stacked_pieces,
     sweep,
 )
 
@@ -28,7 +29,7 @@ Ring = tuple[float, float, float, float, float]
 Row = Annotated[Sequence[float], Field(min_length=2, max_length=5)]  # of a product's file, see ``bottle``
 
 
-def bottle(
+def make_bottle(
     size: Size,
     *,
     foot: tuple[float, float, float],
@@ -37,14 +38,19 @@ def bottle(
     cap: Sequence[Row],
     cuts: Sequence[float],
 ) -> Shape:
-    """A bottle that is a stack of rings.
+    """Make a bottle from rings.
+
+    A ring has five numbers, or two to four if it is round. Five numbers: half width, half depth and height as fractions
+    of those of the bottle, exponent, and the length in m that is cut off to round the corner. Two to four numbers:
+    radius in m, height as a fraction, cut-off length in m (default 0), exponent (default 2).
 
     Args:
-        size: see ``shapes``.
-        foot: half width and half depth of the rounded lower edge, as fractions of the size's; exponent.
-        side, shoulder, cap: rings upwards: half width, half depth, height as fractions of the size's, exponent, corner
-            cut in m; or, of round ones, radius in m, height as a fraction, corner cut in m (0), exponent (2).
-        cuts: see ``stacked_pieces``, as fractions of the height.
+        size: outer size (x, y, z), m.
+        foot: half width and half depth of the rounded lower edge, as fractions of those of the bottle; exponent.
+        side: rings of the side, from the bottom to the top.
+        shoulder: rings of the shoulder.
+        cap: rings of the cap.
+        cuts: heights at which the profile is concave, as fractions of the height.
     """
     a, b, h = _halves(size)
 
@@ -63,13 +69,15 @@ def bottle(
     return _bottle(size, [*lower, *rings(side)], rings(shoulder), rings(cap), cuts=[h * cut for cut in cuts])
 
 
-def flip_top_bottle(size: Size, *, exponent: float, cap_height: float, taper: float, waist: float) -> Shape:
-    """An oval bottle with a waist, whose shoulders continue in a wide oval cap.
+def make_flip_top_bottle(size: Size, *, exponent: float, cap_height: float, taper: float, waist: float) -> Shape:
+    """Make an oval bottle with a waist and a wide oval cap.
 
     Args:
-        size: see ``shapes``. exponent: of its section.
-        cap_height: as a fraction of the height. taper: width of the cap as a fraction of the body's.
-        waist: how much narrower the middle of the body is, as a fraction of the width.
+        size: outer size (x, y, z), m.
+        exponent: exponent of the section, see ``surfaces``.
+        cap_height: height of the cap as a fraction of the height.
+        taper: width of the cap as a fraction of the width.
+        waist: fraction by which the middle of the body is narrower.
     """
     a, b, h = _halves(size)
     cap_z, top = h * (1 - cap_height), h * (0.88 - cap_height)
@@ -83,30 +91,31 @@ def flip_top_bottle(size: Size, *, exponent: float, cap_height: float, taper: fl
     return _bottle(size, side, shoulder, cap, cuts=[middle, cap_z])
 
 
-def drink_bottle(size: Size) -> Shape:
-    """A round bottle with waist, long shoulders and a screw cap."""
+def make_drink_bottle(size: Size) -> Shape:
+    """Make a round bottle with a waist, long shoulders and a screw cap."""
     r, _, h = _halves(size)
     side = [_neck(r * 0.8, 0), _neck(r, 0, 0.008), _neck(r, h * 0.16, 0.004)]
     side += [_neck(r * 0.93, h * 0.2, 0.006), _neck(r * 0.93, h * 0.24, 0.006), _neck(r, h * 0.28, 0.004)]
     side += [_neck(r, h * 0.62)]
     shoulder = [_neck(r, h * 0.72, 0.04), _neck(0.0135, h * 0.88, 0.01), _neck(0.0135, h * 0.905)]
     cap = [_neck(0.0155, h * 0.905), _neck(0.0155, h, 0.0015), _neck(0.012, h)]
-    # straight through the waist, which is 2 mm deep; lying, it rests on one facet
+    # without the waist, which is only 2 mm deep, so that a lying bottle rests on one facet
     pieces = [
-        prism_piece([(r * 0.86, 0), (r, 0.005), (r, h * 0.65)]),
-        prism_piece([(r, h * 0.65), (r * 0.9, h * 0.73), (0.0135, h * 0.87)]),
-        prism_piece([(0.0135, h * 0.87), (0.0135, h * 0.905)]),
-        prism_piece([(0.0155, h * 0.905), (0.0155, h)]),
+        make_prism_piece([(r * 0.86, 0), (r, 0.005), (r, h * 0.65)]),
+        make_prism_piece([(r, h * 0.65), (r * 0.9, h * 0.73), (0.0135, h * 0.87)]),
+        make_prism_piece([(0.0135, h * 0.87), (0.0135, h * 0.905)]),
+        make_prism_piece([(0.0155, h * 0.905), (0.0155, h)]),
     ]
     return _bottle(size, side, shoulder, cap, pieces=pieces)
 
 
-def pump_bottle(size: Size, *, exponent: float, body: float) -> Shape:
-    """A bottle with a pump, its spout towards +x. Regions: side, shoulder, cap, spout, bottom.
+def make_pump_bottle(size: Size, *, exponent: float, body: float) -> Shape:
+    """Make a bottle with a pump and a spout towards +x; regions: side, shoulder, cap, spout, bottom.
 
     Args:
-        size: see ``shapes``. exponent: of its section.
-        body: height of its straight part, as a fraction of the height.
+        size: outer size (x, y, z), m.
+        exponent: exponent of the section, see ``surfaces``.
+        body: height of the straight part, as a fraction of the height.
     """
     a, b, h = _halves(size)
     side = [*_foot(a, b, exponent), (a, b, h * body, exponent, 0)]
@@ -125,8 +134,8 @@ def pump_bottle(size: Size, *, exponent: float, body: float) -> Shape:
     return _bottle(size, side, shoulder, cap, cuts=[h * body, h * neck, h * (neck + 0.085), h * 0.93], spout=spout)
 
 
-def upended_bottle(size: Size) -> Shape:
-    """A bottle standing on its wide flat cap, broadest near its domed top. Regions: side, shoulder, cap, lid."""
+def make_upended_bottle(size: Size) -> Shape:
+    """Make a bottle that stands on its wide cap, with a domed top; regions: side, shoulder, cap, lid."""
     a, b, h = _halves(size)
     ca, cb, z = a * 0.74, b * 0.86, h * 0.15
     cap = [(ca * 0.94, cb * 0.94, 0, 2.6, 0), (ca, cb, 0, 2.6, 0.002), (ca, cb, z, 2.6, 0.001)]
@@ -135,24 +144,25 @@ def upended_bottle(size: Size) -> Shape:
     dome = [side[-1], (a * 0.97, b * 0.96, h * 0.985, 2.6, 0.018), (a * 0.55, b * 0.5, h, 2.4, 0.015), _neck(0, h)]
     part = loft(
         [
-            Section("lid", oval_rings([_neck(0, 0), cap[0]]), flat=True, detail=0.5),
-            Section("cap", oval_rings(cap), detail=0.5),
-            Section("side", oval_rings(side, steps=3)),
-            Section("shoulder", oval_rings(dome, steps=4), flat=False, detail=0.4),
+            Section("lid", make_oval_rings([_neck(0, 0), cap[0]]), flat=True, detail=0.5),
+            Section("cap", make_oval_rings(cap), detail=0.5),
+            Section("side", make_oval_rings(side, steps=3)),
+            Section("shoulder", make_oval_rings(dome, steps=4), flat=False, detail=0.4),
         ]
     )
-    return fitted([part], size, pieces=stacked_pieces(part, [z, h * 0.34]))
+    return build_fitted_shape([part], size, pieces=make_stacked_pieces(part, [z, h * 0.34]))
 
 
-def tube(size: Size, *, cap_radius: float, cap_height: float, flare: float = 1.0) -> Shape:
-    """A squeeze tube standing on its cap: round there, blending into a flat crimp on top. Regions: side, cap, lid.
+def make_tube(size: Size, *, cap_radius: float, cap_height: float, flare: float = 1.0) -> Shape:
+    """Make a squeeze tube that stands on its cap: round at the cap, flat at the top; regions: side, cap, lid.
 
-    Its circumference is the same all along, as of a real tube: the crimp is pi / 2 times as wide as the round end.
+    As in a real tube, the circumference is constant: the flat end is pi / 2 times as wide as the round end.
 
     Args:
-        size: see ``shapes``; the depth is the diameter of the round end.
-        cap_radius: of the cap where it meets the tube, m. cap_height: m.
-        flare: additional width of the cap at its base.
+        size: outer size (x, y, z), m; y is the diameter of the round end.
+        cap_radius: radius of the cap at the tube, m.
+        cap_height: height of the cap, m.
+        flare: radius of the cap at its base, as a factor of ``cap_radius``.
     """
     r, h, thick = size[1] / 2, size[2], 0.0008
     perimeter = 2 * np.pi * r
@@ -171,12 +181,12 @@ def tube(size: Size, *, cap_radius: float, cap_height: float, flare: float = 1.0
     foot = cap_radius * flare
     cap = [(foot * 0.9, 0, 0), (foot, 0, 0.002), (cap_radius, cap_height, 0.001), (cap_radius * 0.97, cap_height, 0)]
     sections = [
-        Section("lid", round_rings([(0, 0, 0), (foot * 0.9, 0, 0)]), flat=True, detail=0.5),
-        Section("cap", round_rings(cap), detail=0.6),
+        Section("lid", make_circular_rings([(0, 0, 0), (foot * 0.9, 0, 0)]), flat=True, detail=0.5),
+        Section("cap", make_circular_rings(cap), detail=0.6),
         Section("side", np.array(body)),
     ]
     part = loft(sections)
-    return fitted([part], size, pieces=stacked_pieces(part, [cap_height, start]))
+    return build_fitted_shape([part], size, pieces=make_stacked_pieces(part, [cap_height, start]))
 
 
 def _bottle(
@@ -189,30 +199,34 @@ def _bottle(
     pieces: list[np.ndarray] | None = None,
     spout: list[Patch] | None = None,
 ) -> Shape:
-    """Body, shoulder and cap, each beginning where the one before ends; a flat lid, unless the cap closes itself.
+    """Make a bottle from the rings of body, shoulder and cap; add a flat lid if the last ring is open.
 
     Args:
-        size: see ``shapes``. side, shoulder, cap: rings, upwards.
-        cuts: see ``stacked_pieces``. pieces: convex ones, instead of those cut there.
-        spout: a separate part.
+        size: outer size (x, y, z), m.
+        side: rings of the body, from the bottom to the top.
+        shoulder: rings of the shoulder, which continue the body.
+        cap: rings of the cap, which continue the shoulder.
+        cuts: heights at which the body is cut into convex collision pieces, m.
+        pieces: points (k, 3) of each convex collision piece; None: from ``cuts``.
+        spout: patches of the spout, a separate part; None: no spout.
     """
     a, b, _, n, _ = side[0]
     shoulder, cap = [(*side[-1][:4], 0), *shoulder], [(*shoulder[-1][:4], 0), *cap]
     bottom = [(0, 0, 0.003, n, 0), (a * 0.78, b * 0.74, 0.003, n, 0.004), side[0]]
     sections = [
-        Section("bottom", oval_rings(bottom), flat=True, detail=0.4),
-        Section("side", oval_rings(list(side), steps=3)),
-        Section("shoulder", oval_rings(shoulder, steps=4), detail=0.4),
-        Section("cap", oval_rings(cap, steps=3), detail=0.5),
+        Section("bottom", make_oval_rings(bottom), flat=True, detail=0.4),
+        Section("side", make_oval_rings(list(side), steps=3)),
+        Section("shoulder", make_oval_rings(shoulder, steps=4), detail=0.4),
+        Section("cap", make_oval_rings(cap, steps=3), detail=0.5),
     ]
     if cap[-1][0] > 0:
         lid = [cap[-1], (0, 0, *cap[-1][2:])]
-        sections.append(Section("lid", oval_rings(lid), flat=True, detail=0.6))
+        sections.append(Section("lid", make_oval_rings(lid), flat=True, detail=0.6))
     part = loft(sections)
-    pieces = stacked_pieces(part, cuts) if pieces is None else pieces
+    pieces = make_stacked_pieces(part, cuts) if pieces is None else pieces
     if spout is None:
-        return fitted([part], size, pieces=pieces)
-    return fitted([part, spout], size, pieces=pieces + chained_pieces(spout[0], 2))
+        return build_fitted_shape([part], size, pieces=pieces)
+    return build_fitted_shape([part, spout], size, pieces=pieces + make_chained_pieces(spout[0], 2))
 
 
 def _halves(size: Size) -> tuple[float, float, float]:
@@ -220,15 +234,15 @@ def _halves(size: Size) -> tuple[float, float, float]:
 
 
 def _foot(a: float, b: float, exponent: float) -> list[Ring]:
-    """The rounded lower edge of a body of half sizes a and b."""
+    """Return the rings of the rounded lower edge of a body with half width ``a`` and half depth ``b``."""
     return [(a * 0.88, b * 0.86, 0, exponent, 0), (a, b, 0, exponent, 0.007)]
 
 
 def _neck(radius: float, z: float, cut: float = 0.0) -> Ring:
-    """A round ring."""
+    """Return a round ring with a radius and a height z, m; ``cut`` is cut off to round the corner."""
     return radius, radius, z, 2.0, cut
 
 
 def _ellipse_perimeter(a: float, b: float) -> float:
-    """Approximate the perimeter as Ramanujan did."""
+    """Return the perimeter of an ellipse with radii a and b (Ramanujan's approximation)."""
     return np.pi * (3 * (a + b) - np.sqrt((3 * a + b) * (a + 3 * b)))

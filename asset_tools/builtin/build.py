@@ -1,4 +1,4 @@
-"""The builtin pack: what is to be made of its formulas."""
+"""Build the assets of the builtin pack."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from asset_tools.build import build_furniture, build_object
-from asset_tools.builtin.catalogue import products
+from asset_tools.builtin.catalogue import load_builtin_products
 from asset_tools.builtin.furniture import MAKERS
 from asset_tools.pipeline import AssetJob, content_hash
 from asset_tools.sources import ObjectSource
@@ -18,44 +18,45 @@ from robocas_ms3.core.errors import AssetError
 NAME = "builtin"
 DESCRIPTION = "Everyday objects, furniture and a room, made of formulas"
 FORMULAS_HASH = "formulas.sha256"
-"""File of the shipped pack with the `formulas_hash` it was built from."""
+"""File of the bundled pack; it contains the `compute_formulas_hash` of the code that built the pack."""
 
 
-def formulas_hash() -> str:
-    """Return the SHA-256 of the code and tables of this package, which the shipped pack is built from."""
+def compute_formulas_hash() -> str:
+    """Return the SHA-256 of the Python and YAML files of this package, from which the bundled pack is built."""
     digest, here = hashlib.sha256(), Path(__file__).parent
     for path in sorted(path for path in here.rglob("*") if path.suffix in (".py", ".yaml")):
         digest.update(path.relative_to(here).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()
 
 
-def builtin_jobs(ids: Sequence[str] = ()) -> list[AssetJob]:
-    """What is to be made.
+def make_builtin_jobs(ids: Sequence[str] = ()) -> list[AssetJob]:
+    """Return one job per asset of the builtin pack.
 
     Args:
-        ids: only these assets; none: all.
+        ids: ids of the assets to build; empty: all.
 
     Raises:
-        AssetError: there is no such builtin asset.
+        AssetError: an id is unknown.
     """
-    known = [*MAKERS, *products()]
+    known = [*MAKERS, *load_builtin_products()]
     unknown = sorted(set(ids) - set(known))
     if unknown:
-        raise AssetError("no such builtin asset", expected=f"one of {', '.join(known)}", found=", ".join(unknown))
+        expected, found = f"ids among {', '.join(known)}", ", ".join(unknown)
+        raise AssetError("unknown ids of builtin assets", expected=expected, found=found)
     content = content_hash(packages=("builtin", "builtin/furniture", "builtin/products"))
     return [AssetJob(id_, partial(build_asset, id_), content) for id_ in ids or known]
 
 
 def build_asset(asset_id: str, folder: Path) -> ObjectAsset | FurnitureAsset:
-    """Build one asset's files in a folder. The same code gives the same files.
+    """Write the files of a builtin asset to a folder and return the manifest entry of the asset; deterministic.
 
     Raises:
-        KeyError: there is no such builtin asset.
-        AssetError: it can't be built.
+        KeyError: the id is unknown.
+        AssetError: the asset cannot be built.
     """
     if asset_id in MAKERS:
         return build_furniture(MAKERS[asset_id](), folder)
-    product = products()[asset_id]
+    product = load_builtin_products()[asset_id]
     shape, mesh = product.build()
     source = ObjectSource(
         id=product.id,

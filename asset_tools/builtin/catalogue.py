@@ -1,4 +1,4 @@
-"""The products of the builtin pack, as ``products/*.yaml`` has them; the formulas they name are code."""
+"""Read the products of the builtin pack from ``products/*.yaml``; these files refer to functions by name."""
 
 from __future__ import annotations
 
@@ -25,24 +25,27 @@ FOLDER = Path(__file__).parent / "products"
 
 
 class Formula(StrictModel):
-    """A function, or a class of functions, by its name (``kind``); the other keys are its keyword arguments."""
+    """A function or class in a product file: its name is ``kind``, and the other keys are its keyword arguments."""
 
     function: ClassVar[Callable[..., Any]]
 
     kind: str
 
     def __call__(self, *given: Any) -> Any:
-        """What the function makes of it."""
+        """Call the function with the positional arguments ``given`` and the keyword arguments of the file."""
         named = {key: getattr(self, key) for key in type(self).model_fields if key != "kind"}
         function = type(self).function
         return function(**named)(*given) if isinstance(function, type) else function(*given, **named)
 
 
 def _any_of(functions: Iterable[Callable[..., Any]]) -> Any:
-    """Type of a key that names one of these."""
+    """Return the pydantic type of a key whose value is a call of one of ``functions``.
+
+    The name of a function in a file is its Python name without ``make_`` or ``paint_``.
+    """
     kinds: list[Any] = []
     for function in functions:
-        kind = function.__name__.removeprefix("paint_").lower()
+        kind = function.__name__.removeprefix("make_").removeprefix("paint_").lower()
         types = get_type_hints(function, include_extras=True)
         fields: dict[str, Any] = {"kind": (Literal[kind], ...)}
         for name, parameter in inspect.signature(function).parameters.items():
@@ -57,9 +60,29 @@ def _any_of(functions: Iterable[Callable[..., Any]]) -> Any:
 # (size) -> Shape
 ShapeFormula = _any_of(
     (
-        *(shapes.carton, shapes.soap_bar, shapes.can, shapes.canister, shapes.jar, shapes.mug),
-        *(bottles.bottle, bottles.flip_top_bottle, bottles.drink_bottle, bottles.pump_bottle, bottles.upended_bottle),
-        *(bottles.tube, fruits.fruit, fruits.round_fruit, fruits.banana, toys.ball, toys.rubiks_cube),
+        *(
+            shapes.make_carton,
+            shapes.make_soap_bar,
+            shapes.make_can,
+            shapes.make_canister,
+            shapes.make_jar,
+            shapes.make_mug,
+        ),
+        *(
+            bottles.make_bottle,
+            bottles.make_flip_top_bottle,
+            bottles.make_drink_bottle,
+            bottles.make_pump_bottle,
+            bottles.make_upended_bottle,
+        ),
+        *(
+            bottles.make_tube,
+            fruits.make_fruit,
+            fruits.make_round_fruit,
+            fruits.make_banana,
+            toys.make_ball,
+            toys.make_rubiks_cube,
+        ),
     )
 )
 # (Shape, Generator) -> Image
@@ -70,29 +93,37 @@ PaintFormula = _any_of(
     )
 )
 MODELS: dict[str, Callable[[], Model]] = {
-    maker.__name__: maker
+    maker.__name__.removeprefix("make_"): maker
     for maker in (
-        *(tools.power_drill, tools.scissors, tools.screwdriver, tools.padlock, tools.computer_mouse),
-        *(planes.red_airplane, planes.airliner, planes.biplane),
-        *(animals.large_elephant, animals.small_elephant, animals.rhinoceros, animals.monkey),
+        *(
+            tools.make_power_drill,
+            tools.make_scissors,
+            tools.make_screwdriver,
+            tools.make_padlock,
+            tools.make_computer_mouse,
+        ),
+        *(planes.make_red_airplane, planes.make_airliner, planes.make_biplane),
+        *(animals.make_large_elephant, animals.make_small_elephant, animals.make_rhinoceros, animals.make_monkey),
     )
 }
 ModelName = Literal[tuple(MODELS)]
 
 
 class Product(StrictModel):
-    """One object of the pack: what a file says of it.
+    """Entry of a product file: an object of the builtin pack.
 
     Attributes:
-        id: its folder's name, and its key in the file. category: its kind.
-        size: outer size (x, y, z), upright or in its usual pose, m.
-        mass: kg.
-        roughness: of the surface, 0 mirror to 1 chalk.
-        graspnet_id: of the object of GraspNet-1Billion that it replaces.
-        spoken: name for language; empty: made of the id.
-        hollow: a container, or thin: its hulls are judged by distance, not by volume.
-        shape: makes the shape of that size. paint: makes its texture.
-        model: of ``MODELS``, makes both.
+        id: id of the object, which is the key of the entry.
+        category: category of the object.
+        size: outer size (x, y, z) in the usual pose, m.
+        mass: mass in kg.
+        roughness: roughness of the surface, 0 (mirror) to 1 (chalk).
+        graspnet_id: number of the object in GraspNet-1Billion that this object replaces.
+        spoken: name in instructions; empty: the id with spaces.
+        hollow: whether the object is a container or thin. If so, the hulls are judged by surface distance, not by IoU.
+        shape: function that makes the shape from ``size``.
+        paint: function that paints the texture of the shape.
+        model: name in ``MODELS`` of a model, which replaces ``shape`` and ``paint``.
     """
 
     id: Name
@@ -111,16 +142,16 @@ class Product(StrictModel):
     def _made_somehow(self) -> Product:
         parts = [part for part in (self.shape, self.paint) if part is not None]
         if len(parts) != (0 if self.model else 2):
-            raise ValueError("a product has a shape and a paint, or a model")
+            raise ValueError("expected either the keys shape and paint, or the key model")
         return self
 
     @property
     def name(self) -> str:
-        """For language: 'sugar box'."""
+        """Name in instructions, such as "sugar box"."""
         return self.spoken or self.id.replace("_", " ")
 
     def build(self) -> tuple[Shape, trimesh.Trimesh]:
-        """The shape, and the textured mesh to render; the same every time."""
+        """Return the shape of the object and its textured mesh for rendering; deterministic."""
         made: Any = MODELS[self.model]() if self.model else self
         shape = made.shape(self.size)
         image = made.paint(shape, np.random.default_rng(zlib.crc32(self.id.encode())))
@@ -128,27 +159,28 @@ class Product(StrictModel):
 
 
 @cache
-def products() -> dict[str, Product]:
-    """The products by id, as ``products/*.yaml`` has them."""
+def load_builtin_products() -> dict[str, Product]:
+    """Read the products of the builtin pack; return id -> product."""
     return load_products(FOLDER)
 
 
 def load_products(folder: Path) -> dict[str, Product]:
-    """Read the products of a folder's files.
+    """Read the products from all YAML files of a folder; return id -> product.
 
     Raises:
-        AssetError: a file can't be read, an id is there twice, or a key is unknown, missing or wrong: naming the first.
+        AssetError: a file cannot be read, an id occurs twice, or a key is unknown, missing or invalid.
     """
     found: dict[str, Product] = {}
     for path in sorted(folder.glob("*.yaml")):
         try:
             entries = load_yaml(path)
         except (OSError, DocumentError) as error:
-            raise AssetError("products can't be read", where=path, found=error) from error
+            raise AssetError("cannot read the products", where=path, expected="a YAML file", found=error) from error
         if not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):
-            raise AssetError("products can't be read", where=path, expected="a mapping of products by id")
+            expected, found_type = "a mapping of ids to mappings", type(entries).__name__
+            raise AssetError("invalid file of products", where=path, expected=expected, found=found_type)
         for id_, entry in entries.items():
             if id_ in found:
-                raise AssetError("this product is there twice", where=f"{path}, {id_}")
+                raise AssetError("two products have the same id", where=path, found=id_, fix="Rename one of them.")
             found[id_] = parse(Product, {**entry, "id": id_}, AssetError, where=f"{path}, {id_}")
     return found

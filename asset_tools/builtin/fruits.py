@@ -1,4 +1,4 @@
-"""Parametric fruit, see ``shapes``."""
+"""Make fruits of a given size, as in ``shapes``."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from asset_tools.builtin.mesh import Shape, Size, fitted
-from asset_tools.builtin.surfaces import Section, chained_pieces, loft, stacked_pieces, sweep
+from asset_tools.builtin.mesh import Shape, Size, build_fitted_shape
+from asset_tools.builtin.surfaces import Section, loft, make_chained_pieces, make_stacked_pieces, sweep
 
 
 def _spline_rings(points: Sequence[tuple[float, float]], count: int) -> np.ndarray:
-    """Rings (count, 4) of a smooth profile through (radius, z), level where it meets the axis at both ends."""
+    """Return ``count`` rings (count, 4) of a smooth profile through points (radius, z); its ends are horizontal."""
     line = np.array(points)
     t = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     spline = CubicSpline(t, line, bc_type=((1, [1.0, 0.0]), (1, [-1.0, 0.0])))  # pyright: ignore[reportArgumentType]
@@ -21,7 +21,7 @@ def _spline_rings(points: Sequence[tuple[float, float]], count: int) -> np.ndarr
     return np.column_stack([smooth[:, 0], smooth[:, 0], smooth[:, 1], np.full(count, 2.0)])
 
 
-def fruit(
+def make_fruit(
     size: Size,
     *,
     profile: Sequence[tuple[float, float]],
@@ -32,17 +32,17 @@ def fruit(
     cuts: Sequence[float] = (),
     rings: int = 25,
 ) -> Shape:
-    """A body of revolution made a little irregular. Regions: skin (angle to the right, profile upwards), stem.
+    """Make a fruit, a slightly irregular body of revolution; regions: skin (angle to the right, profile upwards), stem.
 
     Args:
-        size: outer size with the stem, m.
-        profile: (radius, z) from the bottom's centre to the top's, m; a spline goes through them.
+        size: outer size (x, y, z) with the stem, m.
+        profile: points (radius, z) of a spline from the centre of the bottom to the centre of the top, m.
         lobes: depth of five lobes towards the bottom, as a fraction of the radius.
-        lean: how far the top is moved sideways (+x), as a fraction of the height.
+        lean: shift of the top towards +x, as a fraction of the height.
         groove: depth of a groove along the front, as a fraction of the radius.
-        stem: z of the stem's foot and tip, and its radius, m.
+        stem: z of the lower end, z of the tip, and radius of the stem, m; None: no stem.
         cuts: heights at which the profile is concave, m.
-        rings: along the profile.
+        rings: number of rings along the profile.
     """
     heights = [z for _, z in profile]
     bottom, height = min(heights), max(heights) - min(heights)
@@ -58,7 +58,7 @@ def fruit(
         return moved
 
     parts = [loft([Section("skin", _spline_rings(profile, rings))], segments=28, warp=warp)]
-    pieces = stacked_pieces(parts[0], cuts)
+    pieces = make_stacked_pieces(parts[0], cuts)
     if stem:
         foot, tip, radius = stem
         t = np.linspace(0, 1, 7)
@@ -68,30 +68,34 @@ def fruit(
         path[-1, 2] += 1e-4
         path[0, 2] -= 1e-4
         parts.append(sweep("stem", path, radii, normal=(0, 1, 0), segments=8, detail=0.6))
-        pieces += chained_pieces(parts[1][0], 1)
-    return fitted(parts, size, pieces=pieces)
+        pieces += make_chained_pieces(parts[1][0], 1)
+    return build_fitted_shape(parts, size, pieces=pieces)
 
 
-def round_fruit(
+def make_round_fruit(
     size: Size, *, radius: float, flatness: float, dimple: float, lobes: float = 0.0, groove: float = 0.0
 ) -> Shape:
-    """A fruit that is a flattened ball with a dimple at the top.
+    """Make a fruit that is a flattened ball with a dimple at the top; region: skin.
 
     Args:
-        size: see ``fruit``. radius: of the ball, m. flatness: its height as a fraction of its width.
-        dimple: its depth, m. lobes, groove: see ``fruit``.
+        size: outer size (x, y, z), m.
+        radius: radius of the ball, m.
+        flatness: height of the ball as a fraction of its width.
+        dimple: depth of the dimple, m.
+        lobes: depth of five lobes towards the bottom, as a fraction of the radius.
+        groove: depth of a groove along the front, as a fraction of the radius.
     """
     angles = np.linspace(0, np.pi, 9)
     line = [(float(radius * np.sin(a)), float(-radius * flatness * np.cos(a))) for a in angles]
     line[-1] = (0.0, line[-1][1] - dimple)
-    return fruit(size, profile=line, lobes=lobes, groove=groove)
+    return make_fruit(size, profile=line, lobes=lobes, groove=groove)
 
 
-def banana(size: Size) -> Shape:
-    """A banana on its side, bent in the xy plane. Region: skin (around to the right, stem to tip upwards)."""
+def make_banana(size: Size) -> Shape:
+    """Make a banana that lies on its side, bent in the xy plane; region: skin (angle to the right, tip at the top)."""
     chord, thick = size[0], size[2] / 2
     t = np.linspace(0, 1, 37)
-    # The bend is stronger in the middle and the stem goes straight on.
+    # the bend is stronger in the middle, and the stem is straight
     heading = 1.0 - 2.0 * np.clip((t - 0.08) / 0.92, 0, 1) ** 0.9
     step = np.stack([np.cos(heading), np.sin(heading), 0 * t], axis=-1)
     path = np.cumsum(step, axis=0)
@@ -109,4 +113,4 @@ def banana(size: Size) -> Shape:
     theta = 2 * np.pi * np.arange(20) / 20
     section = 1 + 0.045 * np.cos(5 * theta)
     part = sweep("skin", path, radii, normal=(0, 0, 1), section=section, segments=20)
-    return fitted([part], size, pieces=chained_pieces(part[0], 6))
+    return build_fitted_shape([part], size, pieces=make_chained_pieces(part[0], 6))

@@ -1,4 +1,4 @@
-"""What is printed on packages: one ``Label`` per product, drawn onto cartons, round packages and tubes."""
+"""Paint labels on packages: one ``Label`` per product, on cartons, round packages, tubes, soap and mugs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from asset_tools.builtin.textures import Box, Canvas, Colour, Painter
 from robocas_ms3.core.strict_model import StrictModel
 
 METAL = (186, 190, 194)
-PLATED = ("stripes", "diagonal", "dots")  # styles too busy to print on: words stand on a plate of the base colour
+PLATED = ("stripes", "diagonal", "dots")  # styles with a pattern; the text is on a plate of the base colour
 
 
 FACTS = {  # heading and rows of the table on the back
@@ -31,22 +31,28 @@ FACTS = {  # heading and rows of the table on the back
 
 def _known(motif: str) -> str:
     if motif not in MOTIFS:
-        raise ValueError(f"no such motif; known are {', '.join(MOTIFS)}")
+        raise ValueError(f"unknown motif {motif!r}: expected one of {', '.join(MOTIFS)}")
     return motif
 
 
 class Label(StrictModel):
-    """The print on a package.
+    """Text, colours and pattern of a package.
 
     Attributes:
-        title, subtitle, amount: words; the title may hold line breaks.
-        base, accent: the package's colours. ink: of the letters. outline: around the title's letters, or none.
-        amount_ink: of the amount, where the ground there differs.
-        style: how the accent colour is laid out.
-        motif: an image of ``MOTIFS``.
-        cap: colour of lids, caps and nozzles. ridged: with grooves to turn it by; otherwise it flips open.
-        turn: degrees by which the front is turned (tubes: 90).
-        facts: the table on the back, of ``FACTS``.
+        title: name of the product, with or without line breaks.
+        subtitle: text below the title.
+        amount: text at the bottom, such as "500 ml".
+        base: first colour of the package.
+        accent: second colour of the package.
+        ink: colour of the letters.
+        outline: colour of an outline around the title; None: no outline.
+        amount_ink: colour of the amount; None: ``ink``.
+        style: pattern of the second colour.
+        motif: name of a picture in ``MOTIFS``.
+        cap: colour of lids, caps and nozzles.
+        ridged: whether the cap has vertical grooves, as screw caps have; otherwise it has the seam of a flip-top lid.
+        turn: rotation of the front in degrees; 90 for tubes.
+        facts: name of the table on the back in ``FACTS``.
     """
 
     title: str
@@ -66,7 +72,7 @@ class Label(StrictModel):
 
 
 def paint_carton(shape: Shape, rng: np.random.Generator, *, label: Label) -> Image.Image:
-    """All six faces of a box; the larger ones show the front."""
+    """Paint the six faces of a box; the largest faces show the front of the label."""
     painter = Painter(shape, rng, label.base)
     largest = max(region.size[0] * region.size[1] for region in shape.regions.values())
     for name, region in shape.regions.items():
@@ -98,13 +104,13 @@ def paint_carton(shape: Shape, rng: np.random.Generator, *, label: Label) -> Ima
 
 
 def paint_wrapped(shape: Shape, rng: np.random.Generator, *, label: Label, metal: bool = False) -> Image.Image:
-    """Cans, jars and bottles: print around the ``side``, plain caps and lids.
+    """Paint a can, jar or bottle: the label around the ``side``, and caps and lids of one colour.
 
     Args:
-        shape: with a ``side`` region and any of shoulder, rim, cap, spout, lid, bottom.
-        rng: source of variation.
-        label: the print.
-        metal: rims, lids and bottoms are tin.
+        shape: shape with the region ``side``; it may have shoulder, rim, cap, spout, lid and bottom.
+        rng: random generator for bar codes.
+        label: the label.
+        metal: whether rims, lids and bottoms are of metal.
     """
     painter = Painter(shape, rng, label.base)
     with painter.region("side") as canvas:
@@ -136,7 +142,7 @@ def paint_wrapped(shape: Shape, rng: np.random.Generator, *, label: Label, metal
 
 
 def paint_tube(shape: Shape, rng: np.random.Generator, *, label: Label) -> Image.Image:
-    """Tubes: the print runs along the body, front and back alike."""
+    """Paint a tube, with the label along the body, on the front and the back."""
     painter = Painter(shape, rng, label.base)
     with painter.region("side") as canvas:
         _background(canvas, label)
@@ -153,7 +159,7 @@ def paint_tube(shape: Shape, rng: np.random.Generator, *, label: Label) -> Image
 
 
 def paint_soap(shape: Shape, rng: np.random.Generator, *, label: Label) -> Image.Image:
-    """A bar of soap with its name pressed in."""
+    """Paint a bar of soap with its name on the top and the bottom."""
     painter = Painter(shape, rng, label.base)
     for name in ("top", "bottom"):
         with painter.region(name) as canvas:
@@ -164,7 +170,7 @@ def paint_soap(shape: Shape, rng: np.random.Generator, *, label: Label) -> Image
 
 
 def paint_mug(shape: Shape, rng: np.random.Generator, *, label: Label) -> Image.Image:
-    """A glazed mug with a band of print."""
+    """Paint a glazed mug with a coloured band and a text around it."""
     painter = Painter(shape, rng, label.base)
     with painter.region("side") as canvas:
         canvas.rectangle((0, 0.3, 1, 0.78), label.accent)
@@ -179,7 +185,7 @@ def paint_mug(shape: Shape, rng: np.random.Generator, *, label: Label) -> Image.
 
 
 def _background(canvas: Canvas, label: Label) -> None:
-    """The accent colour over the whole canvas, closing around a cylinder."""
+    """Draw the pattern of the second colour on the whole canvas; it continues at the seam of a cylinder."""
     if label.style == "bands":
         for top, bottom in ((0, 0.1), (0.12, 0.135), (0.865, 0.88), (0.9, 1)):
             canvas.rectangle((0, top, 1, bottom), label.accent)
@@ -202,7 +208,10 @@ def _background(canvas: Canvas, label: Label) -> None:
 
 
 def _front(canvas: Canvas, box: Box, label: Label) -> None:
-    """Motif, title, subtitle and amount, stacked or (in a wide box) in a row; turned as a whole if the label is."""
+    """Draw motif, title, subtitle and amount in a box: one below the other, or, in a wide box, side by side.
+
+    The whole drawing is rotated by ``label.turn``.
+    """
     left, top, right, bottom = canvas.pixels(box)
     wide, high = right - left, bottom - top
     area = canvas.image.crop((left, top, right, bottom)).rotate(-label.turn, expand=True)
@@ -231,7 +240,7 @@ def _front(canvas: Canvas, box: Box, label: Label) -> None:
 
 
 def _cap(painter: Painter, label: Label) -> None:
-    """Fine vertical grooves, as on screw caps, or the seam under a lid that flips open."""
+    """Paint the cap, if the shape has one: vertical grooves of a screw cap, or the seam of a flip-top lid."""
     if "cap" in painter.shape.regions:
         angle, level = painter.grid("cap")
         groove = np.cos(angle * 40)[None, :] > 0.3 if label.ridged else np.abs(level - 0.42)[:, None] < 0.025
@@ -240,7 +249,7 @@ def _cap(painter: Painter, label: Label) -> None:
 
 
 def _rings(painter: Painter, name: str, colour: Colour) -> None:
-    """Concentric grooves of a tin's lid."""
+    """Paint the concentric grooves on the lid of a can."""
     with painter.region(name, colour) as canvas:
         for radius, shade in ((0.44, 1.1), (0.41, 0.86), (0.395, 1.0), (0.33, 1.1), (0.305, 0.88), (0.29, 1.02)):
             tone = tuple(min(255, round(c * shade)) for c in colour)

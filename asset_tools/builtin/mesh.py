@@ -1,7 +1,7 @@
-"""From grids of points to closed, textured meshes: patches, a texture atlas, creased normals, unions.
+"""Make closed, textured meshes from grids of points.
 
-A *patch* is a grid of points that shows one rectangle (*region*) of the texture. Patches that together close a volume
-make a *part*; parts are united into a *shape*. Frames: metres, z up, front towards -y.
+A *patch* is a grid of points on the surface. It shows one rectangle of the texture, a *region*. Patches that together
+enclose a volume are a *part*. The union of the parts is a *shape*. Frames: metres, z up, front towards -y.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from PIL import Image
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-WELD = 1e-7  # m: corners closer than this are one point of the surface
-PADDING = 4  # pixels around a region, filled with its border so that mip levels don't bleed
+WELD = 1e-7  # m: vertices closer than this are merged
+PADDING = 4  # pixels around a region, filled with the colours of its border, so that mip levels do not mix regions
 CREASE_DEG = 40.0
 
 Size = tuple[float, float, float]
@@ -24,14 +24,14 @@ Size = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Patch:
-    """A grid of points and what it shows.
+    """A grid of surface points that shows one region of the texture.
 
     Args:
-        region: name of the texture region; patches that show the same one must give it the same size.
-        points: (m, n, 3) m; seen from outside, columns run to the right and rows upwards.
-        uv: (m, n, 2) in [0, 1] inside the region, v upwards.
-        size: (width, height) of the region in metres, which sets its share of the texture.
-        detail: how many times more pixels per metre than the rest.
+        region: name of the texture region; patches with the same region must have the same ``size``.
+        points: (m, n, 3) points, m; seen from outside, columns run to the right and rows upwards.
+        uv: (m, n, 2) texture coordinates in the region, 0 to 1, v upwards.
+        size: width and height of the region in metres; larger regions get more pixels.
+        detail: factor of the number of pixels per metre.
     """
 
     region: str
@@ -43,7 +43,12 @@ class Patch:
 
 @dataclass(frozen=True)
 class Region:
-    """A rectangle of the texture: size in metres, pixel box (left, top, right, bottom)."""
+    """A rectangle of the texture.
+
+    Attributes:
+        size: width and height on the surface, m.
+        box: left, top, right and bottom in the texture, pixels.
+    """
 
     size: tuple[float, float]
     box: tuple[int, int, int, int]
@@ -51,13 +56,16 @@ class Region:
 
 @dataclass(frozen=True)
 class Shape:
-    """A closed surface ready for a texture: vertices are split where UVs or normals jump.
+    """A closed surface with texture coordinates; vertices are split at seams of the texture and at sharp edges.
 
     Args:
-        vertices: (n, 3) m. faces: (f, 3). normals: (n, 3) unit, outward. uv: (n, 2) in [0, 1], v upwards.
-        regions: the texture's regions by name.
-        texture_size: width and height of the square texture in pixels.
-        pieces: convex collision pieces, points (k, 3) each, where the formulas know them better than a decomposition.
+        vertices: (n, 3) vertices, m.
+        faces: (f, 3) indices of vertices.
+        normals: (n, 3) outward unit normals.
+        uv: (n, 2) texture coordinates, 0 to 1, v upwards.
+        regions: name -> region of the texture.
+        texture_size: width and height of the texture in pixels.
+        pieces: points (k, 3) of each convex collision piece, m; empty: computed later by convex decomposition.
     """
 
     vertices: np.ndarray
@@ -69,12 +77,12 @@ class Shape:
     pieces: tuple[np.ndarray, ...] = ()
 
     def closed(self) -> trimesh.Trimesh:
-        """The bare surface, welded by position: watertight, for volume and hulls."""
+        """Return the watertight mesh of the surface, with vertices merged by position and without texture."""
         points, index = weld(self.vertices)
         return trimesh.Trimesh(points, index[self.faces], process=False)
 
     def textured(self, image: Image.Image, *, roughness: float = 0.5) -> trimesh.Trimesh:
-        """The mesh to render, with vertex normals; the image is embedded as JPEG on export."""
+        """Return the mesh for rendering, with vertex normals and the texture ``image``."""
         material = PBRMaterial(
             baseColorTexture=image, baseColorFactor=[255, 255, 255, 255], metallicFactor=0.0, roughnessFactor=roughness
         )
@@ -85,7 +93,12 @@ class Shape:
 
 
 def build_shape(parts: list[list[Patch]], *, texture_size: int = 512, crease_deg: float = CREASE_DEG) -> Shape:
-    """Unite closed parts into one shape with one texture atlas.
+    """Return the union of closed parts as one shape with one texture.
+
+    Args:
+        parts: patches of each part, m.
+        texture_size: width and height of the texture in pixels.
+        crease_deg: angle between two faces above which the edge is sharp.
 
     Raises:
         ValueError: a part is not closed.
@@ -96,17 +109,25 @@ def build_shape(parts: list[list[Patch]], *, texture_size: int = 512, crease_deg
     return _with_normals(vertices, uv, faces, regions, texture_size, crease_deg)
 
 
-def fitted(parts: list[list[Patch]], size: Size, *, pieces: Sequence[np.ndarray] = (), tolerance: float = 0.2) -> Shape:
-    """Build the shape, centred and stretched to its exact size; its convex ``pieces`` likewise.
+def build_fitted_shape(
+    parts: list[list[Patch]], size: Size, *, pieces: Sequence[np.ndarray] = (), tolerance: float = 0.2
+) -> Shape:
+    """Return the union of closed parts as a shape that is centred and scaled along each axis to an exact size.
+
+    Args:
+        parts: patches of each part, m.
+        size: outer size (x, y, z) of the shape, m.
+        pieces: points (k, 3) of each convex collision piece in the frame of the parts, m.
+        tolerance: largest allowed change of a size by scaling, as a fraction.
 
     Raises:
-        ValueError: an axis would have to be stretched by more than ``tolerance``.
+        ValueError: the size along an axis would change by more than ``tolerance``, or a part is not closed.
     """
     shape = build_shape(parts)
     low, high = shape.vertices.min(0), shape.vertices.max(0)
     factor = np.asarray(size) / (high - low)
     if np.abs(factor - 1).max() > tolerance:
-        raise ValueError(f"the formulas give {high - low} m for a shape of {size} m")
+        raise ValueError(f"the parts do not fit the shape: expected a size of {size} m, found {high - low} m")
     middle = (low + high) / 2
     stretched = [
         [Patch(p.region, (p.points - middle) * factor, p.uv, p.size, p.detail) for p in part] for part in parts
@@ -114,7 +135,7 @@ def fitted(parts: list[list[Patch]], size: Size, *, pieces: Sequence[np.ndarray]
     return replace(build_shape(stretched), pieces=tuple((piece - middle) * factor for piece in pieces))
 
 
-def creased_shape(
+def make_creased_shape(
     vertices: np.ndarray,
     uv: np.ndarray,
     faces: np.ndarray,
@@ -123,18 +144,21 @@ def creased_shape(
     *,
     crease_deg: float = CREASE_DEG,
 ) -> Shape:
-    """A shape of any closed surface that is unwrapped already; it has no regions.
+    """Return a closed surface that has texture coordinates as a shape without regions.
 
     Args:
-        vertices: (n, 3) m, split where the UVs jump. uv: (n, 2). faces: (f, 3).
-        texture_size: pixels. pieces: see ``Shape``.
-        crease_deg: faces that meet more sharply get an edge, not a smooth normal.
+        vertices: (n, 3) vertices, split at seams of the texture, m.
+        uv: (n, 2) texture coordinates.
+        faces: (f, 3) indices of vertices.
+        texture_size: width and height of the texture in pixels.
+        pieces: points (k, 3) of each convex collision piece, m.
+        crease_deg: angle between two faces above which the edge is sharp.
     """
     return replace(_with_normals(vertices, uv, faces, {}, texture_size, crease_deg), pieces=pieces)
 
 
 def weld(vertices: np.ndarray, tolerance: float = WELD) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct positions (k, 3) and, for each of the (n, 3) vertices, its position's index (n,)."""
+    """Merge vertices (n, 3) by position; return distinct positions (k, 3) and the index (n,) of each position."""
     _, first, index = np.unique(
         np.round(vertices / tolerance).astype(np.int64), axis=0, return_index=True, return_inverse=True
     )
@@ -142,16 +166,23 @@ def weld(vertices: np.ndarray, tolerance: float = WELD) -> tuple[np.ndarray, np.
 
 
 def pack_regions(patches: list[Patch], texture_size: int) -> dict[str, Region]:
-    """Pack the patches' regions in rows at the largest common scale that fits.
+    """Pack the regions of patches into a texture, in rows and with the largest possible number of pixels per metre.
+
+    Args:
+        patches: all patches of a shape.
+        texture_size: width and height of the texture in pixels.
+
+    Returns:
+        Name -> region.
 
     Raises:
-        ValueError: two patches of one region disagree about its size.
+        ValueError: two patches of one region have different sizes, or the regions do not fit.
     """
     wanted: dict[str, tuple[float, float, float]] = {}
     for patch in patches:
         entry = (*patch.size, patch.detail)
         if not np.allclose(wanted.setdefault(patch.region, entry), entry, atol=1e-6):
-            raise ValueError(f"region {patch.region}: sizes {wanted[patch.region]} and {entry} differ")
+            raise ValueError(f"patches of the region {patch.region} differ in size: {wanted[patch.region]} and {entry}")
     order = sorted(wanted, key=lambda name: (-wanted[name][1] * wanted[name][2], name))
 
     def shelves(scale: float) -> dict[str, tuple[int, int, int, int]] | None:
@@ -172,14 +203,17 @@ def pack_regions(patches: list[Patch], texture_size: int) -> dict[str, Region]:
         low, high = (middle, high) if shelves(middle) else (low, middle)
     boxes = shelves(low)
     if boxes is None:
-        raise ValueError(f"the regions {order} don't fit a texture of {texture_size} pixels")
+        raise ValueError(f"the regions {order} do not fit in a texture of {texture_size} pixels")
     return {name: Region(wanted[name][:2], boxes[name]) for name in order}
 
 
 def _join(
     part: list[Patch], regions: dict[str, Region], texture_size: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (n, 3), atlas UVs (n, 2) and triangles (f, 3) of a part, without the empty ones at poles."""
+    """Triangulate the patches of a part; return vertices (n, 3), UVs (n, 2) in the texture and triangles (f, 3).
+
+    Triangles without area, at poles, are left out.
+    """
     vertices, uvs, faces, offset = [], [], [], 0
     for patch in part:
         rows, columns = patch.points.shape[:2]
@@ -200,7 +234,7 @@ def _join(
 
 
 def _unite(pieces: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Boolean union that carries the UVs along."""
+    """Return the boolean union of parts, each given by vertices, UVs and triangles, in the same form."""
     import manifold3d
 
     solids = []
@@ -233,7 +267,10 @@ def _with_normals(
     texture_size: int,
     crease_deg: float,
 ) -> Shape:
-    """Normals averaged over the neighbouring faces within the crease angle, larger faces counting more."""
+    """Return a shape with vertex normals.
+
+    A normal is the mean over adjacent faces within ``crease_deg``, weighted by the area and angle of each face.
+    """
     points, index = weld(vertices)
     corners = index[faces]
     sides = points[np.roll(corners, -1, axis=1)] - points[corners]
@@ -242,7 +279,7 @@ def _with_normals(
     flat = cross / np.maximum(area, 1e-300)[:, None]
     unit = sides / np.maximum(np.linalg.norm(sides, axis=2, keepdims=True), 1e-300)
     angle = np.arccos(np.clip(-(unit * np.roll(unit, 1, axis=1)).sum(2), -1, 1))
-    # All pairs of corners that meet in one point.
+    # all pairs of corners at one point
     order = np.argsort(corners.reshape(-1), kind="stable")
     counts = np.bincount(corners.reshape(-1), minlength=len(points))
     starts = np.concatenate([[0], np.cumsum(counts)[:-1]])

@@ -1,4 +1,4 @@
-"""Models: coloured parts blended into one closed body, unwrapped, and painted in space, so that no seam shows."""
+"""Make objects from coloured parts: blend the parts into one closed body, unwrap it, and paint it without seams."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import xatlas
 from PIL import Image
 from scipy.ndimage import distance_transform_edt
 
-from asset_tools.builtin.blends import Field, Point, mesh_of, smooth_min
-from asset_tools.builtin.mesh import Shape, Size, creased_shape
+from asset_tools.builtin.blends import Field, Point, mesh_field, smooth_min
+from asset_tools.builtin.mesh import Shape, Size, make_creased_shape
 from asset_tools.builtin.textures import Colour, as_jpeg
 from asset_tools.decompose import reduce_vertices
 
 MM = 1e-3
 CREASE_DEG = 55.0  # simplified roundings are coarse
 OVERSAMPLING = 2
-SHADE = 0.3  # how much darker the deepest creases are
+SHADE = 0.3  # fraction by which the deepest creases are darker
 
 Box = tuple[Point, Point]
 # points (n, 3) mm, unit normals (n, 3), colours (n, 3) to change in place
@@ -29,11 +29,12 @@ Decorate = Callable[[np.ndarray, np.ndarray, np.ndarray, np.random.Generator], N
 
 @dataclass(frozen=True)
 class Part:
-    """One part of a model.
+    """A part of a model.
 
     Args:
-        field: its body. colour: of its surface.
-        soft: how far its creases with the parts before it are filled, mm.
+        field: signed distance field of the part, mm.
+        colour: colour of the part.
+        soft: width of the rounded transition to the previous parts, mm.
     """
 
     field: Field
@@ -43,17 +44,19 @@ class Part:
 
 @dataclass(frozen=True)
 class Model:
-    """A body made of parts; lengths in mm, see ``blends``.
+    """An object that is a union of parts; lengths in mm.
 
     Args:
-        parts: united in this order; each point of the surface has the colour of the nearest.
-        low, high: box that holds the body.
-        decorate: paints details over the parts' colours.
-        floor: level below which the shape is cut off to get a flat base.
-        step, triangles: of the mesh, see ``mesh_of``.
-        texture_size: pixels.
-        hulls: boxes (low, high); what the body has in each makes one convex collision piece.
-        grain: how much the brightness varies, as a fraction.
+        parts: parts in the order of the union. Each point of the surface has the colour of the nearest part.
+        low: lower corner of a box that contains the object.
+        high: upper corner of this box.
+        decorate: function that paints details over the colours of the parts.
+        floor: height at which the object is cut off to get a flat base; None: not cut.
+        step: grid spacing of the mesh.
+        triangles: approximate number of triangles of the mesh.
+        texture_size: width and height of the texture in pixels.
+        hulls: boxes (lower corner, upper corner). The part of the object in each box becomes a convex collision piece.
+        grain: amplitude of the variation of brightness, as a fraction.
     """
 
     parts: tuple[Part, ...]
@@ -68,7 +71,7 @@ class Model:
     grain: float = 0.02
 
     def field(self, points: np.ndarray) -> np.ndarray:
-        """The distance to the whole."""
+        """Return the signed distances (n,) of points (n, 3) from the surface of the whole object, mm."""
         distance = self.parts[0].field(points)
         for part in self.parts[1:]:
             distance = smooth_min(distance, part.field(points), part.soft)
@@ -76,8 +79,8 @@ class Model:
 
     @cached_property
     def body(self) -> trimesh.Trimesh:
-        """The closed surface, mm."""
-        body = mesh_of(self.field, self.low, self.high, step=self.step, triangles=self.triangles)
+        """Closed mesh of the object, mm."""
+        body = mesh_field(self.field, self.low, self.high, step=self.step, triangles=self.triangles)
         if self.floor is not None:  # simplifying moves the rim a little
             low = body.vertices[:, 2] < self.floor + 0.3
             body.vertices[low, 2] = self.floor
@@ -94,7 +97,7 @@ class Model:
             raise ValueError(f"the parts give {self.body.extents} mm for a shape of {size} m")
         points = (self.body.vertices - self.body.bounds.mean(0)) * MM * factor
         pieces = tuple(reduce_vertices((piece - self.body.bounds.mean(0)) * MM * factor) for piece in self._pieces())
-        return unwrapped(np.asarray(points), np.asarray(self.body.faces), self.texture_size, pieces)
+        return make_uv_mapped_shape(np.asarray(points), np.asarray(self.body.faces), self.texture_size, pieces)
 
     def paint(self, shape: Shape, rng: np.random.Generator) -> Image.Image:
         """The texture of a shape that this model made."""
@@ -118,7 +121,7 @@ class Model:
         return paint_in_space(shape, colours)
 
     def _pieces(self) -> list[np.ndarray]:
-        """Return points (k, 3) in each box, mm."""
+        """Return the points (k, 3) of each convex collision piece, mm: the part of the object in each box."""
         import manifold3d
 
         solid = manifold3d.Manifold(
@@ -132,15 +135,23 @@ class Model:
         return pieces
 
 
-def pair(low: Point, high: Point) -> tuple[Box, Box]:
-    """A box, and its mirror image at the other side of y = 0."""
+def make_box_pair(low: Point, high: Point) -> tuple[Box, Box]:
+    """Return a box, given by its lower and upper corner, and its mirror image at the plane y = 0."""
     return (low, high), ((low[0], -high[1], low[2]), (high[0], -low[1], high[2]))
 
 
-def unwrapped(vertices: np.ndarray, faces: np.ndarray, texture_size: int, pieces: tuple[np.ndarray, ...] = ()) -> Shape:
-    """A closed surface as a shape with one texture atlas that shows each of its triangles once.
+def make_uv_mapped_shape(
+    vertices: np.ndarray, faces: np.ndarray, texture_size: int, pieces: tuple[np.ndarray, ...] = ()
+) -> Shape:
+    """Unwrap a closed surface and return it as a shape, whose triangles do not overlap in the texture.
 
-    Some charts are mirrored, which is all the same to what is painted in space.
+    Parts of the texture may be mirrored. This does not matter for `paint_in_space`.
+
+    Args:
+        vertices: (n, 3) vertices, m.
+        faces: (f, 3) indices of vertices.
+        texture_size: width and height of the texture in pixels.
+        pieces: points (k, 3) of each convex collision piece, m.
     """
     low, reach = vertices.min(0), float(np.ptp(vertices, axis=0).max())
     atlas = xatlas.Atlas()
@@ -150,13 +161,15 @@ def unwrapped(vertices: np.ndarray, faces: np.ndarray, texture_size: int, pieces
     atlas.generate(pack_options=options)
     origin, corners, uv = atlas[0]
     uv, corners = uv.astype(float), corners.astype(np.int64)
-    return creased_shape(vertices[origin], uv, corners, texture_size, pieces, crease_deg=CREASE_DEG)
+    return make_creased_shape(vertices[origin], uv, corners, texture_size, pieces, crease_deg=CREASE_DEG)
 
 
 def paint_in_space(shape: Shape, colours: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Image.Image:
-    """The texture of a shape, given the colours (n, 3) in 0..255 of points (n, 3) m with normals (n, 3).
+    """Paint the texture of a shape from a function that returns the colour at each point in space.
 
-    The shape's triangles must not overlap in the texture.
+    Args:
+        shape: shape whose triangles do not overlap in the texture.
+        colours: function of points (n, 3) in m and normals (n, 3) that returns colours (n, 3) in 0..255.
     """
     size = OVERSAMPLING * shape.texture_size
     row, column, face, weights = _texels(shape.uv[shape.faces], size)
@@ -173,7 +186,15 @@ def paint_in_space(shape: Shape, colours: Callable[[np.ndarray, np.ndarray], np.
 
 
 def _texels(uv: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Row, column, face and (n, 3) corner weights of each texel whose centre a face (f, 3, 2) covers."""
+    """Find the texels whose centres are in a face.
+
+    Args:
+        uv: (f, 3, 2) texture coordinates of the corners of each face.
+        size: width and height of the texture in pixels.
+
+    Returns:
+        Row (n,), column (n,), face (n,) and barycentric weights (n, 3) of each texel.
+    """
     corners = uv * (size, -size) + (-0.5, size - 0.5)  # column, row; whole numbers are centres
     low = np.clip(np.ceil(corners.min(1)), 0, size - 1).astype(int)
     count = np.maximum(np.clip(np.floor(corners.max(1)), 0, size - 1).astype(int) - low + 1, 0)
@@ -199,6 +220,6 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _grain(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Smooth variation in about [-1, 1], a few cm wide."""
+    """Return smooth noise (n,) in about [-1, 1] at points (n, 3) in mm; its waves are a few cm long."""
     waves = rng.normal(size=(6, 3)) * 0.12
     return np.cos(points @ waves.T + rng.uniform(0, 2 * np.pi, 6)).sum(1) / np.sqrt(6)

@@ -1,22 +1,22 @@
-"""Toy aeroplanes; lengths in mm, noses towards +x, wheels on z = 0."""
+"""Make models of toy aeroplanes; lengths in mm, noses towards +x, wheels at z = 0."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from asset_tools.builtin.blends import (
-    both_sides,
     box,
     chain,
     curve,
     cylinder,
     ellipsoid,
+    mirror_y,
     plate,
     polygon,
-    turned,
+    revolve,
     union,
 )
-from asset_tools.builtin.models import Model, Part, pair
+from asset_tools.builtin.models import Model, Part, make_box_pair
 from asset_tools.builtin.textures import Colour
 
 DARK: Colour = (34, 34, 38)
@@ -30,8 +30,8 @@ def _star(x: float, y: float, radius: float) -> list[tuple[float, float]]:
     return [(float(a), float(b)) for a, b in np.column_stack([x + reach * np.cos(angle), y + reach * np.sin(angle)])]
 
 
-def red_airplane() -> Model:
-    """Wooden, single propeller: a red body, straight red wings with stars, a yellow nose."""
+def make_red_airplane() -> Model:
+    """Make a red wooden aeroplane with one propeller, straight wings with stars and a yellow nose."""
     red: Colour = (204, 34, 30)
     yellow: Colour = (248, 200, 40)
     star = polygon(_star(14, 50, 9.5))
@@ -59,14 +59,14 @@ def red_airplane() -> Model:
             Part(chain((-62, 0, 30, 6.5), (-10, 0, 28, 13.5), (36, 0, 27, 15.5)), red),
             Part(cylinder("x", (49, 0, 27), 16, 16, 3), yellow),
             Part(plate("x", 61, 5, _blade(27, 27, 25, 4.2), edge=2.2), (36, 66, 150)),
-            Part(turned("x", (0, 0, 27), [(55, 7.5), (62, 6.5), (68, 2.5)], 1), (36, 66, 150)),
-            Part(both_sides(plate("z", 26, 7.5, wing, edge=3)), red),
-            Part(both_sides(plate("z", 31, 6, tail, edge=2.6)), red),
+            Part(revolve("x", (0, 0, 27), [(55, 7.5), (62, 6.5), (68, 2.5)], 1), (36, 66, 150)),
+            Part(mirror_y(plate("z", 26, 7.5, wing, edge=3)), red),
+            Part(mirror_y(plate("z", 31, 6, tail, edge=2.6)), red),
             Part(plate("y", 0, 6, fin, edge=2.6), red),
             Part(ellipsoid((8, 0, 40), (13, 8.5, 9)), (120, 190, 226)),
-            Part(both_sides(cylinder("y", (24, 16, 9), 7, 9, 2)), DARK),
+            Part(mirror_y(cylinder("y", (24, 16, 9), 7, 9, 2)), DARK),
             Part(cylinder("y", (24, 0, 9), 30, 3), (190, 150, 96)),
-            Part(union(both_sides(box((24, 8.5, 14), (8, 5, 14), 1))), (190, 150, 96)),
+            Part(union(mirror_y(box((24, 8.5, 14), (8, 5, 14), 1))), (190, 150, 96)),
             Part(chain((-61, 0, 28, 4), (-63, 0, 5, 3.4)), (190, 150, 96)),
             Part(cylinder("y", (-63, 0, 5), 7, 5, 1.2), DARK),
         ),
@@ -81,7 +81,7 @@ def red_airplane() -> Model:
             ((-80, -5, 35), (-42, 5, 68)),
             ((58.4, -9, -4), (63.6, 9, 60)),
             ((57, -9, 18), (78, 9, 36)),
-            *pair((10, 12, -4), (40, 30, 20)),
+            *make_box_pair((10, 12, -4), (40, 30, 20)),
             ((18, -13, 4), (30, 13, 14)),
             ((-72, -8, -4), (-54, 8, 24)),
         ),
@@ -95,15 +95,15 @@ def red_airplane() -> Model:
 
 
 def _blade(y: float, z: float, length: float, half_width: float) -> list[tuple[float, float]]:
-    """Outline of a propeller with two upright blades, its middle at (y, z)."""
+    """Return the outline (y, z) of a propeller with two vertical blades, centred at (y, z), mm."""
     side = [(0.55, 0.0), (1.0, 0.45), (1.0, 0.85), (0.4, 1.0)]
     half = [(w * half_width, t * length) for w, t in side]
     right = [*((w, -t) for w, t in reversed(half)), *half]
     return [(w, z + t) for w, t in right] + [(-w, z + t) for w, t in reversed(right)]
 
 
-def airliner() -> Model:
-    """White with a blue tail: swept wings, two jet engines, rows of windows."""
+def make_airliner() -> Model:
+    """Make a white airliner with a blue tail, swept wings, two jet engines and rows of windows."""
     blue: Colour = (28, 84, 170)
     pale: Colour = (214, 218, 224)
     wing = [(24, 0), (20, 8), (-22, 66), (-26, 70), (-33, 70), (-34, 66), (-16, 22), (-16, 0)]
@@ -140,7 +140,7 @@ def airliner() -> Model:
     return Model(
         parts=(
             Part(
-                turned(
+                revolve(
                     "x",
                     (0, 0, 30),
                     [(-82, 2.2), (-66, 6.4), (-46, 10.4), (-34, 11), (54, 11), (66, 9), (74, 5.2), (78, 1.5)],
@@ -148,13 +148,13 @@ def airliner() -> Model:
                 ),
                 WHITE,
             ),
-            Part(both_sides(plate("z", 23.5, 5.0, wing, edge=2.0)), pale, 2),
-            Part(both_sides(plate("z", 34, 4.4, tail, edge=1.8)), pale, 2),
+            Part(mirror_y(plate("z", 23.5, 5.0, wing, edge=2.0)), pale, 2),
+            Part(mirror_y(plate("z", 34, 4.4, tail, edge=1.8)), pale, 2),
             Part(plate("y", 0, 4.4, fin, edge=1.8), blue, 2),
-            Part(both_sides(turned("x", (0, 27, 13), [(-10, 4.4), (-2, 6), (10, 6.6), (17, 5.8)], 0.8)), blue),
-            Part(both_sides(box((0, 27, 20), (18, 2.6, 6), 1)), pale),
-            Part(both_sides(cylinder("y", (-8, 9, 5), 5, 5, 1.2)), DARK),
-            Part(both_sides(chain((-8, 9, 5, 2.2), (-8, 9, 24, 2.2))), STEEL),
+            Part(mirror_y(revolve("x", (0, 27, 13), [(-10, 4.4), (-2, 6), (10, 6.6), (17, 5.8)], 0.8)), blue),
+            Part(mirror_y(box((0, 27, 20), (18, 2.6, 6), 1)), pale),
+            Part(mirror_y(cylinder("y", (-8, 9, 5), 5, 5, 1.2)), DARK),
+            Part(mirror_y(chain((-8, 9, 5, 2.2), (-8, 9, 24, 2.2))), STEEL),
             Part(cylinder("y", (56, 0, 5), 6, 5, 1.2), DARK),
             Part(chain((56, 0, 5, 2.2), (56, 0, 22, 2.2)), STEEL),
         ),
@@ -162,13 +162,13 @@ def airliner() -> Model:
             ((-40, -12, 18), (90, 12, 42)),
             ((-92, -12, 18), (-40, 12, 41)),
             ((-92, -5, 40), (-44, 5, 74)),
-            *pair((-92, 3, 31.6), (-50, 30, 36.4)),
-            *pair((-42, 10, 20.9), (28, 22, 26.1)),
-            *pair((-42, 22, 20.9), (28, 78, 26.1)),
-            *pair((-14, 18, 4), (22, 37, 20.8)),
-            *pair((-16, 4, -4), (0, 15, 10.5)),
+            *make_box_pair((-92, 3, 31.6), (-50, 30, 36.4)),
+            *make_box_pair((-42, 10, 20.9), (28, 22, 26.1)),
+            *make_box_pair((-42, 22, 20.9), (28, 78, 26.1)),
+            *make_box_pair((-14, 18, 4), (22, 37, 20.8)),
+            *make_box_pair((-16, 4, -4), (0, 15, 10.5)),
             ((48, -6, -4), (64, 6, 10.5)),
-            *pair((-12, 6, 10), (-4, 12, 24)),
+            *make_box_pair((-12, 6, 10), (-4, 12, 24)),
             ((53, -3, 10), (59, 3, 22)),
         ),
         low=(-92, -78, -4),
@@ -181,8 +181,8 @@ def airliner() -> Model:
     )
 
 
-def biplane() -> Model:
-    """Yellow: two pairs of wings with struts, an open cockpit, a round engine."""
+def make_biplane() -> Model:
+    """Make a yellow biplane with struts between the wings, an open cockpit and a round engine."""
     yellow: Colour = (250, 204, 32)
     green: Colour = (20, 104, 70)
     upper = [(26, 0), (26, 50), (20, 59), (2, 59), (-2, 52), (-2, 0)]
@@ -217,16 +217,16 @@ def biplane() -> Model:
             Part(cylinder("x", (36, 0, 31), 15, 13.5, 2.5), green),
             Part(plate("x", 48.5, 4.0, _blade(0, 31, 25, 4.0), edge=1.8), (120, 72, 36)),
             Part(chain((42, 0, 31, 4), (50, 0, 31, 3.2)), STEEL),
-            Part(both_sides(plate("z", 60, 5.2, upper, edge=2.2)), yellow),
-            Part(both_sides(plate("z", 26, 5.2, lower, edge=2.2)), yellow),
-            Part(both_sides(chain((16, 36, 26, 2.2), (20, 36, 60, 2.2))), (150, 104, 60)),
-            Part(both_sides(chain((0, 36, 26, 2.2), (4, 36, 60, 2.2))), (150, 104, 60)),
-            Part(both_sides(chain((18, 7, 38, 2.2), (20, 10, 60, 2.2))), (150, 104, 60)),
-            Part(both_sides(chain((2, 7, 38, 2.2), (4, 10, 60, 2.2))), (150, 104, 60)),
-            Part(both_sides(plate("z", 34, 4.6, tail, edge=2)), yellow),
+            Part(mirror_y(plate("z", 60, 5.2, upper, edge=2.2)), yellow),
+            Part(mirror_y(plate("z", 26, 5.2, lower, edge=2.2)), yellow),
+            Part(mirror_y(chain((16, 36, 26, 2.2), (20, 36, 60, 2.2))), (150, 104, 60)),
+            Part(mirror_y(chain((0, 36, 26, 2.2), (4, 36, 60, 2.2))), (150, 104, 60)),
+            Part(mirror_y(chain((18, 7, 38, 2.2), (20, 10, 60, 2.2))), (150, 104, 60)),
+            Part(mirror_y(chain((2, 7, 38, 2.2), (4, 10, 60, 2.2))), (150, 104, 60)),
+            Part(mirror_y(plate("z", 34, 4.6, tail, edge=2)), yellow),
             Part(plate("y", 0, 4.6, fin, edge=2), yellow),
-            Part(both_sides(cylinder("y", (22, 18, 9), 6, 9, 2)), DARK),
-            Part(both_sides(chain((20, 7, 24, 2.6), (22, 16, 9, 2.6))), STEEL),
+            Part(mirror_y(cylinder("y", (22, 18, 9), 6, 9, 2)), DARK),
+            Part(mirror_y(chain((20, 7, 24, 2.6), (22, 16, 9, 2.6))), STEEL),
             Part(cylinder("y", (22, 0, 9), 34, 2.2), STEEL),
             Part(chain((-50, 0, 32, 3), (-51, 0, 5, 2.6)), STEEL),
             Part(cylinder("y", (-51, 0, 4.5), 6, 4.5, 1.2), DARK),
@@ -240,14 +240,14 @@ def biplane() -> Model:
             ((-60, -26, 31.6), (-32, 26, 36.4)),
             ((-60, -5, 37), (-30, 5, 58)),
             ((46, -10, 0), (51, 10, 64)),
-            *pair((8, 14.5, -4), (36, 26, 22)),
+            *make_box_pair((8, 14.5, -4), (36, 26, 22)),
             ((18, -15, 6), (26, 15, 12)),
-            *pair((15, 5, 11), (27, 16, 20)),
+            *make_box_pair((15, 5, 11), (27, 16, 20)),
             ((-58, -6, -4), (-44, 6, 27)),
-            *pair((-4, 32, 29.5), (10, 40, 56.7)),
-            *pair((11, 32, 29.5), (26, 40, 56.7)),
-            *pair((-2, 5, 43), (9, 14, 56.7)),
-            *pair((12, 5, 43), (26, 14, 56.7)),
+            *make_box_pair((-4, 32, 29.5), (10, 40, 56.7)),
+            *make_box_pair((11, 32, 29.5), (26, 40, 56.7)),
+            *make_box_pair((-2, 5, 43), (9, 14, 56.7)),
+            *make_box_pair((12, 5, 43), (26, 14, 56.7)),
         ),
         low=(-66, -66, -4),
         high=(60, 66, 70),

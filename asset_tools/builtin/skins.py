@@ -1,4 +1,4 @@
-"""Fruit skins: colour varies smoothly in space, so it has neither seams nor poles."""
+"""Paint the skins of fruits; colours are functions of the position in space, so they have no seams."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from asset_tools.builtin.textures import Colour, Painter, blend, noise
 
 @dataclass(frozen=True, kw_only=True)
 class Fruit:
-    """Skin and stem of a round fruit.
+    """Colours of the skin and the stem of a round fruit. A colour that is None is not used.
 
     Attributes:
-        base, blush: ground colour, and the colour of its sunny side.
-        blush_amount: how much of the surface is blushed, 0 to 1.
-        streaks: how strongly the blush runs in lines from stem to bottom.
+        base: main colour.
+        blush: colour of the sunny side.
+        blush_amount: fraction of the surface with the colour ``blush``.
+        streaks: strength of lines of the colour ``blush`` from the stem to the bottom.
         poles: colour around the stem and the bottom.
-        crown: colour of a wider, ragged patch around the stem.
+        crown: colour of a wide, irregular patch around the stem.
         speckle: colour of small dots.
-        pores: depth of fine dimples, as a fraction of the brightness.
-        bloom: colour of a patchy film of wax or fuzz.
-        groove: how much darker the groove along the front is, as a fraction of the brightness.
-        stem: its colour.
+        pores: amplitude of fine dimples, as a fraction of the brightness.
+        bloom: colour of an irregular film of wax or fuzz.
+        groove: fraction by which the groove along the front is darker.
+        stem: colour of the stem.
     """
 
     base: Colour
@@ -41,7 +42,7 @@ class Fruit:
     stem: Colour = (92, 62, 34)
 
     def __call__(self, shape: Shape, rng: np.random.Generator) -> Image.Image:
-        """Paint a shape with a ``skin`` region."""
+        """Return the texture of a shape with the region ``skin``."""
         painter = Painter(shape, rng, self.base)
         angle, level = painter.grid("skin")
         polar = np.pi * (1 - level)[:, None]
@@ -82,7 +83,7 @@ class Fruit:
 
 
 def paint_banana(shape: Shape, rng: np.random.Generator) -> Image.Image:
-    """Yellow, greenish towards the ends, brown stem, tip, edges and freckles."""
+    """Paint a banana: yellow, greenish at the ends, with a brown stem, tip, edges and freckles."""
     painter = Painter(shape, rng, (236, 200, 60))
     angle, level = painter.grid("skin")
     from_stem = level[:, None]  # the bottom of the region is the start of the sweep: the stem

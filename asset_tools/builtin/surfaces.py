@@ -1,8 +1,8 @@
-"""Patches for the usual surfaces: lofts of rings, sweeps along a planar curve, rounded boxes.
+"""Make patches for common surfaces: lofts of rings, tubes along a planar curve, rounded boxes.
 
-A ring is (half_x, half_y, z, exponent): a superellipse, 2 = ellipse, 4 = nearly a rounded rectangle. Rings run from the
-bottom's centre outwards, up, and back to the axis, so that the surface closes. Angles start at the back (+y), so the
-middle of a region's width faces the front (-y).
+A ring is a horizontal superellipse (half_x, half_y, z, exponent); the exponent 2 is an ellipse, 4 is nearly a rounded
+rectangle. The rings of a part run from the centre of the bottom outwards, upwards, and back to the axis, so that the
+surface is closed. Angles start at the back (+y), so the middle of a region is at the front (-y).
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ class Section:
     """Consecutive rings that show one region of the texture.
 
     Args:
-        region: its name.
-        rings: (m, 4) half_x, half_y, z, exponent.
-        flat: True maps the rings as seen from above or below (lids, bottoms), False unrolls them.
-        detail: see ``Patch``.
+        region: name of the region.
+        rings: (m, 4) rings: half_x, half_y, z, exponent; m.
+        flat: whether the texture is projected from above or below, as for lids and bottoms; otherwise it is unrolled.
+        detail: factor of the number of pixels per metre.
     """
 
     region: str
@@ -34,18 +34,19 @@ class Section:
     detail: float = 1.0
 
 
-def soften(points: list[tuple[float, ...]], steps: int = 2) -> np.ndarray:
-    """A polyline with rounded corners.
+def round_corners(points: list[tuple[float, ...]], steps: int = 2) -> np.ndarray:
+    """Round the corners of a polyline.
 
     Args:
-        points: k coordinates and, last, the length cut off each side of that corner (0 keeps it sharp).
-        steps: segments per rounded corner.
+        points: for each corner k coordinates and, as the last number, the length that is cut off at both sides of the
+            corner; 0 keeps the corner sharp.
+        steps: number of segments per rounded corner.
 
     Returns:
-        (m, k) points.
+        Points (m, k) of the new polyline.
     """
     data = np.array([point[:-1] for point in points], dtype=float)
-    # A cut takes at most half of each neighbouring side.
+    # a cut takes at most half of each adjacent side
     result = [data[0]]
     for i in range(1, len(data) - 1):
         back, ahead = data[i - 1] - data[i], data[i + 1] - data[i]
@@ -62,21 +63,32 @@ def soften(points: list[tuple[float, ...]], steps: int = 2) -> np.ndarray:
     return np.array(result)[keep]
 
 
-def round_rings(profile: list[tuple[float, float, float]], steps: int = 2) -> np.ndarray:
-    """Rings (m, 4) of a surface of revolution from (radius, z, corner cut), see ``soften``."""
-    line = soften(list(profile), steps)
+def make_circular_rings(profile: list[tuple[float, float, float]], steps: int = 2) -> np.ndarray:
+    """Return the rings (m, 4) of a surface of revolution with rounded corners.
+
+    Args:
+        profile: for each corner of the profile the radius, the height z, and the length that is cut off to round it, m.
+        steps: number of segments per rounded corner.
+    """
+    line = round_corners(list(profile), steps)
     return np.column_stack([line[:, 0], line[:, 0], line[:, 1], np.full(len(line), 2.0)])
 
 
-def oval_rings(profile: list[tuple[float, float, float, float, float]], steps: int = 2) -> np.ndarray:
-    """Rings (m, 4) from (half_x, half_y, z, exponent, corner cut)."""
-    # Exponents are scaled down so that they don't count as lengths.
-    line = soften([(a, b, z, n * 1e-3, cut) for a, b, z, n, cut in profile], steps)
+def make_oval_rings(profile: list[tuple[float, float, float, float, float]], steps: int = 2) -> np.ndarray:
+    """Return the rings (m, 4) of an oval surface with rounded corners.
+
+    Args:
+        profile: for each corner of the profile half_x, half_y, z, the exponent, and the length that is cut off to round
+            it, m.
+        steps: number of segments per rounded corner.
+    """
+    # exponents are scaled down so that they hardly count as lengths
+    line = round_corners([(a, b, z, n * 1e-3, cut) for a, b, z, n, cut in profile], steps)
     return np.column_stack([line[:, :3], line[:, 3] * 1e3])
 
 
-def ring_points(rings: np.ndarray, segments: int) -> np.ndarray:
-    """Points (m, segments + 1, 3) of the rings (m, 4); the last column repeats the first exactly."""
+def compute_ring_points(rings: np.ndarray, segments: int) -> np.ndarray:
+    """Return points (m, segments + 1, 3) on rings (m, 4), m; the last column is equal to the first column."""
     theta = np.pi / 2 + 2 * np.pi * np.arange(segments) / segments
     cos, sin = np.cos(theta), np.sin(theta)
     power = 2 / rings[:, 3:4]
@@ -89,17 +101,27 @@ def ring_points(rings: np.ndarray, segments: int) -> np.ndarray:
 def loft(
     sections: list[Section], *, segments: int = 32, warp: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> list[Patch]:
-    """A closed part of rings; ``warp`` moves the points (..., 3) at the end, UVs stay as they were."""
+    """Return the patches of a closed part that consists of rings.
+
+    Args:
+        sections: sections of the part, from the bottom to the top.
+        segments: number of segments around the part.
+        warp: function that moves the points (..., 3) after the texture coordinates are computed.
+    """
     patches = []
     for section in sections:
-        points = ring_points(section.rings, segments)
-        uv, size = _flat_uv(points, section.rings) if section.flat else unrolled_uv(points)
+        points = compute_ring_points(section.rings, segments)
+        uv, size = _flat_uv(points, section.rings) if section.flat else unroll_uv(points)
         patches.append(Patch(section.region, points if warp is None else warp(points), uv, size, section.detail))
     return patches
 
 
-def unrolled_uv(points: np.ndarray) -> tuple[np.ndarray, tuple[float, float]]:
-    """UVs (m, n, 2) by arc length of a grid (m, n, 3), around its widest row and along its columns; its size in m."""
+def unroll_uv(points: np.ndarray) -> tuple[np.ndarray, tuple[float, float]]:
+    """Unroll a grid of points (m, n, 3) by arc length, along the longest row and along the columns.
+
+    Returns:
+        Texture coordinates (m, n, 2), and width and height of the region in m.
+    """
     around = np.linalg.norm(np.diff(points, axis=1), axis=2)
     widest = around[np.argmax(around.sum(1))]
     u = np.concatenate([[0], np.cumsum(widest)])
@@ -111,7 +133,11 @@ def unrolled_uv(points: np.ndarray) -> tuple[np.ndarray, tuple[float, float]]:
 
 
 def _flat_uv(points: np.ndarray, rings: np.ndarray) -> tuple[np.ndarray, tuple[float, float]]:
-    """UVs as seen from above, or from below where the rings grow outwards."""
+    """Project points (m, n, 3) on rings from above, or from below if the rings grow outwards.
+
+    Returns:
+        Texture coordinates (m, n, 2), and width and height of the region in m.
+    """
     half = rings[:, :2].max(0)
     right = points[..., 0] * (-1 if rings[-1, 0] > rings[0, 0] else 1)
     uv = np.stack([0.5 + right / (2 * half[0]), 0.5 + points[..., 1] / (2 * half[1])], axis=-1)
@@ -128,16 +154,16 @@ def sweep(
     segments: int = 24,
     detail: float = 1.0,
 ) -> list[Patch]:
-    """A closed tube along a planar curve.
+    """Return the patch of a closed tube along a planar curve, as a list.
 
     Args:
-        region: texture region: around the tube to the right, along it upwards.
-        path: (m, 3) m.
-        radii: (m, 2) across the plane's normal (inside the plane), and along the normal; the ends' are 0 to close it.
-        normal: unit normal of the curve's plane.
-        section: (segments,) factors on the radius around the tube, by default 1 (an ellipse).
-        segments: around the tube.
-        detail: see ``Patch``.
+        region: name of the texture region. Its u runs around the tube, its v along the tube.
+        path: (m, 3) points of the curve, m.
+        radii: (m, 2) radius in the plane of the curve, and radius along the normal of the plane, m; 0 at both ends.
+        normal: unit normal of the plane.
+        section: (segments,) factors of the radius around the tube; None: 1, which is an ellipse.
+        segments: number of segments around the tube.
+        detail: factor of the number of pixels per metre.
     """
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -151,16 +177,16 @@ def sweep(
         + (radii[:, 1:2] * factor * np.sin(theta))[..., None] * second[:, None]
     )
     points = np.concatenate([points, points[:, :1]], axis=1)
-    uv, size = unrolled_uv(points)
+    uv, size = unroll_uv(points)
     return [Patch(region, points, uv, size, detail)]
 
 
-def stacked_pieces(patches: list[Patch], cuts: Sequence[float] = ()) -> list[np.ndarray]:
-    """Convex pieces (k, 3) of an upright part, cut at heights where its profile is concave; hollows are filled.
+def make_stacked_pieces(patches: list[Patch], cuts: Sequence[float] = ()) -> list[np.ndarray]:
+    """Cut an upright part at given heights; return the points (k, 3) of the convex hull of each section.
 
     Args:
-        patches: their rows are level.
-        cuts: ascending heights, m.
+        patches: patches of the part, whose rows are horizontal.
+        cuts: ascending heights at which the profile is concave, m.
     """
     rows = np.concatenate([patch.points[:, :-1] for patch in patches])
     height = rows[:, 0, 2]
@@ -177,15 +203,16 @@ def stacked_pieces(patches: list[Patch], cuts: Sequence[float] = ()) -> list[np.
     ]
 
 
-def prism_piece(rings: Sequence[tuple[float, float]], sides: int = 16) -> np.ndarray:
-    """Convex piece (k, 3) of an upright round part: regular polygons, of the area of its circles.
+def make_prism_piece(rings: Sequence[tuple[float, float]], sides: int = 16) -> np.ndarray:
+    """Return the points (k, 3) of a convex piece of a round, upright part: a regular polygon per circle.
 
-    Its facets are equal, so that it comes to rest on any of them; on unequal ones, as `reduce_vertices` leaves them, a
-    round thing rocks for long. With up to three rings of 16 the engine keeps every corner.
+    Each polygon has the area of its circle. All facets are equal, so that the object comes to rest on each of them. An
+    object with unequal facets, as from `reduce_vertices`, would rock for a long time. PhysX keeps all corners of up to
+    three polygons of 16 sides.
 
     Args:
-        rings: (radius, z) upwards, convex, m.
-        sides: of the polygons.
+        rings: radius and height z of each circle, from the bottom to the top; convex, m.
+        sides: number of sides of the polygons.
     """
     angles = 2 * np.pi * (np.arange(sides) + 0.5) / sides
     larger = np.sqrt(2 * np.pi / sides / np.sin(2 * np.pi / sides))
@@ -193,14 +220,14 @@ def prism_piece(rings: Sequence[tuple[float, float]], sides: int = 16) -> np.nda
     return np.concatenate([np.column_stack([radius * circle, np.full(sides, z)]) for radius, z in rings])
 
 
-def chained_pieces(patch: Patch, count: int) -> list[np.ndarray]:
-    """Convex pieces (k, 3) of a swept tube, each of an equal share of its rings."""
+def make_chained_pieces(patch: Patch, count: int) -> list[np.ndarray]:
+    """Cut a tube of `sweep` along its length into ``count`` sections; return the points (k, 3) of each hull."""
     rows = patch.points[1:-1, :-1]
     bounds = np.round(np.linspace(0, len(rows) - 1, count + 1)).astype(int)
     return [reduce_vertices(rows[a : b + 1].reshape(-1, 3)) for a, b in itertools.pairwise(bounds.tolist())]
 
 
-FACES = {  # right, up as seen from outside: (axis, sign) each
+FACES = {  # (axis, sign) of the directions right and up, seen from outside
     "front": ((0, 1), (2, 1)),
     "back": ((0, -1), (2, 1)),
     "right": ((1, 1), (2, 1)),
@@ -210,7 +237,7 @@ FACES = {  # right, up as seen from outside: (axis, sign) each
 }
 
 
-def rounded_box(
+def make_rounded_box(
     size: tuple[float, float, float],
     radius: float,
     *,
@@ -219,13 +246,15 @@ def rounded_box(
     regions: dict[str, str] | None = None,
     detail: float = 1.0,
 ) -> list[Patch]:
-    """A box with rounded edges, one patch a face: front (-y), back, right (+x), left, top, bottom.
+    """Return the patches of a box with rounded edges, one per face: front (-y), back, right (+x), left, top, bottom.
 
     Args:
-        size: outer size, m. radius: of all edges, m; 0 keeps them sharp. steps: segments of half an edge's rounding.
-        center: of the box, m.
-        regions: texture region of each face, by default the face's own name.
-        detail: see ``Patch``.
+        size: outer size (x, y, z), m.
+        radius: radius of all edges, m; 0: sharp edges.
+        steps: number of segments of half of a rounded edge.
+        center: centre of the box, m.
+        regions: name of a face -> name of its texture region; default: the name of the face.
+        detail: factor of the number of pixels per metre.
     """
     half = np.asarray(size) / 2
     angles = np.linspace(0, np.pi / 4, steps + 1) if radius > 0 else np.zeros(1)

@@ -1,7 +1,7 @@
-"""Drawing label-like textures: an atlas with one canvas per region, text that fits its box, noise without seams.
+"""Draw textures of packages: one canvas per region of the texture, text that fits in a box, noise without seams.
 
-Canvas coordinates are fractions of the region: x to the right, y downwards. Everything is drawn larger than the region
-and reduced once, in the region's true proportions, so circles and letters stay undistorted on the object.
+Canvas coordinates are fractions of the region: x to the right, y downwards. A canvas has the proportions of the region
+on the object, so circles and letters are not distorted. It is larger than the region and is reduced at the end.
 """
 
 from __future__ import annotations
@@ -22,14 +22,17 @@ Colour = tuple[Channel, Channel, Channel]
 Box = tuple[float, float, float, float]
 
 OVERSAMPLING = 2.0
-LINE_PITCH = 1.12  # of the letters' size
+LINE_PITCH = 1.12  # line spacing over size of the letters
 
 
 class Canvas:
-    """One region to draw on.
+    """Canvas for one region of a texture.
 
     Args:
-        size: of the region in metres. pixels: per metre. background: colour. rng: for noise and bar codes.
+        size: width and height of the region, m.
+        pixels: pixels per metre.
+        background: initial colour.
+        rng: random generator for noise and bar codes.
     """
 
     def __init__(self, size: tuple[float, float], pixels: float, background: Colour, rng: np.random.Generator) -> None:
@@ -39,7 +42,7 @@ class Canvas:
         self.rng = rng
 
     def pixels(self, box: Box) -> tuple[int, int, int, int]:
-        """A box of fractions in pixels."""
+        """Convert a box (left, top, right, bottom) from fractions to pixels."""
         left, top, right, bottom = box
         return (
             round(left * self.width),
@@ -49,35 +52,38 @@ class Canvas:
         )
 
     def rectangle(self, box: Box, colour: Colour, *, corner: float = 0.0) -> None:
-        """A filled rectangle; ``corner`` is its corners' radius as a fraction of its shorter side."""
+        """Draw a filled rectangle; ``corner`` is the radius of its corners as a fraction of the shorter side."""
         left, top, right, bottom = self.pixels(box)
         radius = corner * min(right - left, bottom - top)
         self.draw.rounded_rectangle((left, top, right - 1, bottom - 1), radius, fill=colour)
 
     def disc(self, x: float, y: float, radius: float, colour: Colour, *, stretch: float = 1.0) -> None:
-        """A filled circle, radius as a fraction of the height; ``stretch`` makes it wider."""
+        """Draw a filled circle; ``radius`` is a fraction of the height, and ``stretch`` a factor of the width."""
         r = radius * self.height
         x, y = x * self.width, y * self.height
         self.draw.ellipse((x - r * stretch, y - r, x + r * stretch, y + r), fill=colour)
 
     def polygon(self, points: list[tuple[float, float]], colour: Colour) -> None:
-        """A filled polygon of (x, y) fractions."""
+        """Draw a filled polygon with corners (x, y) in fractions."""
         self.draw.polygon([(x * self.width, y * self.height) for x, y in points], fill=colour)
 
     def wave(self, y: float, amplitude: float, periods: float, colour: Colour, *, bottom: float = 1.0) -> None:
-        """Fill from a sine line at y down to ``bottom``; whole ``periods`` close around a cylinder."""
+        """Fill the area between a sine wave at ``y`` and ``bottom``.
+
+        If ``periods`` is a whole number, the wave continues at the seam of a cylinder.
+        """
         x = np.linspace(0, 1, 129)
         line = y + amplitude * np.sin(2 * np.pi * periods * x)
         self.polygon([*zip(x.tolist(), line.tolist(), strict=True), (1, bottom), (0, bottom)], colour)
 
     def gradient(self, top: Colour, bottom: Colour) -> None:
-        """Fill everything from one colour to another downwards."""
+        """Fill the canvas with a gradient from the colour ``top`` to the colour ``bottom``."""
         t = np.linspace(0, 1, self.height)[:, None, None]
         rows = np.asarray(top) * (1 - t) + np.asarray(bottom) * t
         self.paste(np.broadcast_to(rows, (self.height, self.width, 3)))
 
     def paste(self, pixels: np.ndarray) -> None:
-        """Replace everything by (height, width, 3) colours in 0..255."""
+        """Replace the content of the canvas by colours (height, width, 3) in 0..255."""
         self.image.paste(Image.fromarray(np.clip(pixels, 0, 255).astype(np.uint8)))
 
     def text(
@@ -92,17 +98,17 @@ class Canvas:
         like: tuple[str, ...] = (),
         left_aligned: bool = False,
     ) -> None:
-        """Text as large as its box allows, centred in it.
+        """Draw a text in the centre of a box, as large as the box allows.
 
         Args:
-            words: may hold line breaks.
-            box: where, in fractions.
-            colour: of the letters.
-            bold: stroke width as a fraction of the letters' size.
-            turn: degrees counterclockwise, a multiple of 90.
-            outline: colour around the letters.
-            like: further texts that have to fit a box of this size, so that all get letters of one size.
-            left_aligned: start at the box's left.
+            words: the text, with or without line breaks.
+            box: left, top, right and bottom of the box, fractions.
+            colour: colour of the letters.
+            bold: width of an additional stroke around the letters, as a fraction of their size.
+            turn: rotation in degrees counterclockwise, a multiple of 90.
+            outline: colour of an outline around the letters; None: no outline.
+            like: other texts for boxes of this size. The letters are so small that these texts also fit.
+            left_aligned: whether lines start at the left side of the box.
         """
         left, top, right, bottom = self.pixels(box)
         wide, high = (bottom - top, right - left) if turn % 180 else (right - left, bottom - top)
@@ -125,7 +131,7 @@ class Canvas:
             self.image.paste(ink, (left, top), mask.rotate(turn, expand=True))
 
     def barcode(self, box: Box) -> None:
-        """Black bars on white."""
+        """Draw a bar code: black bars on white."""
         self.rectangle(box, (250, 250, 250))
         left, top, right, bottom = self.pixels(box)
         margin = max(1, (right - left) // 12)
@@ -136,7 +142,7 @@ class Canvas:
             x += bar + gap
 
     def facts(self, box: Box, title: str, rows: list[tuple[str, str]], *, ink: Colour = (25, 25, 25)) -> None:
-        """A table as on the back of a package."""
+        """Draw a table with a title and rows (name, amount), as on the back of a package."""
         self.rectangle(box, (248, 248, 244))
         left, top, right, bottom = box
         step = (bottom - top) / (len(rows) + 1.6)
@@ -153,12 +159,12 @@ class Canvas:
 
 
 class Painter:
-    """The texture of a shape, region by region.
+    """Texture of a shape that is painted region by region.
 
     Args:
-        shape: whose regions are painted.
-        rng: source of all variation.
-        background: colour where nothing is painted.
+        shape: shape with regions.
+        rng: random generator for all variations.
+        background: initial colour of the texture.
     """
 
     def __init__(self, shape: Shape, rng: np.random.Generator, background: Colour) -> None:
@@ -170,7 +176,7 @@ class Painter:
 
     @contextmanager
     def region(self, name: str, background: Colour | None = None) -> Iterator[Canvas]:
-        """A canvas for one region; it goes into the texture when the block ends."""
+        """Return a canvas for one region as a context manager; the canvas is copied to the texture at the end."""
         region = self.shape.regions[name]
         wide, high = _box_size(region)
         pixels = OVERSAMPLING * max(wide / region.size[0], high / region.size[1])
@@ -179,29 +185,29 @@ class Painter:
         self.put(name, np.asarray(canvas.image.resize((wide, high), Image.Resampling.LANCZOS)))
 
     def fill(self, name: str, colour: Colour) -> None:
-        """One colour for a region, if the shape has it."""
+        """Fill a region with one colour; do nothing if the shape has no such region."""
         if name in self.shape.regions:
             wide, high = _box_size(self.shape.regions[name])
             self.put(name, np.full((high, wide, 3), colour, dtype=np.uint8))
 
     def put(self, name: str, pixels: np.ndarray) -> None:
-        """(height, width, 3) pixels into a region, their border repeated into its padding."""
+        """Copy pixels (height, width, 3) to a region, and continue their border in the padding around the region."""
         left, top, right, bottom = self.shape.regions[name].box
         padded = np.pad(pixels, ((PADDING, PADDING), (PADDING, PADDING), (0, 0)), mode="edge")
         self.pixels[top - PADDING : bottom + PADDING, left - PADDING : right + PADDING] = padded
 
     def grid(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Angle (w,) in radians and level (h,) from 1 at the top to 0, of a region's pixels."""
+        """Return the angle (w,) in radians and the level (h,), 1 at the top to 0, of the pixels of a region."""
         wide, high = _box_size(self.shape.regions[name])
         return np.linspace(0, 2 * np.pi, wide), np.linspace(1, 0, high)
 
     def image(self, quality: int = 88) -> Image.Image:
-        """The texture as a JPEG image."""
+        """Return the texture as an image that is stored as JPEG with a quality in percent."""
         return as_jpeg(Image.fromarray(self.pixels), quality)
 
 
 def as_jpeg(image: Image.Image, quality: int = 88) -> Image.Image:
-    """The same image, loaded back from JPEG, so that exporters embed it as such."""
+    """Encode an image as JPEG and return the decoded image, so that exporters embed a JPEG file."""
     data = io.BytesIO()
     image.convert("RGB").save(data, "JPEG", quality=quality, subsampling=0, optimize=True)
     data.seek(0)
@@ -213,11 +219,14 @@ def as_jpeg(image: Image.Image, quality: int = 88) -> Image.Image:
 def noise(
     points: np.ndarray, rng: np.random.Generator, *, frequency: float, octaves: int = 3, waves: int = 12
 ) -> np.ndarray:
-    """Smooth noise in about [-1, 1] at (..., 3) points: sums of random waves, so it has no seams.
+    """Return smooth noise (...) in about [-1, 1] at points: a sum of random waves in space, which has no seams.
 
     Args:
-        points: where. rng: which noise. frequency: of the first octave, in waves per unit of length.
-        octaves: each twice as fine and half as strong. waves: per octave.
+        points: (..., 3) points.
+        rng: random generator.
+        frequency: waves per unit of length in the first octave.
+        octaves: number of octaves; each octave has twice the frequency and half the amplitude of the previous octave.
+        waves: number of waves per octave.
     """
     result = np.zeros(points.shape[:-1])
     for octave in range(octaves):
@@ -229,7 +238,7 @@ def noise(
 
 
 def blend(amount: np.ndarray | float, first: np.ndarray | Colour, second: np.ndarray | Colour) -> np.ndarray:
-    """Mix two colours (..., 3): 0 gives the first, 1 the second."""
+    """Mix two colours (..., 3); the amount (...) is 0 for the first colour and 1 for the second colour."""
     amount = np.clip(np.asarray(amount, dtype=float), 0, 1)[..., None]
     return np.asarray(first) * (1 - amount) + np.asarray(second) * amount
 
@@ -240,7 +249,10 @@ def _box_size(region: Region) -> tuple[int, int]:
 
 
 def _extents(words: str, spread: float) -> tuple[float, float, float, float]:
-    """Left, top, right, bottom of a text around its first baseline, letters of size 1, centred lines."""
+    """Return left, top, right and bottom of a text with letters of size 1 and centred lines.
+
+    The origin is on the first baseline. ``spread`` is added at all sides.
+    """
     font = ImageFont.load_default(100)
     lines = words.split("\n")
     boxes = [font.getbbox(line, anchor="ls") for line in lines]
@@ -249,8 +261,8 @@ def _extents(words: str, spread: float) -> tuple[float, float, float, float]:
     return -half - spread, top - spread, half + spread, bottom + spread
 
 
-def lettering(words: str, x: np.ndarray, y: np.ndarray, height: float) -> np.ndarray:
-    """Where (x, y) lie on a line of letters that is centred on 0 and ``height`` tall."""
+def compute_text_mask(words: str, x: np.ndarray, y: np.ndarray, height: float) -> np.ndarray:
+    """Return whether points (n,), (n,) are on the letters of a line of text, centred at 0 and ``height`` tall."""
     font = ImageFont.load_default(64)
     left, top, right, bottom = (round(v) for v in font.getbbox(words, stroke_width=2))
     image = Image.new("L", (right - left, bottom - top))

@@ -1,33 +1,33 @@
-"""Tools and things for desk and door; lengths in mm."""
+"""Make models of tools, a padlock and a computer mouse; lengths in mm."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from asset_tools.builtin.blends import (
-    both_sides,
     box,
     chain,
-    common,
     curve,
-    cut,
     cylinder,
     ellipsoid,
     hoop,
-    moved,
+    intersect,
+    mirror_y,
     plate,
-    turned,
+    revolve,
+    subtract,
+    transform,
 )
-from asset_tools.builtin.models import Model, Part, pair
-from asset_tools.builtin.textures import Colour, lettering
+from asset_tools.builtin.models import Model, Part, make_box_pair
+from asset_tools.builtin.textures import Colour, compute_text_mask
 
 BLACK: Colour = (30, 30, 32)
 STEEL: Colour = (176, 180, 186)
 SILVER: Colour = (206, 208, 212)
 
 
-def power_drill() -> Model:
-    """Cordless: an orange housing, a black chuck and grip; the battery is its base."""
+def make_power_drill() -> Model:
+    """Make a cordless power drill with an orange housing and a black chuck and grip; it stands on the battery."""
     orange: Colour = (236, 98, 22)
 
     def decorate(points, normals, colours, rng):
@@ -42,19 +42,19 @@ def power_drill() -> Model:
         label = side & (x > -40) & (x < 34) & (np.abs(z - 162) < 10)
         colours[label & (x > -38) & (x < 26)] = (40, 40, 44)
         flip = np.where(y > 0, -1, 1)  # letters run to the right as seen from outside
-        colours[label & lettering("18V DRILL", (x + 6) * flip, z - 162, 9)] = (250, 250, 248)
+        colours[label & compute_text_mask("18V DRILL", (x + 6) * flip, z - 162, 9)] = (250, 250, 248)
         grip = (z > 62) & (z < 122) & (x < -28)
         colours[grip & ((z + 0.4 * x) % 6 < 1.8)] = (64, 64, 68)
         colours[side & (np.abs(z - 27) < 1.0) & (x < 50)] = (84, 84, 88)
-        battery = side & lettering("LITHIUM", (x + 24) * flip, z - 14, 8)
+        battery = side & compute_text_mask("LITHIUM", (x + 24) * flip, z - 14, 8)
         colours[battery & (z < 26)] = orange
 
     return Model(
         parts=(
-            Part(turned("x", (0, 0, 159), [(-82, 20), (-78, 24), (-60, 25.5), (30, 25.5), (46, 23)], 3), orange),
-            Part(turned("x", (0, 0, 159), [(46, 22), (60, 19), (62, 17), (82, 17), (90, 11)], 1.5), BLACK),
-            Part(turned("x", (0, 0, 159), [(88, 6), (98, 3.0)], 0.5), STEEL),
-            Part(turned("x", (0, 0, 159), [(-88, 17), (-76, 23)], 2.5), BLACK),
+            Part(revolve("x", (0, 0, 159), [(-82, 20), (-78, 24), (-60, 25.5), (30, 25.5), (46, 23)], 3), orange),
+            Part(revolve("x", (0, 0, 159), [(46, 22), (60, 19), (62, 17), (82, 17), (90, 11)], 1.5), BLACK),
+            Part(revolve("x", (0, 0, 159), [(88, 6), (98, 3.0)], 0.5), STEEL),
+            Part(revolve("x", (0, 0, 159), [(-88, 17), (-76, 23)], 2.5), BLACK),
             Part(curve((-34, 0, 142, 19), (-40, 0, 118, 17), (-45, 0, 84, 16.5), (-46, 0, 44, 18)), BLACK, 8),
             Part(ellipsoid((-10, 0, 136), (20, 14, 14)), orange, 6),
             Part(box((-16, 0, 117), (16, 14, 24), 5, (0, -10, 0)), (196, 30, 24)),
@@ -80,8 +80,8 @@ def power_drill() -> Model:
     )
 
 
-def scissors() -> Model:
-    """Slightly open: two steel blades on a screw, red handles, one ring longer than the other."""
+def make_scissors() -> Model:
+    """Make slightly open scissors with two steel blades, a screw and red handles with rings of different length."""
     red: Colour = (206, 36, 34)
     opening = 5.5
     blade = [(-32, -4.0), (-20, -7.5), (10, -8), (60, -4.2), (93, 1.0), (93, 1.8), (60, 2.2), (10, 4), (-32, 6)]
@@ -91,7 +91,8 @@ def scissors() -> Model:
         knife = plate("z", level, 3.2, [(x, flip * y) for x, y in blade], edge=0.6)
         arm = curve((-12, 0, 0, 4.2), (-26, flip * 1.5, 0, 5.5), (ring[0] + radii[0], flip * (ring[1] - 6), 0, 5.5))
         return tuple(
-            moved(field, (0, 0, 0), turn) for field in (knife, hoop((ring[0], flip * ring[1]), radii, 4.6, 7.8), arm)
+            transform(field, (0, 0, 0), turn)
+            for field in (knife, hoop((ring[0], flip * ring[1]), radii, 4.6, 7.8), arm)
         )
 
     first = half(1.5, 1.0, (-68, 18), (25, 15))
@@ -117,15 +118,15 @@ def scissors() -> Model:
             Part(cylinder("z", (0, 0, 0), 9.5, 5, 1.2), SILVER),
         ),
         hulls=(
-            *pair((-112, 0, -12), (-86, 50, 12)),
-            *pair((-86, 25, -12), (-68, 56, 12)),
-            *pair((-86, 0, -12), (-68, 25, 12)),
-            *pair((-68, 25, -12), (-50, 56, 12)),
-            *pair((-68, 0, -12), (-50, 25, 12)),
-            *pair((-50, 0, -12), (-38, 56, 12)),
+            *make_box_pair((-112, 0, -12), (-86, 50, 12)),
+            *make_box_pair((-86, 25, -12), (-68, 56, 12)),
+            *make_box_pair((-86, 0, -12), (-68, 25, 12)),
+            *make_box_pair((-68, 25, -12), (-50, 56, 12)),
+            *make_box_pair((-68, 0, -12), (-50, 25, 12)),
+            *make_box_pair((-50, 0, -12), (-38, 56, 12)),
             ((-38, -56, -12), (-10, 56, 12)),
             ((-10, -20, -12), (30, 20, 12)),
-            *pair((30, 0, -12), (102, 20, 12)),
+            *make_box_pair((30, 0, -12), (102, 20, 12)),
         ),
         low=(-112, -56, -12),
         high=(102, 56, 12),
@@ -136,18 +137,18 @@ def scissors() -> Model:
     )
 
 
-def screwdriver() -> Model:
-    """Flat blade, a fluted yellow handle with black bands."""
+def make_screwdriver() -> Model:
+    """Make a screwdriver with a flat blade and a grooved yellow handle with black bands."""
     yellow: Colour = (246, 196, 24)
-    handle = turned(
+    handle = revolve(
         "x", (0, 0, 0), [(-106, 8), (-102, 13), (-84, 15), (-40, 13.2), (-24, 10.4), (-12, 12.4), (-4, 11), (0, 6)], 0.8
     )
     flutes = [
         cylinder("x", (-62, 19.2 * float(np.cos(a)), 19.2 * float(np.sin(a))), 74, 5.6, 5.5)
         for a in np.arange(6) * np.pi / 3
     ]
-    blade = common(
-        turned("x", (0, 0, 0), [(0, 3.3), (86, 3.3), (92, 5.2), (108, 4.6)]),
+    blade = intersect(
+        revolve("x", (0, 0, 0), [(0, 3.3), (86, 3.3), (92, 5.2), (108, 4.6)]),
         plate("y", 0, 14, [(0, 4), (80, 4), (108, 0.9), (108, -0.9), (80, -4), (0, -4)]),
     )
 
@@ -162,7 +163,7 @@ def screwdriver() -> Model:
         colours[(x > 97)] *= 0.72
 
     return Model(
-        parts=(Part(cut(handle, *flutes), yellow), Part(blade, SILVER)),
+        parts=(Part(subtract(handle, *flutes), yellow), Part(blade, SILVER)),
         hulls=(
             ((-114, -22, -22), (-30, 22, 22)),
             ((-30, -22, -22), (2, 22, 22)),
@@ -179,8 +180,8 @@ def screwdriver() -> Model:
     )
 
 
-def padlock() -> Model:
-    """A brass body with a steel shackle."""
+def make_padlock() -> Model:
+    """Make a padlock with a brass body and a steel shackle."""
     brass: Colour = (206, 160, 68)
 
     def decorate(points, normals, colours, rng):
@@ -191,8 +192,8 @@ def padlock() -> Model:
         frame = np.maximum(np.abs(x) / 19.5, np.abs(z - 23) / 18.5)
         colours[front & (np.abs(frame - 1) < 0.035)] = (126, 92, 30)
         flip = np.where(y > 0, -1, 1)
-        colours[front & lettering("40", x * flip, z - 28, 12)] = (110, 78, 24)
-        colours[front & lettering("HARDENED", x * flip, z - 14, 4)] = (110, 78, 24)
+        colours[front & compute_text_mask("40", x * flip, z - 28, 12)] = (110, 78, 24)
+        colours[front & compute_text_mask("HARDENED", x * flip, z - 14, 4)] = (110, 78, 24)
         below = body & (normals[:, 2] < -0.8)
         slot = (np.hypot(x, y) < 5) & below
         colours[slot] = (150, 112, 44)
@@ -203,7 +204,7 @@ def padlock() -> Model:
     return Model(
         parts=(
             Part(box((0, 0, 23), (47, 27, 46), 3.5), brass),
-            Part(both_sides_x(chain((14, 0, 36, 4.2), (14, 0, 57, 4.2))), STEEL),
+            Part(mirror_x(chain((14, 0, 36, 4.2), (14, 0, 57, 4.2))), STEEL),
             Part(_arch(14, 57, 4.2), STEEL),
         ),
         hulls=(
@@ -225,14 +226,20 @@ def padlock() -> Model:
     )
 
 
-def both_sides_x(field):
-    """Return the part at x > 0 and its mirror image."""
-    turned_field = both_sides(lambda points: field(points[:, [1, 0, 2]]))
+def mirror_x(field):
+    """Return the field of the part at x > 0 and its mirror image."""
+    turned_field = mirror_y(lambda points: field(points[:, [1, 0, 2]]))
     return lambda points: turned_field(points[:, [1, 0, 2]])
 
 
 def _arch(radius: float, z: float, tube: float):
-    """The upper half of a ring in the plane y = 0."""
+    """Return the field of the upper half of a ring in the plane y = 0.
+
+    Args:
+        radius: radius of the ring, mm.
+        z: height of the ring's centre, mm.
+        tube: radius of the section, mm.
+    """
 
     def field(points: np.ndarray) -> np.ndarray:
         ring = np.hypot(np.hypot(points[:, 0], points[:, 2] - z) - radius, points[:, 1]) - tube
@@ -241,15 +248,15 @@ def _arch(radius: float, z: float, tube: float):
     return field
 
 
-def computer_mouse() -> Model:
-    """White, with two buttons and a wheel; heading towards +x."""
+def make_computer_mouse() -> Model:
+    """Make a white computer mouse with two buttons and a wheel; the front is towards +x."""
     white: Colour = (240, 240, 238)
     angle = np.linspace(0, 2 * np.pi, 36, endpoint=False)
     # Between an ellipse and a rectangle, narrower in front.
     across = 30 * np.sign(np.sin(angle)) * np.abs(np.sin(angle)) ** 0.8 * (1 - 0.05 * np.cos(angle))
     along = 52.5 * np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** 0.8
     outline = [(float(u), float(v)) for u, v in np.column_stack([along, across])]
-    shell = common(plate("z", 15, 44, outline, edge=6), ellipsoid((-8, 0, -6), (66, 42, 43)), reach=8)
+    shell = intersect(plate("z", 15, 44, outline, edge=6), ellipsoid((-8, 0, -6), (66, 42, 43)), reach=8)
 
     def decorate(points, normals, colours, rng):
         x, y, z = points.T

@@ -1,4 +1,4 @@
-"""A puzzle cube and a ball."""
+"""Make and paint a puzzle cube and a ball."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import trimesh
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from asset_tools.builtin.mesh import Patch, Shape, Size, fitted
-from asset_tools.builtin.models import paint_in_space, unwrapped
+from asset_tools.builtin.mesh import Patch, Shape, Size, build_fitted_shape
+from asset_tools.builtin.models import make_uv_mapped_shape, paint_in_space
 from asset_tools.builtin.surfaces import FACES
-from asset_tools.builtin.textures import Colour, Painter, lettering
+from asset_tools.builtin.textures import Colour, Painter, compute_text_mask
 from asset_tools.decompose import reduce_vertices
 
 STICKERS: dict[str, Colour] = {
@@ -25,8 +25,8 @@ TURNS = ((0, 1, 1), (1, -1, 1), (2, 1, 3), (0, -1, 3), (1, 1, 1), (2, -1, 1), (0
 CUBIE, BEVEL, SINK = 0.0190, 0.0014, 0.0011  # m
 
 
-def rubiks_cube(size: Size) -> Shape:
-    """A cube of 3 x 3 x 3 cubies with bevelled edges; one region a face."""
+def make_rubiks_cube(size: Size) -> Shape:
+    """Make a puzzle cube of 3 x 3 x 3 small cubes with bevelled edges; one region per face, as in `FACES`."""
     half, groove = size[0] / 2, CUBIE / 2
     inner = half - BEVEL
     positive = [groove - BEVEL, groove, groove + BEVEL, inner, half]
@@ -40,7 +40,7 @@ def rubiks_cube(size: Size) -> Shape:
         u, v = np.meshgrid(line, line)
         u_groove, v_groove = np.meshgrid(is_groove, is_groove)
         u_edge, v_edge = np.meshgrid(is_edge, is_edge)
-        # A point sinks below each of its faces: by grooves across that face, and by the bevel along its edges.
+        # a point is lower in the grooves of its face, and at bevelled edges
         points = np.zeros((*u.shape, 3))
         on_edge = u_edge.astype(int) + v_edge
         sink = np.where(u_groove | v_groove, SINK, 0.0)
@@ -52,13 +52,13 @@ def rubiks_cube(size: Size) -> Shape:
         uv = np.stack([u, v], axis=-1) / (2 * half) + 0.5
         patches.append(Patch(name, points, uv, (2 * half, 2 * half)))
     body = np.concatenate([patch.points.reshape(-1, 3) for patch in patches])
-    return fitted([patches], size, pieces=[reduce_vertices(body)])
+    return build_fitted_shape([patches], size, pieces=[reduce_vertices(body)])
 
 
 def paint_rubiks_cube(shape: Shape, rng: np.random.Generator) -> Image.Image:
-    """Coloured stickers with round corners on black, as some turns leave them."""
+    """Paint the stickers of a scramble_stickers puzzle cube on black."""
     painter = Painter(shape, rng, (16, 16, 18))
-    for name, colours in scrambled().items():
+    for name, colours in scramble_stickers().items():
         with painter.region(name) as canvas:
             for i, colour in enumerate(colours):
                 left, top = (i % 3) / 3, (i // 3) / 3
@@ -66,11 +66,11 @@ def paint_rubiks_cube(shape: Shape, rng: np.random.Generator) -> Image.Image:
     return painter.image()
 
 
-def scrambled(turns: tuple[tuple[int, int, int], ...] = TURNS) -> dict[str, list[Colour]]:
-    """The nine stickers of each face, rows from the top as seen from outside.
+def scramble_stickers(turns: tuple[tuple[int, int, int], ...] = TURNS) -> dict[str, list[Colour]]:
+    """Return name of a face -> colours of its nine stickers, row by row from the top, seen from outside.
 
     Args:
-        turns: of a solved cube: (axis, layer -1 to 1, quarter turns).
+        turns: turns that scramble a solved cube: axis (0 to 2), layer (-1 to 1), number of quarter turns.
     """
     slots = {}  # (place, normal) of a sticker -> (face, number)
     for name, ((right, right_sign), (up, up_sign)) in FACES.items():
@@ -90,24 +90,26 @@ def scrambled(turns: tuple[tuple[int, int, int], ...] = TURNS) -> dict[str, list
     return faces
 
 
-def ball(size: Size, *, texture_size: int = 256) -> Shape:
-    """Make a sphere."""
+def make_ball(size: Size, *, texture_size: int = 256) -> Shape:
+    """Make a ball without regions; its texture is painted with `paint_in_space`."""
     sphere = trimesh.creation.icosphere(subdivisions=3)
     points = sphere.vertices * np.asarray(size) / sphere.extents
     middle = (points.max(0) + points.min(0)) / 2
-    return unwrapped(points - middle, np.asarray(sphere.faces), texture_size, (reduce_vertices(points - middle),))
+    return make_uv_mapped_shape(
+        points - middle, np.asarray(sphere.faces), texture_size, (reduce_vertices(points - middle),)
+    )
 
 
 def paint_racquetball(shape: Shape, rng: np.random.Generator) -> Image.Image:
-    """Blue rubber with a moulded seam and a white print."""
+    """Paint a racquetball: blue rubber with the seam of the mould and a white print."""
 
     def colours(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         x, y, z = (1000 * points).T
         result = np.tile(np.array([24, 78, 190], float), (len(points), 1))
-        # The horizontal seam of the two moulded halves.
+        # the horizontal seam between the two halves
         result *= (1 - 0.45 * np.exp(-((z / 0.45) ** 2)) + 0.22 * np.exp(-(((np.abs(z) - 1.2) / 0.5) ** 2)))[:, None]
         front = y < 0
-        result[front & lettering("PRO", x, z - 11.5, 7.0)] = (240, 244, 250)
+        result[front & compute_text_mask("PRO", x, z - 11.5, 7.0)] = (240, 244, 250)
         result[front & (np.abs(z - 5.6) < 0.6) & (np.abs(x) < 9)] = (240, 244, 250)
         return result
 

@@ -29,7 +29,8 @@ class _ImportOptions:
     skip_errors: bool = False
     """Skip models with errors. Default: stop at the first error."""
     overwrite: bool = False
-    """Replace a pack of this name that was imported from other files or settings; unchanged assets are reused."""
+    """Replace a pack of this name that was imported from other files or with other settings. Unchanged assets are
+    copied from the cache."""
 
     def __post_init__(self) -> None:
         check_number("--jobs", self.jobs, 1)
@@ -104,16 +105,17 @@ class ImportPartNet(_ImportOptions):
     models: Folders
     """Folders of models, each with a mobility.urdf."""
     template: bool = False
-    """Print a template of the annotation of the first model, with its joints, and import nothing."""
+    """Print an annotation file for the first model, to be completed by hand, and import nothing."""
     pack: str = "partnet"
     """Name of the new pack."""
     annotations: Maybe[Path] = None
-    """Folder with ID.yaml for each model without a bundled annotation."""
+    """Folder with an annotation file ID.yaml for each model; ID is the name of the model's folder. Default: bundled
+    annotations of the six models of RoboCAS-v0."""
 
 
 @dataclass(kw_only=True)
 class Build:
-    """Build the builtin pack from its formulas; only in a clone of the repository.
+    """Build the builtin pack from its Python code (asset_tools/builtin); needs a clone of the repository.
 
     Example: robocas assets build --ids plate --out packs/plate
     """
@@ -183,24 +185,24 @@ def build(command: Build) -> int:
 
     try:
         require_mesh_tools()
-        from asset_tools.builtin.build import DESCRIPTION, FORMULAS_HASH, NAME, builtin_jobs, formulas_hash
+        from asset_tools.builtin.build import DESCRIPTION, FORMULAS_HASH, NAME, compute_formulas_hash, make_builtin_jobs
     except ModuleNotFoundError as error:
         if error.name != "asset_tools.builtin":
             raise
         raise AssetError(
-            "the formulas of the builtin pack are not installed",
-            expected="asset_tools/builtin of the repository",
+            "the code that builds the builtin pack is not installed",
+            expected="the folder asset_tools/builtin of the repository",
             found="an installed wheel",
-            fix="The builtin pack is complete; to change its formulas, clone the repository.",
+            fix="Use the bundled pack, or clone the repository to change it.",
         ) from error
     if command.ids and command.out is None:
-        fix = "Pass --out FOLDER to build a part of the pack."
-        raise AssetError("the builtin pack can only be built as a whole", where="--ids", found="no --out", fix=fix)
+        what, fix = "--ids needs --out, since some assets cannot replace the whole builtin pack", "Pass --out FOLDER."
+        raise AssetError(what, expected="--out FOLDER", found="no --out", fix=fix, usage=True)
     out = command.out or builtin_packs_dir() / NAME
     options = _ImportOptions(jobs=command.jobs, overwrite=True)
-    status = _write(builtin_jobs(command.ids), options, out, DESCRIPTION, record=False)
+    status = _write(make_builtin_jobs(command.ids), options, out, DESCRIPTION, record=False)
     if status == 0 and command.out is None:
-        (out / FORMULAS_HASH).write_text(f"{formulas_hash()}\n")
+        (out / FORMULAS_HASH).write_text(f"{compute_formulas_hash()}\n")
     return status
 
 
@@ -221,7 +223,8 @@ def _target(name: str) -> Path:
 
     if (builtin_packs_dir() / name).exists() or Path(name).name != name:
         what, fix = "invalid name for an imported pack", "Choose another name."
-        raise AssetError(what, where="--pack", expected="a name that no bundled pack has", found=repr(name), fix=fix)
+        expected = "a name without slashes that no bundled pack has"
+        raise AssetError(what, where="--pack", expected=expected, found=repr(name), fix=fix, usage=True)
     out = data_dir() / "packs" / name
     check_pack_folder(out)
     return out
@@ -239,15 +242,15 @@ def _import_pack(jobs: list[Job], command: _ImportOptions, out: Path, what: str)
         try:
             load_pack(out)
         except AssetError as error:
-            print_line(f"the pack is damaged and is imported again: {error}")
+            print_line(f"the pack {out.name} is damaged and is imported again: {error}")
         else:
             print_line(f"{out} is up to date")
             if not (out / CONTACT_SHEET).exists():
                 _draw_sheet(out)
             return 0
     elif out.exists() and not command.overwrite:
-        what = "this pack was imported from other files, settings or versions"
-        fix = "Pass --overwrite to replace it, or choose another name with --pack."
+        what = "this pack exists, and was imported from other files or with other settings or versions"
+        fix = "Pass --overwrite to replace the pack, or choose another name with --pack."
         raise OutputExistsError(what, where=out, fix=fix)
     return _write(jobs, command, out, format_count(len(jobs), what))
 

@@ -39,7 +39,7 @@ class Info:
 class Verify:
     """Check the files and collision hulls of a pack; with --physics, check each asset in simulation.
 
-    Files are compared with the hashes of the manifest. Hulls are cooked for PhysX on CPU and GPU.
+    Files are compared with the hashes of the manifest. PhysX must be able to build each hull on CPU and GPU.
 
     Example: robocas assets verify builtin
     """

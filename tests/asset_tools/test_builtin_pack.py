@@ -8,8 +8,8 @@ import trimesh
 from models import ball_dropped_into
 from scipy.spatial import KDTree
 
-from asset_tools.builtin.build import build_asset, builtin_jobs
-from asset_tools.builtin.catalogue import products
+from asset_tools.builtin.build import build_asset, make_builtin_jobs
+from asset_tools.builtin.catalogue import load_builtin_products
 from asset_tools.builtin.furniture import MAKERS
 from asset_tools.graspnet.catalogue import ENTRIES
 from asset_tools.quality.measure import check_objects
@@ -18,7 +18,7 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import AssetError
 
 DOWN = np.array([0.0, 0.0, -1.0])
-each = pytest.mark.parametrize("product", products().values(), ids=lambda product: product.id)
+each = pytest.mark.parametrize("product", load_builtin_products().values(), ids=lambda product: product.id)
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def pack():
 
 
 def test_the_builtin_pack_is_complete(pack):
-    assert set(pack.objects) == set(products())
+    assert set(pack.objects) == set(load_builtin_products())
     assert set(pack.furniture) == set(MAKERS)
     assert sum(path.stat().st_size for path in pack.root.rglob("*")) < 25e6
 
@@ -96,7 +96,7 @@ def test_basket_is_hollow(pack, x, y):
 
 def test_unknown_ids_are_named():
     with pytest.raises(AssetError, match="no such builtin asset.*found spam"):
-        builtin_jobs(["mug", "spam"])
+        make_builtin_jobs(["mug", "spam"])
 
 
 @pytest.mark.slow

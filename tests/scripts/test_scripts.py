@@ -103,12 +103,12 @@ def test_study_trains_on_the_dataset_or_on_a_fraction(tmp_path, what):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["study_small.sh", "nowhere"], "nowhere: no dataset; make it: bash scripts/reproduce_small.sh pick nowhere"),
+        (["study_small.sh", "nowhere"], "nowhere: no dataset. Run: bash scripts/reproduce_small.sh pick nowhere"),
         (["reproduce_small.sh"], "invalid task ''"),
         (["reproduce_small.sh", "open_pick"], "invalid task 'open_pick'"),
         (
             ["dagger_small.sh", "pick", "nowhere"],
-            "nowhere: no finished run; make it: bash scripts/reproduce_small.sh pick",
+            "nowhere: no finished run (missing eval/report.md). Run: bash scripts/reproduce_small.sh pick",
         ),
     ],
 )

@@ -1,27 +1,27 @@
-"""Builtin furniture: every piece has a maker that gives the source its files are built from."""
+"""Make the furniture of the builtin pack: one function per piece returns the source from which it is built."""
 
 from collections.abc import Callable
 
-from asset_tools.builtin.furniture.cabinets import cabinet, container
-from asset_tools.builtin.furniture.refrigerator import refrigerator
-from asset_tools.builtin.furniture.room import room
-from asset_tools.builtin.furniture.shelf import shelf
-from asset_tools.builtin.furniture.tables import dining_table, side_table, table
-from asset_tools.builtin.furniture.tableware import basket, plate
+from asset_tools.builtin.furniture.cabinets import make_cabinet, make_container
+from asset_tools.builtin.furniture.refrigerator import make_refrigerator
+from asset_tools.builtin.furniture.room import make_room
+from asset_tools.builtin.furniture.shelf import make_shelf
+from asset_tools.builtin.furniture.tables import make_dining_table, make_side_table, make_table
+from asset_tools.builtin.furniture.tableware import make_basket, make_plate
 from asset_tools.sources import FurnitureSource
 
 MAKERS: dict[str, Callable[[], FurnitureSource]] = {
-    maker.__name__: maker
+    maker.__name__.removeprefix("make_"): maker
     for maker in (
-        table,
-        dining_table,
-        side_table,
-        shelf,
-        cabinet,
-        container,
-        refrigerator,
-        basket,
-        plate,
-        room,
+        make_table,
+        make_dining_table,
+        make_side_table,
+        make_shelf,
+        make_cabinet,
+        make_container,
+        make_refrigerator,
+        make_basket,
+        make_plate,
+        make_room,
     )
 }

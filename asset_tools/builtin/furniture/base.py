@@ -1,6 +1,7 @@
-"""Rigid bodies joined from convex solids: boards, bars, discs; each cut from a sample of its material.
+"""Make rigid bodies of furniture from convex solids: boards, bars and discs.
 
-Frame of all furniture: metres, x out of its front, y to the right of whoever faces it, z up, the floor at 0.
+Frame of all furniture: metres, x points out of the front, y to the right of a person who faces the furniture, z up; the
+floor is at z = 0.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from asset_tools.builtin.materials import Grid, Material
-from asset_tools.builtin.mesh import Patch, creased_shape, pack_regions
+from asset_tools.builtin.mesh import Patch, make_creased_shape, pack_regions
 from asset_tools.builtin.textures import Painter
 from robocas_ms3.assets.manifest import Handle, Joint, Surface
 
@@ -24,17 +25,23 @@ Vec3 = tuple[float, float, float]
 Corner = Sequence[float] | Array
 
 BAR = 0.012  # m, thickness of handles
-BAR_GAP = 0.042  # m of free room behind them
+BAR_GAP = 0.042  # m, free space behind a handle
 BEVEL = 0.0015
 
-# PhysX takes a joint's friction as a share of the load it carries. With these, 3 to 5 N at the handle start a part
-# moving, about 10 N move it at 0.2 m/s, and it stays where it is left.
+# In PhysX, the friction of a joint is a fraction of its load. With these values, a part starts to move at 3 to 5 N at
+# the handle, moves at 0.2 m/s at about 10 N, and stays where it is released.
 SLIDE_FRICTION, SLIDE_DAMPING = 0.05, 30.0  # -, N s/m
 HINGE_FRICTION, HINGE_DAMPING = 0.02, 6.0  # -, N m s/rad
 
 
-def block(low: Corner, high: Corner, bevel: float = 0.0) -> Array:
-    """Corners (8, 3) of a box, or (24, 3) of one with bevelled edges."""
+def make_box_corners(low: Corner, high: Corner, bevel: float = 0.0) -> Array:
+    """Return the corners (8, 3) of a box, or the corners (24, 3) of a box with bevelled edges.
+
+    Args:
+        low: (3,) one corner, m.
+        high: (3,) the opposite corner, m.
+        bevel: width of the bevel, m; 0: sharp edges.
+    """
     lower, upper = np.minimum(low, high), np.maximum(low, high)
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     center, half = (lower + upper) / 2, (upper - lower) / 2
@@ -43,8 +50,16 @@ def block(low: Corner, high: Corner, bevel: float = 0.0) -> Array:
     return np.concatenate([center + signs * (half - bevel * (1 - axis)) for axis in np.eye(3)])
 
 
-def disc(center: Vec3, radius: float, thickness: float, *, sides: int = 28, bevel: float = 0.0) -> Array:
-    """Return the corners of a vertical prism that approximates a cylinder; the centre is that of its bottom."""
+def make_disc_corners(center: Vec3, radius: float, thickness: float, *, sides: int = 28, bevel: float = 0.0) -> Array:
+    """Return the corners (k, 3) of a horizontal disc, approximated by a prism.
+
+    Args:
+        center: centre of the bottom, m.
+        radius: radius of the disc, m.
+        thickness: height of the disc, m.
+        sides: number of sides of the prism.
+        bevel: width of the bevel of the rims, m; 0: sharp rims.
+    """
     angles = (np.arange(sides) + 0.5) * 2 * np.pi / sides
     ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     levels = [(0.0, radius), (thickness, radius)]
@@ -54,13 +69,13 @@ def disc(center: Vec3, radius: float, thickness: float, *, sides: int = 28, beve
 
 
 class Body:
-    """What one rigid body is joined from.
+    """A rigid body of furniture to which solids are added.
 
     Args:
-        materials: by name.
-        seed: places of the sample at which boards are cut.
-        texture: width of its texture, pixels.
-        roughness: of its surface.
+        materials: name -> material.
+        seed: seed of the places at which the textures of boards are cut from the samples of the materials.
+        texture: width and height of the texture in pixels.
+        roughness: roughness of the surface, 0 to 1.
     """
 
     def __init__(
@@ -74,14 +89,14 @@ class Body:
     def solid(
         self, points: Array, material: str, *, grain: int | None = None, show: bool = True, collide: bool = True
     ) -> None:
-        """Add the convex hull of points (k, 3).
+        """Add a solid that is the convex hull of points.
 
         Args:
-            points: m.
-            material: its name.
-            grain: axis (0, 1, 2) along which it is cut; none: its longest.
-            show: in the visual mesh.
-            collide: as a collision piece.
+            points: (k, 3) points, m.
+            material: name of the material.
+            grain: axis 0, 1 or 2 of the grain of the material; None: the longest side of the solid.
+            show: whether to add the solid to the visual mesh.
+            collide: whether to add the solid to the collision pieces.
         """
         if show:
             self._solids.append((points, material, grain))
@@ -98,15 +113,32 @@ class Body:
         grain: int | None = None,
         collide: bool = True,
     ) -> None:
-        """Add a box; its bevelled edges are only for the eye."""
-        self.solid(block(low, high, bevel), material, grain=grain, collide=False)
+        """Add a box, whose bevelled edges are only in the visual mesh; other arguments as in `solid`.
+
+        Args:
+            low: (3,) one corner, m.
+            high: (3,) the opposite corner, m.
+            material: name of the material.
+            bevel: width of the bevel, m.
+            grain: axis of the grain of the material, or None.
+            collide: whether to add the box to the collision pieces.
+        """
+        self.solid(make_box_corners(low, high, bevel), material, grain=grain, collide=False)
         if collide:
-            self.pieces.append(block(low, high))
+            self.pieces.append(make_box_corners(low, high))
 
     def bar_handle(
         self, middle: Corner, length: float, material: str, *, along: Literal["y", "z"], bar: float = BAR
     ) -> None:
-        """Add a bar on two posts in front of a face with normal x; ``middle`` is the bar's axis' middle."""
+        """Add a handle in front of a face with the normal +x: a bar on two posts.
+
+        Args:
+            middle: (3,) centre of the bar, m.
+            length: length of the bar, m.
+            material: name of the material.
+            along: axis of the bar.
+            bar: thickness of the bar, m.
+        """
         x, *_ = middle
         axis = 1 if along == "y" else 2
         half = np.full(3, bar / 2)
@@ -120,7 +152,7 @@ class Body:
             self.board(low, high, material)
 
     def mesh(self) -> trimesh.Trimesh:
-        """The textured mesh; the same every time."""
+        """Return the textured mesh of all visible solids; deterministic."""
         names = sorted({material for _, material, _ in self._solids})
         nothing = np.zeros((2, 2, 3)), np.zeros((2, 2, 2))
         samples = {name: self.materials[name] for name in names}
@@ -135,11 +167,11 @@ class Body:
             vertices.append(corners.reshape(-1, 3))
             uvs.append((pixel / self.texture * (1, -1) + (0, 1)).reshape(-1, 2))
         flat = np.concatenate(vertices)
-        shape = creased_shape(flat, np.concatenate(uvs), np.arange(len(flat)).reshape(-1, 3), self.texture)
+        shape = make_creased_shape(flat, np.concatenate(uvs), np.arange(len(flat)).reshape(-1, 3), self.texture)
         painter = Painter(replace(shape, regions=regions), self.rng, (128, 128, 128))
         for name, region in regions.items():
             left, top, right, bottom = region.box
-            grid = Grid.of(region.size, (right - left, bottom - top))
+            grid = Grid.from_size(region.size, (right - left, bottom - top))
             rng = np.random.default_rng([ord(letter) for letter in name])
             painter.put(name, np.clip(samples[name].paint(grid, rng), 0, 255).astype(np.uint8))
         return shape.textured(Image.fromarray(painter.pixels), roughness=self.roughness)
@@ -148,7 +180,17 @@ class Body:
 def _cut(
     points: Array, sample: tuple[float, float], grain: int | None, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Triangles (f, 3, 3) of a convex solid, and UVs (f, 3, 2) in 0 to 1 by which each is cut from the sample."""
+    """Triangulate a convex solid and cut its texture from a sample of a material.
+
+    Args:
+        points: (k, 3) corners of the solid, m.
+        sample: size of the sample along the grain and across, m.
+        grain: axis of the grain in the solid; None: the longest side.
+        rng: random generator of the places in the sample.
+
+    Returns:
+        Triangles (f, 3, 3), and texture coordinates (f, 3, 2) in the sample, 0 to 1.
+    """
     hull = trimesh.convex.convex_hull(points)
     corners = np.asarray(hull.triangles)
     side = np.argmax(np.round(np.abs(hull.face_normals), 6), axis=1)
@@ -162,15 +204,15 @@ def _cut(
             first, second = second, first
         picked = side == axis
         for place, (goal, source) in enumerate(((0, first), (1, second))):
-            scale = min(1.0, sample[goal] / extent[source])  # what is too large stretches the sample
+            scale = min(1.0, sample[goal] / extent[source])  # the sample is stretched on a larger solid
             slack = sample[goal] - extent[source] * scale
             offset = places[axis, place] * slack
             uv[picked, :, goal] = ((corners[picked][..., source] - low[source]) * scale + offset) / sample[goal]
     return corners, uv
 
 
-def slide(name: str, way: Vec3, length: float) -> Joint:
-    """A joint that slides."""
+def make_slide(name: str, way: Vec3, length: float) -> Joint:
+    """Return a sliding joint that opens in the direction ``way``, a unit vector, by ``length`` in m."""
     return Joint(
         name=name,
         kind="prismatic",
@@ -181,8 +223,15 @@ def slide(name: str, way: Vec3, length: float) -> Joint:
     )
 
 
-def hinge(name: str, origin: Vec3, side: Literal[-1, 1], angle: float = 1.9) -> Joint:
-    """An upright hinge of a front door at its left (-1) or right (1) edge."""
+def make_hinge(name: str, origin: Vec3, side: Literal[-1, 1], angle: float = 1.9) -> Joint:
+    """Return a vertical hinge at the left (-1) or right (1) edge of a door at the front.
+
+    Args:
+        name: name of the joint.
+        origin: a point on the axis, m.
+        side: edge of the door with the hinge.
+        angle: largest opening angle, rad.
+    """
     return Joint(
         name=name,
         kind="revolute",
@@ -194,8 +243,15 @@ def hinge(name: str, origin: Vec3, side: Literal[-1, 1], angle: float = 1.9) -> 
     )
 
 
-def bar_grip(link: str, middle: Vec3, *, along: Literal["y", "z"], bar: float = BAR) -> Handle:
-    """How to take a bar from the front: approach -x, the fingers on both sides of it."""
+def make_bar_grasp(link: str, middle: Vec3, *, along: Literal["y", "z"], bar: float = BAR) -> Handle:
+    """Return the grasp of a bar from the front, with approach direction -x and the fingers on both sides of the bar.
+
+    Args:
+        link: name of the link with the bar.
+        middle: centre of the bar, m.
+        along: axis of the bar.
+        bar: thickness of the bar, m.
+    """
     closing = np.array([0.0, 1.0, 0.0]) if along == "z" else np.array([0.0, 0.0, 1.0])
     approach = np.array([-1.0, 0.0, 0.0])
     turn = Rotation.from_matrix(np.column_stack([np.cross(closing, approach), closing, approach]))
@@ -203,9 +259,17 @@ def bar_grip(link: str, middle: Vec3, *, along: Literal["y", "z"], bar: float = 
     return Handle(link=link, position=middle, wxyz=(w, x, y, z), width=bar)
 
 
-def surface(
+def make_surface(
     low: tuple[float, float], high: tuple[float, float], z: float, headroom: float | None = None, link: str = ""
 ) -> Surface:
-    """Where things may stand; the headroom is given with a millimetre to spare."""
+    """Return a horizontal surface on which objects can be placed.
+
+    Args:
+        low: smallest x and y, m.
+        high: largest x and y, m.
+        z: height, m.
+        headroom: free height above the surface, m, which is declared 1 mm smaller; None: nothing is above the surface.
+        link: name of the moving part with the surface; empty: the fixed body.
+    """
     room = None if headroom is None else round(headroom - 0.001, 6)
     return Surface(link=link, min_xy=low, max_xy=high, z=z, headroom=room)

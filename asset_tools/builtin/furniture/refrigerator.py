@@ -1,11 +1,11 @@
-"""A white refrigerator over a freezer, each behind a door."""
+"""Make a white refrigerator above a freezer, each with a door."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from asset_tools.builtin.furniture.base import BAR_GAP, Body, bar_grip, hinge, surface
-from asset_tools.builtin.materials import DARK, STEEL, coat
+from asset_tools.builtin.furniture.base import BAR_GAP, Body, make_bar_grasp, make_hinge, make_surface
+from asset_tools.builtin.materials import DARK, STEEL, make_coating
 from asset_tools.sources import FurnitureSource, LinkSource
 
 BACK, FRONT, HALF, HEIGHT = -0.36, 0.30, 0.35, 1.75
@@ -16,17 +16,17 @@ FREEZER = (0.10, 0.60)  # m, heights of the doors
 FRIDGE = (0.606, 1.745)
 FLOORS = {"freezer": (0.145, 0.58), "shelf_0": (0.66, 0.968), "shelf_1": (0.98, 1.298), "shelf_2": (1.31, 1.70)}
 
-ENAMEL = coat((238, 240, 240))
-LINER = coat((246, 247, 247))
-GLASS = coat((196, 218, 216))
+ENAMEL = make_coating((238, 240, 240))
+LINER = make_coating((246, 247, 247))
+GLASS = make_coating((196, 218, 216))
 
 
-def refrigerator() -> FurnitureSource:
-    """Both doors have hinges on the left edge; the origin is on the floor under the centre."""
+def make_refrigerator() -> FurnitureSource:
+    """Make a refrigerator with two doors with hinges at the left edge; the origin is on the floor below the centre."""
     body = Body({"enamel": ENAMEL, "liner": LINER, "glass": GLASS, "dark": DARK}, seed=9, texture=256, roughness=0.35)
     inner = HALF - WALL
     bottom = 0.10
-    for side in (-1, 1):  # the liner shows from inside, the enamel from outside
+    for side in (-1, 1):  # the liner is visible from inside, the enamel from outside
         body.board(
             (BACK, side * HALF, bottom), (FRONT, side * (inner + 0.01), HEIGHT), "enamel", bevel=0.003, collide=False
         )
@@ -57,15 +57,15 @@ def refrigerator() -> FurnitureSource:
     ):
         link, grip = _door(name, low, high, bar, mass, bins=(0.72, 1.05, 1.38) if name == "door" else ())
         links.append(link)
-        handles[name] = bar_grip(name, grip, along="z", bar=BAR)
-    room = 0.175  # m: bins in the door reach in so far
+        handles[name] = make_bar_grasp(name, grip, along="z", bar=BAR)
+    room = 0.175  # m, x up to which the racks of the door leave space
     surfaces = {
-        name: surface(
+        name: make_surface(
             (BACK + 0.055, -inner + 0.003), (room if name != "freezer" else FRONT - 0.01, inner - 0.003), z, top - z
         )
         for name, (z, top) in FLOORS.items()
     }
-    surfaces["top"] = surface((BACK, -HALF), (FRONT, HALF), HEIGHT)
+    surfaces["top"] = make_surface((BACK, -HALF), (FRONT, HALF), HEIGHT)
     return FurnitureSource(
         "refrigerator",
         "refrigerator",
@@ -81,7 +81,16 @@ def refrigerator() -> FurnitureSource:
 def _door(
     name: str, low: float, high: float, bar: tuple[float, float], mass: float, *, bins: tuple[float, ...]
 ) -> tuple[LinkSource, tuple[float, float, float]]:
-    """A door and the middle of its handle; ``bins`` are the heights of racks on its inside."""
+    """Make a door; return its link and the centre of its handle.
+
+    Args:
+        name: name of the link.
+        low: z of the lower edge, m.
+        high: z of the upper edge, m.
+        bar: z of the lower and upper end of the handle, m.
+        mass: mass of the door, kg.
+        bins: z of the racks on the inside, m.
+    """
     body = Body(
         {"enamel": ENAMEL, "liner": LINER, "steel": STEEL, "glass": GLASS, "dark": DARK},
         seed=10,
@@ -103,9 +112,9 @@ def _door(
         body.board((face - 0.10, -y, z + 0.008), (face - 0.094, y, z + 0.07), "glass")
         for side in (-1, 1):
             body.board((face - 0.10, side * y, z), (face, side * (y - 0.006), z + 0.07), "liner")
-    if bins:  # the temperature's display
+    if bins:  # temperature display
         body.board((out - 0.001, -0.06, high - 0.20), (out + 0.001, 0.06, high - 0.16), "dark", collide=False)
     grip = (out + BAR_GAP + BAR / 2, HALF - 0.055, round(sum(bar) / 2, 6))
     body.bar_handle(np.array(grip), bar[1] - bar[0], "steel", along="z", bar=BAR)
-    joint = hinge(f"{name}_hinge", (face, -HALF, 0.0), -1)
+    joint = make_hinge(f"{name}_hinge", (face, -HALF, 0.0), -1)
     return LinkSource(name, joint, body.mesh(), body.pieces, mass), grip

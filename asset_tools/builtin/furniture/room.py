@@ -1,4 +1,4 @@
-"""A room of 6 x 6 x 4 m, whose walls and floor come in several finishes."""
+"""Make a room of 6 x 6 x 4 m with several finishes of the walls and the floor."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from asset_tools.builtin.finishes import CEILING, FLOORS, TILE, WALLS
-from asset_tools.builtin.furniture.base import block, surface
+from asset_tools.builtin.furniture.base import make_box_corners, make_surface
 from asset_tools.builtin.materials import Grid, Paint
 from asset_tools.sources import FurnitureSource
 
 HALF, HEIGHT = 3.0, 4.0
 SLAB = 0.1  # m, thickness of floor and walls, outside of the room
 PIXELS = 800
-SKIRTING = (0.09, 0.014)  # m, height and thickness; only for the eye
+SKIRTING = (0.09, 0.014)  # m, height and thickness; without collision pieces
 
-Quad = tuple[np.ndarray, np.ndarray, np.ndarray]  # a lower left corner, the way right, the way up
+Quad = tuple[np.ndarray, np.ndarray, np.ndarray]  # lower left corner, vector to the right, vector upwards
 
 
-def room(pixels: int = PIXELS) -> FurnitureSource:
-    """A closed room around the world's origin, seen from inside; it has no door.
+def make_room(pixels: int = PIXELS) -> FurnitureSource:
+    """Make a closed room around the origin of the world frame, without a door; its faces are visible from inside.
 
     Args:
-        pixels: width of the images of its walls and floors.
+        pixels: width and height of the images of the finishes, for 2 x 2 m.
     """
     outer = HALF + SLAB
-    pieces = [block((-outer, -outer, -SLAB), (outer, outer, 0))]
+    pieces = [make_box_corners((-outer, -outer, -SLAB), (outer, outer, 0))]
     for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1)):
         size = (SLAB, 2 * outer, HEIGHT) if x else (2 * outer, SLAB, HEIGHT)
         center = np.array([x * (HALF + SLAB / 2), y * (HALF + SLAB / 2), HEIGHT / 2])
-        pieces.append(block(center - np.divide(size, 2), center + np.divide(size, 2)))
+        pieces.append(make_box_corners(center - np.divide(size, 2), center + np.divide(size, 2)))
     walls, floor = _walls(), _level(0.0)
     return FurnitureSource(
         "room",
@@ -40,7 +40,7 @@ def room(pixels: int = PIXELS) -> FurnitureSource:
         "room",
         _fixed(),
         pieces,
-        surfaces={"floor": surface((-HALF, -HALF), (HALF, HALF), 0.0)},
+        surfaces={"floor": make_surface((-HALF, -HALF), (HALF, HALF), 0.0)},
         finishes={
             "wall": {name: _tiled(walls, _picture(paint, pixels)) for name, paint in WALLS.items()},
             "floor": {name: _tiled(floor, _picture(paint, pixels)) for name, paint in FLOORS.items()},
@@ -50,7 +50,7 @@ def room(pixels: int = PIXELS) -> FurnitureSource:
 
 def _walls() -> list[Quad]:
     quads = []
-    for turn in range(4):  # the wall at +y, and its turns about z
+    for turn in range(4):  # the wall at +y, and its rotations about z
         right = np.array([(1, 0, 0), (0, 1, 0), (-1, 0, 0), (0, -1, 0)][turn], float)
         back = np.array([-right[1], right[0], 0.0])
         for across in np.arange(-HALF, HALF, TILE):
@@ -68,7 +68,7 @@ def _level(z: float, *, upward: bool = True) -> list[Quad]:
 
 
 def _fixed() -> trimesh.Trimesh:
-    """Ceiling and skirting boards: white, the same with every finish."""
+    """Return the mesh of the white ceiling and skirting boards, which all finishes have."""
     quads = _level(HEIGHT, upward=False)
     high, thick = SKIRTING
     inner = HALF - thick
@@ -83,12 +83,12 @@ def _fixed() -> trimesh.Trimesh:
 
 
 def _picture(paint: Paint, pixels: int) -> Image.Image:
-    colours = paint(Grid.of((TILE, TILE), (pixels, pixels)), np.random.default_rng(11))
+    colours = paint(Grid.from_size((TILE, TILE), (pixels, pixels)), np.random.default_rng(11))
     return Image.fromarray(np.clip(colours, 0, 255).astype(np.uint8))
 
 
 def _tiled(quads: list[Quad], image: Image.Image) -> trimesh.Trimesh:
-    """Each quad shows the whole image."""
+    """Return a mesh of rectangles, each of which shows the whole image."""
     points = np.concatenate([[corner, corner + right, corner + right + up, corner + up] for corner, right, up in quads])
     normals = np.concatenate([[np.cross(right, up)] * 4 for _, right, up in quads])
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)

@@ -1,9 +1,9 @@
-"""A shop's shelf of four layers: oak boards between black steel posts, a white back, price rails along the front."""
+"""Make a shop shelf with four layers of oak boards, black steel posts, a white back and price rails."""
 
 from __future__ import annotations
 
-from asset_tools.builtin.furniture.base import Body, surface
-from asset_tools.builtin.materials import BLACK_STEEL, OAK, WHITE, coat, wooden
+from asset_tools.builtin.furniture.base import Body, make_surface
+from asset_tools.builtin.materials import BLACK_STEEL, OAK, WHITE, make_coating, make_wood
 from asset_tools.sources import FurnitureSource
 
 LAYERS = (0.085, 0.514, 0.942, 1.371)  # m, as in RoboCAS-v0
@@ -13,10 +13,15 @@ POST = 0.04
 BOARD = 0.022
 
 
-def shelf() -> FurnitureSource:
-    """A shelf that is open to its front at x = 0; origin on the floor in the middle of its front."""
+def make_shelf() -> FurnitureSource:
+    """Make a shelf that is open at the front, x = 0; the origin is on the floor at the middle of the front."""
     body = Body(
-        {"oak": wooden(OAK, (1.2, 0.45)), "steel": BLACK_STEEL, "back": WHITE, "rail": coat((222, 226, 228))},
+        {
+            "oak": make_wood(OAK, (1.2, 0.45)),
+            "steel": BLACK_STEEL,
+            "back": WHITE,
+            "rail": make_coating((222, 226, 228)),
+        },
         seed=3,
         roughness=0.55,
     )
@@ -34,7 +39,7 @@ def shelf() -> FurnitureSource:
     body.board((back, -inner, LAYERS[0]), (back + 0.008, inner, TOP - BOARD), "back")
     ceilings = (*LAYERS[1:], TOP)
     surfaces = {
-        f"layer_{i}": surface((back + 0.02, -0.53), (-0.01, 0.53), z, ceilings[i] - BOARD - z)
+        f"layer_{i}": make_surface((back + 0.02, -0.53), (-0.01, 0.53), z, ceilings[i] - BOARD - z)
         for i, z in enumerate(LAYERS)
     }
     return FurnitureSource("shelf", "shelf", "shelf", body.mesh(), body.pieces, surfaces=surfaces)

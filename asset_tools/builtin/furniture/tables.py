@@ -1,11 +1,11 @@
-"""Three tables: a plain one of oak, a dining table with painted legs, a round one of marble and steel."""
+"""Make three tables: an oak table, a dining table with painted legs, and a round table of marble and steel."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from asset_tools.builtin.furniture.base import Body, disc, surface
-from asset_tools.builtin.materials import BLACK_STEEL, OAK, WALNUT, WHITE, Material, marble, wooden
+from asset_tools.builtin.furniture.base import Body, make_disc_corners, make_surface
+from asset_tools.builtin.materials import BLACK_STEEL, OAK, WALNUT, WHITE, Material, make_wood, paint_marble
 from asset_tools.sources import FurnitureSource
 
 TABLE_HEIGHT = 0.61  # m, as in RoboCAS-v0
@@ -16,22 +16,24 @@ SIDE_HEIGHT = 0.50
 SIDE_RADIUS = 0.46
 
 
-def table() -> FurnitureSource:
-    """A table of oak with square legs: origin on the floor under its centre, top at 0.61 m."""
+def make_table() -> FurnitureSource:
+    """Make an oak table with square legs, 0.61 m high; the origin is on the floor below the centre."""
     (x, y), z, thickness, leg = TABLE_HALF, TABLE_HEIGHT, 0.03, 0.06
-    body = Body({"top": wooden(OAK, (1.37, 0.77), plank=0.1283), "oak": wooden(OAK, (1.25, 0.16))}, roughness=0.55)
+    body = Body(
+        {"top": make_wood(OAK, (1.37, 0.77), plank=0.1283), "oak": make_wood(OAK, (1.25, 0.16))}, roughness=0.55
+    )
     body.board((-x, -y, z - thickness), (x, y, z), "top", bevel=0.003)
     _legs(body, "oak", x - 0.03, y - 0.03, leg, z - thickness)
     _apron(body, "oak", x - 0.045, y - 0.045, leg, z - thickness, 0.07)
     return FurnitureSource(
-        "table", "table", "table", body.mesh(), body.pieces, surfaces={"top": surface((-x, -y), (x, y), z)}
+        "table", "table", "table", body.mesh(), body.pieces, surfaces={"top": make_surface((-x, -y), (x, y), z)}
     )
 
 
-def dining_table() -> FurnitureSource:
-    """A table with a walnut top on white tapered legs, top at 0.75 m."""
+def make_dining_table() -> FurnitureSource:
+    """Make a table with a walnut top and white tapered legs, 0.75 m high."""
     (x, y), z, thickness = DINING_HALF, DINING_HEIGHT, 0.035
-    body = Body({"top": wooden(WALNUT, (1.62, 0.86), plank=0.1433), "white": WHITE}, seed=1, roughness=0.5)
+    body = Body({"top": make_wood(WALNUT, (1.62, 0.86), plank=0.1433), "white": WHITE}, seed=1, roughness=0.5)
     body.board((-x, -y, z - thickness), (x, y, z), "top", bevel=0.006)
     below = z - thickness
     for sx in (-1, 1):
@@ -49,19 +51,22 @@ def dining_table() -> FurnitureSource:
         "table",
         body.mesh(),
         body.pieces,
-        surfaces={"top": surface((-x, -y), (x, y), z)},
+        surfaces={"top": make_surface((-x, -y), (x, y), z)},
     )
 
 
-def side_table() -> FurnitureSource:
-    """A low round table: a marble top 0.5 m high on black steel legs. Its surface is the square within the circle."""
+def make_side_table() -> FurnitureSource:
+    """Make a round table with a paint_marble top and black steel legs, 0.5 m high.
+
+    Its supporting surface is the square inscribed in the top.
+    """
     z, radius, thickness = SIDE_HEIGHT, SIDE_RADIUS, 0.025
-    body = Body({"top": Material((0.94, 0.94), marble), "steel": BLACK_STEEL}, seed=2, roughness=0.35)
-    body.solid(disc((0, 0, z - thickness), radius, thickness, bevel=0.003), "top", collide=False)
-    body.solid(disc((0, 0, z - thickness), radius, thickness), "top", show=False)
+    body = Body({"top": Material((0.94, 0.94), paint_marble), "steel": BLACK_STEEL}, seed=2, roughness=0.35)
+    body.solid(make_disc_corners((0, 0, z - thickness), radius, thickness, bevel=0.003), "top", collide=False)
+    body.solid(make_disc_corners((0, 0, z - thickness), radius, thickness), "top", show=False)
     bar, reach = 0.022, 0.30
     for sx in (-1, 1):
-        for sy in (-1, 1):  # leaning outwards
+        for sy in (-1, 1):  # legs that lean outwards
             head, foot = np.array([sx * 0.19, sy * 0.19, z - thickness]), np.array([sx * reach, sy * reach, 0.0])
             half = np.array([bar / 2, bar / 2, 0])
             body.solid(np.concatenate([_square(end - half, end + half) for end in (head, foot)]), "steel")
@@ -86,12 +91,12 @@ def side_table() -> FurnitureSource:
         "table",
         body.mesh(),
         body.pieces,
-        surfaces={"top": surface((-half, -half), (half, half), z)},
+        surfaces={"top": make_surface((-half, -half), (half, half), z)},
     )
 
 
 def _square(corner: np.ndarray, opposite: np.ndarray) -> np.ndarray:
-    """Corners (4, 3) of a level rectangle."""
+    """Return the corners (4, 3) of a horizontal rectangle, given by opposite corners; z is that of ``corner``."""
     return np.array([(x, y, corner[2]) for x in (corner[0], opposite[0]) for y in (corner[1], opposite[1])])
 
 
@@ -102,7 +107,17 @@ def _legs(body: Body, material: str, x: float, y: float, width: float, height: f
 
 
 def _apron(body: Body, material: str, x: float, y: float, leg: float, top: float, depth: float) -> None:
-    """Boards on edge below the top, between the legs; ``x`` and ``y`` are their outer faces."""
+    """Add four vertical boards below the top, between the legs.
+
+    Args:
+        body: body of the table.
+        material: name of the material.
+        x: x of the outer face of the front board, m.
+        y: y of the outer face of the side board, m.
+        leg: width of the legs, m.
+        top: z of the upper edge, m.
+        depth: height of the boards, m.
+    """
     board = 0.02
     for side in (-1, 1):
         body.board((side * x, -y + leg / 2, top - depth), (side * (x - board), y - leg / 2, top), material)

@@ -1,4 +1,4 @@
-"""Square vessels that stand on tables, free bodies: a wicker basket, an enamelled plate."""
+"""Make movable square containers for tables: a wicker basket and an enamelled plate."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from asset_tools.builtin.materials import Grid, Material, painted, plaited, woven
+from asset_tools.builtin.materials import Grid, Material, paint_plain, paint_wickerwork, paint_wrapped_rim
 from asset_tools.builtin.mesh import Patch, Shape, build_shape
-from asset_tools.builtin.surfaces import unrolled_uv
+from asset_tools.builtin.surfaces import unroll_uv
 from asset_tools.builtin.textures import Painter
 from asset_tools.sources import FurnitureSource
 from robocas_ms3.assets.manifest import InnerBox, Surface
@@ -21,10 +21,12 @@ PLATE_HEIGHT = 0.10
 ROUNDING_STEPS = 3
 
 
-def basket() -> FurnitureSource:
-    """A red woven basket, open on top; its origin is 0.096 m above its bottom."""
-    side = Material((1.2, 0.19), partial(woven, cell=(0.014, 0.01)))
-    paints = {"rim": Material((1.2, 0.04), plaited)} | dict.fromkeys(("side", "inside", "floor", "bottom"), side)
+def make_basket() -> FurnitureSource:
+    """Make a red wicker basket, open at the top; the origin is 0.096 m above the bottom."""
+    side = Material((1.2, 0.19), partial(paint_wickerwork, cell=(0.014, 0.01)))
+    paints = {"rim": Material((1.2, 0.04), paint_wrapped_rim)} | dict.fromkeys(
+        ("side", "inside", "floor", "bottom"), side
+    )
     shape, pieces, floor, inside, top = _vessel(
         low=-BASKET_ORIGIN,
         height=BASKET_HEIGHT,
@@ -46,10 +48,10 @@ def basket() -> FurnitureSource:
     )
 
 
-def plate() -> FurnitureSource:
-    """A deep square plate of white enamel with a blue rim, sized as in RoboCAS-v0; origin at its bottom centre."""
-    white = Material((0.3, 0.3), partial(painted, colour=(240, 240, 236)))
-    paints = {"rim": Material((1.2, 0.02), partial(painted, colour=(38, 62, 122)))}
+def make_plate() -> FurnitureSource:
+    """Make a deep, square, white plate with a blue rim, as large as in RoboCAS-v0; the origin is at its bottom."""
+    white = Material((0.3, 0.3), partial(paint_plain, colour=(240, 240, 236)))
+    paints = {"rim": Material((1.2, 0.02), partial(paint_plain, colour=(38, 62, 122)))}
     paints |= dict.fromkeys(("side", "inside", "floor", "bottom"), white)
     shape, pieces, floor, inside, top = _vessel(
         low=0.0, height=PLATE_HEIGHT, half_bottom=0.15, half_top=0.20, wall=0.006, rim=0.008, corner=0.03
@@ -69,7 +71,21 @@ def plate() -> FurnitureSource:
 def _vessel(
     *, low: float, height: float, half_bottom: float, half_top: float, wall: float, rim: float, corner: float
 ) -> tuple[Shape, list[np.ndarray], float, float, float]:
-    """A square vessel that widens upwards: shape, pieces, height of its floor, half its inner width, its top."""
+    """Make a square container that widens upwards.
+
+    Args:
+        low: z of the bottom, m.
+        height: height, m.
+        half_bottom: half of the outer width at the bottom, m.
+        half_top: half of the outer width at the top, m.
+        wall: thickness of walls and floor, m.
+        rim: height of the rim, m.
+        corner: radius of the vertical edges, m.
+
+    Returns:
+        Shape, points (k, 3) of each collision piece, z of the inner floor, half of the inner width at the floor, and z
+        of the top.
+    """
     high, floor = low + height, low + wall
     flare = (half_top - half_bottom) / height
 
@@ -78,7 +94,7 @@ def _vessel(
 
     def rows(region: str, *rings: tuple[float, float]) -> Patch:
         points = np.stack([_ring(size, z, corner) for size, z in rings])
-        uv, size = unrolled_uv(points)
+        uv, size = unroll_uv(points)
         return Patch(region, points, uv, size)
 
     band = high - rim
@@ -105,13 +121,19 @@ def _painted(
     painter = Painter(shape, np.random.default_rng(7), (128, 128, 128))
     for name, region in shape.regions.items():
         left, top, right, bottom = region.box
-        colours = materials[name].paint(Grid.of(region.size, (right - left, bottom - top)), painter.rng)
+        colours = materials[name].paint(Grid.from_size(region.size, (right - left, bottom - top)), painter.rng)
         painter.put(name, np.clip(colours * (0.8 if name in dark else 1.0), 0, 255).astype(np.uint8))
     return shape.textured(Image.fromarray(painter.pixels), roughness=roughness)
 
 
 def _ring(half: float, z: float, corner: float) -> np.ndarray:
-    """Points (n, 3) around a square with rounded corners, closed, from the middle of the back counterclockwise."""
+    """Return points (n, 3) around a square with rounded corners, counterclockwise; the last point is the first point.
+
+    Args:
+        half: half of the width of the square, m.
+        z: height, m.
+        corner: radius of the corners, m.
+    """
     center = half - corner
     points = []
     for i, (sx, sy) in enumerate([(-1, 1), (-1, -1), (1, -1), (1, 1)]):

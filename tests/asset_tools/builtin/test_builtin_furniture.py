@@ -7,7 +7,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from asset_tools.builtin.furniture import MAKERS
-from asset_tools.builtin.furniture.room import room
+from asset_tools.builtin.furniture.room import make_room
 from asset_tools.quality.furniture import examine_furniture
 from robocas_ms3.assets.annotations import GRIPPER_BOXES
 
@@ -17,7 +17,7 @@ JOINTS += [("container", "door"), ("refrigerator", "door"), ("refrigerator", "fr
 
 @cache
 def made(name):
-    return room(64) if name == "room" else MAKERS[name]()
+    return make_room(64) if name == "room" else MAKERS[name]()
 
 
 def bodies(source):

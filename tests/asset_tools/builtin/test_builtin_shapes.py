@@ -9,13 +9,13 @@ from scipy.spatial import KDTree
 from shapely import MultiPoint, Point
 
 from asset_tools.builtin import bottles, shapes
-from asset_tools.builtin.catalogue import products
+from asset_tools.builtin.catalogue import load_builtin_products
 from asset_tools.decompose import GPU_LIMIT, count_flat_faces
 from asset_tools.glb import write_glb
 from asset_tools.quality.hulls import compute_volume_iou
 
 GRIPPER_OPENING = 0.08  # m
-TOYS = {p.id for p in products().values() if p.model or p.category in ("ball", "toy")}
+TOYS = {p.id for p in load_builtin_products().values() if p.model or p.category in ("ball", "toy")}
 # Built in the fast run too: one of each kind, a thin one, and those with holes. The others take seconds each.
 QUICK = {"padlock", "scissors", "small_elephant", "rubiks_cube", "racquetball"}
 
@@ -27,20 +27,20 @@ def parametrised(specs):
     )
 
 
-each = parametrised(list(products().values()))
-each_toy = parametrised([spec for spec in products().values() if spec.id in TOYS])
-each_household = parametrised([spec for spec in products().values() if spec.id not in TOYS])
+each = parametrised(list(load_builtin_products().values()))
+each_toy = parametrised([spec for spec in load_builtin_products().values() if spec.id in TOYS])
+each_household = parametrised([spec for spec in load_builtin_products().values() if spec.id not in TOYS])
 
 
 @cache
 def built(name):
     """Shape and textured mesh of a toy."""
-    return products()[name].build()
+    return load_builtin_products()[name].build()
 
 
 @cache
 def shape_of(name):
-    product = products()[name]
+    product = load_builtin_products()[name]
     return built(name)[0] if name in TOYS else product.shape(product.size)
 
 
@@ -98,7 +98,7 @@ def test_texture_is_used_and_files_are_small(spec, tmp_path):
     assert (tmp_path / "a.glb").stat().st_size < 115_000
 
 
-@parametrised([spec for spec in products().values() if spec.id in TOYS or shape_of(spec.id).pieces])
+@parametrised([spec for spec in load_builtin_products().values() if spec.id in TOYS or shape_of(spec.id).pieces])
 def test_pieces_fill_the_shape(spec):
     shape, toy = shape_of(spec.id), spec.id in TOYS
     closed, pieces = shape.closed(), list(shape.pieces)
@@ -137,9 +137,9 @@ def test_holes_are_open():
 
 def test_regions_do_not_overlap():
     for shape in (
-        *(shape_of(spec.id) for spec in products().values() if spec.id not in TOYS),
-        shapes.carton((0.2, 0.01, 0.1)),
-        bottles.drink_bottle((0.05, 0.05, 0.18)),
+        *(shape_of(spec.id) for spec in load_builtin_products().values() if spec.id not in TOYS),
+        shapes.make_carton((0.2, 0.01, 0.1)),
+        bottles.make_drink_bottle((0.05, 0.05, 0.18)),
     ):
         taken = np.zeros((shape.texture_size, shape.texture_size), dtype=int)
         for region in shape.regions.values():

@@ -7,17 +7,17 @@ import trimesh
 from PIL import ImageFont
 from scipy.ndimage import binary_dilation
 
-from asset_tools.builtin.catalogue import products
+from asset_tools.builtin.catalogue import load_builtin_products
 from asset_tools.builtin.textures import OVERSAMPLING
 
 WHITE, BLACK = (255, 255, 255), (0, 0, 0)
-HOUSEHOLD = [p for p in products().values() if not p.model and p.category not in ("ball", "toy")]
-LABELS = {p.id: p.paint.label for p in products().values() if hasattr(p.paint, "label")}
+HOUSEHOLD = [p for p in load_builtin_products().values() if not p.model and p.category not in ("ball", "toy")]
+LABELS = {p.id: p.paint.label for p in load_builtin_products().values() if hasattr(p.paint, "label")}
 
 
 @cache
 def built(name):
-    return products()[name].build()
+    return load_builtin_products()[name].build()
 
 
 @pytest.mark.parametrize("name", ["apple", "orange", "banana"])
@@ -45,7 +45,7 @@ def test_titles_are_legible(name, monkeypatch):
     sizes = []
     load = ImageFont.load_default
     monkeypatch.setattr(ImageFont, "load_default", lambda size: sizes.append(size) or load(size))
-    _, mesh = products()[name].build()
+    _, mesh = load_builtin_products()[name].build()
     assert max(size for size in sizes if size != 100) / OVERSAMPLING >= 14  # 100: only measured with
     texture = np.asarray(mesh.visual.material.baseColorTexture).astype(float)
     ink = np.abs(texture - LABELS[name].ink).max(2) < 30
@@ -59,7 +59,7 @@ def test_titles_are_legible(name, monkeypatch):
 @cache
 def look(name, seed=None):
     """Colours over the surface (216,) and half widths (2, 60) in x and y every 5 mm of the height, m."""
-    entry = products()[name]
+    entry = load_builtin_products()[name]
     shape, mesh = built(name)
     image = mesh.visual.material.baseColorTexture
     if seed is not None:
