@@ -1,6 +1,12 @@
-"""Measure the seconds that each step of making an asset takes, for builtin objects; print JSON.
+"""Measure the seconds that each step of building an object takes, for builtin objects; print JSON.
 
 python benchmarks/assets.py --ids banana drink large_elephant
+
+JSON keys:
+  objects   number of objects
+  steps     per step, median_s and max_s: median and maximum over the objects of the wall-clock time in seconds. Steps:
+            shape and texture, display meshes (both levels of detail), hulls, resting poses, grasps, quality (hull
+            comparison, drop test and hold test)
 """
 
 from __future__ import annotations
@@ -31,8 +37,6 @@ from robocas_ms3.assets.physics import RigidBody
 
 @dataclass
 class Benchmark:
-    """Measure the steps of making builtin objects."""
-
     ids: tuple[str, ...] = ()
     """Ids of the objects. Default: all 46."""
 
@@ -76,4 +80,4 @@ def main(cfg: Benchmark) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Benchmark))
+    main(tyro.cli(Benchmark, description=__doc__))

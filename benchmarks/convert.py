@@ -1,11 +1,18 @@
-"""Measure the CPU time of conversions and that of rendering alone; print JSON.
+"""Measure the CPU time of conversions, and compare it with rendering alone; print JSON.
 
-The bare loop sets each state, renders the three cameras and fetches the raw images of the shader, which every
-conversion has to do. Conversions are complete: scenes, environment, files, previews. They alternate with the bare loop,
-on the same recordings; the result of a case is the median of its rounds. CPU time is the sum over this process and its
-children; other programs affect it less than the wall-clock time. --jobs is measured by wall-clock time.
+python benchmarks/convert.py [demos/pick/trajectory.h5] [--episodes 2] [--turns 3] [--jobs 2]
 
-Run: python benchmarks/convert.py [demos/pick/trajectory.h5] [--episodes 2] [--turns 3] [--jobs 2]
+The bare loop sets each state, renders the three cameras and reads the raw images of the shader, as all conversions do.
+A conversion also builds scenes, computes all features, and writes files and previews. The cases alternate with the bare
+loop on the same recordings. CPU time is the sum over this process and its children. JSON keys:
+  cores, load, size    number of cores, load average, size of the images in pixels
+  steps                number of dataset steps of all recordings
+  bare, depth; bare    results of the bare loop with and without depth
+  png, depth; png; lerobot, depth; lerobot   results of conversions to RoboCAS and LeRobot, with and without depth
+    cpu ms per step    median over the rounds of the CPU time per dataset step in ms
+    cpu s, wall s      CPU and wall-clock time of each round in seconds
+    / bare             CPU time as a factor of the bare loop
+  jobs                 only with --jobs: speedup (by wall-clock time) and wall s (number of processes -> times)
 """
 
 from __future__ import annotations
@@ -69,7 +76,7 @@ def main(cfg: Benchmark) -> None:
     """Run the benchmark."""
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
-        source = cfg.trajectory or generated(work / "demos", cfg.episodes)
+        source = cfg.trajectory or generate_demonstrations(work / "demos", cfg.episodes)
         trajectory = repeat_recordings(source, cfg.episodes, work / "trajectory.h5")
         report: dict[str, Any] = {"cores": os.cpu_count(), "load": os.getloadavg()[1], "size": cfg.size}
         report |= measure_cases(cfg, trajectory, work)
@@ -78,9 +85,9 @@ def main(cfg: Benchmark) -> None:
             walls: dict[int, list[float]] = {1: [], cfg.jobs: []}
             for _ in range(cfg.turns):
                 for jobs, spent in walls.items():
-                    spent.append(time_of(partial(convert_one, cfg, more, work, "robocas", True, jobs))[1])
+                    spent.append(measure_seconds(partial(convert_one, cfg, more, work, "robocas", True, jobs))[1])
             faster = median(walls[1]) / median(walls[cfg.jobs])
-            report["jobs"] = {"speedup": round(faster, 2), "wall s": {n: rounded(w) for n, w in walls.items()}}
+            report["jobs"] = {"speedup": round(faster, 2), "wall s": {n: round_seconds(w) for n, w in walls.items()}}
     print(json.dumps(report, indent=2))
 
 
@@ -95,31 +102,37 @@ def measure_cases(cfg: Benchmark, trajectory: Path, work: Path) -> dict[str, Any
         with closing(EnvRenderer(file.env, file.read_recording(0).control_mode, ImageOptions(size=cfg.size))) as source:
             for _ in range(cfg.turns):
                 for depth, spent in bare.items():
-                    spent.append(alone(cfg, file, source, TEXTURES[depth]))
+                    spent.append(render_alone(cfg, file, source, TEXTURES[depth]))
                 for name, spent in cases.items():
                     to, depth = CASES[name]
-                    spent.append(time_of(partial(convert_one, cfg, trajectory, work, to, depth)))
+                    spent.append(measure_seconds(partial(convert_one, cfg, trajectory, work, to, depth)))
 
-    def figures(spent: list[tuple[float, float]]) -> dict[str, Any]:
+    def summarise(spent: list[tuple[float, float]]) -> dict[str, Any]:
         cpu, wall = zip(*spent, strict=True)
-        return {"cpu ms per step": round(1000 * median(cpu) / steps, 1), "cpu s": rounded(cpu), "wall s": rounded(wall)}
+        return {
+            "cpu ms per step": round(1000 * median(cpu) / steps, 1),
+            "cpu s": round_seconds(cpu),
+            "wall s": round_seconds(wall),
+        }
 
     per_step = {depth: median(cpu for cpu, _ in spent) for depth, spent in bare.items()}
     return {
         "steps": steps,
-        "bare, depth": figures(bare[True]),
-        "bare": figures(bare[False]),
+        "bare, depth": summarise(bare[True]),
+        "bare": summarise(bare[False]),
         **{
             name: {
                 "/ bare": round(median(cpu for cpu, _ in spent) / per_step[CASES[name][1]], 2),
-                **figures(spent),
+                **summarise(spent),
             }
             for name, spent in cases.items()
         },
     }
 
 
-def alone(cfg: Benchmark, file: TrajectoryFile, source: EnvRenderer, textures: tuple[str, ...]) -> tuple[float, float]:
+def render_alone(
+    cfg: Benchmark, file: TrajectoryFile, source: EnvRenderer, textures: tuple[str, ...]
+) -> tuple[float, float]:
     """Return the CPU and wall-clock seconds of rendering the recordings, without the time of building scenes."""
     total = (0.0, 0.0)
     env: Any = source.env.unwrapped
@@ -144,7 +157,7 @@ def alone(cfg: Benchmark, file: TrajectoryFile, source: EnvRenderer, textures: t
                     for texture in textures:
                         camera.get_picture(texture)
 
-        spent = time_of(loop)
+        spent = measure_seconds(loop)
         total = (total[0] + spent[0], total[1] + spent[1])
     return total
 
@@ -160,27 +173,27 @@ def convert_one(cfg: Benchmark, trajectory: Path, work: Path, to: str, depth: bo
         convert(ConversionSettings(trajectory, Path(out) / "out", embeddings=False, **common))
 
 
-def generated(out: Path, episodes: int) -> Path:
+def generate_demonstrations(out: Path, episodes: int) -> Path:
     """Generate pick demonstrations from seed 0."""
     command = [sys.executable, ROOT / "robocas_cli.py", "generate", "pick", "-n", str(episodes), "--out", out]
     subprocess.run(command, check=True, stdout=sys.stderr)
     return out / "trajectory.h5"
 
 
-def time_of(call: Callable[[], object]) -> tuple[float, float]:
+def measure_seconds(call: Callable[[], object]) -> tuple[float, float]:
     """Return the CPU and wall-clock seconds of a call."""
-    before, start = cpu(), time.perf_counter()
+    before, start = read_cpu_seconds(), time.perf_counter()
     call()
-    return cpu() - before, time.perf_counter() - start
+    return read_cpu_seconds() - before, time.perf_counter() - start
 
 
-def cpu() -> float:
+def read_cpu_seconds() -> float:
     """Return the CPU seconds of this process and its finished children."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in used)
 
 
-def rounded(seconds: Any) -> list[float]:
+def round_seconds(seconds: Any) -> list[float]:
     return [round(one, 2) for one in seconds]
 
 
@@ -189,4 +202,4 @@ def _stride(cfg: Benchmark, file: TrajectoryFile) -> int:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Benchmark))
+    main(tyro.cli(Benchmark, description=__doc__))

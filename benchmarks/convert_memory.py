@@ -1,6 +1,18 @@
-"""Measure the seconds per episode by part, and the memory, of conversions to RoboCAS and to LeRobot; print JSON.
+"""Measure the time per episode and the peak memory of conversions to RoboCAS and LeRobot; print JSON.
 
 python benchmarks/convert_memory.py demos/pick/trajectory.h5 --episodes 20 200 --size 64 48
+
+Compare the peak memory of conversions with different numbers of episodes to see whether memory grows. If the trajectory
+has fewer episodes, its recordings are repeated in a temporary file. Each conversion runs in a new process, whose peak
+memory includes Python, torch, PhysX, the renderer and a scene. With a software renderer, full images take seconds per
+episode; --size 64 48 or --stand-in gives a result in a minute. JSON keys:
+  size, rate, jobs, stand_in      options of the benchmark
+  conversions                     one entry per conversion:
+    to, episodes, steps           format, number of episodes and of dataset steps
+    seconds, seconds_per_episode  wall-clock time
+    peak_mb                       peak memory of the process in MB
+    peak_mb_after_episode         number of converted episodes -> peak memory until then in MB
+    peak_mb_of_largest_child      peak memory of the largest child process in MB; with --jobs, a process that renders
 """
 
 from __future__ import annotations
@@ -26,13 +38,6 @@ _SHOWN = (1, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 @dataclass
 class Benchmark:
-    """Measure the time of conversion by part, and whether memory grows with the number of episodes.
-
-    The recordings of a trajectory with fewer episodes are repeated in a temporary file. Each conversion runs in a new
-    process, whose peak memory includes Python, torch, PhysX, the renderer and a scene. With a software renderer, full
-    images take seconds per episode; --size 64 48 or --stand-in shows in a minute whether memory grows.
-    """
-
     trajectory: Annotated[Path, tyro.conf.Positional]
     """File F.h5, next to F.json."""
     episodes: tuple[int, ...] = (20, 200)
@@ -159,4 +164,4 @@ def _peak(whose: int) -> int:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Benchmark))
+    main(tyro.cli(Benchmark, description=__doc__))

@@ -1,10 +1,20 @@
-"""Measure the cost and quality of demonstrations, without rendering; print JSON.
-
-For each configuration, over seeds: the CPU seconds per episode by part, and those of bare PhysX for the same actions;
-success, length, attempts and memory; and the success of the 7-D actions of a dataset in open loop, with and without
-noise.
+"""Measure the cost and the quality of demonstrations, without rendering; print JSON.
 
 python benchmarks/episode.py pick_table_scattered search_table_stacked --seeds 60000:60020
+
+A line with the measurements of each seed goes to stderr. JSON keys, per task configuration:
+  seeds, success, lost    number of seeds, success rate, seeds without a demonstration
+  cpu_seconds, cpu_seconds_median   mean and median of the CPU time per seed in seconds
+  cpu_seconds_by_part     mean CPU time of each part of the generation in seconds
+  physx_cpu_seconds       mean CPU time of bare PhysX for the same actions in seconds
+  over_physx              CPU time of the successful seeds as a factor of bare PhysX
+  mean_length_s, mean_attempts   mean length of a demonstration in seconds, mean number of attempts per seed
+  failures                "stage: reason" -> number of failed attempts
+  facts                   mean of each fact that is recorded about an episode
+  clean_success           success rate of the 7-D actions of a dataset in open loop, without noise
+  noisy_success           success rate of these actions with noise
+  peak_mb, peak_mb_with_branches   peak memory of this process; with --memory, of this process and forked processes
+  rss_mb                  seed -> memory of this process after the seed in MB
 """
 
 from __future__ import annotations
@@ -85,16 +95,16 @@ def main(args: Args) -> None:
         first, end = map(int, args.seeds.split(":"))
         shares = [list(range(first, end))[job :: args.jobs] for job in range(args.jobs)]
         if args.jobs == 1:
-            found = run(args, config, shares[0])
+            found = run_seeds(args, config, shares[0])
         else:
             with multiprocessing.get_context("spawn").Pool(args.jobs) as pool:
-                parts = pool.starmap(run, [(args, config, share) for share in shares])
+                parts = pool.starmap(run_seeds, [(args, config, share) for share in shares])
             found = sorted((seed for part in parts for seed in part), key=lambda seed: seed.seed)
-        report[config] = summary(found, args)
+        report[config] = summarise(found, args)
     print(json.dumps(report, indent=2))
 
 
-def run(args: Args, config: str, seeds: list[int]) -> list[Seed]:
+def run_seeds(args: Args, config: str, seeds: list[int]) -> list[Seed]:
     torch.set_num_threads(1)  # as `robocas generate` does
     settings = EpisodeSettings(load_task_config(config).task, config, args.pack)
     generator = EpisodeGenerator(settings, fork=args.fork)
@@ -102,43 +112,45 @@ def run(args: Args, config: str, seeds: list[int]) -> list[Seed]:
     with tempfile.TemporaryDirectory() as folder:
         generator.generate(seeds[0] - 1, Path(folder), "warm")  # loads packs and starts planners
         for seed in seeds:
-            before = cpu()
-            with sampled_memory(args.memory) as memory:
+            before = read_cpu_seconds()
+            with sample_memory(args.memory) as memory:
                 result = generator.generate(seed, Path(folder), str(seed))
-            spent = cpu() - before
+            spent = read_cpu_seconds() - before
             parts = {name: round(value, 3) for name, value in asdict(result.seconds).items()}
             failures = [f"{failure.stage}: {failure.reason}" for failure in result.failures]
             found.append(
-                Seed(seed, result.success, result.steps, result.attempts, round(spent, 3), parts, failures, rss_mb())
+                Seed(
+                    seed, result.success, result.steps, result.attempts, round(spent, 3), parts, failures, read_rss_mb()
+                )
             )
             found[-1].all_mb = max(memory, default=0)
             if result.success:
-                judge(found[-1], generator, Path(folder) / f"{seed}.h5", args)
+                replay_actions(found[-1], generator, Path(folder) / f"{seed}.h5", args)
             print(json.dumps(asdict(found[-1])), file=sys.stderr, flush=True)
     generator.close()
     return found
 
 
-def cpu() -> float:
+def read_cpu_seconds() -> float:
     """Return the CPU seconds of this process and of its finished children."""
     spent = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(usage.ru_utime + usage.ru_stime for usage in spent)
 
 
-def rss_mb() -> int:
+def read_rss_mb() -> int:
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize() // 2**20
 
 
 @contextmanager
-def sampled_memory(wanted: bool) -> Iterator[list[int]]:
+def sample_memory(wanted: bool) -> Iterator[list[int]]:
     """Sample the memory in MB (PSS) of this process and its branches twice per second."""
     samples: list[int] = []
     over = threading.Event()
 
     def sample() -> None:
         while not over.wait(0.5):
-            samples.append(sum(map(pss_kb, family(os.getpid()))) // 1024)
+            samples.append(sum(map(read_pss_kb, list_process_tree(os.getpid()))) // 1024)
 
     thread = threading.Thread(target=sample)
     if wanted:
@@ -151,16 +163,16 @@ def sampled_memory(wanted: bool) -> Iterator[list[int]]:
             thread.join()
 
 
-def family(pid: int) -> list[int]:
+def list_process_tree(pid: int) -> list[int]:
     """Return the ids of a process and all its descendants."""
     try:
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     except OSError:
         return []
-    return [pid, *(member for child in children for member in family(int(child)))]
+    return [pid, *(member for child in children for member in list_process_tree(int(child)))]
 
 
-def pss_kb(pid: int) -> int:
+def read_pss_kb(pid: int) -> int:
     try:
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
     except OSError:
@@ -168,14 +180,14 @@ def pss_kb(pid: int) -> int:
     return next((int(line.split()[1]) for line in lines if line.startswith("Pss:")), 0)
 
 
-def judge(found: Seed, generator: EpisodeGenerator, path: Path, args: Args) -> None:
+def replay_actions(found: Seed, generator: EpisodeGenerator, path: Path, args: Args) -> None:
     """Replay the recorded actions in bare PhysX, and the 7-D actions of the episode in open loop."""
     with open_trajectory(path) as file:
         group: Any = file["traj_0"]
         actions = np.array(group["actions"])
         states = np.array(group["env_states"]["articulations"][MOBILE_PANDA.uid])
     found.facts = json.loads(path.with_suffix(".json").read_text())["episodes"][0]["robocas"]["facts"]
-    found.physx = round(bare_physx(generator, found.seed, actions), 3)
+    found.physx = round(measure_bare_physx(generator, found.seed, actions), 3)
     if not generator.open_loop_envs:
         return
     world = generator.open_loop_envs[0]
@@ -195,7 +207,7 @@ def judge(found: Seed, generator: EpisodeGenerator, path: Path, args: Args) -> N
             found.noisy += success
 
 
-def bare_physx(generator: EpisodeGenerator, seed: int, actions: np.ndarray) -> float:
+def measure_bare_physx(generator: EpisodeGenerator, seed: int, actions: np.ndarray) -> float:
     """Return the CPU seconds that PhysX takes for the actions of an episode."""
     generator.env.reset(seed=seed)
     env: Any = generator.env.unwrapped
@@ -210,7 +222,7 @@ def bare_physx(generator: EpisodeGenerator, seed: int, actions: np.ndarray) -> f
     return spent
 
 
-def summary(found: list[Seed], args: Args) -> dict[str, Any]:
+def summarise(found: list[Seed], args: Args) -> dict[str, Any]:
     good = [seed for seed in found if seed.success]
     mean = lambda values: round(float(np.mean(list(values) or [np.nan])), 3)  # noqa: E731
     return {
@@ -235,4 +247,4 @@ def summary(found: list[Seed], args: Args) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(tyro.cli(Args, description=__doc__))

@@ -1,10 +1,15 @@
-"""Measure the CPU time of the evaluation loop and of a bare loop over the same scenes and actions; print JSON.
+"""Measure the CPU time of the evaluation loop and of a bare loop over equal scenes and actions; print JSON.
+
+python benchmarks/evaluation.py [--tasks pick search] [--turns 5] [--steps 300]
 
 The bare loop only resets and steps the same vector environment, without policy, stages, measures and files. Both loops
-run one episode in each env, with the same joint targets and the same number of steps; resets are not timed. The loops
-alternate, and the result of a case is the median of its rounds. CPU time is the sum over this process and its workers.
-
-Run: python benchmarks/evaluation.py [--tasks pick search] [--turns 5] [--steps 300]
+run one episode in each env with equal joint targets and an equal number of steps; resets are not timed. The loops
+alternate. CPU time is the sum over this process and the worker processes. JSON keys:
+  cores, tasks, protocol, envs, turns, steps   number of cores, and options of the benchmark
+  cases                                        per task:
+    bare, cpu ms per step; evaluation, cpu ms per step   median over the rounds of the CPU time per step and env in ms
+    evaluation / bare                                    ratio of these times
+    turns                                                CPU seconds of each round
 """
 
 from __future__ import annotations
@@ -67,9 +72,9 @@ class JointWavePolicy:
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
         """Return joint targets (E, 8)."""
-        return self.targets(observations.qpos)
+        return self.next_targets(observations.qpos)
 
-    def targets(self, qpos: NDArray[np.floating]) -> NDArray[np.floating]:
+    def next_targets(self, qpos: NDArray[np.floating]) -> NDArray[np.floating]:
         """Return the next targets from the joint positions at the first step."""
         if self._step == 0:
             self._from = np.array(qpos[:, MOBILE_PANDA.arm_slice])
@@ -104,8 +109,8 @@ def main(args: Args) -> None:
         ours = EvaluationSession(JointWavePolicy(), settings)
         spent: dict[str, list[float]] = {"bare": [], "evaluation": []}
         for _ in range(args.turns):
-            spent["bare"].append(alone(bare, [one.seed for one in episodes], args.steps))
-            spent["evaluation"].append(evaluated(ours, episodes, args.steps))
+            spent["bare"].append(run_bare_loop(bare, [one.seed for one in episodes], args.steps))
+            spent["evaluation"].append(run_evaluation_loop(ours, episodes, args.steps))
         per_step = {name: 1000 * float(np.median(turns)) / args.steps / args.envs for name, turns in spent.items()}
         cases[task] = {
             **{f"{name}, cpu ms per step": round(value, 3) for name, value in per_step.items()},
@@ -117,24 +122,24 @@ def main(args: Args) -> None:
     print(json.dumps({"cores": os.cpu_count(), **vars(args), "cases": cases}, indent=2))
 
 
-def alone(env: Any, seeds: list[int], steps: int) -> float:
+def run_bare_loop(env: Any, seeds: list[int], steps: int) -> float:
     """Return the CPU seconds of a bare loop."""
     policy = JointWavePolicy()
     policy.reset([])
     obs, _ = env.reset(seed=seeds, options={"env_idx": np.arange(len(seeds))})
-    before = cpu(env)
+    before = read_cpu_seconds(env)
     for _ in range(steps):
-        obs, *_ = env.step(policy.targets(obs["agent"]["qpos"]))
-    return cpu(env) - before
+        obs, *_ = env.step(policy.next_targets(obs["agent"]["qpos"]))
+    return read_cpu_seconds(env) - before
 
 
-def evaluated(session: EvaluationSession, episodes: list[ProtocolEpisode], steps: int) -> float:
+def run_evaluation_loop(session: EvaluationSession, episodes: list[ProtocolEpisode], steps: int) -> float:
     """Return the CPU seconds of the evaluation loop from the first step on."""
     batch = session.open_batch(episodes[0], len(episodes), steps)
     policy = TimedPolicy(batch.env)
     ended = list(run_rollouts(batch, policy, [session.make_episode_spec(one) for one in episodes]))
     assert [one.steps for one in ended] == [steps] * len(episodes)
-    return cpu(batch.env) - policy.before
+    return read_cpu_seconds(batch.env) - policy.before
 
 
 class TimedPolicy(JointWavePolicy):
@@ -147,14 +152,14 @@ class TimedPolicy(JointWavePolicy):
     def reset(self, episodes: list[EpisodeSpec]) -> None:
         """Start episodes in all envs."""
         super().reset(episodes)
-        self.before = cpu(self._env)
+        self.before = read_cpu_seconds(self._env)
 
 
-def cpu(env: Any) -> float:
+def read_cpu_seconds(env: Any) -> float:
     """Return the CPU seconds of this process and the workers of an environment."""
     workers = [int(Path(f"/proc/{pid}/schedstat").read_text().split()[0]) / 1e9 for pid in env.unwrapped.pids]
     return time.process_time() + sum(workers)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(tyro.cli(Args, description=__doc__))

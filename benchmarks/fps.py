@@ -1,9 +1,16 @@
-"""Measure the steps per second of batched envs, of ManiSkill's PickCube-v1, and of a bare scene with as many bodies.
+"""Measure the steps per second of batched envs, of ManiSkill's PickCube-v1, and of a bare scene; print JSON.
 
-Without PhysX on a GPU only one env runs; `benchmarks/vector.py` measures several envs in processes. Actions are random.
-Time is wall-clock time after a warm-up, without resets. Prints JSON.
+python benchmarks/fps.py [--envs 1 16 256 1024 4096] [--modes state rgb] [--size 128 128] [--steps 100]
 
-Run: python benchmarks/fps.py [--envs 1 16 256 1024 4096] [--modes state rgb] [--size 128 128] [--steps 100]
+The bare scene has the bodies of a task configuration and no task. Without PhysX on a GPU only one env is measured;
+`benchmarks/vector.py` measures several envs in processes. Actions are random. Time is wall-clock time after a warm-up,
+without resets. JSON keys:
+  device             name of the GPU, or cpu
+  size               width and height of the images in pixels
+  steps_per_second   observation mode -> case -> number of envs -> steps per second of all envs together, or an error
+  over_bare          observation mode -> configuration -> number of envs -> rate as a factor of the bare scene
+  skipped            reason why only one env was measured
+Exit status: 1 if a case could not be measured.
 """
 
 from __future__ import annotations
@@ -127,7 +134,7 @@ def main(args: Args) -> None:
             for count in args.envs:
                 if count == 1 or not problem:
                     try:
-                        rates[name][count] = round(rate(env_id, count, mode, args, kwargs), 1)
+                        rates[name][count] = round(measure_rate(env_id, count, mode, args, kwargs), 1)
                     except Exception as error:  # for example too little memory; the other cases still run
                         rates[name][count] = f"{type(error).__name__}: {error}"
                         failed += 1
@@ -159,7 +166,7 @@ def start_physx() -> str:
     return ""
 
 
-def rate(env_id: str, count: int, mode: str, args: Args, kwargs: dict[str, Any]) -> float:
+def measure_rate(env_id: str, count: int, mode: str, args: Args, kwargs: dict[str, Any]) -> float:
     """Return the steps per second of all envs together."""
     kwargs = kwargs if mode == "rgb" else {**kwargs, "render_backend": "none"}
     sensors = dict(zip(("width", "height"), args.size, strict=True))
@@ -192,4 +199,4 @@ def _wait(device: torch.device) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(tyro.cli(Args, description=__doc__))

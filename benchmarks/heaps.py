@@ -1,6 +1,16 @@
-"""Measure the height of heaps, the hidden fraction of objects, and the time to make a heap; print JSON.
+"""Measure the height of heaps, the visible fractions of objects, and the time to make a heap; print JSON.
 
 python benchmarks/heaps.py --seeds 50
+
+A visible fraction (p_vis) is the fraction of an object that is seen from above. JSON keys:
+  config, pack            task configuration and object pack
+  heaps                   number of heaps
+  failures                seeds without a layout, with the reason
+  height_m                5th, 50th and 95th percentile of the height of a heap in m
+  objects_p_vis_below     limit -> fraction of all objects whose visible fraction is below the limit
+  target_p_vis            5th, 50th and 95th percentile of the visible fraction of the target
+  targets_p_vis_below     limit -> fraction of targets whose visible fraction is below the limit
+  cpu_seconds             5th, 50th and 95th percentile of the CPU time per heap in seconds
 """
 
 from __future__ import annotations
@@ -22,8 +32,6 @@ from robocas_ms3.scenes.sample import sample_layout
 
 @dataclass
 class Benchmark:
-    """Make heaps and measure them."""
-
     config: str = "search_table_stacked"
     """Task configuration."""
     pack: str = "builtin"
@@ -84,4 +92,4 @@ def _share(mask: np.ndarray) -> float:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Benchmark))
+    main(tyro.cli(Benchmark, description=__doc__))

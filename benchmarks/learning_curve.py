@@ -1,6 +1,6 @@
-"""Draw the learning curves of runs of `robocas train ppo`; write a JPEG.
+"""Draw the learning curves of runs of `robocas train ppo` in one figure; write a JPEG file.
 
-Run: python benchmarks/learning_curve.py out/ppo_1 out/ppo_2 out/ppo_3 [--out docs/images/ppo.jpg]
+python benchmarks/learning_curve.py out/ppo_1 out/ppo_2 out/ppo_3 [--out docs/images/ppo.jpg]
 """
 
 import csv
@@ -29,7 +29,7 @@ def main(args: Args) -> None:
         FigureCanvasAgg(figure)
         left, middle, right = figure.subplots(1, 3)
         for run, colour in zip(args.runs, COLOURS, strict=False):
-            found = read(run / "metrics.csv")
+            found = read_metrics(run / "metrics.csv")
             steps = found["step"] / 1000
             left.plot(steps, found["return"], color=colour)
             middle.plot(steps, 100 * found["held"], color=colour)
@@ -45,7 +45,7 @@ def main(args: Args) -> None:
         figure.savefig(args.out, dpi=110, pil_kwargs={"quality": 88})
 
 
-def read(path: Path) -> dict[str, np.ndarray]:
+def read_metrics(path: Path) -> dict[str, np.ndarray]:
     """Return the columns of the training rows of a metrics.csv."""
     with path.open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["split"] == "train"]
@@ -54,4 +54,4 @@ def read(path: Path) -> dict[str, np.ndarray]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(tyro.cli(Args, description=__doc__))

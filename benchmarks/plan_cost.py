@@ -1,6 +1,15 @@
-"""Estimate the cost of a plan from a few episodes of each part: CPU hours, hours on N cores, gigabytes; print JSON.
+"""Estimate the cost of a plan from a few episodes per plan part; print JSON.
 
 python benchmarks/plan_cost.py paper --episodes 4 --seed 0
+
+The benchmark records and renders the same number of episodes of each plan part, and extrapolates. JSON keys:
+  plan                       name or file of the plan
+  measured_episodes_a_part   number of measured episodes per plan part
+  measured_minutes           wall-clock time of the measurement in minutes
+  parts                      per plan part: record_cpu_seconds and render_cpu_seconds (CPU seconds per episode),
+                             megabytes (size per episode), episodes (number in the plan), cpu_hours (of the part)
+  cpu_hours, gigabytes       cost of the whole plan
+  hours                      number of cores -> wall-clock hours of the whole plan
 """
 
 from __future__ import annotations
@@ -25,8 +34,6 @@ from robocas_ms3.plans.status import PartStatus, read_status
 
 @dataclass
 class Benchmark:
-    """Run a plan with the same number of episodes for each part, and extrapolate."""
-
     plan: Annotated[str, tyro.conf.Positional] = "paper"
     """Name of a bundled plan, or a YAML file."""
     episodes: int = 4
@@ -44,14 +51,14 @@ def main(cfg: Benchmark) -> None:
     plan = load_plan(cfg.plan)
     with tempfile.TemporaryDirectory() as folder:
         path, out = Path(folder) / "sample.yaml", Path(folder) / "out"
-        path.write_text(yaml.safe_dump(sample_of(plan, cfg)), encoding="utf-8")
+        path.write_text(yaml.safe_dump(make_sample_plan(plan, cfg)), encoding="utf-8")
         command = [sys.executable, "-W", "ignore", "robocas_cli.py", "plan", "run", str(path), "--out", str(out)]
         start = time.monotonic()
         subprocess.run([*command, "--jobs", str(cfg.jobs)], check=True, stdout=subprocess.DEVNULL)
-        print(json.dumps(report(plan, cfg, read_status(out).parts, time.monotonic() - start), indent=2))
+        print(json.dumps(make_report(plan, cfg, read_status(out).parts, time.monotonic() - start), indent=2))
 
 
-def sample_of(plan: Plan, cfg: Benchmark) -> dict[str, Any]:
+def make_sample_plan(plan: Plan, cfg: Benchmark) -> dict[str, Any]:
     """Return the plan with fewer episodes, work units of one episode, and no embeddings (their cost is negligible)."""
     sample = plan.model_dump(mode="json", exclude_none=True)
     for number, part in enumerate(sample["parts"]):
@@ -59,7 +66,7 @@ def sample_of(plan: Plan, cfg: Benchmark) -> dict[str, Any]:
     return {**sample, "stages": ["demonstrations", "datasets"], "formats": ["robocas"], "embeddings": False, "block": 1}
 
 
-def report(plan: Plan, cfg: Benchmark, parts: list[PartStatus], wall: float) -> dict[str, Any]:
+def make_report(plan: Plan, cfg: Benchmark, parts: list[PartStatus], wall: float) -> dict[str, Any]:
     """Return the costs and the measurements that they follow from."""
     rows = {}
     for part, measured in zip(plan.parts, parts, strict=True):
@@ -84,4 +91,4 @@ def report(plan: Plan, cfg: Benchmark, parts: list[PartStatus], wall: float) -> 
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Benchmark))
+    main(tyro.cli(Benchmark, description=__doc__))

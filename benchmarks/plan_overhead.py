@@ -1,6 +1,15 @@
-"""Measure the overhead of the executor and files of a plan with work units that only wait; print JSON.
+"""Measure the overhead of the executor and of the files of a plan, with work units that only wait; print JSON.
 
 python benchmarks/plan_overhead.py --units 10000 --workers 64
+
+Each work unit has one seed and sleeps for a fixed time; no dataset is written. JSON keys:
+  units, workers, cores   number of work units, worker processes, and cores of this machine
+  seconds_a_unit          duration of a work unit in seconds
+  units_per_second        finished work units per second while all workers are busy
+  overhead_percent        by how much longer a work unit takes than its sleep
+  wall_seconds            time from the start to the last finished work unit
+  seconds_to_start        time until all workers have started
+  runner_cpu_ms_a_unit    CPU time of the main process per work unit in ms
 """
 
 from __future__ import annotations
@@ -25,8 +34,6 @@ from robocas_ms3.plans.run import run_shard
 
 @dataclass
 class Benchmark:
-    """Run a plan of synthetic work units of one seed each; nothing is joined."""
-
     units: int = 10_000
     """Number of work units."""
     workers: int = 64
@@ -68,7 +75,7 @@ def main(cfg: Benchmark) -> None:
         run_shard(LocalExecutor(folder, cfg.workers), (0, 1))
         cpu = time.process_time() - cpu
         units = [WorkUnit(0, block) for block in range(cfg.units)]
-        at = np.sort([one.at for unit in units for one in folder.read_outcomes(unit) or ()])
+        at = np.sort([one.end_time for unit in units for one in folder.read_outcomes(unit) or ()])
     # from the start of the last worker until the first worker is idle
     first, last = 2 * cfg.workers, cfg.units - cfg.workers
     rate = (last - first) / (at[last] - at[first])
@@ -87,4 +94,4 @@ def main(cfg: Benchmark) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Benchmark))
+    main(tyro.cli(Benchmark, description=__doc__))

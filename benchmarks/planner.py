@@ -1,9 +1,18 @@
-"""Measure the planner: inverse kinematics, joint-space plans, straight lines, batched reachability; print JSON.
+"""Measure the motion planner: inverse kinematics, joint-space plans, straight lines, reachability; print JSON.
 
-Each scene is a table with 15 boxes as a point cloud with 5 mm spacing (about 50,000 points). The arm moves to top-down
-poses over the table, and straight down or up from there.
+python benchmarks/planner.py --scenes 5 --plans 20
 
-    python benchmarks/planner.py --scenes 5 --plans 20
+Each scene is a table with 15 boxes as a point cloud with a spacing of 5 mm, about 50,000 points. The arm moves to poses
+above the table, in which the gripper points down, and from there straight down or up. JSON keys:
+  points                      median number of points of a scene
+  trajectory_seconds_median   median duration of the planned motions in seconds
+  set_scene                   building the collision model of a scene
+  ik                          inverse kinematics of one pose
+  plan_to_pose                a joint-space plan to a pose
+  plan_straight               a straight line of the TCP
+  reachability_256            inverse kinematics of a batch of 256 poses
+    median_ms, p95_ms         median and 95th percentile of the wall-clock time in ms
+    outcomes                  "ok" or reason of the failure -> number of calls
 """
 
 from __future__ import annotations
@@ -26,7 +35,7 @@ from robocas_ms3.robots.urdf import make_robot_files
 SPACING = 0.005
 
 
-def box_surface(center: Array, size: Array, yaw: float) -> Array:
+def sample_box_surface(center: Array, size: Array, yaw: float) -> Array:
     """Return points (P, 3) on the six faces of a box, in m."""
     faces = []
     for axis in range(3):
@@ -41,17 +50,17 @@ def box_surface(center: Array, size: Array, yaw: float) -> Array:
     return np.concatenate(faces) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + center
 
 
-def table(rng: np.random.Generator) -> Array:
+def make_table_cloud(rng: np.random.Generator) -> Array:
     """Return the point cloud of a table top 4 cm below the arm's base with 15 boxes on it."""
-    pieces = [box_surface(np.array([0.6, 0, -0.05]), np.array([0.5, 0.7, 0.02]), 0.0)]
+    pieces = [sample_box_surface(np.array([0.6, 0, -0.05]), np.array([0.5, 0.7, 0.02]), 0.0)]
     for _ in range(15):
         size = rng.uniform(0.03, 0.1, 3)
         x, y = rng.uniform((0.4, -0.3), (0.8, 0.3))
-        pieces.append(box_surface(np.array([x, y, -0.04 + size[2] / 2]), size, rng.uniform(-3, 3)))
+        pieces.append(sample_box_surface(np.array([x, y, -0.04 + size[2] / 2]), size, rng.uniform(-3, 3)))
     return np.concatenate(pieces)
 
 
-def top_down(rng: np.random.Generator) -> Array:
+def sample_top_down_pose(rng: np.random.Generator) -> Array:
     """Return a random pose of the TCP over the table, pointing down."""
     yaw = rng.uniform(-np.pi, np.pi)
     c, s = np.cos(yaw), np.sin(yaw)
@@ -104,13 +113,13 @@ def main() -> None:
     reachability = InverseKinematics(ArmChain(files.arm_urdf, MOBILE_PANDA))
     for scene in range(options.seed, options.seed + options.scenes):
         rng = np.random.default_rng(scene)
-        cloud = table(rng)
+        cloud = make_table_cloud(rng)
         points.append(len(cloud))
         planner.seed(scene)
         watch.run("set_scene", planner.set_scene, cloud)
         here = np.array(MOBILE_PANDA.arm_rest)
         for _ in range(options.plans):
-            goal = top_down(rng)
+            goal = sample_top_down_pose(rng)
             watch.run("ik", planner.ik, goal, here)
             trajectory = watch.run("plan_to_pose", planner.plan_to_pose, here, goal, stage="reach")
             if trajectory is None:
@@ -120,7 +129,7 @@ def main() -> None:
             lift = goal.copy()
             lift[2, 3] += rng.choice((-0.05, 0.1))
             watch.run("plan_straight", planner.plan_straight, here, lift, stage="straight")
-        poses = np.array([top_down(rng) for _ in range(256)])
+        poses = np.array([sample_top_down_pose(rng) for _ in range(256)])
         watch.run("reachability_256", reachability.nearest_solutions, poses, np.array(MOBILE_PANDA.arm_rest))
     result = {
         "points": int(np.median(points)),

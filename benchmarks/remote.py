@@ -1,12 +1,15 @@
-"""Measure the observations per second of a remote policy against servers that take a fixed time. Prints JSON.
+"""Measure the observations per second of a remote policy with servers of a fixed inference time; print JSON.
 
-The servers run in processes of their own; observations are synthetic, and nothing is simulated:
+python benchmarks/remote.py [--in-turn] [--inference-ms 100] [--rounds 20] [--images 224]
 
-serial     openpi's protocol, one request at a time, as openpi's server computes
-parallel   openpi's protocol, every request takes the time by itself, as with a process per connection
-batched    `robocas serve-policy`: a call of the policy takes the time, whatever the number of envs
-
-Run: python benchmarks/remote.py [--in-turn] [--inference-ms 100] [--rounds 20] [--images 224]
+Each server runs in a process. Observations are synthetic, and nothing is simulated. Servers:
+  serial     openpi's protocol, one request at a time, as openpi's server
+  parallel   openpi's protocol, all requests at the same time, as with one process per connection
+  batched    `robocas serve-policy`, which computes the actions of all envs in one call
+JSON keys:
+  inference_ms, images, rounds   options of the benchmark
+  serial, parallel, batched      number of envs -> obs_per_s (observations per second) and act_ms (median time of
+                                 a call of `act` in ms)
 """
 
 import asyncio
@@ -82,10 +85,10 @@ def measure(server: str, envs: int, spec: PolicySpec, args: Args) -> dict[str, f
     process = context.Process(target=serve_slowly, args=(server, args, spec, theirs), daemon=True)
     process.start()
     try:
-        options = [] if server == "batched" else [*plain_options(spec), *["max_in_flight=1"] * args.in_turn]
+        options = [] if server == "batched" else [*make_openpi_options(spec), *["max_in_flight=1"] * args.in_turn]
         policy = RemotePolicy(f"{ours.recv()}?{'&'.join(options)}")
         policy.reset([EpisodeSpec(env, env, "pick", "", "", "", env, "take the apple") for env in range(envs)])
-        observations, times = synthetic(envs, spec), []
+        observations, times = make_observations(envs, spec), []
         for _ in range(WARM_UP + args.rounds):
             start = time.perf_counter()
             policy.act(observations)
@@ -99,7 +102,7 @@ def measure(server: str, envs: int, spec: PolicySpec, args: Args) -> dict[str, f
     return {"obs_per_s": round(per_second, 1), "act_ms": round(1000 * float(np.median(measured)), 2)}
 
 
-def synthetic(envs: int, spec: PolicySpec) -> Observations:
+def make_observations(envs: int, spec: PolicySpec) -> Observations:
     """Return observations of seeded noise."""
     rng = np.random.default_rng(0)
     shapes = {name: (envs, height, width, 3) for name, (width, height) in spec.cameras.items()}
@@ -108,7 +111,7 @@ def synthetic(envs: int, spec: PolicySpec) -> Observations:
     return Observations(np.arange(envs), ["take the apple"] * envs, None, images, {}, robot, None)
 
 
-def plain_options(spec: PolicySpec) -> list[str]:
+def make_openpi_options(spec: PolicySpec) -> list[str]:
     """Return the options of an address that a plain openpi server needs."""
     cameras = ",".join(f"{name}:{width}x{height}" for name, (width, height) in spec.cameras.items())
     return [f"cameras={cameras}"] if cameras else []
@@ -142,4 +145,4 @@ async def serve_openpi(seconds: float, pipe: Connection, *, parallel: bool) -> N
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(tyro.cli(Args, description=__doc__))

@@ -1,6 +1,13 @@
-"""Measure resets whose layout is in the layout cache, without images; print JSON.
+"""Measure resets to layouts in the layout cache, without images; print JSON.
 
 python benchmarks/resets.py --seeds 60
+
+The benchmark fills the layout cache, and then resets to each seed several times. JSON keys:
+  config, objects, seeds   task configuration, number of objects per scene, number of seeds with a layout
+  first_round_ms           times of the first reset to each seed, which reads objects from the pack
+  later_rounds_ms          times of all later resets
+Each of both times has wall (wall-clock time) and cpu (CPU time of the main thread): median, mean, p95 (95th percentile)
+and max in ms.
 """
 
 from __future__ import annotations
@@ -21,8 +28,6 @@ from robocas_ms3.tasks import TASKS
 
 @dataclass
 class Benchmark:
-    """Fill the layout cache, then reset to each of its seeds."""
-
     config: str = "search_table_stacked"
     """Task configuration; the default has 15 objects."""
     pack: str = "builtin"
@@ -69,4 +74,4 @@ def _figures(rounds: list[list[tuple[float, float]]]) -> dict[str, dict[str, flo
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Benchmark))
+    main(tyro.cli(Benchmark, description=__doc__))

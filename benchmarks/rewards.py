@@ -1,6 +1,8 @@
-"""Draw the dense reward of a demonstration of each task, and of runs that stop on the way; write a JPEG.
+"""Draw the dense reward of one demonstration per task, and of runs that stop on the way; write a JPEG file.
 
-Run: python benchmarks/rewards.py [--out docs/images/rewards.jpg]
+python benchmarks/rewards.py [--out docs/images/rewards.jpg]
+
+Printed lines: length of each demonstration and mean reward of each fifth; reward per step of each run that stops.
 """
 
 import tempfile
@@ -53,9 +55,9 @@ def main(args: Args) -> None:
 def draw(axes: Any, config: str, seed: int) -> None:
     env, actions, seed = demonstrate(config, seed)
     freq = env.unwrapped.control_freq
-    levels, infos = play(env, seed, actions, round(AFTER * freq))
+    levels, infos = run_actions(env, seed, actions, round(AFTER * freq))
     stages = list(env.unwrapped.REWARDS.stages)
-    at = np.array([stage_of(env.unwrapped.REWARDS, info) for info in infos])
+    at = np.array([find_stage(env.unwrapped.REWARDS, info) for info in infos])
     times = np.arange(1, len(levels) + 1) / freq
     bounds = [0, *(np.flatnonzero(np.diff(at)) + 1), len(at)]
     for shade, (first, after) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
@@ -63,8 +65,8 @@ def draw(axes: Any, config: str, seed: int) -> None:
         if after - first > 0.035 * len(at):
             name = [*stages, "success"][at[first]]
             axes.text((first + after) / 2 / freq, 1.04, name, ha="center", color="#555", size=8)
-    for stop in stop_steps(infos, actions):
-        idle, _ = play(env, seed, actions[:stop], len(levels) - stop)
+    for stop in find_stop_steps(infos, actions):
+        idle, _ = run_actions(env, seed, actions[:stop], len(levels) - stop)
         axes.plot(times[stop - 1 :], idle[stop - 1 :], color=ORANGE, lw=1.2, ls=(0, (4, 2)), zorder=3)
         axes.plot(times[stop - 1], idle[stop - 1], "o", color=ORANGE, ms=4, zorder=4)
         print(f"{config} seed {seed}: a run that stops after {stop / freq:.1f} s gets {idle[-1]:.3f} per step then")
@@ -95,7 +97,7 @@ def demonstrate(config: str, seed: int) -> tuple[gym.Env, np.ndarray, int]:
     return gym.make(TASKS[task].env_id, config=config, **kwargs), actions, seed
 
 
-def play(env: gym.Env, seed: int, actions: np.ndarray, then: int) -> tuple[np.ndarray, list[dict]]:
+def run_actions(env: gym.Env, seed: int, actions: np.ndarray, then: int) -> tuple[np.ndarray, list[dict]]:
     """Return rewards and infos of the actions, followed by `then` repetitions of the last action."""
     env.reset(seed=seed)
     levels, infos = [], []
@@ -106,13 +108,13 @@ def play(env: gym.Env, seed: int, actions: np.ndarray, then: int) -> tuple[np.nd
     return np.array(levels), infos
 
 
-def stage_of(table: Any, info: dict) -> int:
+def find_stage(table: Any, info: dict) -> int:
     """Return the index of the first stage with a reward term below 1."""
     full = [all(info["reward_terms"][name] == 1 for name in own) for own in table.stages.values()]
     return [*full, False].index(False)
 
 
-def stop_steps(infos: list[dict], actions: np.ndarray) -> list[int]:
+def find_stop_steps(infos: list[dict], actions: np.ndarray) -> list[int]:
     """Return steps at which to stop: before the first touch of the target, grasped, lifted, above the basket."""
     first = {
         flag: next(i for i, info in enumerate(infos) if info[flag])
@@ -124,4 +126,4 @@ def stop_steps(infos: list[dict], actions: np.ndarray) -> list[int]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(tyro.cli(Args, description=__doc__))

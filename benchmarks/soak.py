@@ -1,6 +1,17 @@
-"""Run a plan for some time and interrupt it: episodes per hour, seconds and memory per episode; print JSON.
+"""Run a plan for some time and interrupt it with Ctrl-C; print JSON.
 
 python benchmarks/soak.py --minutes 60 --jobs 2
+
+The plan is longer than the time. JSON keys:
+  minutes, jobs                          duration until Ctrl-C, number of parallel jobs
+  episodes, seeds                        task -> number of recorded episodes, and of seeds that were tried
+  episodes_per_hour, recent_episodes_per_hour   rate over the whole time, and the rate that `robocas plan status` prints
+  cpu_seconds_per_episode                task -> CPU seconds per recorded episode
+  wall_seconds_times_jobs_per_episode    wall-clock seconds times number of jobs per recorded episode
+  steps_per_episode, megabytes_per_episode   task -> mean number of steps, and of MB on the disk
+  crashes, ctrl_c_seconds                number of crashed workers, seconds from Ctrl-C to the end of the plan
+  processes                              one entry per worker process: minutes (lifetime), first_mb, last_mb and peak_mb
+                                         (memory), growth_mb_per_500_episodes (memory growth from the third minute on)
 """
 
 from __future__ import annotations
@@ -31,8 +42,6 @@ LOOK = 5.0  # s between two samples of memory
 
 @dataclass
 class Benchmark:
-    """Run `robocas plan run` on a plan that is longer than the time, then send Ctrl-C."""
-
     minutes: float = 60.0
     """Minutes until Ctrl-C."""
     jobs: int = 2
@@ -61,12 +70,12 @@ def main(cfg: Benchmark) -> None:
     """Run the benchmark."""
     with tempfile.TemporaryDirectory() as folder:
         plan, out = Path(folder) / "soak.yaml", Path(folder) / "out"
-        plan.write_text(yaml.safe_dump(plan_of(cfg)), encoding="utf-8")
+        plan.write_text(yaml.safe_dump(make_plan(cfg)), encoding="utf-8")
         words = ["plan", "run", str(plan), "--out", str(out), "--jobs", str(cfg.jobs)]
         start = time.monotonic()
         process = subprocess.Popen([sys.executable, "-W", "ignore", "robocas_cli.py", *words], start_new_session=True)
         try:
-            memory = watch(process, start + 60 * cfg.minutes)
+            memory = sample_memory(process, start + 60 * cfg.minutes)
             wall = time.monotonic() - start
             os.killpg(process.pid, signal.SIGINT)
             interrupted = time.monotonic()
@@ -74,10 +83,10 @@ def main(cfg: Benchmark) -> None:
             ctrl_c = time.monotonic() - interrupted
         finally:
             process.kill()
-        print(json.dumps(report(cfg, out, wall, ctrl_c, memory), indent=2))
+        print(json.dumps(make_report(cfg, out, wall, ctrl_c, memory), indent=2))
 
 
-def plan_of(cfg: Benchmark) -> dict[str, Any]:
+def make_plan(cfg: Benchmark) -> dict[str, Any]:
     """Return a plan with the tasks in turns, longer than the time."""
     turns, apart = max(1, int(cfg.minutes * cfg.jobs)), max(1000, 10 * cfg.turn)
     parts = [
@@ -89,7 +98,7 @@ def plan_of(cfg: Benchmark) -> dict[str, Any]:
     return {"parts": parts, "stages": stages, "images": {"size": list(cfg.size)}, "embeddings": False, "block": 1}
 
 
-def watch(process: subprocess.Popen[bytes], until: float) -> dict[int, Memory]:
+def sample_memory(process: subprocess.Popen[bytes], until: float) -> dict[int, Memory]:
     """Sample the memory of the processes of the run until a time, or until the run ends."""
     memory: dict[int, Memory] = defaultdict(Memory)
     runner = psutil.Process(process.pid)
@@ -106,7 +115,7 @@ def watch(process: subprocess.Popen[bytes], until: float) -> dict[int, Memory]:
     return memory
 
 
-def report(cfg: Benchmark, out: Path, wall: float, ctrl_c: float, memory: dict[int, Memory]) -> dict[str, Any]:
+def make_report(cfg: Benchmark, out: Path, wall: float, ctrl_c: float, memory: dict[int, Memory]) -> dict[str, Any]:
     """Return the measurements."""
     progress = PlanProgress(read_plan(out))
     found: dict[str, list[Outcome]] = defaultdict(list)
@@ -135,11 +144,13 @@ def report(cfg: Benchmark, out: Path, wall: float, ctrl_c: float, memory: dict[i
         },
         "crashes": sum(len(one.crashes) for made in found.values() for one in made),
         "ctrl_c_seconds": round(ctrl_c, 2),
-        "processes": [growth(one, episodes / cfg.jobs / wall) for one in memory.values() if len(one.at) * LOOK > 60],
+        "processes": [
+            measure_growth(one, episodes / cfg.jobs / wall) for one in memory.values() if len(one.at) * LOOK > 60
+        ],
     }
 
 
-def growth(memory: Memory, episodes_per_second: float) -> dict[str, float]:
+def measure_growth(memory: Memory, episodes_per_second: float) -> dict[str, float]:
     """Return the memory growth of a process from its third minute on; before, it loads its modules and packs."""
     at, megabytes = np.array(memory.at), np.array(memory.megabytes)
     later = at > at[0] + 120
@@ -156,4 +167,4 @@ def growth(memory: Memory, episodes_per_second: float) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Benchmark))
+    main(tyro.cli(Benchmark, description=__doc__))

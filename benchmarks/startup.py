@@ -1,6 +1,11 @@
-"""Wall-clock and CPU seconds until `robocas --help` and the help of each command are printed; prints JSON.
+"""Measure the time until `robocas --help` and the help of each command are printed; print JSON, one line per command.
 
 python benchmarks/startup.py --repeats 5
+
+JSON keys:
+  command   the command
+  wall_s    shortest wall-clock time of all repeats in seconds
+  cpu_s     shortest CPU time of all repeats in seconds
 """
 
 from __future__ import annotations
@@ -22,13 +27,11 @@ PROGRAM = Path(__file__).resolve().parents[1] / "robocas_cli.py"
 
 @dataclass
 class Benchmark:
-    """Measure the time until the help of each command is printed."""
-
     repeats: int = 5
     """Runs of each command; the least time counts."""
 
 
-def seconds(words: list[str]) -> tuple[float, float]:
+def measure_seconds(words: list[str]) -> tuple[float, float]:
     """Return wall-clock and CPU seconds of a command."""
     start, before = time.perf_counter(), os.times()
     subprocess.run([sys.executable, str(PROGRAM), *words], stdout=subprocess.DEVNULL, check=True)
@@ -40,10 +43,10 @@ def seconds(words: list[str]) -> tuple[float, float]:
 def main(cfg: Benchmark) -> None:
     """Run the benchmark."""
     for words in ([], *([name] for name in COMMANDS)):
-        runs = [seconds([*words, "--help"]) for _ in range(cfg.repeats)]
+        runs = [measure_seconds([*words, "--help"]) for _ in range(cfg.repeats)]
         wall, cpu = (round(min(times), 3) for times in zip(*runs, strict=True))
         print(json.dumps({"command": " ".join(["robocas", *words, "--help"]), "wall_s": wall, "cpu_s": cpu}))
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Benchmark))
+    main(tyro.cli(Benchmark, description=__doc__))

@@ -1,9 +1,14 @@
-"""Measure the CPU time of a control step, next to PickCube-v1 of ManiSkill and to the physics alone; print JSON.
+"""Measure the CPU time of a control step, next to PickCube-v1 of ManiSkill and to physics alone; print JSON.
 
-Nothing is rendered. All arms make the same motion in the air. The cases alternate, so that other load affects all of
-them. Times are CPU times of this process, and ratios are medians over the rounds.
+python benchmarks/step.py [--rounds 5] [--steps 100]
 
-Run: python benchmarks/step.py [--rounds 5] [--steps 100]
+Nothing is rendered. The arms of all cases make the same motion in the air. The cases alternate, so that other programs
+affect all cases. JSON keys:
+  ms      case -> median over the rounds of the CPU time of this process per control step in ms
+  ratio   "case / other case" -> median over the rounds of the ratio of the times
+Cases: pick_cube (PickCube-v1), pick and search (RoboCASPick-v1, RoboCASSearch-v1, joint positions, states),
+pick_ee (RoboCASPick-v1 with pd_ee_delta_pose), pick_recorded and search_recorded (with the recorder of episodes),
+pick_bare and search_bare (only PhysX).
 """
 
 import json
@@ -49,16 +54,16 @@ def main(args: Args) -> None:
     cube = np.column_stack([CUBE_REST + sway - sway[0], np.ones(args.steps)]).astype(np.float32)
     deltas = np.column_stack([0.1 * np.diff(sway[:, :6], axis=0, prepend=sway[:1, :6]), np.ones(args.steps)])
     with tempfile.TemporaryDirectory() as folder:
-        pick, search = make("RoboCASPick-v1", "none"), make("RoboCASSearch-v1", "none")
+        pick, search = make_env("RoboCASPick-v1", "none"), make_env("RoboCASSearch-v1", "none")
         cases: dict[str, tuple[gym.Env, Callable[[gym.Env, np.ndarray], None], np.ndarray]] = {
-            "pick_cube": (make("PickCube-v1", "state"), steps, cube),
-            "pick": (make("RoboCASPick-v1", "state"), steps, joints),
-            "search": (make("RoboCASSearch-v1", "state"), steps, joints),
-            "pick_ee": (make("RoboCASPick-v1", "state", "pd_ee_delta_pose"), steps, deltas.astype(np.float32)),
-            "pick_recorded": (EpisodeRecorder(pick, Path(folder), "pick"), steps, joints),
-            "search_recorded": (EpisodeRecorder(search, Path(folder), "search"), steps, joints),
-            "pick_bare": (pick, bare_steps, joints),
-            "search_bare": (search, bare_steps, joints),
+            "pick_cube": (make_env("PickCube-v1", "state"), run_steps, cube),
+            "pick": (make_env("RoboCASPick-v1", "state"), run_steps, joints),
+            "search": (make_env("RoboCASSearch-v1", "state"), run_steps, joints),
+            "pick_ee": (make_env("RoboCASPick-v1", "state", "pd_ee_delta_pose"), run_steps, deltas.astype(np.float32)),
+            "pick_recorded": (EpisodeRecorder(pick, Path(folder), "pick"), run_steps, joints),
+            "search_recorded": (EpisodeRecorder(search, Path(folder), "search"), run_steps, joints),
+            "pick_bare": (pick, run_bare_steps, joints),
+            "search_bare": (search, run_bare_steps, joints),
         }
         taken: dict[str, list[float]] = {name: [] for name in cases}
         for _ in range(args.rounds):
@@ -74,16 +79,16 @@ def main(args: Args) -> None:
     print(json.dumps({"ms": {n: round(float(np.median(t)), 3) for n, t in taken.items()}, "ratio": ratios}, indent=2))
 
 
-def make(env_id: str, obs_mode: str, control_mode: str = "pd_joint_pos") -> gym.Env:
+def make_env(env_id: str, obs_mode: str, control_mode: str = "pd_joint_pos") -> gym.Env:
     return gym.make(env_id, obs_mode=obs_mode, control_mode=control_mode, render_backend="none")
 
 
-def steps(env: gym.Env, actions: np.ndarray) -> None:
+def run_steps(env: gym.Env, actions: np.ndarray) -> None:
     for action in actions:
         env.step(action)
 
 
-def bare_steps(env: gym.Env, actions: np.ndarray) -> None:
+def run_bare_steps(env: gym.Env, actions: np.ndarray) -> None:
     """Step only PhysX with ``pd_joint_pos`` actions."""
     base: Any = env.unwrapped
     system, joints = base.scene.px, base.agent.robot.joints_map
@@ -102,4 +107,4 @@ def bare_steps(env: gym.Env, actions: np.ndarray) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(tyro.cli(Args, description=__doc__))

@@ -1,13 +1,16 @@
 """Measure steps per second and memory of several environments on a CPU, without images; print JSON.
 
+python benchmarks/vector.py [--turns 5] [--steps 100] [--envs 8]
+
 The cases are `make_vec`, one plain environment, and gymnasium's ``AsyncVectorEnv`` with ManiSkill's ``CPUGymWrapper``.
-Actions are random; resets are not timed. The cases alternate, so that other load affects all of them.
-
-``steps_per_second`` is the median of wall-clock times. CPU time does not depend on other load: ``on_two_cores`` is the
-rate that this process and then the workers, distributed over two cores, would reach on an idle machine. ``pss_mb`` is
-the memory of the workers of a case that runs alone, plus the growth of this process.
-
-Run: python benchmarks/vector.py [--turns 5] [--steps 100] [--envs 8]
+Actions are random; resets are not timed. The cases alternate, so that other programs affect all cases. JSON keys:
+  env_id ... memory_of    options of the benchmark
+  cases                   per case:
+    steps_per_second           steps per second of all envs: median over the rounds, by wall-clock time
+    on_two_cores               steps per second that two cores of an idle machine would reach, from CPU times: this
+                               process and then the workers, distributed over two cores
+    cpu_ms_per_step_of_all     CPU time of one step of all envs in ms: of this process, and of all workers
+    pss_mb                     memory (PSS) of the workers and growth of this process in MB, while only this case runs
 """
 
 from __future__ import annotations
@@ -59,14 +62,14 @@ def main(args: Args) -> None:
     torch.set_num_threads(1)
     cases = make_cases(args)
     if args.memory_of:
-        print(memory(cases[args.memory_of]))
+        print(measure_memory(cases[args.memory_of]))
         return
     envs = {name: make() for name, make in cases.items()}
-    workers = {name: workers_of(env) for name, env in envs.items()}
+    workers = {name: find_worker_pids(env) for name, env in envs.items()}
     taken: dict[str, list[tuple[float, float, float, float]]] = {name: [] for name in envs}
     for _ in range(args.turns):
         for name, env in envs.items():
-            taken[name].append(turn(env, workers[name], args.steps))
+            taken[name].append(run_round(env, workers[name], args.steps))
     report = {}
     for name, env in envs.items():
         count = getattr(env, "num_envs", 1)
@@ -107,37 +110,37 @@ def make_unbatched(env_id: str, kwargs: dict[str, Any]) -> gym.Env:
     return CPUGymWrapper(gym.make(env_id, **kwargs))
 
 
-def workers_of(env: Any) -> list[int]:
+def find_worker_pids(env: Any) -> list[int]:
     """Return the process ids of a vector environment."""
     if isinstance(env, gym.vector.AsyncVectorEnv):
         return [process.pid for process in env.processes if process.pid is not None]
     return getattr(env.unwrapped, "pids", [])
 
 
-def turn(env: Any, workers: Sequence[int], steps: int) -> tuple[float, float, float, float]:
+def run_round(env: Any, workers: Sequence[int], steps: int) -> tuple[float, float, float, float]:
     """Return seconds, and CPU seconds of this process, of the busiest worker and of all workers."""
     env.reset(seed=0)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(steps)]
-    start, own, before = time.perf_counter(), time.process_time(), [*map(cpu_of, workers)]
+    start, own, before = time.perf_counter(), time.process_time(), [*map(read_cpu_seconds, workers)]
     for action in actions:
         env.step(action)
     wall, own = time.perf_counter() - start, time.process_time() - own
-    spent = [cpu_of(pid) - earlier for pid, earlier in zip(workers, before, strict=True)]
+    spent = [read_cpu_seconds(pid) - earlier for pid, earlier in zip(workers, before, strict=True)]
     return wall, own, max(spent, default=0.0), sum(spent)
 
 
-def cpu_of(pid: int) -> float:
+def read_cpu_seconds(pid: int) -> float:
     """Return the CPU seconds that a process has used."""
     return int(Path(f"/proc/{pid}/schedstat").read_text().split()[0]) / 1e9
 
 
-def memory(make: Callable[[], Any]) -> float:
+def measure_memory(make: Callable[[], Any]) -> float:
     """Return the memory of a case in MB (PSS): all child processes and the growth of this process."""
     me = psutil.Process()
     before = me.memory_full_info().pss
     env = make()
-    turn(env, [], 20)
+    run_round(env, [], 20)
     grown = me.memory_full_info().pss - before
     found = grown + sum(child.memory_full_info().pss for child in me.children(recursive=True))
     env.close()
@@ -145,4 +148,4 @@ def memory(make: Callable[[], Any]) -> float:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(tyro.cli(Args, description=__doc__))

@@ -1,9 +1,16 @@
-"""Measure the seconds until the page of `robocas view` is shown in Chromium; print JSON.
+"""Measure the time until the page of `robocas view` is shown in Chromium; print JSON.
 
 python benchmarks/view.py --episodes 1000
 
-The browser measures ``first_paint`` and ``first_contentful_paint`` from the navigation on, like the other times of the
-page. ``server`` is the time from the command to its printed address, mostly the start of Python.
+JSON keys:
+  episodes       number of episodes
+  median, runs   medians over the runs, and values of each run, in seconds:
+    server                                 from the command to the printed address, mostly the start of Python
+    first_paint, first_contentful_paint    from the navigation to these events of the browser
+    table, images, thumbnails_in_view      from the navigation until the list of episodes, the camera images of the
+                                           first episode, and the 12 visible thumbnails are shown
+    a_thumbnail_median, a_thumbnail_slowest   loading time of a thumbnail
+    click_to_episode, click_to_images      from a click on an episode until its text and its camera images are shown
 """
 
 from __future__ import annotations
@@ -34,8 +41,6 @@ LOADED = "every(img => img.complete && img.naturalWidth)"
 
 @dataclass
 class Benchmark:
-    """Open a page of many episodes."""
-
     episodes: int = 1000
     """Number of episodes."""
     dataset: Path | None = None
@@ -150,4 +155,4 @@ def _page(page: Any, url: str, count: int) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Benchmark))
+    main(tyro.cli(Benchmark, description=__doc__))

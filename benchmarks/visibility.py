@@ -1,8 +1,15 @@
-"""Measure the time of p_vis by resolution, and its error: heaps of search, all objects, one core; print JSON.
+"""Measure the time and the error of visible fractions (p_vis) at several resolutions; print JSON.
 
-Milliseconds are medians of CPU time per view; the first view of a mesh also builds its search tree.
+python benchmarks/visibility.py [--heaps 5] [--pack builtin]
 
-Run: python benchmarks/visibility.py [--heaps 5] [--pack builtin]
+The scenes are heaps of the task search. Visible fractions of all objects are computed on one core. JSON keys:
+  heaps, objects     number of heaps, and of objects per heap
+  objects_below_0.9  fraction of objects with a visible fraction below 0.9
+  fast, full         results for the meshes of this level of detail:
+    triangles                    mean number of triangles per heap
+    first_view_ms                CPU time of the first view in ms, which also builds the search trees of the meshes
+    view_ms                      image size in pixels -> median CPU time per view in ms
+    worst_difference_to_finest   image size -> largest difference of a visible fraction from that at 512 pixels
 """
 
 from __future__ import annotations
@@ -38,7 +45,7 @@ class Args:
     """Views per heap and size."""
 
 
-def milliseconds(work: Callable[[], object], repeats: int) -> float:
+def measure_milliseconds(work: Callable[[], object], repeats: int) -> float:
     times = []
     for _ in range(repeats):
         start = time.thread_time()
@@ -66,8 +73,8 @@ def main(args: Args) -> None:
             for size in SIZES:
                 camera = top_down_camera(center[:2], center[2], size=size)
                 if size == SIZES[0]:
-                    first.append(milliseconds(lambda: scenery.visible_fractions(camera), 1))  # noqa: B023
-                spent[size].append(milliseconds(lambda: scenery.visible_fractions(camera), args.repeats))  # noqa: B023
+                    first.append(measure_milliseconds(lambda: scenery.visible_fractions(camera), 1))  # noqa: B023
+                spent[size].append(measure_milliseconds(lambda: scenery.visible_fractions(camera), args.repeats))  # noqa: B023
                 shares[size].append(scenery.visible_fractions(camera))
         finest = np.concatenate(shares[SIZES[0]])
         report[level] = {
@@ -84,4 +91,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(tyro.cli(Args, description=__doc__))

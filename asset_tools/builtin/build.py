@@ -41,8 +41,8 @@ def make_builtin_jobs(ids: Sequence[str] = ()) -> list[AssetJob]:
     known = [*MAKERS, *load_builtin_products()]
     unknown = sorted(set(ids) - set(known))
     if unknown:
-        expected, found = f"ids among {', '.join(known)}", ", ".join(unknown)
-        raise AssetError("unknown ids of builtin assets", expected=expected, found=found)
+        fix = "Run `robocas assets info builtin` for the ids."
+        raise AssetError("unknown ids of builtin assets", found=", ".join(unknown), fix=fix, usage=True)
     content = content_hash(packages=("builtin", "builtin/furniture", "builtin/products"))
     return [AssetJob(id_, partial(build_asset, id_), content) for id_ in ids or known]
 

@@ -95,7 +95,7 @@ def test_basket_is_hollow(pack, x, y):
 
 
 def test_unknown_ids_are_named():
-    with pytest.raises(AssetError, match="no such builtin asset.*found spam"):
+    with pytest.raises(AssetError, match="unknown ids of builtin assets .found spam"):
         make_builtin_jobs(["mug", "spam"])
 
 

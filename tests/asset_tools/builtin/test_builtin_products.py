@@ -51,5 +51,5 @@ def test_invalid_values_are_named(tmp_path, right, wrong):
 def test_an_id_in_two_files(tmp_path):
     for name in ("boxes.yaml", "cans.yaml"):
         (tmp_path / name).write_text(CARTON)
-    with pytest.raises(AssetError, match="cans.yaml, box: this product is there twice"):
+    with pytest.raises(AssetError, match="cans.yaml: two products have the same id .found box"):
         load_products(tmp_path)
