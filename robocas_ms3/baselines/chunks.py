@@ -24,8 +24,8 @@ from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 
 ROW = 10
-_MIN_DEVIATION = np.array([0.004] * 3 + [0.02] * 6)  # m and 1; smaller deviations are noise
-_NEAR = 0.05  # m; the metric `near_mm` averages key poses closer than this
+_MIN_DEVIATION = np.array([0.004] * 3 + [0.02] * 6)  # positions in m, rotation columns; smaller deviations are noise
+_NEAR = 0.05  # m; the metric `near_mm` averages key poses closer than this to the TCP
 _EMPTY_WIDTH = 0.004  # m; a narrower gripper has closed on nothing
 
 Predict = Callable[[Observations, int], NDArray[np.floating]]
@@ -241,7 +241,7 @@ class ChunkPolicy:
                 if self._update_stuck(env, tcp[row, :3, 3], float(observations.robot[GRIPPER_WIDTH].reshape(-1)[row])):
                     chunks = [
                         replace(one, open_probabilities=np.ones_like(one.open_probabilities)) for one in chunks
-                    ]  # else outvoted
+                    ]  # otherwise older predictions outvote it
             self._chunks[env] = chunks
         return np.stack([self._make_action(self._chunks[env], here) for env, here in zip(envs, tcp, strict=True)])
 

@@ -86,7 +86,7 @@ def check_tcp_frame(source: EpisodeSource, number: int) -> None:
             the episode has neither a gripper camera nor a ``scene.json``.
     """
     camera, episode = EE_CAMERA, source.episode(number)
-    if episode.scene.get("env_info"):  # recorded by this package, in that frame, wherever the camera is mounted
+    if episode.scene.get("env_info"):  # recorded by this package, always in the frame of ManiSkill's TCP
         return
     if camera not in source.cameras:
         if episode.scene:

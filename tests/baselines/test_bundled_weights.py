@@ -82,7 +82,7 @@ def test_initial_weights_by_name(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_policy_reaches_a_target(short, tmp_path, needs_renderer):
-    """At least one of three objects; which one depends on the rounding of the CPU."""
+    """The policy reaches at least one of three targets; which one depends on the rounding of the CPU."""
     words = ["eval", "--policy", "small", "--protocol", short, "--envs", "2"]
     assert run([*words, "--out", str(tmp_path / "eval")]) == 0
     played = [json.loads(line) for line in (tmp_path / "eval" / "episodes.jsonl").read_text().splitlines()]

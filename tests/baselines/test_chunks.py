@@ -65,7 +65,7 @@ def test_key_poses_are_at_the_next_gripper_command():
     assert keys[:, 0].tolist() == [2, 1, 0, 1, 0, 1, 0]
 
 
-def test_scale_and_inverse():
+def test_normalizer_and_inverse():
     motions = np.array([[[0.0] * 9], [[1.0] * 9]])  # two samples of one step: mean 0.5, deviation 0.5
     scale = Normalizer(**compute_normalizer_statistics(motions))
     assert torch.allclose(scale(torch.ones(1, 9)), torch.ones(1, 9))
@@ -133,7 +133,7 @@ def test_first_chunk_is_executed():
 
 
 def test_older_predictions_are_for_the_same_step_and_frame():
-    """The TCP stays where it was; an older chunk says 0.2 for this step, the new one 0.4: the target is their mean."""
+    """The TCP does not move. An older chunk predicts 0.2 for this step, the new chunk 0.4; the action is their mean."""
     acting = policy([row(0.1), row(0.2)], [row(0.4), row(0.5)])
     act(acting)
     assert act(acting)[0, 0] == pytest.approx(0.3)

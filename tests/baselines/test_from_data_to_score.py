@@ -23,7 +23,7 @@ def demos(tmp_path_factory):
     return out / "trajectory.h5"
 
 
-def played(folder):
+def read_outcomes(folder):
     return [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
 
 
@@ -35,7 +35,7 @@ def test_bc_state(demos, tmp_path, monkeypatch):
     assert len(list((tmp_path / "cache" / "bc-state").iterdir())) == 1
     words = ["eval", "pick", "--policy", str(tmp_path / "run"), "--protocol", "paper-v1", "--episodes", "1"]
     assert run([*words, "--out", str(tmp_path / "eval"), "--envs", "1"]) == 0
-    [outcome] = played(tmp_path / "eval")
+    [outcome] = read_outcomes(tmp_path / "eval")
     assert outcome["error"] == "" and outcome["steps"] > 0
     said = json.loads((tmp_path / "eval" / "run.json").read_text())["policy"]
     assert (said["baseline"], said["steps"], said["spec"]["state"]) == ("bc-state", 5, True)
@@ -57,5 +57,5 @@ def test_small(demos, short, tmp_path, needs_renderer):
     assert run(words) == 0
     words = ["eval", "pick", "--policy", str(tmp_path / "run"), "--protocol", short, "--episodes", "1"]
     assert run([*words, "--out", str(tmp_path / "eval"), "--envs", "1"]) == 0
-    [outcome] = played(tmp_path / "eval")
+    [outcome] = read_outcomes(tmp_path / "eval")
     assert outcome["error"] == "" and outcome["steps"] > 0

@@ -78,7 +78,9 @@ class TopDownActionWrapper(gym.Wrapper):
 
 def _make_observation(obs: dict[str, Any]) -> torch.Tensor:
     agent = obs["agent"]
-    state = [value for name, value in obs["extra"].items() if name != "tcp_pose"]  # as in `privileged`
+    state = [
+        value for name, value in obs["extra"].items() if name != "tcp_pose"
+    ]  # as in `concatenate_privileged_state`
     return join_observation(agent["qpos"], agent["tcp_in_arm_base"], agent[GRIPPER_WIDTH], torch.cat(state, dim=1))
 
 

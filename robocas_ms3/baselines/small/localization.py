@@ -27,9 +27,9 @@ NOWHERE = -1
 """Cell index of a point outside the image."""
 POINT_FEATURES = 7
 """Features per point: three coarse coordinates, three fine coordinates, probability of the cell."""
-_NEAREST = 0.01  # m in front of the camera
+_NEAREST = 0.01  # smallest depth of a point that is projected, m
 _FINE, _COARSE = 0.05, 0.3  # m, scales of the coordinates
-_FURTHEST = 2.0  # m along a ray
+_FURTHEST = 2.0  # greatest distance of a point along a ray, m
 _FLATTEST = 0.03  # smallest downward component of a ray's direction; flatter rays are clamped to it
 
 
@@ -63,7 +63,7 @@ def project_points_to_view(
 def pixel_to_cell(pixels: torch.Tensor, view: CameraView) -> torch.Tensor:
     """Return the row-major cell indices (...) of pixel coordinates (..., 2): `NOWHERE` for pixels outside the view."""
     size = torch.tensor(view.size, device=pixels.device)
-    inside = ((pixels >= 0) & (pixels < size)).all(dim=-1)  # NaN is not
+    inside = ((pixels >= 0) & (pixels < size)).all(dim=-1)  # False for NaN
     cell = (pixels.nan_to_num(0.0) / CELL).floor().long()
     return torch.where(inside, cell[..., 1] * (view.size[0] // CELL) + cell[..., 0], NOWHERE)
 

@@ -41,7 +41,7 @@ class Learner:
             _make_parameter_groups(model, settings.weight_decay), lr=1.0, betas=settings.betas
         )
         self._model, self._optimizer = self._accelerator.prepare(model, optimizer)
-        if run.checkpoint is not None:  # after `prepare`, which moves counts to the GPU, for which steps would wait
+        if run.checkpoint is not None:  # after `prepare`: it moves step counts to the GPU, and steps would wait
             run.checkpoint.load_optimizer(self._optimizer)
 
     def update(self, batch: Batch, learning_rate: float) -> None:

@@ -87,7 +87,7 @@ class MetricsLog:
     def _remove_lines_after(self, step: int) -> None:
         with self._path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
-        whole = [row for row in rows if None not in row.values()]  # a kill may have cut off the last line
+        whole = [row for row in rows if None not in row.values()]  # a killed process may have written half a line
         kept = [row for row in whole if _parse_number(row["step"], math.inf) <= step]
         self._written = {(int(row["step"]), row["split"]) for row in kept}
         self._columns = list(rows[0]) if rows else []

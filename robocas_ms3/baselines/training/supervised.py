@@ -142,7 +142,7 @@ def _read_batches(run: RunFolder, samples: Samples, indices: Iterable[list[int]]
         collate_fn=_identity,
         num_workers=workers,
         persistent_workers=workers > 0,
-        generator=torch.Generator(),  # a generator of its own: the loader draws a seed at each start
+        generator=torch.Generator(),  # the loader draws a seed from it, not from the global generator
         multiprocessing_context="forkserver" if workers else None,
     )
     for batch in loader:

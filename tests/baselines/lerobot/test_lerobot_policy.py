@@ -51,7 +51,7 @@ def preprocess(item):
     return {key: value[None] if isinstance(value, torch.Tensor) else value for key, value in item.items()}
 
 
-def made(model=None, inputs=None):
+def make_policy(model=None, inputs=None):
     return LeRobotPolicy(model or Chunks(), preprocess, lambda action: 2 * action, inputs or INPUTS, 5.0)
 
 
@@ -71,10 +71,10 @@ def observations(widths):
 
 
 def test_the_spec_follows_from_the_checkpoint():
-    spec = made().spec
+    spec = make_policy().spec
     assert (spec.convention, spec.reference, spec.rate_hz, spec.language) == ("robocas", "tcp", 5.0, "embedding")
     assert spec.cameras == {"base_camera": (4, 2)}
-    assert made(inputs={STATE: (17,)}).spec.language == "text"
+    assert make_policy(inputs={STATE: (17,)}).spec.language == "text"
     policy = LeRobotPolicy(Chunks(), preprocess, preprocess, INPUTS, 5.0, {"weights": "abc"})
     assert describe_policy(policy)["weights"] == "abc"
 
@@ -82,12 +82,12 @@ def test_the_spec_follows_from_the_checkpoint():
 @pytest.mark.parametrize("key, shape", [(STATE, (18,)), (EMBEDDING, (7,)), ("observation.images.wrist", (3, 2, 4))])
 def test_other_inputs_are_refused(key, shape):
     with pytest.raises(EvaluationError, match=f"{key}: unexpected input"):
-        made(inputs={**INPUTS, key: shape})
+        make_policy(inputs={**INPUTS, key: shape})
 
 
 def test_an_observation_is_an_item_of_the_dataset():
     model = Chunks()
-    policy = made(model)
+    policy = make_policy(model)
     policy.reset([start(0)])
     policy.act(observations({0: 0.07}))
     seen = model.seen[0]  # the list is shared by copies
@@ -97,18 +97,18 @@ def test_an_observation_is_an_item_of_the_dataset():
     np.testing.assert_allclose(seen["observation.images.base_camera"][0, :, 0, 1], [1, 0, 0.2])
     assert seen[EMBEDDING][0, 0] == pytest.approx(19.5959, abs=1e-4)  # sqrt(384)
     assert seen["task"] == "take it"
-    assert set(made_without_embedding(model)) == {STATE, "task"}
+    assert set(make_policy_without_embedding(model)) == {STATE, "task"}
 
 
-def made_without_embedding(model):
-    policy = made(model, {STATE: (17,)})
+def make_policy_without_embedding(model):
+    policy = make_policy(model, {STATE: (17,)})
     policy.reset([start(0)])
     policy.act(observations({0: 0.07}))
     return model.seen[-1]
 
 
 def test_each_env_has_its_own_chunks():
-    policy = made()
+    policy = make_policy()
     policy.reset([start(0), start(5)])
     assert policy.act(observations({0: 1, 5: 50}))[:, :2].tolist() == [[2, 4], [100, 4]]
     policy.reset([start(5)])  # starts again while env 0 continues its chunk
@@ -124,7 +124,7 @@ def test_noise_depends_on_the_episode_seed_only():
     def noise(policy, env, others=()):
         return policy.act(observations({**dict.fromkeys(others, 1.0), env: 1.0}))[-1, 2]
 
-    alone, among_others = made(), made()
+    alone, among_others = make_policy(), make_policy()
     alone.reset([start(0, seed=7)])
     among_others.reset([start(1, seed=8), start(2, seed=7)])
     first = noise(alone, 0)

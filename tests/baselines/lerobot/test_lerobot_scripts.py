@@ -8,7 +8,7 @@ import pytest
 SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
 
 
-def refused(folder, name, *words):
+def run_refused_script(folder, name, *words):
     command = ["bash", SCRIPTS / name, *words]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, timeout=60)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
@@ -22,5 +22,5 @@ def test_output_folder_of_another_training_is_refused(tmp_path, settings):
     (tmp_path / "out" / "dataset").mkdir(parents=True)
     if settings:
         (tmp_path / "out" / "settings.txt").write_text(settings)
-    assert str(tmp_path / "out") in refused(tmp_path, "train_lerobot.sh", "act", "data", "out", "40000")
+    assert str(tmp_path / "out") in run_refused_script(tmp_path, "train_lerobot.sh", "act", "data", "out", "40000")
     assert [path.name for path in (tmp_path / "out").iterdir() if path.name != "settings.txt"] == ["dataset"]

@@ -18,7 +18,7 @@ from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 FACTS = {"observation_size": 12 + 7 + 1 + 4, "action_size": 5, "rate_hz": 5}
 
 
-def see(count, state=4):
+def make_observations(count, state=4):
     return observe(range(count), state=np.zeros((count, state), np.float32))
 
 
@@ -40,7 +40,7 @@ def test_5d_actions_expand_to_7d_actions():
 def test_actions_are_equal_in_evaluation_and_training():
     policy = policy_with([0.5, -1.0, 0.3, 0.4, -0.2])
     assert choose_control_mode(policy.spec.convention) == "pd_ee_delta_pose"
-    motion = CONVENTIONS[policy.spec.convention].decode(policy.act(see(1)))
+    motion = CONVENTIONS[policy.spec.convention].decode(policy.act(make_observations(1)))
     assert isinstance(motion.rotation, Rotation)
     assert motion.open.tolist() == [False]
     again = to_ee_delta_action(motion.translation, motion.rotation)
@@ -50,7 +50,7 @@ def test_actions_are_equal_in_evaluation_and_training():
 
 def test_other_scenes_are_refused():
     with pytest.raises(EvaluationError, match="24 numbers.*30"):
-        policy_with([0.0] * 5).act(see(1, state=10))
+        policy_with([0.0] * 5).act(make_observations(1, state=10))
 
 
 def test_observations_are_normalised_by_running_statistics():

@@ -60,7 +60,7 @@ def test_run_continues_after_ctrl_c(stub, tmp_path):
 
 
 def test_a_nan_gradient_is_not_saved(stub, monkeypatch, tmp_path):
-    """Also in the last step of an update, whose losses are finite."""
+    """A NaN gradient is also found in the last step of an update, whose losses are finite."""
     clip, calls = torch.nn.utils.clip_grad_norm_, []
 
     def spoil(parameters, most):

@@ -13,12 +13,12 @@ from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.evaluation.policy import describe_policy
 
 
-def rows_of(images):
-    """Return the row numbers (N, h) of images of `striped`."""
+def read_row_numbers(images):
+    """Return the row numbers (N, h) of images of `make_striped_images`."""
     return images[:, 0, :, 0]
 
 
-def striped(count, height=256, width=4):
+def make_striped_images(count, height=256, width=4):
     """Return images whose rows have their row number as value, and whose last column is 7."""
     images = torch.arange(height, dtype=torch.uint8)[:, None].repeat(count, 3, 1, width)
     images[..., -1] = 7
@@ -26,23 +26,23 @@ def striped(count, height=256, width=4):
 
 
 def test_evaluation_uses_the_middle_rows():
-    rows = rows_of(crop_rows(striped(2), 236, random=False))
+    rows = read_row_numbers(crop_rows(make_striped_images(2), 236, random=False))
     assert rows.dtype == torch.float32
     assert rows.tolist() == [list(range(10, 246))] * 2
 
 
 def test_training_crops_each_image_at_random():
     torch.manual_seed(0)
-    seen = crop_rows(striped(600).view(100, 3, 2, 3, 256, 4), 236, random=True)
+    seen = crop_rows(make_striped_images(600).view(100, 3, 2, 3, 256, 4), 236, random=True)
     assert seen.shape == (100, 3, 2, 3, 236, 4)
     flat = seen.flatten(0, 2)
-    first = rows_of(flat)[:, 0]
+    first = read_row_numbers(flat)[:, 0]
     assert set(first.tolist()) == set(range(21))  # 0 to 256 - 236
-    assert torch.equal(rows_of(flat), first[:, None] + torch.arange(236))
+    assert torch.equal(read_row_numbers(flat), first[:, None] + torch.arange(236))
     assert (flat[..., -1] == 7).all()  # columns stay
     assert torch.equal(flat[:, 0], flat[:, 2])  # colours are cropped together
     torch.manual_seed(0)
-    assert torch.equal(crop_rows(striped(600).view(100, 3, 2, 3, 256, 4), 236, random=True), seen)
+    assert torch.equal(crop_rows(make_striped_images(600).view(100, 3, 2, 3, 256, 4), 236, random=True), seen)
 
 
 def test_film():

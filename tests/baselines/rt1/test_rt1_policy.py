@@ -40,7 +40,7 @@ def seen():
 
 
 def test_images_are_requested_in_the_size_of_the_dataset(config, facts, model):
-    """They are scaled like samples; rendering at 64 x 48 would have another field of view."""
+    """The policy scales images as the training does; images rendered at 64 x 48 have another field of view."""
     stored = {**facts, "cameras": {"base_camera": [96, 64], "gripper_camera": [128, 96]}}
     policy = BASELINE.policy(config, stored, model)
     assert (policy.spec.convention, policy.spec.reference, policy.spec.rate_hz) == ("robocas", "tcp", 5.0)

@@ -96,8 +96,8 @@ def unproject(mount=DOWN, on_hand=False, intrinsic=(32, 32, 32, 24), heights=(0.
     return Unproject(WHOLE, {"on_hand": on_hand, "mount": mount, "intrinsic": intrinsic}, heights, 4, 8)
 
 
-def turned(seed=0):
-    """A TCP somewhere before the arm, (1, 4, 4)."""
+def random_tcp_pose(seed=0):
+    """Return a random TCP pose in front of the arm, (1, 4, 4)."""
     draw = np.random.default_rng(seed)
     turn = Rotation.from_euler("xyz", [np.pi, 0, 0]) * Rotation.from_rotvec(draw.normal(size=3) * 0.2)
     return from_rotation(np.array([[0.5, 0.1, 0.3]]) + draw.normal(size=(1, 3)) * 0.1, turn.as_matrix()[None])
@@ -112,10 +112,10 @@ def test_height_above_the_camera_gives_no_point_behind_it():
     x=st.floats(-0.3, 0.3), y=st.floats(-0.3, 0.3), z=st.floats(0, 0.3), seed=st.integers(0, 99), on_hand=st.booleans()
 )
 def test_visible_point_is_unprojected_to_its_position(x, y, z, seed, on_hand):
-    """From its pixel and height, for cameras on the gripper and in the base frame."""
-    tcp, mount, intrinsic = turned(seed), np.array(DOWN), np.array([40.0, 40.0, 32.0, 24.0])
+    """The point follows from its pixel and height, for cameras on the gripper and in the base frame."""
+    tcp, mount, intrinsic = random_tcp_pose(seed), np.array(DOWN), np.array([40.0, 40.0, 32.0, 24.0])
     if on_hand:
-        mount = inverse(turned(1)[0]) @ mount
+        mount = inverse(random_tcp_pose(1)[0]) @ mount
     camera = tcp[0] @ mount if on_hand else mount
     point = np.array([0.4 + x, y, z])
     assume(
@@ -161,7 +161,7 @@ def test_loss_counts_objects_in_the_image():
 
 
 def test_heights_are_in_the_base_frame():
-    tcp = torch.from_numpy(turned()).float()
+    tcp = torch.from_numpy(random_tcp_pose()).float()
     assert float(compute_heights_in_base(torch.zeros(1, 3), tcp)) == pytest.approx(float(tcp[0, 2, 3]))
     above = tcp[:, :3, :3].transpose(1, 2) @ torch.tensor([0.0, 0.0, 0.1])
     assert float(compute_heights_in_base(above, tcp)) == pytest.approx(float(tcp[0, 2, 3]) + 0.1)

@@ -132,7 +132,7 @@ def test_unknown_baseline_and_missing_data(stub, data, tmp_path):
 
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_a_folder_with_other_files_is_refused(stub, data, tmp_path, overwrite):
-    """For example notes, and the log of another trainer."""
+    """A folder with notes, or with the log of another trainer."""
     out = tmp_path / "mine"
     out.mkdir()
     (out / ".draft.tmp.txt").write_text("mine")
@@ -173,7 +173,7 @@ def test_an_unchecked_nan_is_not_saved(stub, data, tmp_path, monkeypatch):
 
 
 def test_a_removed_folder_is_an_error(stub, data, tmp_path, monkeypatch):
-    """Between two steps, and during a write."""
+    """The folder is removed between two steps, or during a write."""
     out, save = tmp_path / "run", checkpoints.save_tensors
 
     def remove(done, total):

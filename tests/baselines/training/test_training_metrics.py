@@ -38,7 +38,7 @@ def test_run_without_checkpoint_starts_new_curves(tmp_path):
             about = {"epoch": 1.0, "seconds": 70.0, "learning_rate": 0.1}
             log.add(step, "train", about, {"loss": loss})
         log.close()
-    assert shown(tmp_path, "train/loss") == [(50, 1.0)]
+    assert read_curve(tmp_path, "train/loss") == [(50, 1.0)]
 
 
 def test_continued_run_hides_events_after_its_checkpoint(tmp_path):
@@ -46,12 +46,12 @@ def test_continued_run_hides_events_after_its_checkpoint(tmp_path):
         log = MetricsLog(tmp_path, first)
         for step, loss in losses.items():
             log.add(step, "train", {"epoch": 1.0, "seconds": 1.0, "learning_rate": 0.5}, {"loss": loss})
-            assert shown(tmp_path, "train/learning_rate")[-1] == (step, 0.5)  # without buffering
+            assert read_curve(tmp_path, "train/learning_rate")[-1] == (step, 0.5)  # without buffering
         log.close()
-    assert shown(tmp_path, "train/loss") == [(50, 3.0), (100, 2.0), (150, 1.0)]
+    assert read_curve(tmp_path, "train/loss") == [(50, 3.0), (100, 2.0), (150, 1.0)]
 
 
-def shown(folder, name):
+def read_curve(folder, name):
     """Return (step, value) of a curve as TensorBoard reads it."""
     board = EventAccumulator(str(folder / "tensorboard"))
     board.Reload()
