@@ -87,7 +87,7 @@ def test_state_except_robot_is_unchanged_while_only_the_robot_moves(env):
         others = base.bodies.state_except_robot
 
 
-def test_state_dict_equals_that_of_maniskill(env):
+def test_state_dict_equals_the_state_dict_of_maniskill(env):
     base = env.unwrapped
     ours, theirs = base.get_state_dict(), base.scene.get_sim_state()
     assert list(theirs) == ["actors", "articulations"]

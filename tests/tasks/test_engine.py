@@ -45,7 +45,7 @@ def test_failed_download_of_the_gpu_library_is_an_error(monkeypatch, num_envs, s
         check_engine_arguments(num_envs, "full", sim_backend)
 
 
-def test_few_envs_have_the_limits_of_maniskill():
+def test_few_envs_have_the_memory_limits_of_maniskill():
     assert gpu_memory_limits(1, 15) == gpu_memory_limits(16, 10) == GPUMemoryConfig()
 
 

@@ -65,6 +65,6 @@ def test_statuses_found_before_an_interruption_are_stored(cache, monkeypatch):
     assert table.find_pairs(LayoutStatus.UNCHECKED) == [(1, 0), (1, 1)]
 
 
-def test_three_millimetres_are_allowed():
+def test_shift_of_3_mm_is_stable():
     assert status_from_shift(0.0029) == LayoutStatus.STABLE
     assert status_from_shift(0.0031) == status_from_shift(float("nan")) == LayoutStatus.UNSTABLE

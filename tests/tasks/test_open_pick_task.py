@@ -82,7 +82,7 @@ def drive_recording(tmp_path_factory):
     return folder / "driven.h5", seen
 
 
-def test_drive_is_in_the_actions_and_the_arm_is_still(drive_recording):
+def test_recorded_actions_contain_the_drive_and_the_arm_is_still(drive_recording):
     path, seen = drive_recording
     with TrajectoryFile(path) as file:
         actions = file.read_recording(0).actions
@@ -97,7 +97,7 @@ def test_drive_is_in_the_actions_and_the_arm_is_still(drive_recording):
     assert moved == pytest.approx([0.2, -0.1], abs=0.01)
 
 
-def test_drive_is_in_the_base_motion_of_the_dataset(drive_recording):
+def test_base_motion_of_the_dataset_contains_the_drive(drive_recording):
     path, seen = drive_recording
     with TrajectoryFile(path) as file:
         recording = file.read_recording(0)

@@ -43,7 +43,7 @@ def test_inside_box_follows_the_frame(make_array):
     assert terms.is_inside_box(points, position, quaternion, low, high).tolist() == [True, False, True, False]
 
 
-def test_inside_box_of_several_objects_an_env(make_array):
+def test_inside_box_of_several_objects_per_env(make_array):
     low, high = make_array([-0.2, -0.1, 0.0]), make_array([0.2, 0.1, 0.3])
     points = make_array([[[1.15, 0, 0.1], [1.0, 0.15, 0.1], [0.85, 0.05, 0.2]]] * 2)
     position, quaternion = make_array([[1.0, 0, 0]] * 2), make_array([UPRIGHT, YAW_90])

@@ -68,7 +68,7 @@ def test_dense_is_normalized_dense_times_the_total(env):
     assert set(info["reward_terms"]) == {*base.REWARDS.weights, *base.REWARDS.penalties}
 
 
-def test_the_action_rate_is_that_of_the_last_two_actions(env):
+def test_action_rate_compares_the_last_two_actions(env):
     _, info = env.reset(seed=0)
     first = make_hold_action(env)
     *_, info = env.step(first)

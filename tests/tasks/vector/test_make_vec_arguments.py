@@ -126,14 +126,14 @@ def test_rows_of_different_types_become_a_list(other):
         assert row.dtype == np.float32 and row.tolist() == [[0, 0]] and not np.shares_memory(row, zeros)
 
 
-def test_rows_of_one_kind_are_an_array():
+def test_rows_of_equal_shapes_become_an_array():
     ones = [{("x",): np.full((1, 2), i)} for i in range(3)]
     joined = join_rows([(1, row) for row in ones])
     assert joined["x",].tolist() == [[0, 0], [1, 1], [2, 2]]
     assert [row["x",].tolist() for row in split_rows(3, joined)] == [[[0, 0]], [[1, 1]], [[2, 2]]]
 
 
-def test_calls_reach_through_wrappers():
+def test_call_finds_methods_behind_wrappers():
     env = RoboCASVectorEnv(gym.Wrapper(FakeBatch()))
     env.reset()
     assert env.call("elapsed_steps").tolist() == [0, 0, 0]

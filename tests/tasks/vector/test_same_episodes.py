@@ -57,7 +57,7 @@ def test_env_does_not_depend_on_other_envs(four_envs):
 
 
 @slow
-def test_env_equals_that_of_gym_make(four_envs):
+def test_env_gives_the_results_of_gym_make(four_envs):
     steps = HORIZON + 2
     seen = record_episodes(four_envs, 4, 20, steps)[3]
     env = gym.make("RoboCASPick-v1", max_episode_steps=HORIZON, **STATE_ONLY)
@@ -102,7 +102,7 @@ def test_partial_reset_does_not_change_the_other_envs(four_envs):
 
 
 @slow
-def test_envs_that_keep_their_objects_have_those_of_gym_make():
+def test_envs_that_keep_their_objects_have_the_objects_of_gym_make():
     kwargs = {"reconfiguration_freq": 0, "seeds": (100, 199), **STATE_ONLY}
     plain = gym.make("RoboCASPick-v1", **kwargs)
     short = {"max_episode_steps": 1, **kwargs}
