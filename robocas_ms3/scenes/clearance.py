@@ -73,7 +73,7 @@ def check_clearance(
         deep = max((overlap_depth(a, b) for a, b in _near_hulls(one, other)), default=0.0)
         if deep > _TOUCHING:
             fix = f"Move one of them by more than {deep:.2f} m" + ("." if other is room else ", or leave one out.")
-            what, found = f"{one.key} and {other.key} overlap", f"overlap of {deep:.3f} m"
+            what, found = f"{one.key} and {other.key} overlap", f"an overlap of {deep:.3f} m"
             raise ConfigError(what, expected="no overlap", found=found, fix=fix)
     if envelope is not None:
         if config.randomisation.robot is None:

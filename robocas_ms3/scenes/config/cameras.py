@@ -19,27 +19,30 @@ _Pixels = Annotated[int, Field(ge=16, le=8192, multiple_of=2)]
 
 
 class CameraConfig(StrictModel):
-    """A camera; its name ends in `_camera`. An additional camera needs `position` or `overview`."""
+    """Changes of a camera of the robot, or an additional camera, which needs `position` or `overview`."""
 
-    mount: Mount | None = Field(default=None, description="frame to which the camera is fixed; default: world")
+    mount: Mount | None = Field(
+        default=None, description="body that carries the camera; world for an additional camera"
+    )
     position: tuple[_Coordinate, _Coordinate, _Coordinate] | None = Field(
-        default=None, description="position in the frame of the mount (world, base link or hand link), m"
+        default=None, description="position in the frame of the mount (world, base link, hand link), m"
     )
     rotation_deg: tuple[_Angle, _Angle, _Angle] | None = Field(
-        default=None, description="roll, pitch, yaw in the frame of the mount; the camera looks along x, z is up"
+        default=None,
+        description="roll, pitch, yaw (fixed axes) in the frame of the mount; the camera looks along x, z is up",
     )
     look_at: tuple[_Coordinate, _Coordinate, _Coordinate] | None = Field(
         default=None,
-        description="point in the frame of the mount at which the camera looks, m; replaces `rotation_deg`",
+        description="point at which the camera looks, in the frame of the mount, m; instead of `rotation_deg`",
     )
     overview: bool | None = Field(
-        default=None, description="the task places the camera so that it sees the whole scene"
+        default=None, description="whether the task places the camera so that it sees the whole scene"
     )
     fov_deg: Annotated[float, Field(gt=0, lt=180)] | None = Field(
-        default=None, description="vertical field of view; default: 90"
+        default=None, description="vertical field of view; 90 for an additional camera"
     )
-    width: _Pixels | None = Field(default=None, description="image width, pixels; default: 640")
-    height: _Pixels | None = Field(default=None, description="image height, pixels; default: 480")
+    width: _Pixels | None = Field(default=None, description="image width, pixels; 640 for an additional camera")
+    height: _Pixels | None = Field(default=None, description="image height, pixels; 480 for an additional camera")
 
     @model_validator(mode="after")
     def _check_direction(self) -> CameraConfig:

@@ -17,7 +17,7 @@ def _check_range(values: tuple[float, float]) -> tuple[float, float]:
 
 Range = Annotated[
     tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]],
-    Field(description="least and greatest value"),
+    Field(description="least and greatest intensity"),
     AfterValidator(_check_range),
 ]
 Ids = Annotated[list[str | StrictInt], Field(min_length=1)]
@@ -29,7 +29,7 @@ class LightRandomisation(StrictModel):
     ambient: Range = (0.25, 0.6)
     directional: Range = (0.6, 1.4)
     direction_deg: Annotated[float, Field(ge=0, le=60)] = Field(
-        default=20.0, description="greatest rotation of the light's direction"
+        default=20.0, description="greatest angle between the drawn and the configured direction of the slanted light"
     )
 
 
@@ -50,12 +50,12 @@ class CameraRandomisation(StrictModel):
         for key in ("position", "rotation_deg"):
             least, most = getattr(self, f"min_{key}"), getattr(self, key)
             if least > most:
-                raise ValueError(f"min_{key} {least:g} must not be above {key} {most:g}")
+                raise ValueError(f"min_{key} {least:g}: expected at most {key}, {most:g}")
         return self
 
 
 class PoseRandomisation(StrictModel):
-    """Random shift and turn of the robot or the basket, drawn for every episode."""
+    """Random shift and turn of the robot (or the basket), drawn for every episode."""
 
     position: Annotated[float, Field(ge=0, le=0.5)] = Field(default=0.03, description="greatest shift in x and y, m")
     yaw_deg: Annotated[float, Field(ge=0, le=180)] = Field(
@@ -66,29 +66,27 @@ class PoseRandomisation(StrictModel):
 class DistractorConfig(StrictModel):
     """Additional objects that are never the target."""
 
-    ids: Ids = Field(description="asset ids of the object pack, or their numbers in GraspNet-1Billion")
+    ids: Ids = Field(description="ids of objects in the object pack, or numbers in GraspNet-1Billion")
     count: Annotated[
         tuple[Annotated[int, Field(ge=0, le=16)], Annotated[int, Field(ge=0, le=16)]], AfterValidator(_check_range)
     ] = Field(default=(1, 3), description="least and greatest number of distractors")
 
 
 class RandomisationConfig(StrictModel):
-    """What the episode's seed decides in addition to the layout. A block that is not given is off."""
+    """Properties of the scene that the seed of an episode decides. A block that is not given changes nothing."""
 
-    room: list[str] | None = Field(
-        default=None, description="parts of the room whose finish is random: wall, floor, ..."
-    )
+    room: list[str] | None = Field(default=None, description="parts of the room (wall, floor) that get a random finish")
     finishes: dict[str, Annotated[list[str], Field(min_length=1)]] = Field(
-        default={}, description="part of `room` -> finishes to draw from; parts without an entry: all finishes"
+        default={}, description="part of the room -> finishes to draw from; a part without an entry: all finishes"
     )
     lights: LightRandomisation | None = None
     cameras: CameraRandomisation | None = None
     robot: PoseRandomisation | None = None
     basket: PoseRandomisation | None = None
     object_sets: Annotated[list[Ids], Field(min_length=1)] | None = Field(
-        default=None, description="sets of ids; one set, chosen at random, replaces `objects.ids`"
+        default=None, description="sets of object ids; one set, drawn at random, replaces `objects.ids`"
     )
     count: tuple[Annotated[int, Field(ge=1, le=64)], Annotated[int, Field(ge=1, le=64)]] | None = Field(
-        default=None, description="least and greatest number of objects; at most objects.count"
+        default=None, description="least and greatest number of objects without distractors; at most `objects.count`"
     )
     distractors: DistractorConfig | None = None

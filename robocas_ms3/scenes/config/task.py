@@ -31,7 +31,7 @@ Direction = Annotated[Vec3, AfterValidator(_check_direction)]
 
 
 class PoseConfig(StrictModel):
-    """A pose in the world: a position and a yaw angle."""
+    """Pose in the world frame: position and yaw angle."""
 
     position: Vec3 = Field(description="x, y, z, m")
     yaw_deg: Annotated[float, Field(ge=-360, le=360)] = Field(
@@ -40,20 +40,20 @@ class PoseConfig(StrictModel):
 
 
 class RoomConfig(StrictModel):
-    """The room: an asset of the furniture pack at the world's origin."""
+    """Room: an asset of the furniture pack. The origin of its frame is the origin of the world."""
 
     asset: str = Field(description="id in the furniture pack")
     finishes: dict[str, str] = Field(
-        default={}, description="part (wall, floor) -> finish; other parts have their default"
+        default={}, description="part (wall, floor) -> finish; a part without an entry has its default finish"
     )
 
 
 class LightConfig(StrictModel):
-    """Lights of the scene."""
+    """Lights: ambient light, one directional light from above, and one slanted directional light."""
 
     ambient: Annotated[float, Field(ge=0, le=2)] = Field(default=0.4, description="intensity of the ambient light")
     directional: Annotated[float, Field(ge=0, le=10)] = Field(
-        default=1.0, description="intensity of the directional lights"
+        default=1.0, description="intensity of both directional lights"
     )
     direction: Direction = Field(default=(0.3, 0.6, -1.0), description="direction of the slanted light")
     shadow: bool = Field(
@@ -62,31 +62,34 @@ class LightConfig(StrictModel):
 
 
 class PlacedConfig(StrictModel):
-    """An asset and the pose of its lowest point."""
+    """Asset, and the pose of its lowest point."""
 
-    asset: str = Field(description="id in the furniture pack, or pack/id")
+    asset: str = Field(description="id in the furniture pack, or PACK/ID in another pack")
     pose: PoseConfig
 
 
 class FurnitureConfig(PlacedConfig):
-    """A piece of furniture."""
+    """Piece of furniture: an asset, and the pose of its lowest point."""
 
     joints: dict[str, Coordinate] = Field(
-        default={}, description="start positions of doors and drawers, m or rad; others are 0 (closed)"
+        default={},
+        description="start position of doors and drawers by joint name, m or rad; all others start closed (0)",
     )
 
 
 class BasketConfig(PlacedConfig):
-    """The container into which objects are put."""
+    """Container into which the target is put: an asset, and the pose of its lowest point."""
 
 
 class SurfaceConfig(StrictModel):
-    """The rectangle of a furniture surface on which objects are placed, in the furniture's frame."""
+    """Rectangle of a furniture surface on which objects are placed, in the frame of the furniture."""
 
-    furniture: str = Field(description="name of the piece of furniture in `furniture`")
-    name: str = Field(description="name of the surface of this piece of furniture")
-    min_xy: Vec2 | None = Field(default=None, description="least corner of the rectangle, m; none: the whole surface")
-    max_xy: Vec2 | None = Field(default=None, description="greatest corner of the rectangle, m")
+    furniture: str = Field(description="name of a piece of furniture: a key of the block `furniture`")
+    name: str = Field(description="name of a surface of this piece of furniture")
+    min_xy: Vec2 | None = Field(
+        default=None, description="corner of the rectangle with least x and y, m; none: the whole surface"
+    )
+    max_xy: Vec2 | None = Field(default=None, description="corner of the rectangle with greatest x and y, m")
 
     @model_validator(mode="after")
     def _check_corners(self) -> SurfaceConfig:
@@ -98,24 +101,24 @@ class SurfaceConfig(StrictModel):
 
 
 class ScatteredLayout(StrictModel):
-    """Objects that don't touch each other, each in a stable pose at a random yaw."""
+    """Objects that do not touch each other, each in a random resting pose with a random yaw."""
 
     kind: Literal["scattered"]
     min_gap: Annotated[float, Field(ge=0, le=0.2)] = Field(
         default=0.01, description="least distance between two objects, m"
     )
     max_tries: Annotated[int, Field(ge=1, le=10**7)] = Field(
-        default=40_000, description="number of drawn poses after which a seed has no layout"
+        default=40_000, description="greatest number of drawn poses; after them, the seed has no layout"
     )
 
 
 class OrderlyLayout(StrictModel):
-    """Upright objects in columns that start at the front edge, one kind per column, labels to the front."""
+    """Upright objects in columns that start at the front edge, one kind per column, with labels to the front."""
 
     kind: Literal["orderly"]
-    copies: Annotated[int, Field(ge=1, le=8)] = Field(default=2, description="objects of each kind")
+    copies: Annotated[int, Field(ge=1, le=8)] = Field(default=2, description="number of objects of each kind")
     rows: Annotated[int, Field(ge=1, le=8)] = Field(
-        default=2, description="objects in a column; more copies start another column"
+        default=2, description="greatest number of objects in a column; more copies form another column"
     )
     row_gap: Annotated[float, Field(ge=0, le=0.2)] = Field(
         default=0.01, description="distance between the objects of a column, m"
@@ -124,42 +127,44 @@ class OrderlyLayout(StrictModel):
         default=1.3, description="distance of neighbouring columns as a multiple of their mean width"
     )
     yaw_jitter_deg: Annotated[float, Field(ge=0, le=45)] = Field(
-        default=0.0, description="greatest random turn of an object"
+        default=0.0, description="greatest random turn of each object"
     )
     column_yaw: Literal["front", "random"] = Field(
-        default="front", description="random: all objects of a column are turned by one random angle (RoboCAS-v0)"
+        default="front",
+        description="front: labels face the front; random: each column is turned by one random angle (RoboCAS-v0)",
     )
     keep_what_fits: bool = Field(
         default=False,
-        description="whether columns and objects that don't fit are omitted (RoboCAS-v0); false: other kinds are drawn",
+        description="true: columns and objects that do not fit are left out (RoboCAS-v0); false: other kinds are drawn",
     )
 
 
 class StackedLayout(StrictModel):
-    """A heap: objects drop one by one between four walls, which are then removed."""
+    """Heap: objects drop one by one between four walls, which are then removed."""
 
     kind: Literal["stacked"]
     drop_height: Annotated[float, Field(gt=0, le=1)] = Field(
-        default=0.3, description="height of the drop above the surface or heap, m"
+        default=0.3, description="height above the surface, or above the heap, from which objects drop, m"
     )
     tumble_probability: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.6, description="probability that an object falls in a random orientation instead of a stable pose"
+        default=0.6,
+        description="probability that an object falls in a random orientation; else it falls in a resting pose",
     )
     bucket: Annotated[float, Field(gt=0, le=1)] = Field(
         default=0.8,
-        description="size of the walled area as a fraction of the region; less hides more objects (RoboCAS-v0: 1)",
+        description="sides of the walled area / sides of the region; less hides more objects (RoboCAS-v0: 1)",
     )
     drop_spread: Annotated[float, Field(ge=0, le=1)] = Field(
         default=1.0,
-        description="fraction of the walled area into which objects fall; 0: its middle (RoboCAS-v0)",
+        description="fraction of the walled area onto which objects drop; 0: only its middle (RoboCAS-v0)",
     )
     order_noise: Annotated[float, Field(ge=0)] | None = Field(
         default=0.5,
-        description="small objects fall first: standard deviation of the noise on the logarithm of their sizes; null: "
-        "random order (RoboCAS-v0)",
+        description="objects drop in the order of size times a random factor, small ones first; standard deviation of "
+        "the factor's logarithm; null: random order (RoboCAS-v0)",
     )
     fall_seconds: Annotated[float, Field(gt=0, le=5)] = Field(
-        default=0.5, description="time between two objects, s; an object lands after 0.25 s (RoboCAS-v0: 1)"
+        default=0.5, description="time between two drops, s; an object lands after 0.25 s (RoboCAS-v0: 1)"
     )
 
 
@@ -167,105 +172,116 @@ LayoutConfig = Annotated[ScatteredLayout | OrderlyLayout | StackedLayout, Field(
 
 
 class ObjectsConfig(StrictModel):
-    """Which objects are on the surface."""
+    """Objects on the surface."""
 
     ids: list[str | StrictInt] | Literal["all"] = Field(
-        default="all", description="ids of the object pack, or numbers in GraspNet-1Billion"
+        default="all", description="ids of objects in the object pack, or numbers in GraspNet-1Billion"
     )
-    count: Annotated[int, Field(ge=1, le=64)] = Field(default=10, description="number of objects")
+    count: Annotated[int, Field(ge=1, le=64)] = Field(default=10, description="number of objects without distractors")
     repeats: bool = Field(
         default=False,
-        description="whether an object (or a kind of columns) may be drawn repeatedly even if there are enough ids",
+        description="whether ids (or kinds of columns) are drawn independently, so that they may repeat",
     )
 
 
 class TargetConfig(StrictModel):
-    """Which objects may be the target."""
+    """Conditions for objects that may be the target."""
 
-    min_grasps: Annotated[int, Field(ge=0)] = Field(default=20, description="least number of annotated grasps")
+    min_grasps: Annotated[int, Field(ge=0)] = Field(
+        default=20, description="least number of grasps in the annotations of the object"
+    )
     min_free_grasps: Annotated[int, Field(ge=0)] = Field(
-        default=6, description="least number of grasps from the robot's side that are free of collisions"
+        default=6, description="least number of collision-free grasps from the robot's side"
     )
     max_distance: Annotated[float, Field(gt=0)] = Field(
         default=0.8, description="greatest horizontal distance from the arm's base to the object's centre, m"
     )
     approach: Literal["top", "front"] = Field(
-        default="top", description="top: from above; front: horizontal, as into a shelf"
+        default="top", description="direction of grasps: top from above, front horizontal, as into a shelf"
     )
     relations: list[Relation] = Field(
         default=list(RELATIONS),
-        description="select: relations that may distinguish the target; default: all that the copies allow; []: none, "
-        "the nearest object of its name is the target (RoboCAS-v0)",
+        description="select: relations that may distinguish the target; default: all relations that `layout.copies` "
+        "allows; []: no relation, the target is the nearest object of its name (RoboCAS-v0)",
     )
     max_visible_share: Annotated[float, Field(gt=0, le=1)] | None = Field(
-        default=0.9, description="search: upper limit of the target's visible fraction p_vis from above; null: no limit"
+        default=0.9,
+        description="search: greatest visible fraction of the target (p_vis), seen from above; null: no limit",
     )
     weight: Literal["nearness", "uniform"] = Field(
-        default="nearness", description="search: weight of a candidate: 1 / distance to the robot, or equal weights"
+        default="nearness",
+        description="search: weight of an object in the draw: nearness 1 / distance to the robot, uniform 1",
     )
     min_uncovered_grasps: Annotated[int, Field(ge=0)] = Field(
         default=6,
-        description="search: least number of grasps in its pose that are clear of furniture and basket",
+        description="search: least number of grasps that would be collision-free without the other objects",
     )
 
 
 class OpeningConfig(StrictModel):
-    """The door or drawer that must be opened."""
+    """Door or drawer that the task open_pick opens."""
 
-    furniture: str = Field(description="name of the piece of furniture in `furniture`")
-    handle: str = Field(description="name of the handle of this piece of furniture")
-    part: str = Field(default="", description="name of the part in instructions; default: from the handle's name")
+    furniture: str = Field(description="name of a piece of furniture: a key of the block `furniture`")
+    handle: str = Field(description="name of a handle of this piece of furniture")
+    part: str = Field(
+        default="", description="name of the part in instructions; default: made from the name of the handle"
+    )
     opened_at: Annotated[float, Field(gt=0, le=1)] = Field(
         default=0.6,
-        description="fraction of the joint's range from which it counts as open, below 0.8 (hinge) or 0.95 (slide)",
+        description="fraction of the joint's range from which it counts as open; less than 0.8 (hinge) or 0.95 (slide)",
     )
 
 
 class LanguageConfig(StrictModel):
-    """Templates and words of instructions."""
+    """Templates and synonyms of instructions."""
 
     split: Literal["upstream", "train", "held_out"] = Field(
-        default="upstream", description="upstream: RoboCAS-v0's template; train, held_out: a random template of the set"
+        default="upstream",
+        description="upstream: RoboCAS-v0's template; train, held_out: a random template of this split",
     )
     synonyms: bool = Field(
-        default=True, description="whether templates of train and held_out are filled with synonyms too"
+        default=True, description="train, held_out: whether synonyms may replace names and relations"
     )
 
 
 class TaskConfig(StrictModel):
-    """One task configuration: a file of ``task_configs/``."""
+    """Keys of a task configuration file, such as those in ``task_configs/``."""
 
     task: str = Field(description="name of the task; see tasks.md", json_schema_extra={"enum": list(TASKS.builtin)})
     description: str = Field(default="", description="one line for `robocas list`")
-    support: str = Field(description="word of the instruction for the place of the objects, e.g. 'table'")
+    support: str = Field(description="word for the place of the objects in instructions, such as table")
     room: RoomConfig
     lights: LightConfig = LightConfig()
     furniture: dict[str, FurnitureConfig]
     basket: BasketConfig | None = Field(
-        default=None, description="the container into which objects are put; required by the four bundled tasks"
+        default=None, description="container into which the target is put; required by the four bundled tasks"
     )
-    robot: PoseConfig = Field(description="pose of the mobile base's frame on the floor")
+    robot: PoseConfig = Field(description="pose of the robot's root frame on the floor")
     robot_start: Literal["rest", "evaluation"] = Field(
         default="rest",
-        description="start pose of the arm: folded, or above the table as in RoboCAS-v0's evaluation",
+        description="start pose of the arm: rest folded; evaluation above the table as in RoboCAS-v0's evaluation",
     )
     surface: SurfaceConfig
     objects: ObjectsConfig = ObjectsConfig()
     layout: LayoutConfig
     target: TargetConfig = TargetConfig()
-    opening: OpeningConfig | None = Field(default=None, description="open_pick: the door or drawer to open")
+    opening: OpeningConfig | None = Field(
+        default=None, description="door or drawer to open; only for open_pick, which requires it"
+    )
     language: LanguageConfig = LanguageConfig()
     static_camera: Literal["upstream", "overview"] = Field(
         default="upstream",
-        description="upstream: at (1, 1.5, 1.5) as in RoboCAS-v0, for a table; overview: next to the scene, anywhere",
+        description="pose of static_camera: upstream (1, 1.5, 1.5) m as in RoboCAS-v0, for scenes at a table; overview "
+        "where it sees the whole scene",
     )
     cameras: CamerasConfig = Field(
         default={},
         exclude_if=lambda cameras: not cameras,  # configurations without the key stay unchanged
-        description="changes of the robot's cameras, and additional cameras",
+        description="changes of the robot's cameras, and additional cameras, by name",
     )
     base_motion: bool = Field(
-        default=False, description="whether scripted policies may drive the base; recorded actions then include it"
+        default=False,
+        description="whether the scripted policy may drive the base; then recorded actions include the base",
     )
     randomisation: RandomisationConfig = RandomisationConfig()
 
@@ -283,46 +299,53 @@ class TaskConfig(StrictModel):
             raise ValueError(str(invalid)) from error
         if (self.opening is not None) != ("part" in spec.slots):
             those = ", ".join(name for name, other in TASKS.items() if "part" in other.slots)
-            raise ValueError(f"`opening` is required for the task {those} and not allowed for other tasks")
+            what = f"`opening` is {'missing' if self.opening is None else 'not allowed for the task ' + self.task}"
+            raise ValueError(f"{what}: the task {those} requires it, other tasks do not allow it")
         if self.randomisation.basket is not None and self.basket is None:
-            raise ValueError("randomisation.basket requires a `basket`")
+            raise ValueError("randomisation.basket needs the key `basket`")
         for check in spec.checks:
             import_object(check)(self)
         undrawn = sorted(set(self.randomisation.finishes) - set(self.randomisation.room or ()))
         if undrawn:
-            raise ValueError(f"randomisation.finishes: {undrawn} must be among randomisation.room")
+            known = self.randomisation.room or "no parts"
+            raise ValueError(
+                f"randomisation.finishes: expected only parts in randomisation.room ({known}), found {undrawn}"
+            )
         count = self.randomisation.count
         if count is not None and not count[0] <= count[1] <= self.objects.count:
             raise ValueError(
-                f"randomisation.count {list(count)} must be a range [least, greatest] up to objects.count "
-                f"{self.objects.count}"
+                f"randomisation.count: expected [least, greatest] with least <= greatest <= objects.count "
+                f"{self.objects.count}, found {list(count)}"
             )
         return self
 
     def cameras_of(self, robot: RobotDescription) -> tuple[CameraSpec, ...]:
-        """Return the cameras of a robot with the changes of this configuration.
+        """Return the cameras of a robot with the changes and additions of this configuration.
 
         Raises:
-            ConfigError: an additional camera has no position.
+            ConfigError: an additional camera has neither `position` nor `overview`.
         """
         overview = [("static_camera", CameraConfig(overview=True))] if self.static_camera == "overview" else []
         return apply_camera_changes(robot.cameras, [*overview, *self.cameras.items()])
 
     @property
     def has_unused_slots(self) -> bool:
-        """Whether an episode may use fewer objects than the number of slots."""
+        """Whether an episode may have fewer objects than object slots."""
         random, layout = self.randomisation, self.layout
         kept = isinstance(layout, OrderlyLayout) and layout.keep_what_fits
         return kept or bool(random.count or random.distractors)
 
 
 def require_basket(config: TaskConfig) -> None:
-    """Raise ValueError if a configuration has no basket; for the ``checks`` of a task."""
+    """Raise ValueError if a configuration has no basket. Tasks name this function in `TaskSpec.checks`."""
     if config.basket is None:
-        raise ValueError(f"task {config.task} needs a `basket`")
+        raise ValueError(f"task {config.task} needs the key `basket`")
 
 
 def require_copies(config: TaskConfig) -> None:
-    """Raise ValueError if no kind has several objects in columns; see `require_basket`."""
+    """Raise ValueError if a configuration does not have columns with several objects of each kind.
+
+    Tasks name this function in `TaskSpec.checks`.
+    """
     if not (isinstance(config.layout, OrderlyLayout) and config.layout.copies > 1):
-        raise ValueError(f"task {config.task} needs layout.kind orderly with layout.copies > 1")
+        raise ValueError(f"task {config.task} needs layout.kind: orderly, and layout.copies of at least 2")
