@@ -44,7 +44,7 @@ def test_bundled_configurations_load_repeatedly(name):
         ("layout.kind", "stackd", ["'layout.kind'", "'orderly', 'scattered', 'stacked'", "Did you mean stacked?"]),
         ("randomisation", {"object_sets": []}, ["'randomisation.object_sets'", "at least 1 item", "[]"]),
         ("randomisation", {"count": [3]}, ["'randomisation.count.1'", "at least 2 items"]),
-        ("randomisation", {"count": [3, 2]}, ["randomisation.count [3, 2]", "objects.count 10"]),
+        ("randomisation", {"count": [3, 2]}, ["randomisation.count", "objects.count 10", "[3, 2]"]),
         ("task", "serch", ["'task'", "'pick'", "'serch'", "Did you mean search?"]),
         ("support", ["x" * 500], ["found ['" + "x" * 78 + "...)"]),
         ("lights", {"direction": [0, 0, 0]}, ["direction"]),
