@@ -229,7 +229,7 @@ def read_generation(root):
 
 def read_conversion(root):
     output = OutputFolder(root, DATASET, CONVERSION)
-    output.read()
+    output.read_record()
     plan_episodes(output, [ENTRY], CONVERSION, append=False)
 
 
