@@ -138,7 +138,7 @@ def render_alone(
     env: Any = source.env.unwrapped
     for index in range(cfg.episodes):
         recording = file.read_recording(index)
-        source.load(recording)
+        source.load_scene(recording)
         scene = env.scene.sub_scenes[0]
         cameras = [sensor.camera._render_cameras[0] for sensor in env._sensors.values()]
         samples = sample_states(recording.control_steps, _stride(cfg, file))

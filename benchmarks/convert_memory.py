@@ -63,7 +63,7 @@ class StandIn:
         ramp = np.add.outer(np.arange(height), np.arange(width))
         self.rgb, self.depth = np.repeat(ramp[..., None] % 256, 3, 2).astype(np.uint8), ramp.astype(np.uint16)
 
-    def load(self, recording: Any) -> None:
+    def load_scene(self, recording: Any) -> None:
         """Build nothing."""
 
     def frames(self, _recording: Any, samples: np.ndarray) -> Iterator[Any]:

@@ -36,7 +36,7 @@ from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, open_finished
 from robocas_ms3.datasets.manage.import_robocas import import_robocas
 from robocas_ms3.datasets.manage.merge import merge
 from robocas_ms3.datasets.manage.split import split_by_value, write_split
-from robocas_ms3.datasets.manage.survey import survey
+from robocas_ms3.datasets.manage.survey import survey_dataset
 
 _NOT_UPSTREAMS = {"agv_pose", "rel_agv_pose", "language_embedding", "step_goal_embs"}
 
@@ -93,7 +93,7 @@ def _one(trajectory: Path, ours: Path, size: tuple[int, int] | None) -> dict[str
     theirs, back = Path(f"{base}_v0"), Path(f"{base}_imported")
     _write_v0(ours, theirs)
     with _timed(report, "import"):
-        import_robocas(survey(theirs), back, options=CopyOptions())
+        import_robocas(survey_dataset(theirs), back, options=CopyOptions())
     changed = _different(Dataset(ours), Dataset(back))
     report["import"] |= {"episodes_changed": changed, "violations": len(validate(back).violations)}
     return report

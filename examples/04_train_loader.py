@@ -49,7 +49,7 @@ if __name__ == "__main__":
         ),
     )
     print(f"{len(data.episodes)} episodes, {len(data)} samples, first: {data[0]['instruction']}")
-    sampler = WeightedRandomSampler(data.weights().tolist(), 8 * STEPS)  # each kind of sub-goal equally often
+    sampler = WeightedRandomSampler(data.sampling_weights().tolist(), 8 * STEPS)  # each kind of sub-goal equally often
     loader = DataLoader(data, batch_size=8, sampler=sampler, num_workers=2)
     policy = Policy()
     optimizer = torch.optim.AdamW(policy.parameters(), lr=1e-3)

@@ -47,7 +47,7 @@ PUBLIC = {
     ],
     "robocas_ms3.datasets": [
         "ActionScale",
-        "Conversion",
+        "ConversionResult",
         "ConversionSettings",
         "Dataset",
         "EpisodeSource",

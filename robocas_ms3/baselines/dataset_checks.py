@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.baselines.baseline import Split, make_empty_split_error
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.datasets.manage.repairs import eef_turn
+from robocas_ms3.datasets.manage.repairs import find_eef_rotation
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource
 from robocas_ms3.robots.cameras import EE_CAMERA
 
@@ -98,7 +98,7 @@ def check_tcp_frame(source: EpisodeSource, number: int) -> None:
             found="neither",
             fix="Import the dataset with `robocas import-robocas`.",
         )
-    turn = eef_turn(episode.camera_in_parent(camera))
+    turn = find_eef_rotation(episode.camera_in_parent(camera))
     if turn:
         raise DatasetError(
             "the actions are not in the frame of ManiSkill's TCP",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from robocas_ms3.cli.options import resumable
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import format_count
-from robocas_ms3.datasets.conversion.settings import Conversion, ConversionSettings
+from robocas_ms3.datasets.conversion.settings import ConversionResult, ConversionSettings
 
 if TYPE_CHECKING:
     from robocas_ms3.datasets.formats import Format
@@ -20,7 +20,7 @@ def main(settings: ConversionSettings) -> int:
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
 
-    write: Callable[..., Conversion] = _find_format(settings).load("writer")
+    write: Callable[..., ConversionResult] = _find_format(settings).import_function("writer")
     with ProgressBar("episodes written") as bar:
         done = write(settings, on_start=bar.start, on_episode=bar.advance)
     count = len(done.episodes)

@@ -51,12 +51,12 @@ def main(cfg: ImportRobocas) -> int:
     from robocas_ms3.core.output_folder import OutputFolder
     from robocas_ms3.core.text import format_count
     from robocas_ms3.datasets.conversion.episode_plan import DATASET
-    from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, check_apart
+    from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, check_no_overlap
     from robocas_ms3.datasets.manage.import_robocas import import_robocas
-    from robocas_ms3.datasets.manage.survey import survey
+    from robocas_ms3.datasets.manage.survey import survey_dataset
 
     if cfg.out is not None:
-        check_apart(cfg.out, [cfg.dataset])
+        check_no_overlap(cfg.out, [cfg.dataset])
         OutputFolder(
             cfg.out, DATASET, overwrite=cfg.overwrite
         ).read_record()  # checked before the dataset is read, which takes minutes
@@ -66,7 +66,7 @@ def main(cfg: ImportRobocas) -> int:
 
         embed = TextEmbedder()
     with ProgressBar("episodes read") as bar:
-        found = survey(cfg.dataset, rate_hz=cfg.rate, turn_eef=cfg.turn_eef, on_episode=bar.update)
+        found = survey_dataset(cfg.dataset, rate_hz=cfg.rate, turn_eef=cfg.turn_eef, on_episode=bar.update)
     if cfg.json:
         print_json(found.as_json())
     else:

@@ -35,11 +35,11 @@ def main(cfg: Stats) -> int:
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_json, print_line
     from robocas_ms3.datasets.schema import PREVIEW_FOLDER
-    from robocas_ms3.datasets.statistics.collect import collect
+    from robocas_ms3.datasets.statistics.collect import collect_statistics
     from robocas_ms3.datasets.statistics.plots import write_stats
 
     with ProgressBar("episodes read") as bar:
-        stats = collect(cfg.path, rate_hz=cfg.rate, on_episode=bar.update)
+        stats = collect_statistics(cfg.path, rate_hz=cfg.rate, on_episode=bar.update)
     default = cfg.path / PREVIEW_FOLDER / "stats" if cfg.path.is_dir() else cfg.path.with_name(f"{cfg.path.stem}_stats")
     out = cfg.out or (None if cfg.json else default)
     paths = write_stats(stats, out) if out else []

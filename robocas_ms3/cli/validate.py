@@ -56,7 +56,7 @@ def main(cfg: Validate) -> int:
         what, expected = "this dataset can't be replayed", "a RoboCAS folder"
         raise DatasetError(what, where="--replay", expected=expected, found=f"{cfg.dataset}, a {found.title}")
     with ProgressBar("episodes checked", transient=True) as bar:
-        check = found.load("checker") if found and found.checker else validate
+        check = found.import_function("checker") if found and found.checker else validate
         report: ValidationReport = check(cfg.dataset, on_episode=bar.update)
     if not cfg.json:
         for violation in report.violations:
@@ -69,7 +69,7 @@ def main(cfg: Validate) -> int:
         replays = _replay(cfg.dataset, cfg.pack)
         content["replay"] = replays.as_json()
         least = cfg.min_success or 0.0
-        wrong |= any((of_task["success_rate"] or 0.0) < least for of_task in replays.by_task().values())
+        wrong |= any((of_task["success_rate"] or 0.0) < least for of_task in replays.summarize_by_task().values())
         if not cfg.json:
             for line in _lines(replays):
                 print_line(line)
@@ -95,7 +95,7 @@ def _lines(report: ReplayReport) -> Iterator[str]:
         elif not episode.success:
             error = f"largest tracking error {episode.max_error * 1000:.0f} mm"
             yield f"episode {episode.number}: the replay does not succeed; {error}"
-    for task, of_task in report.by_task().items():
+    for task, of_task in report.summarize_by_task().items():
         name = task or "unknown task"
         if not of_task["replayed"]:
             count = format_count(of_task["skipped"], "episode")

@@ -36,7 +36,7 @@ def main(cfg: Video) -> int:
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.datasets.formats import open_source
-    from robocas_ms3.datasets.images.video import contact_sheet, write_video
+    from robocas_ms3.datasets.images.video import write_contact_sheet, write_video
     from robocas_ms3.datasets.schema import PREVIEW_FOLDER, episode_folder
 
     if not 0 < cfg.speed < math.inf:
@@ -54,5 +54,5 @@ def main(cfg: Video) -> int:
             print_line(str(write_video(dataset, number, path, speed=cfg.speed, kind=cfg.kind)))
             bar.advance()
     sheet = out / f"contact_sheet{suffix}.png"
-    print_line(str(contact_sheet(dataset, sheet, episodes=cfg.episodes or None, kind=cfg.kind)))
+    print_line(str(write_contact_sheet(dataset, sheet, episodes=cfg.episodes or None, kind=cfg.kind)))
     return 0

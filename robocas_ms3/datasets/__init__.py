@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from robocas_ms3.datasets.checks.dataset import validate as validate
     from robocas_ms3.datasets.checks.violation import Violation as Violation
     from robocas_ms3.datasets.conversion.convert import convert as convert
-    from robocas_ms3.datasets.conversion.settings import Conversion as Conversion
+    from robocas_ms3.datasets.conversion.settings import ConversionResult as ConversionResult
     from robocas_ms3.datasets.conversion.settings import ConversionSettings as ConversionSettings
     from robocas_ms3.datasets.conversion.settings import WrittenEpisode as WrittenEpisode
     from robocas_ms3.datasets.formats import Format as Format
@@ -35,7 +35,7 @@ __getattr__, __dir__, __all__ = make_lazy_exports(
         "robocas_ms3.datasets.checks.dataset": ["ValidationReport", "validate"],
         "robocas_ms3.datasets.checks.violation": ["Violation"],
         "robocas_ms3.datasets.conversion.convert": ["convert"],
-        "robocas_ms3.datasets.conversion.settings": ["Conversion", "ConversionSettings", "WrittenEpisode"],
+        "robocas_ms3.datasets.conversion.settings": ["ConversionResult", "ConversionSettings", "WrittenEpisode"],
         "robocas_ms3.datasets.formats": ["Format", "open_source"],
         "robocas_ms3.datasets.images.image_files": ["ImageOptions"],
         "robocas_ms3.datasets.lerobot.convert": ["convert_lerobot"],

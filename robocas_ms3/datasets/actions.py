@@ -19,22 +19,27 @@ ACTION_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
 """Translation in m and Euler xyz angles in rad, both in the EEF frame at the step; gripper command, 1 = open."""
 ACTION_ARRAYS = ("rel_pos", "rel_orn", "gripper_status")
 """Keys of ``episode_info.npz`` from which actions are computed."""
+_RANGES = "relative_position and relative_rotation, each [lowest (3), highest (3)]"
 
 
-def episode_actions(arrays: Mapping[str, NDArray]) -> NDArray[np.float32]:
-    """Return the actions (T, 7) of an episode; row t leads to step t + 1, the last row does not move.
+def compute_actions(arrays: Mapping[str, NDArray]) -> NDArray[np.float32]:
+    """Compute the 7-D actions (T, 7) of an episode from its arrays.
 
-    Translation is ``rel_pos[t]`` in m. Rotation is ``rel_orn[t]`` as Euler angles in rad about the fixed axes x, y, z
-    (scipy's "xyz", the convention of ``action_space``). The gripper command is ``gripper_status[t + 1]``.
+    Row t moves the robot from step t to step t + 1; the last row has no motion. Columns: translation ``rel_pos[t]`` in
+    m; rotation ``rel_orn[t]`` as Euler angles in rad about the fixed axes x, y, z (scipy's "xyz", as in
+    ``action_space``); gripper command ``gripper_status[t + 1]``, 1 = open (the last row repeats the command).
     """
     return to_dataset_actions(arrays["rel_pos"], arrays["rel_orn"], arrays["gripper_status"])
 
 
-def require_actions(arrays: Mapping[str, NDArray], where: str) -> NDArray[np.float32]:
-    """Return `episode_actions` of arrays that may be damaged; raise DatasetError if they are."""
+def compute_valid_actions(arrays: Mapping[str, NDArray], where: str) -> NDArray[np.float32]:
+    """Compute the 7-D actions (T, 7) of an episode; raise DatasetError if its arrays are damaged.
+
+    ``where`` names the episode in the error.
+    """
     check_finite(arrays, where)
     try:
-        return episode_actions(arrays)
+        return compute_actions(arrays)
     except ValueError as error:
         what, found = "no actions can be computed from these arrays", one_line(error)
         raise DatasetError(what, where=where, found=found, fix=SEE_VALIDATE) from error
@@ -50,16 +55,17 @@ def to_joint_positions(actions: NDArray) -> NDArray[np.float32]:
 
 
 def check_finite(arrays: Mapping[str, NDArray], where: str) -> None:
-    """Raise DatasetError if an array of floats holds NaN or infinite values."""
+    """Raise DatasetError if an array contains NaN or infinite values; ``where`` names the episode."""
     for key, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise DatasetError("NaN or infinite value", where=f"{where}, {key}", fix=SEE_VALIDATE)
 
 
-def action_space(rel_pos: Sequence[NDArray], rel_orn: Sequence[NDArray]) -> dict[str, list[list[float]]]:
-    """Return the range of the relative motion: 1st and 99th percentile of each axis, m and rad.
+def compute_action_space(rel_pos: Sequence[NDArray], rel_orn: Sequence[NDArray]) -> dict[str, list[list[float]]]:
+    """Compute ``action_space`` of ``data_info.json``: 1st and 99th percentile of the motion per axis, m and rad.
 
-    ``rel_pos`` and ``rel_orn`` hold one array per episode, (T, 3) and (T, 4) xyzw. The last row of each is ignored.
+    ``rel_pos`` and ``rel_orn`` have one array per episode, (T, 3) and (T, 4) xyzw. Last rows are ignored, because they
+    are 0 by definition.
     """
     positions = np.concatenate([rows[:-1] for rows in rel_pos]).astype(np.float64)
     quaternions = np.concatenate([rows[:-1] for rows in rel_orn]).astype(np.float64)
@@ -72,34 +78,36 @@ def action_space(rel_pos: Sequence[NDArray], rel_orn: Sequence[NDArray]) -> dict
 
 @dataclass(frozen=True)
 class ActionScale:
-    """Linear scale that maps motion from ``low`` to ``high``, (6,) m and rad, to [-1, 1]."""
+    """Linear scale of the motion in actions: ``low`` becomes -1 and ``high`` becomes 1, both (6,) in m and rad."""
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]
 
     @classmethod
     def from_action_space(cls, action_space: Mapping[str, Any], where: object = "action_space") -> ActionScale:
-        """Return the scale of ``action_space`` of ``data_info.json``."""
+        """Make the scale of an ``action_space`` as in ``data_info.json``; ``where`` names it in errors."""
         try:
             rows = [np.asarray(action_space[key], float) for key in ("relative_position", "relative_rotation")]
         except (KeyError, TypeError, ValueError) as error:
-            raise DatasetError("invalid range of actions", where=where, found=str(error)) from error
+            found = str(action_space)[:80]
+            raise DatasetError("invalid range of actions", where=where, expected=_RANGES, found=found) from error
         if any(row.shape != (2, 3) or not np.isfinite(row).all() for row in rows):
             found = [row.tolist() for row in rows]
-            raise DatasetError(
-                "invalid range of actions", where=where, expected="[low (3), high (3)] each", found=found
-            )
+            raise DatasetError("invalid range of actions", where=where, expected=_RANGES, found=found)
         low, high = np.concatenate(rows, axis=1)
         return cls(low, high)
 
     def encode(self, actions: NDArray) -> NDArray[np.float32]:
-        """Return normalized actions (..., 7), clipped to the range; an axis without a range becomes 0."""
+        """Normalize actions (..., 7): motion scaled and clipped to [-1, 1], gripper unchanged.
+
+        An axis with ``low`` = ``high`` becomes 0.
+        """
         span = self.high - self.low
         scaled = 2 * (actions[..., :6] - self.low) / np.where(span > 0, span, 1) - 1
         motion = np.where(span > 0, np.clip(scaled, -1, 1), 0)
         return np.concatenate([motion, actions[..., 6:]], axis=-1).astype(np.float32)
 
     def decode(self, actions: NDArray) -> NDArray[np.float32]:
-        """Return actions (..., 7) in m and rad from normalized actions: the inverse of ``encode``."""
+        """Convert normalized actions (..., 7) to m and rad: the inverse of `encode`."""
         motion = self.low + (actions[..., :6] + 1) / 2 * (self.high - self.low)
         return np.concatenate([motion, actions[..., 6:]], axis=-1).astype(np.float32)

@@ -19,22 +19,22 @@ from robocas_ms3.core.signals import forbid_exit
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource
 
-GROUP = "robocas_ms3.formats"
+ENTRY_POINT_GROUP = "robocas_ms3.formats"
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format of episodes. Its functions are named as ``module:function`` and imported at first use.
+    """Dataset format; its reader, writer and checker are named as ``module:function`` and imported at first use.
 
     Attributes:
         name: name in ``robocas convert --to``.
         title: name in messages, such as "LeRobot dataset".
-        matches: function that says whether a path holds episodes in this format, complete or not; it reads little.
+        matches: function that returns whether a path has this format, complete or not; it should read little.
         reader: (path, *, rate_hz=None, include_failed=False) -> `EpisodeSource`.
-        writer: (`conversion.settings.ConversionSettings`, *, on_start=None, on_episode=None) -> `Conversion`, see
+        writer: (`conversion.settings.ConversionSettings`, *, on_start=None, on_episode=None) -> `ConversionResult`, see
             `conversion.convert.convert`; empty: the format can't be written.
-        checker: (root, *, on_episode=None) -> `checks.dataset.ValidationReport`; empty: there is none.
+        checker: (root, *, on_episode=None) -> `checks.dataset.ValidationReport`; empty: the format can't be checked.
         options: options of ``robocas convert`` that apply to this format and not to all formats.
     """
 
@@ -46,7 +46,7 @@ class Format:
     checker: str = ""
     options: tuple[str, ...] = ()
 
-    def load(self, name: str) -> Callable[..., Any]:
+    def import_function(self, name: str) -> Callable[..., Any]:
         """Import and return a function of the format: ``reader``, ``writer`` or ``checker``."""
         path: str = getattr(self, name)
         if not path:
@@ -91,12 +91,12 @@ _BUILTIN = (
         ("append", "image_format", "skip_errors"),
     ),
 )
-FORMATS: Registry[Format] = Registry("dataset format", GROUP, Format, {one.name: one for one in _BUILTIN})
+FORMATS: Registry[Format] = Registry("dataset format", ENTRY_POINT_GROUP, Format, {one.name: one for one in _BUILTIN})
 """Formats by name."""
 
 
 def detect_format(path: Path) -> Format | None:
-    """Return the format of a path, None if no format matches; formats of other packages are tested first."""
+    """Return the format of a file or folder, None if unknown; formats of other packages are tested first."""
     for name in reversed(list(FORMATS)):
         try:
             if FORMATS[name].matches(path):
@@ -116,4 +116,4 @@ def open_source(path: Path | str, *, rate_hz: float | None = None, include_faile
     """
     path = Path(path)
     found = detect_format(path) or FORMATS["robocas"]  # its error suggests a nearby dataset
-    return found.load("reader")(path, rate_hz=rate_hz, include_failed=include_failed)
+    return found.import_function("reader")(path, rate_hz=rate_hz, include_failed=include_failed)

@@ -73,17 +73,20 @@ def check_version(found: object, where: Path, what: str = "a dataset") -> None:
         elif isinstance(found, int) and found > SCHEMA_VERSION:
             fix = "Update robocas_ms3."
         raise DatasetError(
-            f"{what} with another schema version", where=where, expected=SCHEMA_VERSION, found=found, fix=fix
+            f"unsupported schema version of {what}", where=where, expected=SCHEMA_VERSION, found=found, fix=fix
         )
 
 
 def pose_files(parent: Parent) -> tuple[str, str]:
-    """Return both names of the pose file of a camera whose pose is in the frame ``parent``."""
+    """Return the names of the two pose files of a camera whose pose is in the frame ``parent``."""
     return f"cam_pos_wrt_{parent}.npy", f"cam_pose_wrt_{parent}.npy"
 
 
 def camera_parent(folder: Path) -> Parent:
-    """Return the parent frame of a camera pose by its file name; default: that of the standard camera."""
+    """Return the parent frame of a camera pose, by the name of the pose file in the camera folder.
+
+    Without a pose file: the parent frame of the standard camera with this name.
+    """
     for parent in PARENT_FRAMES:
         if any((folder / name).exists() for name in pose_files(parent)):
             return parent
@@ -91,14 +94,14 @@ def camera_parent(folder: Path) -> Parent:
 
 
 def camera_names(episode: Path) -> tuple[str, ...]:
-    """Return the names of the cameras with a folder in the folder of an episode, sorted."""
+    """Return the sorted names of the camera folders in the folder of an episode."""
     if not episode.is_dir():
         return ()
     return tuple(sorted(p.name for p in episode.iterdir() if re.fullmatch(CAMERA_NAME, p.name) and p.is_dir()))
 
 
 def episode_folder(number: int) -> str:
-    """Return the folder name of an episode."""
+    """Return the folder name of an episode, such as ``episode_0000012``."""
     return f"episode_{number:07d}"
 
 

@@ -20,9 +20,9 @@ from robocas_ms3.core.output_folder import remove_leftovers
 from robocas_ms3.core.text import format_count, one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.conversion.data_info import write_info
-from robocas_ms3.datasets.conversion.episode_plan import dataset_settings, header
-from robocas_ms3.datasets.manage.split import SplitOptions, cut, group_episodes
-from robocas_ms3.datasets.sources.provenance import recording_entry
+from robocas_ms3.datasets.conversion.episode_plan import make_header, make_settings
+from robocas_ms3.datasets.manage.split import SplitOptions, divide_episodes, group_episodes
+from robocas_ms3.datasets.sources.provenance import make_recording_entry
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
@@ -193,11 +193,11 @@ def _join_dataset(plan: Plan, root: Path, files: EpisodeFiles) -> None:
                 _set_source(each.episode_path / schema.SCENE_FILE, {**trajectory, "episode_id": place})
                 os.replace(each.episode_path, folder)
             with TrajectoryFile(each.recording_path, pack=plan.parts[part].pack) as file:
-                entry = recording_entry(file, 0)
+                entry = make_recording_entry(file, 0)
             entries[str(number)] = {**entry, **trajectory, "trajectory_episode": place}
-    settings = dataset_settings(plan.rate, plan.images.image_options(), plan.embeddings)
+    settings = make_settings(plan.rate, plan.images.image_options(), plan.embeddings)
     write_json(
-        root / schema.CONVERSION_FILE, {**header(settings, describe_split(plan)), "episodes": entries}, sync=True
+        root / schema.CONVERSION_FILE, {**make_header(settings, describe_split(plan)), "episodes": entries}, sync=True
     )
     flush_to_disk(root)  # episodes are on disk before the file that lists them
     write_info(root, split_episodes(plan, root))
@@ -239,7 +239,7 @@ def split_episodes(plan: Plan, root: Path) -> tuple[list[int], list[int]]:
         _log.warning("%s: there are no validation episodes, because all episodes have the same %s", root, by)
         by_rule = free, []
     else:
-        by_rule = cut(groups, [1 - plan.split.val_fraction, plan.split.val_fraction])
+        by_rule = divide_episodes(groups, [1 - plan.split.val_fraction, plan.split.val_fraction])
     return sorted([*train, *by_rule[0]]), sorted([*val, *by_rule[1]])
 
 
@@ -257,11 +257,13 @@ def _convert_lerobot(plan: Plan, robocas: Path, out: Path, jobs: int) -> None:
 
 
 def _write_statistics(out: Path) -> None:
-    from robocas_ms3.datasets.statistics.collect import collect
+    from robocas_ms3.datasets.statistics.collect import collect_statistics
     from robocas_ms3.datasets.statistics.plots import write_stats
 
     dataset = Path(DATASETS, "robocas")
-    write_stats(replace(collect(out / dataset), path=dataset), out / STATISTICS)  # no absolute path in the statistics
+    write_stats(
+        replace(collect_statistics(out / dataset), path=dataset), out / STATISTICS
+    )  # no absolute path in the statistics
 
 
 def _make_report(plan: Plan, chosen: ChosenEpisodes) -> dict[str, Any]:

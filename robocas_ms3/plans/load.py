@@ -110,10 +110,10 @@ def check_plan(plan: Plan) -> None:
 
             TextEmbedder()  # checks the extra and the model without loading it
         if "lerobot" in plan.formats:
-            from robocas_ms3.datasets.lerobot.schema import check_video_size, require_lerobot, whole_rate
+            from robocas_ms3.datasets.lerobot.schema import check_video_size, require_lerobot, to_integer_rate
 
             require_lerobot()
-            whole_rate(plan.rate)
+            to_integer_rate(plan.rate)
             check_video_size(plan.images.size)
     if "statistics" in plan.stages:
         require_extra("plots", "statistics", "matplotlib", fix="Or remove the stage `statistics`.")

@@ -147,7 +147,7 @@ class Renderer:
     def open_env(self, env: RecordedEnv, control_mode: str, image_options: ImageOptions) -> EnvRenderer:
         """Open the environment that recorded an episode, with a renderer."""
         use_one_torch_thread()
-        return rendered_source.open_env(env, control_mode, image_options)
+        return rendered_source.open_env_renderer(env, control_mode, image_options)
 
     def _open_source(self, files: SeedFiles) -> rendered_source.RenderedSource:
         if self._source is None or self._part != files.part:

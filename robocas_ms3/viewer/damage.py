@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import format_error
-from robocas_ms3.datasets.checks.scene import valid_values
+from robocas_ms3.datasets.checks.scene import read_valid_values
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 
 T = TypeVar("T")
@@ -58,5 +58,5 @@ def read_object(read: Callable[[], Any], name: str) -> tuple[dict[Any, Any], str
 
 def read_scene(read: Callable[[], Any], name: str) -> tuple[dict[str, Any], str]:
     """Return the valid values of an object with keys of ``scene.json``, and a text on invalid values."""
-    (found, wrong), failed = read_or_default(lambda: valid_values(read(), name), ({}, ""))
+    (found, wrong), failed = read_or_default(lambda: read_valid_values(read(), name), ({}, ""))
     return found, f"{name}: {failed}" if failed else wrong

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.core.json_lines import JsonLinesFile
-from robocas_ms3.datasets.sources.provenance import environment_id
+from robocas_ms3.datasets.sources.provenance import compute_environment_id
 from robocas_ms3.demos.failures import FAILURES_FILE, FailedAttempt
 
 
@@ -44,7 +44,7 @@ class TaskFailedAttempt(FailedAttempt):
     def is_of(self, env_info: Any) -> bool:
         if not self.environment or not isinstance(env_info, Mapping):
             return True
-        return environment_id(env_info) in ("", self.environment)
+        return compute_environment_id(env_info) in ("", self.environment)
 
 
 @dataclass(frozen=True)

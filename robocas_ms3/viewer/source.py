@@ -17,7 +17,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.formats import detect_format
 from robocas_ms3.datasets.images.image_headers import read_image_bytes
 from robocas_ms3.datasets.sources.episode_source import ImageKind
-from robocas_ms3.datasets.sources.provenance import entry_without_fingerprint, task_of
+from robocas_ms3.datasets.sources.provenance import make_entry_without_fingerprint, parse_task_name
 from robocas_ms3.datasets.sources.reader import DEFAULT_RATE, Dataset
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.demos.recordings.trajectory_file import Recording, TrajectoryFile
@@ -54,7 +54,7 @@ def open_content(path: Path | str) -> PageContent:
         return TrajectoryContent(path)
     if found.name == "lerobot":
         return LeRobotContent(path)
-    return PageContent(found.load("reader")(path), found.title)
+    return PageContent(found.import_function("reader")(path), found.title)
 
 
 class FolderContent(PageContent):
@@ -97,9 +97,9 @@ class TrajectoryContent(PageContent):
     def __init__(self, path: Path) -> None:
         with as_dataset_error(path):
             with TrajectoryFile(path) as file:
-                task = task_of(file.env_info["env_id"])
+                task = parse_task_name(file.env_info["env_id"])
                 self._entries = [
-                    {"task": task, **entry_without_fingerprint(file, index)} for index in range(len(file.episodes))
+                    {"task": task, **make_entry_without_fingerprint(file, index)} for index in range(len(file.episodes))
                 ]
             self.recordings = TrajectorySource(path, rate_hz=file.control_freq, include_failed=True)
         super().__init__(self.recordings, "trajectory file", [_NO_IMAGES.format(name=path.name)])
@@ -114,7 +114,7 @@ class TrajectoryContent(PageContent):
         episode = self.recordings.episode(number)
         recording, arrays = episode.recording(), episode.arrays
         base = from_xyzw(arrays["base_pos"][:1].astype(float), arrays["base_orn"][:1].astype(float))[0]
-        objects = _object_paths(recording, scene, self.recordings.objects(number), base)
+        objects = _object_paths(recording, scene, self.recordings.object_ids(number), base)
         shown = show_arrays(arrays, scene, actions=_action_plots(recording), moving=objects)
         return {**shown, "facts": facts_of({**scene, "source": None})}  # the source is this file
 
@@ -128,11 +128,11 @@ class LeRobotContent(PageContent):
 
         with as_dataset_error(root):
             self.dataset = dataset = LeRobotDataset(root)
-            _ = dataset.is_robocas, dataset.lengths, dataset.rate_hz, dataset.cameras, dataset.has_depth
+            _ = dataset.has_robocas_features, dataset.lengths, dataset.rate_hz, dataset.cameras, dataset.has_depth
         self.entry_name, self._indices = lerobot.CONVERSION_FILE, {*lerobot.INDICES, lerobot.SUBTASK_INDEX.key}
         settings, wrong_settings = read_object(lambda: dataset.settings, lerobot.CONVERSION_FILE)
         dataset.settings = settings or {"train_eps": []}
-        dataset.scene_texts, wrong_scenes = read_object(lambda: dataset.scene_texts, lerobot.SCENES_FILE)
+        dataset.scene_json_texts, wrong_scenes = read_object(lambda: dataset.scene_json_texts, lerobot.SCENES_FILE)
         notes = wrong_scenes, wrong_settings
         super().__init__(dataset, "LeRobot dataset", notes)
         self._decoded: OrderedDict[tuple[int, str, ImageKind, int], NDArray] = (
@@ -141,7 +141,7 @@ class LeRobotContent(PageContent):
 
     def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
         """Return the content of an episode; datasets of other tools get one plot per numeric column."""
-        if self.dataset.is_robocas:
+        if self.dataset.has_robocas_features:
             return super()._show(number, scene)
         episode = self.dataset.episode(number)
         features = self.dataset.info["features"]
@@ -167,7 +167,7 @@ class LeRobotContent(PageContent):
         key = number, camera, kind, first
         with self._reading:
             if key not in self._decoded:
-                check_inside(episode.video(camera, kind)[0], self.root)
+                check_inside(episode.find_video(camera, kind)[0], self.root)
                 frames = episode.frames(camera, kind, first, min(_AT_ONCE, episode.steps - first))
                 self._decoded[key] = np.stack(list(frames))
             self._decoded.move_to_end(key)

@@ -9,7 +9,7 @@ from synthetic import RayCaster, write_trajectory
 from robocas_ms3.datasets.conversion.convert import convert
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.manage.import_robocas import import_robocas
-from robocas_ms3.datasets.manage.survey import survey
+from robocas_ms3.datasets.manage.survey import survey_dataset
 from robocas_ms3.datasets.sources.reader import Dataset
 
 
@@ -103,11 +103,11 @@ def problems(root, *outcomes):
     """Return episode, place, found value and repair of the findings with an outcome."""
     return [
         (f.episode, f.violation.where.removeprefix(f"episode_{f.episode or 0:07d}/"), f.violation.found, f.repair)
-        for f in survey(root).findings
+        for f in survey_dataset(root).findings
         if f.outcome in outcomes
     ]
 
 
 def imported(root, out, **kwargs):
-    import_robocas(survey(root, **kwargs), out)
+    import_robocas(survey_dataset(root, **kwargs), out)
     return Dataset(out)

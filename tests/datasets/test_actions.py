@@ -1,7 +1,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.datasets.actions import episode_actions, to_joint_positions
+from robocas_ms3.datasets.actions import compute_actions, to_joint_positions
 
 
 def test_joint_actions_of_a_dataset_become_joint_positions():
@@ -18,7 +18,7 @@ def test_euler_angles_of_actions_are_about_fixed_axes():
     roll, pitch, yaw = 0.2, -0.3, 0.4
     rotation = Rotation.from_euler("z", yaw) * Rotation.from_euler("y", pitch) * Rotation.from_euler("x", roll)
     turns = np.stack([rotation.as_quat(), [0, 0, 0, 1]])
-    actions = episode_actions(
+    actions = compute_actions(
         {"rel_pos": np.zeros((2, 3)), "rel_orn": turns, "gripper_status": np.array([True, False])}
     )
     np.testing.assert_allclose(actions[0, 3:], [roll, pitch, yaw, 0], atol=1e-6)

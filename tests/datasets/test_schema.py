@@ -5,7 +5,7 @@ import pytest
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.file_models import DataInfoRecord, SceneRecord
-from robocas_ms3.datasets.sources.provenance import task_of
+from robocas_ms3.datasets.sources.provenance import parse_task_name
 from robocas_ms3.robots.cameras import PARENT_FRAMES, STANDARD_CAMERAS
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "dataset.md"
@@ -62,6 +62,6 @@ def test_other_versions_are_refused():
 def test_task_of_an_environment_id():
     from robocas_ms3.scenes.task_specs import TASKS
 
-    assert [task_of(f"robocas_ms3:{spec.env_id}") for spec in TASKS.values()] == list(TASKS)
-    assert task_of("PushCube-v1") is None
-    assert task_of(None) is None
+    assert [parse_task_name(f"robocas_ms3:{spec.env_id}") for spec in TASKS.values()] == list(TASKS)
+    assert parse_task_name("PushCube-v1") is None
+    assert parse_task_name(None) is None

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.datasets.actions import episode_actions
-from robocas_ms3.datasets.sources.arrays import episode_arrays
+from robocas_ms3.datasets.actions import compute_actions
+from robocas_ms3.datasets.sources.arrays import make_episode_arrays
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.open_loop import OpenLoopEnv
 from robocas_ms3.demos.recordings.motion import sample_states
@@ -50,8 +50,8 @@ def recorded(tmp_path_factory):
 def own_actions(recording):
     samples = sample_states(recording.control_steps, 4)
     goals = sample_subgoals(recording.subgoals, samples)
-    arrays = episode_arrays(recording.compute_motion(samples), recording.instruction, goals)
-    return episode_actions(arrays)[:-1], arrays["ee_pos"]
+    arrays = make_episode_arrays(recording.compute_motion(samples), recording.instruction, goals)
+    return compute_actions(arrays)[:-1], arrays["ee_pos"]
 
 
 def play(env, actions):

@@ -26,7 +26,7 @@ def toy_package(tmp_path, monkeypatch):
     folder = install("A dataset format", tmp_path / "site")
     monkeypatch.syspath_prepend(folder)
     monkeypatch.setattr("robocas_ms3.datasets.conversion.env_renderer.EnvRenderer", RayCaster)
-    registry = Registry("dataset format", formats.GROUP, formats.Format, formats.FORMATS.builtin)
+    registry = Registry("dataset format", formats.ENTRY_POINT_GROUP, formats.Format, formats.FORMATS.builtin)
     monkeypatch.setattr(formats, "FORMATS", registry)  # entry points are read again
     yield folder
     sys.modules.pop("toy_format", None)

@@ -24,15 +24,15 @@ from robocas_ms3.core.paths import builtin_packs_dir
 from robocas_ms3.core.poses import from_xyz_yaw
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.conversion.convert import convert
-from robocas_ms3.datasets.conversion.episode_plan import DATASET, dataset_settings, plan_episodes
+from robocas_ms3.datasets.conversion.episode_plan import DATASET, make_settings, plan_episodes
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.convert import convert_lerobot
-from robocas_ms3.datasets.sources.provenance import recorded_scene, recording_entry
+from robocas_ms3.datasets.sources.provenance import make_recorded_scene, make_recording_entry
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
-from robocas_ms3.datasets.statistics.collect import collect
+from robocas_ms3.datasets.statistics.collect import collect_statistics
 from robocas_ms3.demos.failures import FailedAttempt, count_by_reason
 from robocas_ms3.demos.generation import OUTPUT
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
@@ -66,7 +66,7 @@ LAYOUT = Layout(
 RUN = {"settings": asdict(EpisodeSettings("pick")), "first_seed": 0, "versions": {"a": "1"}}
 FAILURE = {"seed": 1, "attempt": 0, "stage": "a", "reason": "b", "seconds": 1.0}
 ENTRY = {"trajectory": "F.h5", "trajectory_episode": 0, "seed": 3, "success": True, "recording": "ab", "source": 0}
-CONVERSION = dataset_settings(5, ImageOptions(STANDARD_CAMERA_NAMES), False)
+CONVERSION = make_settings(5, ImageOptions(STANDARD_CAMERA_NAMES), False)
 
 
 # What is whole at first: functions that write it into a folder
@@ -175,8 +175,8 @@ def read_recording(root):
             motion = recording.compute_motion(np.arange(0, recording.control_steps + 1, 4))
             assert np.isfinite(motion.actions).all()
             assert np.isfinite(RecordedEpisode.read(path, file.episodes[index]).actions).all()
-            assert recording_entry(file, index)
-            assert recorded_scene(file, index)
+            assert make_recording_entry(file, index)
+            assert make_recorded_scene(file, index)
     source = TrajectorySource(path)
     for number in source.numbers:
         episode = source.episode(number)
@@ -256,7 +256,7 @@ CASES = [  # writer, file, reader, number of changed files, least number of erro
     (write_recording, "trajectory.json", show_page, 40, 0),
     (write_recording, "trajectory.h5", read_recording, 80, 20),
     (write_recording, "trajectory.json", read_recording, 120, 30),
-    (write_recording, "trajectory.json", lambda root: collect(root / "trajectory.h5"), 20, 0),
+    (write_recording, "trajectory.json", lambda root: collect_statistics(root / "trajectory.h5"), 20, 0),
     (write_pack, "manifest.json", load_pack, 150, 120),
     (write_pack, "hulls.obj", read_hull_file, 40, 10),
     (write_pack, "annotations.npz", read_annotations, 80, 40),

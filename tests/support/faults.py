@@ -19,7 +19,7 @@ import numpy as np
 import psutil
 
 from robocas_ms3.core.json_lines import JsonLinesFile
-from robocas_ms3.datasets.conversion.episode_folder import find_damaged
+from robocas_ms3.datasets.conversion.episode_folder import find_damaged_file
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.failures import FAILURES_FILE, FailedAttempt
@@ -117,7 +117,7 @@ def count_readable(command, out):
         return sum(bool(json.loads(line)) for line in lines if line.endswith(b"\n"))
     folders = sorted(out.glob("episode_*" if command.name == "convert" else "units/*/*/[0-9]*/episode_*"))
     for folder in folders:
-        assert find_damaged(folder, ImageOptions(STANDARD_CAMERA_NAMES, (64, 48), depth=False)) is None, folder
+        assert find_damaged_file(folder, ImageOptions(STANDARD_CAMERA_NAMES, (64, 48), depth=False)) is None, folder
     return len(folders)
 
 

@@ -15,7 +15,7 @@ from robocas_ms3.datasets.manage import copy_episodes, import_robocas
 POINTS = {  # point -> (module, function, number of the call at which to kill)
     "image": (episode_folder, "write_image", 50),  # in the second episode
     "arrays": (episode_folder, "write_episode_files", 2),
-    "file": (copy_episodes.FilePlacer, "place", 70),  # in the second episode
+    "file": (copy_episodes.FileCopier, "copy_file", 70),  # in the second episode
     "rename": (files, "_move_in", 2),
     "convert overview": (convert, "write_info", 1),
     "merge overview": (copy_episodes, "write_info", 1),
@@ -32,7 +32,7 @@ def lerobot_points():
     return {
         "frame": (video.VideoEncoder, "add", 50),  # in the second episode
         "join": (video.VideoJoiner, "add", 7),
-        "table": (writer.RollingTable, "add", 4),
+        "table": (writer.RollingTableWriter, "add", 4),
         "folders": (lerobot.os, "replace", 3),  # the third of plan, data, videos
         "joined": (Path, "rmdir", 1),
         "parts": (lerobot.shutil, "rmtree", 1),

@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from robocas_ms3.datasets.images.image_files import ImageOptions, bounding_box
+from robocas_ms3.datasets.images.image_files import ImageOptions, compute_bounding_box
 from robocas_ms3.datasets.sources.episode_source import CameraModel, StepImages
 from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES, standard_camera_parent
 from robocas_ms3.robots.description import MOBILE_PANDA
@@ -56,11 +56,11 @@ class RayCaster:
     """``Renderer`` of a room with a floor, a table and a cube for each actor."""
 
     def __init__(self, env_info, control_mode, image_options=None):
-        self.image_options = (image_options or ImageOptions()).choose(STANDARD_CAMERA_NAMES, "here")
+        self.image_options = (image_options or ImageOptions()).select_cameras(STANDARD_CAMERA_NAMES, "here")
         self.size = self.image_options.size or SIZE
         self.closed = False
 
-    def load(self, recording):
+    def load_scene(self, recording):
         pass
 
     def close(self):
@@ -94,7 +94,7 @@ class RayCaster:
             shots = {n: self.shoot(parents[n] @ camera, boxes) for n, camera in wanted.items()}
             depth = {n: p[1] for n, p in shots.items() if self.image_options.depth}
             masks = {n: p[2] == 2 for n, p in shots.items() if self.image_options.boxes}  # after the table: the target
-            found = {n: box for n, mask in masks.items() if (box := bounding_box(mask))}
+            found = {n: box for n, mask in masks.items() if (box := compute_bounding_box(mask))}
             yield StepImages({n: p[0] for n, p in shots.items()}, depth, found)
 
     def shoot(self, camera_in_world, boxes):
@@ -195,7 +195,7 @@ def write_trajectory(path: Path, seeds=(3, 4, 5), failed=(), steps=STEPS):
 
 def stub_embeddings(source, entries):
     """Return unit vectors instead of sentence embeddings, whose model takes seconds to load."""
-    texts = {text for entry in entries for text in source.texts(entry["source"])}
+    texts = {text for entry in entries for text in source.list_texts(entry["source"])}
     return {text: np.eye(384, dtype=np.float32)[number] for number, text in enumerate(sorted(texts))}
 
 

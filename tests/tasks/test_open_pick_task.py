@@ -10,7 +10,7 @@ import pytest
 
 import robocas_ms3  # noqa: F401
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.datasets.sources.arrays import episode_arrays
+from robocas_ms3.datasets.sources.arrays import make_episode_arrays
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.open_loop import OpenLoopChecks
 from robocas_ms3.demos.recordings.motion import sample_states
@@ -111,7 +111,7 @@ def test_base_motion_of_the_dataset_contains_the_drive(drive_recording):
     base[:, :3, 3] = np.column_stack([x, y, np.full(len(x), 0.49)])
     assert base[-1] == pytest.approx(seen["base"], abs=0.02)
     assert motion.arm_base_in_world == pytest.approx(base, abs=1e-5)
-    arrays = episode_arrays(motion, "", sample_subgoals(recording.subgoals, samples))
+    arrays = make_episode_arrays(motion, "", sample_subgoals(recording.subgoals, samples))
     steps = np.linalg.norm(arrays["base_rel_pos"], axis=1)
     assert steps.max() > 0.02
     assert steps.sum() == pytest.approx(np.hypot(0.2, 0.1), abs=0.02)

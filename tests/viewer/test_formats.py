@@ -42,7 +42,7 @@ def open_toy(folder, monkeypatch, broken=()):
 
     toy = formats.Format("toy", "toy dataset", lambda path: path == folder, "toys:read")
     with monkeypatch.context() as patch:
-        patch.setattr(formats.Format, "load", lambda self, name: read)
+        patch.setattr(formats.Format, "import_function", lambda self, name: read)
         patch.setattr(formats, "FORMATS", {"toy": toy})
         return open_content(folder)
 

@@ -39,14 +39,14 @@ from robocas_ms3.core.output_folder import check_replaceable
 from robocas_ms3.core.text import escape_controls
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset, LeRobotEpisode
 from robocas_ms3.datasets.lerobot.schema import INDICES, INFO_FILE, STAGING, STATS_FILE, image_key, is_depth
-from robocas_ms3.datasets.lerobot.stats import vector_stats
-from robocas_ms3.datasets.lerobot.tables import as_column
+from robocas_ms3.datasets.lerobot.stats import compute_stats
+from robocas_ms3.datasets.lerobot.tables import to_column
 from robocas_ms3.datasets.lerobot.variants import V3
 from robocas_ms3.datasets.sources.files import read_json
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH, STATE
 
 Embed = Callable[[Sequence[str]], NDArray[np.float32]]
-_NOT_COPIED = ("data", "episodes", "robocas", "depth", ".parts", STAGING)
+_NOT_COPIED = ("data", "episodes", "robocas", "depth", ".episodes", STAGING)
 """Folders that `prepare_dataset` writes itself, or that the policies do not need."""
 
 
@@ -73,14 +73,14 @@ def prepare_dataset(source: Path, out: Path, embed: Embed | None) -> None:
         if embed is not None:
             vectors = dict(zip(dataset.tasks, scale_embeddings(embed(dataset.tasks)), strict=True))
         parts: dict[str, list[NDArray]] = defaultdict(list)
-        for path, rows in dataset.files("data").items():
+        for path, rows in dataset.rows_by_file("data").items():
             tables = []
             for episode in (dataset.episode(row["episode_index"]) for row in rows):
                 columns = _make_columns(episode, vectors)
                 for key, values in columns.items():
                     parts[key].append(values)
-                indices = {key: episode.table.column(key) for key in INDICES}
-                tables.append(pa.table({**{key: as_column(values) for key, values in columns.items()}, **indices}))
+                indices = {key: episode.frame_table.column(key) for key in INDICES}
+                tables.append(pa.table({**{key: to_column(values) for key, values in columns.items()}, **indices}))
             _write_table(pa.concat_tables(tables), part / path.relative_to(source))
         for path in sorted((source / "meta" / "episodes").rglob("*.parquet")):
             table = pq.read_table(
@@ -99,7 +99,7 @@ def _open_export(source: Path) -> LeRobotDataset:
         dataset = LeRobotDataset(source)
     except DatasetError as error:
         raise DatasetError(what, where=source, found=error, fix=fix) from error
-    if dataset.layout is not V3 or not dataset.is_robocas or not dataset.cameras:
+    if dataset.file_layout is not V3 or not dataset.has_robocas_features or not dataset.cameras:
         expected = f"format {V3.codebase_version}, the columns of robocas convert, and a camera"
         found = f"format {dataset.info['codebase_version']}, cameras {', '.join(dataset.cameras) or 'none'}"
         raise DatasetError(what, where=source, expected=expected, found=found, fix=fix)
@@ -124,7 +124,7 @@ def _write_meta(dataset: LeRobotDataset, part: Path, columns: dict[str, NDArray]
     }
     features |= {key: info["features"][key] for key in (*map(image_key, dataset.cameras), *INDICES)}
     stats = {key: values for key, values in read_json(dataset.root / STATS_FILE).items() if key in features}
-    stats |= {key: vector_stats(values) for key, values in columns.items()}
+    stats |= {key: compute_stats(values) for key, values in columns.items()}
     write_json(part / INFO_FILE, {**info, "features": features})
     write_json(part / STATS_FILE, stats)
 

@@ -19,7 +19,7 @@ from robocas_ms3.baselines.lerobot.policy import LeRobotPolicy
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import EvaluationError, RobocasError
 from robocas_ms3.core.text import escape_controls, escape_log_lines, escape_tracebacks
-from robocas_ms3.datasets.lerobot.schema import checksum
+from robocas_ms3.datasets.lerobot.schema import compute_checksum
 from robocas_ms3.evaluation.remote.server import PolicyServer
 
 CHECKPOINT = "train/checkpoints/last/pretrained_model"
@@ -58,7 +58,7 @@ def load_policy(checkpoint: Path, rate_hz: float, device: str, n_action_steps: i
     description = {
         "lerobot": version("lerobot"),
         "type": config.type,
-        "weights": checksum(checkpoint / "model.safetensors"),  # a result is not continued with other weights
+        "weights": compute_checksum(checkpoint / "model.safetensors"),  # a result is not continued with other weights
         "n_action_steps": config.n_action_steps,
     }
     return LeRobotPolicy(model, preprocessor, postprocessor, inputs, rate_hz, description)

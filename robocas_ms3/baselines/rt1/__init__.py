@@ -13,7 +13,7 @@ from robocas_ms3.baselines.baseline import Baseline
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.rt1.data import RT1Samples
 from robocas_ms3.baselines.rt1.model import RT1Model
-from robocas_ms3.datasets.training.torch_dataset import resize
+from robocas_ms3.datasets.training.torch_dataset import resize_image
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 
@@ -73,7 +73,7 @@ class RT1Policy:
 
     def _encode(self, observations: Observations, row: int) -> torch.Tensor:
         assert observations.embeddings is not None
-        views = [resize(observations.images[name][row], self._config.image_size) for name in self._config.cameras]
+        views = [resize_image(observations.images[name][row], self._config.image_size) for name in self._config.cameras]
         device = self._model.mean.device
         images = torch.from_numpy(np.stack(views).transpose(0, 3, 1, 2)[None].copy()).to(device)
         with torch.inference_mode():

@@ -14,7 +14,7 @@ from robocas_ms3.baselines.training.scenes import read_training_scenes
 from robocas_ms3.datasets.actions import ActionScale
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.training.options import SampleOptions
-from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset, read_episode
+from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset, read_sample_arrays
 
 
 class RT1Samples:
@@ -50,7 +50,7 @@ class RT1Samples:
         self.episodes, self.scenes = len(self._data.episodes), read_training_scenes(source, self._data.episodes)
         scale = ActionScale.from_action_space(source.action_space(), folder)
         for done, number in enumerate(self._data.episodes, start=1):  # finds damaged episodes before the training
-            read_episode(source, number, self._data.options)
+            read_sample_arrays(source, number, self._data.options)
             on_read(done, self.episodes)
         first = source.episode(self._data.episodes[0])
         self.facts: dict[str, Any] = {

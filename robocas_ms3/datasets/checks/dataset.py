@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.actions import action_space
+from robocas_ms3.datasets.actions import compute_action_space
 from robocas_ms3.datasets.checks import arrays as array_checks
 from robocas_ms3.datasets.checks.images import Sizes, check_cameras, check_depth, check_images
-from robocas_ms3.datasets.checks.scene import check_entries, read_settings
-from robocas_ms3.datasets.checks.violation import Violation, read_object
-from robocas_ms3.datasets.conversion.episode_plan import MARKS
+from robocas_ms3.datasets.checks.scene import check_listed_episodes, read_settings
+from robocas_ms3.datasets.checks.violation import Violation, read_json_object
+from robocas_ms3.datasets.conversion.episode_plan import MARKER_FILES
 from robocas_ms3.datasets.images.image_files import ImageOptions
-from robocas_ms3.datasets.sources.arrays import SPECS, EpisodeArrays, is_declared, read_arrays
+from robocas_ms3.datasets.sources.arrays import SPECS, EpisodeArrays, matches_schema, read_arrays
 from robocas_ms3.datasets.sources.file_models import DataInfoRecord, SceneRecord
 from robocas_ms3.datasets.sources.files import no_dataset_error
 
@@ -47,15 +47,17 @@ class ValidationReport:
 
 
 def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None = None) -> ValidationReport:
-    """Check a RoboCAS folder; ``on_episode`` is called with (done, total) after each episode.
+    """Check a RoboCAS folder against the schema and list all violations.
+
+    ``on_episode`` is called with (done, total) after each episode.
 
     Raises:
         DatasetError: the folder does not exist, or is not a dataset.
     """
     root = Path(root)
     if not root.is_dir():
-        raise DatasetError("no such dataset folder", where=root)
-    marked = any((root / mark).exists() for mark in MARKS)
+        raise DatasetError("no such folder", where=root)
+    marked = any((root / mark).exists() for mark in MARKER_FILES)
     numbers = {n: folder for folder in sorted(root.iterdir()) if (n := schema.episode_number(folder.name)) is not None}
     if not (numbers or marked) and any(root.iterdir()):
         raise no_dataset_error(root, "folders episode_0000000, ...")
@@ -65,7 +67,7 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
     embedded: set[bool] = set()
     for done, (number, folder) in enumerate(numbers.items(), start=1):
         stored = read_arrays(folder / schema.EPISODE_FILE)
-        scene, wrong = read_object(root, f"{folder.name}/{schema.SCENE_FILE}", SceneRecord)
+        scene, wrong = read_json_object(root, f"{folder.name}/{schema.SCENE_FILE}", SceneRecord)
         violations += [*wrong, *check_episode(folder, stored, image_options, sizes)]
         embedded |= {"language_embedding" in stored.arrays} if stored.arrays else set()
         small = {key: array for key, array in stored.arrays.items() if key not in _EMBEDDINGS}
@@ -74,8 +76,8 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
             on_episode(done, len(numbers))
     if len(embedded) > 1:
         violations.append(Violation("", "language_embedding", "in all episodes or in none", "in some episodes"))
-    violations += check_entries(settings, episodes)
-    violations += check_info(root, {number: stored.arrays for number, (stored, _) in episodes.items()})
+    violations += check_listed_episodes(settings, episodes)
+    violations += check_data_info(root, {number: stored.arrays for number, (stored, _) in episodes.items()})
     positions = (stored.arrays.get("ee_pos") for stored, _ in episodes.values())
     return ValidationReport(
         len(numbers), sum(len(found) for found in positions if found is not None and found.ndim), violations
@@ -83,12 +85,15 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
 
 
 def check_episode(folder: Path, stored: EpisodeArrays, image_options: ImageOptions, sizes: Sizes) -> list[Violation]:
-    """Return the violations in the arrays, cameras and images of an episode."""
-    wrong, values = list(array_checks.violations_of(stored, array_checks.FORM)), []
+    """Return the violations in the arrays, cameras and images of an episode.
+
+    ``sizes``: image size by camera; the first episode of a dataset sets it for the other episodes.
+    """
+    wrong, values = list(array_checks.run_checks(stored, array_checks.FORM_CHECKS)), []
     if not wrong:
         wrong, values = (
             list(array_checks.check_units(stored)),
-            list(array_checks.violations_of(stored, array_checks.CONTENT)),
+            list(array_checks.run_checks(stored, array_checks.CONTENT_CHECKS)),
         )
     wrong += check_cameras(folder, image_options)
     if "" in stored.unreadable:
@@ -99,12 +104,12 @@ def check_episode(folder: Path, stored: EpisodeArrays, image_options: ImageOptio
     return [*wrong, *values, *images]
 
 
-def check_info(root: Path, episodes: Mapping[int, _Arrays]) -> Iterator[Violation]:
+def check_data_info(root: Path, episodes: Mapping[int, _Arrays]) -> Iterator[Violation]:
     """Check ``data_info.json`` against the arrays of the episodes on disk."""
     unfinished = (
         " (unfinished conversion: run robocas convert again)" if (root / schema.CONVERSION_FILE).is_file() else ""
     )
-    info, wrong = read_object(root, INFO, DataInfoRecord, absent=f"this file{unfinished}")
+    info, wrong = read_json_object(root, INFO, DataInfoRecord, expected_file=f"this file{unfinished}")
     if wrong:
         yield from wrong
         return
@@ -122,14 +127,14 @@ def check_info(root: Path, episodes: Mapping[int, _Arrays]) -> Iterator[Violatio
         if wanted != found:
             yield Violation(INFO, key, "the episodes on disk", f"{len(wanted ^ found)} missing or unknown")
     for number, arrays in sorted(episodes.items()):
-        declared = {key: array for key, array in arrays.items() if key in SPECS and is_declared(key, array)}
+        declared = {key: array for key, array in arrays.items() if key in SPECS and matches_schema(key, array)}
         for key, array, kind in (("ep_length", "episode_length", int), ("language_goal", "language_goal", str)):
             listed = info[key].get(str(number))
             if listed is not None and array in declared and listed != (expected := kind(declared[array])):
                 yield Violation(INFO, f"{key}.{number}", repr(expected), repr(listed))
         if str(number) in info["step_goals"] and {"step_lang_goals", "step_goal_type"} <= declared.keys():
             yield from _check_goals(f"step_goals.{number}", info["step_goals"][str(number)], declared)
-    yield from _check_range(info["action_space"], episodes)
+    yield from _check_action_space(info["action_space"], episodes)
 
 
 def _check_goals(key: str, goals: list[dict[str, Any]], arrays: _Arrays) -> Iterator[Violation]:
@@ -149,10 +154,10 @@ def _check_goals(key: str, goals: list[dict[str, Any]], arrays: _Arrays) -> Iter
         yield Violation(INFO, key, f"ranges up to step {len(texts) - 1}", f"up to {next_step - 1}")
 
 
-def _check_range(space: Mapping[str, Any], episodes: Mapping[int, _Arrays]) -> Iterator[Violation]:
+def _check_action_space(space: Mapping[str, Any], episodes: Mapping[int, _Arrays]) -> Iterator[Violation]:
     complete = [a for a in episodes.values() if all(np.ndim(a.get(key, 0)) == 2 for key in ("rel_pos", "rel_orn"))]
     try:
-        expected = action_space([a["rel_pos"] for a in complete], [a["rel_orn"] for a in complete])
+        expected = compute_action_space([a["rel_pos"] for a in complete], [a["rel_orn"] for a in complete])
     except ValueError:
         return  # damaged arrays, which other checks report
     for key, rows in expected.items():

@@ -25,7 +25,7 @@ from robocas_ms3.robots.cameras import Parent
 
 _UNEXPECTED = "an additional file"
 _INTACT = "an intact image"
-_GEOMETRY_STEPS = 3  # steps whose depth is decoded
+_DEPTH_STEPS = 3  # steps whose depth is decoded
 _READERS = 4  # threads; reading and checksums release the GIL
 _HEADERS = {"rgb": (8, 3), "depth": (16, 1)}
 Sizes = dict[str, tuple[int, int]]
@@ -53,7 +53,7 @@ def check_cameras(folder: Path, image_options: ImageOptions) -> Iterator[Violati
             except DAMAGED_FILE_ERRORS as error:
                 yield Violation(file, "", "a numpy array", one_line(error))
                 continue
-            wrong = list(check_camera_file(file, found, pose=name in pose_files))
+            wrong = list(check_camera_array(file, found, pose=name in pose_files))
             yield from wrong
             poses += [found] if name in pose_files and not wrong else []
         if len(poses) == 2 and not np.allclose(poses[0], poses[1], atol=1e-6):
@@ -61,8 +61,8 @@ def check_cameras(folder: Path, image_options: ImageOptions) -> Iterator[Violati
             yield Violation(file, "", f"the pose of {pose_files[0]}", "another pose")
 
 
-def check_camera_file(file: str, array: NDArray, *, pose: bool) -> Iterator[Violation]:
-    """Check the pose (4, 4) or the intrinsics (4,) of a camera."""
+def check_camera_array(file: str, array: NDArray, *, pose: bool) -> Iterator[Violation]:
+    """Check the values of a pose (4, 4), or with ``pose`` False of the intrinsics (4,) of a camera."""
     shape = (4, 4) if pose else (4,)
     if array.shape != shape or array.dtype.kind != "f":
         yield Violation(file, "", f"floats of shape {shape}", f"{array.dtype} of shape {array.shape}")
@@ -81,11 +81,14 @@ def _is_rigid(matrix: NDArray) -> bool:
 def check_images(
     folder: Path, image_options: ImageOptions, steps: int, sizes: Sizes, read: ReadHeader = read_header
 ) -> Iterator[Violation]:
-    """Check that there is an intact image of each step, all with one size per camera, and no other file."""
-    places = [(camera, kind) for camera in image_options.cameras for kind in image_options.kinds]
+    """Check that each step has an intact image, with one size per camera, and that there is no other file.
+
+    ``sizes``: image size by camera; a missing size is set from the first image.
+    """
+    folders = [(camera, kind) for camera in image_options.cameras for kind in image_options.kinds]
     with ThreadPoolExecutor(_READERS) as pool:
-        headers = list(pool.map(partial(_read_headers, folder, image_options.image_format, steps, read), places))
-    for (camera, kind), found in zip(places, headers, strict=True):
+        headers = list(pool.map(partial(_read_headers, folder, image_options.image_format, steps, read), folders))
+    for (camera, kind), found in zip(folders, headers, strict=True):
         wanted = [name for name, header in found.items() if header != _UNEXPECTED]
         for name, header in found.items():
             file = f"{folder.name}/{camera}/{kind}/{name}"
@@ -104,9 +107,9 @@ def check_images(
 
 
 def _read_headers(
-    folder: Path, image_format: schema.ImageFormat, steps: int, read: ReadHeader, place: tuple[str, str]
+    folder: Path, image_format: schema.ImageFormat, steps: int, read: ReadHeader, camera_and_kind: tuple[str, str]
 ) -> dict[str, ImageHeader | str | None]:
-    first = schema.image_path(folder, *place, 0, image_format)
+    first = schema.image_path(folder, *camera_and_kind, 0, image_format)
     present = {path.name for path in first.parent.iterdir()} if first.parent.is_dir() else set()
     wanted = [f"{step:04d}{first.suffix}" for step in range(min(steps, schema.MAX_STEPS))]
     found: dict[str, ImageHeader | str | None] = {}
@@ -119,7 +122,10 @@ def _read_headers(
 
 
 def check_depth(folder: Path, stored: EpisodeArrays, image_options: ImageOptions) -> Iterator[Violation]:
-    """Check depth at a few steps with `depth.check`; all other checks of the episode must have passed."""
+    """Check that the depth images of three steps agree with the cameras, see `checks.depth`.
+
+    All other checks of the episode must have passed.
+    """
     arrays = {key: array.astype(np.float64) for key, array in stored.arrays.items() if array.dtype.kind == "f"}
     base = from_xyzw(arrays["base_pos"], arrays["base_orn"])
     ee = base @ from_xyzw(arrays["ee_pos"], arrays["ee_orn"])
@@ -131,8 +137,8 @@ def check_depth(folder: Path, stored: EpisodeArrays, image_options: ImageOptions
         ]
         for camera, parent in parent_of.items()
     }
-    steps = sorted({round(step) for step in np.linspace(0, stored.steps - 1, _GEOMETRY_STEPS)})
-    views: list[list[geometry.View]] = []
+    steps = sorted({round(step) for step in np.linspace(0, stored.steps - 1, _DEPTH_STEPS)})
+    views: list[list[geometry.DepthView]] = []
     for step in steps:
         parents = {"ee": ee[step], "arm_base": base[step], "world": np.eye(4)}
         views.append([])
@@ -144,9 +150,11 @@ def check_depth(folder: Path, stored: EpisodeArrays, image_options: ImageOptions
                 yield Violation(file, "", _INTACT, "a damaged image")
                 return
             if not image.any():
-                yield Violation(file, "", "depth", "only zeros")
+                yield Violation(file, "", "depth > 0 in some pixels", "only zeros")
             intrinsic, pose = cameras[camera]
             camera_in_world = parents[parent] @ pose
-            views[-1].append(geometry.View(camera, image.astype(np.uint16), intrinsic, camera_in_world, parent == "ee"))
-    for index, camera_name, expected, found in geometry.check(views):
+            views[-1].append(
+                geometry.DepthView(camera, image.astype(np.uint16), intrinsic, camera_in_world, parent == "ee")
+            )
+    for index, camera_name, expected, found in geometry.check_depth_views(views):
         yield Violation(f"{folder.name}/{camera_name}/depth/{steps[index]:04d}.png", "", expected, found)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.text import one_line
-from robocas_ms3.datasets.actions import episode_actions
-from robocas_ms3.datasets.sources.file_models import EnvInfo, Layout, SceneRecord, read_scene
+from robocas_ms3.datasets.actions import compute_actions
+from robocas_ms3.datasets.sources.file_models import EnvInfoRecord, LayoutRecord, SceneRecord, read_scene
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.open_loop import OpenLoopEnv
 from robocas_ms3.demos.recordings.environment import read_recorded_env
@@ -28,8 +28,14 @@ _BASE_STILL = 1e-3  # m; 7-D actions do not move the base
 class EpisodeReplay:
     """Outcome of the replay of an episode.
 
-    ``success`` is None if the episode was not replayed; ``skipped`` is the reason.
-    Errors are distances from the recorded TCP in m. ``clipped`` counts actions beyond the limits of the controller.
+    Attributes:
+        number: number of the episode.
+        task: name of the task; empty if unknown.
+        success: whether the replay succeeded; None: the episode was not replayed.
+        mean_error: mean distance between replayed and recorded TCP, m.
+        max_error: largest distance between replayed and recorded TCP, m.
+        clipped: number of actions beyond the limits of the controller.
+        skipped: why the episode was not replayed; empty if it was.
     """
 
     number: int
@@ -43,12 +49,12 @@ class EpisodeReplay:
 
 @dataclass(frozen=True)
 class ReplayReport:
-    """Outcomes of the replay of a dataset."""
+    """Result of the open-loop replay of a dataset: one outcome per episode."""
 
     episodes: list[EpisodeReplay] = field(default_factory=list)
 
-    def by_task(self) -> dict[str, dict[str, Any]]:
-        """Return counts, success rate and tracking errors in m per task."""
+    def summarize_by_task(self) -> dict[str, dict[str, Any]]:
+        """Return counts of replays and successes, success rate, and tracking errors in m, by task name."""
         result = {}
         for task in sorted({episode.task for episode in self.episodes}):
             of_task = [episode for episode in self.episodes if episode.task == task]
@@ -65,7 +71,7 @@ class ReplayReport:
         return result
 
     def as_json(self) -> dict[str, Any]:
-        return {"by_task": self.by_task(), "episodes": [asdict(episode) for episode in self.episodes]}
+        return {"by_task": self.summarize_by_task(), "episodes": [asdict(episode) for episode in self.episodes]}
 
 
 def replay_dataset(
@@ -74,7 +80,7 @@ def replay_dataset(
     pack: str | Path | None = None,
     on_episode: Callable[[int, int], None] = lambda done, count: None,
 ) -> ReplayReport:
-    """Replay the 7-D actions of a RoboCAS folder with ``pd_ee_delta_pose``.
+    """Replay the 7-D actions of each episode of a RoboCAS folder open loop with ``pd_ee_delta_pose``.
 
     ``pack`` is the name or folder of an object pack that replaces the recorded one.
 
@@ -97,15 +103,15 @@ def replay_dataset(
 
 
 class _Replayer:
-    """Replays episodes; the environment is made again only if an episode needs another one."""
+    """Replays episodes; makes a new environment only if an episode has other environment arguments."""
 
     def __init__(self, rate_hz: float, pack: str | Path | None) -> None:
         self._rate_hz, self._pack = rate_hz, pack
-        self._env_info: EnvInfo | None = None
+        self._env_info: EnvInfoRecord | None = None
         self._open_loop: OpenLoopEnv | None = None
 
     def replay(self, number: int, task: str, scene: SceneRecord, arrays: Mapping[str, NDArray]) -> EpisodeReplay:
-        seed, reason = parse_seed(scene.seed), _skip_reason(scene, arrays)
+        seed, reason = parse_seed(scene.seed), _find_skip_reason(scene, arrays)
         if seed is None or reason:
             return EpisodeReplay(number, task, None, skipped=reason)
         if self._open_loop is None or scene.env_info != self._env_info:
@@ -115,12 +121,12 @@ class _Replayer:
             )
             self._env_info, self._open_loop = scene.env_info, OpenLoopEnv(env, self._rate_hz)
         self._open_loop.reset(seed, read_reset_options(scene.reset_options, "reset_options"))
-        difference = _scene_difference(scene.layout or Layout(), self._open_loop)
+        difference = _describe_scene_difference(scene.layout or LayoutRecord(), self._open_loop)
         if difference:
             return EpisodeReplay(number, task, None, skipped=f"the seed builds another scene: {difference}")
-        played = self._open_loop.replay(episode_actions(arrays)[:-1])
-        error = np.linalg.norm(played.tcp_in_base - arrays["ee_pos"], axis=1)
-        return EpisodeReplay(number, task, played.success, float(error.mean()), float(error.max()), played.clipped)
+        outcome = self._open_loop.replay(compute_actions(arrays)[:-1])
+        error = np.linalg.norm(outcome.tcp_in_base - arrays["ee_pos"], axis=1)
+        return EpisodeReplay(number, task, outcome.success, float(error.mean()), float(error.max()), outcome.clipped)
 
     def close(self) -> None:
         if self._open_loop is not None:
@@ -128,7 +134,7 @@ class _Replayer:
             self._open_loop = None
 
 
-def _scene_difference(recorded: Layout, open_loop: OpenLoopEnv) -> str:
+def _describe_scene_difference(recorded: LayoutRecord, open_loop: OpenLoopEnv) -> str:
     built = open_loop.layout
     if recorded.object_ids and recorded.object_ids != list(built.object_ids):
         return "other objects"
@@ -145,13 +151,13 @@ def _scene_difference(recorded: Layout, open_loop: OpenLoopEnv) -> str:
     return ""
 
 
-def _skip_reason(scene: SceneRecord, arrays: Mapping[str, NDArray]) -> str:
+def _find_skip_reason(scene: SceneRecord, arrays: Mapping[str, NDArray]) -> str:
     if not scene.env_info or parse_seed(scene.seed) is None:
         return "scene.json lacks env_info or seed, so the scene can't be built"
     if scene.success is False:
-        return "the recording has no success"
+        return "the recording did not succeed"
     if scene.recorded and scene.recorded.intervention is not None:
-        return "the episode starts after another policy (expert intervention), not from its seed"
+        return "the episode starts where another policy stopped (expert intervention), so its seed can't reproduce it"
     if len(arrays["ee_pos"]) < 2:
         return "the episode has no actions"
     if not all(np.isfinite(arrays[key]).all() for key in ("rel_pos", "rel_orn", "ee_pos", "base_pos")):

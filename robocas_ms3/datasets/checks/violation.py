@@ -20,9 +20,9 @@ _WORDS = {"int_type": "an integer", "string_type": "text", "dict_type": "an obje
 
 @dataclass(frozen=True)
 class Violation:
-    """Violation of the schema by a key of a file.
+    """Violation of the schema: file and key of the wrong value, the expected value and the found value.
 
-    An empty ``key`` means the file as a whole, an empty ``file`` for the dataset as a whole.
+    ``key`` is empty if the whole file is wrong; ``file`` is empty if the whole dataset is wrong.
     """
 
     file: str
@@ -42,29 +42,38 @@ class Violation:
         return {"file": self.file, "key": self.key, "expected": self.expected, "found": self.found}
 
 
-def read_object(
-    root: Path, name: str, model: type[BaseModel] | None = None, *, absent: str = "this file"
+def read_json_object(
+    root: Path, name: str, model: type[BaseModel] | None = None, *, expected_file: str = "this file"
 ) -> tuple[dict[str, Any], list[Violation]]:
-    """Return the object in a JSON file of a dataset, empty if it can't be read, and its violations."""
+    """Read a JSON file of a dataset; return its object (empty if it can't be read) and its violations.
+
+    ``model``: the content must match this model. ``expected_file``: expected value in the violation of a missing file.
+    """
     try:
         content = load_json(root / name)
     except FileNotFoundError:
-        return {}, [Violation(name, "", absent, NO_FILE, "missing")]
+        return {}, [Violation(name, "", expected_file, NO_FILE, "missing")]
     except (OSError, ValueError) as error:
         return {}, [Violation(name, "", "JSON", one_line(error))]
     if not isinstance(content, dict):
         return {}, [Violation(name, "", "an object", type(content).__name__)]
-    return content, check_form(model, content, name) if model else []
+    return content, check_model(model, content, name) if model else []
 
 
-def check_form(model: type[BaseModel], content: Mapping[str, Any], file: str) -> list[Violation]:
-    """Return the violations of the model of a JSON file, one per key (the first of a list)."""
+def check_model(model: type[BaseModel], content: Mapping[str, Any], file: str) -> list[Violation]:
+    """Check the content of a JSON file against a model; return one violation per invalid key.
+
+    Only the first invalid element of a list is reported.
+    """
     try:
         model.model_validate(content)
     except ValidationError as error:
         found: dict[str, Violation] = {}
         for mistake in list_invalid_values(error, words=_WORDS):
-            expected, value = mistake.expected or mistake.what.removeprefix(f"{mistake.key}: "), shorten(mistake.value)
+            expected, value = (
+                mistake.expected or mistake.what.removeprefix(f"{mistake.key}: "),
+                shorten_json(mistake.value),
+            )
             if mistake.kind in ("too_short", "too_long"):
                 limit = mistake.context.get("min_length", mistake.context.get("max_length"))
                 expected, value = f"{limit} values", f"{mistake.context['actual_length']}"
@@ -76,7 +85,7 @@ def check_form(model: type[BaseModel], content: Mapping[str, Any], file: str) ->
     return []
 
 
-def shorten(value: Any) -> str:
+def shorten_json(value: Any) -> str:
     """Return a JSON value as a text of at most 60 characters."""
     text = json.dumps(value, default=str)
     return text if len(text) <= 60 else text[:57] + "..."

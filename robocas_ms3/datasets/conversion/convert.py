@@ -21,20 +21,20 @@ from robocas_ms3.core.output_folder import OutputFolder, remove_leftovers
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.conversion.conversion_input import ConversionInput, open_trajectory
-from robocas_ms3.datasets.conversion.data_info import add_failures, write_info
-from robocas_ms3.datasets.conversion.episode_folder import FolderWriter, find_damaged
+from robocas_ms3.datasets.conversion.data_info import copy_failures, write_info
+from robocas_ms3.datasets.conversion.episode_folder import FolderWriter, find_damaged_file
 from robocas_ms3.datasets.conversion.episode_plan import (
     DATASET,
-    dataset_settings,
-    missing_episodes,
+    describe_missing_episodes,
+    make_settings,
+    move_unwritten_to_skipped,
     plan_episodes,
-    planned_split,
-    remove_unwritten,
+    split_planned_episodes,
 )
 from robocas_ms3.datasets.conversion.rendered_source import RenderedSource
-from robocas_ms3.datasets.conversion.settings import Conversion, ConversionSettings, WrittenEpisode
+from robocas_ms3.datasets.conversion.settings import ConversionResult, ConversionSettings, WrittenEpisode
 from robocas_ms3.datasets.conversion.workers import PendingEpisodes, write_episodes
-from robocas_ms3.datasets.images.video import MAX_PREVIEWS, finish_previews, sheet_episodes
+from robocas_ms3.datasets.images.video import MAX_PREVIEWS, complete_contact_sheet, select_sheet_episodes
 from robocas_ms3.datasets.sources.file_models import SettingsRecord
 from robocas_ms3.datasets.sources.files import read_json
 from robocas_ms3.datasets.sources.reader import Dataset
@@ -49,7 +49,7 @@ def convert(
     *,
     on_start: Callable[[int], None] | None = None,
     on_episode: Callable[[WrittenEpisode], None] | None = None,
-) -> Conversion:
+) -> ConversionResult:
     """Write a RoboCAS folder from a trajectory file.
 
     A ``failures.jsonl`` in the folder of the trajectory file is copied. The same call continues an interrupted
@@ -70,19 +70,19 @@ def convert(
     with ExitStack() as stack:
         source = stack.enter_context(closing(open_trajectory(settings)))
         image_options = source.image_options
-        stored = dataset_settings(source.rate_hz, image_options, settings.embeddings)
+        stored = make_settings(source.rate_hz, image_options, settings.embeddings)
         recorded = {**stored, "made_with": package_versions()}
         output = stack.enter_context(OutputFolder(out, DATASET, recorded, overwrite=settings.overwrite))
         # Everything that may fail runs before the output changes.
         entries = ConversionInput(source, image_options, settings.include_failed).entries()
         content, tasks = plan_episodes(output, entries, stored, append=settings.append)
-        settings.check_device()
-        embed = partial(_look_up, embed_texts(source, entries)) if settings.embeddings else None
+        settings.require_renderer()
+        embed = partial(_look_up_embeddings, embed_texts(source, entries)) if settings.embeddings else None
         output.start(content)
         remove_leftovers(out / schema.PREVIEW_FOLDER)
-        previous = _previous_split(out)
+        previous = _read_previous_split(out)
         for folder in (out / schema.episode_folder(number) for number, _ in tasks):
-            if folder.is_dir() and (path := find_damaged(folder, image_options)):
+            if folder.is_dir() and (path := find_damaged_file(folder, image_options)):
                 _log.warning("%s is missing or truncated; its episode is written again", path)
                 shutil.rmtree(folder)
         missing = [task for task in tasks if not (out / schema.episode_folder(task[0])).is_dir()]
@@ -90,31 +90,31 @@ def convert(
             on_start(len(missing))
         sheet = None
         if settings.video and (settings.all_videos or len(tasks) <= MAX_PREVIEWS):
-            sheet = sheet_episodes(map(int, content["episodes"]))
-        job = PendingEpisodes(settings, FolderWriter(out, embed, sheet), missing, len(missing) < len(tasks), _FIX)
+            sheet = select_sheet_episodes(map(int, content["episodes"]))
+        pending = PendingEpisodes(settings, FolderWriter(out, embed, sheet), missing, len(missing) < len(tasks), _FIX)
         try:
-            written, incomplete = write_episodes(job, output, on_episode)
+            written, incomplete = write_episodes(pending, output, on_episode)
         finally:
             for folder in (out, out / schema.PREVIEW_FOLDER):
                 remove_leftovers(folder)  # of workers that crashed
         if incomplete:
-            write_json(out / schema.CONVERSION_FILE, remove_unwritten(out, content, incomplete.reasons))
-        add_failures(settings.source.parent, out, source.file.env_info)
-        write_info(out, planned_split(content, previous))
+            write_json(out / schema.CONVERSION_FILE, move_unwritten_to_skipped(out, content, incomplete.reasons))
+        copy_failures(settings.source.parent, out, source.file.env_info)
+        write_info(out, split_planned_episodes(content, previous))
         if sheet is not None:
             rows = {episode.number: episode.row for episode in written if episode.row is not None}
-            finish_previews(Dataset(out), rows)
+            complete_contact_sheet(Dataset(out), rows)
         if incomplete and not settings.skip_errors:
             raise incomplete
         if incomplete:
             _log.warning("%s", incomplete)
-        if missing_names := missing_episodes(out, content):
-            _log.warning("%s: %s are missing; convert them with --append", out, " and ".join(missing_names))
-    return Conversion(written, len(tasks) - len(missing), time.perf_counter() - start, previews=sheet is not None)
+        if missing_names := describe_missing_episodes(out, content):
+            _log.warning("%s: %s are missing; add them with robocas convert --append", out, " and ".join(missing_names))
+    return ConversionResult(written, len(tasks) - len(missing), time.perf_counter() - start, previews=sheet is not None)
 
 
 def _inherit_settings(settings: ConversionSettings) -> ConversionSettings:
-    """Return settings whose cameras and size are those of the dataset to append to, if they are not given."""
+    """Fill in cameras and image size from the dataset to append to, unless they are given."""
     path = settings.out / schema.CONVERSION_FILE
     stored = read_json(path) if settings.append else {}
     if not stored:
@@ -125,7 +125,7 @@ def _inherit_settings(settings: ConversionSettings) -> ConversionSettings:
     return replace(settings, cameras=settings.cameras or tuple(dataset.cameras), size=settings.size or size)
 
 
-def _previous_split(out: Path) -> tuple[list[int], list[int]]:
+def _read_previous_split(out: Path) -> tuple[list[int], list[int]]:
     if not (out / schema.DATA_INFO_FILE).is_file():
         return [], []
     try:
@@ -137,21 +137,24 @@ def _previous_split(out: Path) -> tuple[list[int], list[int]]:
 
 
 def embed_texts(source: RenderedSource, entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the embedding (384,) of each instruction and sub-goal text of some episodes, by text."""
+    """Compute the embedding (384,) of each instruction and sub-goal text of the given episodes, by text."""
     from robocas_ms3.scenes.language.embed import TextEmbedder
 
     embedder = TextEmbedder()
-    texts = list(dict.fromkeys(text for entry in entries for text in _texts(source, entry["source"])))
+    texts = list(dict.fromkeys(text for entry in entries for text in _list_texts(source, entry["source"])))
     return dict(zip(texts, embedder(texts), strict=True))
 
 
-def _look_up(vectors: dict[str, Any], texts: list[str]) -> NDArray[np.float32]:
+def _look_up_embeddings(vectors: dict[str, Any], texts: list[str]) -> NDArray[np.float32]:
     return np.stack([vectors[text] for text in texts])
 
 
-def _texts(source: RenderedSource, number: int) -> list[str]:
-    """Return the texts of an episode; none if it can't be read (writing it raises the error)."""
+def _list_texts(source: RenderedSource, number: int) -> list[str]:
+    """Return the instruction and the sub-goal texts of an episode; empty if the episode can't be read.
+
+    The error is raised later, when the episode is written.
+    """
     try:
-        return source.texts(number)
+        return source.list_texts(number)
     except DatasetError:
         return []

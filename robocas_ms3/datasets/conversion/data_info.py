@@ -14,11 +14,11 @@ from robocas_ms3.core.files import write_json
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.actions import action_space
+from robocas_ms3.datasets.actions import compute_action_space
 from robocas_ms3.datasets.sources.arrays import read_arrays
 from robocas_ms3.datasets.sources.file_models import DataInfoRecord
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
-from robocas_ms3.datasets.sources.provenance import environment_id, task_of
+from robocas_ms3.datasets.sources.provenance import compute_environment_id, parse_task_name
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.failures import FAILURES_FILE
@@ -28,19 +28,25 @@ _NEEDED = ("episode_length", "language_goal", "step_goal_type", "step_lang_goals
 
 
 def write_info(root: Path, previous: tuple[Iterable[int], Iterable[int]] = ((), ())) -> None:
-    """Write ``data_info.json`` of the episodes on disk; see `build_info`."""
+    """Write ``data_info.json`` for the episodes on disk.
+
+    ``previous``: training and validation episodes of the current split; they keep their split, see `split_by_seed`.
+    """
     write_json(root / schema.DATA_INFO_FILE, build_info(root, previous))
 
 
 def build_info(root: Path, previous: tuple[Iterable[int], Iterable[int]] = ((), ())) -> dict[str, Any]:
-    """Return the content of ``data_info.json``; ``previous`` is the current split, see `split_by_seed`."""
+    """Compute the content of ``data_info.json`` from the episodes on disk.
+
+    ``previous``: training and validation episodes of the current split; they keep their split, see `split_by_seed`.
+    """
     dataset = Dataset(root)
     seeds, lengths, instructions, goals = {}, {}, {}, {}
     positions, orientations = [], []
     for number in dataset.numbers:
         episode = dataset.episode(number)
         path = episode.folder / schema.EPISODE_FILE
-        arrays = read_arrays(path, _NEEDED).needed(_NEEDED)
+        arrays = read_arrays(path, _NEEDED).require(_NEEDED)
         for key in ("rel_pos", "rel_orn"):
             if not np.isfinite(arrays[key]).all():
                 what, expected = "NaN or infinite value in the motion of this episode", "finite numbers"
@@ -61,28 +67,31 @@ def build_info(root: Path, previous: tuple[Iterable[int], Iterable[int]] = ((), 
         "step_goals": goals,
     }
     try:
-        info["action_space"] = action_space(positions, orientations)
+        info["action_space"] = compute_action_space(positions, orientations)
         DataInfoRecord.model_validate(info)
     except (ValueError, IndexError) as error:  # a quaternion of length 0, or no episode with two steps
         where = f"{root / schema.DATA_INFO_FILE}, action_space"
         found = one_line(error)
         raise DatasetError(
-            "the range of actions can't be computed", where=where, found=found, fix=SEE_VALIDATE
+            "action_space can't be computed from these episodes", where=where, found=found, fix=SEE_VALIDATE
         ) from error
     return info
 
 
-def add_failures(run: Path, out: Path, env_info: Mapping[str, Any]) -> None:
-    """Add the failures of a run to a dataset, each once, with the task and environment of the run."""
-    made_in = {"task": task_of(str(env_info.get("env_id"))), "environment": environment_id(env_info)}
+def copy_failures(run: Path, out: Path, env_info: Mapping[str, Any]) -> None:
+    """Append the ``failures.jsonl`` of a run of ``robocas generate`` to that of a dataset, without duplicates.
+
+    Each new line also gets the task and the environment of the run.
+    """
+    made_in = {"task": parse_task_name(str(env_info.get("env_id"))), "environment": compute_environment_id(env_info)}
     there: JsonLinesFile[dict[str, Any]] = JsonLinesFile(out / FAILURES_FILE, dict[str, Any])
     failures: JsonLinesFile[dict[str, Any]] = JsonLinesFile(run / FAILURES_FILE, dict[str, Any])
-    known = {_key(line) for line in there.read()}
+    known = {_line_key(line) for line in there.read()}
     marked = ((line, {**line, **made_in}) for line in failures.read())
-    new = [line for before, line in marked if not {_key(before), _key(line)} & known]
+    new = [line for before, line in marked if not {_line_key(before), _line_key(line)} & known]
     if new:  # rewritten, because the file may be hard-linked from another dataset
         there.rewrite([*there.read(), *new])
 
 
-def _key(line: Mapping[str, Any]) -> str:
+def _line_key(line: Mapping[str, Any]) -> str:
     return json.dumps(line, sort_keys=True)

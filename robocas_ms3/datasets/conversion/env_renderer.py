@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import inverse
-from robocas_ms3.datasets.images.image_files import Box, ImageOptions, bounding_box
+from robocas_ms3.datasets.images.image_files import Box, ImageOptions, compute_bounding_box
 from robocas_ms3.datasets.sources.episode_source import CameraModel, StepImages
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.trajectory_file import Recording
@@ -24,11 +24,11 @@ _SAME_PLACE = 1e-3  # m
 
 
 class EnvRenderer:
-    """Renderer of recorded states in the environment that recorded them, for the requested images."""
+    """Renders the images of recorded states in the environment that recorded them, without physics."""
 
     def __init__(self, env: RecordedEnv, control_mode: str, image_options: ImageOptions | None = None) -> None:
         sensors = dict(env.kwargs.get("sensor_configs") or {})
-        self._image_options = (image_options or ImageOptions()).choose(
+        self._image_options = (image_options or ImageOptions()).select_cameras(
             [camera.name for camera in env.cameras()], env.env_id
         )
         if self._image_options.size is not None:
@@ -46,7 +46,7 @@ class EnvRenderer:
     def close(self) -> None:
         self.env.close()
 
-    def load(self, recording: Recording) -> None:
+    def load_scene(self, recording: Recording) -> None:
         """Build the scene of a recording; raise DatasetError if it differs from the recorded scene."""
         self.env.reset(seed=recording.seed, options=dict(recording.reset_options))
         for name in set(self._base._sensors) - set(self._image_options.cameras):
@@ -55,7 +55,7 @@ class EnvRenderer:
 
     def _check_scene(self, recording: Recording) -> None:
 
-        def refuse(name: str, expected: object, found: object) -> None:
+        def raise_difference(name: str, expected: object, found: object) -> None:
             where = f"episode {recording.episode_id}, seed {recording.seed}{f', {name}' if name else ''}"
             what, fix = "the rebuilt scene differs", "Use the pack, configuration and versions of the recording."
             raise DatasetError(what, where=where, expected=expected, found=found, fix=fix)
@@ -64,42 +64,44 @@ class EnvRenderer:
         for kind in ("actors", "articulations"):
             rebuilt, recorded = set(built.get(kind, {})), set(recording.states.get(kind, {}))
             if rebuilt != recorded:
-                refuse("", sorted(recorded), sorted(rebuilt))
+                raise_difference("", sorted(recorded), sorted(rebuilt))
         for name, states in () if recording.is_intervention else recording.states.get("actors", {}).items():
             distance = float(np.linalg.norm(built["actors"][name][0, :3].cpu().numpy() - states[0, :3]))
             if distance > _SAME_PLACE:
-                refuse(name, "the recorded position", f"{distance * 1000:.1f} mm off")
+                raise_difference(name, "the recorded position", f"{distance * 1000:.1f} mm off")
         instruction = self._base.get_language_instruction()[0]
         if instruction != recording.instruction:
-            refuse("", recording.instruction, instruction)
+            raise_difference("", recording.instruction, instruction)
 
     def frames(self, recording: Recording, samples: NDArray[np.int64]) -> Iterator[StepImages]:
-        """Yield the images of some states of the loaded recording, by index."""
+        """Render the states with the indices ``samples`` of the loaded recording; yield the images of each state."""
         for index in samples:
-            yield self._frame(recording.state(int(index)))
+            yield self._render_state(recording.state(int(index)))
 
-    def _frame(self, state: dict[str, dict[str, NDArray[np.float32]]]) -> StepImages:
+    def _render_state(self, state: dict[str, dict[str, NDArray[np.float32]]]) -> StepImages:
         tensors = {kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()}
         self._base.set_state_dict(tensors)
         textures = self._base._get_obs_sensor_data(apply_texture_transforms=False)
         shaders = {name: self._base._sensors[name].config.shader_config for name in self._image_options.cameras}
         return StepImages(
-            rgb={name: _rgb_of(textures[name], shader) for name, shader in shaders.items()},
+            rgb={name: _convert_rgb(textures[name], shader) for name, shader in shaders.items()},
             depth={
-                name: _depth_of(textures[name], shader) for name, shader in shaders.items() if self._image_options.depth
+                name: _convert_depth(textures[name], shader)
+                for name, shader in shaders.items()
+                if self._image_options.depth
             },
-            boxes=self._boxes(textures, shaders) if self._image_options.boxes else {},
+            boxes=self._find_boxes(textures, shaders) if self._image_options.boxes else {},
         )
 
-    def _boxes(self, textures: dict[str, Any], shaders: dict[str, ShaderConfig]) -> dict[str, Box]:
-        """Return the bounding box of the visible pixels of the target, by the cameras that see it."""
+    def _find_boxes(self, textures: dict[str, Any], shaders: dict[str, ShaderConfig]) -> dict[str, Box]:
+        """Return the bounding box of the target's visible pixels, by camera; only cameras that see it."""
         slot = int(self._base.target_slot[0])
         number = int(self._base.scene.actors[f"object_{slot}"].per_scene_id[0])
-        masks = {name: _segmentation_of(textures[name], shader) == number for name, shader in shaders.items()}
-        return {name: box for name, mask in masks.items() if (box := bounding_box(mask)) is not None}
+        masks = {name: _convert_segmentation(textures[name], shader) == number for name, shader in shaders.items()}
+        return {name: box for name, mask in masks.items() if (box := compute_bounding_box(mask)) is not None}
 
     def cameras(self) -> dict[str, CameraModel]:
-        """Return intrinsics and poses of the rendered cameras, by name."""
+        """Return intrinsics and pose of each rendered camera at the last rendered state, by name."""
         agent = self._base.agent
         parents = {"ee": agent.tcp.pose, "arm_base": agent.arm_base_link.pose}
         models = {}
@@ -108,7 +110,7 @@ class EnvRenderer:
                 continue
             camera = self._base.scene.sensors[spec.name].camera
             world_in_camera = np.vstack([camera.get_extrinsic_matrix()[0].cpu().numpy(), [0, 0, 0, 1]])
-            parent_in_world = _matrix(parents[spec.parent]) if spec.parent in parents else np.eye(4)
+            parent_in_world = _pose_matrix(parents[spec.parent]) if spec.parent in parents else np.eye(4)
             k = camera.get_intrinsic_matrix()[0].cpu().numpy().astype(np.float64)
             models[spec.name] = CameraModel(
                 intrinsic=np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]]),
@@ -126,10 +128,10 @@ class EnvRenderer:
             "config": env.task_config.model_dump(mode="json"),
             "layout": {
                 "object_ids": list(layout.object_ids),
-                "poses": [_numbers(pose) for pose in layout.object_poses],
+                "poses": [_pose_values(pose) for pose in layout.object_poses],
                 "present": layout.present.tolist(),
-                "robot_pose": _numbers(layout.robot_pose),
-                "basket_pose": None if layout.basket_pose is None else _numbers(layout.basket_pose),
+                "robot_pose": _pose_values(layout.robot_pose),
+                "basket_pose": None if layout.basket_pose is None else _pose_values(layout.basket_pose),
                 "relation": layout.relation,
             },
             "objects": [
@@ -140,7 +142,7 @@ class EnvRenderer:
         }
 
 
-def _numbers(pose: NDArray[np.float64]) -> list[float]:
+def _pose_values(pose: NDArray[np.float64]) -> list[float]:
     """Return x, y, z, qw, qx, qy, qz of a pose (4, 4)."""
     quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True)
     return [round(float(value), 9) for value in (*pose[:3, 3], quaternion[3], *quaternion[:3])]
@@ -157,26 +159,26 @@ def require_renderer() -> None:
         raise DatasetError("no render device", fix=fix) from error
 
 
-def _rgb_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.uint8]:
-    """Return an RGB image (H, W, 3), contiguous, from the textures of a camera."""
+def _convert_rgb(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.uint8]:
+    """Convert the textures of a camera to an RGB image (H, W, 3)."""
     colour = textures["Color"]
     if colour.dtype == torch.uint8:  # OpenCV takes 0.03 ms to drop alpha at 640 x 480, copying a slice 2
         return cv2.cvtColor(colour[0].cpu().numpy(), cv2.COLOR_RGBA2RGB).astype(np.uint8, copy=False)
     return np.ascontiguousarray(shader.texture_transforms["Color"](colour)["rgb"][0].cpu().numpy())
 
 
-def _depth_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.uint16]:
-    """Return depth (H, W) in mm; 0 = no surface in front of the camera."""
+def _convert_depth(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.uint16]:
+    """Convert the textures of a camera to depth (H, W) in mm; 0 = no surface in front of the camera."""
     name = next(name for name, kinds in shader.texture_names.items() if "depth" in kinds)
     depth = shader.texture_transforms[name](textures[name])["depth"][0, ..., 0]  # int16
     return depth.clamp(min=0).cpu().numpy().astype(np.uint16)
 
 
-def _segmentation_of(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.int16]:
-    """Return the scene id of the actor or link in each pixel (H, W), 0 = none."""
+def _convert_segmentation(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.int16]:
+    """Convert the textures of a camera to the scene id of the actor or link in each pixel (H, W), 0 = none."""
     name = next(name for name, kinds in shader.texture_names.items() if "segmentation" in kinds)
     return shader.texture_transforms[name](textures[name])["segmentation"][0, ..., 0].cpu().numpy()
 
 
-def _matrix(pose: Any) -> NDArray[np.float64]:
+def _pose_matrix(pose: Any) -> NDArray[np.float64]:
     return pose.to_transformation_matrix()[0].cpu().numpy().astype(np.float64)

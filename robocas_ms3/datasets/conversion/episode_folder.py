@@ -17,10 +17,10 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import encode_json
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.images import check_cameras, check_images
-from robocas_ms3.datasets.checks.violation import read_object
+from robocas_ms3.datasets.checks.violation import read_json_object
 from robocas_ms3.datasets.conversion.workers import EpisodeWriter, InputEpisode
 from robocas_ms3.datasets.images.image_files import ImageOptions, write_image
-from robocas_ms3.datasets.images.image_headers import check_ends
+from robocas_ms3.datasets.images.image_headers import check_file_ends
 from robocas_ms3.datasets.images.preview_frames import EpisodeDrawer
 from robocas_ms3.datasets.images.video import open_preview
 from robocas_ms3.datasets.sources.arrays import add_embeddings, read_arrays
@@ -32,9 +32,12 @@ _MAX_WAITING = 24  # images, to bound memory
 
 @dataclass(frozen=True)
 class FolderWriter(EpisodeWriter):
-    """Writer of the episodes of a RoboCAS folder.
+    """Writes the episodes of a RoboCAS folder.
 
-    ``sheet`` has the numbers of the episodes on the contact sheet; None: no previews are written.
+    Attributes:
+        out: folder of the dataset.
+        embed: function that returns the embeddings (N, 384) of N texts; None: no embeddings are written.
+        sheet: numbers of the episodes on the contact sheet; None: no previews are written.
     """
 
     out: Path
@@ -45,23 +48,18 @@ class FolderWriter(EpisodeWriter):
         return self.out / schema.episode_folder(number)
 
     def write_files(
-        self, folder: Path, wanted: InputEpisode, frames: Generator[StepImages, None, None]
+        self, folder: Path, episode: InputEpisode, frames: Generator[StepImages, None, None]
     ) -> NDArray[np.uint8] | None:
-        episode, image_options, arrays, preview = (
-            wanted.episode,
-            wanted.conversion_input.image_options,
-            wanted.arrays,
-            None,
-        )
+        image_options, arrays, preview = episode.conversion_input.image_options, episode.arrays, None
         for camera in image_options.cameras:
             for kind in image_options.kinds:
                 (folder / camera / kind).mkdir(parents=True)
         with ExitStack() as stack:
             if self.sheet is not None:
-                drawing = EpisodeDrawer(wanted.number, arrays, wanted.conversion_input.source.rate_hz)
-                preview = stack.enter_context(open_preview(self.out, drawing, row=wanted.number in self.sheet))
-            encode = stack.enter_context(_encoder())
-            in_order = stack.enter_context(_encoder(1))  # frames of a video
+                drawing = EpisodeDrawer(episode.number, arrays, episode.conversion_input.source.rate_hz)
+                preview = stack.enter_context(open_preview(self.out, drawing, row=episode.number in self.sheet))
+            encode = stack.enter_context(_open_encoder())
+            in_order = stack.enter_context(_open_encoder(1))  # frames of a video
             for step, frame in enumerate(frames):
                 for kind in image_options.kinds:
                     images = frame.rgb if kind == "rgb" else frame.depth
@@ -69,10 +67,10 @@ class FolderWriter(EpisodeWriter):
                         path = schema.image_path(folder, camera, kind, step, image_options.image_format)
                         encode(write_image, path, images[camera])
                 if preview:
-                    in_order(preview.add, step, frame.rgb)
-        cameras = {name: episode.camera(name) for name in image_options.cameras}
+                    in_order(preview.add_step, step, frame.rgb)
+        cameras = {name: episode.source_episode.camera(name) for name in image_options.cameras}
         arrays = add_embeddings(arrays, self.embed) if self.embed else arrays
-        write_episode_files(folder, arrays, cameras, episode.scene)
+        write_episode_files(folder, arrays, cameras, episode.source_episode.scene)
         return preview and preview.row
 
 
@@ -90,8 +88,8 @@ def write_episode_files(
 
 
 @contextmanager
-def _encoder(threads: int = ENCODERS) -> Generator[Callable[..., None], None, None]:
-    """Give a function that runs calls in threads; it blocks while too many calls are waiting."""
+def _open_encoder(threads: int = ENCODERS) -> Generator[Callable[..., None], None, None]:
+    """Yield a function that runs a call in a thread; the function blocks while too many calls are waiting."""
     waiting: deque[Future[Any]] = deque()
 
     def collect(limit: int) -> None:
@@ -110,16 +108,16 @@ def _encoder(threads: int = ENCODERS) -> Generator[Callable[..., None], None, No
         pool.shutdown(cancel_futures=True)
 
 
-def find_damaged(folder: Path, image_options: ImageOptions) -> Path | None:
+def find_damaged_file(folder: Path, image_options: ImageOptions) -> Path | None:
     """Return the first missing or truncated file of an episode, None if all are complete."""
     steps = read_arrays(folder / schema.EPISODE_FILE, ("episode_length",)).arrays.get("episode_length")
     if steps is None or steps.ndim:
         return folder / schema.EPISODE_FILE
     root = folder.parent
     for wrong in (
-        *read_object(root, f"{folder.name}/{schema.SCENE_FILE}")[1],
+        *read_json_object(root, f"{folder.name}/{schema.SCENE_FILE}")[1],
         *check_cameras(folder, image_options),
-        *check_images(folder, image_options, int(steps), {}, check_ends),
+        *check_images(folder, image_options, int(steps), {}, check_file_ends),
     ):
         if wrong.kind != "unexpected" and not (root / wrong.file).is_dir():  # folder of an unexpected camera
             return root / wrong.file

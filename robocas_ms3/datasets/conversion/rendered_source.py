@@ -11,7 +11,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.episode_source import CameraModel, StepImages
-from robocas_ms3.datasets.sources.provenance import entry_without_fingerprint, recording_entry, scene_record
+from robocas_ms3.datasets.sources.provenance import make_entry_without_fingerprint, make_recording_entry, make_scene
 from robocas_ms3.datasets.sources.trajectory import RecordedEpisode, TrajectorySource
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.motion import sample_states
@@ -24,7 +24,7 @@ OpenRenderer = Callable[[RecordedEnv, str, ImageOptions], "EnvRenderer"]
 """(environment of the recording, its control mode, images to render) -> renderer."""
 
 
-def open_env(env: RecordedEnv, control_mode: str, image_options: ImageOptions) -> EnvRenderer:
+def open_env_renderer(env: RecordedEnv, control_mode: str, image_options: ImageOptions) -> EnvRenderer:
     from robocas_ms3.datasets.conversion.env_renderer import EnvRenderer
 
     return EnvRenderer(env, control_mode, image_options)
@@ -40,33 +40,34 @@ class RenderedSource(TrajectorySource):
         rate_hz: float | None,
         image_options: ImageOptions,
         pack: str | Path | None = None,
-        open_renderer: OpenRenderer = open_env,
+        open_renderer: OpenRenderer = open_env_renderer,
     ) -> None:
         super().__init__(path, rate_hz=rate_hz, include_failed=True, pack=pack)
-        self.image_options = image_options.choose([camera.name for camera in self.file.env.cameras()], path)
+        self.image_options = image_options.select_cameras([camera.name for camera in self.file.env.cameras()], path)
         self.cameras, self.has_depth = self.image_options.cameras, image_options.depth
         self._pack, self._open_renderer = pack, open_renderer
         self._renderer: EnvRenderer | None = None
         self._control_mode = ""
 
     def switch_file(self, path: Path) -> None:
-        """Read another file of the same environment; the environment stays open."""
+        """Continue with another trajectory file of the same environment, which stays open."""
         env, control_freq = self.file.env, self.file.control_freq
         with TrajectoryFile(path, pack=self._pack) as file:
             if (file.env, file.control_freq) != (env, control_freq):
-                raise DatasetError("this file was recorded in another environment", where=path, expected=self.root)
+                what = "this file was recorded in another environment"
+                raise DatasetError(what, where=path, expected=f"the environment of {self.root}")
         super().__init__(path, rate_hz=self.rate_hz, include_failed=True, pack=self._pack)
 
     def entry(self, number: int) -> dict[str, Any]:
         with self.file.reopen() as file:
             try:
-                return recording_entry(file, number)
+                return make_recording_entry(file, number)
             except DatasetError:
-                return entry_without_fingerprint(file, number)
+                return make_entry_without_fingerprint(file, number)
 
-    def texts(self, number: int) -> list[str]:
-        """Return the instruction of an episode and the texts of its sub-goals."""
-        entry = self.info(number)
+    def list_texts(self, number: int) -> list[str]:
+        """Return the instruction of an episode and the list_texts of its sub-goals."""
+        entry = self.episode_entry(number)
         return [entry.instruction, *(goal.goal_description for goal in entry.subgoals)]
 
     def episode(self, number: int) -> RenderedEpisode:
@@ -81,7 +82,7 @@ class RenderedSource(TrajectorySource):
             self.close()
             self._renderer = self._open_renderer(self.file.env, recording.control_mode, self.image_options)
             self._control_mode = recording.control_mode
-        self._renderer.load(recording)
+        self._renderer.load_scene(recording)
         return RenderedEpisode(self, number, recording, self._renderer)
 
     def close(self) -> None:
@@ -91,7 +92,7 @@ class RenderedSource(TrajectorySource):
 
 
 class RenderedEpisode(RecordedEpisode):
-    """Episode of a `RenderedSource`; ask for camera models after the images were rendered."""
+    """Episode of a `RenderedSource`; its camera models are valid after its images have been rendered."""
 
     def __init__(self, source: RenderedSource, number: int, recording: Recording, renderer: EnvRenderer) -> None:
         super().__init__(source, number)
@@ -108,7 +109,7 @@ class RenderedEpisode(RecordedEpisode):
     @property
     def scene(self) -> dict[str, Any]:
         source, rendered = self._source, self._renderer.scene()
-        return scene_record(source.file, self._number, self._recording, rendered, source.rate_hz)
+        return make_scene(source.file, self._number, self._recording, rendered, source.rate_hz)
 
     @cached_property
     def _models(self) -> dict[str, CameraModel]:

@@ -36,8 +36,9 @@ class ConversionSettings:
     to: Annotated[str, tyro.conf.arg(metavar="FORMAT")] = "robocas"
     """Output format: robocas, lerobot (needs the extra 'lerobot'), or a format of another package."""
     lerobot_version: Version = NEWEST
-    """LeRobot version that reads the dataset. 0.6: LeRobot 0.6 and later (v3.0, language columns, depth as video);
-    0.5: LeRobot 0.4.4 to 0.5.1 (v3.0, subtask_index); 2.1: readers of format v2.1, such as openpi and GR00T."""
+    """LeRobot version that will read the dataset. 0.6: LeRobot 0.6 and later (format v3.0 with language columns and
+    depth videos); 0.5: LeRobot 0.4.4 to 0.5.1 (format v3.0 with subtask_index); 2.1: openpi, GR00T and other readers
+    of format v2.1."""
     codec: Literal["h264", "av1"] = "h264"
     """Video codec of a LeRobot dataset; av1 needs half the disk space of h264."""
     rate_hz: Annotated[float | None, tyro.conf.arg(name="rate", help_behavior_hint="")] = None
@@ -52,7 +53,8 @@ class ConversionSettings:
     cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]"), _NO_HINT] = ()
     """Names of the cameras. Default: all cameras of the input; with --append those of the output dataset."""
     size: Annotated[tuple[int, int] | None, _NO_HINT] = None
-    """Image width and height in pixels. Default: that of the cameras, 640 480; with --append that of the dataset."""
+    """Image width and height in pixels. Default: the size in the task configuration (640 480); with --append the size
+    of the dataset."""
     depth: bool = True
     """Store depth images in addition to RGB."""
     image_format: Literal["png", "jpg", "webp"] = "png"
@@ -62,14 +64,14 @@ class ConversionSettings:
     overwrite: bool = False
     """Start again. Default: continue an interrupted conversion with the same settings."""
     append: bool = False
-    """Add episodes to an existing dataset; its episodes keep their numbers and stay in training or validation."""
+    """Add episodes to an existing dataset. The existing episodes keep their numbers and their split."""
     skip_errors: bool = False
     """Skip episodes that can't be written, with a warning. Default: write the other episodes, then report an error."""
     jobs: int = 1
     """Number of processes that render."""
     episode_seconds: float = 3600.0
-    """Time limit per episode in seconds. An episode that exceeds the time or memory limit or crashes its process is
-    retried once, then treated as an episode that can't be written."""
+    """Time limit per episode in seconds. An episode that exceeds the time or memory limit, or crashes its process, is
+    retried once. If it fails again, it can't be written; see --skip-errors."""
     memory_gb: float = 8.0
     """Memory limit per process in GB."""
     pack: Annotated[str | None, tyro.conf.arg(metavar="PACK"), _NO_HINT] = None
@@ -100,9 +102,9 @@ class ConversionSettings:
             found = " ".join(self.cameras)
             raise DatasetError("repeated camera", where="--cameras", expected="each name once", found=found)
         if self.size is not None:
-            from robocas_ms3.datasets.images.image_files import check_size
+            from robocas_ms3.datasets.images.image_files import check_image_size
 
-            check_size(self.size, "--size")
+            check_image_size(self.size, "--size")
 
     @property
     def image_options(self) -> ImageOptions:
@@ -130,11 +132,11 @@ class ConversionSettings:
         return found.name == "trajectory" if found else not self.source.is_dir()
 
     @property
-    def needs_device(self) -> bool:
+    def needs_renderer(self) -> bool:
         return self.open_renderer is None and self.is_trajectory
 
-    def check_device(self) -> None:
-        if self.needs_device:
+    def require_renderer(self) -> None:
+        if self.needs_renderer:
             from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 
             require_renderer()
@@ -142,7 +144,14 @@ class ConversionSettings:
 
 @dataclass(frozen=True)
 class WrittenEpisode:
-    """Episode on disk: steps T, size in bytes, and its row (H, W, 3) RGB of the contact sheet, if any."""
+    """Episode that a conversion has written.
+
+    Attributes:
+        number: number of the episode in the dataset.
+        steps: number of steps T.
+        size: size on disk, bytes.
+        row: row of the contact sheet with this episode, (H, W, 3) RGB; None: it has none.
+    """
 
     number: int
     steps: int
@@ -151,8 +160,15 @@ class WrittenEpisode:
 
 
 @dataclass(frozen=True)
-class Conversion:
-    """Result of a conversion: new episodes, number of existing episodes, wall-clock time in s."""
+class ConversionResult:
+    """Result of a conversion.
+
+    Attributes:
+        episodes: episodes that this conversion has written.
+        existing: number of episodes that existed already.
+        seconds: wall-clock time, s.
+        previews: whether videos and a contact sheet were written.
+    """
 
     episodes: list[WrittenEpisode]
     existing: int

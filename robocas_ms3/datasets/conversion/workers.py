@@ -30,7 +30,7 @@ _MAX_FIRST_FAILURES = 3  # without any success; then all episodes are assumed to
 _MAX_LISTED = 5  # failures in an error message
 _log = logging.getLogger(__name__)
 
-Task = tuple[int, int]
+EpisodeNumbers = tuple[int, int]
 """Number of an episode in the dataset, and in the source."""
 
 
@@ -39,66 +39,74 @@ class InputEpisode:
     """Episode to write: its number in the dataset, its source episode, and its checked arrays."""
 
     number: int
-    episode: SourceEpisode
+    source_episode: SourceEpisode
     arrays: dict[str, NDArray]
     conversion_input: ConversionInput
 
 
 class EpisodeWriter(ABC):
-    """Writer of the episodes of one format; picklable."""
+    """Writes the episodes of one dataset format; must be picklable."""
 
     @abstractmethod
     def folder(self, number: int) -> Path:
-        """Return the folder of an episode, which is created atomically."""
+        """Return the path of the folder of an episode, which `write` creates atomically."""
 
     @abstractmethod
     def write_files(
-        self, folder: Path, wanted: InputEpisode, frames: Generator[StepImages, None, None]
+        self, folder: Path, episode: InputEpisode, frames: Generator[StepImages, None, None]
     ) -> NDArray[np.uint8] | None:
-        """Write an episode into a folder; return its row of the contact sheet, if any."""
+        """Write the files of an episode into a folder; return its contact sheet row (H, W, 3) RGB, or None."""
 
-    def write(self, number: int, conversion_input: ConversionInput, source: int) -> WrittenEpisode:
+    def write(self, number: int, conversion_input: ConversionInput, source_number: int) -> WrittenEpisode:
         """Write episode ``source`` of the input as episode ``number`` of the dataset."""
         with atomic_folder(self.folder(number), sync=True) as folder:
-            episode = conversion_input.source.episode(source)
-            wanted = InputEpisode(number, episode, require_complete_arrays(episode), conversion_input)
-            with closing(conversion_input.frames(episode)) as frames:
-                row = self.write_files(folder, wanted, frames)
+            source_episode = conversion_input.source.episode(source_number)
+            episode = InputEpisode(number, source_episode, require_complete_arrays(source_episode), conversion_input)
+            with closing(conversion_input.frames(source_episode)) as frames:
+                row = self.write_files(folder, episode, frames)
             size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-        return WrittenEpisode(number, int(wanted.arrays["episode_length"]), size, row)
+        return WrittenEpisode(number, int(episode.arrays["episode_length"]), size, row)
 
 
 @dataclass(frozen=True)
 class PendingEpisodes:
-    """Missing episodes of a conversion; ``continued``: whether some episodes exist already."""
+    """Episodes that a conversion has to write.
+
+    Attributes:
+        settings: settings of the conversion.
+        writer: writer of the episodes.
+        tasks: number of each episode in the dataset and in the source.
+        has_existing: whether the dataset has episodes already.
+        fix: advice in the error about episodes that can't be written.
+    """
 
     settings: ConversionSettings
     writer: EpisodeWriter
-    tasks: list[Task]
-    continued: bool
+    tasks: list[EpisodeNumbers]
+    has_existing: bool
     fix: str
 
 
 def write_episodes(
-    job: PendingEpisodes, output: OutputFolder, on_episode: Callable[[WrittenEpisode], None] | None
+    pending: PendingEpisodes, output: OutputFolder, on_episode: Callable[[WrittenEpisode], None] | None
 ) -> tuple[list[WrittenEpisode], IncompleteDatasetError | None]:
-    """Write episodes; return them by number, and an error that lists the episodes that can't be written.
+    """Write the pending episodes; return the written episodes sorted by number, and an error or None.
 
-    A failure does not stop the other episodes unless it concerns all: a full disk, a missing extra, or failures of the
-    first three episodes.
+    The error lists the episodes that can't be written. One failed episode does not stop the others. A full disk, a
+    missing extra, or failures of the first three episodes of a new dataset stop the conversion with that error.
     """
-    settings = job.settings
-    renders, processes = settings.is_trajectory, min(settings.jobs, len(job.tasks))
-    apart = settings.limits is not None and settings.needs_device  # survives a crash of the renderer
+    settings = pending.settings
+    renders, processes = settings.is_trajectory, min(settings.jobs, len(pending.tasks))
+    apart = settings.limits is not None and settings.needs_renderer  # survives a crash of the renderer
     here = processes <= 1 and not apart
-    threads = _one_torch_thread() if renders and here else nullcontext()
-    open_worker = partial(_EpisodeWorker, job, one_rasterizer_thread=processes > 1, shared=here)
-    pool: WorkerPool[Task, WrittenEpisode | _Failure] = WorkerPool(
-        open_worker, 0 if here else processes, on_crash=_crash_failure, limits=settings.limits or NO_LIMITS
+    threads = _limit_torch_threads() if renders and here else nullcontext()
+    open_worker = partial(_EpisodeWorker, pending, one_rasterizer_thread=processes > 1, in_process=here)
+    pool: WorkerPool[EpisodeNumbers, WrittenEpisode | _Failure] = WorkerPool(
+        open_worker, 0 if here else processes, on_crash=_make_crash_failure, limits=settings.limits or NO_LIMITS
     )
     written: list[WrittenEpisode] = []
     failures: list[_Failure] = []
-    with threads, pool, closing(pool.map(job.tasks, ordered=False)) as results:
+    with threads, pool, closing(pool.map(pending.tasks, ordered=False)) as results:
         for result in results:
             if isinstance(result, WrittenEpisode):
                 output.check_exists()
@@ -107,29 +115,29 @@ def write_episodes(
                     on_episode(result)
                 continue
             failures.append(result)
-            if written or job.continued:
+            if written or pending.has_existing:
                 _log.warning("%s could not be written: %s", result.episode, result.reason)
             elif len(failures) == _MAX_FIRST_FAILURES:
                 break
-    if failures and not (written or job.continued):
-        raise failures[0].sent.make_error()
+    if failures and not (written or pending.has_existing):
+        raise failures[0].error.make_error()
     written.sort(key=lambda episode: episode.number)
-    return written, _incomplete(failures, job) if failures else None
+    return written, _make_incomplete_error(failures, pending) if failures else None
 
 
 @dataclass(frozen=True)
 class _Failure:
-    """An episode that could not be written."""
+    """Episode that could not be written, and the error."""
 
     episode: str
-    sent: RemoteError
+    error: RemoteError
 
     @property
     def reason(self) -> str:
-        return format_error(self.sent.error).rstrip(".")
+        return format_error(self.error.error).rstrip(".")
 
 
-def _crash_failure(task: Task, why: str) -> _Failure:
+def _make_crash_failure(task: EpisodeNumbers, why: str) -> _Failure:
     episode = episode_folder(task[0])
     return _Failure(
         episode,
@@ -137,36 +145,36 @@ def _crash_failure(task: Task, why: str) -> _Failure:
     )
 
 
-def _incomplete(failures: list[_Failure], job: PendingEpisodes) -> IncompleteDatasetError:
+def _make_incomplete_error(failures: list[_Failure], pending: PendingEpisodes) -> IncompleteDatasetError:
     reasons = {one.episode: one.reason for one in sorted(failures, key=lambda one: one.episode)}
     listed = [why if why.startswith(f"{one}: ") else f"{one}: {why}" for one, why in reasons.items()]
     more = f"; and {len(listed) - _MAX_LISTED} more" if len(listed) > _MAX_LISTED else ""
     what = f"{format_count(len(listed), 'episode')} could not be written"
     error = IncompleteDatasetError(
-        what, where=job.settings.out, found="; ".join(listed[:_MAX_LISTED]) + more, fix=job.fix
+        what, where=pending.settings.out, found="; ".join(listed[:_MAX_LISTED]) + more, fix=pending.fix
     )
-    error.reasons, error.__cause__ = reasons, failures[0].sent.make_error()
+    error.reasons, error.__cause__ = reasons, failures[0].error.make_error()
     return error
 
 
 class _EpisodeWorker:
-    """Worker that writes episodes; the source stays open, and is opened again after a failure."""
+    """Writes episodes; keeps the input open between episodes and opens it again after a failure."""
 
-    def __init__(self, job: PendingEpisodes, *, one_rasterizer_thread: bool, shared: bool) -> None:
-        if job.settings.is_trajectory and not shared:
+    def __init__(self, pending: PendingEpisodes, *, one_rasterizer_thread: bool, in_process: bool) -> None:
+        if pending.settings.is_trajectory and not in_process:
             if one_rasterizer_thread:  # software renderers on all cores slow each other down
                 os.environ.setdefault("LP_NUM_THREADS", "1")
             use_one_torch_thread()
-        self._job = job
-        self._input: ConversionInput | None = open_input(job.settings)
+        self._pending = pending
+        self._input: ConversionInput | None = open_input(pending.settings)
 
-    def run(self, task: Task) -> WrittenEpisode | _Failure:
+    def run(self, task: EpisodeNumbers) -> WrittenEpisode | _Failure:
         number, source = task
         try:
-            self._input = self._input or open_input(self._job.settings)
-            return self._job.writer.write(number, self._input, source)
+            self._input = self._input or open_input(self._pending.settings)
+            return self._pending.writer.write(number, self._input, source)
         except Exception as error:
-            if _concerns_all(error):
+            if _affects_all_episodes(error):
                 raise
             self.close()
             return _Failure(episode_folder(number), RemoteError.from_error(error, "a worker"))
@@ -177,16 +185,16 @@ class _EpisodeWorker:
             conversion_input.close()
 
 
-def _concerns_all(error: Exception) -> bool:
-    """Return whether an error concerns all episodes: an error of the system or the installation."""
+def _affects_all_episodes(error: Exception) -> bool:
+    """Return whether all episodes would fail in the same way: an error of the system, or a missing extra."""
     return isinstance(error, MissingExtraError) or (
         isinstance(error, OSError) and error.errno in errno.errorcode
     )  # FFmpeg uses other numbers
 
 
 @contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    """Use one torch thread: next to a renderer, spinning threads of torch double the CPU time."""
+def _limit_torch_threads() -> Iterator[None]:
+    """Limit PyTorch to one thread in a ``with`` statement: idle threads next to a renderer double the CPU time."""
     import torch
 
     before = torch.get_num_threads()

@@ -29,8 +29,8 @@ Box = tuple[int, int, int, int]
 """x_min, y_min, x_max, y_max: first and last column and row in pixels, from 0 at the top left."""
 
 
-def check_size(size: tuple[int, int], where: str = "size") -> None:
-    """Raise DatasetError if the width and height of images are out of range."""
+def check_image_size(size: tuple[int, int], where: str = "size") -> None:
+    """Raise DatasetError unless width and height are between `SMALLEST` and `LARGEST` pixels."""
     if not SMALLEST <= min(size) <= max(size) <= LARGEST:
         expected = f"{SMALLEST} to {LARGEST} pixels"
         raise DatasetError("invalid image size", where=where, expected=expected, found=list(size))
@@ -38,10 +38,14 @@ def check_size(size: tuple[int, int], where: str = "size") -> None:
 
 @dataclass(frozen=True)
 class ImageOptions:
-    """Options of rendered and stored images; empty ``cameras``: all, ``size`` None: that of the cameras.
+    """Options of the images that are rendered and stored.
 
-    The standard cameras come first, in their order. ``size`` is width and height in pixels. ``boxes`` computes the
-    bounding box of the target in each image.
+    Attributes:
+        cameras: names of the cameras, standard cameras first; empty: all cameras.
+        size: width and height in pixels; None: the size in the task configuration.
+        depth: whether there are depth images in addition to RGB.
+        image_format: format of RGB images.
+        boxes: whether the bounding box of the target in each image is computed.
     """
 
     cameras: tuple[str, ...] = ()
@@ -52,17 +56,17 @@ class ImageOptions:
 
     def __post_init__(self) -> None:
         if self.size is not None:
-            check_size(self.size)
+            check_image_size(self.size)
         names = [*STANDARD_CAMERA_NAMES, *self.cameras]
         object.__setattr__(self, "cameras", tuple(name for name in dict.fromkeys(names) if name in self.cameras))
 
-    def choose(self, cameras: Sequence[str], where: object) -> ImageOptions:
-        """Return the options for the requested ones of the available ``cameras``, in their order."""
-        unknown = sorted(set(self.cameras) - set(cameras))
+    def select_cameras(self, available: Sequence[str], where: object) -> ImageOptions:
+        """Return the options with the requested cameras (default: all), in the order of ``available``."""
+        unknown = sorted(set(self.cameras) - set(available))
         if unknown:
-            expected, found = f"some of {', '.join(cameras)}", ", ".join(unknown)
+            expected, found = f"some of {', '.join(available)}", ", ".join(unknown)
             raise DatasetError("no such camera", where=where, expected=expected, found=found, usage=True)
-        return replace(self, cameras=tuple(name for name in cameras if name in (self.cameras or cameras)))
+        return replace(self, cameras=tuple(name for name in available if name in (self.cameras or available)))
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -74,7 +78,8 @@ def write_image(path: Path, image: NDArray) -> None:
     try:
         data = encode_png(image) if path.suffix == ".png" else _encode(image, path.suffix)
     except (ValueError, cv2.error) as error:
-        raise DatasetError("can't encode this image", where=path, found=one_line(error)) from error
+        expected = "(H, W, 3) uint8 or (H, W) uint16"
+        raise DatasetError("can't encode this image", where=path, expected=expected, found=one_line(error)) from error
     path.write_bytes(data)  # unlike cv2.imwrite, raises an error if the disk is full
 
 
@@ -98,8 +103,8 @@ def read_image(path: Path) -> NDArray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if image.ndim == 3 else image
 
 
-def bounding_box(mask: NDArray[np.bool_]) -> Box | None:
-    """Return the bounding box of a mask (H, W), None if the mask is empty."""
+def compute_bounding_box(mask: NDArray[np.bool_]) -> Box | None:
+    """Return the bounding box of the true pixels of a mask (H, W); None if no pixel is true."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return None

@@ -25,7 +25,7 @@ _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Width and height in pixels, bits per channel, number of channels."""
+    """Header of an image: width and height in pixels, bits per channel, number of channels."""
 
     width: int
     height: int
@@ -37,13 +37,16 @@ class ImageHeader:
 
 
 def read_header(path: Path) -> ImageHeader:
-    """Return the header of an image; raise ValueError or OSError if the file is damaged."""
+    """Check a complete image file and return its header; raise ValueError or OSError if it is damaged."""
     data = read_image_bytes(path)
-    return _read_png(data) if path.suffix == ".png" else _decode(data, _FORMATS[path.suffix])
+    return _check_png(data) if path.suffix == ".png" else _decode_header(data, _FORMATS[path.suffix])
 
 
-def check_ends(path: Path) -> None:
-    """Check the first and last bytes of an image; read the whole file if they are not as expected."""
+def check_file_ends(path: Path) -> None:
+    """Check the first and last bytes of an image file; raise ValueError or OSError if it is damaged.
+
+    The whole file is read only if these bytes are not as expected.
+    """
     if not _has_both_ends(path):
         read_header(path)
 
@@ -63,29 +66,29 @@ def _has_both_ends(path: Path) -> bool:
 
 def read_image_bytes(path: Path) -> bytes:
     """Return the bytes of an image file; raise DocumentError if it is damaged or larger than `LARGEST`."""
-    data, wanted = read_bytes(path, BYTES_LIMIT), _FORMATS[path.suffix]
+    data, image_format = read_bytes(path, BYTES_LIMIT), _FORMATS[path.suffix]
     try:
-        with Image.open(BytesIO(data), formats=[wanted]) as image:
+        with Image.open(BytesIO(data), formats=[image_format]) as image:
             size = image.size
     except Image.DecompressionBombError as error:
         raise DocumentError(str(error)) from error
     except (UnidentifiedImageError, SyntaxError) as error:  # SyntaxError: a damaged PNG
-        raise DocumentError(f"not a {wanted}, or damaged") from error
+        raise DocumentError(f"not a {image_format}, or damaged") from error
     if max(size) > LARGEST:
         raise DocumentError(f"{size[0]} x {size[1]} pixels, more than {LARGEST} in width or height")
     return data
 
 
-def _decode(data: bytes, wanted: str) -> ImageHeader:
+def _decode_header(data: bytes, image_format: str) -> ImageHeader:
     try:
-        with Image.open(BytesIO(data), formats=[wanted]) as image:
+        with Image.open(BytesIO(data), formats=[image_format]) as image:
             image.load()
             return ImageHeader(*image.size, 8, len(image.getbands()))
     except OSError as error:
-        raise ValueError(f"damaged {wanted}: {error}") from error
+        raise ValueError(f"damaged {image_format}: {error}") from error
 
 
-def _read_png(data: bytes) -> ImageHeader:
+def _check_png(data: bytes) -> ImageHeader:
     if not data.startswith(SIGNATURE):
         raise ValueError("not a PNG")
     offset, header, filled = len(SIGNATURE), None, False
@@ -95,14 +98,14 @@ def _read_png(data: bytes) -> ImageHeader:
         if end + 4 > len(data):
             break
         if zlib.crc32(data[offset + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-            raise ValueError("damaged PNG")
+            raise ValueError("damaged PNG: wrong checksum")
         if kind == b"IHDR":
             width, height, bits, colour = struct.unpack_from(">IIBB", data, offset + 8)
             header = ImageHeader(width, height, bits, _CHANNELS.get(colour, 0))
         filled = filled or (kind == b"IDAT" and length > 0)
         if kind == b"IEND" and header is not None:
             if not filled:
-                raise ValueError("PNG without an image")
+                raise ValueError("PNG without image data (no IDAT chunk)")
             return header
         offset = end + 4
     raise ValueError("truncated PNG")

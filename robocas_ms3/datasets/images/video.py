@@ -32,7 +32,10 @@ _PREVIEW_OPTIONS = ("-preset", "veryfast", "-threads", "1")
 
 @contextmanager
 def open_video(path: Path, fps: float, *options: str, quality: float = 8) -> Iterator[Any]:
-    """Open an MP4 (H.264, yuv420p) to append (H, W, 3) RGB to, H and W even; quality is 0 to 10."""
+    """Open a writer of an MP4 video (H.264, yuv420p); its ``append_data`` takes frames (H, W, 3) RGB.
+
+    H and W must be even. ``options``: options of FFmpeg. ``quality``: 0 (worst) to 10 (best).
+    """
     writer = imageio.get_writer(
         path,
         fps=fps,
@@ -50,9 +53,9 @@ def open_video(path: Path, fps: float, *options: str, quality: float = 8) -> Ite
 def write_video(
     dataset: EpisodeSource, number: int, path: Path | str, *, speed: float = 1.0, kind: ImageKind = "rgb"
 ) -> Path:
-    """Write an episode as MP4 (H.264, yuv420p): cameras next to each other, texts below.
+    """Write the video of an episode (MP4, H.264): all cameras next to each other, texts below; return its path.
 
-    ``speed`` 1 is real time; depth is shown in colours.
+    ``speed`` 1 is real time. Depth images are shown in colours.
 
     Raises:
         DatasetError: the episode does not exist, or the speed is invalid.
@@ -68,20 +71,23 @@ def write_video(
         closing(iter_images(episode, episode.cameras, kind)) as run,
     ):
         for step, images in enumerate(run):
-            video.append_data(drawing.frame(step, _coloured(images, kind), PANEL))
+            video.append_data(drawing.draw_frame(step, _colour_images(images, kind), PANEL))
     return path
 
 
-def contact_sheet(
+def write_contact_sheet(
     dataset: EpisodeSource, out: Path | str, *, episodes: Sequence[int] | None = None, kind: ImageKind = "rgb"
 ) -> Path:
-    """Write a PNG with evenly spaced steps of each episode (default: the first ten) and camera."""
+    """Write a contact sheet: a PNG with images of evenly spaced steps, per episode and camera; return its path.
+
+    ``episodes``: episode numbers; default: the first ten.
+    """
     numbers = dataset.numbers[:SHEET_EPISODES] if episodes is None else list(episodes)
-    return _write_sheet([_row(dataset, number, kind) for number in numbers], out)
+    return _write_sheet([_draw_stored_row(dataset, number, kind) for number in numbers], out)
 
 
 class Preview:
-    """Video and contact sheet row of an episode that is being converted; see `open_preview`."""
+    """Writes the video of an episode during its conversion, and draws its contact sheet row."""
 
     def __init__(self, video: Any, drawing: EpisodeDrawer, *, row: bool) -> None:
         self.row: NDArray[np.uint8] | None = None
@@ -89,43 +95,48 @@ class Preview:
         self._video, self._drawing, self._wanted = video, drawing, drawing.row_steps if row else []
         self._shown: dict[int, Images] = {}
 
-    def add(self, step: int, rgb: Images) -> None:
-        """Add the RGB images of a step."""
-        self._video.append_data(self._drawing.frame(step, rgb, PREVIEW_PANEL))
+    def add_step(self, step: int, rgb: Images) -> None:
+        """Append the RGB images of the next step to the video."""
+        self._video.append_data(self._drawing.draw_frame(step, rgb, PREVIEW_PANEL))
         if step in self._wanted:
             self._shown[step] = rgb
             if step == self._wanted[-1]:
-                self.row, self._shown = self._drawing.row(self._shown), {}
+                self.row, self._shown = self._drawing.draw_row(self._shown), {}
 
 
 @contextmanager
 def open_preview(root: Path, drawing: EpisodeDrawer, *, row: bool) -> Iterator[Preview]:
-    """Open the preview of an episode; ``row``: with a row of the contact sheet."""
+    """Open the preview of an episode; ``row``: whether it also draws the contact sheet row."""
     path = make_folder(root / schema.PREVIEW_FOLDER) / f"{schema.episode_folder(drawing.number)}.mp4"
     with atomic_file(path) as tmp, open_video(tmp, drawing.rate_hz, *_PREVIEW_OPTIONS, quality=6) as video:
         yield Preview(video, drawing, row=row)
 
 
-def sheet_episodes(numbers: Iterable[int]) -> tuple[int, ...]:
+def select_sheet_episodes(numbers: Iterable[int]) -> tuple[int, ...]:
     """Return the numbers of the episodes on the contact sheet: the first ten."""
     return tuple(sorted(numbers)[:SHEET_EPISODES])
 
 
-def finish_previews(dataset: EpisodeSource, rows: dict[int, NDArray[np.uint8]]) -> None:
-    """Write the contact sheet of a dataset from new rows and, for other episodes, stored images."""
+def complete_contact_sheet(dataset: EpisodeSource, rows: dict[int, NDArray[np.uint8]]) -> None:
+    """Write the contact sheet of a dataset.
+
+    ``rows``: rows of newly written episodes, by number. The other rows are drawn from stored images.
+    """
     path = dataset.root / schema.PREVIEW_FOLDER / "contact_sheet.png"
     if rows or not path.is_file():
-        numbers = sheet_episodes(dataset.numbers)
-        _write_sheet([rows[number] if number in rows else _row(dataset, number) for number in numbers], path)
+        numbers = select_sheet_episodes(dataset.numbers)
+        _write_sheet(
+            [rows[number] if number in rows else _draw_stored_row(dataset, number) for number in numbers], path
+        )
 
 
-def _row(dataset: EpisodeSource, number: int, kind: ImageKind = "rgb") -> NDArray[np.uint8]:
+def _draw_stored_row(dataset: EpisodeSource, number: int, kind: ImageKind = "rgb") -> NDArray[np.uint8]:
     episode, shown = dataset.episode(number), {}
     drawing = EpisodeDrawer(number, episode.arrays, dataset.rate_hz)
     image = episode.rgb if kind == "rgb" else episode.depth
     for step in drawing.row_steps:
-        shown[step] = _coloured({camera: image(camera, step) for camera in episode.cameras}, kind)
-    return drawing.row(shown)
+        shown[step] = _colour_images({camera: image(camera, step) for camera in episode.cameras}, kind)
+    return drawing.draw_row(shown)
 
 
 def _write_sheet(rows: Sequence[NDArray[np.uint8]], path: Path | str) -> Path:
@@ -135,7 +146,7 @@ def _write_sheet(rows: Sequence[NDArray[np.uint8]], path: Path | str) -> Path:
 
 
 def colour_depth(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """Return depth in colours, (H, W, 3) RGB, on a log scale: near red, far blue, no depth black."""
+    """Convert depth (H, W) in mm to colours (H, W, 3) RGB on a log scale: near red, far blue, no depth black."""
     near, far = np.log(_NEAR_MM), np.log(_FAR_MM)
     fraction = np.clip((far - np.log(np.maximum(depth, 1))) / (far - near), 0, 1)
     colours = cv2.applyColorMap((fraction * 255).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
@@ -143,5 +154,5 @@ def colour_depth(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
     return colours.astype(np.uint8)
 
 
-def _coloured(images: Mapping[str, NDArray], kind: ImageKind) -> Images:
+def _colour_images(images: Mapping[str, NDArray], kind: ImageKind) -> Images:
     return {camera: image if kind == "rgb" else colour_depth(image) for camera, image in images.items()}

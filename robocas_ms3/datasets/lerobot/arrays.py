@@ -14,11 +14,11 @@ from robocas_ms3.demos.recordings.motion import compute_relative_motion
 from robocas_ms3.robots.quantities import feature_columns, lerobot_features
 
 
-def frame_columns(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
-    """Return the numeric features (T, D) of an episode from the arrays of ``episode_info.npz``."""
+def to_frame_columns(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
+    """Convert the arrays of ``episode_info.npz`` to the numeric LeRobot features (T, D), by key."""
     euler = Rotation.from_quat(arrays["rel_orn"].astype(np.float64)).as_euler("xyz")
     status = arrays["gripper_status"].astype(np.float32)[:, None]
-    command, joints = _next(status), _next(arrays["robot_joints"])
+    command, joints = _shift_to_next_step(status), _shift_to_next_step(arrays["robot_joints"])
     parts = {
         **{key: [arrays[one.name] for one in quantities] for key, quantities in lerobot_features().items()},
         "action": (arrays["rel_pos"], euler, command),
@@ -29,10 +29,14 @@ def frame_columns(arrays: dict[str, NDArray]) -> dict[str, NDArray]:
     return {key: np.concatenate(column, axis=1).astype(np.float32) for key, column in columns.items()}
 
 
-def robocas_arrays(
+def to_robocas_arrays(
     columns: dict[str, NDArray], instruction: str, subgoals: list[str], types: list[str]
 ) -> dict[str, NDArray]:
-    """Return the arrays of ``episode_info.npz`` without embeddings: the inverse of `frame_columns`."""
+    """Convert LeRobot features to the arrays of ``episode_info.npz``: the inverse of `to_frame_columns`.
+
+    ``columns`` are the numeric features (T, D), ``subgoals`` and ``types`` the text and type of the sub-goal per step.
+    Embeddings are missing, because LeRobot datasets do not have them.
+    """
     values: dict[str, Any] = {
         "rel_pos": columns["action"][:, :3],
         "rel_agv_pose": columns["action.base"],
@@ -54,5 +58,5 @@ def robocas_arrays(
     return {spec.name: spec.cast(values[spec.name]) for spec in EPISODE_INFO if spec.name in values}
 
 
-def _next(values: NDArray) -> NDArray:
+def _shift_to_next_step(values: NDArray) -> NDArray:
     return np.concatenate([values[1:], values[-1:]])

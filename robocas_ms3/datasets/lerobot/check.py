@@ -12,34 +12,35 @@ from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets.checks.dataset import ValidationReport
-from robocas_ms3.datasets.checks.violation import Violation, check_form, read_object
+from robocas_ms3.datasets.checks.violation import Violation, check_model, read_json_object
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.datasets.lerobot.check_frames import TOLERANCE, KeyViolation, Ranges, check_data, unexpected_files
+from robocas_ms3.datasets.lerobot.check_frames import TOLERANCE, KeyViolation, Ranges, check_data, find_unexpected_files
 from robocas_ms3.datasets.lerobot.file_models import MAX_EPISODES, MAX_FRAMES, InfoRecord, StatsLine, read_lines
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.stats import QUANTILES
-from robocas_ms3.datasets.lerobot.video import packet_times, read_frames
+from robocas_ms3.datasets.lerobot.video import read_frames, read_packet_times
 from robocas_ms3.datasets.sources.file_models import SceneRecord
 
 _MATROSKA_TOLERANCE = 0.6e-3  # s; Matroska rounds to milliseconds
 _STATISTICS = ("min", "max", "mean", "std", "count")
-_MOST = {"total_episodes": MAX_EPISODES, "total_tasks": MAX_EPISODES, "total_frames": MAX_FRAMES}
+_MAX_TOTALS = {"total_episodes": MAX_EPISODES, "total_tasks": MAX_EPISODES, "total_frames": MAX_FRAMES}
 
 
 def check_lerobot(
     root: str | Path, *, decode: bool = False, on_episode: Callable[[int, int], None] | None = None
 ) -> ValidationReport:
-    """Check a LeRobot dataset; checks of RoboCAS features apply only to datasets that have them.
+    """Check a LeRobot dataset and list all violations.
 
-    ``decode`` decodes all frames; otherwise frames are counted. The decoders of FFmpeg conceal damage inside a video,
-    which the checksums of datasets of ``robocas convert`` reveal.
+    RoboCAS features are checked only in datasets that have them. ``decode``: decode all video frames, not only count
+    them. FFmpeg conceals damage inside a video; the checksums that ``robocas convert`` writes reveal it.
+    ``on_episode`` is called with (done, total) after each episode.
 
     Raises:
         MissingExtraError: the extra ``lerobot`` is not installed.
     """
     schema.require_lerobot()
     root = Path(root)
-    info, wrong = read_object(root, schema.INFO_FILE, InfoRecord, absent="JSON")
+    info, wrong = read_json_object(root, schema.INFO_FILE, InfoRecord, expected_file="JSON")
     features = {} if wrong else info["features"]
     for declared in schema.FEATURES if set(schema.ROBOCAS_KEYS) <= set(features) else ():
         if (shape := features[declared.key]["shape"]) != [declared.width]:
@@ -69,9 +70,9 @@ def check_lerobot(
 
 
 def _check_totals(dataset: LeRobotDataset) -> Iterator[Violation]:
-    """Check ``info.json`` against the rows of episodes; set the totals of ``info`` to those of the tables."""
-    declared = {key: dataset.info[key] for key in _MOST}
-    dataset.info.update(_MOST)  # limits of what is read
+    """Check the totals of ``info.json`` against the tables; then set ``dataset.info`` to the totals found."""
+    declared = {key: dataset.info[key] for key in _MAX_TOTALS}
+    dataset.info.update(_MAX_TOTALS)  # limits of what is read
     rows, tasks = dataset.rows, dataset.tasks
     start = 0
     for index, row in enumerate(rows):
@@ -85,24 +86,26 @@ def _check_totals(dataset: LeRobotDataset) -> Iterator[Violation]:
         if declared[key] != found:
             yield Violation(schema.INFO_FILE, key, str(found), str(declared[key]))
     if len(set(tasks)) != len(tasks):
-        name = schema.TASKS_LINES if dataset.layout.one_file_per_episode else schema.TASKS_FILE
+        name = schema.TASKS_LINES if dataset.file_layout.one_file_per_episode else schema.TASKS_FILE
         yield Violation(name, "", "each text once", "repeated texts")
 
 
 def _check_videos(dataset: LeRobotDataset, key: str, decode: bool) -> Iterator[Violation]:
-    """Check the videos of a feature, and the FFV1 depth videos of its camera."""
-    root, layout, fps = dataset.root, dataset.layout, dataset.info["fps"]
-    size, extra = dataset.info["features"][key]["shape"][:2], f"depth/{schema.camera_of(key)}"
+    """Check the video files of a feature, and the separate FFV1 depth files of its camera."""
+    root, layout, fps = dataset.root, dataset.file_layout, dataset.info["fps"]
+    size, extra = dataset.info["features"][key]["shape"][:2], f"depth/{schema.camera_name(key)}"
     has_extra = any(f"{extra}/file_index" in row for row in dataset.rows)
     for prefix in (f"videos/{key}", extra) if has_extra else (f"videos/{key}",):
-        by_file = dataset.files(prefix)
+        by_file = dataset.rows_by_file(prefix)
         for path, inside in by_file.items():
             yield from _check_times(inside, prefix, fps)
             frames, name = sum(row["length"] for row in inside), str(path.relative_to(root))
-            yield from (Violation(name, *violation) for violation in _video_violations(path, frames, fps, size, decode))
-        folder = layout.path(root, prefix, 0, 0).parent  # chunk-000, or below it
+            yield from (
+                Violation(name, *violation) for violation in _find_video_violations(path, frames, fps, size, decode)
+            )
+        folder = layout.file_path(root, prefix, 0, 0).parent  # chunk-000, or below it
         chunks = folder.parent.parent.glob(f"*/{folder.name}") if layout.one_file_per_episode else [folder.parent]
-        yield from unexpected_files(root, chunks, by_file)
+        yield from find_unexpected_files(root, chunks, by_file)
 
 
 def _check_times(rows: list[dict[str, Any]], prefix: str, fps: int) -> Iterator[Violation]:
@@ -116,9 +119,9 @@ def _check_times(rows: list[dict[str, Any]], prefix: str, fps: int) -> Iterator[
         first += row["length"]
 
 
-def _video_violations(path: Path, frames: int, fps: int, size: list[int], decode: bool) -> Iterator[KeyViolation]:
+def _find_video_violations(path: Path, frames: int, fps: int, size: list[int], decode: bool) -> Iterator[KeyViolation]:
     try:
-        times, about = packet_times(path, frames)
+        times, about = read_packet_times(path, frames)
         if decode and len(times) == frames:
             for _ in read_frames(path, 0, frames, fps):
                 pass
@@ -137,20 +140,20 @@ def _video_violations(path: Path, frames: int, fps: int, size: list[int], decode
 
 
 def _check_statistics(dataset: LeRobotDataset, ranges: Ranges) -> Iterator[Violation]:
-    if dataset.layout.one_file_per_episode:
-        yield from _check_lines(dataset)
+    if dataset.file_layout.one_file_per_episode:
+        yield from _check_episode_statistics(dataset)
         if not (dataset.root / schema.STATS_FILE).exists():  # optional in this format
             return
-    stats, wrong = read_object(dataset.root, schema.STATS_FILE, absent="JSON")
+    stats, wrong = read_json_object(dataset.root, schema.STATS_FILE, expected_file="JSON")
     yield from wrong
     for key, feature in dataset.info["features"].items() if not wrong else ():
         if feature["dtype"] not in ("string", "language"):
-            for name, expected, found in _statistics_violations(stats.get(key), feature, ranges.get(key)):
+            for name, expected, found in _find_statistics_violations(stats.get(key), feature, ranges.get(key)):
                 yield Violation(schema.STATS_FILE, f"{key}, {name}" if name else key, expected, found)
 
 
-def _statistics_violations(found: Any, feature: Mapping[str, Any], seen: Any) -> Iterator[KeyViolation]:
-    """Yield name, expected and found of invalid statistics; ``seen`` is the range in the data."""
+def _find_statistics_violations(found: Any, feature: Mapping[str, Any], data_range: Any) -> Iterator[KeyViolation]:
+    """Yield (name, expected, found) per invalid statistic; ``data_range``: min, max and count in the data."""
     try:
         values = {name: np.asarray(found[name], np.float64) for name in (*_STATISTICS, *QUANTILES)}
     except (LookupError, TypeError, ValueError) as error:
@@ -169,21 +172,21 @@ def _statistics_violations(found: Any, feature: Mapping[str, Any], seen: Any) ->
         if not ((least <= array) & (array <= most)).all():  # NaN too
             yield name, "between min and max", str(array.tolist())[:80]
             return
-    if seen:
-        same = np.allclose(low, seen[0], atol=1e-6) and np.allclose(high, seen[1], atol=1e-6)
-        if not same or count.tolist() != [seen[2]]:
-            expected = f"min {seen[0].tolist()}, max {seen[1].tolist()}, count {seen[2]}"
+    if data_range:
+        same = np.allclose(low, data_range[0], atol=1e-6) and np.allclose(high, data_range[1], atol=1e-6)
+        if not same or count.tolist() != [data_range[2]]:
+            expected = f"min {data_range[0].tolist()}, max {data_range[1].tolist()}, count {data_range[2]}"
             yield "", expected, f"min {low.tolist()}, max {high.tolist()}, count {count.tolist()}"
 
 
-def _check_lines(dataset: LeRobotDataset) -> Iterator[Violation]:
+def _check_episode_statistics(dataset: LeRobotDataset) -> Iterator[Violation]:
     features = {key for key, feature in dataset.info["features"].items() if feature["dtype"] not in ("string", "image")}
     try:
         lines = read_lines(dataset.root / schema.STATS_LINES, StatsLine, len(dataset.rows))
     except DatasetError as error:
         yield Violation(schema.STATS_LINES, "", "readable lines", one_line(error))
         return
-    if sorted(line.episode_index for line in lines) != sorted(dataset.row_of):
+    if sorted(line.episode_index for line in lines) != sorted(dataset.row_by_episode):
         yield Violation(schema.STATS_LINES, "episode_index", "each episode once", "other episodes")
     for line in lines:
         missing = sorted(key for key in features if not set(line.stats.get(key, {})) >= set(_STATISTICS))
@@ -193,23 +196,23 @@ def _check_lines(dataset: LeRobotDataset) -> Iterator[Violation]:
 
 
 def _check_robocas_files(dataset: LeRobotDataset) -> Iterator[Violation]:
-    """Check split, scenes and cameras in the RoboCAS files of a dataset, if it has them."""
-    name, scene_texts = schema.SCENES_FILE, {}
+    """Check split, scenes and cameras in ``meta/robocas``; other LeRobot datasets lack that folder."""
+    name, scene_json_texts = schema.SCENES_FILE, {}
     try:
         _ = dataset.split("train"), dataset.split("val")
     except DatasetError as error:
         yield Violation(schema.CONVERSION_FILE, "", "valid content", one_line(error))
     try:
-        scene_texts = dataset.scene_texts
+        scene_json_texts = dataset.scene_json_texts
     except DatasetError as error:
         yield Violation(name, "", "valid content", one_line(error))
-    if scene_texts and scene_texts.keys() != dataset.row_of.keys():
-        found = sorted(scene_texts.keys() ^ dataset.row_of.keys())[:5]
+    if scene_json_texts and scene_json_texts.keys() != dataset.row_by_episode.keys():
+        found = sorted(scene_json_texts.keys() ^ dataset.row_by_episode.keys())[:5]
         yield Violation(name, "episode_index", "the episodes of the dataset", f"{found} added or missing")
-    for number in sorted(scene_texts.keys() & dataset.row_of.keys()):
+    for number in sorted(scene_json_texts.keys() & dataset.row_by_episode.keys()):
         try:
             episode = dataset.episode(number)
-            yield from check_form(SceneRecord, episode.scene, f"{name}, episode {number}")
+            yield from check_model(SceneRecord, episode.scene, f"{name}, episode {number}")
             for camera in dataset.cameras:
                 episode.intrinsic(camera)
         except DatasetError as error:
@@ -219,14 +222,14 @@ def _check_robocas_files(dataset: LeRobotDataset) -> Iterator[Violation]:
 def _check_checksums(root: Path) -> Iterator[Violation]:
     if not (root / schema.CHECKSUMS_FILE).is_file():
         return
-    sums, wrong = read_object(root, schema.CHECKSUMS_FILE)
+    sums, wrong = read_json_object(root, schema.CHECKSUMS_FILE)
     yield from wrong
     for name, expected in sums.items():
         if name.partition("/")[0] not in schema.CONTENT or ".." in Path(name).parts:
             yield Violation(schema.CHECKSUMS_FILE, name, f"a file in {', '.join(schema.CONTENT)}", "another path")
             continue
         try:
-            found = schema.checksum(root / name)
+            found = schema.compute_checksum(root / name)
         except (OSError, DocumentError) as error:
             found = one_line(error)
         if found != expected:

@@ -17,11 +17,11 @@ from robocas_ms3.core.text import format_count, one_line
 from robocas_ms3.datasets.checks import arrays as array_checks
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.datasets.lerobot.arrays import frame_columns, robocas_arrays
+from robocas_ms3.datasets.lerobot.arrays import to_frame_columns, to_robocas_arrays
 from robocas_ms3.datasets.lerobot.file_models import declared_columns
-from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, Row, box_in, read_rows_of
+from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, Row, parse_box, read_language_rows
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
-from robocas_ms3.datasets.lerobot.tables import column_violations, numbers, open_table, read_rows
+from robocas_ms3.datasets.lerobot.tables import find_column_violations, open_table, read_episode_rows, to_array
 from robocas_ms3.datasets.sources.arrays import EpisodeArrays
 
 TOLERANCE = 1e-4
@@ -41,23 +41,26 @@ _CAMERA_STYLES = {"vqa", "trace"}
 def check_data(
     dataset: LeRobotDataset, texts: Texts, on_episode: Callable[[int, int], None]
 ) -> tuple[list[Violation], Ranges]:
-    """Return the violations in all frames, and the ranges of the numeric features."""
-    root, features, by_file = dataset.root, dataset.info["features"], dataset.files("data")
+    """Check all frames; return the violations, and the range of each numeric feature in the data.
+
+    ``on_episode`` is called with (done, total) after each episode.
+    """
+    root, features, by_file = dataset.root, dataset.info["features"], dataset.rows_by_file("data")
     violations: list[Violation] = []
     ranges: Ranges = {}
     done = 0
     for path, rows in by_file.items():
         name = str(path.relative_to(root))
         try:
-            wrong = list(_file_violations(path, rows, features))
+            wrong = list(_check_table_file(path, rows, features))
             violations += [Violation(name, *violation) for violation in wrong]
             for row in [] if wrong else rows:  # one at a time, to bound memory
-                table, where = read_rows(path, row["episode_index"]), f"episode {row['episode_index']}"
-                if wrong := list(column_violations(table, declared_columns(features))):
+                table, where = read_episode_rows(path, row["episode_index"]), f"episode {row['episode_index']}"
+                if wrong := list(find_column_violations(table, declared_columns(features))):
                     violations += [Violation(name, *violation) for violation in wrong]
                     break
                 numeric = [key for key, feature in features.items() if feature["dtype"] not in schema.NOT_NUMERIC]
-                columns = {key: numbers(table.column(key)) for key in numeric}
+                columns = {key: to_array(table.column(key)) for key in numeric}
                 wrong = list(_check_episode(table, columns, row, dataset.info, texts))
                 if dataset.has_language:
                     wrong += check_language(table, name, dataset.info)
@@ -65,22 +68,22 @@ def check_data(
                     Violation(name, f"{where}, {key}" if key else where, expected, found)
                     for key, expected, found in wrong
                 ]
-                _widen(ranges, columns, features)
+                _extend_ranges(ranges, columns, features)
                 done += 1
                 on_episode(done, len(dataset.rows))
         except DatasetError as error:
             violations.append(Violation(name, "", "a readable table", one_line(error)))
-    return [*violations, *unexpected_files(root, [root / "data"], by_file)], ranges
+    return [*violations, *find_unexpected_files(root, [root / "data"], by_file)], ranges
 
 
-def unexpected_files(root: Path, folders: Iterable[Path], known: Container[Path]) -> Iterator[Violation]:
-    """Yield the files in some folders that are not known files of the dataset."""
+def find_unexpected_files(root: Path, folders: Iterable[Path], known: Container[Path]) -> Iterator[Violation]:
+    """Yield a violation for each file in ``folders`` that is not in ``known``."""
     for path in sorted(path for folder in folders for path in folder.rglob("*") if path.is_file()):
         if path not in known:
-            yield Violation(str(path.relative_to(root)), "", "files of episodes only", "a file of no episode")
+            yield Violation(str(path.relative_to(root)), "", "only files of episodes", "a file of no episode")
 
 
-def _file_violations(path: Path, rows: list[dict[str, Any]], features: Mapping[str, Any]) -> Iterator[KeyViolation]:
+def _check_table_file(path: Path, rows: list[dict[str, Any]], features: Mapping[str, Any]) -> Iterator[KeyViolation]:
     wanted = sorted(key for key, feature in features.items() if feature["dtype"] != "video")
     count = sum(row["length"] for row in rows)
     with open_table(path) as file:
@@ -91,16 +94,16 @@ def _file_violations(path: Path, rows: list[dict[str, Any]], features: Mapping[s
         yield "rows", str(count), str(found)
 
 
-def _widen(ranges: Ranges, columns: Columns, features: Mapping[str, Any]) -> None:
-    """Extend the ranges by an episode; features with NaN or infinite values are ignored."""
+def _extend_ranges(ranges: Ranges, columns: Columns, features: Mapping[str, Any]) -> None:
+    """Extend ``ranges`` by the values of an episode; features with NaN or infinite values are ignored."""
     for key, values in columns.items():
-        if len(values) and not _number_violation(values, features[key]):
+        if len(values) and not _find_number_violation(values, features[key]):
             low, high, count = ranges.get(key, (values[0], values[0], 0))
             ranges[key] = np.minimum(low, values.min(axis=0)), np.maximum(high, values.max(axis=0)), count + len(values)
 
 
-def _number_violation(values: NDArray, feature: Mapping[str, Any]) -> tuple[str, str] | None:
-    """Return expected and found, if the width is wrong or a number is NaN or infinite."""
+def _find_number_violation(values: NDArray, feature: Mapping[str, Any]) -> tuple[str, str] | None:
+    """Return (expected, found) if the width is wrong or a number is NaN or infinite, None otherwise."""
     if values.shape[1] != int(np.prod(feature["shape"])):
         return f"{feature['shape']} numbers", str(values.shape[1])
     wrong = np.argwhere(~np.isfinite(values))
@@ -110,13 +113,15 @@ def _number_violation(values: NDArray, feature: Mapping[str, Any]) -> tuple[str,
 def _check_episode(
     table: pa.Table, columns: Columns, row: Mapping[str, Any], info: Mapping[str, Any], texts: Texts
 ) -> Iterator[KeyViolation]:
-    """Check indices, timestamps, texts and outcome of an episode, and that features are consistent."""
+    """Check indices, timestamps, texts, outcome and values of an episode."""
     length = row["length"]
     if len(table) != length:
         yield "", format_count(length, "frame"), str(len(table))
         return
     wrong = [
-        (key, *fault) for key, found in columns.items() if (fault := _number_violation(found, info["features"][key]))
+        (key, *fault)
+        for key, found in columns.items()
+        if (fault := _find_number_violation(found, info["features"][key]))
     ]
     yield from wrong
     steps = np.arange(length)
@@ -164,30 +169,30 @@ def _check_texts(columns: Columns, tasks: list[str], texts: Texts) -> Iterator[K
 
 
 def _check_content(columns: Columns, types: list[Any], instruction: str) -> Iterator[KeyViolation]:
-    """Check values by the rules of RoboCAS folders, and that each action leads to the next state."""
+    """Check the values with the rules of RoboCAS folders, and that each action leads to the next state."""
     arrays: dict[str, NDArray] = {"step_goal_type": np.array([str(kind) for kind in types], np.str_)}
     if set(schema.ROBOCAS_KEYS) <= set(columns):
         try:
-            arrays = robocas_arrays(dict(columns), instruction, [], arrays["step_goal_type"].tolist())
+            arrays = to_robocas_arrays(dict(columns), instruction, [], arrays["step_goal_type"].tolist())
         except ValueError as error:  # a quaternion of length 0
             yield "observation.state, observation.arm_base", "unit quaternions", one_line(error)
             return
-        again, command = frame_columns(arrays), columns["action"]
+        again, command = to_frame_columns(arrays), columns["action"]
         if not np.array_equal(command[:, -1], again["action"][:, -1]):
             yield "action", "the gripper command of the next step", "other values"
         if not np.array_equal(columns["action.joint"], again["action.joint"]):
             yield "action.joint", "joints and gripper of the next step", "other values"
         arrays["rel_orn"] = Rotation.from_euler("xyz", command[:, 3:6]).as_quat()
-    for wrong in array_checks.violations_of(
-        EpisodeArrays(Path(), arrays), (array_checks.check_units, *array_checks.CONTENT)
+    for wrong in array_checks.run_checks(
+        EpisodeArrays(Path(), arrays), (array_checks.check_units, *array_checks.CONTENT_CHECKS)
     ):
         key = schema.SUBGOAL_TYPE.key if wrong.key == "step_goal_type" else wrong.key
         yield key, wrong.expected, wrong.found
 
 
 def check_language(table: pa.Table, file: str, info: Mapping[str, Any]) -> Iterator[KeyViolation]:
-    """Check the language rows of an episode, including those of ``lerobot-annotate``."""
-    persistent, events = (read_rows_of(table, key, file) for key in (PERSISTENT, EVENTS))
+    """Check the language rows of an episode, which ``robocas convert`` or ``lerobot-annotate`` has written."""
+    persistent, events = (read_language_rows(table, key, file) for key in (PERSISTENT, EVENTS))
     if any(rows != persistent[0] for rows in persistent[1:]):
         yield PERSISTENT, "the same rows in each frame", "different rows"
         return
@@ -221,7 +226,7 @@ def _check_events(rows: list[Row], features: Mapping[str, Any]) -> Iterator[tupl
             continue
         elif camera not in features or features[camera]["dtype"] not in ("video", "image"):
             yield "a camera of the dataset", str(camera)
-        elif row["role"] == "assistant" and (box := box_in(row["content"])):
+        elif row["role"] == "assistant" and (box := parse_box(row["content"])):
             height, width = features[camera]["shape"][:2]
             left, top, right, bottom = box
             if not (0 <= left <= right < width and 0 <= top <= bottom < height):

@@ -19,8 +19,8 @@ from robocas_ms3.core.output_folder import FolderKind, OutputFolder, remove_left
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.core.text import format_count
 from robocas_ms3.datasets.conversion.conversion_input import ConversionInput, open_input
-from robocas_ms3.datasets.conversion.episode_plan import SKIPPED, add_versions
-from robocas_ms3.datasets.conversion.settings import Conversion, ConversionSettings, WrittenEpisode
+from robocas_ms3.datasets.conversion.episode_plan import SKIPPED_KEY, add_versions
+from robocas_ms3.datasets.conversion.settings import ConversionResult, ConversionSettings, WrittenEpisode
 from robocas_ms3.datasets.conversion.workers import PendingEpisodes, write_episodes
 from robocas_ms3.datasets.lerobot.schema import (
     CONTENT,
@@ -30,7 +30,7 @@ from robocas_ms3.datasets.lerobot.schema import (
     FileLimits,
     check_video_size,
     require_lerobot,
-    whole_rate,
+    to_integer_rate,
 )
 from robocas_ms3.datasets.lerobot.variants import Variant, find_variant
 from robocas_ms3.datasets.schema import episode_folder
@@ -38,12 +38,12 @@ from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.recordings.trajectory_json import package_versions
 
 FILE_LIMITS = FileLimits()
-_PARTS, _JOINED = ".parts", ".joined"  # folders of finished episodes, and of the dataset being joined
+_EPISODES, _JOINED = ".episodes", ".joined"  # folders of finished episodes, and of the dataset being joined
 _OUTPUT = FolderKind(
     "robocas convert --to lerobot",
-    (f"{_PARTS}/plan.json", CONVERSION_FILE),
+    (f"{_EPISODES}/plan.json", CONVERSION_FILE),
     "settings",
-    markers=(INFO_FILE, _PARTS),
+    markers=(INFO_FILE, _EPISODES),
     upgrade=add_versions,
 )
 _FOLDERS = (*CONTENT, STAGING, "meta")  # meta is last: its presence marks a complete dataset
@@ -56,12 +56,13 @@ def convert_lerobot(
     *,
     on_start: Callable[[int], None] | None = None,
     on_episode: Callable[[WrittenEpisode], None] | None = None,
-) -> Conversion:
+) -> ConversionResult:
     """Write a LeRobot dataset from a trajectory file or a dataset with images.
 
-    Episodes are written into ``out/.parts`` and joined at the end, without encoding again. The same call continues an
-    interrupted conversion, with the same result. The folder ``meta`` appears last. ``on_start`` is called with the
-    number of episodes to write, ``on_episode`` after each episode.
+    Each episode is written into a temporary episode folder in ``out/.episodes``. At the end the episodes are joined
+    without encoding the videos again. The same call continues an interrupted conversion, with the same result.
+    The folder ``meta`` appears last. ``on_start`` is called with the number of episodes to write, ``on_episode`` after
+    each episode.
 
     Raises:
         DatasetError: the input is damaged or has no episodes to convert, the version or rate is invalid, or there is
@@ -77,33 +78,33 @@ def convert_lerobot(
     settings = replace(settings, boxes=variant.language)
     written: list[WrittenEpisode] = []
     with closing(open_input(settings)) as conversion_input:
-        plan = _plan(conversion_input, settings.codec, variant)
+        plan = _make_plan(conversion_input, settings.codec, variant)
         recorded_settings = {key: plan[key] for key in ("settings", "made_with")}
         with OutputFolder(out, _OUTPUT, recorded_settings, overwrite=settings.overwrite) as output:
             _check_episodes(output, plan)  # everything that may fail runs before the output changes
-            settings.check_device()
+            settings.require_renderer()
             if output.recorded is None or not (out / INFO_FILE).is_file():
                 output.start(plan)
                 for name in (_JOINED, *_FOLDERS):  # incomplete, from an interrupted conversion
                     if os.path.lexists(out / name):
                         delete_path(out / name)
-                remove_leftovers(out / _PARTS)
-                job = _missing_parts(settings, variant, plan["episodes"])
+                remove_leftovers(out / _EPISODES)
+                pending = _find_missing_episodes(settings, variant, plan["episodes"])
                 if on_start:
-                    on_start(len(job.tasks))
-                written, incomplete = write_episodes(job, output, on_episode)
+                    on_start(len(pending.tasks))
+                written, incomplete = write_episodes(pending, output, on_episode)
                 if incomplete and not settings.skip_errors:
                     raise incomplete
                 if incomplete:
                     _log.warning("%s", incomplete)
-                    plan = _without_missing(plan, out / _PARTS, incomplete)
+                    plan = _drop_missing_episodes(plan, out / _EPISODES, incomplete)
                 _join(out, plan)
-            for name in (_PARTS, _JOINED):
+            for name in (_EPISODES, _JOINED):
                 shutil.rmtree(out / name, ignore_errors=True)
-    return Conversion(written, len(plan["episodes"]) - len(written), time.perf_counter() - start)
+    return ConversionResult(written, len(plan["episodes"]) - len(written), time.perf_counter() - start)
 
 
-def _plan(conversion_input: ConversionInput, codec: str, variant: Variant) -> dict[str, Any]:
+def _make_plan(conversion_input: ConversionInput, codec: str, variant: Variant) -> dict[str, Any]:
     entries, image_options = conversion_input.entries(), conversion_input.image_options
     place = {entry["source"]: i for i, entry in enumerate(entries)}
     # a dataset keeps its split, a trajectory file has none
@@ -115,7 +116,7 @@ def _plan(conversion_input: ConversionInput, codec: str, variant: Variant) -> di
         "made_with": package_versions(),
         "settings": {
             "lerobot_version": variant.version,
-            "rate_hz": whole_rate(conversion_input.source.rate_hz),
+            "rate_hz": to_integer_rate(conversion_input.source.rate_hz),
             "cameras": list(image_options.cameras),
             "depth": image_options.depth,
             "codec": codec,
@@ -129,35 +130,41 @@ def _plan(conversion_input: ConversionInput, codec: str, variant: Variant) -> di
 
 
 def _check_episodes(output: OutputFolder, plan: Mapping[str, Any]) -> None:
-    """Check that the output has the same episodes; unreadable recordings may have become readable."""
+    """Raise OutputExistsError if the output has other episodes than the plan.
+
+    A recording that could not be read before may be readable now.
+    """
     from robocas_ms3.datasets.lerobot.file_models import ConversionRecord
 
     if output.recorded is None:
         return
     parse(ConversionRecord, output.recorded, DatasetError, where=output.path)
     recorded, now = output.recorded.get("episodes", []), plan["episodes"]
-    listed = sorted([*recorded, *output.recorded.get(SKIPPED, [])], key=lambda entry: entry.get("source") or 0)
-    if len(listed) != len(now) or not all(map(_is_same, listed, now)):
+    listed = sorted([*recorded, *output.recorded.get(SKIPPED_KEY, [])], key=lambda entry: entry.get("source") or 0)
+    if len(listed) != len(now) or not all(map(_is_same_recording, listed, now)):
         what, expected = "this dataset has other episodes", format_count(len(recorded), "episode")
+        found = f"{len(now)}" if len(listed) != len(now) else "other recordings"
         fix = "Choose another folder, or pass --overwrite to start again."
-        raise OutputExistsError(what, where=output.path, expected=expected, found=f"{len(now)}", fix=fix)
+        raise OutputExistsError(what, where=output.path, expected=expected, found=found, fix=fix)
 
 
-def _is_same(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
+def _is_same_recording(stored: Mapping[str, Any], current: Mapping[str, Any]) -> bool:
     keys = ["source", "trajectory", "trajectory_episode", "seed"]
-    if before.get("recording") is not None:
+    if stored.get("recording") is not None:
         keys.append("recording")
-    return all(before.get(key) == now[key] for key in keys)
+    return all(stored.get(key) == current[key] for key in keys)
 
 
-def _missing_parts(settings: ConversionSettings, variant: Variant, episodes: list[dict[str, Any]]) -> PendingEpisodes:
-    from robocas_ms3.datasets.lerobot.parts import EpisodePart, PartWriter
+def _find_missing_episodes(
+    settings: ConversionSettings, variant: Variant, episodes: list[dict[str, Any]]
+) -> PendingEpisodes:
+    from robocas_ms3.datasets.lerobot.temporary_episode import TemporaryEpisode, TemporaryEpisodeWriter
 
-    writer = PartWriter(settings.out / _PARTS, settings.codec, variant)
+    writer = TemporaryEpisodeWriter(settings.out / _EPISODES, settings.codec, variant)
     missing = []
     for number, entry in enumerate(episodes):
         folder = writer.folder(number)
-        if folder.is_dir() and not EpisodePart(folder).is_complete:
+        if folder.is_dir() and not TemporaryEpisode(folder).is_complete:
             _log.warning("%s is damaged; its episode is written again", folder)
             shutil.rmtree(folder)
         if not folder.is_dir():
@@ -165,24 +172,26 @@ def _missing_parts(settings: ConversionSettings, variant: Variant, episodes: lis
     return PendingEpisodes(settings, writer, missing, len(missing) < len(episodes), _FIX)
 
 
-def _without_missing(plan: dict[str, Any], parts: Path, incomplete: IncompleteDatasetError) -> dict[str, Any]:
-    """Return the plan of the existing parts; missing episodes are under ``skipped`` with the reason."""
+def _drop_missing_episodes(
+    plan: dict[str, Any], episodes_folder: Path, incomplete: IncompleteDatasetError
+) -> dict[str, Any]:
+    """Return the plan without episodes that could not be written; they move to ``skipped`` with the reason."""
     episodes = list(enumerate(plan["episodes"]))
-    present = [number for number, _ in episodes if (parts / episode_folder(number)).is_dir()]
+    present = [number for number, _ in episodes if (episodes_folder / episode_folder(number)).is_dir()]
     place = {number: new for new, number in enumerate(present)}
     split = {key: [place[number] for number in plan[key] if number in place] for key in ("train_eps", "val_eps")}
     reasons = incomplete.reasons
     skipped = [{**entry, "reason": reasons.get(episode_folder(n))} for n, entry in episodes if n not in place]
-    return {**plan, **split, "episodes": [entry for n, entry in episodes if n in place], SKIPPED: skipped}
+    return {**plan, **split, "episodes": [entry for n, entry in episodes if n in place], SKIPPED_KEY: skipped}
 
 
 def _join(out: Path, plan: Mapping[str, Any]) -> None:
-    from robocas_ms3.datasets.lerobot.writer import join_parts
+    from robocas_ms3.datasets.lerobot.writer import join_episodes
 
     joined = make_folder(out / _JOINED)
     with add_path_to_errors(joined):
-        join_parts(sorted((out / _PARTS).glob("episode_*")), plan, joined, FILE_LIMITS)
-        flush_to_disk(joined)  # before the parts are removed
+        join_episodes(sorted((out / _EPISODES).glob("episode_*")), plan, joined, FILE_LIMITS)
+        flush_to_disk(joined)  # before the temporary episode folders are removed
     for name in _FOLDERS:
         if (joined / name).is_dir():
             os.replace(joined / name, out / name)

@@ -43,13 +43,13 @@ _Four = Annotated[list[Annotated[float, Field(allow_inf_nan=False)]], Field(min_
 
 
 class _Record(BaseModel):
-    """Model with strict types; other writers may add keys."""
+    """Base class of the models: types are strict, additional keys are accepted."""
 
     model_config = ConfigDict(strict=True, extra="allow")
 
 
 class FeatureRecord(_Record):
-    """Feature in ``info.json``."""
+    """Entry of a feature in ``info.json``."""
 
     dtype: Dtype
     shape: Annotated[list[Annotated[int, Field(ge=1, le=2**14)]], Field(min_length=1, max_length=4)]
@@ -64,7 +64,7 @@ def _check_version(version: str) -> str:
 
 
 class InfoRecord(_Record):
-    """Content of ``meta/info.json``; only the path patterns of LeRobot are accepted."""
+    """Content of ``meta/info.json``; its path patterns must be those of LeRobot."""
 
     codebase_version: Annotated[str, AfterValidator(_check_version)]
     robot_type: str | None = None
@@ -100,7 +100,7 @@ class InfoRecord(_Record):
 
 
 class EpisodeLine(_Record):
-    """Line of ``meta/episodes.jsonl``."""
+    """Line of ``meta/episodes.jsonl``: an episode of format v2.1."""
 
     episode_index: Annotated[int, Field(ge=0, lt=MAX_EPISODES)]
     tasks: list[str]
@@ -108,14 +108,14 @@ class EpisodeLine(_Record):
 
 
 class TaskLine(_Record):
-    """Line of ``meta/tasks.jsonl``."""
+    """Line of ``meta/tasks.jsonl``: an instruction of format v2.1."""
 
     task_index: Annotated[int, Field(ge=0, lt=MAX_EPISODES)]
     task: str
 
 
 class StatsLine(_Record):
-    """Line of ``meta/episodes_stats.jsonl``."""
+    """Line of ``meta/episodes_stats.jsonl``: statistics of an episode of format v2.1."""
 
     episode_index: Annotated[int, Field(ge=0, lt=MAX_EPISODES)]
     stats: dict[str, dict[str, Any]]
@@ -124,26 +124,30 @@ class StatsLine(_Record):
 _Line = TypeVar("_Line", bound=_Record)
 
 
-def read_lines(path: Path, form: type[_Line], most: int) -> list[_Line]:
-    """Read the JSON lines of a file as models; raise DatasetError for more than ``most`` lines."""
+def read_lines(path: Path, model: type[_Line], max_lines: int) -> list[_Line]:
+    """Read a file of JSON lines and validate each line with ``model``.
+
+    Raises:
+        DatasetError: the file is damaged or has more than ``max_lines`` lines.
+    """
     try:
         lines = [line for line in read_text(path, JSON_LIMIT).split("\n") if line.strip()]
-        if len(lines) > most:
-            raise DatasetError("too many lines", where=path, expected=f"at most {most}", found=len(lines))
+        if len(lines) > max_lines:
+            raise DatasetError("too many lines", where=path, expected=f"at most {max_lines}", found=len(lines))
         values = [decode_json(line) for line in lines]
     except (OSError, ValueError) as error:
         raise DatasetError("the JSON lines can't be read", where=path, found=one_line(error)) from error
-    return [parse(form, found, DatasetError, where=f"{path}, line {n}") for n, found in enumerate(values, 1)]
+    return [parse(model, found, DatasetError, where=f"{path}, line {n}") for n, found in enumerate(values, 1)]
 
 
 class SourceEntryRecord(EntryRecord):
-    """Recording of an episode, and its number in the source of the conversion."""
+    """Entry of an episode in ``conversion.json``, with its number in the source of the conversion."""
 
     source: NonNegativeInt | None = None
 
 
 class ConversionRecord(_Record):
-    """Content of ``meta/robocas/conversion.json``, and plan of an interrupted conversion."""
+    """Content of ``meta/robocas/conversion.json``; also the plan of an unfinished conversion."""
 
     made_with: dict[str, str] = {}
     settings: dict[str, Any] = {}
@@ -154,7 +158,7 @@ class ConversionRecord(_Record):
 
 
 class CameraRecord(_Record):
-    """Camera of an episode in ``meta/robocas/episodes.parquet``; see `CameraModel`."""
+    """Intrinsics and pose of a camera in ``meta/robocas/episodes.parquet``; see `CameraModel`."""
 
     intrinsic: _Four
     camera_in_parent: Annotated[list[_Four], Field(min_length=4, max_length=4)]
@@ -167,19 +171,22 @@ class CameraRecord(_Record):
         return cls(intrinsic=intrinsic, camera_in_parent=pose, parent=parent)
 
 
-class CamerasText(RootModel[dict[Name, CameraRecord]]):
-    """Cameras of an episode, by name."""
+class CamerasRecord(RootModel[dict[Name, CameraRecord]]):
+    """Cameras of an episode by name: column ``cameras`` of ``meta/robocas/episodes.parquet``."""
 
 
-class SceneText(RootModel[dict[str, Any]]):
-    """Content of the ``scene.json`` of an episode."""
+class SceneContent(RootModel[dict[str, Any]]):
+    """``scene.json`` of an episode: column ``scene`` of ``meta/robocas/episodes.parquet``."""
 
 
 SCENES: Mapping[str, Column] = {"episode_index": Column(INTEGER), "scene": Column(TEXT), "cameras": Column(TEXT)}
 
 
 def episode_columns(names: Iterable[str], features: Mapping[str, Any]) -> dict[str, Column]:
-    """Return the columns of ``meta/episodes``; ``names`` are the existing ones (depth is optional)."""
+    """Return the declared columns of ``meta/episodes``.
+
+    ``names``: columns in the file. Columns of FFV1 depth files are declared only if the file has them.
+    """
     columns = {
         "episode_index": Column(INTEGER, greatest=MAX_EPISODES - 1),
         "tasks": Column(TEXTS),
@@ -191,7 +198,7 @@ def episode_columns(names: Iterable[str], features: Mapping[str, Any]) -> dict[s
     }
     videos = [key for key, feature in features.items() if feature["dtype"] == "video"]
     present = {name.rpartition("/")[0] for name in names}
-    depth = [f"depth/{schema.camera_of(key)}" for key in videos]
+    depth = [f"depth/{schema.camera_name(key)}" for key in videos]
     for prefix in (*(f"videos/{key}" for key in videos), *(name for name in depth if name in present)):
         for name in ("chunk_index", "file_index"):
             columns[f"{prefix}/{name}"] = Column(INTEGER, greatest=_MAX_FILES)
@@ -201,7 +208,7 @@ def episode_columns(names: Iterable[str], features: Mapping[str, Any]) -> dict[s
 
 
 def declared_columns(features: Mapping[str, Any]) -> dict[str, Column]:
-    """Return the columns of the data tables, by the features of ``info.json``."""
+    """Return the declared columns of the data tables, from ``features`` of ``info.json``."""
     columns: dict[str, Column] = {}
     for key, dtype in ((key, feature["dtype"]) for key, feature in features.items()):
         if dtype not in ("image", "video", "language"):

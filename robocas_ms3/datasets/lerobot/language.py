@@ -25,7 +25,7 @@ from pydantic import BaseModel, ValidationError
 from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.strict_model import validate_json
 from robocas_ms3.core.text import one_line
-from robocas_ms3.datasets.checks.scene import valid_values
+from robocas_ms3.datasets.checks.scene import read_valid_values
 from robocas_ms3.datasets.images.image_files import Box
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.demos.recordings.subgoals import SubGoal
@@ -54,40 +54,40 @@ EVENTS_TYPE = pa.list_(pa.struct([*_TEXTS, _CAMERA, _TOOL_CALLS]))
 """Arrow types of the columns, as in LeRobot."""
 
 
-def persistent_rows(goals: Sequence[SubGoal], instructions: Iterable[str], fps: int) -> list[Row]:
-    """Return the persistent rows of an episode in the order of LeRobot; repeated instructions are dropped."""
-    rows = [_row("user", text, "task_aug", timestamp=0.0) for text in dict.fromkeys(instructions)]
+def make_persistent_rows(goals: Sequence[SubGoal], instructions: Iterable[str], fps: int) -> list[Row]:
+    """Make the ``language_persistent`` rows of an episode, sorted as in LeRobot, without repeated instructions."""
+    rows = [_make_row("user", text, "task_aug", timestamp=0.0) for text in dict.fromkeys(instructions)]
     starts = [(goal, float(np.float32(goal.first / fps))) for goal in goals]
-    rows += [_row("assistant", goal.goal_description, "subtask", timestamp=start) for goal, start in starts]
+    rows += [_make_row("assistant", goal.goal_description, "subtask", timestamp=start) for goal, start in starts]
     return sorted(rows, key=lambda row: (row["timestamp"], row["style"]))
 
 
-def event_rows(boxes: Mapping[str, Box], target: str) -> list[Row]:
-    """Return the event rows of a frame: question and answer per camera that sees the target."""
+def make_event_rows(boxes: Mapping[str, Box], target: str) -> list[Row]:
+    """Make the ``language_events`` rows of a frame: question and answer per camera that sees the target."""
     question = f"Where {'are' if is_plural(target) else 'is'} the {target}?"
     rows = []
     for camera, box in boxes.items():
         detection = {"label": target, "bbox_format": "xyxy", "bbox": list(box)}
         answer = json.dumps({"detections": [detection]}, sort_keys=True, ensure_ascii=False)
         key = schema.image_key(camera)
-        rows += [_row("user", question, "vqa", camera=key), _row("assistant", answer, "vqa", camera=key)]
+        rows += [_make_row("user", question, "vqa", camera=key), _make_row("assistant", answer, "vqa", camera=key)]
     return sorted(rows, key=lambda row: (row["role"], row["camera"]))
 
 
-def _row(role: str, content: str, style: str, *, timestamp: float | None = None, camera: str | None = None) -> Row:
+def _make_row(role: str, content: str, style: str, *, timestamp: float | None = None, camera: str | None = None) -> Row:
     row: Row = {"role": role, "content": content, "style": style}
     if timestamp is not None:
         row["timestamp"] = timestamp
     return {**row, "camera": camera, "tool_calls": None}
 
 
-def paraphrases(scene: Mapping[str, Any], text: str) -> list[str]:
-    """Return the instruction and a paraphrase with plain names per template of the split ``train``.
+def make_paraphrases(scene: Mapping[str, Any], text: str) -> list[str]:
+    """Return the instruction and its paraphrases, one per instruction template of the split ``train``.
 
-    Templates of the split ``held_out`` are for evaluation and are never used. The list is empty if ``scene.json`` lacks
-    the task, target or support of the instruction.
+    Paraphrases name objects without synonyms. Templates of the split ``held_out`` are for evaluation and are never
+    used. The list is empty if ``scene.json`` lacks the task, target or support of the instruction.
     """
-    known, _ = valid_values(scene)
+    known, _ = read_valid_values(scene)
     task, target, recorded = known.get("task"), known.get("target") or {}, known.get("recorded") or {}
     if not (task and target.get("name") and recorded.get("support")):
         return []
@@ -108,20 +108,25 @@ def paraphrases(scene: Mapping[str, Any], text: str) -> list[str]:
     return list(dict.fromkeys([text, *texts])) if texts else []
 
 
-def goals_of(rows: Sequence[Row], count: int, fps: int) -> list[str]:
-    """Return the sub-goal text of each frame from persistent rows; empty before the first sub-goal."""
+def read_subgoal_texts(rows: Sequence[Row], count: int, fps: int) -> list[str]:
+    """Read the sub-goal text of each frame from ``language_persistent`` rows; empty before the first sub-goal."""
     starts = sorted((row["timestamp"], row["content"] or "") for row in rows if row["style"] == "subtask")
     times = (np.arange(count) + 0.5) / fps
     places = np.searchsorted([time for time, _ in starts], times, side="right") - 1
     return [starts[place][1] if place >= 0 else "" for place in places.tolist()]
 
 
-def boxes_of(rows: Sequence[Row]) -> dict[str, Box]:
-    """Return the bounding box of the target by camera from the event rows of a frame."""
+def read_boxes(rows: Sequence[Row]) -> dict[str, Box]:
+    """Read the bounding box of the target, by camera, from the ``language_events`` rows of a frame."""
     boxes = {}
     for row in rows:
-        if row["style"] == "vqa" and row["role"] == "assistant" and row["camera"] and (box := box_in(row["content"])):
-            boxes[schema.camera_of(row["camera"])] = box
+        if (
+            row["style"] == "vqa"
+            and row["role"] == "assistant"
+            and row["camera"]
+            and (box := parse_box(row["content"]))
+        ):
+            boxes[schema.camera_name(row["camera"])] = box
     return boxes
 
 
@@ -133,8 +138,8 @@ class _Answer(BaseModel):
     detections: tuple[_Detection]
 
 
-def box_in(answer: str | None) -> Box | None:
-    """Return the bounding box in an answer; None if it is not the JSON of one detection."""
+def parse_box(answer: str | None) -> Box | None:
+    """Parse the answer of a ``vqa`` row; return its bounding box, None if it is not the JSON of one detection."""
     try:
         (detection,) = validate_json(_Answer, answer or "").detections
     except ValidationError:
@@ -142,8 +147,8 @@ def box_in(answer: str | None) -> Box | None:
     return detection.bbox
 
 
-def read_rows_of(table: pa.Table, key: str, where: object) -> list[list[Row]]:
-    """Return the rows of a language column per frame; raise DatasetError for another type."""
+def read_language_rows(table: pa.Table, key: str, where: object) -> list[list[Row]]:
+    """Read a language column, a list of rows per frame; raise DatasetError if the column is damaged."""
     kind = PERSISTENT_TYPE if key == PERSISTENT else EVENTS_TYPE
     try:
         frames = table.column(key).cast(kind).to_pylist()
@@ -152,5 +157,5 @@ def read_rows_of(table: pa.Table, key: str, where: object) -> list[list[Row]]:
         raise DatasetError(what, where=f"{where}, {key}", expected=str(kind), found=one_line(error)) from error
     found = [frame or [] for frame in frames]
     if not all(row is not None and np.isfinite(row.get("timestamp", 0)) for rows in found for row in rows):
-        raise DatasetError("damaged language row", where=f"{where}, {key}")
+        raise DatasetError("damaged language row", where=f"{where}, {key}", expected="a finite timestamp")
     return found

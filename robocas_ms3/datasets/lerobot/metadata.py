@@ -24,13 +24,13 @@ from robocas_ms3.datasets.lerobot.file_models import (
 from robocas_ms3.datasets.lerobot.tables import (
     OBJECTS_LIMIT,
     check_columns,
-    in_order,
     open_table,
     read_columns,
     read_objects,
     read_texts,
+    sort_by_index,
 )
-from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, LAYOUTS, Layout
+from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, LAYOUTS, FileLayout
 from robocas_ms3.datasets.sources.files import read_json
 
 
@@ -46,7 +46,7 @@ class Metadata:
     def info(self) -> dict[str, Any]:
         path = self.root / schema.INFO_FILE
         if not path.is_file():
-            raise DatasetError("not a LeRobot dataset", where=path, found="no file")
+            raise DatasetError("not a LeRobot dataset", where=path, found="no such file")
         found = read_json(path)
         parse(InfoRecord, found, DatasetError, where=path, about="unsupported or damaged LeRobot dataset")
         return found
@@ -60,14 +60,14 @@ class Metadata:
         return found
 
     @property
-    def layout(self) -> Layout:
+    def file_layout(self) -> FileLayout:
         return LAYOUTS[self.info["codebase_version"]]
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
         """Names of the cameras."""
         features = self.info["features"]
-        return tuple(schema.camera_of(key) for key in self.videos if not schema.is_depth(features[key]))
+        return tuple(schema.camera_name(key) for key in self.videos if not schema.is_depth(features[key]))
 
     @property
     def videos(self) -> list[str]:
@@ -79,7 +79,7 @@ class Metadata:
 
     @property
     def has_depth(self) -> bool:
-        """Whether the first camera has depth, as FFV1 files or as a depth feature."""
+        """Whether the first camera has depth: FFV1 files or a depth video feature."""
         first = self.cameras[:1]
         has_files = bool(self.rows) and any(f"depth/{camera}/file_index" in self.rows[0] for camera in first)
         return has_files or any(self.depth_feature(camera) is not None for camera in first)
@@ -89,26 +89,26 @@ class Metadata:
         return schema.LANGUAGE_COLUMNS[0] in self.info["features"]
 
     @property
-    def is_robocas(self) -> bool:
-        """Whether the dataset has all features of ``robocas convert``."""
+    def has_robocas_features(self) -> bool:
+        """Whether the dataset has all numeric features that ``robocas convert`` writes."""
         features = self.info["features"]
         return all(features.get(feature.key, {}).get("shape") == [feature.width] for feature in schema.FEATURES)
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
-        where, found = self.root / "meta/episodes", [row for table in self._tables() for row in table.to_pylist()]
+        where, found = self.root / "meta/episodes", [row for table in self._read_tables() for row in table.to_pylist()]
         if len({row["episode_index"] for row in found}) < len(found):
-            raise DatasetError("repeated rows of an episode", where=where)
+            raise DatasetError("an episode has several rows", where=where, expected="one row per episode")
         frames, most = sum(row["length"] for row in found), self.info["total_frames"]
         if frames > most:
-            expected = f"at most {most} frames"
-            raise DatasetError("episodes are longer than the dataset", where=where, expected=expected, found=frames)
+            expected = f"at most {most} frames, total_frames of {schema.INFO_FILE}"
+            raise DatasetError("the episodes are too long", where=where, expected=expected, found=frames)
         return found
 
-    def _tables(self) -> Iterator[pa.Table]:
+    def _read_tables(self) -> Iterator[pa.Table]:
         left, features = self.info["total_episodes"], self.info["features"]
-        if self.layout.one_file_per_episode:
-            yield self._table_of_lines(left)
+        if self.file_layout.one_file_per_episode:
+            yield self._read_lines_as_table(left)
             return
         for path in sorted((self.root / "meta/episodes").glob("*/*.parquet")):
             with open_table(path, most_rows=left) as file:
@@ -118,8 +118,8 @@ class Metadata:
             left -= len(table)
             yield table
 
-    def _table_of_lines(self, most: int) -> pa.Table:
-        """Return ``meta/episodes.jsonl`` as a table of format v3.0."""
+    def _read_lines_as_table(self, most: int) -> pa.Table:
+        """Read ``meta/episodes.jsonl`` of format v2.1 as a table with the columns of format v3.0."""
         fps, prefixes = self.info["fps"], ["data", *(f"videos/{key}" for key in self.videos)]
         if (self.root / "depth").is_dir():
             prefixes += [f"depth/{camera}" for camera in self.cameras]
@@ -135,34 +135,37 @@ class Metadata:
             start += line.length
         return pa.Table.from_pylist(rows)
 
-    def files(self, prefix: str) -> dict[Path, list[dict[str, Any]]]:
-        """Return the episode rows of each file; ``prefix`` as in `Layout.path`."""
+    def rows_by_file(self, prefix: str) -> dict[Path, list[dict[str, Any]]]:
+        """Return the rows of ``meta/episodes`` by the file with their frames.
+
+        ``prefix`` selects the kind of file, see `FileLayout.file_path`.
+        """
         found: dict[Path, list[dict[str, Any]]] = {}
         for row in self.rows:
-            found.setdefault(self.layout.path_of(self.root, prefix, row), []).append(row)
+            found.setdefault(self.file_layout.episode_path(self.root, prefix, row), []).append(row)
         return found
 
     @cached_property
-    def row_of(self) -> dict[int, dict[str, Any]]:
+    def row_by_episode(self) -> dict[int, dict[str, Any]]:
         return {row["episode_index"]: row for row in self.rows}
 
     @cached_property
     def tasks(self) -> list[str]:
         """Instructions by ``task_index``."""
         most = self.info["total_tasks"]
-        if not self.layout.one_file_per_episode:
+        if not self.file_layout.one_file_per_episode:
             return read_texts(self.root / schema.TASKS_FILE, "task_index", most)
         path = self.root / schema.TASKS_LINES
         lines = read_lines(path, TaskLine, most)
-        return in_order([line.task_index for line in lines], [line.task for line in lines], f"{path}, task_index")
+        return sort_by_index([line.task_index for line in lines], [line.task for line in lines], f"{path}, task_index")
 
     @cached_property
     def subtasks(self) -> list[str]:
         return read_texts(self.root / schema.SUBTASKS_FILE, "subtask_index", self.info["total_frames"])
 
     @cached_property
-    def scene_texts(self) -> dict[int, dict[str, str]]:
-        """Scene and cameras of each episode as JSON texts; empty for other LeRobot datasets."""
+    def scene_json_texts(self) -> dict[int, dict[str, str]]:
+        """JSON texts ``scene`` and ``cameras`` by episode; empty unless ``robocas convert`` wrote the dataset."""
         path = self.root / schema.SCENES_FILE
         rows = read_objects(path, SCENES, most_rows=self.info["total_episodes"]).to_pylist() if path.exists() else []
         return {row.pop("episode_index"): row for row in rows}

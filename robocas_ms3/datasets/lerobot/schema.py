@@ -39,9 +39,9 @@ _FILE_LIMIT = 2**34  # bytes
 
 @dataclass(frozen=True)
 class FileLimits:
-    """Limits at which a new file starts, sizes in MiB as in LeRobot; an episode is never divided.
+    """Largest size in MiB and largest duration in s of a data or video file; episodes are never divided.
 
-    LeRobot finds frames by float32 timestamps to 0.1 ms, which float32 resolves up to 1024 s.
+    LeRobot finds frames by float32 timestamps with a tolerance of 0.1 ms. float32 has this resolution up to 1024 s.
     """
 
     data_mb: float = 100
@@ -51,7 +51,10 @@ class FileLimits:
 
 @dataclass(frozen=True)
 class Feature:
-    """Column of the data tables; with two or more names its values are lists, otherwise scalars."""
+    """LeRobot feature: a column of the data tables.
+
+    With two or more ``names`` a value is a list of numbers, otherwise a scalar.
+    """
 
     key: str
     names: tuple[str, ...] = ()
@@ -105,7 +108,7 @@ def depth_key(camera: str) -> str:
     return f"{image_key(camera)}_depth"
 
 
-def camera_of(key: str) -> str:
+def camera_name(key: str) -> str:
     return key.removeprefix("observation.images.")
 
 
@@ -114,32 +117,37 @@ def is_depth(feature: dict[str, Any]) -> bool:
     return info.get("is_depth_map") is True or info.get("video.is_depth_map") is True
 
 
-def robot_type(scene: dict[str, Any]) -> str:
+def find_robot_type(scene: dict[str, Any]) -> str:
     env_info = scene.get("env_info")
     kwargs = env_info.get("env_kwargs") if isinstance(env_info, dict) else None
     named = kwargs.get("robot_uids") if isinstance(kwargs, dict) else None
     return ROBOT_TYPE if named in (None, DEFAULT_ROBOT) else str(named)
 
 
-def features_json(variant: Variant, videos: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return ``features`` of ``info.json``; ``videos``: key -> description from `video.packet_times`."""
+def make_features(variant: Variant, videos: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Make ``features`` of ``info.json``.
+
+    ``videos``: description of each video feature, as from `video.read_packet_times`, by key.
+    """
     features = {feature.key: feature.as_json() for feature in FEATURES}
     for key, video in videos.items():
         shape = [video["video.height"], video["video.width"], video["video.channels"]]
         features[key] = {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"], "info": video}
     language = [Feature(key, dtype="language") for key in LANGUAGE_COLUMNS] if variant.language else []
     indices = [Feature(key, dtype="float32" if key == "timestamp" else "int64") for key in INDICES]
-    return features | {feature.key: feature.as_json() for feature in (*single_features(variant), *language, *indices)}
+    return features | {
+        feature.key: feature.as_json() for feature in (*per_frame_features(variant), *language, *indices)
+    }
 
 
-def single_features(variant: Variant) -> tuple[Feature, ...]:
-    """Return the features of a variant with one value per frame, without index features."""
+def per_frame_features(variant: Variant) -> tuple[Feature, ...]:
+    """Return the features of a variant with one value per frame, except index features."""
     subtask = () if variant.language else (SUBTASK_INDEX,)
     return (SUBGOAL_TYPE, *subtask, *(OUTCOME if variant.outcome else ()))
 
 
-def modality_json(cameras: Sequence[str]) -> dict[str, Any]:
-    """Return the content of ``meta/modality.json``, which GR00T needs for datasets of format v2.1."""
+def make_modality(cameras: Sequence[str]) -> dict[str, Any]:
+    """Make the content of ``meta/modality.json``, which GR00T needs with format v2.1."""
     action = {"rel_pos": slice(0, 3), "rel_orn": slice(3, 6), "gripper_open": slice(6, 7)}
     parts = {"state": feature_columns(STATE), "action": action}
     return {
@@ -152,8 +160,8 @@ def modality_json(cameras: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def whole_rate(rate_hz: float) -> int:
-    """Return a rate in Hz as an integer; raise DatasetError if it is not a whole number."""
+def to_integer_rate(rate_hz: float) -> int:
+    """Convert a rate in Hz to an integer; raise DatasetError if it is not a whole number."""
     if rate_hz < 1 or abs(rate_hz - round(rate_hz)) > 1e-9:
         what, expected = "invalid rate for LeRobot", "a whole number of frames per second"
         raise DatasetError(what, where="rate", expected=expected, found=rate_hz)
@@ -171,7 +179,7 @@ def require_lerobot() -> None:
     require_extra("lerobot", "LeRobot datasets", "pyarrow", "av")
 
 
-def checksum(path: Path) -> str:
+def compute_checksum(path: Path) -> str:
     """Return the SHA-256 of a file."""
     check_regular_file(path, _FILE_LIMIT)
     digest = hashlib.sha256()

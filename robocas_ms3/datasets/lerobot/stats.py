@@ -15,8 +15,8 @@ _THINNED = 150
 Stats = dict[str, Any]
 
 
-def vector_stats(values: NDArray) -> Stats:
-    """Return the statistics of a feature (T, D): lists of D numbers."""
+def compute_stats(values: NDArray) -> Stats:
+    """Compute the statistics of a feature (T, D): each is a list of D numbers, ``count`` is [T]."""
     values = values.astype(np.int64) if values.dtype == bool else values
     numbers = values.astype(np.float64)
     quantiles = np.quantile(numbers, list(QUANTILES.values()), axis=0)
@@ -30,17 +30,20 @@ def vector_stats(values: NDArray) -> Stats:
     }
 
 
-def joined_stats(episodes: Sequence[NDArray]) -> Stats:
-    """Return the statistics of a feature over episodes; columns are processed one by one to save memory."""
+def compute_dataset_stats(episodes: Sequence[NDArray]) -> Stats:
+    """Compute the statistics of a feature over all episodes, one column after another to save memory.
+
+    ``episodes``: values (T, D) per episode.
+    """
     columns = (np.concatenate([values[:, [n]] for values in episodes]) for n in range(episodes[0].shape[1]))
-    found = [vector_stats(column) for column in columns]
+    found = [compute_stats(column) for column in columns]
     return {name: found[0][name] if name == "count" else [one[name][0] for one in found] for name in found[0]}
 
 
 class LevelHistogram:
-    """Histogram (channels, levels) of the pixel values of images, for exact statistics.
+    """Histogram (channels, levels) of pixel values, from which statistics of images are computed exactly.
 
-    RGB images have 3 channels and statistics between 0 and 1; depth images have one channel and statistics in mm.
+    RGB images have 3 channels, and statistics between 0 and 1. Depth images have one channel, and statistics in mm.
     """
 
     def __init__(self, counts: ArrayLike, images: int = 0) -> None:
@@ -48,11 +51,11 @@ class LevelHistogram:
         self._unit = 1.0 if len(self.counts) == 1 else 1 / 255
 
     @classmethod
-    def rgb(cls) -> LevelHistogram:
+    def make_rgb(cls) -> LevelHistogram:
         return cls(np.zeros((3, 256)))
 
     @classmethod
-    def depth(cls) -> LevelHistogram:  # 12 bits
+    def make_depth(cls) -> LevelHistogram:  # 12 bits
         return cls(np.zeros((1, 4096)))
 
     def add(self, image: NDArray) -> None:
@@ -70,7 +73,7 @@ class LevelHistogram:
         self.images += other.images
 
     def stats(self) -> Stats:
-        """Return the statistics, each with shape (channels, 1, 1); ``count`` is the number of images."""
+        """Compute the statistics, each with shape (channels, 1, 1); ``count`` is [number of images]."""
         values = np.arange(self.counts.shape[1]) * self._unit
         total = self.counts.sum(axis=1)
         mean = self.counts @ values / total

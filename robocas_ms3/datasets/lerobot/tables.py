@@ -31,14 +31,14 @@ _EPISODE = "episode_index"
 
 @dataclass(frozen=True)
 class Column:
-    """Declaration of a column: kind of values, and range of integers and numbers."""
+    """Declaration of a table column: kind of values, and smallest and largest valid number."""
 
     kind: str
     least: float = 0
     greatest: float = 2**53
 
-    def violation(self, values: pa.ChunkedArray) -> tuple[str, str] | None:
-        """Return expected and found if a column violates the declaration, None otherwise."""
+    def find_violation(self, values: pa.ChunkedArray) -> tuple[str, str] | None:
+        """Return (expected, found) if the values violate the declaration, None otherwise."""
         if not _is_kind(values.type, self.kind):
             return self.kind, str(values.type)
         if values.null_count:
@@ -53,24 +53,26 @@ class Column:
         return None
 
 
-def column_violations(table: pa.Table, columns: Mapping[str, Column]) -> Iterator[tuple[str, str, str]]:
-    """Yield key, expected and found of columns that are missing or violate their declaration."""
+def find_column_violations(table: pa.Table, columns: Mapping[str, Column]) -> Iterator[tuple[str, str, str]]:
+    """Yield (key, expected, found) for each column that is missing or violates its declaration."""
     for key, column in columns.items():
         if key not in table.column_names:
             yield key, "this column", "no such column"
-        elif violation := column.violation(table.column(key)):
+        elif violation := column.find_violation(table.column(key)):
             yield key, *violation
 
 
 @contextmanager
 def open_table(path: Path, *, most_rows: float = np.inf) -> Iterator[pq.ParquetFile]:
-    """Open a Parquet file; texts are read as dictionaries to save memory.
+    """Open a Parquet file to read; texts are read as Arrow dictionaries to save memory.
 
-    A damaged file, too many rows, and errors of Arrow inside the ``with`` statement raise DatasetError.
+    Raises:
+        DatasetError: the file is damaged, it has more than ``most_rows`` rows, or Arrow raises an error inside the
+            ``with`` statement.
     """
     try:
         check_regular_file(path)
-        footer, texts, _ = _footer(path, path.stat().st_mtime_ns)
+        footer, texts, _ = _read_footer(path, path.stat().st_mtime_ns)
         with pq.ParquetFile(path, metadata=footer, read_dictionary=texts) as file:
             names = file.schema_arrow.names
             if len(set(names)) < len(names):
@@ -84,8 +86,8 @@ def open_table(path: Path, *, most_rows: float = np.inf) -> Iterator[pq.ParquetF
         raise DatasetError(what, where=path, found=found, fix=SEE_VALIDATE) from error
 
 
-def as_column(values: NDArray) -> pa.Array:
-    """Return an array as a column: (T, D) as lists of D numbers, (T, 1) and (T,) as numbers."""
+def to_column(values: NDArray) -> pa.Array:
+    """Convert an array to an Arrow column: (T, D) to lists of D numbers, (T, 1) and (T,) to numbers."""
     flat = pa.array(np.ascontiguousarray(values).reshape(-1))
     width = values.shape[1] if values.ndim == 2 else 1
     return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
@@ -99,7 +101,10 @@ def read_columns(
     groups: Sequence[int] | None = None,
     limit: int = _ARRAYS_LIMIT,
 ) -> pa.Table:
-    """Read columns of an open file, default all; raise DatasetError for more bytes than ``limit``."""
+    """Read columns (default: all) of an open file; raise DatasetError for values of more than ``limit`` bytes.
+
+    ``groups``: row groups to read; default: all.
+    """
     footer = file.metadata
     groups = range(footer.num_row_groups) if groups is None else groups
     names = file.schema_arrow.names if columns is None else [key for key in file.schema_arrow.names if key in columns]
@@ -114,7 +119,7 @@ def read_columns(
             chunk = group.column(number)
             size += max(group.num_rows, chunk.num_values) * width + chunk.total_uncompressed_size
     table = file.read_row_groups(list(groups), columns=names) if size <= limit else None
-    if table is None or (size := size + sum(map(_text_bytes, table.columns))) > limit:
+    if table is None or (size := size + sum(map(_count_text_bytes, table.columns))) > limit:
         what, expected = "this table is too large", f"at most {limit >> 20} MB of values per file"
         raise DatasetError(
             what, where=path, expected=expected, found=f"{size >> 20} MB", fix="Split the dataset into more files."
@@ -130,7 +135,7 @@ def read_objects(path: Path, columns: Mapping[str, Column], *, most_rows: float 
 
 
 def check_columns(table: pa.Table, columns: Mapping[str, Column], path: Path) -> None:
-    for key, expected, found in column_violations(table, columns):
+    for key, expected, found in find_column_violations(table, columns):
         what = "invalid column of a table"
         raise DatasetError(what, where=f"{path}, {key}", expected=expected, found=found, fix=SEE_VALIDATE)
 
@@ -154,22 +159,22 @@ def _is_kind(found: pa.DataType, kind: str) -> bool:
     return pa.types.is_integer(found) or (kind == NUMBER and pa.types.is_floating(found))
 
 
-def _text_bytes(values: pa.ChunkedArray | pa.Array) -> int:
-    """Return the bytes of texts stored as dictionaries, each counted as often as it occurs."""
+def _count_text_bytes(values: pa.ChunkedArray | pa.Array) -> int:
+    """Count the bytes of a dictionary-encoded text column as if each occurrence of a text were stored."""
     if isinstance(values, pa.ChunkedArray):
-        return sum(map(_text_bytes, values.chunks))
+        return sum(map(_count_text_bytes, values.chunks))
     if pa.types.is_list(values.type) or pa.types.is_large_list(values.type):
-        return _text_bytes(values.flatten())
+        return _count_text_bytes(values.flatten())
     if pa.types.is_struct(values.type):
-        return sum(map(_text_bytes, values.flatten()))
+        return sum(map(_count_text_bytes, values.flatten()))
     if not pa.types.is_dictionary(values.type) or not len(values):
         return 0
     lengths = pc.binary_length(values.dictionary).to_numpy(zero_copy_only=False)  # pyright: ignore[reportAttributeAccessIssue]
     return int(lengths[values.indices.drop_null().to_numpy()].sum())
 
 
-def numbers(values: pa.ChunkedArray | pa.Array) -> NDArray:
-    """Return a numeric column as an array: lists of D numbers as (T, D), numbers as (T, 1)."""
+def to_array(values: pa.ChunkedArray | pa.Array) -> NDArray:
+    """Convert a numeric Arrow column to an array: lists of D numbers to (T, D), numbers to (T, 1)."""
     whole = values.combine_chunks() if isinstance(values, pa.ChunkedArray) else values
     if not is_numeric(whole.type):
         raise DatasetError("not a numeric column", expected=NUMBERS, found=whole.type)
@@ -185,10 +190,10 @@ def numbers(values: pa.ChunkedArray | pa.Array) -> NDArray:
     return flat.to_numpy(zero_copy_only=False).reshape(len(whole), -1)
 
 
-def read_rows(path: Path, number: int, most_rows: float = np.inf) -> pa.Table:
-    """Read the rows of an episode in a data file; row groups without them are skipped."""
+def read_episode_rows(path: Path, number: int, most_rows: float = np.inf) -> pa.Table:
+    """Read the rows of the episode ``number`` from a data file; row groups of other episodes are not read."""
     with open_table(path, most_rows=most_rows) as file:
-        _, _, spans = _footer(path, path.stat().st_mtime_ns)
+        _, _, spans = _read_footer(path, path.stat().st_mtime_ns)
         groups = [group for group, (low, high) in enumerate(spans) if low <= number <= high]
         table = read_columns(file, path, groups=groups)
         check_columns(table, {_EPISODE: Column(INTEGER)}, path)
@@ -196,8 +201,11 @@ def read_rows(path: Path, number: int, most_rows: float = np.inf) -> pa.Table:
 
 
 @lru_cache(maxsize=8)
-def _footer(path: Path, _changed_ns: int) -> tuple[pq.FileMetaData, list[str], list[tuple[float, float]]]:
-    """Return the footer of a file, its text columns, and the range of episode numbers per row group."""
+def _read_footer(path: Path, _changed_ns: int) -> tuple[pq.FileMetaData, list[str], list[tuple[float, float]]]:
+    """Read the footer of a file, its text columns, and the range of episode numbers per row group.
+
+    ``_changed_ns``: time of the last change, so that the cache is not used for a changed file.
+    """
     with pq.ParquetFile(path) as file:
         footer = file.metadata
     leaves = [footer.schema.column(number) for number in range(footer.num_columns)]
@@ -211,19 +219,20 @@ def _footer(path: Path, _changed_ns: int) -> tuple[pq.FileMetaData, list[str], l
 
 def read_texts(path: Path, name: str, most_rows: float = np.inf) -> list[str]:
     table = read_objects(path, {name: Column(INTEGER), TEXT_INDEX: Column(TEXT)}, most_rows=most_rows)
-    return in_order(table.column(name).to_pylist(), table.column(TEXT_INDEX).to_pylist(), f"{path}, {name}")
+    return sort_by_index(table.column(name).to_pylist(), table.column(TEXT_INDEX).to_pylist(), f"{path}, {name}")
 
 
-def in_order(places: list[int], texts: list[str], where: str) -> list[str]:
-    """Return texts in the order of their indices; raise DatasetError if these are not 0, 1, 2, ..."""
+def sort_by_index(places: list[int], texts: list[str], where: str) -> list[str]:
+    """Sort texts by their indices ``places``; raise DatasetError if the indices are not 0, 1, 2, ..."""
     if sorted(places) != list(range(len(places))):
         expected = f"0 to {len(places) - 1}, each once"
-        raise DatasetError("invalid indices of texts", where=where, expected=expected, fix=SEE_VALIDATE)
+        found = sorted(places)[:5]
+        raise DatasetError("invalid indices of texts", where=where, expected=expected, found=found, fix=SEE_VALIDATE)
     return [text for _, text in sorted(zip(places, texts, strict=True))]
 
 
 def write_texts(path: Path, name: str, texts: Sequence[str]) -> None:
-    """Write a table of texts and their indices; the texts are the pandas index, as LeRobot expects."""
+    """Write a table of texts and their numbers 0, 1, 2, ...; the texts are the pandas index, as LeRobot expects."""
     text = {"pandas_type": "unicode", "numpy_type": "object"}
     number = {"pandas_type": "int64", "numpy_type": "int64"}
     about = {

@@ -18,10 +18,15 @@ _EPISODE_CHUNK = "chunk-{episode_chunk:03d}"
 
 
 @dataclass(frozen=True)
-class Layout:
-    """File layout of a format version: path patterns as in ``info.json``; LeRobot does not read ``depth``.
+class FileLayout:
+    """Paths of the files of a LeRobot format version.
 
-    With ``one_file_per_episode``, tables in ``meta`` are JSON lines.
+    Attributes:
+        codebase_version: format version in ``info.json``.
+        data: path pattern of data tables, as in ``info.json``.
+        video: path pattern of videos, as in ``info.json``.
+        depth: path pattern of FFV1 depth files, which LeRobot does not read.
+        one_file_per_episode: whether each episode has its own files; then the tables in ``meta`` are JSON lines.
     """
 
     codebase_version: str
@@ -30,20 +35,24 @@ class Layout:
     depth: str
     one_file_per_episode: bool = False
 
-    def path(self, root: Path, prefix: str, chunk: int, file: int) -> Path:
-        """Return the path of a file; ``prefix`` as of its columns in ``meta/episodes``: ``videos/KEY``."""
+    def file_path(self, root: Path, prefix: str, chunk: int, file: int) -> Path:
+        """Return the path of a file by its chunk and file number.
+
+        ``prefix`` is ``data``, ``meta/episodes``, ``videos/KEY`` or ``depth/CAMERA``, as in column names of
+        ``meta/episodes``.
+        """
         kind, _, name = prefix.partition("/")
         pattern = {"data": self.data, "videos": self.video, "depth": self.depth, "meta": _EPISODES}[kind]
         numbers = {"chunk_index": chunk, "episode_chunk": chunk, "file_index": file}
         numbers["episode_index"] = chunk * CHUNK_FILES + file
         return root / pattern.format(**numbers, video_key=name, camera=name)
 
-    def path_of(self, root: Path, prefix: str, row: Mapping[str, Any]) -> Path:
-        return self.path(root, prefix, row[f"{prefix}/chunk_index"], row[f"{prefix}/file_index"])
+    def episode_path(self, root: Path, prefix: str, row: Mapping[str, Any]) -> Path:
+        return self.file_path(root, prefix, row[f"{prefix}/chunk_index"], row[f"{prefix}/file_index"])
 
 
-V3 = Layout("v3.0", f"data/{_FILE}.parquet", f"videos/{{video_key}}/{_FILE}.mp4", f"depth/{{camera}}/{_FILE}.mkv")
-V21 = Layout(
+V3 = FileLayout("v3.0", f"data/{_FILE}.parquet", f"videos/{{video_key}}/{_FILE}.mp4", f"depth/{{camera}}/{_FILE}.mkv")
+V21 = FileLayout(
     "v2.1",
     f"data/{_EPISODE_CHUNK}/{_EPISODE}.parquet",
     f"videos/{_EPISODE_CHUNK}/{{video_key}}/{_EPISODE}.mp4",
@@ -67,7 +76,7 @@ class Variant:
     """
 
     version: Version
-    layout: Layout
+    layout: FileLayout
     language: bool = False
     native_depth: bool = False
     outcome: bool = False

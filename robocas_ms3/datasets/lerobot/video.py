@@ -41,7 +41,7 @@ class VideoCodec:
 
 
 # Every second frame is a key frame, as in LeRobot: random access decodes at most two frames. No B-frames, so that
-# packets are in frame order and parts join without edit lists. A fixed number of threads makes encoding deterministic.
+# packets are in frame order and videos join without edit lists. A fixed number of threads makes encoding deterministic.
 VIDEO_CODECS = {
     "h264": VideoCodec(
         "libx264",
@@ -88,7 +88,7 @@ DEPTH_INFO: Mapping[str, Any] = {
 _Metres = Annotated[float, Field(gt=-1e6, lt=1e6, allow_inf_nan=False)]
 
 
-class _Range(BaseModel):
+class _DepthRange(BaseModel):
     """Depth range of a video in m; defaults as in LeRobot."""
 
     model_config = ConfigDict(strict=True)
@@ -99,7 +99,7 @@ class _Range(BaseModel):
     use_log: bool = Field(True, alias="video.use_log")
 
     @model_validator(mode="after")
-    def _check_range(self) -> _Range:
+    def _check_range(self) -> _DepthRange:
         if not self.depth_min < self.depth_max:
             raise ValueError(f"expected depth_min < depth_max, found {self.depth_min:g} and {self.depth_max:g}")
         if self.use_log and self.depth_min + self.shift <= 0:
@@ -108,26 +108,26 @@ class _Range(BaseModel):
 
 
 def find_codec(kind: ImageKind, codec: str, variant: Variant) -> VideoCodec:
-    """Return the codec of the videos of a kind; ``codec`` is the name of that of RGB."""
+    """Return the codec of RGB or depth videos; ``codec`` is the name of the RGB codec."""
     return VIDEO_CODECS[codec if kind == "rgb" else "depth12" if variant.native_depth else "depth"]
 
 
 class VideoEncoder:
-    """Encoder of one video with a width and height in pixels, for a ``with`` statement."""
+    """Encodes one video in a ``with`` statement; ``size`` is the width and height in pixels."""
 
-    def __init__(self, path: Path, coding: VideoCodec, fps: int, size: tuple[int, int]) -> None:
+    def __init__(self, path: Path, codec: VideoCodec, fps: int, size: tuple[int, int]) -> None:
         width, height = size
-        if coding.pixels == "yuv420p":
+        if codec.pixels == "yuv420p":
             check_video_size(size)
         os.environ.setdefault("SVT_LOG", "1")  # log errors only
-        self.frames, self._coding = 0, coding
+        self.frames, self._codec = 0, codec
         self._container = av.open(str(path), "w", options=_CONTAINER)
         try:
-            stream: Any = self._container.add_stream(coding.encoder, rate=fps, options=coding.options)
+            stream: Any = self._container.add_stream(codec.encoder, rate=fps, options=codec.options)
         except (FFmpegError, ValueError) as error:
             self._container.close()
-            raise DatasetError("encoder missing in this FFmpeg", where=coding.encoder, found=error) from error
-        stream.width, stream.height, stream.pix_fmt = width, height, coding.pixels
+            raise DatasetError("this FFmpeg lacks the encoder", where=codec.encoder, found=error) from error
+        stream.width, stream.height, stream.pix_fmt = width, height, codec.pixels
         self._stream, self._time_base = stream, Fraction(1, fps)
 
     def __enter__(self) -> VideoEncoder:
@@ -145,7 +145,7 @@ class VideoEncoder:
 
     def add(self, image: NDArray) -> None:
         """Append a frame, (H, W, 3) uint8 RGB or (H, W) uint16."""
-        layout = "rgb24" if image.ndim == 3 else self._coding.pixels
+        layout = "rgb24" if image.ndim == 3 else self._codec.pixels
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format=layout)
         frame.pts, frame.time_base = self.frames, self._time_base
         self._container.mux(self._stream.encode(frame))
@@ -153,7 +153,10 @@ class VideoEncoder:
 
 
 class VideoJoiner:
-    """Joiner of videos into files ``path(chunk, number)`` without encoding; one file is open at a time."""
+    """Joins videos into larger files without encoding again; one output file is open at a time.
+
+    ``path(chunk, number)`` returns the path of an output file.
+    """
 
     def __init__(self, path: Callable[[int, int], Path], fps: int, limit_mb: float, limit_seconds: float) -> None:
         self._path, self._fps = path, fps
@@ -163,11 +166,11 @@ class VideoJoiner:
         self._out: Any = None
         self._stream: Any = None
 
-    def add(self, part: Path, frames: int) -> tuple[int, int, int]:
+    def add(self, path: Path, frames: int) -> tuple[int, int, int]:
         """Append a video with ``frames`` frames; return chunk, file, and index of its first frame in the file."""
-        size = part.stat().st_size
+        size = path.stat().st_size
         try:
-            with av.open(str(part)) as video:
+            with av.open(str(path)) as video:
                 stream = video.streams.video[0]
                 head = (stream.codec_context.name, stream.width, stream.height, stream.codec_context.extradata)
                 full = self._bytes + size > self._limit_bytes or self._frames + frames > self._limit_frames
@@ -186,9 +189,9 @@ class VideoJoiner:
         except FFmpegError as error:
             if error.errno in _FULL:  # of the output file
                 raise
-            raise DatasetError("damaged video", where=part, found=error.strerror) from error
+            raise DatasetError("damaged video", where=path, found=error.strerror) from error
         if found != frames:
-            raise DatasetError("missing frames in this video", where=part, expected=frames, found=found)
+            raise DatasetError("missing frames in this video", where=path, expected=frames, found=found)
         self._frames += frames
         self._bytes += size
         return *divmod(self._count - 1, CHUNK_FILES), first
@@ -211,7 +214,10 @@ class VideoJoiner:
 
 
 def read_frames(path: Path, first: int, count: int, fps: int) -> Generator[NDArray, None, None]:
-    """Yield frames, (H, W, 3) uint8 RGB or (H, W) uint16; close the generator to close the file."""
+    """Yield ``count`` frames from frame ``first`` on, (H, W, 3) uint8 RGB or (H, W) uint16.
+
+    Close the generator to close the file.
+    """
     given = 0
     try:
         check_regular_file(path)
@@ -236,20 +242,20 @@ def read_frames(path: Path, first: int, count: int, fps: int) -> Generator[NDArr
         raise DatasetError("missing frames in this video", where=path, expected=first + count, found=first + given)
 
 
-def packet_times(path: Path, most: int | None = None) -> tuple[list[Fraction], dict[str, Any]]:
-    """Return the frame times of a video in s, at most ``most`` + 1, and its ``info`` for ``info.json``."""
+def read_packet_times(path: Path, most: int | None = None) -> tuple[list[Fraction], dict[str, Any]]:
+    """Read the frame times of a video in s, at most ``most`` + 1, and its description for ``info.json``."""
     try:
         check_regular_file(path)
         with av.open(str(path)) as video:
             stream: Any = video.streams.video[0]
             packets = (p.pts * p.time_base for p in video.demux(stream) if p.pts is not None)
             times = list(packets if most is None else islice(packets, most + 1))
-            return sorted(times), _describe(stream)
+            return sorted(times), _describe_stream(stream)
     except _BAD_VIDEO as error:
         raise DatasetError("the video can't be read", where=path, found=getattr(error, "strerror", error)) from error
 
 
-def _describe(stream: Any) -> dict[str, Any]:
+def _describe_stream(stream: Any) -> dict[str, Any]:
     return {
         "video.height": stream.height,
         "video.width": stream.width,
@@ -262,13 +268,13 @@ def _describe(stream: Any) -> dict[str, Any]:
 
 
 def to_levels(depth: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """Return the 12-bit levels of depth in mm."""
+    """Convert depth (H, W) in mm to 12-bit levels; depth above 4095 mm becomes 4095."""
     return np.minimum(depth, np.uint16(MAX_DEPTH_MM))
 
 
 def to_depth(levels: NDArray[np.uint16], info: Mapping[str, Any]) -> NDArray[np.uint16]:
-    """Return depth in mm from levels (H, W), 0 to 4095, by the ``info`` of the video feature."""
-    values = parse(_Range, dict(info), DatasetError, where="info", about="invalid range of a depth video")
+    """Convert levels (H, W), 0 to 4095, to depth in mm; ``info`` of the video feature has the range."""
+    values = parse(_DepthRange, dict(info), DatasetError, where="info", about="invalid range of a depth video")
     low, high, shift = values.depth_min, values.depth_max, values.shift
     fraction = levels.astype(np.float64) / (_LEVELS - 1)
     if values.use_log:

@@ -22,11 +22,11 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import arrays as array_checks
 from robocas_ms3.datasets.checks.images import check_cameras, check_images
 from robocas_ms3.datasets.checks.scene import read_settings
-from robocas_ms3.datasets.checks.violation import Violation, read_object
+from robocas_ms3.datasets.checks.violation import Violation, read_json_object
 from robocas_ms3.datasets.conversion.data_info import write_info
-from robocas_ms3.datasets.conversion.episode_plan import DATASET, SETTINGS, header
-from robocas_ms3.datasets.images.image_headers import check_ends
-from robocas_ms3.datasets.sources.arrays import arrays_fingerprint, read_arrays
+from robocas_ms3.datasets.conversion.episode_plan import DATASET, SETTINGS_KEYS, make_header
+from robocas_ms3.datasets.images.image_headers import check_file_ends
+from robocas_ms3.datasets.sources.arrays import fingerprint_arrays, read_arrays
 from robocas_ms3.datasets.sources.file_models import ConversionRecord
 from robocas_ms3.datasets.sources.reader import Dataset
 
@@ -36,7 +36,13 @@ _NO_LINKS = {errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.EOPNOTS
 
 @dataclass(frozen=True)
 class FinishedDataset:
-    """Dataset with consistent files, its name, and its entries; see `open_finished_dataset`."""
+    """Dataset whose files are complete and consistent, see `open_finished_dataset`.
+
+    Attributes:
+        dataset: the open dataset.
+        name: name of the dataset in ``conversion.json`` of a copy.
+        entries: entry of each episode in ``conversion.json``, by number.
+    """
 
     dataset: Dataset
     name: str
@@ -46,21 +52,21 @@ class FinishedDataset:
     def root(self) -> Path:
         return self.dataset.root
 
-    def identity(self, number: int) -> str:
-        """Return the fingerprint of the recording of an episode; if unknown, that of its arrays."""
+    def recording_id(self, number: int) -> str:
+        """Return the fingerprint of the recording of an episode, or of its arrays if the recording is unknown."""
         recording = self.entries[number].get("recording")
-        return recording or f"arrays {arrays_fingerprint(self.dataset.episode(number).arrays)}"
+        return recording or f"arrays {fingerprint_arrays(self.dataset.episode(number).arrays)}"
 
 
-def schema_version(dataset: Dataset) -> object:
-    """Return the schema version of a dataset; 0 is the format of RoboCAS-v0."""
+def find_schema_version(dataset: Dataset) -> object:
+    """Return the schema version of a dataset; 0: the format of RoboCAS-v0."""
     return dataset.settings.get("schema_version", 1) if dataset.settings else 0
 
 
 def open_finished_dataset(root: Path, name: str = "") -> FinishedDataset:
-    """Open a dataset to copy from; raise DatasetError if it is unfinished or inconsistent."""
+    """Open a dataset to copy episodes from; raise DatasetError if it is unfinished or inconsistent."""
     dataset = Dataset(root)
-    schema.check_version(schema_version(dataset), root)
+    schema.check_version(find_schema_version(dataset), root)
     if not dataset.info:
         path, fix = root / schema.DATA_INFO_FILE, "Run robocas convert again with the same arguments."
         raise DatasetError("this dataset is unfinished", where=path, found="no file", fix=fix)
@@ -78,7 +84,7 @@ def open_finished_dataset(root: Path, name: str = "") -> FinishedDataset:
     entries = {int(number): entry for number, entry in dataset.settings.get("episodes", {}).items()}
     unlisted = [number for number in dataset.numbers if number not in entries]
     if unlisted:
-        raise DatasetError("episodes without an entry", where=where, found=format_ranges(unlisted))
+        raise DatasetError("episodes on disk are not listed", where=where, found=format_ranges(unlisted))
     for number in dataset.numbers:
         episode = dataset.episode(number)
         found = episode.scene.get("schema_version", 1)
@@ -88,7 +94,7 @@ def open_finished_dataset(root: Path, name: str = "") -> FinishedDataset:
 
 @dataclass(frozen=True)
 class CopiedEpisode:
-    """Episode of a dataset to copy, and the split of the copy."""
+    """Episode to copy, and its split in the new dataset."""
 
     source: FinishedDataset
     number: int
@@ -101,7 +107,7 @@ class CopyOptions:
 
     Attributes:
         link: hard-link files if the file system allows it; edits of a linked file change the source too.
-        overwrite: start again instead of continuing.
+        overwrite: delete the output and start again, instead of continuing.
         on_start: called with the number of episodes to write.
         on_episode: called with the number of each written episode.
     """
@@ -114,7 +120,16 @@ class CopyOptions:
 
 @dataclass(frozen=True)
 class CopyResult:
-    """Result of copying: numbers of episodes, existing episodes, files, and skipped duplicates."""
+    """Result of copying episodes to a new dataset.
+
+    Attributes:
+        out: folder of the new dataset.
+        episodes: number of its episodes.
+        existing: number of episodes that existed already.
+        linked: number of hard-linked files.
+        copied: number of copied files.
+        skipped: number of skipped duplicate episodes.
+    """
 
     out: Path
     episodes: int
@@ -131,71 +146,75 @@ class CopyResult:
 
 
 def copy_episodes(
-    outs: Mapping[Path, Sequence[CopiedEpisode]], split_rule: str, options: CopyOptions
+    outputs: Mapping[Path, Sequence[CopiedEpisode]], split_rule: str, options: CopyOptions
 ) -> list[CopyResult]:
-    """Write datasets of episodes with equal settings, numbered from 0 in the given order.
+    """Write one dataset per output folder with the given episodes, numbered from 0 in their order.
 
-    All inputs are checked before the first write. The same call continues an interrupted one, with the same result.
+    All inputs are checked before anything is written. The same call continues an interrupted call, with the same
+    result. ``split_rule``: description of the split for ``conversion.json``.
     """
     numbers: dict[Path, list[int]] = {}
-    for member in (member for members in outs.values() for member in members):
+    for member in (member for members in outputs.values() for member in members):
         numbers.setdefault(member.source.root, []).append(member.number)
-    records = {out: _record(members, split_rule) for out, members in outs.items()}
+    records = {out: _make_conversion_record(members, split_rule) for out, members in outputs.items()}
     for out, record in records.items():
-        check_apart(out, list(numbers))
-        OutputFolder(out, DATASET, _settings_of(record), overwrite=options.overwrite).read_record()
+        check_no_overlap(out, list(numbers))
+        OutputFolder(out, DATASET, _drop_versions(record), overwrite=options.overwrite).read_record()
     for root, chosen in numbers.items():
         _check_episodes(root, chosen)
     if options.on_start:
-        folders = [out / schema.episode_folder(n) for out, members in outs.items() for n in range(len(members))]
+        folders = [out / schema.episode_folder(n) for out, members in outputs.items() for n in range(len(members))]
         options.on_start(sum(options.overwrite or not folder.is_dir() for folder in folders))
-    return [_copy(out, members, records[out], options) for out, members in outs.items()]
+    return [_copy(out, members, records[out], options) for out, members in outputs.items()]
 
 
 def _copy(out: Path, members: Sequence[CopiedEpisode], record: Mapping[str, Any], options: CopyOptions) -> CopyResult:
-    placer = FilePlacer(options.link)
-    with dataset_output(out, record, options.overwrite):
+    copier = FileCopier(options.link)
+    with open_dataset_output(out, record, options.overwrite):
         missing = [n for n in range(len(members)) if not (out / schema.episode_folder(n)).is_dir()]
         for number in missing:
             member = members[number]
             with atomic_folder(out / schema.episode_folder(number)) as folder:
-                placer.place_tree(member.source.root / schema.episode_folder(member.number), folder)
+                copier.copy_tree(member.source.root / schema.episode_folder(member.number), folder)
             if options.on_episode:
                 options.on_episode(number)
         train, val = ([n for n, member in enumerate(members) if member.split == name] for name in ("train", "val"))
         write_info(out, (train, val))
-    return CopyResult(out, len(members), len(members) - len(missing), placer.linked, placer.copied)
+    return CopyResult(out, len(members), len(members) - len(missing), copier.linked, copier.copied)
 
 
-def _record(members: Sequence[CopiedEpisode], split_rule: str) -> dict[str, Any]:
+def _make_conversion_record(members: Sequence[CopiedEpisode], split_rule: str) -> dict[str, Any]:
     episodes = {}
     for number, member in enumerate(members):
         entry = member.source.entries[member.number]
         origin = {"from": entry["from"]} if "from" in entry else {}  # of an episode that is a copy itself
         episodes[str(number)] = {**entry, "from": {"dataset": member.source.name, "episode": member.number, **origin}}
     settings = members[0].source.dataset.settings
-    return {**copied_header({key: settings[key] for key in SETTINGS}, split_rule), "episodes": episodes}
+    return {**make_copied_header({key: settings[key] for key in SETTINGS_KEYS}, split_rule), "episodes": episodes}
 
 
-def copied_header(settings: Mapping[str, Any], split_rule: str) -> dict[str, Any]:
-    """Return ``conversion.json`` of a merged or split dataset, without the episodes."""
-    return {**header(settings, split_rule), "made_with": {"robocas_ms3": robocas_ms3.__version__}}
+def make_copied_header(settings: Mapping[str, Any], split_rule: str) -> dict[str, Any]:
+    """Make ``conversion.json`` of a merged or split dataset, without the episodes."""
+    return {**make_header(settings, split_rule), "made_with": {"robocas_ms3": robocas_ms3.__version__}}
 
 
 @contextmanager
-def dataset_output(out: Path, record: Mapping[str, Any], overwrite: bool) -> Iterator[None]:
-    """Start or continue a merged or split dataset; ``conversion.json`` must match except for versions."""
-    with OutputFolder(out, DATASET, _settings_of(record), overwrite=overwrite) as output:
+def open_dataset_output(out: Path, record: Mapping[str, Any], overwrite: bool) -> Iterator[None]:
+    """Start or continue a merged or split dataset inside a ``with`` statement.
+
+    An existing ``conversion.json`` must equal ``record``, except for versions.
+    """
+    with OutputFolder(out, DATASET, _drop_versions(record), overwrite=overwrite) as output:
         output.start(record)
         yield
 
 
-def _settings_of(record: Mapping[str, Any]) -> dict[str, Any]:
+def _drop_versions(record: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in record.items() if key != "made_with"}
 
 
-def check_apart(out: Path, inputs: Sequence[Path]) -> None:
-    """Raise DatasetError if the output folder is an input, or contains or is in one."""
+def check_no_overlap(out: Path, inputs: Sequence[Path]) -> None:
+    """Raise DatasetError if the output folder is an input folder, contains one, or is inside one."""
     target = out.resolve()
     for path in (path.resolve() for path in inputs):
         if path == target or path in target.parents or target in path.parents:
@@ -205,41 +224,41 @@ def check_apart(out: Path, inputs: Sequence[Path]) -> None:
 
 
 def _check_episodes(root: Path, numbers: Iterable[int]) -> None:
-    """Check arrays, cameras and images of episodes; arrays missing since the import are accepted."""
+    """Check arrays, cameras and images of episodes; arrays that an import could not derive may be missing."""
     _, image_options, _ = read_settings(root)
     for folder in (root / schema.episode_folder(number) for number in numbers):
         stored = read_arrays(folder / schema.EPISODE_FILE)
-        source = read_object(folder, schema.SCENE_FILE)[0].get("source")
+        source = read_json_object(folder, schema.SCENE_FILE)[0].get("source")
         missing = source.get("missing") if isinstance(source, dict) else None
         lacking = missing if isinstance(missing, list) else []
         for wrong in (
             *(wrong for wrong in array_checks.check_keys(stored) if wrong.key not in lacking),
-            *array_checks.violations_of(
+            *array_checks.run_checks(
                 stored, (array_checks.check_file, array_checks.check_shapes, array_checks.check_finite)
             ),
             *check_cameras(folder, image_options),
-            *check_images(folder, image_options, stored.steps, {}, check_ends),
+            *check_images(folder, image_options, stored.steps, {}, check_file_ends),
         ):
             if wrong.kind != "unexpected":
                 raise damaged_episode_error(root, wrong)
 
 
 def damaged_episode_error(root: Path, wrong: Violation) -> DatasetError:
-    """Return an error for a violation in an episode."""
+    """Make the error for a violation in an episode of the dataset ``root``."""
     where, fix = root / wrong.where, f"Run robocas validate {root} for all violations."
     return DatasetError("this episode is damaged", where=where, expected=wrong.expected, found=wrong.found, fix=fix)
 
 
 @dataclass
-class FilePlacer:
-    """Placer of files: links or copies them into a dataset, and counts both."""
+class FileCopier:
+    """Hard-links or copies files into a dataset, and counts linked and copied files."""
 
     link: bool
     linked: int = 0
     copied: int = 0
 
-    def place(self, source: Path, target: Path) -> None:
-        """Link a file, or copy it if linking is not possible or not requested."""
+    def copy_file(self, source: Path, target: Path) -> None:
+        """Hard-link a file, or copy it if links are not requested or not possible."""
         if self.link and not source.is_symlink():
             try:
                 os.link(source, target)
@@ -253,14 +272,14 @@ class FilePlacer:
         shutil.copyfile(source, target)
         self.copied += 1
 
-    def place_tree(self, source: Path, target: Path) -> None:
-        """Link or copy the files of a folder into an existing folder, except hidden files."""
+    def copy_tree(self, source: Path, target: Path) -> None:
+        """Hard-link or copy all files of a folder, except hidden files, into an existing folder."""
         with os.scandir(source) as entries:
             for entry in sorted(entries, key=lambda entry: entry.name):
                 if entry.name.startswith("."):
                     continue
                 if entry.is_dir():
                     (target / entry.name).mkdir()
-                    self.place_tree(Path(entry.path), target / entry.name)
+                    self.copy_tree(Path(entry.path), target / entry.name)
                 elif entry.is_file():
-                    self.place(Path(entry.path), target / entry.name)
+                    self.copy_file(Path(entry.path), target / entry.name)

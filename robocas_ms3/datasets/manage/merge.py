@@ -8,7 +8,7 @@ from pathlib import Path
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.conversion.episode_plan import SETTINGS
+from robocas_ms3.datasets.conversion.episode_plan import SETTINGS_KEYS
 from robocas_ms3.datasets.manage.copy_episodes import (
     KEEP_RULE,
     CopiedEpisode,
@@ -23,7 +23,7 @@ from robocas_ms3.datasets.manage.copy_episodes import (
 def merge(
     roots: Sequence[Path], out: Path, *, skip_duplicates: bool = False, options: CopyOptions | None = None
 ) -> CopyResult:
-    """Write a dataset with all episodes of several datasets, in the given order; each keeps its split.
+    """Merge datasets into a new one: all episodes, numbered in the order of ``roots``; each keeps its split.
 
     Raises:
         DatasetError: a dataset is unfinished or damaged, the settings differ, or, without ``skip_duplicates``, an
@@ -41,7 +41,7 @@ def merge(
         validation = set(source.dataset.splits[1])
         for number in source.dataset.numbers:
             member = CopiedEpisode(source, number, "val" if number in validation else "train")
-            first = members.setdefault(source.identity(number), member)
+            first = members.setdefault(source.recording_id(number), member)
             if first is not member:
                 duplicates.append((first, member))
     if duplicates and not skip_duplicates:
@@ -54,7 +54,7 @@ def merge(
 
 
 def _distinct_names(roots: Sequence[Path]) -> list[str]:
-    """Return the shortest distinct ends of paths."""
+    """Return a distinct name per path: its last folder, or as many last folders as needed."""
     parts = [root.resolve().parts for root in roots]
     names: list[str] = []
     for length in range(1, max(map(len, parts)) + 1):
@@ -67,7 +67,7 @@ def _distinct_names(roots: Sequence[Path]) -> list[str]:
 def _check_settings(sources: Sequence[FinishedDataset]) -> None:
     first = sources[0].dataset
     for other in (source.dataset for source in sources[1:]):
-        different = [key for key in SETTINGS if first.settings.get(key) != other.settings.get(key)]
+        different = [key for key in SETTINGS_KEYS if first.settings.get(key) != other.settings.get(key)]
         if different:
             raise DatasetError(
                 "the settings of the datasets differ",

@@ -37,7 +37,12 @@ EpisodeSplit = tuple[list[int], list[int]]
 
 @dataclass(frozen=True)
 class SplitOptions:
-    """Choice of validation episodes: their fraction, and the key whose groups stay together."""
+    """Options of a new choice of validation episodes.
+
+    Attributes:
+        val_fraction: fraction of the episodes for validation, between 0 and 1.
+        group_by: episodes with the same seed, target object or task stay in one split.
+    """
 
     val_fraction: float
     group_by: GroupBy = "seed"
@@ -75,11 +80,11 @@ def group_episodes(dataset: Dataset, group_by: GroupBy) -> dict[int, str]:
     return groups
 
 
-def cut(groups: Mapping[int, str], fractions: Sequence[float], salt: str = "") -> list[list[int]]:
-    """Divide episodes into lists of about these fractions, which sum to 1; a group stays in one list.
+def divide_episodes(groups: Mapping[int, str], fractions: Sequence[float], salt: str = "") -> list[list[int]]:
+    """Divide episodes into lists with about these fractions, which sum to 1; episodes of a group stay together.
 
-    No list is empty. Groups in the order of their SHA-256 fill the last list first, so the list of a group depends on
-    the groups alone. Another salt gives an independent order.
+    ``groups``: group of each episode, by number. No list is empty. The groups are sorted by their SHA-256 and fill the
+    last list first, so the result depends on the groups alone. Another ``salt`` gives an independent order.
 
     Raises:
         DatasetError: there are fewer groups than fractions, or the fractions are invalid.
@@ -90,7 +95,8 @@ def cut(groups: Mapping[int, str], fractions: Sequence[float], salt: str = "") -
         members.setdefault(group, []).append(number)
     ranked = sorted(members, key=lambda group: hashlib.sha256(f"{salt}{group}".encode()).hexdigest())
     if len(ranked) < len(fractions):
-        raise DatasetError("too few groups to split", expected=f"at least {len(fractions)} groups", found=len(ranked))
+        what, expected = "too few groups of episodes to split", f"at least {len(fractions)} groups"
+        raise DatasetError(what, expected=expected, found=len(ranked))
     pieces: list[list[int]] = []
     for index in reversed(range(1, len(fractions))):
         goal = round(fractions[index] * len(groups))
@@ -103,24 +109,24 @@ def cut(groups: Mapping[int, str], fractions: Sequence[float], salt: str = "") -
 
 
 def check_fractions(fractions: Sequence[float], where: str = "fractions") -> None:
-    """Raise DatasetError if fractions do not divide a whole."""
+    """Raise DatasetError unless there are two or more fractions > 0 with the sum 1."""
     if len(fractions) < 2 or min(fractions) <= 0 or abs(sum(fractions) - 1) > 1e-6:
         expected = "two or more, each > 0, sum 1"
         raise DatasetError("invalid fractions", where=where, expected=expected, found=list(fractions))
 
 
 def resplit(root: Path, options: SplitOptions | None = None) -> EpisodeSplit:
-    """Rewrite ``data_info.json`` from the episodes on disk and return their split; no episode is changed.
+    """Write ``data_info.json`` again from the episodes on disk; return the new split. Episodes do not change.
 
-    Episodes that are not on disk are removed from ``conversion.json``. Without options each episode keeps its split,
-    and unlisted episodes are split by seed.
+    Episodes that are not on disk are removed from ``conversion.json``. Without options each episode keeps its split;
+    episodes that ``data_info.json`` did not list are split by seed.
     """
     with lock_folder(root):
         dataset = Dataset(root)
         split = dataset.splits if options is None else _choose_split(dataset, options)
         for number in dataset.numbers:
             stored = read_arrays(dataset.episode(number).folder / schema.EPISODE_FILE)
-            for wrong in array_checks.violations_of(stored, (array_checks.check_file, array_checks.check_finite)):
+            for wrong in array_checks.run_checks(stored, (array_checks.check_file, array_checks.check_finite)):
                 raise damaged_episode_error(root, wrong)
         info, settings = build_info(root, split), dataset.settings
         new = {**settings, **({} if options is None else {"split": options.rule})}
@@ -136,7 +142,7 @@ def resplit(root: Path, options: SplitOptions | None = None) -> EpisodeSplit:
 def split_train_val(
     source: FinishedDataset, options: SplitOptions | None, train: Path, val: Path
 ) -> dict[Path, EpisodeSplit]:
-    """Return the episodes of two datasets, training and validation, by folder."""
+    """Choose the episodes of a training and a validation dataset; return both splits by output folder."""
     a, b = train.resolve(), val.resolve()
     if a == b or a in b.parents or b in a.parents:
         fix = "Choose two folders, neither inside the other."
@@ -148,22 +154,22 @@ def split_train_val(
 def split_by_fractions(
     dataset: Dataset, fractions: Sequence[float], group_by: GroupBy, options: SplitOptions | None
 ) -> dict[str, EpisodeSplit]:
-    """Return the episodes of the datasets ``part_0``, ``part_1``, ... with these fractions, by folder."""
-    # Without a salt of its own, the last part would get all validation episodes.
-    pieces = cut(group_episodes(dataset, group_by), fractions, salt="part ")
+    """Choose the episodes of datasets with these fractions; return their splits by folder ``part_0``, ..."""
+    # With the salt of the validation split, the last dataset would get all validation episodes.
+    pieces = divide_episodes(group_episodes(dataset, group_by), fractions, salt="part ")
     return {f"part_{index}": _split_within(dataset, piece, options) for index, piece in enumerate(pieces)}
 
 
 def split_by_value(dataset: Dataset, group_by: GroupBy, options: SplitOptions | None) -> dict[str, EpisodeSplit]:
-    """Return the episodes of one dataset per task or target object, by folder."""
+    """Choose the episodes of one dataset per task or target object; return their splits by folder name."""
     groups = group_episodes(dataset, group_by)
     pieces = {value: [n for n, group in groups.items() if group == value] for value in sorted(set(groups.values()))}
-    names = folder_names(pieces)
+    names = make_folder_names(pieces)
     return {names[value]: _split_within(dataset, piece, options) for value, piece in pieces.items()}
 
 
-def folder_names(values: Iterable[str]) -> dict[str, str]:
-    """Return a distinct folder name of at most 49 characters for each value."""
+def make_folder_names(values: Iterable[str]) -> dict[str, str]:
+    """Make a distinct folder name of at most 49 characters for each value."""
     plain = {value: re.sub(r"[^\w.-]+", "_", value).strip(".")[:40] or "_" for value in values}
     shared = Counter(plain.values())
     return {
@@ -178,7 +184,10 @@ def write_split(
     options: SplitOptions | None,
     copy_options: CopyOptions | None = None,
 ) -> list[CopyResult]:
-    """Write the datasets of a split, by folder; ``options`` None: episodes keep the split of the source."""
+    """Write the datasets of a split; ``pieces`` has the episodes of each dataset by output folder.
+
+    ``options``: how validation episodes were chosen; None: episodes keep the split of the source.
+    """
     members: dict[Path, list[CopiedEpisode]] = {}
     for out, (train, val) in pieces.items():
         if not train and not val:
@@ -195,7 +204,7 @@ def _split_within(dataset: Dataset, numbers: list[int], options: SplitOptions | 
     if options is not None and len(numbers) > 1:
         groups = group_episodes(dataset, options.group_by)
         fractions = [1 - options.val_fraction, options.val_fraction]
-        train, val = cut({number: groups[number] for number in numbers}, fractions)
+        train, val = divide_episodes({number: groups[number] for number in numbers}, fractions)
         return train, val
     chosen = set(numbers)
     train, val = ([number for number in listed if number in chosen] for listed in dataset.splits)
@@ -204,5 +213,5 @@ def _split_within(dataset: Dataset, numbers: list[int], options: SplitOptions | 
 
 def _choose_split(dataset: Dataset, options: SplitOptions) -> EpisodeSplit:
     groups = group_episodes(dataset, options.group_by)
-    train, val = cut(groups, [1 - options.val_fraction, options.val_fraction])
+    train, val = divide_episodes(groups, [1 - options.val_fraction, options.val_fraction])
     return train, val

@@ -29,14 +29,14 @@ _IDENTITY = ("ee_pos", "ee_orn", "robot_joints", "gripper_status", "language_goa
 
 @dataclass(frozen=True)
 class EpisodeArrays:
-    """Readable content of an ``episode_info.npz``.
+    """Arrays of an ``episode_info.npz``, and the errors of arrays that can't be read.
 
     Attributes:
         path: path of the file.
         arrays: arrays by key.
-        unreadable: errors by key; "": error of the file as a whole.
-        derived: for each derived array the keys it was computed from, see `derive_missing_arrays`.
-        ignored: keys that were not requested.
+        unreadable: error of each unreadable array, by key; key "": error of the whole file.
+        derived: for each array that `derive_missing_arrays` has computed, what it was computed from.
+        ignored: keys in the file that were not requested.
     """
 
     path: Path
@@ -47,7 +47,7 @@ class EpisodeArrays:
 
     @property
     def file(self) -> str:
-        """Path of the file within the dataset."""
+        """Path of the file relative to the dataset."""
         return f"{self.path.parent.name}/{self.path.name}"
 
     @property
@@ -57,17 +57,17 @@ class EpisodeArrays:
         most = Counter(lengths.values()).most_common(1)
         return lengths.get("ee_pos", most[0][0] if most else 0)
 
-    def reason(self, key: str = "") -> str:
-        """Return why a key, or the file, is unreadable."""
+    def describe_error(self, key: str = "") -> str:
+        """Return why the array ``key`` (default: the whole file) can't be read."""
         error = self.unreadable[key]
         text = getattr(error, "strerror", None) or one_line(error)
         pickled = PICKLED if key else f"another file, or {PICKLED}"
         return pickled if "pickle" in text else text
 
-    def needed(self, keys: Iterable[str]) -> dict[str, NDArray]:
-        """Return the arrays of some keys; raise DatasetError if any array is unreadable or a key is missing."""
+    def require(self, keys: Iterable[str]) -> dict[str, NDArray]:
+        """Return the arrays with these keys; raise DatasetError if one is missing or any array is unreadable."""
         for key, error in self.unreadable.items():
-            where, found = f"{self.path}, {key}" if key else self.path, self.reason(key)
+            where, found = f"{self.path}, {key}" if key else self.path, self.describe_error(key)
             raise DatasetError("this episode can't be read", where=where, found=found, fix=SEE_VALIDATE) from error
         missing = [key for key in keys if key not in self.arrays]
         if missing:
@@ -76,7 +76,7 @@ class EpisodeArrays:
 
 
 def read_arrays(path: Path, keys: Container[str] | None = None) -> EpisodeArrays:
-    """Read arrays as stored, all or those of ``keys``; errors are stored in ``unreadable``, not raised."""
+    """Read the arrays with these keys (default: all), without casts; errors go to ``unreadable``."""
     arrays: dict[str, NDArray] = {}
     unreadable: dict[str, Exception] = {}
     ignored: list[str] = []
@@ -99,27 +99,34 @@ def read_arrays(path: Path, keys: Container[str] | None = None) -> EpisodeArrays
 
 
 def load_arrays(path: Path) -> EpisodeArrays:
-    """Read the arrays of the schema and cast them to its types; arrays that can't be cast are unreadable."""
+    """Read the arrays of the schema and cast them to its types.
+
+    Arrays that can't be read or cast go to ``unreadable``. An unreadable file raises DatasetError.
+    """
     stored = read_arrays(path, SPECS)
     if "" in stored.unreadable:
         error = stored.unreadable[""]
         if isinstance(error, FileNotFoundError):
             raise DatasetError("no such file", where=path) from error
         raise DatasetError(
-            "damaged numpy archive, or another kind of file", where=path, found=stored.reason()
+            "damaged numpy archive, or another kind of file", where=path, found=stored.describe_error()
         ) from error
     arrays: dict[str, NDArray] = {}
     unreadable = dict(stored.unreadable)
     for key, array in stored.arrays.items():
         try:
-            arrays[key] = cast(SPECS[key], array)
+            arrays[key] = cast_array(SPECS[key], array)
         except (ValueError, MemoryError) as error:
             unreadable[key] = error
     return replace(stored, arrays=arrays, unreadable=unreadable)
 
 
-def cast(spec: schema.ArraySpec, array: NDArray) -> NDArray:
-    """Return an array with the type and number of axes of the schema; extra axes of length 1 are dropped."""
+def cast_array(spec: schema.ArraySpec, array: NDArray) -> NDArray:
+    """Cast an array to the data type of the schema, and drop additional axes of length 1.
+
+    Raises:
+        ValueError: the cast would change values, or the number of axes is wrong.
+    """
     for axis in reversed(range(array.ndim)):
         if array.ndim > len(spec.shape) and array.shape[axis] == 1:
             array = array.squeeze(axis)
@@ -137,15 +144,15 @@ def cast(spec: schema.ArraySpec, array: NDArray) -> NDArray:
     return array.astype(spec.dtype)
 
 
-def is_declared(key: str, array: NDArray) -> bool:
-    """Return whether an array has the type and number of axes of the schema."""
+def matches_schema(key: str, array: NDArray) -> bool:
+    """Return whether an array has the data type and the number of axes of the schema."""
     return SPECS[key].has_dtype(array) and array.ndim == len(SPECS[key].shape)
 
 
 def derive_missing_arrays(loaded: EpisodeArrays, info: Mapping[str, Any], rate_hz: float) -> EpisodeArrays:
-    """Return the arrays, with missing ones computed from others and from ``info``.
+    """Compute missing arrays from other arrays and from ``data_info.json``; return all arrays.
 
-    ``info`` has the entries of the episode in ``data_info.json``, see `files.episode_info`.
+    ``info``: entries of the episode in ``data_info.json``, see `files.episode_info`.
     """
     arrays, derived = dict(loaded.arrays), dict(loaded.derived)
 
@@ -158,15 +165,15 @@ def derive_missing_arrays(loaded: EpisodeArrays, info: Mapping[str, Any], rate_h
         put("episode_length", len(arrays["ee_pos"]), "the length of the arrays")
     if isinstance(info.get("language_goal"), str):
         put("language_goal", info["language_goal"], schema.DATA_INFO_FILE)
-    goals = _goals_of_steps(info.get("step_goals"), len(arrays.get("ee_pos", ())))
+    goals = _expand_goals(info.get("step_goals"), len(arrays.get("ee_pos", ())))
     if goals:
         put("step_goal_type", [kind for kind, _ in goals], schema.DATA_INFO_FILE)
         put("step_lang_goals", [text for _, text in goals], schema.DATA_INFO_FILE)
     for keys in schema.RELATIVE_PAIRS:
-        if not set(keys[2:]) <= arrays.keys() and _poses(arrays, *keys[:2]) is not None:
-            arrays |= motion_arrays(arrays, keys)
+        if not set(keys[2:]) <= arrays.keys() and _read_poses(arrays, *keys[:2]) is not None:
+            arrays |= compute_motion_arrays(arrays, keys)
             derived |= dict.fromkeys(keys[2:], ", ".join(keys[:2]))
-    base = _poses(arrays, "base_pos", "base_orn")
+    base = _read_poses(arrays, "base_pos", "base_orn")
     if base is not None:
         yaw = np.arctan2(base[:, 1, 0], base[:, 0, 0])
         put("agv_pose", np.column_stack([base[:, :2, 3], np.unwrap(yaw)]), "base_pos, base_orn")
@@ -178,15 +185,15 @@ def derive_missing_arrays(loaded: EpisodeArrays, info: Mapping[str, Any], rate_h
     return replace(loaded, arrays=arrays, derived=derived)
 
 
-def motion_arrays(arrays: Mapping[str, NDArray], keys: tuple[str, str, str, str]) -> dict[str, NDArray]:
-    """Return the relative motion between absolute poses, for one tuple of ``schema.RELATIVE_PAIRS``."""
-    poses = _poses(arrays, keys[0], keys[1])
+def compute_motion_arrays(arrays: Mapping[str, NDArray], keys: tuple[str, str, str, str]) -> dict[str, NDArray]:
+    """Compute the two arrays of relative motion from the poses; ``keys``: one of ``schema.RELATIVE_PAIRS``."""
+    poses = _read_poses(arrays, keys[0], keys[1])
     assert poses is not None
     return dict(zip(keys[2:], to_dataset_motion(poses), strict=True))
 
 
-def arrays_fingerprint(arrays: Mapping[str, NDArray]) -> str:
-    """Return a SHA-256 of arrays, which identifies an episode whose recording is unknown."""
+def fingerprint_arrays(arrays: Mapping[str, NDArray]) -> str:
+    """Compute the SHA-256 of the arrays of an episode; it identifies an episode with an unknown recording."""
     digest = hashlib.sha256()
     for key in _IDENTITY:
         if key in arrays:
@@ -196,8 +203,8 @@ def arrays_fingerprint(arrays: Mapping[str, NDArray]) -> str:
     return digest.hexdigest()
 
 
-def _poses(arrays: Mapping[str, NDArray], position: str, orientation: str) -> NDArray[np.float64] | None:
-    """Return poses (T, 4, 4), None if they are missing or invalid."""
+def _read_poses(arrays: Mapping[str, NDArray], position: str, orientation: str) -> NDArray[np.float64] | None:
+    """Make poses (T, 4, 4) from two arrays; None if they are missing or invalid."""
     if not {position, orientation} <= arrays.keys():
         return None
     p, q = (arrays[key].astype(np.float64) for key in (position, orientation))
@@ -208,8 +215,11 @@ def _poses(arrays: Mapping[str, NDArray], position: str, orientation: str) -> ND
     return from_xyzw(p, q)
 
 
-def _goals_of_steps(goals: Any, steps: int) -> list[tuple[str, str]]:
-    """Return (type, text) of each step from ``step_goals``, empty if it does not cover all steps."""
+def _expand_goals(goals: Any, steps: int) -> list[tuple[str, str]]:
+    """Return (type, text) of the sub-goal of each step; empty if ``goals`` do not cover all steps.
+
+    ``goals``: list in ``step_goals`` of ``data_info.json``.
+    """
     found: list[tuple[str, str]] = []
     try:
         for goal in goals or []:
@@ -222,8 +232,8 @@ def _goals_of_steps(goals: Any, steps: int) -> list[tuple[str, str]]:
     return found if len(found) == steps else []
 
 
-def episode_arrays(motion: Motion, instruction: str, subgoals: Sequence[SubGoal]) -> dict[str, np.ndarray]:
-    """Return the arrays of ``episode_info.npz`` without embeddings, from the motion at T sampled states."""
+def make_episode_arrays(motion: Motion, instruction: str, subgoals: Sequence[SubGoal]) -> dict[str, np.ndarray]:
+    """Make the arrays of ``episode_info.npz`` without embeddings, from the motion at T sampled states."""
     of_steps = [goal for goal in subgoals for _ in range(goal.last - goal.first + 1)]
     values = {
         **{quantity.name: quantity.record(motion) for quantity in QUANTITIES if quantity.record},
@@ -236,7 +246,7 @@ def episode_arrays(motion: Motion, instruction: str, subgoals: Sequence[SubGoal]
 
 
 def add_embeddings(arrays: Mapping[str, NDArray], embed: Callable[[list[str]], NDArray]) -> dict[str, NDArray]:
-    """Return the arrays with the embeddings of their texts; ``embed`` maps N texts to (N, 384)."""
+    """Add the embeddings of the texts in the arrays; ``embed`` maps N texts to (N, 384)."""
     made = {
         **arrays,
         "language_embedding": embed([str(arrays["language_goal"])])[0],

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.datasets.actions import action_space
+from robocas_ms3.datasets.actions import compute_action_space
 from robocas_ms3.datasets.images.image_files import Box, ImageOptions
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.recordings.subgoals import SubGoal, group_subgoals
@@ -34,8 +34,10 @@ ImageKind = Literal["rgb", "depth"]
 class CameraModel:
     """Intrinsics and pose of a camera.
 
-    ``intrinsic`` is (4,) fx, fy, cx, cy in pixels, ``camera_in_parent`` (4, 4) the pose of the OpenCV camera frame in
-    its parent frame.
+    Attributes:
+        intrinsic: (4,) fx, fy, cx, cy in pixels.
+        camera_in_parent: (4, 4) pose of the OpenCV camera frame in the parent frame.
+        parent: parent frame: the EEF, the arm base or the world.
     """
 
     intrinsic: NDArray[np.float64]
@@ -45,7 +47,13 @@ class CameraModel:
 
 @dataclass(frozen=True)
 class StepImages:
-    """Images of one step by camera: RGB (H, W, 3), depth (H, W) in mm, bounding box of the visible target."""
+    """Images of one step.
+
+    Attributes:
+        rgb: RGB image (H, W, 3) by camera.
+        depth: depth image (H, W) in mm by camera, 0 = no depth; empty without depth.
+        boxes: bounding box of the target by camera that sees it; empty unless requested.
+    """
 
     rgb: dict[str, NDArray[np.uint8]]
     depth: dict[str, NDArray[np.uint16]]
@@ -53,7 +61,7 @@ class StepImages:
 
 
 class SourceEpisode(ABC):
-    """Episode of a source; reading missing or damaged data raises ``DatasetError``.
+    """Episode of an `EpisodeSource`; reading missing or damaged data raises ``DatasetError``.
 
     Attributes:
         where: path or name of the episode in error messages.
@@ -70,16 +78,16 @@ class SourceEpisode(ABC):
 
     @property
     def instruction(self) -> str:
-        """Instruction to the robot."""
+        """Language instruction of the episode."""
         return str(self.read(["language_goal"])["language_goal"])
 
     @property
     @abstractmethod
     def arrays(self) -> dict[str, NDArray]:
-        """Available arrays of ``schema.EPISODE_INFO``, by key."""
+        """Arrays of ``episode_info.npz`` that the source has, by key; see `schema.EPISODE_INFO`."""
 
     def read(self, keys: Sequence[str]) -> dict[str, NDArray]:
-        """Return some of the arrays; raise DatasetError if one is missing."""
+        """Return the arrays with these keys; raise DatasetError if one is missing."""
         arrays = self.arrays
         missing = [key for key in keys if key not in arrays]
         if missing:
@@ -88,46 +96,47 @@ class SourceEpisode(ABC):
 
     @property
     def goals(self) -> list[SubGoal]:
-        """Sub-goals and their steps; empty if unknown."""
+        """Sub-goals of the episode and their steps; empty if unknown."""
         arrays = self.read(("step_goal_type", "step_lang_goals"))
         return group_subgoals(arrays["step_goal_type"].tolist(), arrays["step_lang_goals"].tolist())
 
     @property
     def scene(self) -> dict[str, Any]:
-        """Description of the recording, known keys of `file_models.SceneRecord`; empty if unknown."""
+        """Content of ``scene.json``: the known keys of `file_models.SceneRecord`; empty if unknown."""
         return {}
 
     @property
     def layout(self) -> dict[str, Any]:
-        """Layout at the start, as in `file_models.SceneRecord`; empty if unknown."""
+        """Object layout at the start of the episode, as in `file_models.LayoutRecord`; empty if unknown."""
         return self.scene.get("layout") or {}
 
     @property
     def target_boxes(self) -> Sequence[dict[str, Box]]:
-        """Bounding box of the target per step, by the cameras that see it; empty if unknown."""
+        """Bounding box of the target for each step, by camera that sees it; empty if unknown."""
         return []
 
     def rgb(self, camera: str, step: int) -> NDArray[np.uint8]:
-        """Return an RGB image (H, W, 3)."""
-        raise _no_images(self)
+        """Return the RGB image (H, W, 3) of a camera at a step."""
+        raise _make_no_images_error(self)
 
     def depth(self, camera: str, step: int) -> NDArray[np.uint16]:
-        """Return a depth image (H, W) in mm, 0 = no depth."""
-        raise _no_images(self)
+        """Return the depth image (H, W) of a camera at a step, mm, 0 = no depth."""
+        raise _make_no_images_error(self)
 
     def frames(
         self, camera: str, kind: ImageKind = "rgb", first: int = 0, count: int | None = None
     ) -> Generator[NDArray, None, None]:
-        """Yield the images of a camera from step ``first`` on; close the generator if it is not exhausted.
+        """Yield ``count`` images of a camera from step ``first`` on; default: up to the last step.
 
-        ``count`` None: up to the last step. The default reads image by image; formats with videos override it.
+        Close the generator if you stop before the last image. Formats with videos override this method to decode each
+        frame once.
         """
         image = self.rgb if kind == "rgb" else self.depth
         for step in range(first, self.steps if count is None else first + count):
             yield image(camera, step)
 
     def images(self, image_options: ImageOptions) -> Generator[StepImages, None, None]:
-        """Yield the images of each step; close the generator if it is not exhausted."""
+        """Yield the requested images of each step; close the generator if you stop before the last step."""
         boxes = self.target_boxes if image_options.boxes else []
         with closing(iter_images(self, image_options.cameras, "rgb")) as rgb, ExitStack() as stack:
             depth = (
@@ -140,22 +149,22 @@ class SourceEpisode(ABC):
 
     def intrinsic(self, camera: str) -> NDArray[np.float64]:
         """Return the intrinsics of a camera, (4,) fx, fy, cx, cy in pixels."""
-        raise _no_images(self)
+        raise _make_no_images_error(self)
 
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
         """Return the pose (4, 4) of the OpenCV camera frame in its parent frame."""
-        raise _no_images(self)
+        raise _make_no_images_error(self)
 
     def camera_parent(self, camera: str) -> Parent:
-        """Return the parent frame of the pose of a camera; default: that of the standard camera."""
+        """Return the parent frame of the camera pose; default: as for the standard camera with this name."""
         return standard_camera_parent(camera)
 
     def camera(self, name: str) -> CameraModel:
-        """Return intrinsics and pose of a camera."""
+        """Return the intrinsics and the pose of a camera."""
         return CameraModel(self.intrinsic(name), self.camera_in_parent(name), self.camera_parent(name))
 
 
-def _no_images(episode: SourceEpisode) -> DatasetError:
+def _make_no_images_error(episode: SourceEpisode) -> DatasetError:
     fix = "Render them with robocas convert."
     return DatasetError("this episode has no images", where=episode.where, fix=fix)
 
@@ -163,7 +172,7 @@ def _no_images(episode: SourceEpisode) -> DatasetError:
 def iter_images(
     episode: SourceEpisode, cameras: Sequence[str], kind: ImageKind = "rgb"
 ) -> Generator[dict[str, NDArray], None, None]:
-    """Yield the images of each step by camera; close the generator if it is not exhausted."""
+    """Yield the images of each step, by camera; close the generator if you stop before the last step."""
     steps = episode.steps
     with ExitStack() as stack:
         runs = {camera: stack.enter_context(closing(episode.frames(camera, kind, 0, steps))) for camera in cameras}
@@ -172,7 +181,9 @@ def iter_images(
 
 
 class EpisodeSource(ABC):
-    """Source of episodes by number; reading missing or damaged data raises ``DatasetError``.
+    """Trajectory file or dataset that is read episode by episode; its format does not matter to the caller.
+
+    Reading missing or damaged data raises ``DatasetError``.
 
     Attributes:
         root: path of the folder or file.
@@ -196,23 +207,31 @@ class EpisodeSource(ABC):
         return {number: self.episode(number).steps for number in self.numbers}
 
     def split(self, name: Split) -> list[int]:
-        """Return the episode numbers of a split; default: by seed, or by number without a seed."""
+        """Return the episode numbers of a split.
+
+        The default splits by the seed of the episode, or by its number if the seed is unknown.
+        """
         if name == "all":
             return self.numbers
         return split_by_seed({number: self.entry(number).get("seed") for number in self.numbers})[name == "val"]
 
     def entry(self, number: int) -> Mapping[str, Any]:
-        """Return the recording of an episode, see `provenance.recording_entry`; empty if unknown."""
+        """Return the entry of an episode in ``conversion.json``: its seed, success and recording; empty if unknown.
+
+        `provenance.make_recording_entry` lists the keys.
+        """
         return {}
 
     def action_space(self) -> dict[str, Any]:
-        """Return the range of the motion, as in ``data_info.json``; the default reads all episodes."""
+        """Return ``action_space`` as in ``data_info.json``; the default computes it from all episodes."""
         episodes = [self.episode(number).read(("rel_pos", "rel_orn")) for number in self.numbers]
-        return action_space([arrays["rel_pos"] for arrays in episodes], [arrays["rel_orn"] for arrays in episodes])
+        return compute_action_space(
+            [arrays["rel_pos"] for arrays in episodes], [arrays["rel_orn"] for arrays in episodes]
+        )
 
     @abstractmethod
     def episode(self, number: int) -> SourceEpisode:
-        """Open an episode."""
+        """Return an episode by number; its data are read on access."""
 
     def close(self) -> None:  # noqa: B027  (most sources keep nothing open)
-        """Release open resources."""
+        """Close renderers or files that the source keeps open."""

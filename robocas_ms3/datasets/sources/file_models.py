@@ -26,9 +26,9 @@ from robocas_ms3.demos.recordings.trajectory_json import parse_seed
 from robocas_ms3.robots.cameras import CAMERA_NAME
 
 
-def _seed(value: Any) -> Any:
+def _check_seed(value: Any) -> Any:
     if value is not None and parse_seed(value) is None:
-        raise ValueError("an integer, or a list of one")
+        raise ValueError("an integer, or a list of one integer")
     return value
 
 
@@ -39,19 +39,19 @@ EpisodeNumber = Annotated[str, StringConstraints(pattern=r"^[0-9]{1,7}$")]
 Pose = Annotated[list[FiniteFloat], Field(min_length=7, max_length=7)]
 
 
-class _Part(BaseModel):
+class _JsonObject(BaseModel):
     model_config = ConfigDict(strict=True, extra="allow")  # other writers may add keys
 
 
-class EnvInfo(_Part):
-    """Content of ``env_info``."""
+class EnvInfoRecord(_JsonObject):
+    """``env_info`` in ``scene.json``: arguments of ``gym.make``."""
 
     env_id: str
     env_kwargs: dict[str, Any]
 
 
-class Layout(_Part):
-    """Content of ``layout``: poses [x, y, z, qw, qx, qy, qz] in the world frame."""
+class LayoutRecord(_JsonObject):
+    """``layout`` in ``scene.json``: the scene at the start; poses [x, y, z, qw, qx, qy, qz] in the world frame."""
 
     object_ids: list[str] = []
     poses: list[Pose] = []
@@ -61,41 +61,41 @@ class Layout(_Part):
     relation: str | None = None
 
     @model_validator(mode="after")
-    def _check_lengths(self) -> Layout:
+    def _check_lengths(self) -> LayoutRecord:
         for values in (self.poses, self.present):
             if len(values) not in (0, len(self.object_ids)):
                 raise ValueError("one pose and one value of present per object id")
         return self
 
 
-class _Object(_Part):
+class _Object(_JsonObject):
     slot: NonNegativeInt
     id: str
     name: str
 
 
-class Target(_Part):
-    """Content of ``target``."""
+class TargetRecord(_JsonObject):
+    """``target`` in ``scene.json``: the object that the instruction names."""
 
     slot: NonNegativeInt
     asset_id: str
     name: str
 
 
-class _Source(_Part):
+class _Source(_JsonObject):
     trajectory: str | None = None
     episode_id: int | None = None
     recording: str | None = None
 
 
-class _Recovery(_Part):
+class _Recovery(_JsonObject):
     range: Annotated[list[int], Field(min_length=2, max_length=2)]
     stage: str
     reason: str
 
 
-class RecordedDetails(_Part):
-    """Content of ``recorded``."""
+class RecordedDetails(_JsonObject):
+    """``recorded`` in ``scene.json``: additional information of ``robocas generate``."""
 
     instruction_template: str | None = None
     relation: str | None = None
@@ -107,26 +107,26 @@ class RecordedDetails(_Part):
     seconds: dict[str, Any] | None = None
 
 
-class EntryRecord(_Part):
-    """Recording of an episode in ``conversion.json``; see `provenance.recording_entry`."""
+class EntryRecord(_JsonObject):
+    """Entry of an episode in ``conversion.json``, see `provenance.make_recording_entry`."""
 
     trajectory: str | None = None
     trajectory_episode: int | None = None
-    seed: Annotated[Any, PlainValidator(_seed)] = None
+    seed: Annotated[Any, PlainValidator(_check_seed)] = None
     success: bool | None = None
     recording: str | None = None
 
 
-class EpisodesRecord(_Part):
-    """Episodes of ``conversion.json``; ``skipped`` ones could not be written, each has a ``reason``."""
+class EpisodesRecord(_JsonObject):
+    """Episodes in ``conversion.json``; those in ``skipped`` could not be written and have a ``reason``."""
 
     made_with: dict[str, str] = {}
     episodes: dict[EpisodeNumber, EntryRecord] = {}
     skipped: dict[EpisodeNumber, EntryRecord] = {}
 
 
-class SettingsRecord(_Part):
-    """Settings of ``conversion.json``, which all episodes of a dataset share."""
+class SettingsRecord(_JsonObject):
+    """Settings in ``conversion.json``, which apply to all episodes of a dataset."""
 
     rate_hz: RateHz
     cameras: Annotated[list[CameraName], Field(min_length=1)]
@@ -144,13 +144,13 @@ _Row = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 _Range = Annotated[list[_Row], Field(min_length=2, max_length=2)]
 
 
-class _ActionSpace(_Part):
+class _ActionSpace(_JsonObject):
     relative_position: _Range
     relative_rotation: _Range
 
 
-class DataInfoRecord(_Part):
-    """Content of ``data_info.json``; episode numbers as JSON keys are strings."""
+class DataInfoRecord(_JsonObject):
+    """Content of ``data_info.json``; JSON keys that are episode numbers are strings."""
 
     train_eps: list[int] = Field(description="list of episode numbers")
     val_eps: list[int] = Field(description="list of episode numbers: 10 % of the seeds, at least one if there are two")
@@ -165,23 +165,23 @@ class DataInfoRecord(_Part):
     )
 
 
-class SceneRecord(_Part):
-    """Content of ``scene.json``; None: unknown, as in imported datasets."""
+class SceneRecord(_JsonObject):
+    """Content of ``scene.json``; a value is None if it is unknown, as in imported datasets."""
 
     schema_version: Literal[schema.SCHEMA_VERSION] = Field(  # pyright: ignore[reportInvalidTypeForm]
         description=f"{schema.SCHEMA_VERSION}"
     )
     task: str | None = Field(description="pick, select, search or open_pick")
-    env_info: EnvInfo | None = Field(description="{env_id, env_kwargs}: arguments of `gym.make`")
-    seed: Annotated[Any, PlainValidator(_seed)] = Field(description="seed of `env.reset`")
+    env_info: EnvInfoRecord | None = Field(description="{env_id, env_kwargs}: arguments of `gym.make`")
+    seed: Annotated[Any, PlainValidator(_check_seed)] = Field(description="seed of `env.reset`")
     reset_options: dict[str, Any] | None = Field(description="other options of `env.reset`")
     config: dict[str, Any] | None = Field(description="the complete task configuration")
-    layout: Layout | None = Field(
+    layout: LayoutRecord | None = Field(
         description="{object_ids, poses [x, y, z, qw, qx, qy, qz] in the world, present, robot_pose, basket_pose,"
         " relation}"
     )
     objects: list[_Object] | None = Field(description="[{slot, id, name}] of the objects in the scene")
-    target: Target | None = Field(description="{slot, asset_id, name}")
+    target: TargetRecord | None = Field(description="{slot, asset_id, name}")
     success: bool | None = Field(description="whether the recording ended in success")
     control_mode: str | None = Field(description="control mode of the recorded actions")
     control_freq: RateHz | None = Field(description="control frequency of the recorded actions, Hz")
@@ -201,16 +201,16 @@ _UNKNOWN = {**dict.fromkeys(SCENE_KEYS), "schema_version": schema.SCHEMA_VERSION
 
 
 def fill_unknown_keys(scene: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of ``scene.json`` with None for missing keys."""
+    """Add the missing keys of ``scene.json`` with the value None (unknown)."""
     return {**_UNKNOWN, **scene}
 
 
 def read_scene(scene: Mapping[str, Any], where: object) -> SceneRecord:
-    """Validate ``scene.json`` as a `SceneRecord`, None for missing keys; raise DatasetError if invalid."""
+    """Validate the content of ``scene.json``; missing keys become None. Raise DatasetError if it is invalid."""
     try:
         return SceneRecord.model_validate(fill_unknown_keys(scene))
     except ValidationError as problem:
-        about = "invalid description of a scene"
+        about = "invalid content of scene.json"
         raise error_from_validation(
             problem, SceneRecord, DatasetError, where=where, about=about, fix=SEE_VALIDATE
         ) from problem

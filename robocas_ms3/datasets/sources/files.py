@@ -20,7 +20,7 @@ SEE_VALIDATE = "Run robocas validate for all violations."
 
 
 def no_dataset_error(root: Path, expected: str) -> DatasetError:
-    """Return an error for a path without a dataset; it suggests a nearby dataset or trajectory file."""
+    """Make the error for a folder without a dataset; it suggests a dataset or trajectory file inside."""
     if (root / "meta" / "info.json").is_file():
         return DatasetError("this is a LeRobot dataset", where=root, expected="a RoboCAS folder")
     # the output folder of a plan has its datasets in datasets/
@@ -34,13 +34,16 @@ def no_dataset_error(root: Path, expected: str) -> DatasetError:
 
 
 def episode_info(info: Mapping[str, Any], number: int | None) -> dict[str, Any]:
-    """Return the entries of an episode in ``data_info.json``, by key."""
+    """Return the entries of an episode in the content of ``data_info.json``, by key.
+
+    The keys are ``ep_length``, ``language_goal`` and ``step_goals``.
+    """
     tables = {key: info.get(key) for key in ("ep_length", "language_goal", "step_goals")}
     return {k: table[str(number)] for k, table in tables.items() if isinstance(table, dict) and str(number) in table}
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the JSON object in a file, empty if the file does not exist."""
+    """Read the JSON object in a file; empty if the file does not exist."""
     try:
         content = load_json(path)
     except FileNotFoundError:
@@ -53,7 +56,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_array(path: Path) -> NDArray[np.float64]:
-    """Read an array of numbers, such as intrinsics or a pose."""
+    """Read an array of numbers from a ``.npy`` file, such as intrinsics or a pose."""
     try:
         array = load_npy(path, CAMERA_LIMIT)
         if array.dtype.kind not in "fiu":

@@ -15,48 +15,52 @@ from robocas_ms3.datasets.sources.file_models import SCENE_KEYS
 from robocas_ms3.demos.recordings.trajectory_file import Recording, TrajectoryFile
 
 
-def fingerprint(recording: Recording) -> str:
-    """Return the SHA-256 of seed, control mode, instruction and actions, which identifies a recording."""
+def fingerprint_recording(recording: Recording) -> str:
+    """Compute the SHA-256 of seed, control mode, instruction and actions, which identifies a recording."""
     digest = hashlib.sha256()
     digest.update(f"{recording.seed} {recording.control_mode} {recording.instruction}\n".encode())
     digest.update(np.ascontiguousarray(recording.actions).tobytes())
     return digest.hexdigest()
 
 
-def recording_entry(file: TrajectoryFile, index: int) -> dict[str, Any]:
-    """Return the recording of an episode, as stored in ``conversion.json``."""
+def make_recording_entry(file: TrajectoryFile, index: int) -> dict[str, Any]:
+    """Make the entry of an episode for ``conversion.json``.
+
+    ``index`` is its position in the trajectory file. The keys are ``trajectory``, ``trajectory_episode``, ``seed``,
+    ``success``, ``target`` and ``recording`` (the fingerprint).
+    """
     return {
-        **entry_without_fingerprint(file, index),
-        "recording": fingerprint(file.read_recording(index, bodies=False)),
+        **make_entry_without_fingerprint(file, index),
+        "recording": fingerprint_recording(file.read_recording(index, bodies=False)),
     }
 
 
-def entry_without_fingerprint(file: TrajectoryFile, index: int) -> dict[str, Any]:
-    """Return `recording_entry` without the fingerprint, for which the actions are read."""
+def make_entry_without_fingerprint(file: TrajectoryFile, index: int) -> dict[str, Any]:
+    """Make the entry of an episode without reading its actions; ``recording`` (the fingerprint) is None."""
     episode = file.episodes[index]
     recorded = episode.get("robocas")
     return {
         "trajectory": file.path.name,
         "trajectory_episode": episode["episode_id"],
         "seed": episode.get("episode_seed"),
-        "success": is_success(episode),
+        "success": was_successful(episode),
         "target": recorded.get("target") if isinstance(recorded, dict) else None,
         "recording": None,
     }
 
 
-def recorded_scene(file: TrajectoryFile, index: int) -> dict[str, Any]:
-    """Return the content of ``scene.json`` that the JSON of a trajectory file has, by `SCENE_KEYS`."""
+def make_recorded_scene(file: TrajectoryFile, index: int) -> dict[str, Any]:
+    """Make the part of ``scene.json`` that is known from the JSON of a trajectory file."""
     entry, recorded = file.read_entry(index), file.episodes[index].get("robocas", {})
     known = {"target", "instruction", "subgoals", "objects"}  # stored under other keys
     return {
         "schema_version": schema.SCHEMA_VERSION,
-        "task": task_of(file.env_info["env_id"]),
+        "task": parse_task_name(file.env_info["env_id"]),
         "env_info": {key: file.env_info[key] for key in ("env_id", "env_kwargs")},
         "seed": entry.seed,
         "reset_options": entry.reset_options,
         "target": recorded.get("target"),
-        "success": is_success(file.episodes[index]),
+        "success": was_successful(file.episodes[index]),
         "control_mode": entry.control_mode,
         "control_freq": file.control_freq,
         "source": {"trajectory": file.path.name, "episode_id": entry.episode_id},
@@ -65,29 +69,29 @@ def recorded_scene(file: TrajectoryFile, index: int) -> dict[str, Any]:
     }
 
 
-def scene_record(
+def make_scene(
     file: TrajectoryFile, index: int, recording: Recording, scene: dict[str, Any], rate_hz: float
 ) -> dict[str, Any]:
-    """Return ``scene.json`` of a recording; ``scene``: task, config, layout and objects as rebuilt."""
-    record = {**recorded_scene(file, index), **scene, "rate_hz": rate_hz}
-    record["source"]["recording"] = fingerprint(recording)
+    """Make ``scene.json`` of a recording; ``scene``: task, config, layout and objects of the rebuilt scene."""
+    record = {**make_recorded_scene(file, index), **scene, "rate_hz": rate_hz}
+    record["source"]["recording"] = fingerprint_recording(recording)
     return {key: record.get(key) for key in SCENE_KEYS}
 
 
-def is_success(episode: dict[str, Any]) -> bool:
-    """Return whether a recorded episode was successful, by its JSON entry."""
+def was_successful(episode: dict[str, Any]) -> bool:
+    """Return whether a recorded episode succeeded, from its entry in the JSON of the trajectory file."""
     found = episode.get("success", False)
     return found is True or (isinstance(found, list) and bool(found) and all(one is True for one in found))
 
 
-def task_of(env_id: str | None) -> str | None:
-    """Return the task name of an environment id, without importing the simulator."""
+def parse_task_name(env_id: str | None) -> str | None:
+    """Parse the task name from an environment id, such as ``open_pick`` from ``RoboCASOpenPick-v1``."""
     match = re.fullmatch(r"(?:\w+:)?RoboCAS(\w+)-v\d+", env_id or "")
     return "_".join(re.findall("[A-Z][a-z]*", match[1])).lower() if match else None
 
 
-def environment_id(env_info: Mapping[str, Any] | None) -> str:
-    """Return an identifier of the task, configuration and pack of an environment; empty if unknown."""
+def compute_environment_id(env_info: Mapping[str, Any] | None) -> str:
+    """Compute an identifier of the id and the arguments of an environment; empty if they are unknown."""
     if not env_info or not env_info.get("env_id"):
         return ""
     known = [env_info["env_id"], env_info.get("env_kwargs") or {}]

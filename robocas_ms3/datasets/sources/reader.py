@@ -20,7 +20,7 @@ from pydantic import BeforeValidator, TypeAdapter, ValidationError
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.images.image_files import read_image
-from robocas_ms3.datasets.sources.arrays import derive_missing_arrays, is_declared, load_arrays, read_arrays
+from robocas_ms3.datasets.sources.arrays import derive_missing_arrays, load_arrays, matches_schema, read_arrays
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource, SourceEpisode, Split
 from robocas_ms3.datasets.sources.file_models import CameraName, RateHz
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE, episode_info, no_dataset_error, read_array, read_json
@@ -31,13 +31,13 @@ DEFAULT_RATE = 5.0  # Hz, of RoboCAS-v0
 _SPLIT = "Run robocas split --in-place --val-fraction 0.1 to split again."
 
 
-def _number(value: Any) -> int:
+def _parse_episode_number(value: Any) -> int:
     if type(value) is int or (isinstance(value, str) and value.isdecimal()):
         return int(value)
     raise ValueError("an episode number: a whole number, at least 0")
 
 
-EpisodeIndex = Annotated[int, BeforeValidator(_number)]
+EpisodeIndex = Annotated[int, BeforeValidator(_parse_episode_number)]
 
 
 _RATE, _CAMERAS = TypeAdapter(RateHz), TypeAdapter(list[CameraName])
@@ -46,7 +46,7 @@ _NUMBERS, _LENGTHS = TypeAdapter(list[EpisodeIndex]), TypeAdapter(dict[int, int]
 
 @dataclass(frozen=True)
 class Episode(SourceEpisode):
-    """Episode of a RoboCAS folder."""
+    """Episode of a `Dataset`."""
 
     folder: Path
     dataset: Dataset = field(repr=False, compare=False)
@@ -56,24 +56,24 @@ class Episode(SourceEpisode):
         path = self.folder / schema.EPISODE_FILE
         loaded = load_arrays(path)
         if any(spec.name not in loaded.arrays for spec in schema.EPISODE_INFO if not spec.embedding):
-            loaded = derive_missing_arrays(loaded, self._info(), self.dataset.rate_hz)
+            loaded = derive_missing_arrays(loaded, self._read_data_info(), self.dataset.rate_hz)
         for key in set(loaded.unreadable) - set(loaded.derived):
-            where, found = f"{path}, {key}", loaded.reason(key)
+            where, found = f"{path}, {key}", loaded.describe_error(key)
             raise DatasetError("this array can't be read", where=where, found=found, fix=SEE_VALIDATE)
         return dict(loaded.arrays)
 
     def read(self, keys: Sequence[str]) -> dict[str, NDArray]:
         found = read_arrays(self.folder / schema.EPISODE_FILE, keys)
-        if found.unreadable or all(key in found.arrays and is_declared(key, found.arrays[key]) for key in keys):
-            return found.needed(keys)
-        return replace(found, arrays=self.arrays).needed(keys)  # slower: casts types and derives missing arrays
+        if found.unreadable or all(key in found.arrays and matches_schema(key, found.arrays[key]) for key in keys):
+            return found.require(keys)
+        return replace(found, arrays=self.arrays).require(keys)  # slower: casts types and derives missing arrays
 
     @property
     def goals(self) -> list[SubGoal]:
         where = f"{self.folder.parent / schema.DATA_INFO_FILE}, step_goals.{schema.episode_number(self.folder.name)}"
-        return read_subgoals(self._info().get("step_goals", []), where)
+        return read_subgoals(self._read_data_info().get("step_goals", []), where)
 
-    def _info(self) -> dict[str, Any]:
+    def _read_data_info(self) -> dict[str, Any]:
         return episode_info(self.dataset.info, schema.episode_number(self.folder.name))
 
     @property
@@ -86,7 +86,7 @@ class Episode(SourceEpisode):
 
     @property
     def instruction(self) -> str:
-        listed = self._info().get("language_goal")
+        listed = self._read_data_info().get("language_goal")
         return listed if isinstance(listed, str) else str(self.read(["language_goal"])["language_goal"])
 
     @cached_property
@@ -103,7 +103,7 @@ class Episode(SourceEpisode):
 
     @cached_property
     def image_format(self) -> schema.ImageFormat:
-        """Format of RGB images, by the first existing image."""
+        """Format of the RGB images, from the name of the first image."""
         for camera in self.cameras:
             for image_format in schema.IMAGE_FORMATS:
                 if schema.image_path(self.folder, camera, "rgb", 0, image_format).is_file():
@@ -111,7 +111,7 @@ class Episode(SourceEpisode):
         return "png"
 
     def image_path(self, camera: str, kind: str, step: int) -> Path:
-        """Return the path of an image."""
+        """Return the path of the ``rgb`` or ``depth`` image of a camera at a step."""
         return schema.image_path(self.folder, camera, kind, step, self.image_format)
 
     def rgb(self, camera: str, step: int) -> NDArray[np.uint8]:
@@ -136,14 +136,14 @@ class Episode(SourceEpisode):
 
 
 class Dataset(EpisodeSource):
-    """RoboCAS folder."""
+    """RoboCAS folder; arrays and images are read on access."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        if next(self._found(), None) is None:
+        if next(self._scan_numbers(), None) is None:
             raise no_dataset_error(self.root, "folders episode_0000000, ...")
 
-    def _found(self) -> Iterator[int]:
+    def _scan_numbers(self) -> Iterator[int]:
         if not self.root.is_dir():
             return
         with os.scandir(self.root) as entries:  # faster than a stat call per entry
@@ -154,10 +154,10 @@ class Dataset(EpisodeSource):
 
     @cached_property
     def numbers(self) -> list[int]:
-        return sorted(self._found())
+        return sorted(self._scan_numbers())
 
     @cached_property
-    def _known(self) -> frozenset[int]:
+    def _number_set(self) -> frozenset[int]:
         return frozenset(self.numbers)
 
     @cached_property
@@ -168,8 +168,8 @@ class Dataset(EpisodeSource):
     def info(self) -> dict[str, Any]:
         return read_json(self.root / schema.DATA_INFO_FILE)
 
-    def _value(self, file: str, key: str, form: TypeAdapter[Any], default: Any, fix: str = SEE_VALIDATE) -> Any:
-        """Return a validated value of an overview file; the default if the key is missing."""
+    def _read_value(self, file: str, key: str, form: TypeAdapter[Any], default: Any, fix: str = SEE_VALIDATE) -> Any:
+        """Read and validate a value of ``conversion.json`` or ``data_info.json``; default if the key is missing."""
         content = self.settings if file == schema.CONVERSION_FILE else self.info
         try:
             return form.validate_python(content[key]) if key in content else default
@@ -181,17 +181,19 @@ class Dataset(EpisodeSource):
     @cached_property
     def splits(self) -> tuple[list[int], list[int]]:
         """Numbers of the training and validation episodes, as listed in ``data_info.json``."""
-        train, val = (self._value(schema.DATA_INFO_FILE, key, _NUMBERS, [], _SPLIT) for key in ("train_eps", "val_eps"))
+        train, val = (
+            self._read_value(schema.DATA_INFO_FILE, key, _NUMBERS, [], _SPLIT) for key in ("train_eps", "val_eps")
+        )
         return train, val
 
     @cached_property
     def rate_hz(self) -> float:
-        return float(self._value(schema.CONVERSION_FILE, "rate_hz", _RATE, DEFAULT_RATE))
+        return float(self._read_value(schema.CONVERSION_FILE, "rate_hz", _RATE, DEFAULT_RATE))
 
     @cached_property
     def cameras(self) -> tuple[str, ...]:
         first = self.episode(self.numbers[0])
-        return tuple(self._value(schema.CONVERSION_FILE, "cameras", _CAMERAS, first.cameras))
+        return tuple(self._read_value(schema.CONVERSION_FILE, "cameras", _CAMERAS, first.cameras))
 
     @property
     def has_depth(self) -> bool:
@@ -212,13 +214,15 @@ class Dataset(EpisodeSource):
         if missing:
             where, expected = self.root / schema.DATA_INFO_FILE, ", ".join(missing)
             raise DatasetError("missing keys", where=where, expected=expected, fix=SEE_VALIDATE)
-        return self._value(schema.DATA_INFO_FILE, "ep_length", _LENGTHS, {})
+        return self._read_value(schema.DATA_INFO_FILE, "ep_length", _LENGTHS, {})
 
     def split(self, name: Split) -> list[int]:
         numbers = sorted(self.lengths) if name == "all" else self.splits[name == "val"]
         unknown = [number for number in numbers if number not in self.lengths]
         if unknown:
-            raise DatasetError("episodes of unknown length", where=self.root / schema.DATA_INFO_FILE, found=unknown[:5])
+            what, expected = "episodes of unknown length", "all episodes of the split in ep_length"
+            where = self.root / schema.DATA_INFO_FILE
+            raise DatasetError(what, where=where, expected=expected, found=f"no {unknown[:5]}", fix=SEE_VALIDATE)
         return numbers
 
     def entry(self, number: int) -> dict[str, Any]:
@@ -230,21 +234,24 @@ class Dataset(EpisodeSource):
         return self.info.get("action_space", {})
 
     def episode(self, number: int) -> Episode:
-        if number not in self._known:
+        if number not in self._number_set:
             known = f"{self.numbers[0]} to {self.numbers[-1]}"
             raise DatasetError("no such episode", where=self.root, expected=known, found=number, usage=True)
         return Episode(self.root / schema.episode_folder(number), self)
 
 
 def open_folder(path: Path, *, rate_hz: float | None = None, include_failed: bool = False) -> Dataset:
-    """Open a RoboCAS folder; ``include_failed`` has no effect."""
+    """Open a RoboCAS folder; raise DatasetError if ``rate_hz`` is not its rate.
+
+    ``include_failed`` has no effect, because a dataset has all of its episodes.
+    """
     dataset = Dataset(path)
     check_rate(dataset, rate_hz)
     return dataset
 
 
 def check_rate(source: EpisodeSource, rate_hz: float | None) -> None:
-    """Raise DatasetError if a requested rate is not the rate of a dataset."""
+    """Raise DatasetError if the requested rate (None: any) is not the rate of the dataset."""
     if rate_hz is not None and rate_hz != source.rate_hz:
         what, fix = "the dataset has another rate", "Convert the trajectory file with this --rate."
-        raise DatasetError(what, where=source.root, expected=f"{source.rate_hz:g} Hz", found=f"{rate_hz:g}", fix=fix)
+        raise DatasetError(what, where=source.root, expected=f"{source.rate_hz:g} Hz", found=f"{rate_hz:g} Hz", fix=fix)

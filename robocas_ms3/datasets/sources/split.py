@@ -17,11 +17,13 @@ SPLIT_RULE = (
 def split_by_seed(
     seed_of: Mapping[int, Any], previous: tuple[Iterable[int], Iterable[int]] = ((), ())
 ) -> tuple[list[int], list[int]]:
-    """Split episodes by seed, 90 % training and 10 % validation; return the numbers of both.
+    """Split episodes by seed: 90 % of the seeds for training, 10 % for validation; return both lists of numbers.
 
-    ``seed_of`` has the seed of each episode by number; an episode without a seed is split by its number. The split
-    depends on the seeds alone, not on their order. Episodes of the ``previous`` split, and their seeds, keep their
-    split; new seeds fill validation up to a tenth of all seeds. At least one of two seeds is for validation.
+    ``seed_of``: seed of each episode by number; None: the number replaces the seed. The split depends on the seeds
+    alone, not on their order. With two or more seeds, validation has at least one.
+
+    ``previous``: an earlier split. Its episodes keep their split, and so do other episodes with the same seeds. New
+    seeds are added to validation until it has a tenth of all seeds.
     """
     known = {number: parse_seed(value) for number, value in seed_of.items()}
     seeds = {number: number if seed is None else seed for number, seed in known.items()}

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from robocas_ms3.assets.pack import find_packs, load_pack
 from robocas_ms3.core.errors import AssetError, DatasetError, RobocasError
-from robocas_ms3.datasets.sources.arrays import episode_arrays
+from robocas_ms3.datasets.sources.arrays import make_episode_arrays
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource, SourceEpisode, Split
-from robocas_ms3.datasets.sources.provenance import is_success, recorded_scene, recording_entry
+from robocas_ms3.datasets.sources.provenance import make_recorded_scene, make_recording_entry, was_successful
 from robocas_ms3.datasets.sources.reader import DEFAULT_RATE
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.recordings.motion import sample_states, sample_stride
@@ -25,12 +25,12 @@ from robocas_ms3.scenes.layout import PARKING_HEIGHT
 
 
 class TrajectorySource(EpisodeSource):
-    """Trajectory file with episodes numbered and sampled as by ``robocas convert``.
+    """Trajectory file as an episode source, with the numbers and steps of a dataset of ``robocas convert``.
 
     Attributes:
-        file: the closed trajectory file.
-        stride: control steps per step.
-        index: position of each episode in the file.
+        file: metadata of the trajectory file; its HDF5 file is closed.
+        stride: number of control steps per dataset step.
+        index: position in the trajectory file of each episode.
     """
 
     cameras: tuple[str, ...] = ()
@@ -47,40 +47,40 @@ class TrajectorySource(EpisodeSource):
         self.root, self.rate_hz = path, float(DEFAULT_RATE if rate_hz is None else rate_hz)
         with TrajectoryFile(path, pack=pack) as file:
             self.stride = sample_stride(file.control_freq, self.rate_hz)
-            self.index = [n for n, e in enumerate(file.episodes) if include_failed or is_success(e)]
+            self.index = [n for n, e in enumerate(file.episodes) if include_failed or was_successful(e)]
             self._entries = [_read_entry(file, index) for index in self.index]
         self.numbers, self.file = list(range(len(self.index))), file
 
-    def info(self, number: int) -> EpisodeEntry:
+    def episode_entry(self, number: int) -> EpisodeEntry:
         """Return the validated JSON entry of an episode."""
         found = self._entries[number]
         if isinstance(found, DatasetError):
             raise found
         return found
 
-    def objects(self, number: int) -> list[Any]:
-        """Return the object ids of an episode, by slot."""
+    def object_ids(self, number: int) -> list[Any]:
+        """Return the object id in each slot of the scene of an episode."""
         return list(self.file.episodes[self.index[number]]["robocas"].get("objects") or ())
 
-    def steps(self, number: int) -> int:
-        """Return the number of steps T of an episode."""
-        return len(sample_states(self.info(number).control_steps, self.stride))
+    def count_steps(self, number: int) -> int:
+        """Return the number of dataset steps T of an episode."""
+        return len(sample_states(self.episode_entry(number).control_steps, self.stride))
 
     @cached_property
     def lengths(self) -> dict[int, int]:
-        return {number: self.steps(number) for number in self.numbers}
+        return {number: self.count_steps(number) for number in self.numbers}
 
     def split(self, name: Split) -> list[int]:
         if name == "all":
             return self.numbers
-        return split_by_seed({number: self.info(number).seed for number in self.numbers})[name == "val"]
+        return split_by_seed({number: self.episode_entry(number).seed for number in self.numbers})[name == "val"]
 
     def entry(self, number: int) -> Mapping[str, Any]:
         with self.file.reopen() as file:
-            return recording_entry(file, self.index[number])
+            return make_recording_entry(file, self.index[number])
 
     def recording(self, number: int, *, bodies: bool = True) -> Recording:
-        """Return the recording of an episode, with the states of all bodies or of the robot only."""
+        """Read the recording of an episode; ``bodies`` False: only the states of the robot."""
         with self.file.reopen() as file:
             return file.read_recording(self.index[number], bodies=bodies)
 
@@ -101,7 +101,7 @@ class RecordedEpisode(SourceEpisode):
 
     @property
     def _entry(self) -> EpisodeEntry:
-        return self._source.info(self._number)
+        return self._source.episode_entry(self._number)
 
     @property
     def where(self) -> str:
@@ -109,7 +109,7 @@ class RecordedEpisode(SourceEpisode):
 
     @property
     def steps(self) -> int:
-        return self._source.steps(self._number)
+        return self._source.count_steps(self._number)
 
     @property
     def instruction(self) -> str:
@@ -119,7 +119,7 @@ class RecordedEpisode(SourceEpisode):
     def arrays(self) -> dict[str, NDArray]:
         recording = self.recording(bodies=False)
         samples = sample_states(recording.control_steps, self._source.stride)
-        return episode_arrays(recording.compute_motion(samples), recording.instruction, self.goals)
+        return make_episode_arrays(recording.compute_motion(samples), recording.instruction, self.goals)
 
     @property
     def goals(self) -> list[SubGoal]:
@@ -128,22 +128,25 @@ class RecordedEpisode(SourceEpisode):
 
     @property
     def scene(self) -> dict[str, Any]:
-        """Content of ``scene.json`` from the JSON of the file; object names need the installed pack."""
+        """Content of ``scene.json`` as far as the trajectory file has it.
+
+        Object names are known only if the pack is installed.
+        """
         source = self._source
-        scene = recorded_scene(source.file, source.index[self._number])
+        scene = make_recorded_scene(source.file, source.index[self._number])
         kwargs = scene["env_info"]["env_kwargs"]
-        config, names = kwargs.get("config"), _names(str(kwargs.get("pack", "builtin")))
+        config, names = kwargs.get("config"), _load_object_names(str(kwargs.get("pack", "builtin")))
         objects = [
             {"slot": slot, "id": asset, "name": names[asset]}
-            for slot, asset in enumerate(source.objects(self._number))
+            for slot, asset in enumerate(source.object_ids(self._number))
             if isinstance(asset, str) and asset in names
         ]
-        config = config if isinstance(config, Mapping) else _bundled_config(str(config))
+        config = config if isinstance(config, Mapping) else _load_bundled_config(str(config))
         return {**scene, "config": config, "objects": objects}
 
     @cached_property
     def layout(self) -> dict[str, Any]:
-        ids = self._source.objects(self._number)
+        ids = self._source.object_ids(self._number)
         actors = self.recording().states.get("actors", {})
         poses = [actors[f"object_{slot}"][0, :7] if f"object_{slot}" in actors else None for slot in range(len(ids))]
         there = [pose is not None and bool(pose[2] > PARKING_HEIGHT / 2) for pose in poses]
@@ -155,18 +158,18 @@ class RecordedEpisode(SourceEpisode):
 
 
 def _read_entry(file: TrajectoryFile, index: int) -> EpisodeEntry | DatasetError:
-    """Return the JSON entry of an episode, or its error, which is raised when the episode is read."""
+    """Return the JSON entry of an episode, or the error to raise when the episode is read."""
     try:
         entry = file.read_entry(index)
-        recorded_scene(file, index)
+        make_recorded_scene(file, index)
         return entry
     except DatasetError as error:
         return error
 
 
 @cache
-def _names(pack: str) -> dict[str, str]:
-    """Return the object names of an installed pack, by id; empty for paths and unknown packs."""
+def _load_object_names(pack: str) -> dict[str, str]:
+    """Load the object names of an installed pack, by object id; empty for paths and unknown packs."""
     try:
         return {asset: of.asset.name for asset, of in load_pack(pack).objects.items()} if pack in find_packs() else {}
     except AssetError:
@@ -174,8 +177,8 @@ def _names(pack: str) -> dict[str, str]:
 
 
 @cache
-def _bundled_config(name: str) -> Mapping[str, Any]:
-    """Return a bundled configuration by name; empty if it does not exist."""
+def _load_bundled_config(name: str) -> Mapping[str, Any]:
+    """Load a bundled task configuration by name; empty if it does not exist."""
     try:
         return load_task_config(name).model_dump(mode="json")
     except RobocasError:

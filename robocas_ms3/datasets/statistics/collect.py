@@ -14,13 +14,19 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import format_count, format_error
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.actions import ACTION_ARRAYS, ACTION_NAMES, require_actions
+from robocas_ms3.datasets.actions import ACTION_ARRAYS, ACTION_NAMES, compute_valid_actions
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.sources.episode_source import SourceEpisode
-from robocas_ms3.datasets.sources.file_models import Layout, RecordedDetails, SceneRecord, read_scene
+from robocas_ms3.datasets.sources.file_models import LayoutRecord, RecordedDetails, SceneRecord, read_scene
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
-from robocas_ms3.datasets.sources.provenance import task_of
-from robocas_ms3.datasets.statistics.layouts import LayoutMap, Placement, layout_map, round_values, surface_of
+from robocas_ms3.datasets.sources.provenance import parse_task_name
+from robocas_ms3.datasets.statistics.layouts import (
+    LayoutMap,
+    ObjectPositions,
+    find_surface,
+    make_layout_map,
+    round_values,
+)
 
 NOOP = (1e-3, np.deg2rad(0.5))  # m and rad per step; smaller motion counts as no motion
 BINS = 41  # of histograms; odd, so that zero motion has a bin of its own
@@ -28,8 +34,25 @@ UNKNOWN = "unknown"
 
 
 @dataclass
-class Stats:
-    """Statistics of a dataset: episode counts, lengths T per task, sub-goal lengths in steps per type."""
+class DatasetStatistics:
+    """Statistics of a dataset; counts are numbers of episodes.
+
+    Attributes:
+        path: path of the dataset.
+        rate_hz: rate in Hz.
+        split: counts by split.
+        lengths: numbers of steps T of the episodes, by task.
+        success: counts by ``true``, ``false`` and ``unknown``.
+        configs: counts by task configuration.
+        names: object names by object id.
+        objects: counts by object id in the scene.
+        targets: counts by object id of the target.
+        layouts: heat map of object positions, by task configuration.
+        instructions, templates, relations: counts by instruction, instruction template and relation.
+        actions: all 7-D actions (N, 7), m and rad.
+        subgoals: numbers of steps of the sub-goals, by type.
+        gripper_changes: number of open and close commands of each episode.
+    """
 
     path: Path
     rate_hz: float
@@ -56,15 +79,15 @@ class Stats:
     def steps(self) -> int:
         return sum(map(sum, self.lengths.values()))
 
-    def add(self, episode: SourceEpisode, steps: int) -> tuple[str, Placement]:
-        """Count an episode by its ``scene.json``; return its configuration name and its object positions."""
+    def add_episode(self, episode: SourceEpisode, steps: int) -> tuple[str, ObjectPositions]:
+        """Count an episode with T steps; return the name of its configuration and its object positions."""
         where = f"{episode.where}/{schema.SCENE_FILE}"
         scene = read_scene(episode.scene, where)
         recorded, target, config = scene.recorded or RecordedDetails(), scene.target, _config_name(scene)
         try:
-            layout, surface = Layout.model_validate(episode.layout), surface_of(scene.config or {})
+            layout, surface = LayoutRecord.model_validate(episode.layout), find_surface(scene.config or {})
         except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
-            what, found = "invalid description of a scene", format_error(error, 200)
+            what, found = "invalid content of scene.json", format_error(error, 200)
             raise DatasetError(what, where=where, found=found, fix=SEE_VALIDATE) from error
         slots = [n for n in range(len(layout.object_ids)) if not layout.present or layout.present[n]]
         poses = np.array(layout.poses, dtype=np.float64).reshape(-1, 7)
@@ -83,12 +106,12 @@ class Stats:
             if value:
                 counter[value] += 1
         if not len(poses):
-            return config, Placement(np.zeros((0, 2)))
+            return config, ObjectPositions(np.zeros((0, 2)))
         index = slots.index(target.slot) if target and target.slot in slots else None
-        return config, Placement(poses[slots, :2], index, surface)
+        return config, ObjectPositions(poses[slots, :2], index, surface)
 
     def summary(self) -> str:
-        """Return the statistics in one line."""
+        """Return the most important statistics as one line of text."""
         tasks = ", ".join(f"{task} {len(lengths)}" for task, lengths in sorted(self.lengths.items()))
         covered = [layout.coverage for layout in self.layouts.values() if layout.coverage is not None]
         parts = [
@@ -103,7 +126,10 @@ class Stats:
         return ", ".join(parts)
 
     def as_json(self) -> dict[str, Any]:
-        """Return ``stats.json``: counts in descending order, lengths in steps, durations in s, positions in m."""
+        """Return the content of ``stats.json``.
+
+        Counts are in descending order, lengths in steps, durations in s, and positions in m.
+        """
         shift, turn = np.linalg.norm(self.actions[:, :3], axis=1), np.abs(self.actions[:, 3:6]).max(1, initial=0)
         noop = (shift < NOOP[0]) & (turn < NOOP[1])
         return {
@@ -128,7 +154,7 @@ class Stats:
             "templates": sort_counts(self.templates),
             "relations": sort_counts(self.relations),
             "actions": {
-                name: {**summarize_values(column), **histogram(column)}
+                name: {**summarize_values(column), **compute_histogram(column)}
                 for name, column in zip(ACTION_NAMES, self.actions.T, strict=True)
             },
             "noop_fraction": round_values(float(noop.mean())) if len(noop) else None,
@@ -143,12 +169,13 @@ class Stats:
         }
 
 
-def collect(
+def collect_statistics(
     path: Path | str, *, rate_hz: float | None = None, on_episode: Callable[[int, int], None] | None = None
-) -> Stats:
-    """Return the statistics of a dataset, or of a trajectory file including its failed episodes.
+) -> DatasetStatistics:
+    """Compute the statistics of a dataset, or of a trajectory file including its failed episodes.
 
-    Images are not read. ``on_episode`` is called with (done, total) after each episode.
+    Images are not read. ``rate_hz``: rate at which a trajectory file is sampled (default 5). ``on_episode`` is
+    called with (done, total) after each episode.
 
     Raises:
         DatasetError: the dataset is damaged or has no episodes.
@@ -157,22 +184,22 @@ def collect(
     numbers = source.split("all")
     if not numbers:
         raise DatasetError("this dataset has no episodes", where=path)
-    stats = Stats(source.root, source.rate_hz, {name: len(source.split(name)) for name in ("train", "val")})
+    stats = DatasetStatistics(source.root, source.rate_hz, {name: len(source.split(name)) for name in ("train", "val")})
     actions: list[NDArray[np.float32]] = []
-    places: dict[str, list[Placement]] = defaultdict(list)
+    places: dict[str, list[ObjectPositions]] = defaultdict(list)
     for done, number in enumerate(numbers, start=1):
         episode = source.episode(number)
-        config, placement = stats.add(episode, source.lengths[number])
+        config, placement = stats.add_episode(episode, source.lengths[number])
         for goal in episode.goals:
             stats.subgoals[goal.goal_type].append(goal.last - goal.first + 1)
-        actions.append(require_actions(episode.read(ACTION_ARRAYS), f"{source.root}, episode {number}")[:-1])
+        actions.append(compute_valid_actions(episode.read(ACTION_ARRAYS), f"{source.root}, episode {number}")[:-1])
         stats.gripper_changes.append(int(np.count_nonzero(np.diff(actions[-1][:, 6]))))
         if len(placement.positions):
             places[config].append(placement)
         if on_episode:
             on_episode(done, len(numbers))
     stats.actions = np.concatenate(actions)
-    stats.layouts = {config: layout_map(placements) for config, placements in places.items()}
+    stats.layouts = {config: make_layout_map(placements) for config, placements in places.items()}
     return stats
 
 
@@ -181,17 +208,17 @@ def _config_name(scene: SceneRecord) -> str:
     config = kwargs.get("config")
     if isinstance(config, str):
         return Path(config).stem
-    name = scene.task or task_of(env_id) or UNKNOWN
+    name = scene.task or parse_task_name(env_id) or UNKNOWN
     return f"{name} (own configuration)" if config else name
 
 
 def sort_counts(counter: Mapping[str, int]) -> dict[str, int]:
-    """Return counts sorted by descending count, then by name."""
+    """Sort counts by descending count, then by name."""
     return dict(sorted(counter.items(), key=lambda item: (-item[1], item[0])))
 
 
 def summarize_values(values: Iterable[float] | NDArray) -> dict[str, Any]:
-    """Return count, mean, standard deviation and percentiles of some values."""
+    """Compute count, mean, standard deviation, minimum, maximum and percentiles of values."""
     array = np.asarray(list(values) if not isinstance(values, np.ndarray) else values, dtype=np.float64)
     if not len(array):
         return {"count": 0}
@@ -200,8 +227,8 @@ def summarize_values(values: Iterable[float] | NDArray) -> dict[str, Any]:
     return {"count": len(array), **{key: round_values(float(value)) for key, value in found.items()}}
 
 
-def histogram(values: NDArray) -> dict[str, Any]:
-    """Return a histogram with equal bins, symmetric about 0; two bins for values that are 0 or 1."""
+def compute_histogram(values: NDArray) -> dict[str, Any]:
+    """Compute a histogram with equal bins, symmetric about 0; values that are all 0 or 1 have two bins."""
     if not len(values):
         return {"edges": [], "counts": []}
     reach = float(np.abs(values).max()) or 1.0

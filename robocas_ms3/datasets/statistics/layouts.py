@@ -15,7 +15,15 @@ MARGIN = 0.3  # m around the region in which layouts are sampled; heaps extend b
 
 @dataclass(frozen=True)
 class Surface:
-    """Supporting surface: pose of its furniture in the world (m, rad), and region in the furniture frame."""
+    """Surface on which objects are placed.
+
+    Attributes:
+        label: name of the furniture and of the surface.
+        x: position of the furniture in the world, m.
+        y: position of the furniture in the world, m.
+        yaw: rotation of the furniture in the world, rad.
+        region: [min_xy, max_xy] in which layouts are sampled, in the furniture frame, m; None: unknown.
+    """
 
     label: str
     x: float
@@ -23,15 +31,21 @@ class Surface:
     yaw: float
     region: list[list[float]] | None
 
-    def place(self, xy: Array) -> Array:
+    def to_furniture_frame(self, xy: Array) -> Array:
         """Convert positions (N, 2) from the world frame to the furniture frame, m."""
         cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
         return (xy - [self.x, self.y]) @ np.array([[cosine, -sine], [sine, cosine]])
 
 
 @dataclass(frozen=True)
-class Placement:
-    """Positions (N, 2) of the objects at the start of an episode, world frame, m; index of the target."""
+class ObjectPositions:
+    """Positions of the objects at the start of an episode.
+
+    Attributes:
+        positions: (N, 2) x and y in the world frame, m.
+        target: index of the target in ``positions``; None: unknown.
+        surface: surface on which the objects are placed; None: unknown.
+    """
 
     positions: Array
     target: int | None = None
@@ -87,18 +101,21 @@ class LayoutMap:
         }
 
 
-def layout_map(placements: list[Placement]) -> LayoutMap:
-    """Return the heat map of a configuration, in the furniture frame if all episodes have the same one."""
+def make_layout_map(placements: list[ObjectPositions]) -> LayoutMap:
+    """Compute the heat map of object positions over episodes of one configuration.
+
+    Its frame is the furniture frame if all episodes have the same surface, otherwise the world frame.
+    """
     surface = placements[0].surface
     if surface is None or any(placement.surface != surface for placement in placements):
         surface = None
-    placed = [p.positions if surface is None else surface.place(p.positions) for p in placements]
+    placed = [p.positions if surface is None else surface.to_furniture_frame(p.positions) for p in placements]
     points = np.concatenate(placed)
     targets = [xy[p.target] for p, xy in zip(placements, placed, strict=True) if p.target is not None]
     region = surface.region if surface else None
     low, high = np.asarray(region) if region else (points.min(0), points.max(0))
     near = points[((points >= low - MARGIN) & (points <= high + MARGIN)).all(axis=1)]
-    x_edges, y_edges = (_edges(low[axis], high[axis], near[:, axis]) for axis in (0, 1))
+    x_edges, y_edges = (_make_edges(low[axis], high[axis], near[:, axis]) for axis in (0, 1))
     counts = np.histogramdd(near, bins=(x_edges, y_edges))[0].astype(np.int64)
     frame = surface.label if surface else "world"
     outside = len(points) - int(counts.sum())
@@ -107,16 +124,19 @@ def layout_map(placements: list[Placement]) -> LayoutMap:
     )
 
 
-def _edges(low: float, high: float, points: Array) -> Array:
-    """Return edges of equal cells of about ``CELL`` that divide [low, high] and cover all points."""
+def _make_edges(low: float, high: float, points: Array) -> Array:
+    """Make the edges of equal cells of about ``CELL`` m that divide [low, high] and cover all points."""
     cell = (high - low) / max(1, round((high - low) / CELL)) if high - low > CELL / 2 else CELL
     before = np.ceil((low - points.min(initial=low)) / cell - 1e-9)
     after = np.ceil((points.max(initial=high) - low) / cell - 1e-9)
     return low + cell * np.arange(-int(before), max(1, int(after)) + 1, dtype=np.float64)
 
 
-def surface_of(config: dict[str, Any]) -> Surface | None:
-    """Return the surface of a configuration, None without one; an invalid configuration raises any error."""
+def find_surface(config: dict[str, Any]) -> Surface | None:
+    """Find the surface of a task configuration; None: it has no surface.
+
+    An invalid configuration raises KeyError, TypeError or another error.
+    """
     surface = config.get("surface")
     if not surface:
         return None

@@ -12,7 +12,7 @@ from robocas_ms3.core.errors import require_extra
 from robocas_ms3.core.files import atomic_file, make_folder, write_json
 from robocas_ms3.core.text import escape_controls, format_count, format_object_name
 from robocas_ms3.datasets.actions import ACTION_NAMES
-from robocas_ms3.datasets.statistics.collect import Stats, histogram, sort_counts
+from robocas_ms3.datasets.statistics.collect import DatasetStatistics, compute_histogram, sort_counts
 from robocas_ms3.datasets.statistics.layouts import LayoutMap
 
 DPI = 110
@@ -21,7 +21,7 @@ MAX_ROWS = 50  # bars per plot; stats.json has all
 _TEXT = 84  # characters of a label
 
 
-def write_stats(stats: Stats, out: Path) -> list[Path]:
+def write_stats(stats: DatasetStatistics, out: Path) -> list[Path]:
     """Write ``stats.json`` and the plots as PNG into a folder; return the paths."""
     require_extra("plots", "statistics", "matplotlib")
     make_folder(out)
@@ -38,7 +38,7 @@ def write_stats(stats: Stats, out: Path) -> list[Path]:
     return paths
 
 
-def _figure(width: float, height: float) -> Any:
+def _make_figure(width: float, height: float) -> Any:
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -46,7 +46,7 @@ def _figure(width: float, height: float) -> Any:
         return Figure(figsize=(width, height), layout="constrained")
 
 
-def _axes(figure: Any, rows: int, columns: int, count: int) -> list[Any]:
+def _make_axes(figure: Any, rows: int, columns: int, count: int) -> list[Any]:
     grid = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel()
     for axes in grid[count:]:
         axes.remove()
@@ -56,25 +56,25 @@ def _axes(figure: Any, rows: int, columns: int, count: int) -> list[Any]:
     return list(grid[:count])
 
 
-def _shape(count: int, columns: int) -> tuple[int, int]:
+def _grid_shape(count: int, columns: int) -> tuple[int, int]:
     columns = min(count, columns)
     return -(-count // columns), columns
 
 
-def _label(text: str) -> str:
-    """Return a text as a short label: one line, dollar signs escaped."""
+def _shorten_label(text: str) -> str:
+    """Shorten a text to a label of one line; dollar signs are escaped for matplotlib."""
     text = escape_controls(text)
     return (text if len(text) <= _TEXT else text[: _TEXT - 1].rstrip() + "…").replace("$", r"\$")
 
 
-def _whole_numbers(axis: Any) -> None:
+def _use_integer_ticks(axis: Any) -> None:
     axis.get_major_locator().set_params(integer=True)
 
 
-def draw_lengths(stats: Stats) -> Any:
-    rows, columns = _shape(len(stats.lengths), 2)
-    figure = _figure(4.6 * columns + 0.4, 2.7 * rows + 0.3)
-    panels = _axes(figure, rows, columns, len(stats.lengths))
+def draw_lengths(stats: DatasetStatistics) -> Any:
+    rows, columns = _grid_shape(len(stats.lengths), 2)
+    figure = _make_figure(4.6 * columns + 0.4, 2.7 * rows + 0.3)
+    panels = _make_axes(figure, rows, columns, len(stats.lengths))
     for axes, (task, lengths) in zip(panels, sorted(stats.lengths.items()), strict=True):
         low, high = min(lengths), max(lengths)
         edges = np.linspace(low - 0.5, high + 0.5, min(30, high - low + 1) + 1)
@@ -82,27 +82,27 @@ def draw_lengths(stats: Stats) -> Any:
         median = float(np.median(lengths))
         axes.axvline(median, color=ORANGE, linestyle="--", linewidth=1)
         about = f"median {median:.0f} steps = {median / stats.rate_hz:.0f} s"
-        axes.set_title(f"{_label(task)}: {format_count(len(lengths), 'episode')}, {about}")
+        axes.set_title(f"{_shorten_label(task)}: {format_count(len(lengths), 'episode')}, {about}")
         axes.set(xlabel=f"steps of {stats.rate_hz:g} Hz", ylabel="episodes")
-        _whole_numbers(axes.xaxis)
-        _whole_numbers(axes.yaxis)
+        _use_integer_ticks(axes.xaxis)
+        _use_integer_ticks(axes.yaxis)
     return figure
 
 
-def draw_objects(stats: Stats) -> Any:
+def draw_objects(stats: DatasetStatistics) -> Any:
     if not stats.objects and not stats.targets:
         return None
     everything = sort_counts(stats.objects | stats.targets)
     ids = list(everything)[:MAX_ROWS]
-    figure = _figure(7, 1.2 + 0.2 * len(ids))
-    axes = _axes(figure, 1, 1, 1)[0]
+    figure = _make_figure(7, 1.2 + 0.2 * len(ids))
+    axes = _make_axes(figure, 1, 1, 1)[0]
     rows = np.arange(len(ids))
-    names = [_label(format_object_name(i, stats.names.get(i, ""))) for i in ids]
+    names = [_shorten_label(format_object_name(i, stats.names.get(i, ""))) for i in ids]
     axes.barh(rows, [stats.objects[i] for i in ids], color=GREY, height=0.8, label="in the scene")
     axes.barh(rows, [stats.targets[i] for i in ids], color=ORANGE, height=0.45, label="target")
     axes.set_yticks(rows, names)
     axes.set_ylim(len(ids) - 0.4, -0.6)
-    _whole_numbers(axes.xaxis)
+    _use_integer_ticks(axes.xaxis)
     more = f", the first {len(ids)} of {len(everything)}" if len(everything) > len(ids) else ""
     never = sum(1 for asset in everything if not stats.targets[asset])
     axes.set(xlabel="episodes", title=f"Objects{more}; {never} never the target")
@@ -111,13 +111,13 @@ def draw_objects(stats: Stats) -> Any:
     return figure
 
 
-def draw_layouts(stats: Stats) -> Any:
+def draw_layouts(stats: DatasetStatistics) -> Any:
     """Draw a heat map of object positions per configuration, with the targets; x is up, y is left."""
     if not stats.layouts:
         return None
-    rows, columns = _shape(len(stats.layouts), 3)
-    figure = _figure(4.2 * columns, 2.6 * rows + 0.3)
-    panels = _axes(figure, rows, columns, len(stats.layouts))
+    rows, columns = _grid_shape(len(stats.layouts), 3)
+    figure = _make_figure(4.2 * columns, 2.6 * rows + 0.3)
+    panels = _make_axes(figure, rows, columns, len(stats.layouts))
     for axes, (name, layout) in zip(panels, sorted(stats.layouts.items()), strict=True):
         _draw_layout(figure, axes, name, layout)
     figure.suptitle("Objects per cell at the start; dots: targets", fontsize=9)
@@ -147,14 +147,14 @@ def _draw_layout(figure: Any, axes: Any, name: str, layout: LayoutMap) -> None:
     axes.set_ylim(layout.x_edges[0], layout.x_edges[-1])
     axes.locator_params(nbins=5)
     covered = "" if layout.coverage is None else f", {layout.coverage:.0%} covered"
-    axes.set_title(f"{_label(name)}\n{format_count(layout.episodes, 'episode')}{covered}")
+    axes.set_title(f"{_shorten_label(name)}\n{format_count(layout.episodes, 'episode')}{covered}")
     axes.set(xlabel=f"y of {layout.frame} (m)", ylabel="x (m)")
     bar = figure.colorbar(mesh, cax=axes.inset_axes((1.04, 0.0, 0.04, 1.0)))  # as high as the map
     bar.ax.set_ylim(0, max(1, layout.counts.max()))
-    _whole_numbers(bar.ax.yaxis)
+    _use_integer_ticks(bar.ax.yaxis)
 
 
-def draw_instructions(stats: Stats) -> Any:
+def draw_instructions(stats: DatasetStatistics) -> Any:
     tables = {
         f"Instructions, {len(stats.instructions)} different": stats.instructions,
         f"Templates, {len(stats.templates)} different": stats.templates,
@@ -162,27 +162,27 @@ def draw_instructions(stats: Stats) -> Any:
     }
     tables = {title: list(sort_counts(table).items())[: MAX_ROWS // 2] for title, table in tables.items() if table}
     heights = [0.8 + 0.2 * len(rows) for rows in tables.values()]
-    figure = _figure(10, sum(heights))
+    figure = _make_figure(10, sum(heights))
     panels = np.atleast_1d(figure.subplots(len(tables), 1, height_ratios=heights))
     for axes, (title, rows) in zip(panels, tables.items(), strict=True):
         axes.spines[["top", "right"]].set_visible(False)
         places = np.arange(len(rows))
         axes.barh(places, [count for _, count in rows], color=BLUE, height=0.7)
-        axes.set_yticks(places, [_label(text) for text, _ in rows])
+        axes.set_yticks(places, [_shorten_label(text) for text, _ in rows])
         axes.set_ylim(len(rows) - 0.4, -0.6)
-        _whole_numbers(axes.xaxis)
+        _use_integer_ticks(axes.xaxis)
         axes.set_title(title, loc="left")
     panels[-1].set_xlabel("episodes")
     return figure
 
 
-def draw_actions(stats: Stats) -> Any:
+def draw_actions(stats: DatasetStatistics) -> Any:
     if not len(stats.actions):
         return None
-    figure = _figure(11, 5.2)
+    figure = _make_figure(11, 5.2)
     units = ("m", "m", "m", "rad", "rad", "rad", "")
-    for axes, name, column, unit in zip(_axes(figure, 2, 4, 7), ACTION_NAMES, stats.actions.T, units, strict=True):
-        bins = histogram(column)
+    for axes, name, column, unit in zip(_make_axes(figure, 2, 4, 7), ACTION_NAMES, stats.actions.T, units, strict=True):
+        bins = compute_histogram(column)
         edges, counts = np.array(bins["edges"]), np.array(bins["counts"])
         if name == "gripper":
             axes.bar([0, 1], counts, color=BLUE, width=0.6)
@@ -200,12 +200,12 @@ def draw_actions(stats: Stats) -> Any:
     return figure
 
 
-def draw_subgoals(stats: Stats) -> Any:
+def draw_subgoals(stats: DatasetStatistics) -> Any:
     if not stats.subgoals:
         return None
     kinds = sorted(stats.subgoals, key=lambda kind: -len(stats.subgoals[kind]))
-    figure = _figure(7.5, 1.2 + 0.55 * len(kinds))
-    axes = _axes(figure, 1, 1, 1)[0]
+    figure = _make_figure(7.5, 1.2 + 0.55 * len(kinds))
+    axes = _make_axes(figure, 1, 1, 1)[0]
     seconds = [np.array(stats.subgoals[kind]) / stats.rate_hz for kind in kinds]
     boxes = axes.boxplot(
         seconds,
@@ -218,7 +218,7 @@ def draw_subgoals(stats: Stats) -> Any:
     for box in boxes["boxes"]:
         box.set(facecolor="#b9d3ea", edgecolor=BLUE)
     labels = [
-        f"{_label(kind)}\n{format_count(len(s), 'time')}, median {np.median(s):.1f} s"
+        f"{_shorten_label(kind)}\n{format_count(len(s), 'time')}, median {np.median(s):.1f} s"
         for kind, s in zip(kinds, seconds, strict=True)
     ]
     axes.set_yticks(np.arange(1, len(kinds) + 1), labels)
@@ -229,7 +229,7 @@ def draw_subgoals(stats: Stats) -> Any:
     return figure
 
 
-PLOTS: dict[str, Callable[[Stats], Any]] = {
+PLOTS: dict[str, Callable[[DatasetStatistics], Any]] = {
     "lengths": draw_lengths,
     "objects": draw_objects,
     "layouts": draw_layouts,

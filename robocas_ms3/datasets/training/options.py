@@ -37,8 +37,8 @@ class SampleOptions:
         split: ``train`` or ``val`` by ``data_info.json``, or ``all``.
         observation_horizon: number of observed steps H, including the current one; RoboCAS-v0: RT-1 6, RoboFlamingo 11.
         action_horizon: number of actions A from the current step on; RoboCAS-v0: 1.
-        padding: values outside an episode. ``hold``: the robot does not move (first image, no motion, nearest gripper
-            command); ``zero``: zeros; ``drop``: no samples with padding.
+        padding: values before the first and after the last step. ``hold``: the robot stands still (first image, no
+            motion, nearest gripper command); ``zero``: zeros; ``drop``: samples that need padding are omitted.
         cameras: names of the cameras, in the order of the stack; empty: no images.
         size: width and height to which images are scaled, pixels; None: no scaling.
         depth: whether samples have depth images.
@@ -47,7 +47,8 @@ class SampleOptions:
         embedding: whether samples have embeddings of the texts.
         subgoals: whether samples have sub-goals.
         normalize: whether motion is scaled from ``action_space`` to [-1, 1] and clipped.
-        action_space: range that replaces that of ``data_info.json``; without it, a trajectory file is read completely.
+        action_space: range for ``normalize``, instead of the range in ``data_info.json``. None with a trajectory file:
+            the range is computed from all of its episodes.
         rate_hz: rate of the samples of a trajectory file in Hz; default 5.
         include_failed: whether failed episodes of a trajectory file are used.
         cached_episodes: number of episodes whose arrays are cached per worker.
@@ -83,16 +84,19 @@ class SampleOptions:
             raise DatasetError("invalid size", where="size", expected="width and height >= 1", found=self.size)
 
     def sample_steps(self, length: int) -> range:
-        """Return the steps that have a sample in an episode of T steps."""
+        """Return the steps of an episode that have a sample; ``length`` is its number of steps T."""
         if self.padding == "drop":
             first = self.observation_horizon - 1
             return range(first, max(first, length - self.action_horizon))
         return range(max(0, length - 1))
 
     def observation_steps(self, step: int) -> Steps:
-        """Return the observed steps (H,) of a sample; negative before the episode."""
+        """Return the observed steps (H,) of the sample at a step; steps before the episode are negative."""
         return np.arange(step - self.observation_horizon + 1, step + 1)
 
     def action_steps(self, step: int) -> Steps:
-        """Return the action steps (H + A - 1,) of a sample; negative or above T - 2 outside the episode."""
+        """Return the action steps (H + A - 1,) of the sample at a step.
+
+        Steps outside the episode are negative or above T - 2.
+        """
         return np.arange(step - self.observation_horizon + 1, step + self.action_horizon)

@@ -19,7 +19,7 @@ from torch.utils.data import get_worker_info
 
 from robocas_ms3.core.errors import DatasetError, EmptySplitError
 from robocas_ms3.core.text import format_count
-from robocas_ms3.datasets.actions import ACTION_ARRAYS, ActionScale, check_finite, require_actions
+from robocas_ms3.datasets.actions import ACTION_ARRAYS, ActionScale, check_finite, compute_valid_actions
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource, ImageKind, SourceEpisode
 from robocas_ms3.datasets.training.options import SampleOptions
@@ -29,10 +29,10 @@ _TYPE_INDEX = {kind: index for index, kind in enumerate(GOAL_TYPES)}
 
 
 class RoboCASDataset(torch.utils.data.Dataset):
-    """PyTorch dataset of the samples of a dataset, or of a trajectory file (state and action only).
+    """PyTorch dataset of training samples from a dataset or a trajectory file (state and action only).
 
     Arrays and images are read on access, and no file stays open, so workers may be forked or spawned. A sample is a
-    dict; H = ``observation_horizon``, A = ``action_horizon``, C = number of cameras:
+    dict. H = ``observation_horizon``, A = ``action_horizon``, C = number of cameras:
 
     ======================  ==================  ==================================================================
     ``rgb``                 (H, C, 3, h, w)     uint8, or float32 in 0..1; cameras in the given order
@@ -59,7 +59,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
     Attributes:
         rate_hz: steps per second.
         episodes: sorted numbers of the episodes of the split.
-        stages: (N,) int8 sub-goal type of each sample's step, index in ``GOAL_TYPES``; -1 = unknown.
+        subgoal_types: (N,) int8 sub-goal type of the step of each sample, index in ``GOAL_TYPES``; -1 = unknown.
         scale: scale of normalized actions; None: actions are not normalized.
 
     Raises:
@@ -88,16 +88,19 @@ class RoboCASDataset(torch.utils.data.Dataset):
         if not len(self):
             longest = max(self.source.lengths[number] for number in self.episodes)
             needed = options.observation_horizon + options.action_horizon if options.padding == "drop" else 2
+            fix = 'Pass padding="hold".' if options.padding == "drop" else ""
             what, expected = "all episodes are too short", f"at least {format_count(needed, 'step')}"
-            raise DatasetError(what, where=path, expected=expected, found=longest, fix='Pass padding="hold".')
-        self.subgoal_types = np.concatenate([self._types_of(number, within) for number, within in self._steps.items()])
+            raise DatasetError(what, where=path, expected=expected, found=longest, fix=fix)
+        self.subgoal_types = np.concatenate(
+            [self._read_types(number, within) for number, within in self._steps.items()]
+        )
         self.scale: ActionScale | None = None
         if options.normalize:
             space = self.source.action_space() if options.action_space is None else options.action_space
             self.scale = ActionScale.from_action_space(space, path)
         self._cache: OrderedDict[int, dict[str, Any]] = OrderedDict()
 
-    def _types_of(self, number: int, steps: range) -> NDArray[np.int8]:
+    def _read_types(self, number: int, steps: range) -> NDArray[np.int8]:
         types = np.full(self.source.lengths[number], -1, dtype=np.int8)
         for goal in self.source.episode(number).goals:
             types[goal.first : goal.last + 1] = _TYPE_INDEX.get(goal.goal_type, -1)
@@ -106,8 +109,8 @@ class RoboCASDataset(torch.utils.data.Dataset):
     def __len__(self) -> int:
         return int(self._offsets[-1])
 
-    def locate(self, index: int) -> tuple[int, int]:
-        """Return episode number and step of a sample."""
+    def locate_sample(self, index: int) -> tuple[int, int]:
+        """Return the episode number and the step of a sample."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"sample index {index} out of range for {len(self)} samples")
         index %= len(self)
@@ -115,42 +118,42 @@ class RoboCASDataset(torch.utils.data.Dataset):
         number = self.episodes[place]
         return number, self._steps[number][index - int(self._offsets[place])]
 
-    def indices(self, episode: int) -> range:
+    def sample_indices(self, episode: int) -> range:
         """Return the sample indices of an episode of the split."""
         if episode not in self._steps:
             raise DatasetError("no such episode in this split", where=f"episode {episode}")
         place = self.episodes.index(episode)
         return range(int(self._offsets[place]), int(self._offsets[place + 1]))
 
-    def index(self, episode: int, step: int) -> int:
-        """Return the sample index of a step of an episode."""
-        found, steps = self.indices(episode), self._steps[episode]
+    def sample_index(self, episode: int, step: int) -> int:
+        """Return the index of the sample at a step of an episode."""
+        found, steps = self.sample_indices(episode), self._steps[episode]
         if step not in steps:
             expected = f"{steps[0]} to {steps[-1]}" if steps else "none"
             raise DatasetError("this step has no sample", where=f"episode {episode}", expected=expected, found=step)
         return found[step - steps.start]
 
-    def weights(self) -> torch.Tensor:
-        """Return weights (N,) for ``WeightedRandomSampler`` that balance the sub-goal types."""
+    def sampling_weights(self) -> torch.Tensor:
+        """Return weights (N,) of all samples for ``WeightedRandomSampler``; each sub-goal type has the same sum."""
         if (self.subgoal_types < 0).all():
             raise DatasetError("this dataset has no sub-goals", where=self.source.root, expected="the array step_goals")
         _, types, counts = np.unique(self.subgoal_types, return_inverse=True, return_counts=True)
         return torch.from_numpy(1.0 / (len(counts) * counts[types]))
 
     def __getitem__(self, index: int) -> Any:
-        number, step = self.locate(int(index))
-        arrays, options = self._arrays(number), self.options
-        observed, acted = options.observation_steps(step), options.action_steps(step)
+        number, step = self.locate_sample(int(index))
+        arrays, options = self._load_arrays(number), self.options
+        observed_steps, action_steps = options.observation_steps(step), options.action_steps(step)
         last = len(arrays["action"]) - 2  # last step with an action
         sample: dict[str, Any] = {"episode": number, "step": step}
-        sample["observation_mask"] = torch.from_numpy(observed >= 0)
-        sample["action_mask"] = torch.from_numpy((acted >= 0) & (acted <= last))
-        sample["action"] = self._actions(arrays, acted, last)
+        sample["observation_mask"] = torch.from_numpy(observed_steps >= 0)
+        sample["action_mask"] = torch.from_numpy((action_steps >= 0) & (action_steps <= last))
+        sample["action"] = self._pad_actions(arrays, action_steps, last)
         for key in ("state", "subgoal_type", "subgoal_embedding"):
             if key in arrays:
-                rows = arrays[key][np.maximum(observed, 0)]
+                rows = arrays[key][np.maximum(observed_steps, 0)]
                 if options.padding == "zero":
-                    rows[observed < 0] = -1 if key == "subgoal_type" else 0
+                    rows[observed_steps < 0] = -1 if key == "subgoal_type" else 0
                 sample[key] = torch.from_numpy(rows)
         sample["instruction"] = arrays["instruction"]
         if options.embedding:
@@ -158,25 +161,25 @@ class RoboCASDataset(torch.utils.data.Dataset):
         if options.subgoals:
             sample["subgoal"] = arrays["texts"][step]
         for kind in ("rgb", "depth")[: 1 + options.depth] if options.cameras else ():
-            sample[kind] = read_images(self.source.episode(number), options, observed, kind)
+            sample[kind] = read_sample_images(self.source.episode(number), options, observed_steps, kind)
         return sample if self.transform is None else self.transform(sample)
 
-    def _actions(self, arrays: Mapping[str, Any], acted: NDArray[np.int64], last: int) -> torch.Tensor:
-        rows = np.clip(acted, 0, last)
+    def _pad_actions(self, arrays: Mapping[str, Any], action_steps: NDArray[np.int64], last: int) -> torch.Tensor:
+        rows = np.clip(action_steps, 0, last)
         actions = arrays["action"][rows]
-        outside = acted != rows
+        outside = action_steps != rows
         if self.options.padding == "hold":
             actions[outside, :6] = 0
-            actions[acted < 0, 6] = arrays["first_command"]  # after the end, the last command is repeated
+            actions[action_steps < 0, 6] = arrays["first_command"]  # after the end, the last command is repeated
         if self.scale is not None:
             actions = self.scale.encode(actions)
         if self.options.padding == "zero":
             actions[outside] = 0
         return torch.from_numpy(actions)
 
-    def _arrays(self, number: int) -> dict[str, Any]:
+    def _load_arrays(self, number: int) -> dict[str, Any]:
         if number not in self._cache:
-            self._cache[number] = read_episode(self.source, number, self.options)
+            self._cache[number] = read_sample_arrays(self.source, number, self.options)
         self._cache.move_to_end(number)
         if len(self._cache) > max(1, self.options.cached_episodes):
             self._cache.popitem(last=False)
@@ -187,7 +190,7 @@ class RoboCASDataset(torch.utils.data.Dataset):
 
 
 def check_options(source: EpisodeSource, options: SampleOptions) -> None:
-    """Raise DatasetError if a source lacks requested cameras, depth or embeddings."""
+    """Raise DatasetError if a source lacks the requested cameras, depth images or embeddings."""
     available, cameras = source.cameras, tuple(options.cameras)
     if set(cameras) - set(available) or len(set(cameras)) < len(cameras):
         fix = "" if available else "Pass cameras=(), or render images with robocas convert."
@@ -195,17 +198,18 @@ def check_options(source: EpisodeSource, options: SampleOptions) -> None:
         raise DatasetError("unknown or repeated camera", where=source.root, expected=expected, found=found, fix=fix)
     if options.depth and not (source.has_depth and cameras):
         found = "no cameras" if source.has_depth else "no depth"
-        raise DatasetError("missing depth images", where=source.root, found=found, fix="Pass depth=False.")
+        what = "depth images are not available"
+        raise DatasetError(what, where=source.root, found=found, fix="Pass depth=False.")
     if options.embedding and not source.has_embeddings:
         fix = "Pass embedding=False, or convert the trajectory file with embeddings."
-        raise DatasetError("missing embeddings", where=source.root, fix=fix)
+        raise DatasetError("this dataset has no embeddings", where=source.root, fix=fix)
 
 
-def read_episode(source: EpisodeSource, number: int, options: SampleOptions) -> dict[str, Any]:
-    """Read the arrays of an episode from which its samples are computed.
+def read_sample_arrays(source: EpisodeSource, number: int, options: SampleOptions) -> dict[str, Any]:
+    """Read the arrays of an episode from which its samples are made, by key.
 
-    Return ``action`` (T, 7), ``first_command`` and ``instruction``; if requested, ``state`` (T, D), ``texts``,
-    ``subgoal_type`` (T,) and embeddings.
+    The keys are ``action`` (T, 7), ``first_command`` (gripper command before step 0) and ``instruction``; if requested,
+    also ``state`` (T, D), ``texts`` (sub-goals), ``subgoal_type`` (T,) and the embeddings.
     """
     state, embedding, subgoals = options.state, options.embedding, options.subgoals
     keys = (*ACTION_ARRAYS, *state, "language_goal")
@@ -219,7 +223,7 @@ def read_episode(source: EpisodeSource, number: int, options: SampleOptions) -> 
             raise DatasetError(what, where=f"{where}, {key}", expected=length, found=len(array))
     check_finite(arrays, where)
     made: dict[str, Any] = {
-        "action": require_actions(arrays, where),
+        "action": compute_valid_actions(arrays, where),
         "first_command": float(arrays["gripper_status"][0]),
         "instruction": str(arrays["language_goal"]),
     }
@@ -236,16 +240,16 @@ def read_episode(source: EpisodeSource, number: int, options: SampleOptions) -> 
     return made
 
 
-def read_images(
-    episode: SourceEpisode, options: SampleOptions, observed: NDArray[np.int64], kind: ImageKind
+def read_sample_images(
+    episode: SourceEpisode, options: SampleOptions, observed_steps: NDArray[np.int64], kind: ImageKind
 ) -> torch.Tensor:
-    """Read the images of steps (H,): RGB (H, C, 3, h, w) or depth (H, C, h, w) in m.
+    """Read the images of the steps (H,) of an episode: RGB (H, C, 3, h, w) or depth (H, C, h, w) in m.
 
-    Negative steps use the first image.
+    Negative steps get the first image, or zeros with ``padding="zero"``.
     """
     if get_worker_info() is not None and cv2.getNumThreads() > 1:
         cv2.setNumThreads(0)  # the thread pool of OpenCV does not survive a fork
-    steps = np.maximum(observed, 0)
+    steps = np.maximum(observed_steps, 0)
     first, count = int(steps[0]), int(steps[-1] - steps[0]) + 1
     by_camera = {
         camera: _read_camera(episode, camera, kind, (first, count), options.size) for camera in options.cameras
@@ -262,16 +266,16 @@ def read_images(
         stack = np.ascontiguousarray(stack.transpose(0, 1, 4, 2, 3))
         stack = stack.astype(np.float32) / 255 if options.float_images else stack
     if options.padding == "zero":
-        stack[observed < 0] = 0
+        stack[observed_steps < 0] = 0
     return torch.from_numpy(stack)
 
 
 def _read_camera(
-    episode: SourceEpisode, camera: str, kind: ImageKind, run: tuple[int, int], size: tuple[int, int] | None
+    episode: SourceEpisode, camera: str, kind: ImageKind, first_and_count: tuple[int, int], size: tuple[int, int] | None
 ) -> list[NDArray]:
     images = []
-    with closing(episode.frames(camera, kind, *run)) as frames:
-        for step, image in enumerate(frames, start=run[0]):
+    with closing(episode.frames(camera, kind, *first_and_count)) as frames:
+        for step, image in enumerate(frames, start=first_and_count[0]):
             if (image.ndim, image.dtype) != ((3, np.uint8) if kind == "rgb" else (2, np.uint16)):
                 raise DatasetError(
                     "invalid image",
@@ -279,12 +283,12 @@ def _read_camera(
                     expected="(H, W, 3) uint8" if kind == "rgb" else "(H, W) uint16",
                     found=f"{image.shape} {image.dtype}",
                 )
-            images.append(resize(image, size))
+            images.append(resize_image(image, size))
     return images
 
 
-def resize(image: NDArray, size: tuple[int, int] | None) -> NDArray:
-    """Scale an image to a width and height: RGB by area, depth by nearest pixel."""
+def resize_image(image: NDArray, size: tuple[int, int] | None) -> NDArray:
+    """Resize an image to (width, height): RGB by area (linear if enlarged), depth by nearest pixel."""
     if size is None or image.shape[1::-1] == tuple(size):
         return image
     smaller = size[0] <= image.shape[1] and size[1] <= image.shape[0]

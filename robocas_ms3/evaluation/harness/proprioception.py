@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.datasets.lerobot import schema
-from robocas_ms3.datasets.lerobot.arrays import frame_columns
-from robocas_ms3.datasets.sources.arrays import episode_arrays
+from robocas_ms3.datasets.lerobot.arrays import to_frame_columns
+from robocas_ms3.datasets.sources.arrays import make_episode_arrays
 from robocas_ms3.demos.recordings.motion import Motion, sample_gripper_commands
 from robocas_ms3.robots.description_file import chain_poses
 from robocas_ms3.robots.quantities import ARM_BASE, STATE, feature_columns, lerobot_features
@@ -62,7 +62,7 @@ class Proprioception:
             self._spec.description, commands, np.array([len(commands)]), initial_width=width
         )
         motion = Motion.from_joints(self._spec, self._roots[env][None], qpos, qvel, opened)
-        columns = frame_columns(episode_arrays(motion, "", []))
+        columns = to_frame_columns(make_episode_arrays(motion, "", []))
         found = {name: columns[column][0] for name, column in KEYS.items()}
         self._last[env] = _remove_jumps(self._last[env], found) if env in self._last else found
         return self._last[env]

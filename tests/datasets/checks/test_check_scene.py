@@ -4,8 +4,8 @@ import pytest
 from managing import edit
 
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.checks.scene import valid_values
-from robocas_ms3.datasets.checks.violation import check_form
+from robocas_ms3.datasets.checks.scene import read_valid_values
+from robocas_ms3.datasets.checks.violation import check_model
 from robocas_ms3.datasets.sources.file_models import SCENE_KEYS, SceneRecord
 
 FILE = "episode_0000001/scene.json"
@@ -36,7 +36,7 @@ WHOLE = {
 
 
 def check_values(scene):
-    return check_form(SceneRecord, scene, "scene.json")
+    return check_model(SceneRecord, scene, "scene.json")
 
 
 def said(violation):
@@ -45,7 +45,7 @@ def said(violation):
 
 def test_complete_scene_has_no_violations():
     assert check_values(WHOLE) == []
-    assert valid_values(WHOLE) == (WHOLE, "")
+    assert read_valid_values(WHOLE) == (WHOLE, "")
 
 
 def test_unknown_values_may_be_null():
@@ -58,7 +58,7 @@ def test_each_missing_key_is_a_violation():
     for key in SCENE_KEYS:
         without = {name: value for name, value in WHOLE.items() if name != key}
         assert [said(v) for v in check_values(without)] == [(key, "this key", "no such key")]
-        assert valid_values(without) == (without, "")  # an older file, which can be shown as far as it goes
+        assert read_valid_values(without) == (without, "")  # an older file, which can be shown as far as it goes
 
 
 @pytest.mark.parametrize(
@@ -84,8 +84,8 @@ def test_each_invalid_value_is_one_violation(new, key, expected, found):
 
 
 def test_scene_that_is_not_an_object():
-    assert valid_values(None) == ({}, "")
-    assert valid_values([1]) == ({}, "scene.json: expected an object, found [1]")
+    assert read_valid_values(None) == ({}, "")
+    assert read_valid_values([1]) == ({}, "scene.json: expected an object, found [1]")
 
 
 @pytest.mark.parametrize(

@@ -12,10 +12,10 @@ from irregular import KINDS, replace_file
 from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.conversion.episode_folder import find_damaged
+from robocas_ms3.datasets.conversion.episode_folder import find_damaged_file
 from robocas_ms3.datasets.images.image_files import ImageOptions, read_image
 from robocas_ms3.datasets.images.image_headers import LARGEST, read_header
-from robocas_ms3.datasets.manage.copy_episodes import FilePlacer
+from robocas_ms3.datasets.manage.copy_episodes import FileCopier
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.recordings.trajectory_hdf5 import open_trajectory
 from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
@@ -58,9 +58,9 @@ def test_other_readers_refuse_irregular_files(dataset, tmp_path):
         with pytest.raises(DatasetError):
             open_trajectory(replace_file(tmp_path / "F.h5", kind))
         with pytest.raises(DocumentError):
-            FilePlacer(link=False).place(replace_file(tmp_path / "F.h5", kind), tmp_path / "copy")
+            FileCopier(link=False).copy_file(replace_file(tmp_path / "F.h5", kind), tmp_path / "copy")
         path = replace_file(dataset / EPISODE / IMAGES[0], kind)
-        assert find_damaged(dataset / EPISODE, ImageOptions(STANDARD_CAMERA_NAMES)) == path
+        assert find_damaged_file(dataset / EPISODE, ImageOptions(STANDARD_CAMERA_NAMES)) == path
         path.unlink()
         shutil.copy(path.with_name("0001.png"), path)
 

@@ -84,7 +84,7 @@ def test_replay_uses_the_actions_of_the_dataset(dataset, player):
         np.testing.assert_allclose(quaternions, arrays["rel_orn"][:-1], atol=1e-6)
         assert actions[:, 6].tolist() == arrays["gripper_status"][1:].tolist()
     assert [episode.success for episode in report.episodes] == [True, False]
-    of_task = report.by_task()["pick"]
+    of_task = report.summarize_by_task()["pick"]
     assert (of_task["replayed"], of_task["succeeded"], of_task["success_rate"], of_task["skipped"]) == (2, 1, 0.5, 0)
 
 

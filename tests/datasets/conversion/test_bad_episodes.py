@@ -31,7 +31,7 @@ class Breaking(RayCaster):
 
 
 class OfOddSeeds(RayCaster):
-    def load(self, recording):
+    def load_scene(self, recording):
         if recording.seed % 2:
             raise RuntimeError("odd")
 

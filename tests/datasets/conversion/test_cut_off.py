@@ -9,7 +9,7 @@ from synthetic import RayCaster
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.conversion.episode_folder import find_damaged
+from robocas_ms3.datasets.conversion.episode_folder import find_damaged_file
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
@@ -45,8 +45,8 @@ def test_each_truncated_file_is_found(whole, tmp_path, name, left):
     out = shutil.copytree(whole, tmp_path / "out")
     harm(out / "episode_0000001" / name, left)
     image_options = ImageOptions(STANDARD_CAMERA_NAMES)
-    assert find_damaged(out / "episode_0000000", image_options) is None
-    assert find_damaged(out / "episode_0000001", image_options) == out / "episode_0000001" / name
+    assert find_damaged_file(out / "episode_0000000", image_options) is None
+    assert find_damaged_file(out / "episode_0000001", image_options) == out / "episode_0000001" / name
     assert any(name.rpartition("/")[2] in str(violation) for violation in validate(out).violations)
 
 
@@ -65,11 +65,11 @@ def test_images_of_each_format(trajectory, tmp_path, image_format):
     image_options = ImageOptions(("base_camera",), image_format=image_format, depth=False)
     run(trajectory, tmp_path / "out", cameras=("base_camera",), image_format=image_format, depth=False)
     folder = tmp_path / "out" / "episode_0000000"
-    assert find_damaged(folder, image_options) is None
+    assert find_damaged_file(folder, image_options) is None
     for left in (0.9, 0):
         path = folder / "base_camera" / "rgb" / f"0002.{image_format}"
         harm(path, left)
-        assert find_damaged(folder, image_options) == path
+        assert find_damaged_file(folder, image_options) == path
 
 
 def test_truncated_split_is_made_again_after_deleting_it(whole, trajectory, tmp_path):
@@ -95,7 +95,7 @@ def test_parts_of_a_lerobot_dataset(trajectory, tmp_path, monkeypatch, name):
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(lerobot, "_join", killed)
         lerobot.convert_lerobot(ConversionSettings(trajectory, tmp_path / "out", open_renderer=RayCaster))
-    harm(tmp_path / "out" / ".parts" / "episode_0000001" / name, 0.5)
+    harm(tmp_path / "out" / ".episodes" / "episode_0000001" / name, 0.5)
     done = lerobot.convert_lerobot(ConversionSettings(trajectory, tmp_path / "out", open_renderer=RayCaster))
     assert (done.existing, [episode.number for episode in done.episodes]) == (1, [1])
     lerobot.convert_lerobot(ConversionSettings(trajectory, tmp_path / "whole", open_renderer=RayCaster))

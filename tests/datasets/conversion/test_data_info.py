@@ -6,7 +6,7 @@ from managing import change
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.datasets.actions import action_space
+from robocas_ms3.datasets.actions import compute_action_space
 from robocas_ms3.datasets.conversion.data_info import write_info
 from robocas_ms3.datasets.sources.split import split_by_seed
 
@@ -38,7 +38,7 @@ def test_action_space_by_hand():
     positions[101, 0] = 1e6
     turns = np.zeros((102, 3))
     turns[:101, 2] = np.linspace(-1, 1, 101)
-    ranges = action_space([positions], [Rotation.from_euler("xyz", turns).as_quat()])
+    ranges = compute_action_space([positions], [Rotation.from_euler("xyz", turns).as_quat()])
     np.testing.assert_allclose(ranges["relative_position"], [[1, 0, 0], [99, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(ranges["relative_rotation"], [[0, 0, -0.98], [0, 0, 0.98]], atol=1e-12)
 

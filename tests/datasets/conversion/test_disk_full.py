@@ -142,8 +142,8 @@ def test_a_merge(made, tmp_path, monkeypatch, capsys, last, episodes):
 def test_a_conversion_to_lerobot(made, tmp_path, monkeypatch, capsys, moment, last, parts):
     pytest.importorskip("av", reason="needs the extra 'lerobot'")
     pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
-    from robocas_ms3.datasets.lerobot import parts as written
-    from robocas_ms3.datasets.lerobot.variants import Layout
+    from robocas_ms3.datasets.lerobot import temporary_episode as written
+    from robocas_ms3.datasets.lerobot.variants import FileLayout
 
     out, source = tmp_path / "out", files_of(made)
     command = ["convert", str(made), "--to", "lerobot", "--out", str(out)]
@@ -152,14 +152,14 @@ def test_a_conversion_to_lerobot(made, tmp_path, monkeypatch, capsys, moment, la
         "video": (written, "VideoEncoder", to_dev_full(written.VideoEncoder, 0)),
         "frames": (written.pq, "write_table", to_dev_full(written.pq.write_table, 1)),
         "episode": text,
-        "joined": (Layout, "path", named_dev_full(Layout.path)),
+        "joined": (FileLayout, "file_path", named_dev_full(FileLayout.file_path)),
         "overview": text,
     }
     with monkeypatch.context() as patch:
         owner, name, instead = places[moment]
         fills_up(patch, owner, name, last, instead)
         ends_in_one_line(command, capsys)
-    left = sorted(path.name for path in (out / ".parts").iterdir()) if out.exists() else []
+    left = sorted(path.name for path in (out / ".episodes").iterdir()) if out.exists() else []
     assert left == ([*(f"episode_{n:07d}" for n in range(parts)), "plan.json"] if parts else [])
     assert not (out / "meta").exists()
     assert files_of(made) == source

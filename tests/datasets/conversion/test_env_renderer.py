@@ -79,7 +79,7 @@ def recording(recorded):
 def source(recorded, recording):
     with TrajectoryFile(recorded[0]) as file:
         frames = EnvRenderer(file.env, "pd_joint_pos", ImageOptions(size=SIZE))
-    frames.load(recording)
+    frames.load_scene(recording)
     yield frames
     frames.close()
 
@@ -107,7 +107,7 @@ def test_boxes_contain_the_target(recorded, recording):
     """A visible centre of the target is inside its box."""
     with TrajectoryFile(recorded[0]) as file:
         frames = EnvRenderer(file.env, "pd_joint_pos", ImageOptions(size=SIZE, boxes=True))
-    frames.load(recording)
+    frames.load_scene(recording)
     frame = shown(frames, recording, 0)
     base, cameras = frames.env.unwrapped, frames.cameras()
     centre = base.target_center(base.object_states)[0]
@@ -160,14 +160,14 @@ def test_depth_agrees_with_the_cameras(source, recording):
         parents = {"gripper_camera": motion.tcp_in_world[0], "base_camera": motion.arm_base_in_world[0]}
         steps.append(
             [
-                geometry.View(
+                geometry.DepthView(
                     *(n, frame.depth[n], m.intrinsic, parents.get(n, np.eye(4)) @ m.camera_in_parent),
                     on_hand=m.parent == "ee",
                 )
                 for n, m in source.cameras().items()
             ]
         )
-    assert list(geometry.check(steps)) == []
+    assert list(geometry.check_depth_views(steps)) == []
     # The table's top is a plane at 0.61 m: most of its points agree to the millimetre.
     heights = steps[0][-1].points()[:, 2]
     assert np.median(np.abs(heights[np.abs(heights - 0.61) < 0.01] - 0.61)) < 0.0025
@@ -189,7 +189,7 @@ def test_different_scene_is_refused(source, recording):
         source.load(spoiled(states=fewer))
     with pytest.raises(DatasetError, match="expected fly away"):
         source.load(spoiled(instruction="fly away"))
-    source.load(recording)
+    source.load_scene(recording)
 
 
 def test_refused_scene_leaves_no_files(recorded, tmp_path):

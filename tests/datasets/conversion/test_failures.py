@@ -6,9 +6,9 @@ from synthetic import write_trajectory
 
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.conversion.data_info import add_failures
+from robocas_ms3.datasets.conversion.data_info import copy_failures
 from robocas_ms3.datasets.manage.merge import merge
-from robocas_ms3.datasets.sources.provenance import environment_id
+from robocas_ms3.datasets.sources.provenance import compute_environment_id
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.demos.failures import FailedAttempt
 
@@ -64,7 +64,7 @@ def test_failures_of_two_tasks_are_distinct(tmp_path):
     assert made_in[0] == made_in[1]
     assert len(set(made_in)) == 3
     scenes = [Dataset(out).episode(n).scene for n in Dataset(out).numbers]
-    assert [environment_id(scene["env_info"]) for scene in scenes] == [made_in[i] for i in (0, 0, 2, 2, 3)]
+    assert [compute_environment_id(scene["env_info"]) for scene in scenes] == [made_in[i] for i in (0, 0, 2, 2, 3)]
 
 
 def test_lines_of_an_earlier_version_are_not_added_again(tmp_path):
@@ -83,5 +83,5 @@ def test_truncated_failures_file(tmp_path):
         (tmp_path / name / "failures.jsonl").write_text(text)
     (tmp_path / "out").mkdir()
     for name in ("more", "run"):
-        add_failures(tmp_path / name, tmp_path / "out", {"env_id": "robocas_ms3:RoboCASPick-v1"})
+        copy_failures(tmp_path / name, tmp_path / "out", {"env_id": "robocas_ms3:RoboCASPick-v1"})
     assert failures_of(tmp_path / "out", "pick") == [LOST, SLIPPED]

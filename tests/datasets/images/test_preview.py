@@ -13,7 +13,7 @@ from robocas_ms3.datasets.conversion import convert as conversion
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.images import video
 from robocas_ms3.datasets.images.preview_frames import EpisodeDrawer
-from robocas_ms3.datasets.images.video import PREVIEW_PANEL, contact_sheet
+from robocas_ms3.datasets.images.video import PREVIEW_PANEL, write_contact_sheet
 from robocas_ms3.datasets.sources.reader import Dataset
 
 
@@ -48,10 +48,10 @@ def test_preview_shows_the_stored_images(trajectory, tmp_path, monkeypatch):
         episode = dataset.episode(number)
         for step, frame in enumerate(frames):
             images = {camera: episode.rgb(camera, step) for camera in episode.cameras}
-            drawn = EpisodeDrawer(number, episode.arrays, 5).frame(step, images, PREVIEW_PANEL)
+            drawn = EpisodeDrawer(number, episode.arrays, 5).draw_frame(step, images, PREVIEW_PANEL)
             assert frame.shape == drawn.shape == (PREVIEW_PANEL[1] + 64, 3 * PREVIEW_PANEL[0], 3)
             assert np.abs(frame.astype(int) - drawn).mean() < 4, "H.264 loses little"
-    of_images = np.asarray(Image.open(contact_sheet(Dataset(out), tmp_path / "sheet.png")))
+    of_images = np.asarray(Image.open(write_contact_sheet(Dataset(out), tmp_path / "sheet.png")))
     np.testing.assert_array_equal(np.asarray(Image.open(out / "preview" / "contact_sheet.png")), of_images)
     assert validate(out).violations == []
 
@@ -67,7 +67,7 @@ def test_preview_of_new_episodes(stub_images, tmp_path):
     assert times[1][:2] == times[0]
     assert times[2] == times[1]
     assert sheets[1] == sheets[2] == 1.5 * sheets[0]
-    of_images = np.asarray(Image.open(contact_sheet(Dataset(out), tmp_path / "sheet.png")))
+    of_images = np.asarray(Image.open(write_contact_sheet(Dataset(out), tmp_path / "sheet.png")))
     np.testing.assert_array_equal(np.asarray(Image.open(sheet)), of_images)
 
 

@@ -7,13 +7,13 @@ from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import atomic_file
 from robocas_ms3.datasets.images.preview_frames import THUMBNAIL, EpisodeDrawer
-from robocas_ms3.datasets.images.video import PANEL, colour_depth, contact_sheet, open_video, write_video
+from robocas_ms3.datasets.images.video import PANEL, colour_depth, open_video, write_contact_sheet, write_video
 from robocas_ms3.datasets.sources.reader import Dataset
 
 
 def video_frame(episode, step, number=0):
     images = {camera: episode.rgb(camera, step) for camera in episode.cameras}
-    return EpisodeDrawer(number, episode.arrays, 5).frame(step, images, PANEL)
+    return EpisodeDrawer(number, episode.arrays, 5).draw_frame(step, images, PANEL)
 
 
 def test_videos_show_every_step_in_real_time(made, tmp_path):
@@ -64,7 +64,7 @@ def test_long_texts_stay_inside(made, tmp_path):
 
 
 def test_contact_sheet(made, tmp_path):
-    sheet = np.asarray(Image.open(contact_sheet(Dataset(made), tmp_path / "sheet.png")))
+    sheet = np.asarray(Image.open(write_contact_sheet(Dataset(made), tmp_path / "sheet.png")))
     (width, height), part = THUMBNAIL, 30 + 3 * 163 + 10
     assert sheet.shape == (2 * part, 110 + 8 * (width + 3), 3)
     # Row of episode 1, static camera, last column: its last step.

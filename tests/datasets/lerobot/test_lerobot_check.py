@@ -11,7 +11,7 @@ pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 from robocas_ms3.datasets.checks.dataset import ValidationReport
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
-from robocas_ms3.datasets.lerobot.tables import as_column, numbers, write_texts
+from robocas_ms3.datasets.lerobot.tables import to_array, to_column, write_texts
 from robocas_ms3.datasets.lerobot.video import VIDEO_CODECS, VideoEncoder
 
 
@@ -27,9 +27,9 @@ def change(root, key, edit, file=DATA):
     if pa.types.is_string(values.type):
         changed = pa.array(edit(values.to_pylist()), values.type)
     else:
-        array = numbers(values).copy()
+        array = to_array(values).copy()
         edit(array)
-        changed = as_column(array).cast(values.type)
+        changed = to_column(array).cast(values.type)
     pq.write_table(table.set_column(table.column_names.index(key), key, changed), root / file)
 
 

@@ -23,8 +23,8 @@ from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.manage.import_robocas import import_robocas
 from robocas_ms3.datasets.manage.split import SplitOptions, resplit
-from robocas_ms3.datasets.manage.survey import survey
-from robocas_ms3.datasets.sources.arrays import arrays_fingerprint
+from robocas_ms3.datasets.manage.survey import survey_dataset
+from robocas_ms3.datasets.sources.arrays import fingerprint_arrays
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import split_by_seed
 
@@ -143,7 +143,7 @@ def test_an_imported_folder_can_be_resumed(dataset, tmp_path):
     for path in [dataset / "conversion.json", *dataset.glob("*/scene.json")]:
         path.unlink()
     imported, out = tmp_path / "imported", tmp_path / "out"
-    import_robocas(survey(dataset), imported)
+    import_robocas(survey_dataset(dataset), imported)
 
     def stop(episode):
         raise KeyboardInterrupt
@@ -152,7 +152,7 @@ def test_an_imported_folder_can_be_resumed(dataset, tmp_path):
         convert(imported, out, on_episode=stop)
     done = convert(imported, out)
     assert (done.existing, [e.number for e in done.episodes]) == (1, [1])
-    marks = [f"arrays {arrays_fingerprint(Dataset(imported).episode(number).arrays)}" for number in (0, 1)]
+    marks = [f"arrays {fingerprint_arrays(Dataset(imported).episode(number).arrays)}" for number in (0, 1)]
     assert [entry["recording"] for entry in LeRobotDataset(out).settings["episodes"]] == marks
     assert convert(imported, out).existing == 2
     shutil.rmtree(imported / "episode_0000001")

@@ -11,12 +11,12 @@ from robocas_ms3.datasets.lerobot.language import (
     EVENTS_TYPE,
     PERSISTENT,
     PERSISTENT_TYPE,
-    boxes_of,
-    event_rows,
-    goals_of,
-    paraphrases,
-    persistent_rows,
-    read_rows_of,
+    make_event_rows,
+    make_paraphrases,
+    make_persistent_rows,
+    read_boxes,
+    read_language_rows,
+    read_subgoal_texts,
 )
 from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.scenes.language.instructions import template_ids
@@ -27,7 +27,7 @@ INFO = {"fps": 5, "features": {CAMERA: {"dtype": "video", "shape": [48, 64, 3]}}
 
 
 def test_persistent_rows_worked_out_by_hand():
-    rows = persistent_rows(GOALS, ["take it", "grab it", "take it"], fps=5)
+    rows = make_persistent_rows(GOALS, ["take it", "grab it", "take it"], fps=5)
     assert [(row["timestamp"], row["style"], row["role"], row["content"]) for row in rows] == [
         (0.0, "subtask", "assistant", "grasp it"),
         (0.0, "task_aug", "user", "take it"),
@@ -39,16 +39,16 @@ def test_persistent_rows_worked_out_by_hand():
 
 
 def test_event_rows_worked_out_by_hand():
-    answer, question = event_rows({"base_camera": (3, 4, 10, 12)}, "sugar box")
+    answer, question = make_event_rows({"base_camera": (3, 4, 10, 12)}, "sugar box")
     assert question == {
         "role": "user", "content": "Where is the sugar box?", "style": "vqa", "camera": CAMERA, "tool_calls": None
     }  # fmt: skip
     expected = {"detections": [{"bbox": [3, 4, 10, 12], "bbox_format": "xyxy", "label": "sugar box"}]}
     assert json.loads(answer["content"]) == expected
     assert (answer["role"], answer["style"], answer["camera"]) == ("assistant", "vqa", CAMERA)
-    assert event_rows({"base_camera": (0, 0, 1, 1)}, "scissors")[1]["content"] == "Where are the scissors?"
-    assert event_rows({}, "sugar box") == []
-    several = event_rows({"static_camera": (1, 1, 2, 2), "base_camera": (0, 0, 1, 1)}, "pear")
+    assert make_event_rows({"base_camera": (0, 0, 1, 1)}, "scissors")[1]["content"] == "Where are the scissors?"
+    assert make_event_rows({}, "sugar box") == []
+    several = make_event_rows({"static_camera": (1, 1, 2, 2), "base_camera": (0, 0, 1, 1)}, "pear")
     assert [row["role"] for row in several] == ["assistant"] * 2 + ["user"] * 2
     cameras = [row["camera"].removeprefix("observation.images.") for row in several]
     assert cameras == ["base_camera", "static_camera"] * 2
@@ -56,10 +56,10 @@ def test_event_rows_worked_out_by_hand():
 
 @pytest.mark.parametrize("fps", [1, 3, 7, 100])
 def test_goals_of_frames(fps):
-    rows = persistent_rows(GOALS, [], fps)
-    assert goals_of(rows, 7, fps) == ["grasp it"] * 3 + ["drop it"] * 4
-    assert goals_of(rows[1:], 7, fps) == [""] * 3 + ["drop it"] * 4
-    assert goals_of([], 2, fps) == ["", ""]
+    rows = make_persistent_rows(GOALS, [], fps)
+    assert read_subgoal_texts(rows, 7, fps) == ["grasp it"] * 3 + ["drop it"] * 4
+    assert read_subgoal_texts(rows[1:], 7, fps) == [""] * 3 + ["drop it"] * 4
+    assert read_subgoal_texts([], 2, fps) == ["", ""]
 
 
 @pytest.mark.parametrize(
@@ -75,9 +75,9 @@ def test_goals_of_frames(fps):
     ],
 )
 def test_answers_without_exactly_one_integer_box_are_ignored(answer):
-    rows = event_rows({"base_camera": (1, 2, 3, 4)}, "pear")
-    assert boxes_of(rows) == {"base_camera": (1, 2, 3, 4)}
-    assert boxes_of([{**rows[0], "content": answer}, rows[1]]) == {}
+    rows = make_event_rows({"base_camera": (1, 2, 3, 4)}, "pear")
+    assert read_boxes(rows) == {"base_camera": (1, 2, 3, 4)}
+    assert read_boxes([{**rows[0], "content": answer}, rows[1]]) == {}
 
 
 SCENE = {
@@ -88,7 +88,7 @@ SCENE = {
 
 
 def test_paraphrases_use_training_templates():
-    texts = paraphrases(SCENE, "grasp the pear on the table and move it to the basket")
+    texts = make_paraphrases(SCENE, "grasp the pear on the table and move it to the basket")
     assert texts[0] == "grasp the pear on the table and move it to the basket"
     assert "put the pear into the basket" in texts
     assert len(texts) == 1 + len(template_ids("pick", "train"))
@@ -97,9 +97,9 @@ def test_paraphrases_use_training_templates():
 
 def test_paraphrases_with_a_relation_and_a_part():
     related = {**SCENE, "task": "select", "recorded": {"support": "table", "relation": "nearest"}}
-    assert all("nearest pear" in text or "closest" in text for text in paraphrases(related, "")[1:])
+    assert all("nearest pear" in text or "closest" in text for text in make_paraphrases(related, "")[1:])
     opened = {**SCENE, "task": "open_pick", "config": {"opening": {"handle": "door_left"}}}
-    assert any("left door" in text for text in paraphrases(opened, ""))
+    assert any("left door" in text for text in make_paraphrases(opened, ""))
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_paraphrases_with_a_relation_and_a_part():
     ],
 )
 def test_no_paraphrases_of_unknown_scenes(scene):
-    assert paraphrases(scene, "do it") == []
+    assert make_paraphrases(scene, "do it") == []
 
 
 def table_of(persistent, events):
@@ -126,8 +126,8 @@ def found(persistent, events):
     return [f"{key}: {expected}" for key, expected, _ in check_language(table_of(persistent, events), "file", INFO)]
 
 
-ROWS = persistent_rows(GOALS, ["take it"], 5)
-EVENT = event_rows({"base_camera": (3, 4, 63, 47)}, "pear")
+ROWS = make_persistent_rows(GOALS, ["take it"], 5)
+EVENT = make_event_rows({"base_camera": (3, 4, 63, 47)}, "pear")
 
 
 def test_valid_rows():
@@ -147,8 +147,8 @@ def test_valid_rows():
         (ROWS, [[{**EVENT[0], "camera": None}], *[[]] * 6], "a camera of the dataset"),
         (ROWS, [[{**EVENT[0], "style": "subtask"}], *[[]] * 6], "style interjection"),
         (ROWS, [[*EVENT, *EVENT], *[[]] * 6], "one question"),
-        (ROWS, [event_rows({"base_camera": (3, 4, 64, 5)}, "pear"), *[[]] * 6], "a box"),
-        (ROWS, [event_rows({"base_camera": (9, 4, 8, 5)}, "pear"), *[[]] * 6], "a box"),
+        (ROWS, [make_event_rows({"base_camera": (3, 4, 64, 5)}, "pear"), *[[]] * 6], "a box"),
+        (ROWS, [make_event_rows({"base_camera": (9, 4, 8, 5)}, "pear"), *[[]] * 6], "a box"),
     ],
 )
 def test_rows_that_are_wrong(persistent, events, message):
@@ -167,13 +167,13 @@ def test_different_rows_in_frames_are_reported():
 )
 def test_columns_without_language_rows_are_refused(column):
     with pytest.raises(DatasetError):
-        read_rows_of(pa.table({PERSISTENT: pa.array(column)}), PERSISTENT, "file")
+        read_language_rows(pa.table({PERSISTENT: pa.array(column)}), PERSISTENT, "file")
 
 
 def test_columns_as_arrow_infers_them():
     """``lerobot-annotate`` writes no types: times become float64, and a field of nulls has the type null."""
     table = pa.table({PERSISTENT: pa.array([ROWS, ROWS]), EVENTS: pa.array([[], []])})
-    assert read_rows_of(table, PERSISTENT, "file")[0] == ROWS
-    assert read_rows_of(table, EVENTS, "file") == [[], []]
+    assert read_language_rows(table, PERSISTENT, "file")[0] == ROWS
+    assert read_language_rows(table, EVENTS, "file") == [[], []]
     with pytest.raises(DatasetError):
-        read_rows_of(table.drop([EVENTS]), EVENTS, "file")
+        read_language_rows(table.drop([EVENTS]), EVENTS, "file")

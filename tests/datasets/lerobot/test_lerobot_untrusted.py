@@ -15,7 +15,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
-from robocas_ms3.datasets.lerobot.tables import TEXT, Column, read_objects, read_rows
+from robocas_ms3.datasets.lerobot.tables import TEXT, Column, read_episode_rows, read_objects
 
 
 @pytest.mark.parametrize(
@@ -160,10 +160,10 @@ def test_rows_are_counted_before_they_are_read(spoiled, file, monkeypatch):
     monkeypatch.setattr(pq, "read_table", refused)
     dataset = LeRobotDataset(spoiled)
     read = {
-        DATA: lambda: read_rows(spoiled / file, 0, 14),
+        DATA: lambda: read_episode_rows(spoiled / file, 0, 14),
         EPISODES: lambda: dataset.rows,
         schema.TASKS_FILE: lambda: dataset.tasks,
-        schema.SCENES_FILE: lambda: dataset.scene_texts,
+        schema.SCENES_FILE: lambda: dataset.scene_json_texts,
     }
     with pytest.raises(DatasetError):
         read[file]()
@@ -175,7 +175,7 @@ def test_wrong_row_counts_are_bounded_by_size(tmp_path):
     pq.write_table(pa.table({f"{n}": rows.column(0) for n in range(19)} | {"episode_index": rows.column(0)}), path)
     assert path.stat().st_size < 400_000
     with pytest.raises(DatasetError):
-        read_rows(path, 0)
+        read_episode_rows(path, 0)
 
 
 def test_repeated_long_text_counts_each_time(tmp_path):

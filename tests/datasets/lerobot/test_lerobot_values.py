@@ -18,13 +18,13 @@ pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw
-from robocas_ms3.datasets.lerobot.arrays import frame_columns, robocas_arrays
-from robocas_ms3.datasets.lerobot.schema import FEATURES, features_json
-from robocas_ms3.datasets.lerobot.stats import LevelHistogram, joined_stats, vector_stats
-from robocas_ms3.datasets.lerobot.tables import read_rows
+from robocas_ms3.datasets.lerobot.arrays import to_frame_columns, to_robocas_arrays
+from robocas_ms3.datasets.lerobot.schema import FEATURES, make_features
+from robocas_ms3.datasets.lerobot.stats import LevelHistogram, compute_dataset_stats, compute_stats
+from robocas_ms3.datasets.lerobot.tables import read_episode_rows
 from robocas_ms3.datasets.lerobot.variants import VARIANTS
 from robocas_ms3.datasets.lerobot.video import VIDEO_CODECS, VideoEncoder, to_depth
-from robocas_ms3.datasets.sources.arrays import episode_arrays
+from robocas_ms3.datasets.sources.arrays import make_episode_arrays
 from robocas_ms3.demos.recordings.motion import Motion
 from robocas_ms3.demos.recordings.subgoals import SubGoal
 
@@ -38,18 +38,18 @@ def made_up(steps, seed):
         SubGoal.from_range("move and grasp", "grasp it", 0, 0),
         SubGoal.from_range("transfer object", "drop it", 1, steps - 1),
     ]
-    return episode_arrays(Motion(qpos, qvel, root, *poses, rng.random(steps) < 0.5), "grasp it and drop it", goals)
+    return make_episode_arrays(Motion(qpos, qvel, root, *poses, rng.random(steps) < 0.5), "grasp it and drop it", goals)
 
 
 def test_statistics_of_all_episodes_are_exact_and_copy_one_column_at_a_time():
     episodes = [np.random.default_rng(seed).normal(size=(200, 16)).astype(np.float32) for seed in range(50)]
     size = sum(values.nbytes for values in episodes)
     tracemalloc.start()
-    found = joined_stats(episodes)
+    found = compute_dataset_stats(episodes)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < size
-    whole = vector_stats(np.concatenate(episodes))
+    whole = compute_stats(np.concatenate(episodes))
     assert found.keys() == whole.keys()
     for name, values in whole.items():
         np.testing.assert_allclose(found[name], values, rtol=1e-6, atol=1e-9)
@@ -60,7 +60,7 @@ def test_statistics_of_all_episodes_are_exact_and_copy_one_column_at_a_time():
 def test_arrays_round_trip(steps, seed):
     arrays = made_up(steps, seed)
     texts, types = arrays["step_lang_goals"].tolist(), arrays["step_goal_type"].tolist()
-    back = robocas_arrays(frame_columns(arrays), "grasp it and drop it", texts, types)
+    back = to_robocas_arrays(to_frame_columns(arrays), "grasp it and drop it", texts, types)
     assert set(back) == set(arrays)
     for key, values in arrays.items():
         if key in ("rel_orn", "base_rel_orn"):
@@ -81,7 +81,7 @@ def test_actions_worked_out_by_hand():
     arrays["rel_orn"] = np.array(
         [[0, 0, np.sqrt(0.5), np.sqrt(0.5)], [np.sin(np.pi / 8), 0, 0, np.cos(np.pi / 8)], [0, 0, 0, 1]]
     )
-    columns = frame_columns(arrays)
+    columns = to_frame_columns(arrays)
     expected = [[0.1, 0, 0, 0, 0, np.pi / 2, 0], [0, 0.2, 0, np.pi / 4, 0, 0, 1], [0, 0, 0, 0, 0, 0, 1]]
     np.testing.assert_allclose(columns["action"], expected, atol=1e-6)
     joints = arrays["robot_joints"]
@@ -96,7 +96,7 @@ def test_documentation_lists_every_feature():
     for feature in FEATURES:
         assert f"| `{feature.key}` | {feature.width} |" in text
     for variant in VARIANTS.values():
-        features = features_json(variant, {})
+        features = make_features(variant, {})
         assert set(features) <= set(re.findall(r"`([\w.]+)`", text))
         # LeRobot stacks keys that start with `observation.` into tensors
         assert not [key for key, ft in features.items() if ft["dtype"] == "string" and key.startswith("observation")]
@@ -130,7 +130,7 @@ def test_image_statistics_are_exact():
     rng = np.random.default_rng(0)
     images = rng.integers(0, 256, (4, 12, 16, 3), np.uint8)
     images[..., 1] //= 2
-    found, other = LevelHistogram.rgb(), LevelHistogram.rgb()
+    found, other = LevelHistogram.make_rgb(), LevelHistogram.make_rgb()
     for image in images[:3]:
         found.add(image)
     other.add(images[3])
@@ -142,7 +142,7 @@ def test_image_statistics_are_exact():
     median = np.quantile(channels, 0.5, axis=0, method="inverted_cdf")
     np.testing.assert_allclose(np.array(stats["q50"]).reshape(3), median)
     assert stats["count"] == [4]
-    large = LevelHistogram.rgb()  # thinned
+    large = LevelHistogram.make_rgb()  # thinned
     large.add(np.zeros((480, 640, 3), np.uint8))
     assert large.counts.sum() == 3 * 120 * 160
 
@@ -157,19 +157,19 @@ def test_read_rows_returns_the_rows_of_the_episode(tmp_path, group, statistics):
     path, rows = tmp_path / "file.parquet", pa.table(ROWS)
     pq.write_table(rows, path, row_group_size=group, write_statistics=statistics)
     for number in range(6):
-        found = read_rows(path, number)
+        found = read_episode_rows(path, number)
         assert found.column("index").to_pylist() == [i for i, of in enumerate(EPISODES) if of == number]
     before = path.stat().st_mtime_ns  # footers are kept; a file that is replaced is read again
     pq.write_table(rows.slice(3), path, row_group_size=group)
     os.utime(path, ns=(before + 1, before + 1))
-    assert [len(read_rows(path, number)) for number in (0, 1)] == [0, 2]
+    assert [len(read_episode_rows(path, number)) for number in (0, 1)] == [0, 2]
 
 
 @pytest.mark.parametrize("other", [{"index": [1, 2]}, {"episode_index": ["one", "two"]}])
 def test_data_file_without_episode_index(tmp_path, other):
     pq.write_table(pa.table(other), tmp_path / "file.parquet")
     with pytest.raises(DatasetError):
-        read_rows(tmp_path / "file.parquet", 1)
+        read_episode_rows(tmp_path / "file.parquet", 1)
 
 
 def test_encoder_ends_its_stream_after_an_error(tmp_path, capfd):

@@ -14,7 +14,7 @@ pq = pytest.importorskip("pyarrow.parquet", reason="needs the extra 'lerobot'")
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import inverse
 from robocas_ms3.datasets.formats import open_source
-from robocas_ms3.datasets.images.image_files import bounding_box
+from robocas_ms3.datasets.images.image_files import compute_bounding_box
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
@@ -149,8 +149,8 @@ def test_boxes_contain_the_projected_target(versions, trajectory):
         assert left <= fx * x / z + cx <= right + 1
         assert top <= fy * y / z + cy <= bottom + 1
         assert (right - left, bottom - top) < (20, 20)
-    assert bounding_box(np.array([[0, 0, 0], [0, 1, 0], [0, 1, 1]], bool)) == (1, 1, 2, 2)
-    assert bounding_box(np.zeros((2, 3), bool)) is None
+    assert compute_bounding_box(np.array([[0, 0, 0], [0, 1, 0], [0, 1, 1]], bool)) == (1, 1, 2, 2)
+    assert compute_bounding_box(np.zeros((2, 3), bool)) is None
 
 
 def test_files_of_version_2_1(versions):

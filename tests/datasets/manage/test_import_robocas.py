@@ -11,9 +11,9 @@ from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.images.video import contact_sheet
+from robocas_ms3.datasets.images.video import write_contact_sheet
 from robocas_ms3.datasets.manage.import_robocas import import_robocas
-from robocas_ms3.datasets.manage.survey import survey
+from robocas_ms3.datasets.manage.survey import survey_dataset
 from robocas_ms3.datasets.sources.file_models import SCENE_KEYS
 from robocas_ms3.datasets.sources.reader import Dataset
 
@@ -58,7 +58,7 @@ def test_v0_dataset_becomes_valid(dataset, made, tmp_path, pose_name):
         assert scene["source"]["format"] == "robocas v0"
         assert scene["source"]["derived"] == {"agv_pose": "base_pos, base_orn", "rel_agv_pose": "agv_pose"}
     assert read(out / "import_report.json")["importable"] == 2
-    contact_sheet(Dataset(out), tmp_path / "sheet.png")
+    write_contact_sheet(Dataset(out), tmp_path / "sheet.png")
     assert files_of(root) == before
 
 
@@ -194,7 +194,7 @@ def test_invalid_arrays_skip_their_episode(v0, tmp_path, new, key, found):
         (episode, where) == (1, f"{NPZ}, {key}") and text.startswith(found)
         for episode, where, text, _ in problems(v0, "skipped")
     )
-    report = survey(v0).as_json()
+    report = survey_dataset(v0).as_json()
     assert (report["skipped"], report["importable"]) == ([1], 1)
     json.dumps(report)
     out = imported(v0, tmp_path / "out")
@@ -225,7 +225,7 @@ def test_embeddings_are_kept_removed_or_computed(dataset, made, tmp_path):
     assert (None, f"{NPZ}, embeddings", "1 episode without", "not imported") in problems(dataset, "repaired")
     assert imported(dataset, tmp_path / "none").settings["embeddings"] is False
     assert validate(tmp_path / "none").violations == []
-    import_robocas(survey(dataset), tmp_path / "made", embed=embed)
+    import_robocas(survey_dataset(dataset), tmp_path / "made", embed=embed)
     assert validate(tmp_path / "made").violations == []
     new = Dataset(tmp_path / "made")
     assert new.settings["embeddings"] is True

@@ -9,7 +9,7 @@ from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError, OutputExistsError, RobocasError
 from robocas_ms3.core.locks import lock_folder
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, FilePlacer
+from robocas_ms3.datasets.manage.copy_episodes import CopyOptions, FileCopier
 from robocas_ms3.datasets.manage.merge import merge
 from robocas_ms3.datasets.manage.split import SplitOptions, resplit
 from robocas_ms3.datasets.sources.reader import Dataset
@@ -63,9 +63,9 @@ def test_files_are_copied_if_links_are_not_supported(tmp_path, monkeypatch):
 
     (tmp_path / "a").write_text("1")
     monkeypatch.setattr("os.link", refuse)
-    placer = FilePlacer(link=True)
-    placer.place(tmp_path / "a", tmp_path / "b")
-    assert (placer.linked, placer.copied, placer.link) == (0, 1, False)
+    copier = FileCopier(link=True)
+    copier.copy_file(tmp_path / "a", tmp_path / "b")
+    assert (copier.linked, copier.copied, copier.link) == (0, 1, False)
     assert (tmp_path / "b").read_text() == "1"
 
 

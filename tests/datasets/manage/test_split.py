@@ -13,9 +13,9 @@ from robocas_ms3.datasets.manage import split
 from robocas_ms3.datasets.manage.merge import merge
 from robocas_ms3.datasets.manage.split import (
     SplitOptions,
-    cut,
-    folder_names,
+    divide_episodes,
     group_episodes,
+    make_folder_names,
     resplit,
     split_by_fractions,
 )
@@ -38,9 +38,9 @@ def test_groups_stay_together_and_no_list_is_empty(values, shares):
     groups = {number: str(value) for number, value in enumerate(values)}
     if len(set(values)) < len(shares):
         with pytest.raises(DatasetError, match="too few groups to split"):
-            cut(groups, shares)
+            divide_episodes(groups, shares)
         return
-    parts = cut(groups, shares)
+    parts = divide_episodes(groups, shares)
     assert sorted(number for part in parts for number in part) == list(groups)
     inside = [{groups[number] for number in part} for part in parts]
     assert all(inside)
@@ -50,7 +50,7 @@ def test_groups_stay_together_and_no_list_is_empty(values, shares):
 @pytest.mark.parametrize("count", [2, 10, 47, 200])
 def test_tenth_by_seed_equals_the_split_of_convert(count):
     seeds = {number: 1000 + number for number in range(count)}
-    assert cut({n: str(seed) for n, seed in seeds.items()}, [0.9, 0.1]) == list(split_by_seed(seeds))
+    assert divide_episodes({n: str(seed) for n, seed in seeds.items()}, [0.9, 0.1]) == list(split_by_seed(seeds))
 
 
 def test_parts_have_training_and_validation_episodes():
@@ -66,10 +66,10 @@ def test_parts_have_training_and_validation_episodes():
 
 def test_fractions():
     groups = {number: str(number) for number in range(100)}
-    assert [len(part) for part in cut(groups, [0.7, 0.2, 0.1])] == [70, 20, 10]
+    assert [len(part) for part in divide_episodes(groups, [0.7, 0.2, 0.1])] == [70, 20, 10]
     for wrong in ([1.0], [0.5, 0.6], [1.0, 0.0]):
         with pytest.raises(DatasetError, match="invalid fractions"):
-            cut(groups, wrong)
+            divide_episodes(groups, wrong)
 
 
 def test_training_and_validation_as_datasets(six, tmp_path):
@@ -143,11 +143,11 @@ def test_folder_names_stay_inside_the_output(six, tmp_path):
 
 
 def test_folder_names_are_distinct():
-    names = folder_names(["a b", "a_b", "c"])
+    names = make_folder_names(["a b", "a_b", "c"])
     assert len(set(names.values())) == 3
     assert names["c"] == "c"
     assert names["a b"].startswith("a_b-")
-    assert folder_names(["a b", "c"])["a b"] == "a_b"
+    assert make_folder_names(["a b", "c"])["a b"] == "a_b"
 
 
 def test_in_place_writes_two_files_only(six, tmp_path):

@@ -8,15 +8,15 @@ from managing import edit, imported, problems
 
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.manage.repairs import eef_turn
-from robocas_ms3.datasets.manage.survey import survey
+from robocas_ms3.datasets.manage.repairs import find_eef_rotation
+from robocas_ms3.datasets.manage.survey import survey_dataset
 
 NPZ = "episode_info.npz"
 NAMES = ("base", "gripper", "static")
 
 
 def test_finding_of_all_episodes_is_reported_once(copy):
-    assert [(f.episode, f.violation.file, f.outcome) for f in survey(copy).findings] == [
+    assert [(f.episode, f.violation.file, f.outcome) for f in survey_dataset(copy).findings] == [
         (None, "conversion.json", "repaired"),
         (None, NPZ, "repaired"),
         (None, NPZ, "repaired"),
@@ -28,19 +28,19 @@ def test_finding_of_all_episodes_is_reported_once(copy):
     ]
     poses = copy / "episode_0000002" / "static_camera"
     shutil.copy(poses / "cam_pos_wrt_world.npy", poses / "cam_pose_wrt_world.npy")
-    found = [f for f in survey(copy).findings if "static_camera" in f.violation.file]
+    found = [f for f in survey_dataset(copy).findings if "static_camera" in f.violation.file]
     assert [(f.episode, f.violation.file) for f in found] == [
         (n, f"episode_000000{n}/static_camera/cam_pose_wrt_world.npy") for n in (0, 1, 3)
     ]
 
 
 def test_valid_dataset_has_no_findings(made):
-    assert survey(made).findings == []
+    assert survey_dataset(made).findings == []
 
 
 def test_eef_frame_of_a_recorded_episode_is_not_rotated(dataset):
     def turned():
-        return [f.episode for f in survey(dataset).findings if "ee_orn" in f.violation.key]
+        return [f.episode for f in survey_dataset(dataset).findings if "ee_orn" in f.violation.key]
 
     folder = dataset / schema.episode_folder(1)
     pose = np.load(folder / "gripper_camera" / "cam_pos_wrt_ee.npy")
@@ -57,9 +57,14 @@ def test_eef_turn_by_hand():
         pose[:2, 3] = x, y
         return pose
 
-    assert [eef_turn(camera_at(x, y)) for x, y in ((0.05, 0), (0, 0.05), (-0.05, 0), (0, -0.05))] == [0, 90, 180, -90]
-    assert eef_turn(camera_at(0, 0.2)) == 0  # not the known camera
-    assert eef_turn(camera_at(0.04, 0.04)) == 0
+    assert [find_eef_rotation(camera_at(x, y)) for x, y in ((0.05, 0), (0, 0.05), (-0.05, 0), (0, -0.05))] == [
+        0,
+        90,
+        180,
+        -90,
+    ]
+    assert find_eef_rotation(camera_at(0, 0.2)) == 0  # not the known camera
+    assert find_eef_rotation(camera_at(0.04, 0.04)) == 0
 
 
 def test_missing_damaged_and_other_images(copy, tmp_path):

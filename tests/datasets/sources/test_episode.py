@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets.schema import EPISODE_INFO
-from robocas_ms3.datasets.sources.arrays import add_embeddings, episode_arrays
+from robocas_ms3.datasets.sources.arrays import add_embeddings, make_episode_arrays
 from robocas_ms3.demos.recordings.motion import (
     Motion,
     compute_agv_pose,
@@ -64,7 +64,7 @@ def arrays_of(tcp, base, *, qpos=None, subgoals=None, embed=None):
     root = np.broadcast_to(np.eye(4), (count, 4, 4))
     motion = Motion(qpos, np.zeros((count, 12)), root, tcp, base, np.ones(count, bool))
     subgoals = subgoals or [SubGoal.from_range("move and grasp", "grasp it", 0, count - 1)]
-    arrays = episode_arrays(motion, "do it", subgoals)
+    arrays = make_episode_arrays(motion, "do it", subgoals)
     return add_embeddings(arrays, embed) if embed else arrays
 
 

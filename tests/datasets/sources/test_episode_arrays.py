@@ -22,22 +22,22 @@ def test_unreadable_arrays_are_recorded_and_refused_on_access(dataset):
     change(episode, ee_pos=np.array([{}] * 7, object), speed=np.zeros(3))
     stored = read_arrays(episode / "episode_info.npz")
     assert (stored.file, stored.steps, list(stored.unreadable)) == (FILE, 7, ["ee_pos"])
-    assert stored.reason("ee_pos") == "pickled objects, which are never loaded"
+    assert stored.describe_error("ee_pos") == "pickled objects, which are never loaded"
     assert "speed" in stored.arrays
     with pytest.raises(DatasetError, match="episode_info.npz, ee_pos: this episode can't be read .*pickled"):
-        stored.needed(["rel_pos"])
+        stored.require(["rel_pos"])
     some = read_arrays(episode / "episode_info.npz", ("rel_pos", "none"))
     assert list(some.arrays) == ["rel_pos"] and "speed" in some.ignored
     with pytest.raises(DatasetError, match="arrays are missing .expected none"):
-        some.needed(["rel_pos", "none"])
+        some.require(["rel_pos", "none"])
 
 
 def test_missing_file(tmp_path):
     stored = read_arrays(tmp_path / "episode_info.npz")
     assert (stored.steps, list(stored.unreadable)) == (0, [""])
-    assert said(array_checks.violations_of(stored, array_checks.FORM)) == [("", "this file", "no file")]
+    assert said(array_checks.run_checks(stored, array_checks.FORM_CHECKS)) == [("", "this file", "no file")]
     with pytest.raises(DatasetError, match="this episode can't be read .found No such file"):
-        stored.needed([])
+        stored.require([])
     with pytest.raises(DatasetError, match="no such file"):
         load_arrays(tmp_path / "episode_info.npz")
 
@@ -46,9 +46,14 @@ def test_missing_arrays_violate_one_rule_only(tmp_path):
     empty = EpisodeArrays(tmp_path, {})
     assert (
         said(
-            array_checks.violations_of(
+            array_checks.run_checks(
                 empty,
-                (array_checks.check_shapes, array_checks.check_finite, array_checks.check_units, *array_checks.CONTENT),
+                (
+                    array_checks.check_shapes,
+                    array_checks.check_finite,
+                    array_checks.check_units,
+                    *array_checks.CONTENT_CHECKS,
+                ),
             )
         )
         == []

@@ -68,7 +68,7 @@ def test_damaged_entry_of_a_trajectory_is_an_error_of_its_episode(paths, tmp_pat
 def test_recordings_have_every_control_step(paths):
     source = TrajectorySource(paths["trajectory"])
     recording = source.episode(0).recording()
-    assert len(recording.actions) == source.info(0).control_steps > source.lengths[0]
+    assert len(recording.actions) == source.episode_entry(0).control_steps > source.lengths[0]
     assert set(recording.states) == {"actors", "articulations"}
 
 

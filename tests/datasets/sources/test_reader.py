@@ -7,7 +7,7 @@ import pytest
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.datasets.statistics.collect import collect
+from robocas_ms3.datasets.statistics.collect import collect_statistics
 
 
 def test_a_dataset_without_a_split(tmp_path):
@@ -25,7 +25,7 @@ def test_missing_key_of_data_info_is_an_error(tmp_path, key):
     assert (error.value.where, error.value.expected) == (tmp_path / "data_info.json", key)
 
 
-@pytest.mark.parametrize("ask", [Dataset, collect, validate])
+@pytest.mark.parametrize("ask", [Dataset, collect_statistics, validate])
 @pytest.mark.parametrize(
     ("file", "meant"),
     [

@@ -13,8 +13,8 @@ from robocas_ms3.cli.stats import Stats as Command
 from robocas_ms3.cli.stats import main
 from robocas_ms3.core.errors import DatasetError, MissingExtraError
 from robocas_ms3.datasets.actions import ACTION_NAMES
-from robocas_ms3.datasets.statistics.collect import collect, histogram, summarize_values
-from robocas_ms3.datasets.statistics.layouts import Placement, Surface, layout_map
+from robocas_ms3.datasets.statistics.collect import collect_statistics, compute_histogram, summarize_values
+from robocas_ms3.datasets.statistics.layouts import ObjectPositions, Surface, make_layout_map
 from robocas_ms3.datasets.statistics.plots import PLOTS, write_stats
 
 TABLE = Surface("table, top", x=0.9, y=1.0, yaw=-np.pi / 2, region=[[0.0, -0.1], [0.1, 0.1]])
@@ -41,7 +41,7 @@ def described(dataset):
 
 
 def test_counts_of_a_folder(described):
-    found = collect(described).as_json()
+    found = collect_statistics(described).as_json()
     assert (found["episodes"], found["steps"], found["rate_hz"]) == (2, 14, 5.0)
     assert found["split"] == {"train": 1, "val": 1}
     assert found["success"] == {"true": 2}
@@ -71,31 +71,31 @@ def test_counts_of_a_folder(described):
 
 
 def test_statistics_of_trajectory_and_conversion_agree(made, trajectory):
-    folder, file = collect(made).as_json(), collect(trajectory).as_json()
+    folder, file = collect_statistics(made).as_json(), collect_statistics(trajectory).as_json()
     assert (file["episodes"], file["success"]) == (3, {"true": 2, "false": 1})  # failed ones are counted
     assert file["lengths"]["pick"] == {**folder["lengths"]["pick"], "count": 3}
     assert file["objects"]["cube"] == {"name": "cube 5", "episodes": 0, "target": 3}  # the recording lists no objects
     assert file["subgoals"]["move and grasp"]["median"] == folder["subgoals"]["move and grasp"]["median"]
-    assert collect(trajectory, rate_hz=10).as_json()["lengths"]["pick"]["median"] == 12
+    assert collect_statistics(trajectory, rate_hz=10).as_json()["lengths"]["pick"]["median"] == 12
 
 
 def test_far_objects_and_unknown_regions():
     at = np.array([[0.93, 0.99], [0.93, 0.94], [9.0, 9.0]])
-    known = layout_map([Placement(at, surface=TABLE)])
+    known = make_layout_map([ObjectPositions(at, surface=TABLE)])
     assert (known.counts.sum(), known.outside, known.coverage) == (2, 1, 2 / 8)
-    heap = layout_map([Placement(at[:2] + [0, -0.2], surface=TABLE)])  # slid off, by less than the margin
+    heap = make_layout_map([ObjectPositions(at[:2] + [0, -0.2], surface=TABLE)])  # slid off, by less than the margin
     assert (heap.counts.sum(), heap.outside, heap.coverage) == (2, 0, 0)
-    world = layout_map([Placement(at[:2], surface=TABLE), Placement(at[:1])])
+    world = make_layout_map([ObjectPositions(at[:2], surface=TABLE), ObjectPositions(at[:1])])
     assert (world.frame, world.coverage, world.counts.sum()) == ("world", None, 3)
-    one = layout_map([Placement(at[:1])])
+    one = make_layout_map([ObjectPositions(at[:1])])
     assert one.counts.tolist() == [[1]]
 
 
 def test_histogram_and_description():
-    found = histogram(np.array([-2.0, 0.0, 0.0, 1.0]))
+    found = compute_histogram(np.array([-2.0, 0.0, 0.0, 1.0]))
     assert (found["edges"][0], found["edges"][-1], len(found["counts"])) == (-2, 2, 41)
     assert found["counts"][20] == 2
-    assert histogram(np.array([0.0, 1, 1]))["counts"] == [1, 2]
+    assert compute_histogram(np.array([0.0, 1, 1]))["counts"] == [1, 2]
     assert summarize_values([]) == {"count": 0}
     assert summarize_values([1, 2, 3, 4])["median"] == 2.5
 
@@ -103,7 +103,7 @@ def test_histogram_and_description():
 def test_datasets_without_scenes(dataset, tmp_path):
     for path in dataset.glob("*/scene.json"):
         path.unlink()
-    stats = collect(dataset)
+    stats = collect_statistics(dataset)
     assert stats.summary().startswith("2 episodes (unknown 2), 14 steps")
     names = [path.name for path in write_stats(stats, tmp_path / "out")]
     assert names == ["stats.json", "lengths.png", "instructions.png", "actions.png", "subgoals.png"]
@@ -126,7 +126,7 @@ def test_images_and_json(described, tmp_path, capsys):
 
 def test_texts_with_dollars_and_control_characters_are_labels(described, tmp_path):
     """Matplotlib parses text between two dollars as a formula."""
-    stats, text = collect(described), "for $5 and \\frac{ $6\x1b[31m\nmore"
+    stats, text = collect_statistics(described), "for $5 and \\frac{ $6\x1b[31m\nmore"
     stats.names["cup"] = text
     stats.instructions[text] += 1
     stats.lengths[text] = stats.lengths["pick"]
@@ -145,25 +145,25 @@ def test_the_default_folder_is_next_to_a_trajectory(trajectory, tmp_path):
 def test_damaged_scene(described):
     (described / "episode_0000001/scene.json").write_text('{"layout": {"object_ids": 3}}')
     with pytest.raises(DatasetError, match=r"episode_0000001/scene\.json: invalid description of a scene"):
-        collect(described)
+        collect_statistics(described)
 
 
 @pytest.mark.parametrize(("key", "value"), [("rel_pos", np.nan), ("rel_orn", 0.0)])
 def test_invalid_actions_are_refused(described, key, value):
     managing.spoil_array(described / "episode_0000001", key, value)
     with pytest.raises(DatasetError, match="episode 1"):
-        collect(described)
+        collect_statistics(described)
 
 
 def test_no_episodes(described):
     info = {"train_eps": [], "val_eps": [], "ep_length": {}}
     (described / "data_info.json").write_text(json.dumps(info))
     with pytest.raises(DatasetError, match="this dataset has no episodes"):
-        collect(described)
+        collect_statistics(described)
 
 
 def test_without_matplotlib(made, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(MissingExtraError, match="plots"):
-        write_stats(collect(made), tmp_path / "out")
+        write_stats(collect_statistics(made), tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import RoboCASDataset
-from robocas_ms3.datasets.actions import ActionScale, episode_actions
+from robocas_ms3.datasets.actions import ActionScale, compute_actions
 from robocas_ms3.datasets.training.options import SampleOptions
 
 CAMERAS = ("base_camera", "gripper_camera")
@@ -80,7 +80,7 @@ def test_samples_equal_those_of_the_simple_loader(made, horizon, chunk, padding)
             state=("ee_pos", "ee_orn", "gripper_width"),
         ),
     )
-    where = [data.locate(index) for index in range(len(data))]
+    where = [data.locate_sample(index) for index in range(len(data))]
     steps = range(horizon - 1, 7 - chunk) if padding == "drop" else range(6)  # T is 7: states 0, 4, .. 20, 22
     assert where == [(number, step) for number in (0, 1) for step in steps]
     for index, (number, step) in enumerate(where):
@@ -106,7 +106,7 @@ def test_actions_by_hand():
         [0, 0, -0.01, quarter, 0, quarter, 0],  # x -> y -> z -> x: a quarter about x, then about z
         [0, 0, 0, 0, 0, 0, 0],  # nothing follows the last step
     ]
-    assert np.allclose(episode_actions(arrays), expected, atol=1e-6)
+    assert np.allclose(compute_actions(arrays), expected, atol=1e-6)
 
 
 def test_scale_maps_the_range_to_one_and_clips():
@@ -150,31 +150,31 @@ def test_texts_and_subgoals(made):
         made, SampleOptions(split="all", cameras=(), observation_horizon=3, embedding=True, subgoals=True)
     )
     info = np.load(made / "episode_0000001/episode_info.npz")
-    sample = data[data.index(1, 1)]
+    sample = data[data.sample_index(1, 1)]
     assert sample["instruction"] == str(info["language_goal"])
     assert sample["subgoal"] == info["step_lang_goals"][1]
     assert np.array_equal(sample["language_embedding"], info["language_embedding"])
     assert np.array_equal(sample["subgoal_embedding"], info["step_goal_embs"][[0, 0, 1]])
     assert sample["subgoal_type"].tolist() == [2, 2, 2]  # move and grasp
-    assert data[data.index(1, 5)]["subgoal_type"].tolist() == [3, 3, 3]  # transfer object
+    assert data[data.sample_index(1, 5)]["subgoal_type"].tolist() == [3, 3, 3]  # transfer object
 
 
 def test_index_and_locate_are_inverse(made):
     data = RoboCASDataset(made, SampleOptions(split="all", cameras=(), observation_horizon=2, padding="drop"))
-    places = [data.locate(i) for i in range(len(data))]
+    places = [data.locate_sample(i) for i in range(len(data))]
     assert places == [(number, step) for number in (0, 1) for step in range(1, 6)]
-    assert [data.index(*place) for place in places] == list(range(len(data)))
-    assert data.locate(-1) == places[-1] and data.indices(1) == range(5, 10)
+    assert [data.sample_index(*place) for place in places] == list(range(len(data)))
+    assert data.locate_sample(-1) == places[-1] and data.sample_indices(1) == range(5, 10)
     with pytest.raises(IndexError):
-        data.locate(len(data))
+        data.locate_sample(len(data))
     for place in ((1, 0), (1, 6), (2, 1)):
         with pytest.raises(DatasetError):
-            data.index(*place)
+            data.sample_index(*place)
 
 
 def test_weights_balance_the_subgoal_types(made):
     data = RoboCASDataset(made, SampleOptions(split="all", cameras=(), observation_horizon=1, subgoals=True))
-    weights = data.weights()
+    weights = data.sampling_weights()
     assert data.subgoal_types.tolist() == [2, 2, 2, 3, 3, 3] * 2
     assert weights.tolist() == pytest.approx([1 / 12] * 12)
 
@@ -200,7 +200,7 @@ def test_opening_reads_only_the_overview(made, tmp_path):
         tmp_path, SampleOptions(split="all", depth=True, embedding=True, subgoals=True, normalize=True)
     )
     assert len(data) == 12
-    assert data.weights().sum() == pytest.approx(1)
+    assert data.sampling_weights().sum() == pytest.approx(1)
     with pytest.raises(DatasetError, match="this episode can't be read"):
         data[0]
 
@@ -314,7 +314,7 @@ def test_damaged_overviews(dataset):
             [RoboCASDataset(dataset, SampleOptions(split=side, cameras=())) for side in ("train", "val")]
     (dataset / "data_info.json").write_text(json.dumps({k: v for k, v in info.items() if k != "step_goals"}))
     with pytest.raises(DatasetError):
-        RoboCASDataset(dataset, SampleOptions(cameras=())).weights()
+        RoboCASDataset(dataset, SampleOptions(cameras=())).sampling_weights()
     for wrong in ({"rate_hz": 0}, {"rate_hz": -1.0}, {"rate_hz": "fast"}, {"cameras": 3}):
         path = dataset / "conversion.json"
         path.write_text(json.dumps({**json.loads(path.read_text()), **wrong}))

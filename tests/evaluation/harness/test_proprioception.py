@@ -3,9 +3,9 @@
 import numpy as np
 
 from robocas_ms3.core.poses import from_wxyz
-from robocas_ms3.datasets.lerobot.arrays import frame_columns
+from robocas_ms3.datasets.lerobot.arrays import to_frame_columns
 from robocas_ms3.datasets.lerobot.schema import FEATURES
-from robocas_ms3.datasets.sources.arrays import episode_arrays
+from robocas_ms3.datasets.sources.arrays import make_episode_arrays
 from robocas_ms3.demos.recordings.motion import Motion, sample_gripper_commands
 from robocas_ms3.evaluation.harness.proprioception import KEYS, WIDTHS, Proprioception
 from robocas_ms3.robots.description import MOBILE_PANDA
@@ -56,7 +56,7 @@ def test_proprioception_equals_dataset_columns_at_each_step():
             command = None if step == 0 else float(COMMANDS[step - 1])
             read[env].append(state.compute_columns(env, observed(robots, step), command))
     for env, robot in enumerate(robots):
-        columns = frame_columns(episode_arrays(robot, "", []))
+        columns = to_frame_columns(make_episode_arrays(robot, "", []))
         for name, column in KEYS.items():
             found = np.stack([one[name] for one in read[env]])
             assert found.dtype == np.float32
