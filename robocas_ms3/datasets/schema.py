@@ -47,15 +47,25 @@ MAX_STEPS = 10_000  # four digits in image names
 
 EPISODE_INFO: tuple[ArraySpec, ...] = (
     *(quantity for quantity in QUANTITIES if quantity.record),
-    ArraySpec("episode_length", "int64", (), "steps", "T"),
+    ArraySpec("episode_length", "int64", (), "steps", "number of steps T"),
     ArraySpec("language_goal", "str", (), "", "the instruction"),
     ArraySpec(
-        "language_embedding", "float32", (DIMENSIONS,), "", "the instruction, by all-MiniLM-L6-v2", embedding=True
+        "language_embedding",
+        "float32",
+        (DIMENSIONS,),
+        "",
+        "embedding of language_goal by all-MiniLM-L6-v2",
+        embedding=True,
     ),
-    ArraySpec("step_lang_goals", "str", ("T",), "", "text of the sub-goal pursued at this step"),
-    ArraySpec("step_goal_type", "str", ("T",), "", "its type, one of: " + ", ".join(GOAL_TYPES)),
+    ArraySpec("step_lang_goals", "str", ("T",), "", "text of the sub-goal of this step"),
+    ArraySpec("step_goal_type", "str", ("T",), "", "type of this sub-goal: " + ", ".join(GOAL_TYPES)),
     ArraySpec(
-        "step_goal_embs", "float32", ("T", DIMENSIONS), "", "step_lang_goals, by all-MiniLM-L6-v2", embedding=True
+        "step_goal_embs",
+        "float32",
+        ("T", DIMENSIONS),
+        "",
+        "embeddings of step_lang_goals by all-MiniLM-L6-v2",
+        embedding=True,
     ),
 )
 """Arrays of ``episode_info.npz``: the recorded quantities of the robot, and the texts."""

@@ -108,8 +108,8 @@ GRIPPER_WIDTH = "gripper_width"
 """Key of the finger distance in observations, remote messages and recordings."""
 STATE, ARM_BASE = "observation.state", "observation.arm_base"
 """LeRobot features that contain several quantities."""
-_EE = "EEF (TCP) in the arm base frame (panda_link0)"
-_BASE = "arm base in the world"
+_EE = "of the EEF (TCP) in the arm base frame (panda_link0)"
+_BASE = "of the arm base in the world"
 
 QUANTITIES: tuple[Quantity, ...] = (
     Quantity(
@@ -151,7 +151,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "float32",
         ("T", 4),
         "xyzw",
-        "rotation of the same motion; last row the identity",
+        "rotation of the EEF from step t to t+1, in the EEF frame at t; the last row is the identity",
         quaternion=True,
         record=lambda motion: motion.tcp_motion[1],
     ),
@@ -160,7 +160,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "float32",
         ("T", 3),
         "m",
-        _EE,
+        f"position {_EE}",
         record=lambda motion: motion.tcp_in_base[:, :3, 3],
         lerobot_feature=STATE,
         components=_XYZ,
@@ -170,7 +170,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "float32",
         ("T", 4),
         "xyzw",
-        _EE,
+        f"orientation {_EE}",
         quaternion=True,
         record=lambda motion: to_continuous_xyzw(motion.tcp_in_base),
         lerobot_feature=STATE,
@@ -181,7 +181,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "float32",
         ("T", 7),
         "rad",
-        "arm joints",
+        "positions of the arm joints",
         record=lambda motion: motion.qpos[:, RobotDescription.arm_slice],
         lerobot_feature=STATE,
         components=_JOINTS,
@@ -201,7 +201,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "float32",
         ("T", 3),
         "m",
-        _BASE,
+        f"position {_BASE}",
         record=lambda motion: motion.arm_base_in_world[:, :3, 3],
         lerobot_feature=ARM_BASE,
         components=_XYZ,
@@ -211,7 +211,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "float32",
         ("T", 4),
         "xyzw",
-        _BASE,
+        f"orientation {_BASE}",
         quaternion=True,
         record=lambda motion: to_continuous_xyzw(motion.arm_base_in_world),
         lerobot_feature=ARM_BASE,
@@ -222,7 +222,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "float32",
         ("T", 3),
         "m",
-        "motion of the arm base from t to t+1, in the arm base frame at t",
+        "translation of the arm base from step t to t+1, in the arm base frame at t; the last row is 0",
         record=lambda motion: motion.base_motion[0],
     ),
     Quantity(
@@ -230,7 +230,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "float32",
         ("T", 4),
         "xyzw",
-        "as rel_orn, of the arm base",
+        "rotation of the arm base from step t to t+1, in the arm base frame at t; the last row is the identity",
         quaternion=True,
         record=lambda motion: motion.base_motion[1],
     ),
@@ -251,7 +251,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "bool",
         ("T",),
         "",
-        "command in force at this step: True = open (commanded width > 0.04 m)",
+        "gripper command of the action that ended at this step: True = open (commanded width > 0.04 m)",
         record=lambda motion: motion.gripper_open,
         lerobot_feature="observation.gripper_open",
         components=("gripper_open",),
@@ -261,7 +261,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "float32",
         ("T", 3),
         "m, m, rad",
-        "mobile base in the world: x, y, yaw (yaw is unwrapped: no jumps of 2 pi)",
+        "pose of the mobile base in the world: x, y, yaw (yaw is unwrapped: no jumps of 2 pi)",
         record=lambda motion: motion.agv_pose,
         lerobot_feature=STATE,
         components=("agv_x", "agv_y", "agv_yaw"),
@@ -271,7 +271,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         "float32",
         ("T", 3),
         "m, m, rad",
-        "agv_pose[t+1] - agv_pose[t] (world frame); last row 0",
+        "agv_pose[t+1] - agv_pose[t], in the world; the last row is 0",
         record=lambda motion: motion.agv_motion,
     ),
 )

@@ -138,6 +138,14 @@ def test_first_program_prints_the_instruction(needs_renderer, tmp_path):
     assert done.stdout.splitlines()[-1] == page
 
 
+def test_dataset_is_read_by_the_program_of_the_page(folder, tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text(blocks(ROOT / "docs" / "dataset.md", "python")[0], encoding="utf-8")
+    done = server().run(program, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.rstrip().endswith("(7, 3) (48, 64, 3)")
+
+
 def test_instructions_are_those_of_the_page():
     (code,) = blocks(ROOT / "docs" / "language.md", "python")
     lines, namespace, checked = code.splitlines(), {}, 0

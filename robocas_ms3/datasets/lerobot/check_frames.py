@@ -80,7 +80,7 @@ def find_unexpected_files(root: Path, folders: Iterable[Path], known: Container[
     """Yield a violation for each file in ``folders`` that is not in ``known``."""
     for path in sorted(path for folder in folders for path in folder.rglob("*") if path.is_file()):
         if path not in known:
-            yield Violation(str(path.relative_to(root)), "", "only files of episodes", "a file of no episode")
+            yield Violation(str(path.relative_to(root)), "", "files of episodes only", "a file of no episode")
 
 
 def _check_table_file(path: Path, rows: list[dict[str, Any]], features: Mapping[str, Any]) -> Iterator[KeyViolation]:

@@ -161,7 +161,8 @@ class DataInfoRecord(_JsonObject):
     )
     action_space: _ActionSpace = Field(
         description="{relative_position: [1st percentile (3), 99th percentile (3)] of rel_pos in m,"
-        " relative_rotation: percentiles of rel_orn as Euler angles about fixed axes x, y, z in rad}; without last rows"
+        " relative_rotation: the same of rel_orn as Euler angles about fixed axes x, y, z in rad};"
+        " without the last rows, which are 0 by definition"
     )
 
 
@@ -177,12 +178,12 @@ class SceneRecord(_JsonObject):
     reset_options: dict[str, Any] | None = Field(description="other options of `env.reset`")
     config: dict[str, Any] | None = Field(description="the complete task configuration")
     layout: LayoutRecord | None = Field(
-        description="{object_ids, poses [x, y, z, qw, qx, qy, qz] in the world, present, robot_pose, basket_pose,"
-        " relation}"
+        description="scene at the start: {object_ids, poses, present} per slot, {robot_pose, basket_pose, relation};"
+        " poses are [x, y, z, qw, qx, qy, qz] in the world"
     )
     objects: list[_Object] | None = Field(description="[{slot, id, name}] of the objects in the scene")
-    target: TargetRecord | None = Field(description="{slot, asset_id, name}")
-    success: bool | None = Field(description="whether the recording ended in success")
+    target: TargetRecord | None = Field(description="{slot, asset_id, name} of the object that the instruction names")
+    success: bool | None = Field(description="whether the task succeeded")
     control_mode: str | None = Field(description="control mode of the recorded actions")
     control_freq: RateHz | None = Field(description="control frequency of the recorded actions, Hz")
     rate_hz: RateHz = Field(description="rate of this dataset, Hz")

@@ -66,7 +66,7 @@ def test_each_missing_key_is_a_violation():
     [
         ({"schema_version": 1}, "schema_version", "2", "1"),
         ({"env_info": {"env_kwargs": {}}}, "env_info.env_id", "this key", "no such key"),
-        ({"seed": "7"}, "seed", "an integer, or a list of one", '"7"'),
+        ({"seed": "7"}, "seed", "an integer, or a list of one integer", '"7"'),
         ({"layout": {"object_ids": ["a", 3]}}, "layout.object_ids.1", "text", "3"),
         ({"layout": {"poses": [POSE[:6]]}}, "layout.poses.0", "7 values", "6"),
         ({"layout": {"poses": [["x"] * 7] * 9}}, "layout.poses.0.0", "a number", '"x"'),

@@ -102,7 +102,7 @@ def test_tracking_error_by_hand(dataset):
     ("changes", "reason"),
     [
         ({"env_info": None}, "so the scene can't be built"),
-        ({"success": False}, "no success"),
+        ({"success": False}, "did not succeed"),
         ({"layout": {"object_ids": ["cube", "cup", "cube"]}}, "the seed builds another scene: other objects"),
         (
             {"layout": {"object_ids": ["cube"] * 3, "poses": [[0, y, 0, 1, 0, 0, 0] for y in (0, 0.5, 0)]}},

@@ -114,7 +114,7 @@ def test_image_without_pixels(dataset):
     head = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 64, 48, 16, 0, 0, 0, 0))
     path.write_bytes(head + chunk(b"IEND"))
     place = "episode_0000001/base_camera/depth/0000.png"
-    assert found(dataset) == [f"{place}: expected an intact image, found PNG without an image"]
+    assert found(dataset) == [f"{place}: expected an intact image, found PNG without image data (no IDAT chunk)"]
     pixels = chunk(b"IDAT", b"no deflated data")
     path.write_bytes(head + pixels + chunk(b"IEND"))
     assert any(place in violation for violation in found(dataset))
@@ -184,7 +184,7 @@ def test_images(dataset):
         f"{place}/depth/0006.png: expected 64 x 48, 1 x 16 bit, found 64 x 48, 1 x 8 bit",
         f"{place}/rgb/0002.png: expected an image of each step, found no file",
         f"{place}/rgb/0003.png: expected an intact image, found truncated PNG",
-        f"{place}/rgb/0004.png: expected an intact image, found damaged PNG",
+        f"{place}/rgb/0004.png: expected an intact image, found damaged PNG: wrong checksum",
         f"{place}/rgb/0005.png: expected 64 x 48, 3 x 8 bit, found 64 x 40, 3 x 8 bit",
         f"{place}/rgb/0007.png: expected 7 images from 0000.png, found an additional file",
     ]

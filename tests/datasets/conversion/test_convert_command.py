@@ -41,7 +41,7 @@ def tried(path, *rates):
     ("rates", "rate_hz", "said"),
     [
         ((5, 5), 5, ""),
-        ((5, 20), 10, "the open-loop check of the recording used 5 and 20 Hz, not 10 Hz: "),
+        ((5, 20), 10, "the recorded actions were checked open loop at 5 and 20 Hz, but the dataset has 10 Hz; "),
         ((None, 0), 10, ""),  # not tried at any rate: the base drives, or nobody wanted it
         (([5], "5"), 10, ""),  # not ours
     ],
@@ -107,7 +107,7 @@ def test_warning_for_missing_episodes_of_another_trajectory(tmp_path, caplog):
     assert caplog.records == []
     convert(a, out)
     said = [record.getMessage() for record in caplog.records]
-    assert said == [f"{out}: episodes 2, 4 of b.h5 are missing; convert them with --append"]
+    assert said == [f"{out}: episodes 2, 4 of b.h5 are missing; add them with robocas convert --append"]
     hint = "found no folder (convert b.h5 again, or with --append)"
     assert [str(v) for v in validate(out).violations] == [
         f"conversion.json, episodes.{number}: expected the episodes on disk, {hint}" for number in (2, 4)

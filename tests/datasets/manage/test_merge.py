@@ -107,7 +107,7 @@ UNFIT = {  # what is wrong with one of the datasets -> (how it comes about, what
     "a newer schema": (in_conversion(lambda c: c.update(schema_version=3)), "Update robocas_ms3"),
     "an episode of an older schema": (
         lambda part: (part / "episode_0000001/scene.json").unlink(),
-        "an episode with another schema",
+        "unsupported schema version of an episode",
     ),
     "other settings": (in_conversion(lambda c: c.update(rate_hz=10.0)), "settings of the datasets differ"),
     "an episode is gone": (
@@ -115,7 +115,7 @@ UNFIT = {  # what is wrong with one of the datasets -> (how it comes about, what
         "listed episodes differ from those on disk",
     ),
     "no overview": (lambda part: (part / "data_info.json").unlink(), "this dataset is unfinished"),
-    "an unlisted episode": (in_conversion(lambda c: c["episodes"].pop("1")), "episodes without an entry"),
+    "an unlisted episode": (in_conversion(lambda c: c["episodes"].pop("1")), "episodes on disk are not listed"),
     "nothing": (shutil.rmtree, "no dataset here"),
     "a split of texts": (
         lambda part: edit(part / "data_info.json", lambda c: c.update(val_eps=["x"])),

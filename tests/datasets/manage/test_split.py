@@ -37,7 +37,7 @@ def six(tmp_path_factory):
 def test_groups_stay_together_and_no_list_is_empty(values, shares):
     groups = {number: str(value) for number, value in enumerate(values)}
     if len(set(values)) < len(shares):
-        with pytest.raises(DatasetError, match="too few groups to split"):
+        with pytest.raises(DatasetError, match="too few groups of episodes to split"):
             divide_episodes(groups, shares)
         return
     parts = divide_episodes(groups, shares)

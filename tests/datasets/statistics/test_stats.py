@@ -144,7 +144,7 @@ def test_the_default_folder_is_next_to_a_trajectory(trajectory, tmp_path):
 
 def test_damaged_scene(described):
     (described / "episode_0000001/scene.json").write_text('{"layout": {"object_ids": 3}}')
-    with pytest.raises(DatasetError, match=r"episode_0000001/scene\.json: invalid description of a scene"):
+    with pytest.raises(DatasetError, match=r"episode_0000001/scene\.json: invalid content of scene"):
         collect_statistics(described)
 
 
