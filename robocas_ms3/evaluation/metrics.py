@@ -84,7 +84,7 @@ class EpisodeMetrics:
         return read_link_poses(self._env.scene, [self._env.agent.tcp])[:, 0, :3]
 
     def end_step(self) -> None:
-        """Count the policy step for RoboCAS-v0's rule and for the retrieval order."""
+        """End a policy step: add it to ``v0_steps`` if RoboCAS-v0's rule holds, and to the retrieval order."""
         self._sums[:, _V0_STEPS] += self._in_v0
         if self._retrieval is not None:
             self._retrieval.end_step()

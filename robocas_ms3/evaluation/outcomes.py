@@ -60,7 +60,7 @@ class Retrieval:
         """Return the retrieval order from a record of `metrics.RetrievalTracker.compute_record`.
 
         Args:
-            record: (K, 3) values of the K objects by slot.
+            record: (K, 3) row per object slot: policy step of the move, needed, in order.
             objects: ids of the objects by slot.
             held_at: policy step after which the target was first held; None: never.
             cleared: whether the obstacles were cleared in the episode.
@@ -145,7 +145,8 @@ def find_failure_stage(flags: dict[str, int | None], error: str = "", order: Seq
     empty if the task succeeded.
 
     Args:
-        flags: by stage, the policy step after which the stage first held, or None. Other stages are ignored.
+        flags: by stage, the policy step after which the stage first held, or None. A stage of ``order`` without a
+            flag does not exist in the environment.
         error: error that ended the episode; empty: no error.
         order: names of the stages in the order of the task.
     """

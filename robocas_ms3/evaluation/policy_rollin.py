@@ -49,7 +49,7 @@ def check_roll_in_policy(settings: EpisodeSettings) -> str:
 
 
 class PolicyRollIn:
-    """Worker (`core.workers.Worker`) that runs a policy in one environment until the scripted policy continues."""
+    """Worker (`core.workers.Worker`) that runs a policy for some steps in the scene of a seed, in one environment."""
 
     def __init__(self, settings: EpisodeSettings) -> None:
         self._settings, self._stack = settings, ExitStack()

@@ -168,7 +168,7 @@ class LoadedProtocol:
 
     @cached_property
     def hash(self) -> str:
-        """Return the sha256 of the names and contents of all files, in hex."""
+        """Return the hash of the protocol: sha256 of the names and contents of all its files, in hex."""
         digest = hashlib.sha256()
         for path in list_protocol_files(self.folder):
             try:
@@ -211,7 +211,7 @@ class LoadedProtocol:
         return chosen
 
     def find_task_aliases(self, tasks: Sequence[str]) -> dict[str, str]:
-        """Return the tasks that run in the episodes of another task, as in RoboCAS-v0, with this other task.
+        """Return for each task without its own episodes the task in whose episodes it runs, as in RoboCAS-v0.
 
         Example: ``{"select": "pick"}`` in ``paper-v1``, which has no episodes of select.
 
@@ -249,15 +249,15 @@ class LoadedProtocol:
             raise EvaluationError(what, where=self.rules.name, expected="one configuration", found=found, fix=fix)
 
     def config_file(self, config: str) -> Path:
-        """Return the YAML file of a configuration."""
+        """Return the path of the YAML file of a configuration, by name of the configuration."""
         return self.folder / CONFIGS / f"{config}.yaml"
 
     def layouts_file(self, config: str) -> Path:
-        """Return the NumPy file of the scene layouts of a configuration."""
+        """Return the path of the NumPy file of the scene layouts, by name of the configuration."""
         return self.folder / LAYOUTS / f"{config}.npy"
 
     def training_configs(self) -> list[Path]:
-        """Return the files of the configurations for training; empty if the protocol holds nothing out."""
+        """Return the paths of the configurations for training; empty if the protocol has none."""
         return sorted(self.folder.glob(f"{TRAIN}/*.yaml"))
 
 

@@ -233,7 +233,7 @@ def read_result(*folders: Path) -> Result:
 
 
 def group_partial_results(folders: Iterable[Path]) -> list[list[Path]]:
-    """Group result folders: folders with equal settings and without common episodes are one evaluation."""
+    """Return groups of result folders: the folders of a group have equal settings and no common episodes."""
     groups: list[tuple[dict[str, Any], set[int], list[Path]]] = []
     for folder in folders:
         part = _read_folder(folder)

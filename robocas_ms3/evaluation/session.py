@@ -73,7 +73,7 @@ class EvaluationSession:
 
     Raises:
         EvaluationError: the protocol does not exist, the policy or the weld does not fit it, no episode is selected,
-            or the hash of the object pack is another one than the protocol's.
+            or the object pack differs from the pack of the protocol.
         DatasetError: the policy uses cameras and there is no render device.
     """
 

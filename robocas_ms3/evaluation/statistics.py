@@ -98,8 +98,8 @@ def mcnemar_p_value(only_a: int, only_b: int) -> float:
 def compute_paired_interval(only_a: int, only_b: int, n: int) -> tuple[float, float]:
     """Return Tango's 95 % score interval of the difference of two rates over the same n scenes, A - B.
 
-    The differences d that the score test of paired data does not reject (Tango, Statistics in Medicine 17 (1998)
-    891-908):
+    The interval contains the differences d that the score test of paired data does not reject (Tango, Statistics in
+    Medicine 17 (1998) 891-908):
 
         |only_a - only_b - n d| <= z sqrt(n (2 q + d (1 - d)))
 

@@ -87,7 +87,7 @@ class CrashingEnv(CountingEnv):
         return super().step(actions)
 
 
-def play(
+def run_policy(
     env: Any, policy: Policy, episodes: list[EpisodeSpec], max_steps: int, *, refill: bool = True
 ) -> list[Rollout]:
     """Run episodes with a policy, 0.05 s per step."""

@@ -61,7 +61,7 @@ def test_slow_motion_reaches_its_goal(reference):
     assert read_metric(info, "path_length") == pytest.approx(0.1, abs=0.004)
 
 
-def test_motions_start_from_the_tcp_or_from_the_last_target():
+def test_motions_start_from_the_tcp_or_from_the_last_commanded_pose():
     gone = {}
     for reference in ("tcp", "target"):
         env = made(reference=reference)
@@ -164,7 +164,7 @@ def test_images_are_rendered_only_when_the_policy_observes_them(monkeypatch):
 
 @pytest.mark.gpu
 @needs_cuda
-def test_each_env_of_a_batch_is_looked_at_in_its_own_steps():
+def test_each_env_of_a_batch_renders_at_its_own_steps():
     """The last is reset after a step, and is one behind from there on."""
     num_envs = 4
     envs = make_vec(

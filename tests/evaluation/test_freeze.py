@@ -42,7 +42,7 @@ def test_existing_folder_is_refused_before_scenes_are_sampled(made, tmp_path):
         command.freeze(command.Freeze(tmp_path / "source.yaml", made))
 
 
-def test_configurations_may_be_changed_and_instructions_wrong_or_empty(tmp_path):
+def test_changed_configurations_and_wrong_or_empty_instructions_are_frozen(tmp_path):
     fewer = {"objects": {"count": 2}, "layout": {"kind": "orderly", "copies": 1, "rows": 1}}
     scene = {"config": "pick_table_scattered", "count": 1, "first_seed": 110010, "change": fewer}
     parts = [{**scene, "split": words, "instruction": words, "name": "two"} for words in ("correct", "wrong", "empty")]

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from counting_env import CountingEnv, play
+from counting_env import CountingEnv, run_policy
 
 from robocas_ms3.core.errors import EvaluationError, ExtensionError
 from robocas_ms3.evaluation.policies import make_policy, open_policy
@@ -111,7 +111,7 @@ def test_an_error_inside_the_policy_is_not_changed(here):
 def test_a_policy_cannot_end_the_process(here, name):
     with pytest.raises(ExtensionError) as caught, open_policy(name) as policy:
         describe_policy(policy)
-        play(CountingEnv(1, None), policy, [EpisodeSpec(-1, 0, "pick", "", "", "", 2, "")], 3)
+        run_policy(CountingEnv(1, None), policy, [EpisodeSpec(-1, 0, "pick", "", "", "", 2, "")], 3)
     assert str(caught.value.where).startswith("policy own_")
     assert str(here) in str(caught.value.found)
 

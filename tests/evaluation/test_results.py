@@ -29,7 +29,7 @@ def start(folder, run=RUN_OF, new=(), **options):
         return list(done)
 
 
-def test_what_is_appended_is_read_and_a_line_that_was_cut_is_written_over(tmp_path):
+def test_appended_outcomes_are_read_and_an_incomplete_line_is_overwritten(tmp_path):
     start(tmp_path / "a", new=[outcome(3), outcome(1)])
     assert read_result(tmp_path / "a").outcomes == {1: outcome(1), 3: outcome(3)}
     assert read_result(tmp_path / "a").run == RunRecord.from_values(RUN_OF, "")
@@ -98,7 +98,7 @@ def test_partial_results_with_other_clock_times_and_machines_are_merged(tmp_path
         merge_results([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
 
 
-def test_contradicting_partial_results_are_refused(tmp_path):
+def test_partial_results_with_different_outcomes_are_refused(tmp_path):
     write(tmp_path / "a", [outcome(0)])
     write(tmp_path / "b", [outcome(0, seconds=3.6)])
     with pytest.raises(EvaluationError, match=r"different outcomes of episode 0.*seconds: 3\.5 -> 3\.6"):
@@ -178,7 +178,7 @@ def test_address_of_a_server_is_not_part_of_the_settings(tmp_path):
         read_result(tmp_path / "c", tmp_path / "d")
 
 
-def test_what_an_error_broke_off_is_played_again_if_that_is_asked_for(tmp_path):
+def test_episodes_with_an_error_run_again_with_retry_errors(tmp_path):
     broken = outcome(1, 0, error="no server", failure_stage="error")
     write(tmp_path / "a", [outcome(0), broken, outcome(2)])
     assert start(tmp_path / "a") == [0, 1, 2]
@@ -189,7 +189,7 @@ def test_what_an_error_broke_off_is_played_again_if_that_is_asked_for(tmp_path):
 
 @pytest.mark.parametrize("overwrite", [False, True])
 @pytest.mark.parametrize("notes", ['{"settings": {"task": "pick"}, "first_seed": 0}', "[]", "{"])
-def test_the_folder_of_another_command_stays_as_it_is(tmp_path, notes, overwrite):
+def test_folder_of_another_command_is_not_changed(tmp_path, notes, overwrite):
     """Folders of demonstrations also have a run.json."""
     (tmp_path / RUN).write_text(notes)
     with pytest.raises(OutputExistsError):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from counting_env import CountingEnv, play
+from counting_env import CountingEnv, run_policy
 
 from robocas_ms3.core.errors import EvaluationError, PolicyError
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
 
 
-class Obedient:
+class CountingPolicy:
     """Policy that acts for the number of steps in its instruction, in chunks, and records its inputs."""
 
     spec = PolicySpec(state=True)
@@ -38,11 +38,11 @@ def starts(*seeds: int) -> list[EpisodeSpec]:
 
 @pytest.mark.parametrize("count", [1, 2, 4])
 @pytest.mark.parametrize("refill", [True, False])
-def test_every_episode_is_played_once_with_its_own_instruction(count, refill):
-    env, policy = CountingEnv(count, None), Obedient()
-    played = play(env, policy, starts(3, 9, 2, 5, 4, 1), 7, refill=refill)
-    assert sorted(one.spec.episode for one in played) == list(range(6))
-    for one in played:
+def test_every_episode_runs_once_with_its_own_instruction(count, refill):
+    env, policy = CountingEnv(count, None), CountingPolicy()
+    ended = run_policy(env, policy, starts(3, 9, 2, 5, 4, 1), 7, refill=refill)
+    assert sorted(one.spec.episode for one in ended) == list(range(6))
+    for one in ended:
         seed = one.spec.seed
         assert one.steps == min(seed, 7)
         assert one.seconds == pytest.approx(0.05 * one.steps)
@@ -54,28 +54,28 @@ def test_every_episode_is_played_once_with_its_own_instruction(count, refill):
         assert policy.asked[3] == [1, 3]  # ended envs are not observed
 
 
-def test_chunks_are_played_to_their_end_before_the_policy_is_asked_again():
-    policy = Obedient(chunk=3)
-    played = play(CountingEnv(2, None), policy, starts(4, 7), 7)
-    assert {one.spec.seed: one.steps for one in played} == {4: 4, 7: 7}
+def test_all_actions_of_a_chunk_are_executed_before_the_next_call_of_the_policy():
+    policy = CountingPolicy(chunk=3)
+    ended = run_policy(CountingEnv(2, None), policy, starts(4, 7), 7)
+    assert {one.spec.seed: one.steps for one in ended} == {4: 4, 7: 7}
     assert policy.asked == [[0, 1], [0, 1], [1]]
 
 
 @pytest.mark.parametrize(("chunk", "observe_every", "fits"), [(6, 3, True), (1, 3, True), (3, 6, False), (6, 4, False)])
 def test_chunk_lengths_must_be_multiples_of_observe_every(chunk, observe_every, fits):
     """A policy without chunks may have any length."""
-    policy = Obedient(chunk)
+    policy = CountingPolicy(chunk)
     policy.spec = PolicySpec(state=True, observe_every=observe_every)
     if fits:
-        assert [one.steps for one in play(CountingEnv(1, None), policy, starts(4), 7)] == [4]
+        assert [one.steps for one in run_policy(CountingEnv(1, None), policy, starts(4), 7)] == [4]
     else:
         with pytest.raises(EvaluationError, match=f"a multiple of {observe_every} actions"):
-            play(CountingEnv(1, None), policy, starts(4), 7)
+            run_policy(CountingEnv(1, None), policy, starts(4), 7)
 
 
 @pytest.mark.parametrize("fails", [True, False])
-def test_an_episode_whose_policy_fails_or_acts_by_nan_ends_alone(fails):
-    policy = Obedient()
+def test_policy_error_or_nan_action_ends_only_its_episode(fails):
+    policy = CountingPolicy()
     act = policy.act
 
     def sick(observations: Observations) -> np.ndarray:
@@ -86,16 +86,16 @@ def test_an_episode_whose_policy_fails_or_acts_by_nan_ends_alone(fails):
         return actions
 
     policy.act = sick
-    played = sorted(play(CountingEnv(2, None), policy, starts(4, 5, 3), 7), key=lambda one: one.spec.seed)
+    ended = sorted(run_policy(CountingEnv(2, None), policy, starts(4, 5, 3), 7), key=lambda one: one.spec.seed)
     error = "no plan" if fails else "NaN or infinite action of the policy"
-    assert [(one.error, one.steps) for one in played] == [("", 3), (error, 0), ("", 5)]
-    outcome = played[1].make_outcome(load_protocol("smoke").episodes[0], ())
+    assert [(one.error, one.steps) for one in ended] == [("", 3), (error, 0), ("", 5)]
+    outcome = ended[1].make_outcome(load_protocol("smoke").episodes[0], ())
     assert (outcome.success, outcome.failure_stage, outcome.error) == (False, "error", error)
 
 
 def test_actions_of_another_shape_are_refused():
-    policy = Obedient()
+    policy = CountingPolicy()
     policy.act = lambda observations: np.zeros((2, 6))
     with pytest.raises(EvaluationError) as error:
-        play(CountingEnv(1, None), policy, starts(4), 7)
+        run_policy(CountingEnv(1, None), policy, starts(4), 7)
     assert error.value.expected == "numbers of shape (1, 7) or (1, H, 7)"

@@ -197,7 +197,7 @@ def evaluate(folder, policy="random", **settings) -> dict[int, dict]:
 
 
 @pytest.mark.parametrize("times", [1, 2])
-def test_episode_is_retried_once_after_a_crash_and_then_counts_as_failed(short, tmp_path, monkeypatch, caplog, times):
+def test_episode_is_repeated_once_after_a_crash_and_then_counts_as_failed(short, tmp_path, monkeypatch, caplog, times):
     protocol, made, deaths, out = load_protocol(short), [], [times], tmp_path / "out"
 
     def make_vec(env_id, count, **_):

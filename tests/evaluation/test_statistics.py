@@ -49,7 +49,7 @@ def test_exact_interval_equals_published_values(k, n, low, high):
 
 
 @given(k_of_n())
-def test_exact_interval_leaves_half_the_error_at_each_end(counts):
+def test_exact_interval_has_half_of_the_error_at_each_end(counts):
     k, n = counts
     found = compute_success_rate(k, n)
     assert 0 <= found.low <= k / n <= found.high <= 1

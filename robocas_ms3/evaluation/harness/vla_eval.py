@@ -85,12 +85,12 @@ class RoboCAS:
         return {"max_steps": max(self._session.max_steps(task) for task in tasks)}
 
     def get_metric_keys(self) -> dict[str, str]:
-        """Return the names of the metrics of which vla-eval computes the mean over the episodes."""
+        """Return ``{name: "mean"}`` for each metric: vla-eval computes its mean over the episodes."""
         names = ("success", "success_at_end", "success_v0", *PAPER_STAGES.values(), "seconds", *MEASURES)
         return dict.fromkeys(names, "mean")
 
     def get_action_spec(self) -> dict[str, Any]:
-        """Return the parts of an action as vla-eval's ``DimSpec`` by name."""
+        """Return the parts of an action by name (position, rotation, gripper), each as vla-eval's ``DimSpec``."""
         from vla_eval.specs import DimSpec  # pyright: ignore[reportMissingImports]
 
         convention = self._spec.convention
@@ -105,14 +105,14 @@ class RoboCAS:
         }
 
     def get_observation_spec(self) -> dict[str, Any]:
-        """Return the parts of an observation as vla-eval's ``DimSpec`` by name."""
+        """Return the parts of an observation by name (images, state, language), each as vla-eval's ``DimSpec``."""
         from vla_eval.specs import IMAGE_RGB, LANGUAGE, DimSpec  # pyright: ignore[reportMissingImports]
 
         images = dict.fromkeys(["image", *self._spec.cameras] if self._spec.cameras else [], IMAGE_RGB)
         return {**images, "state": DimSpec("state", WIDTHS["agent_pos"], "robocas"), "language": LANGUAGE}
 
     def get_hold_action(self, last_action: dict[str, Any] | None) -> dict[str, Any]:
-        """Raise an error: mode ``live``, in which steps depend on clock time, is not supported."""
+        """Raise `NotImplementedError`: mode ``live``, which follows the wall clock, is not supported."""
         raise NotImplementedError("mode live is not supported. Set mode: sync.")
 
     async def start_episode(self, task: Mapping[str, Any], recorder: Any = None) -> None:
@@ -178,7 +178,7 @@ class RoboCAS:
         self._session.close()
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return the image (H, W, 3) of the first camera; None without cameras."""
+        """Return the last image (H, W, 3) uint8 of the first camera; None without cameras."""
         images = self._observations.images if self._observations is not None else {}
         return next(iter(images.values()))[0] if images else None
 

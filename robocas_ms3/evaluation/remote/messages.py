@@ -253,7 +253,7 @@ def request_size_limit(spec: PolicySpec, max_batch: int = 1) -> int:
 
 
 def max_envs_per_request(spec: PolicySpec, envs: int) -> int:
-    """Return the maximum number of envs per request: so many that the images fit in `MAX_BYTES`, from 1 to ``envs``."""
+    """Return the maximum number of envs per request, 1 to ``envs``, so that the images fit in `MAX_BYTES`."""
     return max(1, min(envs, LARGEST_BATCH, (MAX_BYTES - _OTHER_BYTES) // max(1, _image_bytes(spec))))
 
 

@@ -250,7 +250,7 @@ class _RequestHandler:
     - A batched request becomes one call of ``reset`` with all episodes that start and one call of ``act`` with all
       observations, in the order of the request. An evaluation without a server makes the same calls.
     - A single request becomes a call with one env.
-    - The policy gets the env index of the client, or another index if another client uses this one.
+    - The policy gets the env index of the client. If another client uses this index, the policy gets a free one.
     - Clients that send neither ``env_id`` nor ``reset``, such as openpi's client, have one episode per connection.
     """
 
@@ -263,7 +263,7 @@ class _RequestHandler:
     def answer_message(self, message: Any, envs: dict[int, int]) -> dict[str, Any]:
         """Return the answer to a request.
 
-        ``envs``: index for the policy by index of the client, for the envs of this connection; new envs are added.
+        ``envs``: env index of the policy by env index of the client, for this connection; new envs are added.
         """
         if not isinstance(message, dict):
             raise WireError("invalid request", expected="a msgpack map", found=type(message).__name__)
@@ -293,7 +293,7 @@ class _RequestHandler:
         return parse_observations(messages, numbers, self._spec), starts
 
     def _assign_env(self, env: int, reset: bool | None, envs: dict[int, int]) -> tuple[int, bool]:
-        """Return the index for the policy of an env of a client, and whether the env is new."""
+        """Return the env index of the policy for an env index of the client, and whether the env is new."""
         if env in envs:
             return envs[env], False
         if reset is False:
@@ -342,7 +342,7 @@ def _format_address(host: str, port: int) -> str:
 
 
 def _log_failure(error: Exception) -> str:
-    """Log an error of a policy and return it as one line; errors that are no `RobocasError` with a traceback."""
+    """Log an error of a policy, with a traceback unless it is a `RobocasError`; return the error as one line."""
     _log.warning("the policy failed: %s", error, exc_info=None if isinstance(error, RobocasError) else error)
     return format_error(error, 300)
 

@@ -122,7 +122,7 @@ def list_notes(result: Result) -> list[str]:
 
 
 def get_stage_names(task: str) -> dict[str, str]:
-    """Return the names of the stages of a task for readers, by stage and in the order of the task."""
+    """Return the name of each stage of a task for readers, such as "target grasped", in the order of the task."""
     row = TASKS.get(task)
     if row is None or row.stages == DEFAULT_STAGES:
         return STAGE_NAMES
@@ -130,7 +130,7 @@ def get_stage_names(task: str) -> dict[str, str]:
 
 
 def get_failure_name(stage: str) -> str:
-    """Return the name of a failure stage for readers."""
+    """Return the name of a failure stage for readers, such as "target grasped"."""
     return FAILURE_NAMES.get(stage, stage.replace("_", " "))
 
 

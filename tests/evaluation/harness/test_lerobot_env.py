@@ -113,12 +113,12 @@ def test_all_tasks_of_a_protocol_or_of_a_split(made):
         (dict(backend="threads"), VectorEnvError),
     ],
 )
-def test_settings_that_do_not_exist_are_refused(made, settings, error):
+def test_invalid_settings_of_the_environment_are_refused(made, settings, error):
     with pytest.raises(error):
         make_env(RoboCASEnvConfig(**{**SMALL, **settings}))
 
 
-def test_the_hub_file_makes_the_environments_of_its_settings_and_ignores_the_defaults_of_a_configuration(made, hub):
+def test_hub_file_uses_its_settings_instead_of_the_defaults_of_lerobot(made, hub):
     for task, fps, plain in (
         ("pick", 5, "someone/robocas"),
         ("pick", 5, HubEnvConfig(hub_path="someone/robocas")),  # whose task is None and fps 30
@@ -134,7 +134,7 @@ def test_the_hub_file_makes_the_environments_of_its_settings_and_ignores_the_def
         make_env("someone/robocas", hub_cache_dir=str(hub))
 
 
-def test_the_hub_file_takes_the_settings_of_a_configuration(made, hub):
+def test_hub_file_uses_the_settings_of_a_configuration(made, hub):
     @dataclass
     class OfTheHub(HubEnvConfig):
         hub_path: str | None = "someone/robocas"

@@ -60,7 +60,7 @@ def test_observations_are_in_the_declared_space_and_have_the_datasets_names(make
     assert info["is_success"].tolist() == [False, False] and "final_info" not in info
 
 
-def test_an_episode_ends_by_itself_and_its_last_observation_stays(make):
+def test_env_returns_its_last_observation_after_the_end_of_its_episode(make):
     env = make()
     env.reset(seed=0)
     results = [env.step(act(2.5, 1)) for _ in range(5)]

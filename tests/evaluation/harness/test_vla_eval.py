@@ -49,7 +49,7 @@ async def play(benchmark, task, *, max_steps=None, recorder=None) -> dict[str, A
     return {"seen": seen, "metrics": await benchmark.get_result()}
 
 
-def test_a_task_is_a_configuration_and_its_episodes_are_the_protocols(benchmark, made):
+def test_tasks_are_configurations_with_the_episodes_of_the_protocol(benchmark, made):
     tasks = benchmark.get_tasks()
     assert [(task["name"], task["suite"], task["episodes"]) for task in tasks] == [
         ("pick_table_scattered", "pick", 2),
@@ -70,7 +70,7 @@ def test_a_task_is_a_configuration_and_its_episodes_are_the_protocols(benchmark,
     assert [env.seeds for env in made] == [[110000, 110001]] * 4
 
 
-def test_what_is_observed_and_what_a_result_says(benchmark):
+def test_observations_and_result_of_an_episode(benchmark):
     recorder = Recorder()
     task = {**benchmark.get_tasks()[0], "episode_idx": 0}
     played = asyncio.run(play(benchmark, task, recorder=recorder))
@@ -95,7 +95,7 @@ def test_what_is_observed_and_what_a_result_says(benchmark):
     assert [frame is None or int(frame.max()) for frame in recorder.frames] == [0, 1, 2, 3, 4, True]
 
 
-def test_episodes_cut_short_or_that_the_protocol_lacks_and_mode_live_are_refused(benchmark):
+def test_shortened_or_missing_episodes_and_mode_live_are_refused(benchmark):
     task = {**benchmark.get_tasks()[0], "episode_idx": 0}
     with pytest.raises(EvaluationError, match="Remove max_steps"):
         asyncio.run(play(benchmark, task, max_steps=4))
@@ -107,7 +107,7 @@ def test_episodes_cut_short_or_that_the_protocol_lacks_and_mode_live_are_refused
 
 
 @pytest.mark.parametrize("actions", [None, np.zeros(6), [float("nan")] * 7, [1e9] * 7])
-def test_an_action_that_is_none_fails_its_episode_alone(benchmark, actions, monkeypatch):
+def test_invalid_action_ends_only_its_episode(benchmark, actions, monkeypatch):
     task = {**benchmark.get_tasks()[0], "episode_idx": 0}
     with monkeypatch.context() as patched:
         patched.setitem(ACT, "actions", actions)
@@ -117,6 +117,6 @@ def test_an_action_that_is_none_fails_its_episode_alone(benchmark, actions, monk
 
 
 @pytest.mark.parametrize("params", [{"protocol": "smok"}, {"convention": "euler"}, {"cameras": {"wrist": [4, 4]}}])
-def test_parameters_that_do_not_exist_are_refused(params):
+def test_invalid_parameters_are_refused(params):
     with pytest.raises(EvaluationError):
         RoboCAS(**params)

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
-from counting_env import CountingEnv, play
+from counting_env import CountingEnv, run_policy
 from remote_ends import (
     SHORT_TIMEOUTS,
     RecordingPolicy,
@@ -157,10 +157,10 @@ def test_run_continues_after_policy_errors_and_ends_without_a_server():
     env, starts = CountingEnv(1, 4, steps=True), [make_episode(-1, episode=number) for number in range(7)]
     with serving(FailingEveryThird()) as url:
         remote = RemotePolicy(f"{url}?{SHORT_TIMEOUTS}")
-        played = {one.spec.episode: one for one in play(env, remote, starts, 10)}
-    assert {number: one.steps for number, one in played.items()} == {0: 4, 1: 4, 2: 0, 3: 4, 4: 4, 5: 0, 6: 4}
-    assert {number for number, one in played.items() if one.error} == {2, 5}
-    assert played[2].error == "the policy server failed: RuntimeError: out of memory"
+        ended = {one.spec.episode: one for one in run_policy(env, remote, starts, 10)}
+    assert {number: one.steps for number, one in ended.items()} == {0: 4, 1: 4, 2: 0, 3: 4, 4: 4, 5: 0, 6: 4}
+    assert {number for number, one in ended.items() if one.error} == {2, 5}
+    assert ended[2].error == "the policy server failed: RuntimeError: out of memory"
     with pytest.raises(EvaluationError, match="no connection to the policy server within 0.5 s"):
-        play(env, remote, starts, 10)
+        run_policy(env, remote, starts, 10)
     remote.close()

@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("websockets")
 pytest.importorskip("msgpack")
 
-from counting_env import CountingEnv, play
+from counting_env import CountingEnv, run_policy
 from remote_ends import CAMERA, SHORT_TIMEOUTS, RecordingPolicy, make_episode, make_observations, serve_answer, serving
 
 from robocas_ms3.core.errors import EvaluationError, PolicyError
@@ -78,7 +78,7 @@ def run_eight_episodes(policy):
     """Run eight episodes of different lengths in three envs."""
     env = CountingEnv(3, np.array([3, 4, 7]), steps=True)
     starts = [make_episode(-1, episode=number, seed=number) for number in range(8)]
-    return [replace(one, inference_seconds=0.0) for one in play(env, policy, starts, 9)], env.actions
+    return [replace(one, inference_seconds=0.0) for one in run_policy(env, policy, starts, 9)], env.actions
 
 
 def test_remote_run_equals_local_run_bit_for_bit():
@@ -86,12 +86,12 @@ def test_remote_run_equals_local_run_bit_for_bit():
     expected, expected_actions = run_eight_episodes(local)
     with serving(served) as url:
         remote = RemotePolicy(url)
-        played, actions = run_eight_episodes(remote)
+        ended, actions = run_eight_episodes(remote)
         remote.close()
     assert served.calls == local.calls
     assert any(envs != sorted(envs) for _, envs in local.calls), "the order of rows would not be tested"
     assert served.episodes == local.episodes
-    assert played == expected
+    assert ended == expected
     assert [step.tobytes() for step in actions] == [step.tobytes() for step in expected_actions]
 
 

@@ -30,7 +30,7 @@ def test_comparison_uses_the_common_episodes(tmp_path):
     assert float(p) == float(adjusted) == pytest.approx(2 * 0.5**7, rel=0.01)
 
 
-def test_several_claims_are_adjusted_by_holm(tmp_path):
+def test_p_values_of_several_comparisons_are_adjusted(tmp_path):
     """Three results over two configurations; the rows over all configurations are a separate family."""
 
     def result(name: str, good: int):

@@ -15,7 +15,7 @@ from robocas_ms3.evaluation.report.videos import SIZE, choose_failed_episodes, r
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
 
-def test_all_kinds_of_failures_have_their_turn(tmp_path):
+def test_failed_episodes_are_chosen_in_turn_per_failure_stage(tmp_path):
     came_to = [0, 0, 0, 3, 7, 3]
     table = [outcome(number, came) for number, came in enumerate(came_to)]
     result = write(tmp_path / "a", [*table, outcome(6, 0, config="heap")])

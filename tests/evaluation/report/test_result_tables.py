@@ -37,7 +37,7 @@ def test_tables_of_successes_failures_and_occlusion(result, tmp_path):
     assert row(render_markdown(result), "0 to 0.2") == ["0 to 0.2", "0", ""]
 
 
-def test_notes_name_tasks_played_as_another_task_and_the_conditions_of_the_paper(tmp_path):
+def test_notes_name_task_aliases_and_the_conditions_of_the_paper(tmp_path):
     outcomes = [outcome(0, task="select", config="pick_upstream_eval")]
     text = render_markdown(write(tmp_path / "a", outcomes, protocol="paper-v1", played_as={"select": "pick"}))
     assert "select was evaluated in the episodes of pick" in text
