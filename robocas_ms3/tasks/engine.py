@@ -26,7 +26,7 @@ from robocas_ms3.scenes.config import TaskConfig
 from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ
 
 # Twice the greatest numbers of one env on a CPU (4 seeds of each bundled configuration, random arm motion): 25 contact
-# points and 8 pairs of touching shapes per object, robot and basket included. PhysX drops contacts without memory.
+# points and 8 pairs of touching shapes per object, robot and basket included. PhysX drops contacts that do not fit.
 CONTACTS_PER_OBJECT, PATCHES_PER_OBJECT = 50, 16
 BASE_CONTACTS, BASE_PATCHES = 100, 32  # between robot, furniture and basket
 STACK_PER_PATCH, TEMPORARY_PER_CONTACT = 512, 64  # bytes
@@ -75,7 +75,7 @@ def check_engine_arguments(
 def _start_gpu_physics() -> None:
     try:
         sapien.physx.enable_gpu()
-    except Exception as error:  # of the download, of the driver, or because this process uses PhysX on a CPU
+    except Exception as error:  # the download or the driver failed, or this process already uses PhysX on a CPU
         fix = (
             "SAPIEN downloads PhysX's library for GPUs once; without a network copy ~/.sapien/physx/ from another "
             'machine. To use the CPU: make_vec(backend="processes"), robocas eval --backend processes, '

@@ -15,9 +15,9 @@ from robocas_ms3.core import rotations
 from robocas_ms3.core.arrays import Array, known_all_true, to_native
 from robocas_ms3.tasks import rewards, terms
 
-_RIM = 0.05  # m around the basket's inner volume in which a falling target still counts as above the basket
+_RIM_MARGIN = 0.05  # m around the basket's inner volume in which a falling target still counts as above the basket
 _DROP_HEIGHT, _LOWERING = 0.1, 0.25  # m above the basket's rim: end of the carry; start of the lowering
-_FAR = 0.2  # m from the end of the carry at which its reward is a half
+_HALF_REWARD_DISTANCE = 0.2  # m from the end of the carry at which the term `carry` is 0.5
 
 
 class TaskState(NamedTuple):
@@ -125,7 +125,7 @@ class InBasketGoal(Goal):
         inner = env.model.basket.asset.inner
         assert inner is not None  # checked when the model is loaded
         low, high = (torch.tensor(corner, device=env.device) for corner in (inner.min, inner.max))
-        aside = torch.tensor([_RIM, _RIM, torch.inf], device=env.device)
+        aside = torch.tensor([_RIM_MARGIN, _RIM_MARGIN, torch.inf], device=env.device)
         self._inside = to_native(low), to_native(high)
         self._above = to_native(low - aside), to_native(high + aside)
         self._drop = to_native(torch.cat([(low + high)[:2] / 2, high[2:] + _DROP_HEIGHT]))  # in the basket's frame
@@ -169,7 +169,7 @@ class InBasketGoal(Goal):
             0 * slot + table.stage_index("grasp"),
             [
                 (state.target_held, table.stage_index("lift")),
-                # the basket may be lower than the target's start
+                # not by the current height: the basket may be lower than the start of the target
                 (state.target_held & was_lifted, table.stage_index("carry")),
                 (was_lifted & over, table.stage_index("place")),
                 (delivered, table.stage_index("release")),
@@ -180,7 +180,9 @@ class InBasketGoal(Goal):
         return stage, {
             "reach": rewards.nearness(env.tcp_in_world()[:, :3], center),
             "lift": rewards.change_fraction(target[:, 2], start, terms.LIFT),
-            "carry": rewards.nearness(center, self.goal_position(state.basket_pose), half_distance=_FAR),
+            "carry": rewards.nearness(
+                center, self.goal_position(state.basket_pose), half_distance=_HALF_REWARD_DISTANCE
+            ),
             "place": 1 - rewards.change_fraction(inside[:, 2], high[2], _LOWERING),
             "released": rewards.release_fraction(state.target_held, state.target_touched),
             "at_rest": rewards.stillness(target[:, 7:10], target[:, 10:]),

@@ -21,9 +21,9 @@ CELLS = 64  # cells per side: the grid extends 0.16 m from the target's middle
 NEAREST = 0.05  # m below the camera; points that are higher are treated as if they were at this depth
 MAX_HIDDEN_FRACTION = 0.2  # greatest hidden fraction of a cleared target (paper)
 MAX_OBSTACLES = 1  # greatest number of obstacles around a cleared target (paper)
-REACH = 2  # cells (1 cm) around the target's outline in which objects count as neighbours
+REACH = 2  # cells (1 cm) around the target's outline in which an object can be an obstacle
 LEAST_MOTION = 1e-4  # m and quaternion components; less motion has no effect in cells of 5 mm
-STAND_OFF = 0.02  # m between an obstacle and the start of its push
+PUSH_START_DISTANCE = 0.02  # m between an obstacle and the point where its push starts
 
 _OUTSIDE = CELLS * CELLS  # index of the cell for points outside of the grid
 _NOTHING = -1e3  # height of an empty cell; finite, so that differences are finite
@@ -186,7 +186,7 @@ def find_push_point(points: Tensor, obstacles: Tensor, target_slot: Tensor) -> T
     away = (middle - goal)[:, :2]
     away = away / torch.linalg.vector_norm(away, dim=-1, keepdim=True).clamp(min=1e-6)
     behind = ((highest - middle[..., None])[:, :2] * away[..., None]).sum(dim=1).amin(dim=-1)  # (N,), negative
-    beside = torch.cat([middle[:, :2] + (behind - STAND_OFF)[:, None] * away, middle[:, 2:]], dim=-1)
+    beside = torch.cat([middle[:, :2] + (behind - PUSH_START_DISTANCE)[:, None] * away, middle[:, 2:]], dim=-1)
     return torch.where(obstacles.any(dim=1)[:, None], beside, goal)
 
 

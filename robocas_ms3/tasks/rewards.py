@@ -56,8 +56,9 @@ _TRANSFER = {
     "release": {"released": 0.5},
     "rest": {"at_rest": 0.5, "success": 1.0},
 }
+# pick and select
 TRANSFER = RewardTable(_TRANSFER, {"disturbed": 0.1, "basket_shift": 0.1, "action_rate": 0.05})
-# a heap is disturbed on purpose
+# without the penalty `disturbed`, because clearing disturbs objects on purpose
 SEARCH = RewardTable(
     {"clear": {"push_point": 1.0, "clear": 3.0}, **_TRANSFER}, {"basket_shift": 0.1, "action_rate": 0.05}
 )

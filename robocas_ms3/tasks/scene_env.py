@@ -202,7 +202,7 @@ class SceneEnv(BaseEnv):
         seeds: Any = None if seed is None else self.seeds.map_to_range(seed)
         if seeds is None or self._batched_episode_rng is None or len(envs) == self.num_envs:
             super()._set_episode_rng(seeds, env_idx)
-        else:  # ManiSkill's would seed all envs
+        else:  # ManiSkill's method would seed all envs
             if len(seeds) == 1 and len(envs) > 1:
                 seeds = np.concatenate([seeds, np.random.RandomState(seeds[0]).randint(2**31, size=len(envs) - 1)])
             self._episode_seed[envs] = seeds
@@ -276,6 +276,6 @@ class SceneEnv(BaseEnv):
 
     def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
         last = self._last_obs.get("sensor_data") if isinstance(self._last_obs, dict) else None
-        if self.renders_images or last is None:  # None: point clouds, which are computed from images
+        if self.renders_images or last is None:  # None with point clouds, which need rendered images
             return super()._get_obs_sensor_data(apply_texture_transforms)
         return {camera: {kind: torch.zeros_like(of) for kind, of in kinds.items()} for camera, kinds in last.items()}

@@ -209,9 +209,9 @@ class PeriodicSchedule:
     def __init__(self, num_envs: int, period: int, device: torch.device | str) -> None:
         self._period, self._device = period, device
         self._step = 0
-        self._reset_at = np.zeros(num_envs, dtype=np.int64)  # of `_step`
+        self._reset_at = np.zeros(num_envs, dtype=np.int64)  # value of `_step` at the last reset
         self._always = np.zeros(num_envs, dtype=bool)
-        self._indices: list[torch.Tensor] = []  # by `_step` modulo the period; empty: to be made
+        self._indices: list[torch.Tensor] = []  # due envs by `_step` modulo the period; empty: not computed
 
     def reset(self, envs: NDArray[np.int64]) -> None:
         """Restart the schedule of some envs (E,), which have just been reset."""
@@ -229,7 +229,7 @@ class PeriodicSchedule:
 
     def due_envs(self) -> torch.Tensor:
         """Return the indices (D,) int64 of the envs that are due in the current control step."""
-        if not self._indices:  # for all phases at once, since a copy to the GPU within a step would synchronise
+        if not self._indices:  # for the whole period, because a copy to the GPU in each step would synchronise
             phases = np.arange(self._period)[:, None]
             due = ((phases - self._reset_at) % self._period == 0) | self._always
             self._indices = [torch.from_numpy(np.flatnonzero(row)).to(self._device) for row in due]

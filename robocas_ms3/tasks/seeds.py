@@ -18,7 +18,7 @@ from robocas_ms3.tasks.initial_states import InitialStates, InitialStateTable
 
 SEVERAL_ENVS_SEEDS = (0, 99)  # default range of unseeded resets of several envs
 _OTHER_SEEDS = 20  # number of other seeds to draw after a seed without a layout
-_FIRST_SEEDS = 2  # this number before any seed had a layout, so that a configuration without layouts fails early
+_FIRST_SEEDS = 2  # number of other seeds while none has had a layout: a configuration without layouts fails early
 _T = TypeVar("_T")
 _log = logging.getLogger(__name__)
 
@@ -115,7 +115,7 @@ class EpisodeSeeds:
         self._before: tuple[NDArray[np.int64], dict[int, Layout]] = (self.layout_seeds, {})  # before the current reset
         self._found: dict[int, Layout] = {}  # by env
         self._built_with: dict[int, Layout] = {}  # by seed
-        self._failed: dict[SeedPair, LayoutError] = {}  # sampling again would take long
+        self._failed: dict[SeedPair, LayoutError] = {}  # failed seed pairs, because sampling them again would take long
 
     def start_reset(self, seed: Any, envs: list[int]) -> Any:
         """Start a reset of some envs, and return its seed in the form of ``BaseEnv.reset``.

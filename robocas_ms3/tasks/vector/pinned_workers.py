@@ -98,7 +98,7 @@ class PinnedWorkers(Generic[Task, Result]):
         errors: dict[int, Exception] = {}
         deadline = time.monotonic() + seconds
         while messages or self._unread:
-            with defer_interrupts() as signals:  # no message is sent or read in part
+            with defer_interrupts() as signals:  # so that no message is sent or read only partly
                 for number, message in enumerate(messages):
                     self._processes[number].send(message)
                     self._unread.add(number)
@@ -123,7 +123,7 @@ class PinnedWorkers(Generic[Task, Result]):
 
 def _launch_processes(processes: list[WorkerProcess[Any, Any]], launched: Future[None], ended: threading.Event) -> None:
     """Launch the processes in this thread, and keep the thread alive until they have ended."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # for the processes, until they ignore Ctrl-C
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # new processes inherit this, until they ignore Ctrl-C
     try:
         for process in processes:
             process.launch()

@@ -98,7 +98,7 @@ def test_errors_and_crashes_of_a_process(capfd):
         assert error.value.args == ("gripper fell off", 7)
         assert "env 2" in str(error.value.__cause__)
         assert "in step\n    raise CustomError" in str(error.value.__cause__)
-        with pytest.raises(VectorEnvError, match="Reset them first"):
+        with pytest.raises(VectorEnvError, match="Reset these environments"):
             env.step(make_actions(0, 0, 0, 0))
         assert torch.equal(env.reset(seed=0)[0], first)
         with pytest.raises(RuntimeError, match="UnpicklableError: lost somewhere"):
