@@ -1,4 +1,6 @@
-"""Baseline policies and their training: a folder per baseline, `training` for the trainer, `chunks` for action chunks.
+"""Baseline policies and their training.
+
+Each baseline is a module or package. `training` has the trainer, and `chunks` has action chunks.
 
 Public names are imported from this package at first use.
 """

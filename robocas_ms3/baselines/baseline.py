@@ -117,7 +117,9 @@ class Samples(Protocol):
 
 @dataclass(frozen=True)
 class Baseline:
-    """Baseline: network, policy and training data. It learns from demonstrations (``data``) or in simulation.
+    """Baseline: network, policy and training data.
+
+    A baseline learns from demonstrations (``data``) or in simulation (``environments``).
 
     For demonstrations, ``forward(batch)`` of the network returns metrics by name, one of them ``loss``. A metric is the
     mean over the batch, shape (). If only some samples of the batch have the metric, it is the sum over these samples

@@ -1,4 +1,4 @@
-"""`bc-state`: behaviour cloning of action chunks from the privileged state of the simulator, without images."""
+"""`bc-state`: behaviour cloning of action chunks from privileged state, without images."""
 
 from __future__ import annotations
 

@@ -56,7 +56,9 @@ def encode_chunks(poses: Array, gripper_commands: NDArray[Any], steps: int) -> N
 
 
 def encode_next_key_poses(poses: Array, gripper_commands: NDArray[Any]) -> NDArray[np.float32]:
-    """Encode the next key pose of each step of an episode, (T, 9): a row of a chunk without gripper command.
+    """Encode the next key pose of each step of an episode, (T, 9).
+
+    The encoding is that of a row of a chunk, without the gripper command.
 
     The next key pose of a step is the TCP pose at the next change of the gripper command, or at the end of the episode
     if there is no change. The arguments are those of `encode_chunks`.
@@ -172,7 +174,7 @@ def compute_chunk_losses(
 def _compute_pose_loss(
     predicted: torch.Tensor, poses: torch.Tensor, scale: Normalizer, near_distance: float
 ) -> torch.Tensor:
-    """Return the mean L1 error of normalised poses (..., 9), weighted by distance as in `compute_chunk_losses`."""
+    """Return the mean L1 error () of normalised poses (..., 9), weighted as in `compute_chunk_losses`."""
     error = (predicted - scale(poses)).abs().mean(dim=-1)
     if not near_distance:
         return error.mean()
@@ -255,7 +257,10 @@ class ChunkPolicy:
         return width < _EMPTY_WIDTH and last is not None and bool(np.linalg.norm(position - last) < self._reopen)
 
     def _make_action(self, chunks: list[_Chunk], here: Array) -> NDArray[np.float64]:
-        """Return the action (7,) from the TCP pose ``here`` (4, 4) to the mean of the predictions for this step."""
+        """Return the action (7,) that moves the TCP to the mean of the predictions for this step.
+
+        here: (4, 4) TCP pose in the arm's base frame.
+        """
         weights = np.exp(-self._ensemble_coeff * np.array([one.age for one in chunks]))
         weights /= weights.sum()
         poses = np.stack([one.poses[one.age] for one in chunks])

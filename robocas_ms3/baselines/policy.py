@@ -17,7 +17,7 @@ from robocas_ms3.scenes.config import TaskConfig
 
 
 def shipped_small() -> RunPolicy:
-    """Make the policy `small` with the bundled weights, which were trained for pick; see docs/baselines.md."""
+    """Make the policy `small` with the bundled weights, which were trained for pick."""
     return RunPolicy(BUNDLED / "small")
 
 
@@ -76,7 +76,7 @@ class RunPolicy:
         return self._policy.spec
 
     def describe(self) -> dict[str, Any]:
-        """Return baseline, training data, configuration and weights hash, which an evaluation records in its result."""
+        """Return the baseline, training data, configuration and weights hash, for the record of a result."""
         return {**self._description, **getattr(self._policy, "describe", dict)()}
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
@@ -103,7 +103,10 @@ class RunPolicy:
 
 @contextmanager
 def _convert_fact_errors(path: Path) -> Iterator[None]:
-    """Raise TrainingError in place of the errors that damaged values in ``run.json`` cause; ``path`` is its path."""
+    """Raise TrainingError in place of the errors that damaged values in ``run.json`` cause.
+
+    path: path of ``run.json``, for the message.
+    """
     try:
         yield
     except (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError) as error:

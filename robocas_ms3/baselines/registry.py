@@ -1,4 +1,7 @@
-"""Registry of the baselines. A baseline is imported at first use; other packages register theirs by entry points."""
+"""Registry of the baselines.
+
+A baseline is imported at its first use. Other packages register their baselines by entry points.
+"""
 
 from __future__ import annotations
 

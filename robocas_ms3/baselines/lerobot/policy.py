@@ -1,4 +1,7 @@
-"""Adapter that makes a LeRobot policy a `Policy`. It runs in LeRobot's environment and does not import LeRobot."""
+"""Adapter that makes a LeRobot policy a `Policy`.
+
+It runs in LeRobot's Python environment, but does not import LeRobot.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +58,7 @@ def scale_embeddings(embeddings: NDArray) -> NDArray[np.float32]:
 
 
 class LeRobotPolicy:
-    """Policy that calls ``select_action`` of a LeRobot policy once per step and env, as LeRobot's rollouts do.
+    """Policy that calls ``select_action`` of a LeRobot policy once per step and env.
 
     A LeRobot policy stores past observations and the rest of a chunk, for a batch of envs that start together. The envs
     of an evaluation start at different times. Therefore each env has a copy of the policy with its own queues and the
@@ -111,13 +114,16 @@ class LeRobotPolicy:
         return self._description
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
-        """Start episodes: empty the queues of their envs, and seed the noise of the policy with the episode's seed."""
+        """Start episodes: empty the queues of their envs, and seed the noise with the episodes' seeds."""
         for episode in episodes:
             self._models[episode.env] = _copy_with_queues(self._model)
             self._generators[episode.env] = np.random.default_rng([episode.seed, episode.episode])
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
-        """Return one action per env (E, 7). Each env is a batch of its own, so the envs do not influence each other."""
+        """Return one action per env (E, 7).
+
+        Each env is a batch of its own, so the envs do not influence each other.
+        """
         return np.stack([self._act(env, observations, row) for row, env in enumerate(observations.envs.tolist())])
 
     def _act(self, env: int, observations: Observations, row: int) -> NDArray[np.float32]:
@@ -129,7 +135,10 @@ class LeRobotPolicy:
         return action.reshape(-1).to("cpu", torch.float32).numpy()
 
     def _make_item(self, observations: Observations, row: int) -> dict[str, Any]:
-        """Return the observation of a row as an item of a LeRobot dataset: no batch axis, images (3, H, W) in 0..1."""
+        """Return the observation of a row as an item of a LeRobot dataset.
+
+        The item has no batch axis. Images are (3, H, W) in 0..1.
+        """
         one = slice(row, row + 1)
         tcp = observations.tcp_in_base[one]
         joints = observations.qpos[one, RobotDescription.arm_slice]

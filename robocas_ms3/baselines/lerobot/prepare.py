@@ -1,8 +1,9 @@
-"""Reduce a LeRobot dataset to the data that the policy socket sends, and add embeddings, for LeRobot's training.
+"""Prepare a LeRobot dataset for LeRobot's training: reduce it, and add embeddings.
 
     python -m robocas_ms3.baselines.lerobot.prepare DATASET OUT [--no-language]
 
-Images and episodes do not change (videos are hard links). ``observation.state`` has the values in `policy.STATE_NAMES`.
+The new dataset has only values that the policy socket sends too. Images and episodes do not change (videos are hard
+links). ``observation.state`` has the values in `policy.STATE_NAMES`.
 ``observation.environment_state`` is the embedding of the frame's instruction, because LeRobot's ACT and diffusion
 policy do not read text. The only action is ``action``.
 """
@@ -51,7 +52,9 @@ _NOT_COPIED = ("data", "episodes", "robocas", "depth", ".episodes", STAGING)
 
 
 def prepare_dataset(source: Path, out: Path, embed: Embed | None) -> None:
-    """Write a LeRobot dataset, reduced to the data that the policy socket sends; the folder is complete or absent.
+    """Write a LeRobot dataset that is reduced to the data that the policy socket sends.
+
+    The output folder appears when it is complete.
 
     Args:
         source: dataset folder of ``robocas convert --to lerobot``.

@@ -1,9 +1,9 @@
-"""Serve a LeRobot checkpoint to ``robocas eval``; runs in LeRobot's environment, see scripts/serve_lerobot.sh.
+"""Serve a LeRobot checkpoint to ``robocas eval``, in LeRobot's Python environment.
 
     python -m robocas_ms3.baselines.lerobot.serve RUN [--port 8000] [--n-action-steps N] [--device cpu]
 
-The module imports no simulator. In addition to LeRobot it needs msgpack, websockets, pydantic, scipy, PyYAML and
-platformdirs.
+`scripts/serve_lerobot.sh` calls it. The module imports no simulator. In addition to LeRobot it needs msgpack,
+websockets, pydantic, scipy, PyYAML and platformdirs.
 """
 
 from __future__ import annotations

@@ -84,7 +84,10 @@ def _make_layers(inputs: int, width: int, outputs: int, gain: float) -> nn.Seque
 
 
 class PpoPolicy:
-    """Policy of `ppo`: executes the mean action of the agent. An action commands the same motion as in the training."""
+    """Policy of `ppo`, which executes the mean action of the agent.
+
+    An action commands the same motion as in the training.
+    """
 
     def __init__(self, config: PpoConfig, facts: dict[str, Any], agent: Agent) -> None:
         # Rotations are about one axis: Euler angles and rotation vectors are equal

@@ -52,7 +52,7 @@ def join_observation(qpos: Any, tcp_in_base: Any, width: Any, state: Any) -> tor
 
 
 class TopDownActionWrapper(gym.Wrapper):
-    """Wrapper that accepts the 5-D actions of `expand_action` and returns the observations of `join_observation`.
+    """Wrapper with the actions of `expand_action` and the observations of `join_observation`.
 
     It wraps one environment, or a batch of environments on a GPU.
     """
@@ -85,7 +85,9 @@ def _make_observation(obs: dict[str, Any]) -> torch.Tensor:
 
 
 class PpoEnvironments:
-    """Training environments of `ppo`: the vector environment ``envs``, and `make_envs` for others such as tests.
+    """Training environments of `ppo`.
+
+    ``envs`` is the vector environment of the training; `make_envs` makes others, such as those of the test.
 
     All episodes have the same length: a success does not end an episode. Each env keeps its objects; only the layout
     changes at a reset.

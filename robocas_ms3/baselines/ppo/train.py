@@ -116,7 +116,10 @@ def update_agent(
 
 @torch.inference_mode()
 def evaluate_agent(agent: Agent, environments: PpoEnvironments, count: int) -> torch.Tensor:
-    """Run test episodes with mean actions, in layouts that are not in the training; return `OUTCOMES` (count, 4)."""
+    """Run test episodes with mean actions, and return their `OUTCOMES` (count, 4).
+
+    The layouts are not in the training.
+    """
     envs = environments.make_envs(count, FIRST_TEST_SEED, FIRST_TEST_SEED + count - 1)
     try:
         obs, info = envs.reset(seed=FIRST_TEST_SEED)
@@ -128,7 +131,7 @@ def evaluate_agent(agent: Agent, environments: PpoEnvironments, count: int) -> t
 
 
 class _TrainingState:
-    """State of a training with PPO: optimiser, numbers of steps and episodes, outcomes of the last episodes.
+    """State of a training: optimiser, numbers of steps and episodes, outcomes of the last episodes.
 
     The state comes from a checkpoint, if there is one.
     """
@@ -242,7 +245,9 @@ def steps_per_env(config: PpoConfig) -> int:
 
 
 def compute_advantages(deltas: torch.Tensor, truncated: torch.Tensor, decay: float) -> torch.Tensor:
-    """Return the generalised advantage estimates (T, N) for T steps of N environments (Schulman et al. 2016).
+    """Return the generalised advantage estimates (T, N) of T steps in N environments.
+
+    Source: Schulman et al. 2016.
 
     deltas: (T, N) temporal differences of the values. truncated: (T, N) bool, whether the episode ended at this step.
     decay: gamma * lambda.

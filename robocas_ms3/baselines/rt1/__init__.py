@@ -18,7 +18,9 @@ from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 
 
 class RT1Policy:
-    """Policy of `rt1`: executes the most probable action, predicted from the last ``config.frames`` observations.
+    """Policy of `rt1`, which executes the most probable action.
+
+    The network predicts the action from the last ``config.frames`` frames.
 
     At the start of an episode the first frame is repeated. Each frame is encoded once, with the instruction of its
     step. After an action whose terminate token is 1, the policy does not move and repeats the last gripper command.

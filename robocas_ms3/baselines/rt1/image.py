@@ -21,7 +21,7 @@ _FIX = "Set image_weights to model.safetensors of google/efficientnet-b3."
 
 
 class FiLM(nn.Module):
-    """FiLM layer (Perez et al. 2018): an instruction embedding scales and shifts the channels of image features.
+    """FiLM layer (Perez et al. 2018): an embedding scales and shifts the channels of image features.
 
     The initial scale is 1 and the initial shift is 0, so a new layer does not change its input.
     """
@@ -33,7 +33,10 @@ class FiLM(nn.Module):
         nn.init.zeros_(self.linear.bias)
 
     def forward(self, features: torch.Tensor, language: torch.Tensor) -> torch.Tensor:
-        """Return modulated features (N, C, h, w), from features (N, C, h, w) and instruction embeddings (N, 384)."""
+        """Return the modulated features (N, C, h, w).
+
+        features: (N, C, h, w). language: (N, 384) instruction embeddings.
+        """
         scale, shift = self.linear(language)[:, :, None, None].chunk(2, dim=1)
         return features * (1 + scale) + shift
 
@@ -107,7 +110,9 @@ class ImageEncoder(nn.Module):
         return self.learner(self.compute_features(images, language).flatten(2).transpose(1, 2))
 
     def load_efficientnet_weights(self, path: Path) -> None:
-        """Load the weights of EfficientNet from a file; ignore other tensors in the file, such as a classifier's.
+        """Load the weights of EfficientNet from a file.
+
+        Other tensors in the file, such as those of a classifier, are ignored.
 
         Raises:
             TrainingError: the file is unreadable, or the weights have other names or shapes than the network.

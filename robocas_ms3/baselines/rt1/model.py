@@ -1,4 +1,4 @@
-"""Network of RT-1 (Brohan et al. 2022): image tokens of a history of frames, transformer, action tokens."""
+"""Network of RT-1 (Brohan et al. 2022): image encoders, transformer and action tokens."""
 
 from __future__ import annotations
 
@@ -99,7 +99,10 @@ class Transformer(nn.Module):
         self.register_buffer("mask", make_attention_mask(config.frames, images, FRAME_TOKENS), persistent=False)
 
     def forward(self, image_tokens: torch.Tensor) -> torch.Tensor:
-        """Return logits (B, frames, 8, bins) for image tokens (B, frames, image tokens per frame, token_width)."""
+        """Return the logits (B, frames, 8, bins) of the action tokens and the terminate token.
+
+        image_tokens: (B, frames, image tokens per frame, token_width).
+        """
         projected = self.input_projection(image_tokens)
         empty = projected.new_zeros(len(projected), self.frames, FRAME_TOKENS, projected.shape[-1])
         tokens = torch.cat([projected, empty], dim=2).flatten(1, 2) + self.position_embedding
@@ -109,7 +112,7 @@ class Transformer(nn.Module):
 
 
 def make_attention_mask(frames: int, images: int, predicted: int) -> torch.Tensor:
-    """Return the attention mask (L, L) bool of `Transformer`: token i attends to token j if ``mask[i, j]``.
+    """Return the attention mask (L, L) bool: token i attends to token j if ``mask[i, j]``.
 
     frames: number of frames. images, predicted: number of image tokens and of predicted tokens per frame.
     """
@@ -158,7 +161,7 @@ class RT1Model(nn.Module):
         return self.transformer(tokens.unflatten(0, (-1, frames))).float()
 
     def forward(self, batch: Batch) -> dict[str, torch.Tensor]:
-        """Return the metrics of a batch of `RT1Samples`: ``loss`` (cross entropy) and the accuracies of the tokens."""
+        """Return the metrics of a batch of `RT1Samples`: ``loss`` (cross entropy), accuracies of tokens."""
         if self.training and self.config.image_weights is not None and not self.from_imagenet:
             raise TrainingError(
                 "missing file of image_weights",

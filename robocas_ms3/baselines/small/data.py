@@ -1,4 +1,4 @@
-"""Training samples of `small`: the images of a dataset, decoded once and kept in memory, and the labels."""
+"""Training samples of `small`: images, which are decoded once and kept in memory, and labels."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ class SmallSamples:
         }
 
     def _read_images(self, number: int, start: int) -> dict[str, tuple[int, int]]:
-        """Decode the images of an episode, and store them in the sample tensors from row ``start`` on.
+        """Decode the images of an episode into the sample tensors, from row ``start`` on.
 
         Returns:
             Width and height of the images in the dataset, by camera.
@@ -147,7 +147,7 @@ class SmallSamples:
         return sizes
 
     def _read_arrays(self, index: int, number: int, start: int, sizes: dict[str, tuple[int, int]]) -> SceneObjects:
-        """Read the states and the labels of an episode, and store them in the sample tensors from row ``start`` on.
+        """Read the states and labels of an episode into the sample tensors, from row ``start`` on.
 
         Args:
             index: number of the episode among these samples; ``number`` is its number in the dataset.

@@ -1,4 +1,4 @@
-"""Locate the named object and the next key pose: the cell in each image, and the point in space by unprojection.
+"""Locate the named object and the next key pose: the cell in each image, and the point in space.
 
 The loss of the chunks alone teaches the network poorly which object an instruction names. Therefore auxiliary losses
 train attention over the cells of each image. One label is the cell of the next key pose. The other labels are the cells
@@ -61,7 +61,10 @@ def project_points_to_view(
 
 
 def pixel_to_cell(pixels: torch.Tensor, view: CameraView) -> torch.Tensor:
-    """Return the row-major cell indices (...) of pixel coordinates (..., 2): `NOWHERE` for pixels outside the view."""
+    """Return the row-major cell indices (...) of pixel coordinates x and y (..., 2).
+
+    The index of a pixel outside the view is `NOWHERE`.
+    """
     size = torch.tensor(view.size, device=pixels.device)
     inside = ((pixels >= 0) & (pixels < size)).all(dim=-1)  # False for NaN
     cell = (pixels.nan_to_num(0.0) / CELL).floor().long()
@@ -100,7 +103,7 @@ class CellAttention(nn.Module):
         return scores / math.sqrt(cells.shape[1])
 
     def forward(self, features: torch.Tensor, query: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return a token with the attended features (B, width), and the attention logits of all cells (B, h w).
+        """Return a token of the attended features (B, width), and the logits of all cells (B, h w).
 
         Args:
             features: (B, C, h, w) feature maps.
@@ -113,7 +116,9 @@ class CellAttention(nn.Module):
 
 
 def compute_cell_losses(logits: torch.Tensor, cells: torch.Tensor, columns: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the cross entropy and the accuracy of predicted cells, over the queries with a label in the image.
+    """Return the cross entropy and the accuracy of predicted cells.
+
+    They count only queries with a label in the image.
 
     A prediction is accurate if it is at most one cell away from a label.
 
@@ -237,7 +242,10 @@ class Unproject(nn.Module):
 
 
 def _rotate(rotations: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
-    """Return vectors (B, 3), rotated by matrices (B, 3, 3) or (3, 3); in fp32, because a bf16 matmul rounds to 4 mm."""
+    """Return vectors (B, 3), rotated by matrices (B, 3, 3) or (3, 3).
+
+    The computation is in fp32, because a bf16 matmul rounds positions to 4 mm.
+    """
     return (rotations * vectors[:, None]).sum(dim=-1)
 
 

@@ -1,4 +1,4 @@
-"""The network of `small`: a convolutional network per camera, and a transformer decoder over the feature maps.
+"""The network of `small`: a convolutional network per camera, and a transformer decoder.
 
 The decoder has one query per step of the chunk and one query for the next key pose. The queries attend to coarse
 feature maps (1/16 of the image size), to the language token and to the proprioception token. Language and
@@ -92,7 +92,9 @@ class ImageEncoder(nn.Module):
     def make_tokens(
         self, maps: tuple[torch.Tensor, torch.Tensor], query: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the decoder's tokens (B, h w / 256 + 1, width) and the attention logits of the cells (B, h w / 64).
+        """Return the tokens of the decoder and the attention logits of the cells (B, h w / 64).
+
+        The tokens are (B, h w / 256 + 1, width).
 
         There is one token per cell of the coarse map. A learned vector, weighted by the attention of the query to the
         cell, is added to each of them. The last token has the attended features of the fine map.
@@ -165,7 +167,10 @@ class SmallModel(nn.Module):
         self.chunk_head, self.key_head = nn.Linear(width, ROW), nn.Linear(width, 9)
 
     def forward(self, batch: Batch) -> dict[str, torch.Tensor]:
-        """Return the losses and metrics of a batch of `SmallSamples`, by the names in docs/baselines.md (Metrics)."""
+        """Return the losses and metrics of a batch of `SmallSamples`.
+
+        docs/baselines.md (Metrics) explains the names.
+        """
         images, pixels, shifts = {}, {}, {}
         for camera in self.config.views:
             image, shift = self._shift_in_training(batch[camera])
@@ -298,7 +303,10 @@ class SmallModel(nn.Module):
 
 
 def shift_images(images: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
-    """Shift images (B, h, w, C) by ``shift`` (B, 2) pixels to the right and down; repeat the pixels at the edges."""
+    """Shift images (B, h, w, C) to the right and down; repeat the pixels at the edges.
+
+    shift: (B, 2) pixels.
+    """
     count, height, width, _ = images.shape
     device = images.device
     rows = (torch.arange(height, device=device) - shift[:, 1:]).clamp(0, height - 1)  # (B, h)

@@ -1,4 +1,4 @@
-"""Locate the objects of an episode in its images, for the steps before the first change of the gripper command.
+"""Locate the objects of an episode in its images, until the gripper command changes.
 
 In these steps the objects are at the poses of the layout, because the scripted policy touches no object on its way to
 the target.
@@ -118,7 +118,10 @@ def read_calibration(
 
 
 def calibrations_agree(first: dict[str, Any], second: dict[str, Any], keys: Sequence[str] = tuple(_TOLERANCES)) -> bool:
-    """Return whether two calibrations are equal within 1 mm, 1 mrad and 0.01 pixels; ``keys`` are the compared keys."""
+    """Return whether two calibrations are equal within 1 mm, 1 mrad and 0.01 pixels.
+
+    keys: keys of the calibrations that are compared.
+    """
     return all(np.allclose(first[key], second[key], rtol=0, atol=_TOLERANCES[key]) for key in keys)
 
 

@@ -93,7 +93,7 @@ def save_tensors(path: Path, tensors: Tensors, metadata: Mapping[str, str], step
 
 
 def _sort_header(content: bytes) -> bytes:
-    """Sort the keys in the header of a safetensors file, so that equal tensors give equal bytes and hashes."""
+    """Sort the keys in the header of a safetensors file, so that equal tensors give equal bytes."""
     end = 8 + int.from_bytes(content[:8], "little")
     header = json.dumps(json.loads(content[8:end]), sort_keys=True, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 8)  # aligns the tensors

@@ -137,7 +137,10 @@ class Learner:
         return self._average.module if self._average is not None else self._network
 
     def _update_average(self, average: Any, weights: Any, _: Any) -> None:
-        """Update the average of the weights; the decay is lower at the start, when the weights are still random."""
+        """Update the average of the weights.
+
+        The decay is lower at the start, because the first weights are random.
+        """
         decay = min(self._settings.ema, (self.step + 1) / (self.step + 10))
         torch._foreach_lerp_(average, weights, 1 - decay)  # pyright: ignore[reportPrivateImportUsage]
 
@@ -175,7 +178,7 @@ class Learner:
 
 
 def _make_parameter_groups(model: torch.nn.Module, decay: float) -> list[dict[str, Any]]:
-    """Return two parameter groups of AdamW: matrices and kernels with weight decay, other parameters without."""
+    """Return two parameter groups: matrices and kernels with weight decay, others without."""
     parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
     return [
         {"params": [parameter for parameter in parameters if parameter.ndim > 1], "weight_decay": decay},

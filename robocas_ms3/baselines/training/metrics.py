@@ -20,7 +20,7 @@ _FIRST_COLUMNS = ("step", "split", "epoch", "seconds", "learning_rate")
 
 
 def mean_of_sum_and_count(sum_and_count: torch.Tensor) -> torch.Tensor:
-    """Return the mean (), for a tensor (2,) of the sum and the number of values; 0 if there are no values."""
+    """Return the mean () of values, from their sum and number (2,); 0 if there are no values."""
     return sum_and_count[0] / sum_and_count[1].clamp(min=1)
 
 
@@ -34,7 +34,10 @@ def convert_to_sum_and_count(metric: torch.Tensor, samples: int) -> torch.Tensor
 
 
 def compute_means(sums: Mapping[str, torch.Tensor]) -> dict[str, float]:
-    """Return the mean of each metric, for tensors (2,) of the sum and the number of values; NaN without values."""
+    """Return the mean of each metric; NaN for a metric without values.
+
+    sums: tensors (2,) of the sum and the number of values, by metric.
+    """
     return {name: float(mean_of_sum_and_count(value)) if value[1] else math.nan for name, value in sums.items()}
 
 
@@ -139,7 +142,7 @@ class TensorBoardWriter:
 
 
 def _parse_number(text: Any, default: float) -> float:
-    """Parse a number. Return the default for an invalid text, such as one that a killed process wrote in part."""
+    """Parse a number; return the default if the text is not a number."""
     try:
         return float(text)
     except (TypeError, ValueError):

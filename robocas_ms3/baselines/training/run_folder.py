@@ -123,7 +123,7 @@ class RunFolder:
 
 
 def _list_hardware_changes(record: RunRecord, accelerator: Accelerator) -> str:
-    """Return the recorded hardware values that have changed, such as ``threads 4``; empty: none has changed."""
+    """Return the hardware values that differ from the recorded ones, such as ``threads 4``; or empty."""
     now = describe_hardware(accelerator) | ({} if record.threads else {"threads": 0})
     return ", ".join(f"{name} {value}" for name, value in now.items() if getattr(record, name) != value)
 

@@ -33,7 +33,7 @@ class TrainingScenes(StrictModel):
     configs: dict[str, dict[str, Any]] = {}
 
     def list_differences(self, configs: Mapping[str, TaskConfig], cameras: Collection[str]) -> list[str]:
-        """List the tasks, scene settings, objects and cameras of task configurations that the training data lacks.
+        """List the tasks, scene settings, objects and cameras that the training data lacks.
 
         Args:
             configs: task configurations of an evaluation, by name.
@@ -66,7 +66,10 @@ class TrainingScenes(StrictModel):
 
 
 def read_training_scenes(source: EpisodeSource, numbers: Iterable[int]) -> TrainingScenes:
-    """Read the scenes of the episodes with these numbers from ``scene.json``; values that it lacks stay empty."""
+    """Read the scenes of episodes from their ``scene.json``; values that it lacks stay empty.
+
+    numbers: numbers of the episodes.
+    """
     tasks, objects, configs, known = set[str](), set[str](), dict[str, dict[str, Any]](), set[str]()
     for number in numbers:
         scene = source.episode(number).scene
@@ -101,7 +104,10 @@ def select_scene_settings(config: TaskConfig, cameras: Collection[str] | None = 
 
 
 def _select_cameras(settings: Mapping[str, Any], cameras: Collection[str]) -> dict[str, Any]:
-    """Return the settings without those of unused cameras, and without lights and room if no camera is used."""
+    """Return the settings without those of unused cameras.
+
+    Without cameras, the result has no settings of lights and room either.
+    """
     unused = {"static_camera"} - set(cameras)
     if not cameras:
         unused |= {"lights", "room", "randomisation.lights", "randomisation.room", "randomisation.finishes"}

@@ -85,7 +85,7 @@ class InitialWeights:
 
 
 def train_run(options: RunOptions, progress: ProgressCallbacks | None = None) -> RunRecord:
-    """Train a baseline and return the record of the run; continue the run in ``options.out`` if there is one.
+    """Train a baseline, or continue the run in ``options.out``; return the record of the run.
 
     Raises:
         TrainingError: the configuration or the initial weights are invalid, or the loss became NaN or infinite.
@@ -232,7 +232,7 @@ def _check_data(baseline: Baseline, data: Path | None) -> None:
 
 @contextmanager
 def _open_output(options: RunOptions) -> Iterator[OutputFolder]:
-    """Open the folder of a run. The main process of `accelerate launch` locks it; other processes only read it."""
+    """Open the folder of a run, and lock it in the main process of `accelerate launch`."""
     output = OutputFolder(options.out, OUTPUT, overwrite=options.overwrite)
     if os.environ.get("RANK", "0") == "0":
         with output:
@@ -243,7 +243,9 @@ def _open_output(options: RunOptions) -> Iterator[OutputFolder]:
 
 
 def _read_recorded(output: OutputFolder, baseline: Baseline) -> RunRecord | None:
-    """Return ``run.json`` of the run in the output folder, or None; missing configuration keys get their defaults.
+    """Return ``run.json`` of the run in the output folder, or None if there is no run.
+
+    Configuration keys that the file lacks get their defaults.
 
     Raises:
         OutputExistsError: the run has another baseline, or was made with other package versions.
@@ -260,7 +262,7 @@ def _read_recorded(output: OutputFolder, baseline: Baseline) -> RunRecord | None
 
 
 def _choose_precision(precision: Precision, recorded: RunRecord | None) -> Precision:
-    """Return the configured precision; a run that continues with ``auto`` keeps the precision of its start."""
+    """Return the precision of a run; with ``auto``, a run that continues keeps its precision."""
     if recorded is None or precision != "auto":
         return precision
     return "bf16" if recorded.precision == "bf16" else "fp32"

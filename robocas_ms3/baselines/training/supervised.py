@@ -102,7 +102,7 @@ def epoch_at(step: int, count: int, settings: TrainSettings) -> float:
 
 
 def learning_rate_at(step: int, count: int, settings: TrainSettings) -> float:
-    """Return the learning rate of the step after ``step`` training steps, with ``count`` samples per epoch.
+    """Return the learning rate of the step after ``step`` steps, with ``count`` samples per epoch.
 
     The schedule ``restarts`` is cosine annealing with warm restarts (Loshchilov and Hutter 2017); its periods are in
     epochs.
@@ -123,7 +123,10 @@ def learning_rate_at(step: int, count: int, settings: TrainSettings) -> float:
 
 
 def _validation_batches(run: RunFolder, samples: Samples, settings: TrainSettings) -> Iterator[tuple[int, Batch]]:
-    """Yield the validation batches of this process, each with its size; every validation has the same batches."""
+    """Yield the validation batches of this process, each with its number of samples.
+
+    Every validation has the same batches.
+    """
     accelerator = run.accelerator
     count = min(len(samples), settings.validation_samples)
     indices = torch.linspace(0, len(samples) - 1, count).long().tolist()
