@@ -133,5 +133,5 @@ def test_facts_and_checkpoints_of_a_run(tmp_path):
     for metadata in ({"step": ""}, {"step": "-1"}, {"step": "nan"}, {"step": "1e308"}, {"step": "9" * 5000}, {}):
         save_file({"a": torch.zeros(1)}, small, metadata)
         with pytest.raises(TrainingError) as error:
-            checkpoints.load(small, {})
+            checkpoints.load_checkpoint(small, {})
         assert len(str(error.value)) < 500
