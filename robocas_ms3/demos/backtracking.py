@@ -18,29 +18,32 @@ T = TypeVar("T")
 
 
 class CandidatesExhaustedError(Exception):
-    """The episode failed after each candidate of a decision; backtrack to the previous decision.
+    """The episode failed with each candidate of a decision; the search must backtrack to the previous decision.
 
-    The failures are in the result of the episode already.
+    `EpisodeResult.failures` contains the failures already.
     """
 
 
 def order_candidates(
     candidates: Iterable[T], limits: SearchLimits, result: EpisodeResult
 ) -> Generator[tuple[T, bool], float | PlanningError | None, None]:
-    """Yield candidates in search order, each with a flag: continue the episode from it, or score it.
+    """Yield the candidates of a decision in search order, each with a flag that says what the caller has to do.
 
-    A few candidates are scored, and the episode continues from the best of them first. Then the next few follow. After
-    a candidate to score, the caller sends its score, or the error if its motions failed. After a candidate to continue
-    from, the caller sends None, since the episode failed there.
+    False: run the candidate, and send its score, or the PlanningError of its motions.
+    True: continue the episode from the candidate. If the episode fails, send None.
+
+    First ``limits.max_compared_candidates`` candidates are scored. The episode continues from the best of them, then
+    from the second best, and so on. Then the next candidates are scored.
 
     Args:
-        candidates: of a decision, evaluated lazily.
+        candidates: candidates of the decision, evaluated lazily.
         limits: numbers of candidates to compare and to continue from.
-        result: result of the episode so far.
+        result: result of the episode, whose number of failed attempts can end the search.
 
     Raises:
-        CandidatesExhaustedError: the episode has continued from as many candidates as the limits or its attempts allow.
-        PlanningError: no candidate could be played; the error of the last one.
+        CandidatesExhaustedError: the episode has failed with as many candidates as ``limits`` or the maximum number of
+            attempts allow.
+        PlanningError: no candidate is feasible; the error of the last candidate.
     """
     failure, continued, remaining = PlanningError("decision", "no_candidate"), 0, iter(candidates)
     while continued < limits.max_continued_candidates and not result.has_no_attempts_left:
@@ -69,14 +72,14 @@ class _RestartAttempt(Exception):  # noqa: N818
 
 
 class _Decision:
-    """State of a decision, which repeated runs of an attempt reach again.
+    """State of a decision, which is kept while the attempt is simulated again.
 
     Args:
-        order: `order_candidates` of the indices of the candidates.
+        order: generator `order_candidates` over the indices of the candidates.
 
     Attributes:
-        next: index of the next candidate and whether to continue from it, or the error if none is left.
-        chosen: index of the candidate that the episode continues from; None: not chosen yet.
+        next: index of the next candidate and flag of `order_candidates`, or the error that ends the decision.
+        chosen: index of the candidate from which the episode continues; None while no candidate is chosen.
     """
 
     def __init__(self, order: Generator[tuple[int, bool], float | PlanningError | None, None]) -> None:
@@ -84,7 +87,7 @@ class _Decision:
         self.advance()
 
     def advance(self, outcome: float | PlanningError | None = None) -> None:
-        """Send the outcome of a candidate and fetch the next one, see `order_candidates`."""
+        """Send the outcome of the present candidate to `order_candidates`, and fetch the next candidate."""
         self.chosen: int | None = None
         try:
             self.next: tuple[int, bool] | Exception = self._order.send(outcome)
@@ -93,9 +96,9 @@ class _Decision:
 
 
 class ResimulatedDecisions:
-    """Decisions that undo failures by simulating the attempt again from its reset.
+    """Decisions that undo motions by simulating the attempt again from its reset.
 
-    The class has the same methods as `ForkedDecisions`.
+    The class has the same methods as `ForkedDecisions` and gives the same episodes, but is slower.
     """
 
     def __init__(self, result: EpisodeResult) -> None:
@@ -104,6 +107,10 @@ class ResimulatedDecisions:
         self._depth = 0
 
     def run(self, attempt: Callable[[], None]) -> bool:
+        """Run an attempt from its reset with backtracking; return whether it succeeded.
+
+        ``attempt`` resets the environment, runs the policy and writes the episode.
+        """
         self._decisions = []
         while True:
             self._depth = 0
@@ -143,7 +150,7 @@ class ResimulatedDecisions:
                 decision.advance(outcome)
                 if decision.next != (index, True):
                     raise _RestartAttempt
-                decision.chosen = index  # the candidate just played is the best one: keep its motions
+                decision.chosen = index  # the candidate that has just run is the best one: keep its motions
                 return items[index]
             decision.chosen = index
         run_candidate(items[decision.chosen])

@@ -1,11 +1,11 @@
 """Backtracking with forked processes: each candidate runs in a separate process.
 
-A decision (`planning.decisions`) forks a child process per candidate. The child plays the candidate, sends its score
+A decision (`planning.decisions`) forks a child process per candidate. The child runs the candidate, sends its score
 and waits. The child with the best score then continues the episode, while the parent waits for the result. If the
 episode fails there, the parent, which is still at the decision, lets the next best child continue. The processes form a
 chain with one process per decision, and the last one writes the episode. No candidate is simulated twice.
 
-A child process is killed when its parent ends or a time limit is exceeded. After a crash, the candidate is played once
+A child process is killed when its parent ends or a time limit is exceeded. After a crash, the candidate is run once
 more, so a kill from outside does not change the episode. After a second crash the candidate is skipped, or counts as a
 failed attempt if the episode had continued from it.
 """
@@ -44,12 +44,17 @@ class ForkedProcessError(Exception):
 
 
 class ForkedProcessCrashError(ForkedProcessError):
-    """A forked process ended without sending a result."""
+    """A forked process ended before it sent a result."""
 
 
 @dataclass(frozen=True)
 class ForkedProcess:
-    """A forked child process and the pipe to it."""
+    """A forked child process of this process.
+
+    Attributes:
+        pid: process id of the child.
+        pipe: pipe to the child.
+    """
 
     pid: int
     pipe: Connection
@@ -61,7 +66,11 @@ class ForkedProcess:
             raise ForkedProcessCrashError("crashed") from error
 
     def receive(self, limit: float) -> Any:
-        """Return the next message of the process; raise ForkedProcessError after ``limit`` seconds."""
+        """Return the next message of the child.
+
+        Raises:
+            ForkedProcessError: no message arrived within ``limit`` s, or the child has ended.
+        """
         try:
             if not self.pipe.poll(limit):
                 raise ForkedProcessError("timed_out")
@@ -94,7 +103,7 @@ def fork() -> ForkedProcess | Connection:
 
 
 def set_up_forked_process(parent: int) -> None:
-    """Prepare a forked process, right after the fork; it is killed when the process ``parent`` ends."""
+    """Prepare a child process right after the fork, so that it ends with the process ``parent`` (process id)."""
     die_with_parent(parent)
     gc.freeze()  # a garbage collection of all objects would copy the parent's memory
     torch.set_num_threads(1)  # fork keeps one thread only; a parallel loop would wait for the others forever
@@ -106,9 +115,9 @@ def set_up_forked_process(parent: int) -> None:
 
 
 def reason_not_to_fork(*, renders: bool) -> str:
-    """Return why this process cannot be forked safely; an empty string if it can.
+    """Return the reason why this process cannot be forked safely, or an empty string.
 
-    ``renders`` says whether a renderer is open.
+    ``renders`` says whether the process has an open renderer.
     """
     if sys.platform != "linux":
         return "this is not Linux"
@@ -121,7 +130,7 @@ def reason_not_to_fork(*, renders: bool) -> str:
 
 @cache
 def warn_no_fork(reason: str) -> None:
-    """Log once per reason that this process cannot be forked."""
+    """Log a warning that this process cannot be forked, once per reason."""
     _log.warning(
         "cannot fork (%s): failed attempts are undone by simulating from the reset again, which is slower", reason
     )
@@ -132,7 +141,11 @@ class _EpisodeFinished(Exception):  # noqa: N818
 
 
 class ForkedDecisions:
-    """Decisions that undo failures by forking; child processes send back the episode's result."""
+    """Decisions that undo motions by forking: each candidate runs in a child process.
+
+    Args:
+        result: result of the episode, which the child processes send back.
+    """
 
     def __init__(self, result: EpisodeResult) -> None:
         self._result = result
@@ -140,7 +153,10 @@ class ForkedDecisions:
         self._children: list[ForkedProcess] = []
 
     def run(self, attempt: Callable[[], None]) -> bool:
-        """Run an attempt from its reset, with backtracking; return whether it succeeded with any candidates."""
+        """Run an attempt from its reset with backtracking; return whether it succeeded.
+
+        ``attempt`` resets the environment, runs the policy and writes the episode.
+        """
         succeeded = True
         try:
             attempt()
@@ -162,7 +178,11 @@ class ForkedDecisions:
     def choose(
         self, candidates: Iterable[T], run_candidate: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE
     ) -> T:
-        """Choose a candidate, see `Decisions.choose`; return in the child process that continues the episode."""
+        """Choose a candidate as described in `Decisions.choose`.
+
+        The method returns in the child process that continues the episode. In the parent process it raises an internal
+        exception when the episode has succeeded, and CandidatesExhaustedError when it has failed.
+        """
         order = order_candidates(enumerate(candidates), limits, self._result)
         children: dict[int, ForkedProcess] = {}
         outcome: float | PlanningError | None = None
@@ -187,9 +207,9 @@ class ForkedDecisions:
     def _run_in_child(
         self, run_candidate: Callable[[T], float], candidate: T
     ) -> tuple[ForkedProcess | None, float | PlanningError]:
-        """Play a candidate in a child process; return the child and its score or error.
+        """Run a candidate in a child process; return the child, and the candidate's score or error.
 
-        The child returns once it has to continue the episode.
+        In the child process the method returns (None, 0.0), as soon as the child has to continue the episode.
         """
         for last in (False, True):
             child = self._fork()
@@ -209,7 +229,7 @@ class ForkedDecisions:
         return child, outcome
 
     def _fork(self) -> ForkedProcess | None:
-        """Return a new child process; None in the child."""
+        """Fork this process; return the child process in the parent, and None in the child."""
         parent = os.getpid()
         # an interrupt between fork and set-up would leave a child unknown to the parent, or one that acts as the root
         before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
@@ -228,7 +248,14 @@ class ForkedDecisions:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def _continue_as(self, child: ForkedProcess) -> bool:
-        """Let a child continue the episode; return True if the episode failed, False after a crash."""
+        """Let a child continue the episode.
+
+        Returns:
+            True if the episode failed; False if the child crashed.
+
+        Raises:
+            _EpisodeFinished: the episode succeeded.
+        """
         try:
             child.send(self._result)
             succeeded = self._receive(child, EPISODE_TIMEOUT)

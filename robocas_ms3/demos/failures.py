@@ -24,13 +24,16 @@ WITH_NOISE = "_with_noise"  # suffix of the reasons of attempts that failed only
 
 @dataclass(frozen=True)
 class FailedAttempt:
-    """A failed attempt at an episode, or a skipped seed: a line of ``failures.jsonl``.
+    """Line of ``failures.jsonl``: a failed attempt, or the mark of a skipped seed.
+
+    docs/policies.md lists all stages and reasons.
 
     Attributes:
+        seed: seed of the episode.
         attempt: number of the attempt, from 0; -1 marks a skipped seed.
-        stage: stage of the policy that failed.
-        reason: a short fixed text, which reports count.
-        seconds: wall-clock time of the attempt; 0 if the process was killed before the line was written.
+        stage: motion, check or process that failed, e.g. ``grasp_sampling``.
+        reason: reason of the failure, e.g. ``unreachable``; a fixed text, which reports count.
+        seconds: wall-clock time of the attempt, s; 0 if the process was killed before the line was written.
     """
 
     seed: Annotated[int, Field(ge=0, le=MAX_SEED)]
@@ -47,15 +50,17 @@ class FailedAttempt:
 
 @dataclass
 class EpisodeResult:
-    """Result of a seed; forked processes send theirs to the parent process.
+    """Result of a seed: a recorded episode, or a skipped seed.
 
     Attributes:
+        seed: seed of the episode.
+        success: whether an episode was recorded.
         steps: length of the episode in control steps.
-        attempts: number of attempts, the successful one included.
-        seconds: CPU seconds by part.
-        failures: all failed attempts.
+        attempts: number of attempts, with the successful attempt.
+        seconds: CPU seconds by phase.
+        failures: failed attempts, in order.
         max_attempts: number of failed attempts after which the seed is skipped.
-        attempt_start: start of the current attempt, ``time.perf_counter()`` in s.
+        attempt_start: value of ``time.perf_counter()`` at the start of the present attempt, s.
     """
 
     seed: int
@@ -69,36 +74,38 @@ class EpisodeResult:
 
     @property
     def noise_failures(self) -> int:
-        """Number of attempts that failed only with noise."""
+        """Number of attempts that failed only in an open-loop check with noise."""
         return sum(failure.reason.endswith(WITH_NOISE) for failure in self.failures)
 
     @property
     def has_no_attempts_left(self) -> bool:
+        """Whether the maximum number of attempts has failed."""
         return len(self.failures) >= self.max_attempts
 
     def add_failure(self, error: PlanningError) -> None:
-        """Add a failed attempt that ended now, and start the clock of the next one."""
+        """Add the present attempt to the failures, and start the clock of the next attempt."""
         now = time.perf_counter()
         seconds = round(now - self.attempt_start, 3)
         self.failures.append(FailedAttempt(self.seed, len(self.failures), error.stage, error.reason, seconds))
         self.attempt_start = now
 
     def copy_from(self, other: EpisodeResult) -> None:
-        """Take over all values of another result."""
+        """Replace all values by those of another result, e.g. of a forked process."""
         vars(self.seconds).update(vars(other.seconds))  # in place, since the executor adds to this object
         vars(self).update({key: value for key, value in vars(other).items() if key != "seconds"})
 
 
 @dataclass(frozen=True)
 class Intervention:
-    """Initial state of an expert intervention: the state in which a learned policy left a scene.
+    """Initial state of an expert intervention: the state in which a learned policy left the scene.
 
     Attributes:
-        policy: name of the policy that acted first.
-        policy_steps: number of policy steps before the intervention.
+        seed: seed of the scene.
+        policy: name of the learned policy.
+        policy_steps: number of steps of the learned policy before the intervention.
         state: argument of ``set_state_dict``, each array (1, D) float32 or bool; without controller targets.
         gripper: last gripper command, -1 closed or 1 open.
-        skip_reason: why the seed is skipped, a short fixed text; empty if the scripted policy can continue.
+        skip_reason: reason to skip the seed, e.g. ``succeeded``; empty if the scripted policy can continue.
     """
 
     seed: int
@@ -112,11 +119,12 @@ class Intervention:
 def restore_failed_attempts(
     seed: int, recorded: Iterable[str], logged: Mapping[int, FailedAttempt]
 ) -> list[FailedAttempt]:
-    """Return the failed attempts of a recorded seed.
+    """Return the failed attempts of a seed from its recording, with the times from ``failures.jsonl``.
 
     Args:
-        recorded: ``stage: reason`` of each attempt, from the recording.
-        logged: lines of ``failures.jsonl`` by attempt; they add the seconds.
+        seed: seed of the recorded episode.
+        recorded: text ``stage: reason`` of each failed attempt, from the recording.
+        logged: lines of ``failures.jsonl`` by number of the attempt; lines may be missing after a kill.
     """
     failures = []
     for attempt, text in enumerate(recorded):
@@ -128,5 +136,5 @@ def restore_failed_attempts(
 
 
 def count_by_reason(failures: Iterable[FailedAttempt]) -> dict[str, int]:
-    """Return ``{"stage: reason": count}``, most frequent first."""
+    """Count failed attempts by stage and reason: ``{"stage: reason": count}``, the most frequent first."""
     return dict(Counter(f"{f.stage}: {f.reason}" for f in failures if not f.skipped).most_common())

@@ -19,7 +19,7 @@ from robocas_ms3.core.errors import DatasetError, RobocasError
 from robocas_ms3.core.files import flush_to_disk, make_folder, write_json
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
-from robocas_ms3.core.text import one_line
+from robocas_ms3.core.text import format_count, one_line
 from robocas_ms3.core.workers import Limits, Worker, WorkerPool, use_one_torch_thread
 from robocas_ms3.demos.failures import (
     FAILURES_FILE,
@@ -40,7 +40,7 @@ WEIGHTS = "after_policy_weights"
 
 
 def _upgrade_run(record: dict[str, Any]) -> dict[str, Any]:
-    """Return a ``run.json`` with defaults for keys that older versions of the package did not write."""
+    """Return the content of a ``run.json`` with defaults for keys that older versions did not write."""
     settings = record["settings"]
     if isinstance(settings, dict):
         settings = {**json.loads(json.dumps(asdict(EpisodeSettings("pick")))), **settings}
@@ -52,13 +52,15 @@ OUTPUT = FolderKind("robocas generate", (RUN,), "settings", upgrade=_upgrade_run
 
 @dataclass(frozen=True)
 class Summary:
-    """Result of a run.
+    """Result of `generate`: content of ``summary.json``.
 
     Attributes:
-        seeds: number of seeds tried.
-        mean_seconds: CPU seconds per seed tried, by part: reset, planning, simulation, check (open loop).
-        mean_steps: control steps per episode.
-        failures: ``{"stage: reason": count}`` of all failed attempts.
+        trajectory: path of ``trajectory.h5``.
+        episodes: number of recorded episodes.
+        seeds: number of seeds tried, recorded or skipped.
+        mean_seconds: mean CPU seconds per seed by phase: reset, planning, simulation, check (open-loop checks).
+        mean_steps: mean number of control steps per episode.
+        failures: number of failed attempts by stage and reason: ``{"stage: reason": count}``.
         skipped: skipped seeds.
     """
 
@@ -92,11 +94,12 @@ def generate(
 
     Args:
         settings: options of the run.
-        on_start: called with the number of existing episodes, after all checks.
-        on_result: called for each new seed, in order.
-        make_roll_in: makes the worker that runs ``after_policy`` in the scene of a seed. It runs in separate processes,
-            since a process that renders or uses CUDA cannot be forked.
-        weights: hash of the weights of that policy, if it has weights; a run is resumed with the same weights only.
+        on_start: called after all checks, with the number of episodes that exist already.
+        on_result: called with the result of each new seed, in order.
+        make_roll_in: creates the worker that runs ``after_policy`` in the scene of a seed. It runs in separate
+            processes, since a process that renders or uses CUDA cannot be forked.
+        weights: hash of the weights of ``after_policy``, or an empty string; a run can only be resumed with the same
+            weights.
 
     Raises:
         OutputExistsError: the folder was written with other settings or versions, or by another command.
@@ -129,7 +132,8 @@ def generate(
                         raise RobocasError(
                             "too many seeds are skipped",
                             where=output.path,
-                            found=f"{len(results) - successes} of {len(results)}",
+                            expected=f"at most {max(20, 3 * successes)} for {format_count(successes, 'recorded episode')}",
+                            found=f"{len(results) - successes} skipped seeds",
                             fix=f"See {FAILURES_FILE} for the reasons; fewer objects (--set objects.count=N) may help.",
                         )
         except BaseException:
@@ -154,7 +158,14 @@ def generate_seeds(
     folder: Path,
     make_roll_in: Callable[[], Worker[int, Intervention]] | None = None,
 ) -> Generator[EpisodeResult, None, None]:
-    """Yield the results of endless seeds in order; write each episode to a file in ``folder``."""
+    """Generate episodes in worker processes; yield one result per seed, in order.
+
+    Args:
+        settings: options of the run.
+        seeds: infinite iterator over seeds.
+        folder: folder for one trajectory file per episode.
+        make_roll_in: creates the worker that runs ``after_policy`` in the scene of a seed.
+    """
     limits = Limits(settings.episode_seconds, settings.memory_gb)
     with ExitStack() as stack:
         tasks: Iterator[int | Intervention] = seeds
@@ -200,6 +211,7 @@ def _crashed_episode(task: int | Intervention, reason: str) -> EpisodeResult:
 
 
 def seed_file_stem(seed: int) -> str:
+    """Return the file name, without suffix, of the trajectory file of a seed."""
     return f"seed_{seed:09d}"
 
 
@@ -212,9 +224,9 @@ class _Run:
     """Files of a run in its output folder.
 
     Attributes:
-        shards: folder with one file per episode that is not merged yet.
+        episodes_folder: folder with one trajectory file per episode that is not merged yet.
         failures: ``failures.jsonl``.
-        earlier: results of earlier calls by seed: merged episodes, episodes in ``shards``, and skipped seeds.
+        earlier: results of earlier calls by seed: recorded episodes, merged or not, and skipped seeds.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -240,7 +252,7 @@ class _Run:
         self._rewrite_failures([self.earlier[seed] for seed in sorted(self.earlier)])
 
     def _rewrite_failures(self, results: list[EpisodeResult]) -> None:
-        """Rewrite ``failures.jsonl`` if its lines differ from these results, e.g. after a kill."""
+        """Rewrite ``failures.jsonl`` if its lines differ from the failures of ``results``, e.g. after a kill."""
         lines = [line for result in results for line in _failure_lines(result)]
         if [line.record for line in self.failures.read_lines()] != lines:
             self.failures.rewrite(lines)

@@ -35,13 +35,16 @@ from robocas_ms3.tasks.base import RoboCASEnv
 
 
 class EpisodeGenerator:
-    """Generator of the episodes of one task in one process, with its environment, planner and policy.
+    """Generator of the episodes of one task in one process.
+
+    The generator owns an environment, a motion planner, the scripted policy and the environments of the open-loop
+    checks.
 
     Limit torch to one thread (``torch.set_num_threads``) if several processes generate at once.
 
     Args:
         settings: settings of all episodes.
-        fork: whether to undo failed attempts by forking if that is safe; the episodes do not depend on it.
+        fork: whether to undo failed attempts by forking, if that is safe; the episodes do not depend on it.
     """
 
     def __init__(self, settings: EpisodeSettings, *, fork: bool = True) -> None:
@@ -82,10 +85,15 @@ class EpisodeGenerator:
             self._fork = False
 
     def generate(self, seed: int, folder: Path, name: str, intervention: Intervention | None = None) -> EpisodeResult:
-        """Generate the episode of a seed; write ``folder/name.h5`` and ``.json`` if an attempt succeeds.
+        """Generate the episode of a seed, and write it if an attempt succeeds.
 
-        The episode depends only on the seed, the settings and the package versions. With an intervention, it starts in
-        the state in which another policy left the scene.
+        The episode depends only on the seed, the intervention, the settings and the package versions.
+
+        Args:
+            seed: seed of the episode.
+            folder: folder of the files ``name.h5`` and ``name.json``.
+            name: name of the files without suffix.
+            intervention: state in which another policy left the scene; the episode starts in this state.
         """
         recorder = EpisodeRecorder(self.env, folder, name)
         executor = MotionExecutor(recorder, seed)
@@ -121,7 +129,7 @@ class _Attempts:
     intervention: Intervention | None
 
     def run_from_resets(self, decisions: ForkedDecisions | ResimulatedDecisions) -> None:
-        """Run attempts, each from the reset, with backtracking over the decisions of the policy."""
+        """Run attempts with backtracking, each from the reset, until one succeeds or none is left."""
         while not self.result.has_no_attempts_left:
             number = len(self.result.failures)
 
@@ -134,7 +142,7 @@ class _Attempts:
                 return
 
     def run_in_one_motion(self) -> None:
-        """Run attempts as one motion; start from the reset again if recovery is impossible."""
+        """Run attempts in one continuous recording; start from the reset again if a recovery is impossible."""
         executor, result = self.executor, self.result
         decisions = IrreversibleDecisions(lambda: len(executor.actions))
         recoveries: list[dict[str, Any]] = []
@@ -212,7 +220,7 @@ class _Attempts:
         target = env.target_asset().asset
         if intervention is not None:
             executor.segments[0].first = 0  # the first sub-goal includes the retreat before it
-        bounds = [part.first for part in executor.segments] + [len(executor.actions)]
+        bounds = [segment.first for segment in executor.segments] + [len(executor.actions)]
         instruction, layout = env.instruction(), env.layout()
         assert layout is not None  # set by the reset
         return {
@@ -223,12 +231,12 @@ class _Attempts:
             "target": {"slot": int(env.target_slot[0]), "asset_id": target.id, "name": target.name},
             "objects": [asset.asset.id for asset in env.object_assets[0]],
             "subgoals": [
-                SubGoal.from_range(part.goal_type, part.goal_description, part.first, end - 1).model_dump()
-                for part, end in zip(executor.segments, bounds[1:], strict=True)
+                SubGoal.from_range(segment.goal_type, segment.goal_description, segment.first, end - 1).model_dump()
+                for segment, end in zip(executor.segments, bounds[1:], strict=True)
             ],
             "check_rate": settings.check_rate if checked else None,
             "facts": {"disturbed": int(executor.info["disturbed"][0]), **executor.facts},
-            "seconds": {part: round(value, 3) for part, value in asdict(executor.seconds).items()},
+            "seconds": {phase: round(value, 3) for phase, value in asdict(executor.seconds).items()},
             "attempts": len(self.result.failures) + 1,
             "failed_attempts": [f"{failure.stage}: {failure.reason}" for failure in self.result.failures],
             "check_trials": None if not checked else settings.check_trials if self._check_with_noise else 0,

@@ -24,8 +24,15 @@ LIFT = 0.10  # m that a held target is lifted before it is carried, as after a g
 def intervene(arm: Arm, policy: Callable[[Arm], None]) -> None:
     """Complete the task with a scripted policy from the state in which another policy left the scene.
 
-    On even attempts a held target is carried to the basket. On odd attempts it is released first, since the grasp may
-    be unusable.
+    In attempts with an even number, a held target is carried to the basket. In attempts with an odd number, the target
+    is released first, since the grasp may be unusable.
+
+    Args:
+        arm: context of the attempt.
+        policy: scripted policy of the task.
+
+    Raises:
+        PlanningError: the attempt fails.
     """
     slot = arm.target
     arm.executor.move_gripper(arm.executor.gripper, arm.qpos, seconds=STOP_SECONDS)
@@ -50,7 +57,7 @@ def _carry_held_target(arm: Arm, slot: int) -> None:
 
 
 def _retreat(arm: Arm) -> None:
-    """Open the gripper and move away from all contacts: up, or back after a front approach."""
+    """Open the gripper and move until the arm touches nothing: up, or back after an approach from the front."""
     if arm.executor.gripper != OPEN:
         arm.open_gripper()
     if arm.approach == "top":

@@ -1,7 +1,8 @@
 """Replay 7-D dataset actions open loop, and check demonstrations while they are recorded.
 
-`OpenLoopChecks` replays the actions recorded so far in environments of their own: without noise in the first one, with
-noise in the others. The check runs after each part of the episode, so only a part that fails is done again.
+`OpenLoopChecks` replays the recorded actions in separate environments: without noise in the first environment, with
+noise in the others. The check runs several times per episode, and only the actions since the last check are repeated if
+a check fails.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from robocas_ms3.tasks.base import RoboCASEnv
 
 CONTROL_MODE = "pd_ee_delta_pose"
 SETTLE_SECONDS = 1.0  # s to hold still after the last action, until released objects are at rest
-# m between the target and its recorded position at the end of a part; deviations of other objects are detected later
+# m between the target and its recorded position at a check; deviations of other objects are detected later
 MAX_TARGET_OFFSET = 0.02
 
 States = dict[str, dict[str, NDArray[np.float32]]]
@@ -36,9 +37,9 @@ class OpenLoopResult:
     """Result of an open-loop replay of an episode.
 
     Attributes:
-        success: whether the task succeeded at any step or within ``SETTLE_SECONDS`` after the last one.
-        tcp_in_base: (T, 3) TCP positions in the arm's base frame, m.
-        clipped: number of actions with a translation component, or the norm of the rotation, outside [-1, 1].
+        success: whether the task succeeded at any step or within ``SETTLE_SECONDS`` after the last step.
+        tcp_in_base: (S + 1, 3) TCP positions in the arm's base frame after the reset and after each of S actions, m.
+        clipped: number of actions that exceed the range of one controller step and were clipped.
     """
 
     success: bool
@@ -47,7 +48,7 @@ class OpenLoopResult:
 
 
 class OpenLoopEnv:
-    """An environment that is stepped with 7-D dataset actions.
+    """Environment that executes 7-D dataset actions.
 
     Args:
         env: the recorded environment.
@@ -55,7 +56,7 @@ class OpenLoopEnv:
 
     Attributes:
         success: whether the task has succeeded at any step since the reset.
-        clipped: number of actions since the reset that exceed the range of one step.
+        clipped: number of actions since the reset that exceeded the range of one controller step and were clipped.
 
     Raises:
         DatasetError: invalid rate, or the environment is not installed.
@@ -63,10 +64,8 @@ class OpenLoopEnv:
 
     def __init__(self, env: RecordedEnv, rate_hz: float) -> None:
         if rate_hz < 1 or rate_hz != int(rate_hz) or 100 % int(rate_hz):
-            expected = "a whole number that divides 100"
-            raise DatasetError(
-                "actions cannot be replayed at this rate", where="rate_hz", expected=expected, found=rate_hz
-            )
+            expected = "a divisor of 100 Hz, the rate of physics"
+            raise DatasetError("unsupported rate of actions", where="rate_hz", expected=expected, found=rate_hz)
         self._env = env.make(
             obs_mode="none",
             reward_mode="none",
@@ -95,12 +94,12 @@ class OpenLoopEnv:
         return self.env.agent.tcp_in_arm_base.p[0].numpy().copy()
 
     def start_at(self, state: dict[str, Any], gripper: float) -> None:
-        """Set the state (argument of ``set_state_dict``) and the last gripper command, -1 or 1."""
+        """Set the state (argument of ``set_state_dict``) and the last gripper command, -1 closed or 1 open."""
         self.env.set_state_dict(state)
         self._gripper = gripper
 
     def step(self, action: NDArray[np.floating]) -> None:
-        """Apply one action (7,), see `motion.to_dataset_actions`."""
+        """Execute one dataset action (7,), a row of `motion.to_dataset_actions`."""
         action = np.asarray(action, dtype=np.float64)
         motion = to_ee_delta_action(action[:3], action[3:6], euler="xyz")
         self.clipped += bool(np.abs(motion[:3]).max() > 1 or np.linalg.norm(motion[3:]) > 1)
@@ -120,7 +119,10 @@ class OpenLoopEnv:
         self.success |= bool(info["success"][0])
 
     def replay(self, dataset_actions: NDArray[np.floating]) -> OpenLoopResult:
-        """Replay actions (S, 7) from the reset: the rows of `motion.to_dataset_actions` without the last one."""
+        """Replay S dataset actions (S, 7) from the reset on.
+
+        The actions are the rows of `motion.to_dataset_actions` without the last row.
+        """
         positions = [self.tcp_in_base()]
         for action in np.asarray(dataset_actions, dtype=np.float64).reshape(-1, 7):
             self.step(action)
@@ -133,14 +135,29 @@ class OpenLoopEnv:
 
 
 def draw_noise(rng: np.random.Generator, count: int, std_mm: float, std_deg: float) -> Array:
-    """Draw normal actuation noise (count, 7) for dataset actions, m and rad; gripper 0."""
+    """Draw normal actuation noise (count, 7) for dataset actions.
+
+    Args:
+        rng: random generator.
+        count: number of actions.
+        std_mm: standard deviation of each translation component, mm.
+        std_deg: standard deviation of each rotation component, deg.
+
+    Returns:
+        Translation in m, rotation in rad, and 0 for the gripper.
+    """
     drawn = np.zeros((count, 7))
     drawn[:, :6] = rng.normal(size=(count, 6)) * np.repeat([std_mm / 1000, np.deg2rad(std_deg)], 3)
     return drawn
 
 
 class OpenLoopChecks:
-    """Environments that replay a recording in parts, the first without noise, the others with noise."""
+    """Environments that replay a recording while it grows, the first without noise, the others with noise.
+
+    Args:
+        envs: one environment without noise, followed by one environment per noise check.
+        settings: settings of the episodes.
+    """
 
     def __init__(self, envs: Sequence[OpenLoopEnv], settings: EpisodeSettings) -> None:
         self._envs, self._settings = envs, settings
@@ -161,14 +178,16 @@ class OpenLoopChecks:
         """Replay the actions recorded since the last call and compare the result with the recording.
 
         Args:
-            states: ManiSkill states after the reset and after each control step, see ``EpisodeRecorder.states``.
-            gripper: (S,) gripper commands.
-            finished: whether the recording has ended; then the last action may be shorter, and the task must succeed.
-            noise: whether to replay with noise too; the environments with noise are not stepped otherwise.
+            states: ``EpisodeRecorder.states``: states after the reset and after each control step.
+            gripper: (S,) gripper commands of all control steps since the reset, -1 closed or 1 open.
+            finished: whether the recording is complete; then the last action may be shorter, and the task must succeed.
+            noise: whether to replay with noise too.
 
         Raises:
-            UnrecoverableError: reason ``clipped``, ``target_displaced`` (more than ``MAX_TARGET_OFFSET`` from its
-                recorded position) or ``no_success``; with the suffix ``WITH_NOISE`` if only replays with noise fail.
+            UnrecoverableError: one of these reasons, with the suffix ``WITH_NOISE`` if only a replay with noise fails.
+                ``clipped``: an action exceeds the range of one controller step.
+                ``target_displaced``: the target is more than ``MAX_TARGET_OFFSET`` from its recorded position.
+                ``no_success``: the task does not succeed at the end.
         """
         samples = sample_states(len(gripper), self._stride)
         if not finished:
@@ -185,14 +204,14 @@ class OpenLoopChecks:
         self._replayed += len(actions)
 
     def _with_noise(self, actions: NDArray[np.float64], number: int) -> NDArray[np.float64]:
-        # drawn from the first action on, so that the noise of an action does not depend on the parts
+        # drawn from the first action on, so that the noise of an action does not depend on the number of checks
         rng = np.random.default_rng([self._seed, number])
         std = self._settings.check_noise_mm, self._settings.check_noise_deg
         return actions + draw_noise(rng, self._replayed + len(actions), *std)[self._replayed :]
 
 
 def _find_deviation(env: OpenLoopEnv, states: States, sample: int, finished: bool) -> str:
-    """Return the reason why a replay fails; an empty string if it does not."""
+    """Return the reason why the replay in ``env`` fails, or an empty string."""
     if env.clipped:
         return "clipped"
     if finished:

@@ -23,7 +23,7 @@ def _task_names() -> type:
 
 @dataclass(frozen=True)
 class EpisodeSettings:
-    """Settings of the episodes; the same for all seeds of a run."""
+    """Settings of the episodes of a run, equal for all seeds."""
 
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(constructor_factory=_task_names)]
     """Task to record."""
@@ -90,19 +90,19 @@ class EpisodeSettings:
         check_number("--control-freq", control, 1, SIM_FREQ)
         if SIM_FREQ % control:
             raise RobocasError(
-                "the control rate must divide the rate of physics",
+                "invalid control rate",
                 where="--control-freq",
-                expected=f"one of {', '.join(str(f) for f in range(1, SIM_FREQ + 1) if SIM_FREQ % f == 0)}",
-                found=control,
+                expected=f"one of {', '.join(str(f) for f in range(1, SIM_FREQ + 1) if SIM_FREQ % f == 0)} Hz",
+                found=f"{control} Hz",
             )
         for name in ("check_trials", "check_failures", "check_noise_mm", "check_noise_deg"):
             check_number(f"--{name.replace('_', '-')}", getattr(self, name), 0)
         check_number("--check-rate", replay, 0, control)
         if replay and (control % replay or SIM_FREQ % replay):
             raise RobocasError(
-                "the rate of the open-loop check must divide the control rate and the rate of physics",
+                "invalid rate of the open-loop check",
                 where="--check-rate",
-                expected=f"a divisor of {control}, or 0 for no check",
+                expected=f"a divisor of {control} (control rate) and {SIM_FREQ} (rate of physics), or 0 for no check",
                 found=replay,
             )
         check_number("--after-steps", self.after_steps[0], 1)
@@ -138,8 +138,8 @@ class GenerateSettings:
     memory_gb: float = 8.0
     """Memory limit per process in GB."""
     check_noise: Annotated[tuple[float, float] | None, _NO_HINT] = None
-    """Noise of the additional open-loop checks: standard deviations in mm and degrees of each action component.
-    Default: 0.5 0.2."""
+    """Noise of the noise checks: standard deviation of each component of an action, in mm (translation) and degrees
+    (rotation). Default: 0.5 0.2."""
     fork: bool = True
     """Undo a failed attempt with a forked copy of the process.
     --no-fork records the same episodes by simulating them again, which is slower; this is automatic where a fork is
@@ -149,7 +149,7 @@ class GenerateSettings:
     Default: resume a run with the same settings, or add episodes to a finished run."""
 
     def resolve(self) -> GenerateSettings:
-        """Return settings with output folder and noise filled in, and YAML files and ``set`` resolved.
+        """Return settings with all defaults and ``set`` applied, and with the content of a YAML configuration.
 
         Raises:
             ConfigError: the configuration is invalid.
@@ -167,6 +167,12 @@ class GenerateSettings:
         return replace(self, episode=episode, out=out, set=(), check_noise=None)
 
     def check(self) -> None:
+        """Check the settings before anything is written.
+
+        Raises:
+            RobocasError: a number is out of range, the task cannot run the configuration, or a planner, robot or pack
+                is unknown.
+        """
         check_number("--episodes", self.episodes, 1)
         check_number("--seed", self.seed, 0, MAX_SEED)
         check_number("--jobs", self.jobs, 0)
@@ -205,4 +211,5 @@ class ReplaySettings:
 
     @property
     def file(self) -> Path:
+        """The .h5 file to replay."""
         return self.trajectory / "trajectory.h5" if self.trajectory.is_dir() else self.trajectory

@@ -49,10 +49,13 @@ class RecordedEpisode:
     """A recorded episode of S steps.
 
     Attributes:
-        where: name of the episode for messages.
-        actions: (S, A).
+        where: file and name of the episode for messages.
+        seed: seed of ``env.reset``.
+        options: options of ``env.reset``.
+        control_mode: control mode of the actions.
+        actions: (S, A) actions.
         states: S + 1 states, each an argument of ``set_state_dict``.
-        is_intervention: whether the episode starts at its first state instead of the reset.
+        is_intervention: whether the episode starts in its first recorded state instead of the state after the reset.
     """
 
     where: str
@@ -65,6 +68,7 @@ class RecordedEpisode:
 
     @classmethod
     def read(cls, trajectory: Path, episode: dict[str, Any]) -> RecordedEpisode:
+        """Read the episode with a JSON entry ``episode`` from a trajectory file."""
         where = f"{trajectory}, traj_{episode['episode_id']}"
         reset = read_reset(episode, where)
         with open_trajectory(trajectory) as file:
@@ -72,6 +76,7 @@ class RecordedEpisode:
         return cls(where, *reset, actions, dict_to_list_of_dicts(states), is_intervention(episode))
 
     def check_compatible(self, env: RoboCASEnv) -> None:
+        """Raise ``DatasetError`` if the actions or states have other sizes than those of the environment."""
         converted = env.control_mode != self.control_mode
         width = _JOINT_TARGETS if converted else cast(Any, env.single_action_space).shape[0]
         if self.actions.shape[1] != width:
@@ -98,10 +103,11 @@ class ReplayResult:
     """Result of the replay of one episode.
 
     Attributes:
-        episode_id: number of the episode in the source file.
+        episode_id: number of the episode in the replayed file.
+        seed: seed of the episode.
         success: whether the task is successful at the last step.
-        state_error: greatest absolute difference of any number from the recorded final state, see `state_distance`;
-            None if the actions were converted.
+        state_error: greatest absolute difference between a number of the final state and of the recorded final state;
+            None if the actions were converted to another control mode.
     """
 
     episode_id: int
@@ -111,7 +117,7 @@ class ReplayResult:
 
 
 def replay(settings: ReplaySettings) -> Iterator[ReplayResult]:
-    """Check the settings, then replay episodes lazily, one per result of the iterator.
+    """Check the settings, and return an iterator that replays one episode per result.
 
     Raises:
         DatasetError: the file cannot be read, or the actions cannot be converted to the control mode.
@@ -167,22 +173,22 @@ def _replay_all(
     settings: ReplaySettings, recorded: RecordedEnv, kwargs: dict[str, Any], episodes: list[dict[str, Any]]
 ) -> Iterator[ReplayResult]:
     save = settings.save
-    shards: list[Path] = []
+    sources: list[Path] = []
     place = {} if save is None else {"dir": make_folder(save.parent), "prefix": f".{save.stem}.", "suffix": ".tmp"}
-    with closing(recorded.make(**kwargs)) as env, tempfile.TemporaryDirectory(**place) as parts:
+    with closing(recorded.make(**kwargs)) as env, tempfile.TemporaryDirectory(**place) as folder:
         for episode in episodes:
             if save is None:
                 yield _replay_one(env, settings, episode)
                 continue
-            shard = Path(parts, f"episode_{episode['episode_id']}.h5")
-            recorder = EpisodeRecorder(env, shard.parent, shard.stem)
+            source = Path(folder, f"episode_{episode['episode_id']}.h5")
+            recorder = EpisodeRecorder(env, source.parent, source.stem)
             result = _replay_one(recorder, settings, episode)
             if result.success or settings.allow_failure:
                 recorder.finish(episode.get("robocas", {}))
-                shards.append(shard)
+                sources.append(source)
             yield result
-        if save is not None and shards:
-            merge(shards, save)
+        if save is not None and sources:
+            merge(sources, save)
 
 
 def _replay_one(env: gym.Env, settings: ReplaySettings, episode: dict[str, Any]) -> ReplayResult:
@@ -205,10 +211,10 @@ def _replay_one(env: gym.Env, settings: ReplaySettings, episode: dict[str, Any])
 
 
 def _convert_action(action: np.ndarray, env: RoboCASEnv) -> np.ndarray:
-    """Convert ``pd_joint_pos`` targets (8,) to an action in the control mode of the environment.
+    """Convert an action (8,) of ``pd_joint_pos`` to an action in the control mode of the environment.
 
-    The action is clipped to its bounds. ManiSkill's converter is not used: it expects end-effector deltas in the root
-    frame and measures them in the world frame.
+    The result is clipped to the bounds of its control mode. ManiSkill's converter is not used, since it expects
+    end-effector deltas in the root frame and measures them in the world frame.
     """
     arm, gripper, robot = action[:7].astype(float), action[7:], env.robot_spec.description
     if env.control_mode == "pd_joint_pos":
@@ -229,7 +235,10 @@ def _convert_action(action: np.ndarray, env: RoboCASEnv) -> np.ndarray:
 
 
 def state_distance(state: dict[str, Any], recorded: dict[str, Any]) -> float:
-    """Return the greatest absolute difference of two states (m, rad, ...); NaN if one has NaN."""
+    """Return the greatest absolute difference between a number of two states of all bodies; NaN if one has NaN.
+
+    ``state`` and ``recorded`` are states in ManiSkill's format; their numbers are in m, rad, m/s and rad/s.
+    """
     largest = np.float64(0.0)
     for kind in ("actors", "articulations"):
         for name, value in recorded[kind].items():

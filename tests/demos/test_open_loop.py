@@ -99,5 +99,5 @@ def test_clipped_actions_are_counted(recorded):
 
 @pytest.mark.parametrize("rate", [0, 2.5, 7])
 def test_rate_that_does_not_divide_the_rate_of_physics_is_an_error(rate):
-    with pytest.raises(DatasetError, match="cannot be replayed at this rate"):
+    with pytest.raises(DatasetError, match="unsupported rate of actions"):
         OpenLoopEnv({"env_id": "robocas_ms3:RoboCASPick-v1", "env_kwargs": {}}, rate)

@@ -39,7 +39,7 @@ def recording(tmp_path):
         ("generate --seed -5", "--seed: number out of range (expected 0 to 4294967295, found -5)"),
         (
             "generate --control-freq 7",
-            "--control-freq: the control rate must divide the rate of physics",
+            "--control-freq: invalid control rate (expected one of 1, 2, 4, 5, 10, 20, 25, 50, 100 Hz",
         ),
         ("generate -n 0", "--episodes: "),
         ("generate --jobs -1", "--jobs: "),

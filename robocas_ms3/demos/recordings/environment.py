@@ -32,7 +32,7 @@ _Settings = dict[str, Any]
 
 
 class _EnvKwargs(StrictModel):
-    """Arguments of ``gym.make`` that a file may set: those of the scene and the control mode."""
+    """Arguments of ``gym.make`` that a file may set: arguments of the scene, and the control mode."""
 
     model_config = ConfigDict(strict=True)
 
@@ -63,12 +63,12 @@ class _EnvInfo(BaseModel):
 
 @dataclass(frozen=True)
 class RecordedEnv:
-    """Specification of the environment of a recording.
+    """Specification of the environment in which an episode was recorded.
 
     Attributes:
-        env_id: gymnasium id of a registered task.
-        control_mode: control mode of the actions, if the file has it.
-        kwargs: arguments of ``gym.make`` for the scene; layouts follow from the seed.
+        env_id: gymnasium id of the task, e.g. ``RoboCASPick-v1``.
+        control_mode: control mode of the recorded actions; None if the file does not name it.
+        kwargs: other arguments of ``gym.make``, which determine the scene; a layout follows from the seed.
     """
 
     env_id: str
@@ -76,13 +76,14 @@ class RecordedEnv:
     kwargs: dict[str, Any]
 
     def with_pack(self, pack: str | Path | None) -> RecordedEnv:
-        """Return a copy with another object pack, by name or folder; None keeps the pack."""
+        """Return a copy with another object pack, given by name or folder; None keeps the pack."""
         if pack is None:
             return self
         named = str(pack) if str(pack) in find_packs() else str(Path(pack).absolute())
         return replace(self, kwargs={**self.kwargs, "pack": named})
 
     def robot(self, where: object = "robot_uids") -> RobotSpec:
+        """Return the robot of the recording; raise ``DatasetError`` if it is not installed."""
         try:
             return find_robot(self.kwargs.get("robot_uids"), where=where)
         except ExtensionError as error:
@@ -90,7 +91,7 @@ class RecordedEnv:
             raise DatasetError(error.what, where=where, expected=error.expected, found=error.found, fix=fix) from error
 
     def cameras(self) -> tuple[CameraSpec, ...]:
-        """Return the cameras of task and robot; raise ``DatasetError`` if the task or robot is not installed."""
+        """Return the cameras of task and robot; raise ``DatasetError`` if one of them is not installed."""
         return load_config_for(self._task(), self.kwargs.get("config")).cameras_of(self.robot().description)
 
     def _task(self) -> TaskSpec:
@@ -98,11 +99,12 @@ class RecordedEnv:
         if self.env_id not in known:
             raise DatasetError("unknown task", where="env_id", expected=f"one of {sorted(known)}", found=self.env_id)
         if isinstance(config, str) and config not in bundled_configs():
-            raise DatasetError("unknown configuration", where="config", expected="a bundled one", found=config)
+            expected = "a bundled configuration (robocas list)"
+            raise DatasetError("unknown configuration", where="config", expected=expected, found=config)
         return known[self.env_id]
 
     def make(self, **kwargs: Any) -> Any:
-        """Create the environment with further arguments of ``gym.make``.
+        """Create the environment; ``kwargs`` are arguments of ``gym.make`` that add to or replace recorded ones.
 
         Raises:
             DatasetError: task, configuration, robot or pack is not installed.
@@ -121,9 +123,15 @@ class RecordedEnv:
 
 
 def read_recorded_env(info: Any, where: object, *, pack: str | Path | None = None) -> RecordedEnv:
-    """Read ``env_info`` of a file; ``pack`` replaces the recorded pack.
+    """Read the specification of the environment from the key ``env_info`` of a file.
 
-    ``env_info`` is ``{"env_id": ..., "env_kwargs": {...}}``.
+    Args:
+        info: value of the key, ``{"env_id": ..., "env_kwargs": {...}}``.
+        where: name of the file for error messages.
+        pack: object pack, by name or folder, that replaces the recorded pack.
+
+    Raises:
+        DatasetError: a value is invalid or not allowed.
     """
     if isinstance(info, Mapping) and isinstance(info.get("env_kwargs"), Mapping):
         kwargs = {name: value for name, value in info["env_kwargs"].items() if name not in _READER_KWARGS}
@@ -134,9 +142,7 @@ def read_recorded_env(info: Any, where: object, *, pack: str | Path | None = Non
         raise _to_dataset_error(error, where) from error
     env_id = found.env_id.removeprefix(_PREFIX)
     if not re.fullmatch(r"\w+-v\d+", env_id):
-        raise DatasetError(
-            "invalid environment id", where=f"{where}, env_id", expected="id of a task", found=found.env_id
-        )
+        raise DatasetError("invalid environment id", where=f"{where}, env_id", expected="NAME-vN", found=found.env_id)
     kwargs = found.env_kwargs.model_dump(exclude_unset=True, exclude={"control_mode"})
     for name in ("sim_config", "sensor_configs"):
         _check_settings(kwargs.get(name, {}), f"{where}, env_kwargs.{name}", _MAX_DEPTH)
@@ -144,6 +150,7 @@ def read_recorded_env(info: Any, where: object, *, pack: str | Path | None = Non
 
 
 def to_recorded_env_id(env_id: str) -> str:
+    """Return an id for recordings, with the prefix that makes gymnasium import this package."""
     return f"{_PREFIX}{env_id}"
 
 
@@ -167,7 +174,8 @@ def _check_settings(settings: Any, where: str, depth: int) -> None:
         for value in settings:
             _check_settings(value, where, 0)
     elif not _is_setting(settings):
-        raise DatasetError("invalid setting", where=where, expected="a number or a name", found=str(settings)[:80])
+        expected = "numbers and names, in lists or nested tables"
+        raise DatasetError("invalid setting", where=where, expected=expected, found=str(settings)[:80])
 
 
 def _is_setting(value: Any) -> bool:

@@ -30,10 +30,14 @@ _IMAGES = ("rgb", "depth", "seg")
 
 
 class EpisodeRecorder(gym.Wrapper):
-    """Recorder of a single episode of one env; writes it in ManiSkill's format when it is finished.
+    """Wrapper that records one episode in memory; `finish` writes it in ManiSkill's trajectory format.
 
-    The episode is in memory until then: steps are fast, and the recorder works after a fork of the process. The files
-    are ``NAME.h5`` and ``NAME.json`` in ``folder``.
+    Memory makes steps fast, and allows the process to be forked during an episode.
+
+    Args:
+        env: environment with ``num_envs`` = 1.
+        folder: folder of the files ``name.h5`` and ``name.json``.
+        name: name of the files without suffix.
     """
 
     def __init__(self, env: gym.Env, folder: Path, name: str) -> None:
@@ -53,7 +57,7 @@ class EpisodeRecorder(gym.Wrapper):
         return observation, info
 
     def start_at(self, state: dict[str, Any]) -> None:
-        """Start the recording again from a state (argument of ``set_state_dict``) of the current scene."""
+        """Set a state of the present scene (argument of ``set_state_dict``), and start the recording again there."""
         self._base_env.set_state_dict(state)
         self._steps = _Steps()
         self._store(self._base_env.get_obs())
@@ -73,11 +77,18 @@ class EpisodeRecorder(gym.Wrapper):
 
     @property
     def states(self) -> dict[str, dict[str, NDArray[np.float32]]]:
-        """States since the reset: ``{"actors": {name: (S + 1, 13)}, "articulations": {name: (S + 1, D)}}``."""
+        """States after the reset and after each of S control steps, in ManiSkill's format.
+
+        ``{"actors": {name: (S + 1, 13)}, "articulations": {name: (S + 1, D)}}``
+        """
         return self._base_env.bodies.to_state_dict(np.stack(self._steps.states))
 
     def finish(self, episode: dict[str, Any]) -> None:
-        """Write the episode with its ``robocas`` metadata; the environment stays open."""
+        """Write the recorded episode to its files.
+
+        Args:
+            episode: value of the key ``robocas`` of the episode's entry: instruction, sub-goals, counters, ...
+        """
         steps, env = self._steps, self._base_env
         terminated, truncated, success, fail = np.array(steps.flags, bool).reshape(-1, 4).T
 
@@ -133,7 +144,7 @@ class EpisodeRecorder(gym.Wrapper):
 
 @dataclass
 class _Steps:
-    """Data since the reset: S actions and flags, S + 1 states and observations."""
+    """Recorded data since the reset: S actions and flags, S + 1 states and observations."""
 
     actions: list[NDArray[np.float32]] = field(default_factory=list)
     flags: list[tuple[bool, bool, bool, bool]] = field(default_factory=list)

@@ -27,7 +27,15 @@ _JOINTS = RobotDescription.finger_slice.stop
 
 
 def sample_stride(control_freq: float, rate_hz: float) -> int:
-    """Return the number of control steps per dataset step; raise DatasetError if it is not a whole number."""
+    """Return the number of control steps per dataset step.
+
+    Args:
+        control_freq: control rate of the recording, Hz.
+        rate_hz: rate of the dataset, Hz.
+
+    Raises:
+        DatasetError: the number is not a whole number.
+    """
     stride = round(control_freq / rate_hz) if rate_hz > 0 else 0
     if stride < 1 or abs(stride * rate_hz - control_freq) > 1e-6 * control_freq:
         rates = [f"{control_freq / k:g}" for k in range(1, 21) if (control_freq / k).is_integer()]
@@ -35,13 +43,16 @@ def sample_stride(control_freq: float, rate_hz: float) -> int:
             "the rate is not a divisor of the control frequency",
             where="rate",
             expected=f"one of {', '.join(rates)} Hz at {control_freq:g} Hz",
-            found=f"{rate_hz:g}",
+            found=f"{rate_hz:g} Hz",
         )
     return stride
 
 
 def sample_states(control_steps: int, stride: int) -> NDArray[np.int64]:
-    """Return the indices of sampled states of ``control_steps + 1``: every ``stride``-th and the last."""
+    """Return the indices (T,) of the states that a dataset contains: every ``stride``-th state, and the last state.
+
+    An episode of ``control_steps`` has ``control_steps + 1`` states.
+    """
     indices = np.arange(0, control_steps + 1, stride)
     return indices if indices[-1] == control_steps else np.append(indices, control_steps)
 
@@ -53,15 +64,16 @@ def sample_gripper_commands(
     *,
     initial_width: float,
 ) -> NDArray[np.bool_]:
-    """Return the gripper command (T,), bool, of the action before each sampled state.
+    """Return whether the last gripper command before each sampled state opens the gripper (T,).
 
-    ``gripper_status[t + 1]`` is the command between t and t + 1, as in the loader of RoboCAS-v0. A gripper that is more
-    than half open counts as open.
+    Element t + 1 is the command between the samples t and t + 1, as in the loader of RoboCAS-v0. A command to more than
+    half of the maximum width counts as open.
 
     Args:
+        robot: description of the robot.
         commands: (S,) gripper actions in [-1, 1].
-        samples: (T,) from ``sample_states``.
-        initial_width: width of the gripper at the reset, m; it is the target before the first action.
+        samples: (T,) indices of states from `sample_states`.
+        initial_width: width of the gripper at the reset, m, which is the command before the first action.
     """
     low, high = robot.finger_targets
     finger_targets = low + (np.clip(commands, -1, 1) + 1) / 2 * (high - low)
@@ -70,15 +82,18 @@ def sample_gripper_commands(
 
 
 def compute_relative_motion(poses: Array) -> Array:
-    """Return the relative motion ``inv(pose[t]) pose[t + 1]`` (T, 4, 4); the last one is the identity."""
+    """Return the motions (T, 4, 4) between consecutive poses (T, 4, 4): ``inv(pose[t]) @ pose[t + 1]``.
+
+    The last motion is the identity.
+    """
     return np.concatenate([inverse(poses[:-1]) @ poses[1:], np.eye(4)[None]])
 
 
 def to_dataset_motion(poses: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the relative motion in the format of datasets.
+    """Return the motions between consecutive poses (T, 4, 4) in the format of datasets.
 
     Returns:
-        Positions (T, 3), m, and quaternions (T, 4), xyzw with w >= 0.
+        Translations (T, 3), m; quaternions (T, 4), xyzw with w >= 0. The last row is no motion.
     """
     motion = compute_relative_motion(poses)
     turns = Rotation.from_matrix(motion[:, :3, :3]).as_quat(canonical=True)
@@ -86,10 +101,15 @@ def to_dataset_motion(poses: Array) -> tuple[NDArray[np.float32], NDArray[np.flo
 
 
 def to_dataset_actions(positions: NDArray, turns: NDArray, gripper_status: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return RoboCAS actions (T, 7) for `to_dataset_motion`; row t is the motion from step t to t + 1.
+    """Return dataset actions (T, 7); row t leads from step t to step t + 1, and the last row holds the pose.
 
     An action has a translation in m, Euler angles about the fixed axes x, y, z in rad ("xyz" in scipy), and the gripper
-    command ``gripper_status[t + 1]`` of `sample_gripper_commands`, 1 = open. The last row holds the pose.
+    command, 1 open or 0 closed.
+
+    Args:
+        positions: (T, 3) translations of `to_dataset_motion`, m.
+        turns: (T, 4) quaternions of `to_dataset_motion`, xyzw.
+        gripper_status: (T,) result of `sample_gripper_commands`.
     """
     status = np.asarray(gripper_status, dtype=np.float64)
     actions = np.zeros((len(status), 7))
@@ -102,13 +122,13 @@ def to_dataset_actions(positions: NDArray, turns: NDArray, gripper_status: NDArr
 
 
 def compute_agv_pose(root: Array, qpos: Array) -> Array:
-    """Return the pose (T, 3) of the mobile base in the world: x, y in m, yaw in rad.
+    """Return the poses (T, 3) of the mobile base in the world: x, y in m, yaw in rad.
 
-    The first yaw is in [-pi, pi); the others are unwrapped.
+    The first yaw is in [-pi, pi). Later yaws are continuous, and may leave this range.
 
     Args:
-        root: (T, 4, 4) pose of the robot's root in the world.
-        qpos: (T, 12) joint positions.
+        root: (T, 4, 4) poses of the robot's root link in the world.
+        qpos: (T, 12) joint positions: base x, y in m, yaw in rad, arm, fingers.
     """
     x, y, yaw = qpos[:, RobotDescription.base_slice].T
     position = root[:, :3, 3] + np.einsum("tij,tj->ti", root[:, :3, :3], np.stack([x, y, 0 * x], axis=1))
@@ -117,7 +137,10 @@ def compute_agv_pose(root: Array, qpos: Array) -> Array:
 
 
 def compute_agv_motion(agv_pose: NDArray) -> Array:
-    """Return differences (T, 3) of consecutive x, y, yaw; the last row is 0."""
+    """Return the differences (T, 3) of consecutive base poses ``agv_pose`` (T, 3): x, y in m, yaw in rad.
+
+    The last row is 0.
+    """
     pose = agv_pose.astype(np.float64)
     motion = np.diff(pose, axis=0, append=pose[-1:])
     motion[:, 2] = _wrap(motion[:, 2])
@@ -130,12 +153,15 @@ def _wrap(angle: Array) -> Array:
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion of the robot at the T states of an episode in a dataset.
+    """Motion of the robot at the T sampled states of an episode.
 
     Attributes:
-        qpos: (T, 12) base x, y, yaw, 7 arm joints, 2 fingers, m and rad; ``qvel`` likewise.
-        root_in_world: (T, 4, 4) poses; ``tcp_in_world`` and ``arm_base_in_world`` are computed from them and ``qpos``.
-        gripper_open: (T,) bool commands, see `sample_gripper_commands`.
+        qpos: (T, 12) joint positions: base x, y, yaw, 7 arm joints, 2 fingers; m and rad.
+        qvel: (T, 12) joint velocities; m/s and rad/s.
+        root_in_world: (T, 4, 4) poses of the robot's root link.
+        tcp_in_world: (T, 4, 4) poses of the TCP, computed from ``qpos``.
+        arm_base_in_world: (T, 4, 4) poses of the arm's base, computed from ``qpos``.
+        gripper_open: (T,) whether the last gripper command opens the gripper (`sample_gripper_commands`).
     """
 
     qpos: Array
@@ -153,11 +179,12 @@ class Motion:
         gripper: NDArray[np.floating],
         samples: NDArray[np.int64],
     ) -> Motion:
-        """Compute the motion from recorded states; the same code for all dataset formats gives identical bits.
+        """Compute the motion from recorded states.
 
         Args:
-            robot_states: (S + 1, 37) after the reset and after each control step.
-            gripper: (S,) commands in [-1, 1].
+            robot: specification of the robot.
+            robot_states: (S + 1, 37) ManiSkill states of the robot, after the reset and after each control step.
+            gripper: (S,) gripper commands in [-1, 1].
             samples: (T,) indices of states from `sample_states`, or a contiguous part of them.
         """
         root_in_world, qpos, qvel = split_robot_states(robot_states[samples])
@@ -177,17 +204,17 @@ class Motion:
 
     @cached_property
     def tcp_motion(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """`to_dataset_motion` of the TCP in the arm's base."""
+        """Motions of the TCP in the arm's base frame: translations (T, 3) m, quaternions (T, 4) xyzw."""
         return to_dataset_motion(self.tcp_in_base)
 
     @cached_property
     def base_motion(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """`to_dataset_motion` of the arm's base in the world."""
+        """Motions of the arm's base in the world frame: translations (T, 3) m, quaternions (T, 4) xyzw."""
         return to_dataset_motion(self.arm_base_in_world)
 
     @cached_property
     def agv_pose(self) -> Array:
-        """(T, 3), see `compute_agv_pose`."""
+        """Poses (T, 3) of the mobile base in the world: x, y in m, yaw in rad."""
         return compute_agv_pose(self.root_in_world, self.qpos)
 
     @property
@@ -196,17 +223,17 @@ class Motion:
 
     @property
     def actions(self) -> NDArray[np.float32]:
-        """(T, 7), see `to_dataset_actions`."""
+        """Dataset actions (T, 7), the result of `to_dataset_actions`."""
         return to_dataset_actions(*self.tcp_motion, self.gripper_open)
 
 
 def select_gripper_commands(actions: NDArray[np.floating], control_mode: str) -> NDArray[np.floating]:
-    """Return gripper commands (S,) of actions (S, A): column 6 in ``_ee_`` modes, else column 7."""
+    """Return the gripper commands (S,) in recorded actions (S, A) of a control mode."""
     return actions[:, 6 if "_ee_" in control_mode else 7]
 
 
 def split_robot_states(states: NDArray[np.floating]) -> tuple[Array, Array, Array]:
-    """Split ManiSkill robot states (T, 37) into root pose (T, 4, 4), qpos (T, 12) and qvel (T, 12)."""
+    """Split ManiSkill robot states (T, 37) into poses of the root (T, 4, 4), qpos (T, 12) and qvel (T, 12)."""
     states = np.asarray(states, dtype=np.float64)
     return (
         from_wxyz(states[:, :7]),

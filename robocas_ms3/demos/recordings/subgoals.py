@@ -15,7 +15,13 @@ from robocas_ms3.core.strict_model import parse
 
 
 class SubGoal(BaseModel):
-    """Sub-goal in trajectory files and ``data_info.json``; ``goal_range`` includes both ends."""
+    """Sub-goal of an episode in trajectory files and ``data_info.json``.
+
+    Attributes:
+        goal_type: type of the sub-goal, e.g. ``transfer object``.
+        goal_range: indices of the first and the last action (trajectory file) or step (dataset).
+        goal_description: sub-goal as a sentence.
+    """
 
     model_config = ConfigDict(strict=True, extra="allow", frozen=True)
 
@@ -38,12 +44,12 @@ class SubGoal(BaseModel):
     @model_validator(mode="after")
     def _is_range(self) -> SubGoal:
         if self.first > self.last:
-            raise ValueError(f"goal_range: expected [first, last], found {self.goal_range}")
+            raise ValueError(f"goal_range: expected [first, last] with first <= last, found {self.goal_range}")
         return self
 
 
 class SubGoals(BaseModel):
-    """JSON object with sub-goals."""
+    """JSON object with the sub-goals of an episode."""
 
     model_config = ConfigDict(strict=True, extra="allow", frozen=True)
 
@@ -55,10 +61,17 @@ def read_subgoals(entries: Any, where: object) -> list[SubGoal]:
 
 
 def sample_subgoals(subgoals: Sequence[SubGoal], samples: NDArray[np.int64]) -> list[SubGoal]:
-    """Return the sub-goals of sampled steps (`motion.sample_states`), in order and without gaps.
+    """Convert sub-goals with ranges of actions to sub-goals with ranges of dataset steps.
 
-    A step has the sub-goal of the action after its state; the last step has that of the last action. A sub-goal shorter
-    than a stride may contain no step and is omitted.
+    A step has the sub-goal of the action after its state; the last step has the sub-goal of the last action. A sub-goal
+    that contains no step is omitted.
+
+    Args:
+        subgoals: sub-goals of an episode, with ranges of actions.
+        samples: (T,) indices of the sampled states from `motion.sample_states`.
+
+    Raises:
+        DatasetError: the ranges do not cover all actions in order.
     """
     actions = int(samples[-1])
     expected_first = 0
@@ -83,7 +96,12 @@ def sample_subgoals(subgoals: Sequence[SubGoal], samples: NDArray[np.int64]) -> 
 
 
 def group_subgoals(types: Sequence[str], texts: Sequence[str]) -> list[SubGoal]:
-    """Return one sub-goal per run of equal types and texts."""
+    """Group consecutive steps with equal type and text to one sub-goal each.
+
+    Args:
+        types: type of the sub-goal of each step.
+        texts: text of the sub-goal of each step.
+    """
     goals: list[SubGoal] = []
     for (kind, text), steps in groupby(range(len(types)), key=lambda step: (types[step], texts[step])):
         inside = list(steps)

@@ -28,11 +28,13 @@ _STATE_DIM = 13 + 2 * RobotDescription.finger_slice.stop
 
 @dataclass(frozen=True)
 class Recording(EpisodeEntry):
-    """Recorded episode with its data.
+    """Recorded episode of S control steps: its JSON entry, actions and states.
 
     Attributes:
-        actions: (S, A) actions.
-        states: ``{"actors": {name: (S+1, 13)}, "articulations": {name: (S+1, 13 + 2 joints)}}``.
+        actions: (S, A) actions in the control mode of the recording.
+        states: states after the reset and after each control step, in ManiSkill's format:
+            ``{"actors": {name: (S + 1, 13)}, "articulations": {name: (S + 1, 13 + 2 joints)}}``.
+        robot: specification of the robot.
     """
 
     actions: NDArray[np.float32]
@@ -40,28 +42,34 @@ class Recording(EpisodeEntry):
     robot: RobotSpec
 
     def compute_motion(self, samples: NDArray[np.int64]) -> Motion:
+        """Compute the motion of the robot at sampled states (T,), given by their indices."""
         commands = select_gripper_commands(self.actions, self.control_mode)
         return Motion.from_states(
             self.robot, self.states["articulations"][self.robot.description.uid], commands, samples
         )
 
     def state(self, index: int) -> dict[str, dict[str, NDArray[np.float32]]]:
-        """Return a state as an argument of ``set_state_dict``, each array (1, D)."""
+        """Return the state with an index, 0 to S, as an argument of ``set_state_dict``; each array is (1, D)."""
         return {kind: {n: a[index : index + 1] for n, a in arrays.items()} for kind, arrays in self.states.items()}
 
 
 class TrajectoryFile:
-    """Open trajectory file, a context manager.
+    """Trajectory file of `robocas generate`, open for reading; a context manager.
 
     Args:
-        path: the .h5 file.
-        pack: object pack to use instead of the recorded one, by name or folder.
+        path: the .h5 file; the .json file with the same name is read too.
+        pack: object pack to use instead of the recorded pack, by name or folder.
 
     Attributes:
-        env_info: ``env_info`` of the JSON: ``env_id``, ``env_kwargs``, ...
+        env_info: value of the key ``env_info`` of the JSON file: ``env_id``, ``env_kwargs``, ...
         env: specification of the recorded environment.
-        versions: package versions at recording.
-        episodes: episode entries of the JSON.
+        robot: specification of the robot.
+        control_freq: control rate of the recording, Hz.
+        versions: package versions at the time of recording.
+        episodes: episode entries of the JSON file.
+
+    Raises:
+        DatasetError: a file is missing, damaged, or not a trajectory file of `robocas generate`.
     """
 
     def __init__(self, path: str | Path, *, pack: str | Path | None = None) -> None:
@@ -70,7 +78,7 @@ class TrajectoryFile:
         if self.path.is_dir():
             inside = self.path / "trajectory.h5"
             fix = f"Did you mean {inside}?" if inside.is_file() else "Pass the .h5 file of robocas generate."
-            raise DatasetError("a folder, not a trajectory file", where=self.path, fix=fix)
+            raise DatasetError("not a file", where=self.path, expected="an .h5 file", found="a folder", fix=fix)
         if not self.path.is_file():
             raise DatasetError("no such trajectory file", where=self.path, fix="Record one with robocas generate.")
         metadata = read_json(self.path)
@@ -97,8 +105,9 @@ class TrajectoryFile:
             raise DatasetError(
                 "HDF5 and JSON contain different episodes",
                 where=self.path,
-                expected=f"the {len(listed)} episodes of the JSON",
+                expected=f"the {len(listed)} episodes of the JSON in the HDF5 file",
                 found=f"{len(stored)} episodes, {len(listed ^ stored)} differ",
+                fix="Copy both files again, or record them again.",
             )
 
     def __enter__(self) -> TrajectoryFile:
@@ -111,21 +120,21 @@ class TrajectoryFile:
         self._file.close()
 
     def reopen(self) -> TrajectoryFile:
-        """Open the file again without reading its JSON again."""
+        """Return a second open `TrajectoryFile` of the same file; the JSON file is not read again."""
         file = copy(self)
         file._file = open_trajectory(self.path)
         return file
 
     def __getstate__(self) -> dict[str, Any]:
-        """Drop the open file, which cannot be pickled or copied."""
+        """Return the attributes to pickle, without the open HDF5 file."""
         return {**self.__dict__, "_file": None}
 
     def read_entry(self, index: int) -> EpisodeEntry:
-        """Read the JSON entry of an episode by its position in ``episodes``."""
+        """Read the JSON entry of the episode at a position in ``episodes``, without actions and states."""
         return read_entry(self.episodes[index], self._where(index))
 
     def read_recording(self, index: int, *, bodies: bool = True) -> Recording:
-        """Read an episode by its position in ``episodes``; without ``bodies`` only the robot's states."""
+        """Read the episode at a position in ``episodes``; without ``bodies`` only the states of the robot are read."""
         where, uid = self._where(index), self.robot.description.uid
         group = open_episode(self._file, self.episodes[index]["episode_id"])
         actions, found = read_steps(group, body=None if bodies else uid)
@@ -135,7 +144,7 @@ class TrajectoryFile:
         entry = self.read_entry(index)
         if entry.control_steps != len(actions):
             expected = f"{entry.control_steps} actions as in the JSON"
-            raise DatasetError("damaged episode", where=where, expected=expected, found=len(actions))
+            raise DatasetError("damaged episode", where=where, expected=expected, found=f"{len(actions)} actions")
         robot = states.get("articulations", {}).get(uid)
         width = _STATE_DIM
         if robot is None or robot.shape[1] != width:
@@ -143,7 +152,7 @@ class TrajectoryFile:
                 "states do not fit the robot",
                 where=where,
                 expected=f"{uid} with {width} numbers per state",
-                found=sorted(states.get("articulations", {})) if robot is None else robot.shape[1],
+                found=sorted(states.get("articulations", {})) if robot is None else f"{robot.shape[1]} numbers",
             )
         return Recording(**vars(entry), actions=actions, states=states, robot=self.robot)
 

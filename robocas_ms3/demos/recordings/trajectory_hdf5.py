@@ -36,7 +36,15 @@ _MARGIN_BYTES = 4096  # bytes per episode that a merged file may need in additio
 
 
 def write_hdf5(path: Path, fill: Callable[[h5py.File], None]) -> None:
-    """Create a file in memory and write it at once; raise OSError if it cannot be written."""
+    """Create an HDF5 file in memory and write it at once.
+
+    Args:
+        path: path of the file.
+        fill: function that writes the content to the open file.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
         fill(file)
         file.flush()
@@ -46,7 +54,7 @@ def write_hdf5(path: Path, fill: Callable[[h5py.File], None]) -> None:
 
 @contextmanager
 def open_reserved(path: Path, size: int) -> Iterator[h5py.File]:
-    """Open a new file with ``size`` bytes reserved on the disk; raise OSError if the disk is full."""
+    """Create an HDF5 file with ``size`` bytes reserved on the disk, and open it; raise OSError if the disk is full."""
     write_hdf5(path, lambda file: None)
     with path.open("r+b") as file:
         try:
@@ -60,7 +68,12 @@ def open_reserved(path: Path, size: int) -> Iterator[h5py.File]:
 
 @contextmanager
 def convert_read_errors(where: object, what: str = "damaged episode") -> Iterator[None]:
-    """Convert errors of h5py during reading to ``DatasetError``."""
+    """Convert errors of h5py in a ``with`` block to ``DatasetError``.
+
+    Args:
+        where: file or place for the message.
+        what: fault for the message.
+    """
     try:
         yield
     except (OSError, KeyError, RuntimeError, AttributeError, ValueError, TypeError, MemoryError) as error:
@@ -68,6 +81,7 @@ def convert_read_errors(where: object, what: str = "damaged episode") -> Iterato
 
 
 def open_trajectory(path: Path) -> h5py.File:
+    """Open the HDF5 file of a trajectory for reading; raise ``DatasetError`` if it is missing or damaged."""
     try:
         check_regular_file(path)
         return h5py.File(path, "r")
@@ -83,13 +97,17 @@ def open_trajectory(path: Path) -> h5py.File:
 
 
 def open_episode(file: h5py.File, number: int) -> h5py.Group:
-    """Return an episode of an open trajectory; raise ``DatasetError`` if it contains links."""
+    """Return the group ``traj_NUMBER`` of an open trajectory file.
+
+    Raises:
+        DatasetError: the group is missing or damaged, or contains links to other data.
+    """
     name = f"traj_{number}"
     where = f"{file.filename}, {name}"
     bad_links: list[bytes] = []
 
-    def check_link(place: bytes, link: Any) -> bool | None:
-        return None if link.type == _HARD_LINK else bad_links.append(place) or True
+    def is_bad_link(name: bytes, link: Any) -> bool | None:
+        return None if link.type == _HARD_LINK else bad_links.append(name) or True
 
     with convert_read_errors(where):
         links: Any = file.id.links
@@ -98,12 +116,13 @@ def open_episode(file: h5py.File, number: int) -> h5py.Group:
         group: Any = file[name] if links.get_info(name.encode()).type == _HARD_LINK else None
         if group is None:
             raise _external_reference(where, "a link")
-        if group.id.links.visit(check_link, info=True):  # visits each group once, even in cycles
+        if group.id.links.visit(is_bad_link, info=True):  # visits each group once, even in cycles
             raise _external_reference(f"{where}/{bad_links[0].decode(errors='replace')}", "a link")
     return group
 
 
 def copy_episode(source: h5py.File, number: int, target: h5py.File, new_number: int) -> None:
+    """Copy the group of an episode to another trajectory file under a new number."""
     group = open_episode(source, number)
     with convert_read_errors(f"{source.filename}, traj_{number}"):
         group.visititems(lambda _, item: _check_stored_in_file(item) if isinstance(item, h5py.Dataset) else None)
@@ -111,11 +130,13 @@ def copy_episode(source: h5py.File, number: int, target: h5py.File, new_number: 
 
 
 def read_actions(episode: h5py.Group) -> NDArray[np.float32]:
+    """Read the actions (S, A) of an episode, S > 0; check that they are finite."""
     where = _where(episode)
     with convert_read_errors(where):
         actions = np.asarray(_load_arrays(_collect_arrays(episode["actions"], 0)), np.float32)
     if actions.ndim != 2 or len(actions) == 0:
-        raise DatasetError("episode without actions", where=where)
+        expected = "an array of shape (steps, A) with at least one step"
+        raise DatasetError("episode without actions", where=where, expected=expected, found=f"shape {actions.shape}")
     _check_finite(actions, f"{where}, actions")
     return actions
 
@@ -123,10 +144,15 @@ def read_actions(episode: h5py.Group) -> NDArray[np.float32]:
 def read_steps(
     episode: h5py.Group, *, body: str | None = None, extras: bool = False
 ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-    """Read actions (S, A) and states (S + 1, ...) of an episode; check that they are finite.
+    """Read the actions and states of an episode; check that they are finite.
 
-    By default states of all bodies are read. ``body`` restricts them to one body; ``extras`` adds all other states,
-    e.g. of controllers.
+    Args:
+        episode: group of the episode.
+        body: name of a body; only states of this body are read. Default: states of all bodies.
+        extras: whether to read all other states too, e.g. those of controllers.
+
+    Returns:
+        Actions (S, A); states as nested dicts of arrays (S + 1, ...).
     """
     where, actions = _where(episode), read_actions(episode)
     with convert_read_errors(where):
@@ -151,7 +177,7 @@ def read_steps(
 
 
 def iterate_arrays(node: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the arrays in nested dicts with their paths."""
+    """Yield path and array of each array in nested dicts; a path has the form ``key/key``."""
     if not isinstance(node, dict):
         yield name, node
         return
@@ -169,21 +195,24 @@ def _check_finite(rows: NDArray[Any], where: str) -> None:
 
 def _check_orientations(rows: NDArray[Any], name: str, where: str) -> None:
     if name.count("/") != 1 or rows.ndim != 2 or rows.shape[1] < 7:
-        raise DatasetError("damaged episode", where=where, expected="rows with a pose", found=rows.shape)
+        raise DatasetError(
+            "damaged episode", where=where, expected="rows that start with a pose", found=f"shape {rows.shape}"
+        )
     length = np.linalg.norm(rows[:, 3:7].astype(np.float64), axis=1)
     wrong = np.flatnonzero(abs(length - 1) > _LENGTH_TOLERANCE)
     if len(wrong):
         place, found = f"{where}, row {wrong[0]}", f"{length[wrong[0]]:g}"
-        raise DatasetError("invalid orientation", where=place, expected="a quaternion of length 1", found=found)
+        expected, fix = "a quaternion of length 1", "Record the episode again."
+        raise DatasetError("invalid orientation", where=place, expected=expected, found=f"length {found}", fix=fix)
 
 
 def _collect_arrays(node: Any, depth: int) -> Any:
-    """Return nested groups as dicts of arrays that are not read yet."""
+    """Convert nested groups to dicts of HDF5 datasets, without reading their values."""
     if isinstance(node, h5py.Dataset):
         _check_stored_in_file(node)
         return node
     if not depth:
-        raise ValueError("groups nested too deeply")
+        raise ValueError(f"groups are nested more than {_MAX_DEPTH} levels deep")
     # not node.items(), which holds the lock of h5py as long as the traceback of an error exists
     return {name: _collect_arrays(node[name], depth - 1) for name in node}
 
@@ -215,9 +244,13 @@ def _external_reference(where: str, found: str) -> DatasetError:
 
 
 def merge(sources: list[Path], out: Path) -> None:
-    """Merge trajectory files; episodes are numbered in the given order, unknown JSON keys are kept.
+    """Merge trajectory files to one file; the episodes get new numbers in the given order.
 
-    The file is synced to disk before it is renamed to ``out``.
+    Unknown JSON keys are kept. The file is synced to disk before it is renamed to ``out``.
+
+    Args:
+        sources: trajectory files (.h5), each with a .json file.
+        out: merged trajectory file; may be one of the sources.
     """
     merged: dict[str, Any] = {}
     episodes: list[dict[str, Any]] = []
@@ -237,9 +270,12 @@ def merge(sources: list[Path], out: Path) -> None:
 
 
 def find_violation(path: Path, seeds: Sequence[int]) -> str:
-    """Check that a merged file contains these seeds in order; return the violation, or an empty string.
+    """Check that a trajectory file contains the episodes of these seeds in order.
 
     Only metadata is read.
+
+    Returns:
+        Message about the first violation, or an empty string.
     """
     try:
         with open_trajectory(path) as file:
@@ -257,7 +293,7 @@ def find_violation(path: Path, seeds: Sequence[int]) -> str:
                     steps = len(group["actions"])
                 if steps != episode.get("elapsed_steps", steps):
                     expected = f"{episode['elapsed_steps']} actions"
-                    raise DatasetError("damaged episode", where=where, expected=expected, found=steps)
+                    raise DatasetError("damaged episode", where=where, expected=expected, found=f"{steps} actions")
     except DatasetError as error:
         return str(error)
     return ""

@@ -26,12 +26,12 @@ _ENTRY = "invalid episode entry"
 
 @cache  # reads package metadata from disk
 def package_versions() -> dict[str, str]:
-    """Return the versions of this package and of its main dependencies."""
+    """Return the versions of this package and of its main dependencies: ``{"package": "version"}``."""
     return {name: version(name) for name in ("robocas-ms3", "mani_skill", "sapien", "python-fcl", "torch", "numpy")}
 
 
 def parse_seed(value: Any) -> int | None:
-    """Return a seed as an integer, also from a list of one seed as ManiSkill writes it; None if invalid."""
+    """Return a seed as an integer, or None if the value is invalid; ManiSkill may write a list with one seed."""
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
     return value if type(value) is int else None
@@ -50,13 +50,13 @@ Seed = Annotated[int, BeforeValidator(_single_seed), Field(ge=0, le=MAX_SEED)]
 
 
 class ResetRecord(_Record):
-    """``reset_kwargs`` of an episode."""
+    """Value of the key ``reset_kwargs`` of an episode entry: allowed arguments of ``env.reset``."""
 
     options: dict[Literal["reconfigure"], bool] | None = None
 
 
 class EpisodeHeader(_Record):
-    """Keys of an episode entry in any ManiSkill trajectory that define its reset."""
+    """Keys of an episode entry, in trajectories of any ManiSkill task, that define the reset of the episode."""
 
     episode_id: int
     episode_seed: Seed
@@ -65,13 +65,13 @@ class EpisodeHeader(_Record):
 
 
 class TaskRecord(SubGoals):
-    """Key ``robocas`` of an episode entry: data beyond ManiSkill's format."""
+    """Value of the key ``robocas`` of an episode entry: instruction, sub-goals and other data of this package."""
 
     instruction: str
 
 
 class EpisodeRecord(EpisodeHeader):
-    """Episode entry written by ``robocas generate``."""
+    """Episode entry of a trajectory file that ``robocas generate`` has written."""
 
     elapsed_steps: NonNegativeInt | None = None
     robocas: TaskRecord
@@ -87,14 +87,18 @@ class _EnvRecord(_Record):
 
 
 class RunRecord(_Record):
-    """Key ``robocas`` of the file."""
+    """Value of the key ``robocas`` of the JSON file: control rate in Hz and package versions of the run."""
 
     control_freq: Annotated[FiniteFloat, Field(gt=0)] = 20.0
     versions: dict[str, Any] = {}
 
 
 class TrajectoryRecord(_Record):
-    """The file. Episode entries are validated one by one, so that a damaged one affects no other."""
+    """JSON file of a trajectory.
+
+    Only the number of each episode is validated here; `read_entry` validates a single episode entry, so that a damaged
+    entry does not affect other episodes.
+    """
 
     env_info: _EnvRecord
     episodes: list[_ListedRecord]
@@ -106,10 +110,13 @@ class EpisodeEntry:
     """JSON entry of a recorded episode of S control steps.
 
     Attributes:
-        episode_id: number in the trajectory file.
+        episode_id: number of the episode in the trajectory file.
+        seed: seed of ``env.reset``.
         reset_options: options of ``env.reset``.
-        control_steps: S.
-        subgoals: sub-goals with ranges over the actions 0..S-1.
+        control_mode: control mode of the actions.
+        control_steps: number of control steps, S.
+        instruction: language instruction.
+        subgoals: sub-goals with ranges of the actions 0..S-1.
         is_intervention: whether the episode starts in a state that another policy reached, not at the reset.
     """
 
@@ -124,12 +131,13 @@ class EpisodeEntry:
 
 
 def read_entry(episode: Mapping[str, Any], where: object) -> EpisodeEntry:
-    """Read the entry of an episode in the JSON; raise DatasetError if it is invalid."""
+    """Read an episode entry of the JSON file; raise DatasetError if it is invalid."""
     found = parse(EpisodeRecord, episode, DatasetError, where=where, about=_ENTRY)
     goals = found.robocas.subgoals
     steps = found.elapsed_steps
     if steps is None and not goals:
-        raise DatasetError("unknown length of the episode", where=where, expected="elapsed_steps or subgoals")
+        expected, found = "key elapsed_steps, or subgoals", "neither"
+        raise DatasetError("unknown length of the episode", where=where, expected=expected, found=found)
     return EpisodeEntry(
         episode_id=found.episode_id,
         seed=found.episode_seed,
@@ -143,13 +151,13 @@ def read_entry(episode: Mapping[str, Any], where: object) -> EpisodeEntry:
 
 
 def is_intervention(episode: Mapping[str, Any]) -> bool:
-    """Return whether an episode starts in a state that another policy reached."""
+    """Return whether an episode entry is an expert intervention, which starts in a state of another policy."""
     recorded = episode.get("robocas")
     return isinstance(recorded, Mapping) and recorded.get("intervention") is not None
 
 
 def read_reset(episode: Mapping[str, Any], where: object) -> tuple[int, dict[str, Any], str]:
-    """Read seed and options of ``env.reset`` and the control mode of an episode entry."""
+    """Read seed, reset options and control mode from an episode entry; raise DatasetError if it is invalid."""
     found = parse(EpisodeHeader, episode, DatasetError, where=where, about=_ENTRY)
     return found.episode_seed, _options(found.reset_kwargs), found.control_mode
 
@@ -163,13 +171,21 @@ def _options(reset: ResetRecord | None) -> dict[str, Any]:
 
 
 def read_json(trajectory: Path) -> dict[str, Any]:
-    """Read the JSON file of a trajectory, validated as `TrajectoryRecord`."""
+    """Read and validate the JSON file of a trajectory.
+
+    Args:
+        trajectory: the .h5 file; the JSON file has the same name with the suffix .json.
+
+    Raises:
+        DatasetError: the JSON file is missing or invalid.
+    """
     path, about = trajectory.with_suffix(".json"), "not the JSON file of a trajectory"
     if not path.is_file():
-        raise DatasetError("missing JSON file of the trajectory", where=path)
+        fix = "Copy it from the folder in which the .h5 file was recorded."
+        raise DatasetError("missing JSON file of the trajectory", where=path, fix=fix)
     try:
         metadata = load_json(path)
     except (ValueError, RecursionError) as error:
-        raise DatasetError(about, where=path, expected="env_info and episodes", found=one_line(error)) from error
+        raise DatasetError(about, where=path, expected="keys env_info and episodes", found=one_line(error)) from error
     parse(TrajectoryRecord, metadata, DatasetError, where=path, about=about)
     return metadata
