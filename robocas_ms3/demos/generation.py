@@ -132,7 +132,7 @@ def generate(
                         raise RobocasError(
                             "too many seeds are skipped",
                             where=output.path,
-                            expected=f"at most {max(20, 3 * successes)} for {format_count(successes, 'recorded episode')}",
+                            expected=f"at most {max(20, 3 * successes)} for {format_count(successes, 'episode')}",
                             found=f"{len(results) - successes} skipped seeds",
                             fix=f"See {FAILURES_FILE} for the reasons; fewer objects (--set objects.count=N) may help.",
                         )

@@ -46,7 +46,7 @@ def conditions_of_success() -> set[str]:
     names = set()
     for file in ("success", "goals", "select"):
         for function in walk("tasks", f"{file}.py"):
-            if isinstance(function, ast.FunctionDef) and function.name in ("success_conditions", "_conditions"):
+            if isinstance(function, ast.FunctionDef) and function.name in ("success_conditions", "_compute_conditions"):
                 keys = [key for n in ast.walk(function) if isinstance(n, ast.Dict) for key in n.keys if key]
                 names |= set().union(*map(strings, keys))
     return names
