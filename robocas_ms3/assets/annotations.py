@@ -86,7 +86,7 @@ class Annotations:
 
     @classmethod
     def load(cls, path: Path) -> Annotations:
-        """Read ``annotations.npz``."""
+        """Read the annotations of an object from ``annotations.npz``."""
         try:
             with open_npz(path) as file:
                 arrays = {f.name: file[f.name] for f in fields(cls)}

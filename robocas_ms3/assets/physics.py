@@ -79,7 +79,8 @@ def add_body(scene: sapien.Scene, rigid_body: RigidBody, pose: Array) -> physx.P
         for piece in rigid_body.hulls:
             free.attach(make_shape(piece, material))
     except RuntimeError as error:
-        raise AssetError("the physics engine rejected a convex hull", found=error) from error
+        fix = "Import the asset again."
+        raise AssetError("the physics engine rejected a convex hull", found=error, fix=fix) from error
     free.mass = rigid_body.mass
     free.cmass_local_pose = sapien.Pose(rigid_body.center_of_mass, rigid_body.inertia_wxyz)
     free.set_inertia(np.asarray(rigid_body.inertia, np.float64).tolist())

@@ -57,7 +57,9 @@ class CameraSpec:
 
     def __post_init__(self) -> None:
         if not re.fullmatch(CAMERA_NAME, self.name):
-            raise ExtensionError("invalid camera name", expected="a name such as side_camera", found=self.name)
+            raise ExtensionError(
+                "invalid camera name", expected="a name that ends in _camera, such as side_camera", found=self.name
+            )
 
     @property
     def parent(self) -> Parent:

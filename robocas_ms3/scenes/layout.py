@@ -59,22 +59,21 @@ class Layout:
         """Raise ValueError if shapes or poses are invalid, or an object is not in ``names``, the ids of a pack."""
         count = len(self.object_ids)
         shapes = self.object_poses.shape, self.present.shape, self.visible_fractions.shape
-        if shapes != ((count, 4, 4), (count,), (count,)) or not set(self.object_ids) <= set(names):
-            unknown = sorted(set(self.object_ids) - set(names))
-            raise ValueError(
-                f"expected {count} poses of objects in the pack, found {len(self.object_poses)} poses"
-                f" and {unknown or 'no'} unknown objects"
-            )
+        if shapes != ((count, 4, 4), (count,), (count,)):
+            raise ValueError(f"expected poses, present and visible fractions of {count} objects, found shapes {shapes}")
+        if unknown := sorted(set(self.object_ids) - set(names)):
+            raise ValueError(f"expected only objects of the object pack, found {unknown}")
         fixtures = [self.robot_pose] if self.basket_pose is None else [self.robot_pose, self.basket_pose]
-        if any(pose.shape != (4, 4) for pose in fixtures) or not 0 <= self.target < count:
-            raise ValueError(
-                f"expected 4 x 4 poses of robot and basket and a target index below {count}, found shapes"
-                f" {[pose.shape for pose in fixtures]} and target {self.target}"
-            )
+        if any(pose.shape != (4, 4) for pose in fixtures):
+            raise ValueError(f"expected 4 x 4 poses of robot and basket, found {[pose.shape for pose in fixtures]}")
+        if not 0 <= self.target < count:
+            raise ValueError(f"expected a target slot from 0 to {count - 1}, found {self.target}")
         poses = np.concatenate([self.object_poses, fixtures])
         turns = poses[:, :3, :3]
-        if not np.isfinite(poses).all() or np.abs(turns @ turns.swapaxes(1, 2) - np.eye(3)).max() > _ROTATION_ERROR:
-            raise ValueError("a pose with NaN or infinite values, or with an invalid rotation")
+        if not np.isfinite(poses).all():
+            raise ValueError("a pose with NaN or infinite values")
+        if np.abs(turns @ turns.swapaxes(1, 2) - np.eye(3)).max() > _ROTATION_ERROR:
+            raise ValueError("a pose whose rotation matrix is not orthonormal")
 
 
 LayoutSource = Callable[[int, int], Layout]

@@ -81,7 +81,8 @@ def find_objects(pack: Pack, config: TaskConfig) -> list[str]:
     wanted = sorted(pack.objects) if config.objects.ids == "all" else config.objects.ids
     ids = resolve_ids(pack, wanted, key="objects.ids")
     if not ids:
-        raise ConfigError(f"objects.ids: pack {pack.name!r} has no objects", expected="at least one object")
+        what, fix = f"objects.ids: pack {pack.name!r} has no objects", "Choose another object pack."
+        raise ConfigError(what, expected="at least one object", fix=fix)
     for number, names in enumerate(config.randomisation.object_sets or ()):
         resolve_ids(pack, names, key=f"randomisation.object_sets.{number}")
     if config.randomisation.distractors:

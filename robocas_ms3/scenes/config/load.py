@@ -43,7 +43,8 @@ def load_config_for(spec: TaskSpec, config: str | Path | dict | TaskConfig | Non
     if loaded.task != spec.name:
         name = f" {config}" if isinstance(config, str) else ""
         what = f"{spec.env_id} can't run the configuration{name}"
-        raise ConfigError(what, expected=f"task: {spec.name}", found=f"task: {loaded.task}")
+        fix = "Choose a configuration of this task: `robocas list`."
+        raise ConfigError(what, expected=f"task: {spec.name}", found=f"task: {loaded.task}", fix=fix)
     return loaded
 
 

@@ -11,7 +11,7 @@ from robocas_ms3.core.strict_model import StrictModel
 
 def _check_range(values: tuple[float, float]) -> tuple[float, float]:
     if values[0] > values[1]:
-        raise ValueError(f"invalid range {list(values)}: expected [least, greatest]")
+        raise ValueError(f"expected [least, greatest] with least <= greatest, found {list(values)}")
     return values
 
 

@@ -30,7 +30,8 @@ def sentence_model_source() -> str:
     if folder := os.environ.get("ROBOCAS_SENTENCE_MODEL"):
         if not Path(folder).is_dir():
             expected = "a folder with a sentence model"
-            raise RobocasError("no such folder", where="$ROBOCAS_SENTENCE_MODEL", expected=expected, found=folder)
+            where, fix = "$ROBOCAS_SENTENCE_MODEL", "Correct this environment variable, or unset it."
+            raise RobocasError("no such folder", where=where, expected=expected, found=folder, fix=fix)
         return folder
     spec = importlib.util.find_spec(_PACKAGED_WEIGHTS)
     if spec and spec.origin and (packaged := Path(spec.origin).parent / "model").is_dir():
