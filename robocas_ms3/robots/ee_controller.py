@@ -88,7 +88,9 @@ class _ArmChainController(PDEEPoseController):
             Joint positions (N, joints), and for each env (N,) whether they reach the target.
         """
         target = as_float64(target)
-        qpos, solved = self._chain.inverse(target[:, :3], target[:, 3:], as_float64(qpos), self._lower, self._upper)
+        qpos, solved = self._chain.solve_inverse(
+            target[:, :3], target[:, 3:], as_float64(qpos), self._lower, self._upper
+        )
         return as_float32(qpos), solved
 
 

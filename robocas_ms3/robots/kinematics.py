@@ -66,7 +66,7 @@ class SerialChain:
             constants = tuple(torch.tensor(value, dtype=torch.float64, device=device) for value in constants)
         self._angles, self._shift, self._weights, self._constant, self._quotient, self._identity = constants
 
-    def inverse(
+    def solve_inverse(
         self, position: Array, quaternion: Array, qpos: Array, lower: Array, upper: Array
     ) -> tuple[Array, Array]:
         """Solve inverse kinematics within joint limits for N envs, starting from given joint positions.

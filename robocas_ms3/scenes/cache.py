@@ -89,12 +89,12 @@ class LayoutSampler:
 
     def __call__(self, objects_seed: int, seed: int) -> Layout:
         if objects_seed == seed:
-            return self.make(seed, seed)
+            return self.sample(seed, seed)
         if objects_seed not in self._object_ids:
-            self._object_ids[objects_seed] = self.make(objects_seed, objects_seed).object_ids
-        return self.make(objects_seed, seed, self._object_ids[objects_seed])
+            self._object_ids[objects_seed] = self.sample(objects_seed, objects_seed).object_ids
+        return self.sample(objects_seed, seed, self._object_ids[objects_seed])
 
-    def make(self, objects_seed: int, seed: int, object_ids: ObjectIds | None = None) -> Layout:
+    def sample(self, objects_seed: int, seed: int, object_ids: ObjectIds | None = None) -> Layout:
         """Sample the layout of an objects seed and a seed.
 
         Args:
@@ -211,7 +211,7 @@ class LayoutCache:
             except (*DAMAGED_FILE_ERRORS, KeyError, TypeError) as error:
                 _log.warning("%s: damaged layout file, the layout is sampled again (%s)", path, error)
         known = None if objects_seed == seed else self.get(objects_seed, objects_seed).object_ids
-        layout = self._sample.make(objects_seed, seed, known)
+        layout = self._sample.sample(objects_seed, seed, known)
         if not (self.folder / ABOUT).is_file():
             make_folder(self.folder)
             write_json(self.folder / ABOUT, self._about)

@@ -12,7 +12,7 @@ from robocas_ms3.assets.pack import LoadedFurniture, Pack, load_pack
 from robocas_ms3.core.errors import ConfigError
 from robocas_ms3.core.poses import from_xyz_yaw
 from robocas_ms3.core.strict_model import did_you_mean
-from robocas_ms3.scenes.config.task import OrderlyLayout, PlacedConfig, PoseConfig, SurfaceConfig, TaskConfig
+from robocas_ms3.scenes.config.task import AssetPlacementConfig, OrderlyLayout, PoseConfig, SurfaceConfig, TaskConfig
 from robocas_ms3.scenes.placement import Array, Region
 from robocas_ms3.scenes.relations import RELATIONS, THREE_OBJECT_RELATIONS
 from robocas_ms3.scenes.task_specs import TASKS
@@ -24,7 +24,7 @@ def fixture_pose(config: PoseConfig) -> Array:
     return from_xyz_yaw(*config.position, np.deg2rad(config.yaw_deg))
 
 
-def furniture_pose(config: PlacedConfig, furniture: LoadedFurniture) -> Array:
+def furniture_pose(config: AssetPlacementConfig, furniture: LoadedFurniture) -> Array:
     """Return the pose (4, 4) of a furniture's frame in the world; the configuration has that of its lowest point."""
     pose = fixture_pose(config.pose)
     pose[2, 3] += furniture.asset.origin_height
@@ -69,7 +69,7 @@ def find_room(pack: Pack, config: TaskConfig) -> LoadedFurniture:
     return room
 
 
-def find_container(pack: Pack, config: PlacedConfig) -> LoadedFurniture:
+def find_container(pack: Pack, config: AssetPlacementConfig) -> LoadedFurniture:
     basket = find_furniture(pack, config.asset, key="basket.asset")
     if basket.asset.inner is None or basket.asset.mass is None:
         expected = "an asset with the keys mass and inner in the manifest"

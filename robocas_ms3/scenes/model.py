@@ -189,7 +189,7 @@ class SceneModel:
         )
 
     @property
-    def front(self) -> Array:
+    def front_direction(self) -> Array:
         """Direction (2,) in which columns of objects face: the axis of the furniture's frame nearest to the robot."""
         middle = np.add(self.region.min_xy, self.region.max_xy) / 2
         to_robot = (np.linalg.inv(self.support_pose) @ self.robot_pose)[:2, 3] - middle

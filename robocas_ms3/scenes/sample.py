@@ -247,7 +247,7 @@ def _draw_poses(
     placeables = [make_placeable(asset, model.headroom) for asset in assets]
     if isinstance(layout, ScatteredLayout):
         return sample_scattered(rng, placeables, region, layout), everything
-    return sample_orderly(rng, placeables, region, layout, model.front)
+    return sample_orderly(rng, placeables, region, layout, model.front_direction)
 
 
 def _draw_used_slots(model: SceneModel, slots: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

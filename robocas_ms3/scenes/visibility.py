@@ -106,11 +106,11 @@ class MeshScene:
 
         The fraction is in [0, 1]; NaN if the mesh is out of view.
         """
-        ids, full = self.segmentation(camera)
+        ids, full = self.render_segmentation(camera)
         visible = np.bincount(ids[ids >= 0], minlength=len(full))
         return visible / np.where(full > 0, full, np.nan)
 
-    def segmentation(self, camera: PinholeCamera) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    def render_segmentation(self, camera: PinholeCamera) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
         """Render a segmentation image, and count the pixels of each mesh without occlusion by other meshes.
 
         Returns:

@@ -77,7 +77,7 @@ def nearby_goals(kind: Callable[..., tuple], *, count: int, away: float, seed: i
 @pytest.mark.parametrize(("away", "least"), [(0.02, 1.0), (0.1, 0.995), (0.3, 0.98), (0.6, 0.95)])
 def test_inverse_kinematics_reach_targets_within_the_limits(kind, arm, away, least):
     position, quaternion, start, lower, upper = nearby_goals(kind, count=400, away=away, seed=2)
-    qpos, solved = arm.inverse(position, quaternion, start, lower, upper)
+    qpos, solved = arm.solve_inverse(position, quaternion, start, lower, upper)
     assert np.mean(np.asarray(solved)) >= least
     assert ((qpos >= lower) & (qpos <= upper)).all()
     found, turned = pose_at(ARM, np.asarray(qpos[solved]))
@@ -89,7 +89,7 @@ def test_inverse_kinematics_reach_targets_within_the_limits(kind, arm, away, lea
 def test_targets_out_of_reach_are_not_solved(kind, arm):
     position, quaternion, start, lower, upper = nearby_goals(kind, count=50, away=0.1, seed=4)
     position[:, 0] = 2.0
-    qpos, solved = arm.inverse(position, quaternion, start, lower, upper)
+    qpos, solved = arm.solve_inverse(position, quaternion, start, lower, upper)
     assert not solved.any()
     assert ((qpos >= lower) & (qpos <= upper)).all()
 
@@ -99,7 +99,7 @@ def test_solutions_stay_within_the_joint_limits(kind, tmp_path):
     goals = np.array([[0.1, 0.4], [0.1, 0.6], [-0.7, 0.3]])
     position, quaternion = kind(*pose_at((two_links(tmp_path), "base", "tip"), goals))
     limits = np.array([-0.5, -0.5]), np.array([0.5, 0.5])
-    qpos, solved = chain.inverse(position, quaternion, *kind(np.zeros((3, 2)), *limits))
+    qpos, solved = chain.solve_inverse(position, quaternion, *kind(np.zeros((3, 2)), *limits))
     assert solved.tolist() == [True, False, False]
     np.testing.assert_allclose(qpos[0], goals[0], atol=2e-5)
     assert qpos[1][1] == 0.5
@@ -109,7 +109,7 @@ def test_solutions_stay_within_the_joint_limits(kind, tmp_path):
 def test_a_target_turned_by_180_degrees_is_not_solved(kind, tmp_path):
     chain = SerialChain(two_links(tmp_path), "base", "upper", torch.device("cpu") if kind is tensors else None)
     position, quaternion = kind(*pose_at((two_links(tmp_path), "base", "upper"), np.array([[np.pi]])))
-    qpos, solved = chain.inverse(position, quaternion, *kind(np.zeros((1, 1)), np.array([-2.0]), np.array([2.0])))
+    qpos, solved = chain.solve_inverse(position, quaternion, *kind(np.zeros((1, 1)), np.array([-2.0]), np.array([2.0])))
     assert not solved.any()
     assert abs(float(qpos[0, 0])) > 1  # on its way
 
@@ -122,9 +122,10 @@ def test_a_batch_of_tensors_gives_the_solutions_of_single_arrays():
     position[:20] += [1.0, 0, 0]
     start[:40] = start[:40].clip(LOWER, LOWER + 0.05)  # targets beyond the limits of many joints
     tensor = tensors(position, quaternion, start, LOWER, UPPER)
-    together, solved = (values.numpy() for values in batched.inverse(*tensor))
+    together, solved = (values.numpy() for values in batched.solve_inverse(*tensor))
     alone = [
-        single.inverse(position[i : i + 1], quaternion[i : i + 1], start[i : i + 1], LOWER, UPPER) for i in range(450)
+        single.solve_inverse(position[i : i + 1], quaternion[i : i + 1], start[i : i + 1], LOWER, UPPER)
+        for i in range(450)
     ]
     assert solved.tolist() == [bool(reached[0]) for _, reached in alone]
     assert 20 < np.sum(~solved) < 60
@@ -149,7 +150,7 @@ def test_no_operation_synchronizes_with_a_gpu():
     arm = SerialChain(*ARM, device=torch.device("cpu"))
     goals = nearby_goals(tensors, count=5, away=0.1, seed=9)
     with Operations() as operations:
-        arm.inverse(*goals)
+        arm.solve_inverse(*goals)
     assert "bmm" in operations.names
     waits = {"_local_scalar_dense", "nonzero", "is_nonzero", "equal", "_linalg_check_errors", "masked_select", "index"}
     assert not operations.names & waits

@@ -160,7 +160,7 @@ def kill_this_process():
 
 def test_process_that_crashes_twice_is_no_missing_layout(gpu):
     with pytest.raises(SimulationError) as caught:
-        LayoutSampler(load_scene()).make(0, 1, KillingIds())  # pyright: ignore[reportArgumentType]
+        LayoutSampler(load_scene()).sample(0, 1, KillingIds())  # pyright: ignore[reportArgumentType]
     assert (caught.value.where, caught.value.found) == ("seed 1", "SIGSEGV")
 
 

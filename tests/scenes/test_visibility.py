@@ -45,7 +45,7 @@ def test_visible_fraction_depends_on_the_camera_position():
 
 def test_pixels_are_at_the_projected_positions():
     camera = PinholeCamera(np.eye(4), 100, 80, np.pi / 2)  # looks along x: y is left, z up
-    ids = MeshScene([trimesh.creation.box((0.1, 0.1, 0.1))], at(2.0, 0.5, 0.5)[None]).segmentation(camera)[0]
+    ids = MeshScene([trimesh.creation.box((0.1, 0.1, 0.1))], at(2.0, 0.5, 0.5)[None]).render_segmentation(camera)[0]
     rows, columns = np.nonzero(ids == 0)
     # 2 m ahead, 0.5 left, 0.5 up; focal length 40: 10 pixels left of and above the middle
     assert columns.mean() + 0.5 == pytest.approx(50 - 10, abs=0.6)
@@ -58,16 +58,16 @@ def test_the_selection_camera_looks_down_with_the_worlds_x_up():
     np.testing.assert_allclose(camera.pose[:3, 0], [0, 0, -1])
     assert camera.focal_length == pytest.approx(256)
     scenery = MeshScene([PLATE] * 3, np.stack([at(0, 0, 0), at(0, 0.075, 0.01), at(0.05, 0, 0.02)]))
-    ids = scenery.segmentation(HIGH)[0]
+    ids = scenery.render_segmentation(HIGH)[0]
     # 0.1 m are 85 pixels; the world's x is up, y left: the third plate covers part of the others
     assert [ids[148, 148], ids[148, 64], ids[85, 128], ids[2, 2]] == [0, 1, 2, -1]
 
 
 def test_changed_mesh_file_is_loaded_again():
     plate = PLATE.copy()
-    before = MeshScene([plate], np.eye(4)[None]).segmentation(HIGH)[1][0]
+    before = MeshScene([plate], np.eye(4)[None]).render_segmentation(HIGH)[1][0]
     plate.apply_scale(0.5)
-    assert MeshScene([plate], np.eye(4)[None]).segmentation(HIGH)[1][0] == pytest.approx(before / 4, rel=0.05)
+    assert MeshScene([plate], np.eye(4)[None]).render_segmentation(HIGH)[1][0] == pytest.approx(before / 4, rel=0.05)
 
 
 def test_meshes_are_in_the_assets_frame():
@@ -89,10 +89,10 @@ def test_visibility_laws(seed):
     np.testing.assert_array_equal(seen, ~np.isnan(more))
     assert ((few[seen] >= 0) & (few[seen] <= 1)).all()
     assert (more[seen] <= few[seen]).all()  # more occluders do not increase p_vis
-    alone = [MeshScene([PLATE], pose[None]).segmentation(camera) for pose in poses]
-    ids, full = MeshScene([PLATE] * 5, poses).segmentation(camera)
+    alone = [MeshScene([PLATE], pose[None]).render_segmentation(camera) for pose in poses]
+    ids, full = MeshScene([PLATE] * 5, poses).render_segmentation(camera)
     np.testing.assert_array_equal(full, [one[1][0] for one in alone])
     for i, (one, _) in enumerate(alone):
         assert (one[ids == i] == 0).all()  # each pixel shows one of those that would fill it
-    other_way = MeshScene([PLATE] * 5, poses[::-1]).segmentation(camera)[0]  # the order of meshes doesn't matter
+    other_way = MeshScene([PLATE] * 5, poses[::-1]).render_segmentation(camera)[0]  # the order of meshes doesn't matter
     np.testing.assert_array_equal(np.where(other_way >= 0, 4 - other_way, -1), ids)

@@ -79,4 +79,4 @@ def test_visible_fractions_agree_with_the_segmentation(rendered, seed, camera):
     assert large.sum() >= 6
     assert shares[large] == pytest.approx(visible[large] / full[large], abs=0.02)
     assert shares[large].min() < 0.6  # some objects are hidden
-    assert (scenery.segmentation(camera)[0] != together).mean() < 0.0005  # the same pixels, edges aside
+    assert (scenery.render_segmentation(camera)[0] != together).mean() < 0.0005  # the same pixels, edges aside

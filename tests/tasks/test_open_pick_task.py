@@ -24,7 +24,7 @@ from robocas_ms3.planning.skills.drive import current_base_pose, drive
 from robocas_ms3.planning.skills.grasp import plan_grasp
 from robocas_ms3.planning.skills.handles import MovingPart, open_furniture_part, pull_fraction
 from robocas_ms3.scenes.config import bundled_configs, load_task_config
-from robocas_ms3.scenes.language.templates import subgoal
+from robocas_ms3.scenes.language.templates import make_subgoal
 
 pytestmark = pytest.mark.slow
 
@@ -69,7 +69,7 @@ def drive_recording(tmp_path_factory):
     seen = {}
 
     def policy(arm) -> None:
-        arm.executor.start_subgoal(**subgoal("operate the target", "object", "cabinet"))
+        arm.executor.start_subgoal(**make_subgoal("operate the target", "object", "cabinet"))
         drive(arm, np.array([0.2, -0.1, 0.3]))
         seen["arm"], seen["base"] = arm.scene.arm_qpos - arm.qpos, arm.scene.arm_base_in_world
 

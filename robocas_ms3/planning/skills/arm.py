@@ -16,7 +16,7 @@ from robocas_ms3.planning.protocol import Array, Planner, Trajectory
 from robocas_ms3.planning.scene import PlanningScene
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.scenes.grasp_checks import Approach
-from robocas_ms3.scenes.language.templates import subgoal
+from robocas_ms3.scenes.language.templates import make_subgoal
 from robocas_ms3.tasks.base import RoboCASEnv
 
 T = TypeVar("T")
@@ -109,7 +109,7 @@ class Arm:
     def start_subgoal(self, goal_type: str) -> None:
         """Start a sub-goal of a type, e.g. ``transfer object``, with the text for the target of the episode."""
         words = self.env.target_asset().asset.name, self.env.task_config.support
-        self.executor.start_subgoal(**subgoal(goal_type, *words))
+        self.executor.start_subgoal(**make_subgoal(goal_type, *words))
 
     def planning_time(self):
         """Return a context manager that counts the CPU time of its block as planning."""

@@ -61,14 +61,14 @@ class LightConfig(StrictModel):
     )
 
 
-class PlacedConfig(StrictModel):
+class AssetPlacementConfig(StrictModel):
     """Asset, and the pose of its lowest point."""
 
     asset: str = Field(description="id in the furniture pack, or PACK/ID in another pack")
     pose: PoseConfig
 
 
-class FurnitureConfig(PlacedConfig):
+class FurnitureConfig(AssetPlacementConfig):
     """Piece of furniture: an asset, and the pose of its lowest point."""
 
     joints: dict[str, Coordinate] = Field(
@@ -77,7 +77,7 @@ class FurnitureConfig(PlacedConfig):
     )
 
 
-class BasketConfig(PlacedConfig):
+class BasketConfig(AssetPlacementConfig):
     """Container into which the target is put: an asset, and the pose of its lowest point."""
 
 

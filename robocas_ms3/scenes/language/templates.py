@@ -17,7 +17,7 @@ SUBGOALS = {
 GOAL_TYPES = tuple(SUBGOALS)
 
 
-def subgoal(goal_type: str, object: str, support: str) -> dict[str, str]:
+def make_subgoal(goal_type: str, object: str, support: str) -> dict[str, str]:
     """Return a sub-goal as episodes record it: a dict with ``goal_type`` and ``goal_description``.
 
     Args:
