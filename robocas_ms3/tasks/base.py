@@ -1,4 +1,4 @@
-"""The base environment of all tasks: success, instructions, observations and rewards in the scene of `SceneEnv`."""
+"""The base environment of all tasks: success, instructions, observations and rewards."""
 
 from __future__ import annotations
 
@@ -79,7 +79,10 @@ class RoboCASEnv(SceneEnv):
         return self.success_check.target_center(object_states)
 
     def gripper_forces(self) -> torch.Tensor:
-        """Return the force (N, 3, K, 3) of each object on left finger, right finger and hand; newtons, world frame."""
+        """Return the force (N, 3, K, 3) of each object on left finger, right finger and hand.
+
+        Newtons, world frame, in the last physics step.
+        """
         return as_tensor(self.gripper_contacts.read_forces())
 
     def is_object_grasped(self) -> torch.Tensor:
@@ -106,7 +109,10 @@ class RoboCASEnv(SceneEnv):
         return self.success_check.check()
 
     def success_conditions(self) -> dict[str, torch.Tensor]:
-        """Return the success conditions that must hold at the same time, by name, (N,) bool each; without the lift."""
+        """Return the success conditions by name, (N,) bool each.
+
+        These must hold at the same time. The lift is not one of them, because it must only have happened before.
+        """
         return self.success_check.success_conditions()
 
     def instruction(self, env: int = 0, target_name: str = "") -> Instruction:
@@ -129,7 +135,7 @@ class RoboCASEnv(SceneEnv):
         return {**privileged, "tcp_pose": as_tensor(self.tcp_in_world())}
 
     def privileged_observations(self) -> dict[str, torch.Tensor]:
-        """Return the privileged observations by name, (N, D) each, in the order of flat observations (docs/rl.md)."""
+        """Return the privileged observations by name, (N, D) each; docs/rl.md lists them."""
         return privileged_observations(self)
 
     def get_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:

@@ -111,14 +111,20 @@ class BodyStateReader:
         return None if self._basket is None else self.actor_states(state)[:, self._basket, :7]
 
     def to_state_dict(self, states: _Batch) -> dict[str, dict[str, _Batch]]:
-        """Convert flat states (..., D) to ManiSkill's dictionary ``{"actors": {name: (..., 13)}, ...}`` of views."""
+        """Convert flat states (..., D) to ManiSkill's nested dictionary of views.
+
+        Example: ``{"actors": {name: (..., 13)}, "articulations": {...}}``.
+        """
         return {
             kind: {name: states[..., columns] for name, columns in found.items()}
             for kind, found in self._columns.items()
         }
 
     def _packed_order(self, robot: Articulation) -> tuple[NDArray[np.int64], slice]:
-        """Return the index (D,) of each number of a flat state in the packed state, and the bytes of the robot."""
+        """Return where the packed state has each number of a flat state, and the bytes of the robot.
+
+        The first value is an index (D,), the second value a slice.
+        """
         dynamic: list[Any] = self._px.rigid_dynamic_components
         first = {body: i * BODY for i, body in enumerate(dynamic)}
         order = [first[actor._bodies[0]] + k for actor in self._actors for k in _PACKED_BODY]
@@ -139,7 +145,9 @@ class BodyStateReader:
         return np.array(order), slice(4 * start, 4 * (start + BODY + _PACKED_PER_JOINT * robot.max_dof))
 
     def set_object_poses(self, envs: torch.Tensor, poses: torch.Tensor) -> None:
-        """Write object poses of some envs to the buffers of a GPU; `ManiSkillScene._gpu_apply_all` applies them.
+        """Write object poses of some envs to the buffers of a GPU.
+
+        `ManiSkillScene._gpu_apply_all` applies them.
 
         Args:
             envs: (E,) indices of the envs.
@@ -151,7 +159,7 @@ class BodyStateReader:
         self._px.cuda_rigid_body_data.torch()[self._rows[envs, self._objects], :7] = poses
 
     def zero_velocities(self, envs: torch.Tensor) -> None:
-        """Write zero velocities of all bodies of some envs (E,) to the buffers of a GPU; see `set_object_poses`."""
+        """Write zero velocities of all bodies of some envs (E,) to the buffers of a GPU."""
         self._px.cuda_rigid_body_data.torch()[self._rows[envs].flatten(), 7:BODY] = 0.0
         for articulation in self._articulations:
             self._px.cuda_articulation_qvel.torch()[articulation._data_index[envs], : articulation.max_dof] = 0.0
@@ -167,7 +175,10 @@ class BodyStateReader:
 
 
 def read_link_poses(scene: ManiSkillScene, links: Sequence[Link]) -> Array:
-    """Return world poses (N, L, 7) of L links, position m and quaternion wxyz, as a native array (`core.arrays`)."""
+    """Return the world poses (N, L, 7) of L links as a native array (`core.arrays`).
+
+    A pose is a position in m and a quaternion wxyz.
+    """
     if scene.gpu_sim_enabled:
         return torch.stack([link.pose.raw_pose for link in links], dim=1)
     poses = [link._bodies[0].entity_pose for link in links]
@@ -250,5 +261,8 @@ def _bounding_boxes(bodies: list[Any]) -> _Boxes:
 def read_contact_forces(
     scene: ManiSkillScene, bodies: Sequence[Actor | Link], objects: Sequence[Actor | Link]
 ) -> torch.Tensor:
-    """Return the force (N, B, K, 3) of each object on each body in the last physics step; newtons, world frame."""
+    """Return the force (N, B, K, 3) of each object on each body in the last physics step.
+
+    Newtons, world frame.
+    """
     return as_tensor(ContactForceReader(scene, bodies, objects).read_forces())

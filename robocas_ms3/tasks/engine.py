@@ -129,7 +129,10 @@ def step_without_observation(env: Any, action: NDArray[Any]) -> None:
 
 
 def is_garbage_collection_due(device: sapien.Device | None, resets: int) -> bool:
-    """Return whether to collect garbage at this reset: an unused scene holds 8 MB, or 0.5 MB without a renderer."""
+    """Return whether to collect garbage after a number of resets.
+
+    Until then, each old scene holds 8 MB, or 0.5 MB without a renderer.
+    """
     return resets % (20 if can_render(device) else 30) == 0
 
 
@@ -150,7 +153,7 @@ def _shared_render_system() -> sapien.render.RenderSystem:
 
 
 class EngineErrorMonitor:
-    """Monitor of standard error. PhysX prints there that it dropped contacts, and reports it in no other way."""
+    """Monitor of standard error, which is the only place where PhysX reports dropped contacts."""
 
     def __init__(self) -> None:
         self._log: IO[bytes] | None = None

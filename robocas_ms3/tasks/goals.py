@@ -43,7 +43,9 @@ class TaskState(NamedTuple):
 
 
 class Goal(ABC):
-    """Base class of goals: where the target must be. Without dense rewards, a goal must define only `is_at_goal`.
+    """Base class of goals: where the target must be.
+
+    A goal without dense rewards must define only ``NAME`` and `is_at_goal`.
 
     Args:
         env: the `base.RoboCASEnv`, with a loaded scene.
@@ -61,7 +63,12 @@ class Goal(ABC):
 
     @abstractmethod
     def is_at_goal(self, centers: Array, basket_pose: Array | None) -> Array:
-        """Return whether centres of mass (N, 3) or (N, K, 3), world frame, are at the goal; (N,) or (N, K) bool."""
+        """Return whether centres of mass are at the goal, (N,) or (N, K) bool.
+
+        Args:
+            centers: (N, 3) or (N, K, 3) in the world frame, m.
+            basket_pose: (N, 7) world pose of the basket, or None.
+        """
 
     def success_conditions(self, basket_pose: Array | None) -> dict[str, Array]:
         """Return success conditions in addition to `is_at_goal`, by name, (N,) bool each; default: none."""
@@ -81,7 +88,7 @@ class Goal(ABC):
         return None
 
     def goal_position(self, basket_pose: Array | None) -> Array | None:
-        """Return the point (N, 3) to which the target is carried, m, world frame; None: there is no such point."""
+        """Return the point (N, 3) to which the target is carried, in the world frame, m; None: no point."""
         return None
 
     def stage_and_terms(
@@ -156,7 +163,7 @@ class InBasketGoal(Goal):
     def stage_and_terms(
         self, state: TaskState, was_lifted: Array, table: rewards.RewardTable
     ) -> tuple[Array, dict[str, Array]]:
-        """Return the index (N,) of the reward stage, from grasp to rest, and the terms by name, (N,) in [0, 1] each."""
+        """Return the index (N,) of the reward stage, from grasp to rest, and the terms (N,) by name."""
         env = self.env
         slot = to_native(env.target_slot)
         target, center = terms.select_target(state.object_states, slot), env.target_center(state.object_states)

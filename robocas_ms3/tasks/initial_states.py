@@ -18,7 +18,9 @@ from robocas_ms3.scenes.layout_table import LayoutTable, is_usable
 
 @dataclass(frozen=True)
 class InitialStates:
-    """Initial states of E envs with K object slots, as tensors. Poses: world frame, position m, quaternion wxyz.
+    """Initial states of E envs with K object slots, as tensors.
+
+    Poses are in the world frame: position in m, quaternion wxyz.
 
     Attributes:
         object_poses: (E, K, 7) float32.
@@ -51,7 +53,7 @@ class InitialStates:
         )
 
     def interleave(self, from_self: NDArray[np.bool_], others: InitialStates) -> InitialStates:
-        """Merge two sets of states: row i is the next row of self if ``from_self[i]``, otherwise of ``others``."""
+        """Merge two sets of states: row i is the next row of self if ``from_self[i]``, else of ``others``."""
         order = torch.from_numpy(np.argsort(np.argsort(~from_self, kind="stable"))).to(self.targets.device)
         return InitialStates(
             **{
@@ -93,7 +95,10 @@ class InitialStateTable:
 
 
 def set_initial_states(env: Any, states: InitialStates, envs: torch.Tensor) -> None:
-    """Put robot, furniture, basket and objects of envs (E,) into initial states; store the start poses in the env."""
+    """Put robot, furniture, basket and objects of envs (E,) into initial states.
+
+    The env stores the start poses and the target.
+    """
     with torch.device(env.device):
         qpos: Any = torch.as_tensor(env.agent.keyframes[env.task_config.robot_start].qpos, dtype=torch.float32)
         env.agent.reset(qpos.repeat(len(envs), 1))

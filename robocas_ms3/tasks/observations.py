@@ -41,7 +41,10 @@ def rotate_to_tcp_frame(tcp_poses: Array, vectors: Array) -> torch.Tensor:
 
 
 def over_shoulder_viewpoint(model: SceneModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a camera position over the robot's shoulder, and the point it looks at, (3,) each, world frame, m."""
+    """Return a camera position over the robot's shoulder, and the point it looks at.
+
+    Both are (3,) in the world frame, m.
+    """
     region, robot = model.region, model.robot_pose[:3, 3]
     middle = np.array([*np.add(region.min_xy, region.max_xy) / 2, region.z, 1.0])
     target = (model.support_pose @ middle)[:3]

@@ -1,4 +1,6 @@
-"""Measure which objects hide a target, and which are obstacles next to it, seen from above. N envs, K object slots.
+"""Measure which objects hide a target, and which objects are obstacles next to it.
+
+The view is from above. N envs, K object slots.
 
 Each object is given by points on its surface. They are projected to a grid of square cells around the target. A height
 map has the highest point of each cell. The height maps of two objects show which of them hides the other. The camera is
@@ -83,7 +85,9 @@ def project_to_horizontal_plane(points: Tensor, eye: Tensor, depth: Tensor) -> T
 
 
 def has_clutter_moved(poses: Tensor, earlier_poses: Tensor, radii: Tensor, target_slot: Tensor, eye: Tensor) -> Tensor:
-    """Return (N,) bool, whether the target or an object near it has moved, so that its clutter may have changed.
+    """Return (N,) bool, whether the target or an object near it has moved.
+
+    If not, the clutter around the target is unchanged.
 
     Args:
         poses: (N, K, 7) current world poses of the objects.
@@ -169,7 +173,9 @@ def measure_pairwise_occlusion(points: Tensor, present: Tensor, eye: Tensor) -> 
 
 
 def find_push_point(points: Tensor, obstacles: Tensor, target_slot: Tensor) -> Tensor:
-    """Return the point where the paper's push of the highest obstacle starts: 2 cm from it, on the target's side.
+    """Return the point where the paper's push of the highest obstacle starts.
+
+    It is 2 cm from the obstacle, on the target's side.
 
     Args:
         points: (N, K, 3, P) points on the objects' surfaces, world frame, m.
@@ -198,7 +204,10 @@ def _cell_indices(points: Tensor, middle: Tensor) -> Tensor:
 
 
 def _height_map(cells: Tensor, heights: Tensor) -> Tensor:
-    """Return height maps (N, CELLS, CELLS) from cell indices (N, P) and heights (N, P); empty cell: ``_NOTHING``."""
+    """Return height maps (N, CELLS, CELLS) from cell indices (N, P) and heights (N, P).
+
+    An empty cell has the height ``_NOTHING``.
+    """
     empty = torch.full((len(cells), _OUTSIDE + 1), _NOTHING, device=cells.device)
     return empty.scatter_reduce(1, cells, heights, "amax")[:, :_OUTSIDE].unflatten(1, (CELLS, CELLS))
 

@@ -28,7 +28,10 @@ class RoboCASOpenPickEnv(RoboCASEnv):
     REWARDS = rewards.OPEN_PICK
 
     def overview_viewpoint(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return camera position and look-at point, (3,) each, such that an opening door does not hide the gripper."""
+        """Return a viewpoint from which an opening door does not hide the gripper.
+
+        Camera position and the point it looks at, (3,) each, world frame, m.
+        """
         model, opening = self.model, self.task_config.opening
         assert opening is not None  # checked by the configuration
         assert model.basket_pose is not None
@@ -66,7 +69,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
         return pose[:, :3] + rotations.rotate(pose[:, 3:], position)
 
     def is_furniture_open(self) -> torch.Tensor:
-        """Return (N,) bool, whether the joint is currently open by at least ``opening.opened_at`` of its range."""
+        """Return (N,) bool, whether the joint is currently open by ``opening.opened_at`` of its range."""
         goal, position = self.model.open_threshold, self.opening_joint_position()
         return position >= goal if goal > 0 else position <= goal
 
@@ -77,7 +80,7 @@ class RoboCASOpenPickEnv(RoboCASEnv):
         return {**found, "furniture_opened": opened}
 
     def reward_stage_and_terms(self) -> tuple[Array, dict[str, Array]]:
-        """Return reward stages (N,) and terms (N,) by name; the stage ``open`` comes before the stage ``grasp``."""
+        """Return reward stages (N,) and terms (N,) by name; ``open`` is the stage before ``grasp``."""
         stage, found = super().reward_stage_and_terms()
         shut = (stage == self.REWARDS.stage_index("grasp")) & ~self.success_check.stages["furniture_opened"]
         if not known_all_false(shut):

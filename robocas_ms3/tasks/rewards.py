@@ -1,4 +1,6 @@
-"""Dense rewards: named terms in [0, 1], weighted by the reward table of a task. N envs; native arrays (`core.arrays`).
+"""Dense rewards: named terms in [0, 1], weighted by the reward table of a task.
+
+N envs; arrays are native (`core.arrays`).
 
 A task is a sequence of reward stages, and each env is in one stage at a time. Terms of earlier stages count in full,
 terms of the current stage count with their values, and terms of later stages don't count. So a later stage always has
@@ -104,7 +106,7 @@ def furthest_stage(default: Array, conditions: list[tuple[Array, int]]) -> Array
 
 
 def nearness(points: Array, goals: Array, *, half_distance: float = 0.1) -> Array:
-    """Return the nearness (N,) in (0, 1] of points to goals (N, 3): 1 at the goal, 0.5 at ``half_distance`` m."""
+    """Return the nearness (N,) of points (N, 3) to goals: 1 at the goal, 0.5 at ``half_distance`` m."""
     return half_distance / (half_distance + norm(goals - points))
 
 
@@ -114,14 +116,19 @@ def change_fraction(value: Array, start: Array | float, full_change: float) -> A
 
 
 def clear_fraction(hidden_fraction: Array, obstacle_count: Array) -> Array:
-    """Return (N,) in [0, 1]: 1 for a cleared target, less for a greater hidden fraction (N,) or more obstacles (N,)."""
+    """Return (N,) in [0, 1]: 1 for a cleared target, less if more is hidden or obstacles are left.
+
+    Args:
+        hidden_fraction: (N,) hidden fraction of the target.
+        obstacle_count: (N,) number of obstacles.
+    """
     hidden = clamp((hidden_fraction - MAX_HIDDEN_FRACTION) / (1 - MAX_HIDDEN_FRACTION), 0.0, 1.0)
     around = clamp((as_float32(obstacle_count) - MAX_OBSTACLES) / _MANY_OBSTACLES, 0.0, 1.0)
     return 1 - (hidden + around) / 2
 
 
 def release_fraction(held: Array, touched: Array) -> Array:
-    """Return (N,): 0 if the gripper holds the target, 0.5 if it only touches the target, 1 without contact."""
+    """Return (N,): 0 if the gripper holds the target, 0.5 if it only touches it, 1 without contact."""
     return 1 - (as_float32(held) + as_float32(held | touched)) / 2
 
 

@@ -1,4 +1,4 @@
-"""RoboCASSearch-v1: find a hidden object in a heap, move the obstacles away, and put it into the basket."""
+"""RoboCASSearch-v1: find a hidden object in a heap, clear obstacles, and put it into the basket."""
 
 from __future__ import annotations
 
@@ -65,13 +65,13 @@ class RoboCASSearchEnv(RoboCASEnv):
         self._measure_now[env_idx] = True
 
     def extra_state(self) -> dict:
-        """Return the extra state of `RoboCASEnv` with ``cleared_at_reset`` and ``hidden_fraction``, (N, 1) each."""
+        """Return the extra state of `RoboCASEnv`, ``cleared_at_reset`` and ``hidden_fraction`` (N, 1)."""
         state = super().extra_state()
         own = {"cleared_at_reset": self._cleared_at_reset, "hidden_fraction": self.hidden_fraction}
         return {**state, "task": {**state["task"], **{name: value[:, None].clone() for name, value in own.items()}}}
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None) -> None:
-        """Set the state of some envs as `RoboCASEnv` does; the clutter of these envs is measured in the next step."""
+        """Set the state of some envs as `RoboCASEnv` does; the next step measures their clutter."""
         super().set_state_dict(state, env_idx)
         envs = slice(None) if env_idx is None else env_idx
         self._schedule.make_always_due(slice(None) if env_idx is None else env_idx.cpu().numpy())
@@ -89,12 +89,15 @@ class RoboCASSearchEnv(RoboCASEnv):
         return occlusion.measure_clutter(points, self.present[envs], self.target_slot[envs], self._eye)
 
     def measure_pairwise_occlusion(self, envs: Any = slice(None)) -> torch.Tensor:
-        """Return fractions (E, K, K) for some envs: entry [e, i, j] is the fraction of object j that object i hides."""
+        """Return the fraction (E, K, K) of each object that each other object hides, in some envs.
+
+        Entry [e, i, j] is the fraction of object j that object i hides.
+        """
         points = occlusion.surface_points_in_world(self.object_states[envs, :, :7], self._surface_points[envs])
         return occlusion.measure_pairwise_occlusion(points, self.present[envs], self._eye)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Return the result of `RoboCASEnv.evaluate`, ``obstacles_cleared`` and ``cleared_at_reset``, (N,) bool."""
+        """Return the result of `RoboCASEnv.evaluate`, ``obstacles_cleared`` and ``cleared_at_reset``."""
         found, measured = super().evaluate(), self._last_measurement
         unchanged = (
             measured is not None
@@ -160,7 +163,10 @@ class RoboCASSearchEnv(RoboCASEnv):
         return bool(occlusion.has_clutter_moved(poses, earlier_poses, self._radii, self.target_slot, self._eye).any())
 
     def reward_stage_and_terms(self) -> tuple[Array, dict[str, Array]]:
-        """Return reward stages (N,) and terms (N,) by name; ``clear`` lasts until the target is cleared or held."""
+        """Return reward stages (N,) and terms (N,) by name.
+
+        The stage ``clear`` lasts until the target is cleared or held.
+        """
         stage, found = super().reward_stage_and_terms()
         stages = self.success_check.stages
         settled = stages["obstacles_cleared"] | stages["target_grasped"]
@@ -193,12 +199,12 @@ class _Measurement(NamedTuple):
 
 
 def _sample_points(points: np.ndarray) -> np.ndarray:
-    """Return ``_POINTS`` points with evenly spaced indices from points (P, 3); points repeat if P is smaller."""
+    """Return ``_POINTS`` evenly spaced rows of points (P, 3); rows repeat if P is smaller."""
     return points[np.linspace(0, len(points) - 1, _POINTS).round().astype(int)]
 
 
 class PeriodicSchedule:
-    """Schedule of a measurement that is due in each env before the first step of an episode, then once per period.
+    """Schedule of a measurement: due before the first step of an episode, then once per period.
 
     Args:
         num_envs: N.

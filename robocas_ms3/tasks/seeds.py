@@ -28,7 +28,7 @@ class _UnstableLayoutError(LayoutError):
 
 
 def consecutive_seeds(first: int, count: int, seed_range: tuple[int, int] | None) -> list[int]:
-    """Return the seeds ``first``, ``first`` + 1, ...; if ``first`` is in ``seed_range``, they wrap around at its end.
+    """Return consecutive seeds, which wrap around at the end of ``seed_range`` if ``first`` is in it.
 
     Args:
         first: first seed.
@@ -44,7 +44,7 @@ def consecutive_seeds(first: int, count: int, seed_range: tuple[int, int] | None
 def parse_reset_options(
     options: dict[str, Any] | None, num_envs: int, device: torch.device
 ) -> tuple[dict[str, Any], list[int]]:
-    """Return the options with ``env_idx`` as indices instead of flags, and the indices of the envs to reset.
+    """Return reset options in which ``env_idx`` has indices, and the indices of the envs to reset.
 
     Raises:
         RobocasError: the options contain ``reset_to_env_states``.
@@ -140,7 +140,7 @@ class EpisodeSeeds:
         return seed
 
     def retry_reset(self, error: LayoutError) -> bool:
-        """Return whether to reset again with another drawn seed; otherwise restore the seeds before the failed reset.
+        """Return whether to reset again with another seed; if not, restore the seeds before this reset.
 
         Args:
             error: error of the failed reset.
@@ -219,7 +219,10 @@ class EpisodeSeeds:
             self._found.pop(env, None)
 
     def layout(self, env: int) -> Layout:
-        """Return the layout of an env; draw another layout seed if this seed has no layout and was not requested."""
+        """Return the layout of an env.
+
+        If its seed has no layout and was not requested, another layout seed is drawn.
+        """
         if env not in self._found:
             objects_seed = int(self.objects_seeds[env])
             self._found[env] = self._call_with_usable_seed(
@@ -283,5 +286,5 @@ class EpisodeSeeds:
 
 
 def _log_level(error: LayoutError) -> int:
-    """Return the log level for a replaced seed: DEBUG for an unstable layout, which the check has reported already."""
+    """Return the log level for a replaced seed: DEBUG if its layout is known to be unstable."""
     return logging.DEBUG if isinstance(error, _UnstableLayoutError) else logging.WARNING

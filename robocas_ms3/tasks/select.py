@@ -1,4 +1,4 @@
-"""RoboCASSelect-v1: pick one of several identical objects, which the instruction names by its position."""
+"""RoboCASSelect-v1: pick one of several identical objects, named by its position."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from robocas_ms3.tasks.base import RoboCASEnv
 
 
 class RoboCASSelectEnv(RoboCASEnv):
-    """Pick one of several identical objects by a relation as seen from the robot, such as "the nearest soap".
+    """Pick one of several identical objects by a relation, such as "the nearest soap".
+
+    Relations are defined from the robot's point of view.
 
     In the compared distance, the target differs by at least 3 cm from every other object with its name. For success, no
     other object with its name may be in the basket.
@@ -30,7 +32,7 @@ class RoboCASSelectEnv(RoboCASEnv):
         return {**found, "success": found["success"] & self._is_no_other_in_basket()}
 
     def success_conditions(self) -> dict[str, torch.Tensor]:
-        """Return the conditions of `RoboCASEnv` and ``others_out``: no other object of the name is in the basket."""
+        """Return the success conditions with ``others_out``: no other object of the name is in the basket."""
         return {**super().success_conditions(), "others_out": self._is_no_other_in_basket()}
 
     def _is_no_other_in_basket(self) -> torch.Tensor:

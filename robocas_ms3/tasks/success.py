@@ -75,7 +75,7 @@ class SuccessCheck:
         return as_tensor(row).clone()
 
     def check(self) -> dict[str, torch.Tensor]:
-        """Return the current stages, ``success`` and ``fail`` (N,) bool, and ``disturbed`` (N,) int; read only."""
+        """Return stages, ``success`` and ``fail`` (N,) bool, and ``disturbed`` (N,) int; read only."""
         env = self._env
         state = env.bodies.read()
         forces = env.gripper_contacts.read_forces(env.bodies.state_except_robot)
@@ -89,7 +89,7 @@ class SuccessCheck:
         return dict(found)
 
     def _reuse_key(self, forces: Array) -> object:
-        """Return a value that determines the result; None if the result must be computed (GPU, or gripper contact)."""
+        """Return a value that determines the result; None: compute it (GPU, or gripper contact)."""
         others = self._env.bodies.state_except_robot
         return None if others is None or forces.any() else (others, self.reached.numpy().tobytes())
 
@@ -140,7 +140,7 @@ class SuccessCheck:
         return target[:, :3] + rotations.rotate(target[:, 3:7], center)
 
     def is_object_grasped(self, forces: Array) -> Array:
-        """Return (N, K) bool, whether both fingers hold each object, from the gripper forces (N, 3, K, 3); native."""
+        """Return (N, K) bool, whether both fingers hold each object, from gripper forces (N, 3, K, 3)."""
         pressed = terms.presses_both_fingers(forces[:, 0], forces[:, 1])
         if known_all_false(pressed):  # the usual case: the directions need not be checked
             return pressed
@@ -150,7 +150,10 @@ class SuccessCheck:
         return terms.is_grasped(forces[:, 0], forces[:, 1], opening)
 
     def success_conditions(self) -> dict[str, torch.Tensor]:
-        """Return the success conditions that must hold at the same time, by name, (N,) bool each; without the lift."""
+        """Return the success conditions by name, (N,) bool each.
+
+        These must hold at the same time. The lift is not one of them, because it must only have happened before.
+        """
         touched = terms.is_touched(self._env.gripper_contacts.read_forces())
         found = self._compute_conditions(touched, *self._objects_and_basket(self._env.bodies.read()))
         return {name: as_tensor(measure) for name, measure in found.items()}
@@ -161,7 +164,13 @@ class SuccessCheck:
         return to_native(self._env.bodies.object_states(state)), None if basket is None else to_native(basket)
 
     def _compute_conditions(self, touched: Array, objects: Array, basket: Array | None) -> dict[str, Array]:
-        """Return `success_conditions` as native arrays, from touched objects (N, K) bool and the current state."""
+        """Return `success_conditions` as native arrays.
+
+        Args:
+            touched: (N, K) bool, whether the gripper touches each object.
+            objects: (N, K, 13) states of the objects.
+            basket: (N, 7) pose of the basket, or None.
+        """
         goal, slot = self._env.goal, to_native(self._env.target_slot)
         target = terms.select_target(objects, slot)
         return {
@@ -184,7 +193,7 @@ class SuccessCheck:
         return low & ~env.goal.is_at_goal(self.centers_of_mass(objects), self.state.basket_pose)
 
     def _has_failed(self, conditions: dict[str, Array], objects: Array, basket: Array | None) -> Array:
-        """Return ``fail`` (N,) bool as a native array: the target has fallen, or the goal can't be reached any more."""
+        """Return ``fail`` (N,) bool: the target has fallen, or the goal can't be reached any more."""
         goal, slot = self._env.goal, to_native(self._env.target_slot)
         height = terms.select_target(objects[..., 2], slot)
         low, lost = height < self.fallen_below, goal.is_unreachable(basket, conditions)

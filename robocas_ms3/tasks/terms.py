@@ -44,7 +44,7 @@ def is_inside_box(
 
 
 def presses_both_fingers(left_force: Array, right_force: Array) -> Array:
-    """Return (N, K) bool, whether each object presses on both fingers, in any direction, from forces (N, K, 3)."""
+    """Return (N, K) bool, whether each object presses on both fingers, from forces (N, K, 3)."""
     return (norm(left_force) >= MIN_GRASP_FORCE) & (norm(right_force) >= MIN_GRASP_FORCE)
 
 
@@ -82,13 +82,16 @@ def is_at_rest(linear_velocity: Array, angular_velocity: Array) -> Array:
 
 
 def is_basket_standing(position: Array, quaternion: Array, start_position: Array, start_quaternion: Array) -> Array:
-    """Return (N,) bool, whether baskets stand within `BASKET_SHIFT` and `BASKET_TILT` of their start poses."""
+    """Return (N,) bool, whether baskets are shifted and tilted by no more than the allowed values.
+
+    The values are `BASKET_SHIFT` and `BASKET_TILT`.
+    """
     shift = norm(position - start_position)
     return (shift <= BASKET_SHIFT) & (_cosine_of_tilt(quaternion, start_quaternion) >= _cosine(BASKET_TILT))
 
 
 def has_basket_fallen(position: Array, quaternion: Array, start_position: Array, start_quaternion: Array) -> Array:
-    """Return (N,) bool, whether baskets are lower by `BASKET_DROP` or tilted by `BASKET_FALL` since the start."""
+    """Return (N,) bool, whether baskets are lower by `BASKET_DROP` or tilted by `BASKET_FALL`."""
     dropped = start_position[:, 2] - position[:, 2] > BASKET_DROP
     return dropped | (_cosine_of_tilt(quaternion, start_quaternion) < _cosine(BASKET_FALL))
 
@@ -134,7 +137,9 @@ def inverse_part_motion(body_pose: Array, part_pose: Array, start_part_in_body: 
 
 
 def is_disturbed(poses: Array, start_poses: Array, undo: tuple[Array, Array] | None = None) -> Array:
-    """Return (N, K) bool, whether each object was shifted by `DISTURBED_SHIFT` or tilted by `DISTURBED_TILT`.
+    """Return (N, K) bool, whether each object was shifted or tilted since the start.
+
+    The limits are `DISTURBED_SHIFT` and `DISTURBED_TILT`.
 
     Args:
         poses: (N, K, 7) current world poses of the objects.

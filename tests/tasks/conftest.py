@@ -8,7 +8,7 @@ import torch
 
 @pytest.fixture(params=["torch", "numpy"])
 def make_array(request):
-    """Return a function that converts nested lists to a native array: a tensor as on a GPU, or NumPy as on a CPU."""
+    """Return a function that converts lists to a native array: a tensor (GPU) or NumPy (CPU)."""
 
     def convert(values):
         tensor = torch.as_tensor(values)

@@ -11,7 +11,7 @@ from robocas_ms3.tasks import RoboCASPickEnv
 
 
 def make_batch_env(folder, monkeypatch, num_envs=4, **arguments) -> tuple[RoboCASPickEnv, list]:
-    """Return a batch of pick envs without a simulator, and a list of the seed pairs (objects, layout) of each reset."""
+    """Return a batch of pick envs without a simulator, and a list of the seed pairs of each reset."""
     asked = []
 
     def fake_reset(env, seed=None, options=None):

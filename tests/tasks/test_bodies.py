@@ -1,4 +1,4 @@
-"""States that `BodyStateReader` reads equal the states that ManiSkill reads, also directly after setting a state."""
+"""States that `BodyStateReader` reads equal the states that ManiSkill reads."""
 
 from types import SimpleNamespace
 

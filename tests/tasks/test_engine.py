@@ -61,7 +61,10 @@ def test_capacities_grow_with_envs_and_objects_by_hand():
 
 @contextmanager
 def monitor_standard_error() -> Iterator[EngineErrorMonitor]:
-    """Monitor standard error; not a fixture, because pytest replaces standard error between fixtures and tests."""
+    """Monitor standard error.
+
+    This is no fixture, because pytest replaces standard error between fixtures and tests.
+    """
     errors = EngineErrorMonitor()
     errors.open()
     try:

@@ -18,7 +18,7 @@ from robocas_ms3.tasks.layout_stability import find_unchecked_layouts, measure_l
 
 @pytest.fixture
 def cache(tmp_path) -> LayoutCache:
-    """Return a cache with four layouts of small heaps; in the layout of seeds (1, 0) an object floats in the air."""
+    """Return a cache with four layouts of small heaps; in layout (1, 0) an object floats in the air."""
     pack = load_pack("builtin")
     cache = LayoutCache(SceneModel.load(load_task_config("search_table_small_heap"), pack, pack), tmp_path)
     pairs = seed_pairs([0, 1], [0, 1])

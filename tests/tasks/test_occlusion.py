@@ -21,7 +21,7 @@ from robocas_ms3.tasks.occlusion import (
 
 
 def plate(x: tuple[float, float], y: tuple[float, float], z: float) -> torch.Tensor:
-    """Return 41 x 41 points (3, 1681) of a horizontal rectangle between the limits ``x`` and ``y``, at height ``z``."""
+    """Return 41 x 41 points (3, 1681) of a horizontal rectangle with limits ``x``, ``y`` at height ``z``."""
     u, v = (torch.linspace(low, high, 41) for low, high in (x, y))
     return torch.stack([*(g.flatten() for g in torch.meshgrid(u, v, indexing="ij")), torch.full((41 * 41,), z)])
 
@@ -219,7 +219,7 @@ def test_hidden_fractions_agree_with_ray_casting():
 
 
 def test_pairwise_occlusion_by_hand():
-    """The lid hides half of the target, a small plate hides a quarter of the lid, and a fourth plate hides nothing."""
+    """A lid hides half of the target, and a small plate hides a quarter of the lid."""
     target, lid = plate((0, 0.1), (0, 0.1), 0.5), plate((0.05, 0.15), (0, 0.1), 0.55)
     small, aside = plate((0.1, 0.15), (0, 0.05), 0.6), plate((0.4, 0.5), (0, 0.1), 0.9)
     points = torch.stack([target, lid, small, aside])[None].expand(2, -1, -1, -1)

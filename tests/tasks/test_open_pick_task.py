@@ -1,4 +1,4 @@
-"""Stage ``furniture_opened``, pulls with contact at both fingers, and base motion in actions and recordings."""
+"""Stage ``furniture_opened``, pulls of handles, and base motion in actions and recordings."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_furniture_is_open_from_the_configured_fraction(name):
 
 @contextmanager
 def accept_unfinished_episodes():
-    """Make the generator accept episodes without success, because these tests end before the task is solved."""
+    """Make the generator accept episodes that end before the task is solved."""
     flag = MotionExecutor.flag
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(MotionExecutor, "flag", lambda self, name: name == "success" or flag(self, name))
@@ -120,7 +120,7 @@ def test_base_motion_of_the_dataset_contains_the_drive(drive_recording):
 
 
 def record_contacts(arm) -> dict[str, float]:
-    """Return a dictionary that later steps fill: name of a touched body -> greatest overlap with the robot, m."""
+    """Return a dictionary that later steps fill: touched body -> greatest overlap with the robot, m."""
     touched: dict[str, float] = {}
     step = arm.executor._step
     robot = {link._objs[0].entity.name for link in arm.env.agent.robot.links}

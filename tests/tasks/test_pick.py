@@ -78,7 +78,7 @@ def test_stages_are_sticky_until_the_next_reset(env):
 
 
 def test_reset_ignores_contacts_of_the_last_episode(env, monkeypatch):
-    """If the scene is not built again, the engine reports contacts of the last episode until the first step."""
+    """If a scene is not built again, PhysX reports contacts of the last episode until the first step."""
     base = env.unwrapped
     forces = np.full((1, 3, len(base.objects), 3), 5.0, np.float32)
     monkeypatch.setattr(ContactForceReader, "read_forces", lambda *_: forces)

@@ -117,7 +117,7 @@ def test_layouts_are_settled_and_match_their_kind(env, seed):
 
 @lru_cache
 def collect_checker_messages(env_id: str, mode: str) -> tuple[str, list[str]]:
-    """Run gymnasium's environment checker; return its error and its warnings without the name of the environment."""
+    """Run gymnasium's environment checker; return its error and its warnings without names."""
     size = dict(width=32, height=24)
     env = CPUGymWrapper(gym.make(env_id, control_mode="pd_joint_delta_pos", obs_mode=mode, sensor_configs=size))
     error = ""

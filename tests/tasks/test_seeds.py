@@ -1,4 +1,7 @@
-"""Seeds of episodes, layouts and appearance. Batches are fake, because the simulator has only one env on a CPU."""
+"""Seeds of episodes, layouts and appearance.
+
+Batches are fake, because the simulator has only one env on a CPU.
+"""
 
 from unittest.mock import Mock
 
@@ -136,7 +139,7 @@ def test_several_envs_have_a_default_range_of_seeds(monkeypatch):
 
 
 def make_source_without(*pairs):
-    """Return a layout source that has no layouts for ``pairs``, and the list of the pairs that were requested."""
+    """Return a layout source without layouts for ``pairs``, and the list of the requested pairs."""
     asked = []
 
     def source(objects, seed):

@@ -31,7 +31,7 @@ def cache_with_table(tmp_path_factory):
 
 @pytest.fixture
 def cache_of_gpu_table(cache_with_table, tmp_path, monkeypatch):
-    """Return a cache folder with an unchecked layout table of a GPU; sampling a layout or reading its file fails."""
+    """Return a cache folder with an unchecked table of a GPU; only reading the table succeeds."""
     shutil.copytree(cache_with_table, tmp_path, dirs_exist_ok=True)
     assert cache.count_layouts(next(tmp_path.iterdir())) == 6
     table = next(tmp_path.glob("*/table-cpu.npy"))

@@ -140,7 +140,10 @@ class RoboCASVectorEnv(ManiSkillVectorEnv):
         return _as_numpy(found) if self._in_numpy else found
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
-        """Call a method or read an attribute: of each env in processes (returns a tuple), of the batch on a GPU."""
+        """Call a method or read an attribute of each env (processes) or of the batch (GPU).
+
+        Processes return a tuple with one value per env.
+        """
         if isinstance(self._env, ProcessEnv):
             return self._env.call(name, *args, **kwargs)
         found = self._env.get_wrapper_attr(name)  # ManiSkill's method checks the outermost wrapper only

@@ -93,7 +93,7 @@ class PinnedWorkers(Generic[Task, Result]):
         self._unread.update(range(len(self._processes)))  # each process reports that it is ready
 
     def _exchange_messages(self, messages: Sequence[Any], seconds: float) -> list[Any]:
-        """Send one message to each process, or no messages; wait for all answers, and return them by process number."""
+        """Send one message to each process, or none; return all outstanding answers by process number."""
         answers: list[Any] = [None] * len(self._processes)
         errors: dict[int, Exception] = {}
         deadline = time.monotonic() + seconds

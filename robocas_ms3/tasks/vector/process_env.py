@@ -162,7 +162,7 @@ class ProcessEnv(gym.Env):
         return found.get("obs", {}), found["reward"], found["terminated"], found["truncated"], found["info"]
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call a method or read an attribute of each env; return a tuple of N results, which must be picklable."""
+        """Call a method or read an attribute of each env; return a tuple of N picklable results."""
         answers = self._run_commands([("call", name, args, kwargs)] * len(self._env_ranges))
         return tuple(pickle.loads(result) for results in answers for result in results)
 
@@ -215,7 +215,7 @@ class ProcessEnv(gym.Env):
         return [found for found, _ in answers]
 
     def _batch_last_results(self) -> dict[str, Any]:
-        """Return the last results of all envs as nested dictionaries of tensors (N, ...), or of lists of N values."""
+        """Return the last results of all envs as a nested dictionary of tensors (N, ...) or lists."""
         nested: dict[str, Any] = {}
         for (*path, name), value in join_rows(self._last_results).items():
             inner = nested

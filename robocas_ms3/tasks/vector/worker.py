@@ -158,7 +158,7 @@ def join_rows(parts: Sequence[tuple[int, Rows]]) -> Rows:
 
 
 def _join_pieces(pieces: Sequence[Any]) -> Any:
-    """Join arrays or lists to one new array, or to a list with one value per env if types or shapes differ."""
+    """Join arrays to one new array, or to a list with one value per env if types or shapes differ."""
     kinds = [isinstance(piece, np.ndarray) and (piece.dtype, piece.shape[1:]) for piece in pieces]
     if kinds[0] and kinds.count(kinds[0]) == len(kinds):
         return np.concatenate(pieces)

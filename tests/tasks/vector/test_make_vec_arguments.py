@@ -1,4 +1,4 @@
-"""`make_vec` without simulation: backends, arguments, and conventions on a batch that counts its steps."""
+"""`make_vec` without simulation: backends, arguments, and conventions on a fake batch."""
 
 import gymnasium as gym
 import numpy as np

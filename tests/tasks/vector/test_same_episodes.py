@@ -20,7 +20,7 @@ def draw_actions(seed: int, steps: int) -> np.ndarray:
 
 
 def record_episodes(env, num_envs: int, first_seed: int, steps: int) -> list[list[bytes]]:
-    """Run random actions; return all observations of each env, over several episodes, and its last instruction."""
+    """Run random actions; return all observations and the last instruction of each env."""
     actions = np.stack([draw_actions(first_seed + i, steps) for i in range(num_envs)], 1)
     obs, _ = env.reset(seed=first_seed)
     seen = [[row.numpy().tobytes()] for row in obs]

@@ -96,7 +96,10 @@ class SucceedingWrapper(gym.Wrapper):
 
 
 class MissingLayoutsWrapper(gym.Wrapper):
-    """Wrapper without a layout for seed 5, and for every second reset without a seed after ``draws_none_after``."""
+    """Wrapper without a layout for seed 5 and for some resets without a seed.
+
+    After the seed ``draws_none_after``, every second reset without a seed has no layout.
+    """
 
     def __init__(self, env):
         super().__init__(env)
