@@ -19,7 +19,7 @@ from robocas_ms3.core.files import atomic_file, encode_json, flush_to_disk, make
 from robocas_ms3.core.output_folder import remove_leftovers
 from robocas_ms3.core.text import format_count, one_line
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.conversion.data_info import write_info
+from robocas_ms3.datasets.conversion.data_info import write_data_info
 from robocas_ms3.datasets.conversion.episode_plan import make_header, make_settings
 from robocas_ms3.datasets.manage.split import SplitOptions, divide_episodes, group_episodes
 from robocas_ms3.datasets.sources.provenance import make_recording_entry
@@ -200,7 +200,7 @@ def _join_dataset(plan: Plan, root: Path, files: EpisodeFiles) -> None:
         root / schema.CONVERSION_FILE, {**make_header(settings, describe_split(plan)), "episodes": entries}, sync=True
     )
     flush_to_disk(root)  # episodes are on disk before the file that lists them
-    write_info(root, split_episodes(plan, root))
+    write_data_info(root, split_episodes(plan, root))
 
 
 def _set_source(path: Path, source: dict[str, Any]) -> None:

@@ -120,7 +120,7 @@ class PageContent:
         return read_scene(lambda: self.source.episode(number).scene, self.scene_name)
 
     def _entry(self, number: int) -> Any:
-        entry = self.source.entry(number)
+        entry = self.source.conversion_entry(number)
         known = ("seed", "success", "target")
         return {key: entry[key] for key in known if key in entry} if isinstance(entry, Mapping) else entry
 

@@ -133,11 +133,11 @@ convert_lerobot(ConversionSettings(out / "folder", out / "lerobot"))
 print(json.loads((out / "lerobot/meta/info.json").read_text())["robot_type"])
 arrays = open_source(out / "folder").episode(0).arrays
 with TrajectoryFile(file) as opened:
-    recording = opened.recording(0)
+    recording = opened.read_recording(0)
     env = opened.env.make(obs_mode="none", render_backend="none")
-    env.reset(seed=opened.entry(0).seed)
+    env.reset(seed=opened.read_entry(0).seed)
     world = OpenLoopEnv(opened.env, 5)
-    world.reset(opened.entry(0).seed)
+    world.reset(opened.read_entry(0).seed)
 samples = sample_states(recording.control_steps, 4)
 qpos = recording.states["articulations"]["twin"][samples, 13:25]
 print(*(np.array_equal(arrays[name], found) for name, found in

@@ -181,7 +181,7 @@ def read_recording(root):
     for number in source.numbers:
         episode = source.episode(number)
         assert episode.arrays
-        _ = episode.goals, episode.scene, episode.layout, source.entry(number)
+        _ = episode.goals, episode.scene, episode.layout, source.conversion_entry(number)
 
 
 def show_page(root):

@@ -46,14 +46,14 @@ def test_demonstrations_and_one_dataset_of_all_parts(undisturbed):
     assert report["parts"]["b"]["seeds"] == [3, 4]
     dataset = Dataset(undisturbed / "datasets" / "robocas")
     assert dataset.numbers == list(range(7))
-    assert [dataset.entry(number)["seed"] for number in range(7)] == [10, 11, 12, 13, 14, 3, 4]
+    assert [dataset.conversion_entry(number)["seed"] for number in range(7)] == [10, 11, 12, 13, 14, 3, 4]
     assert validate(dataset.root).violations == []
     with TrajectoryFile(undisturbed / "demos" / "a" / "trajectory.h5") as file:
         assert [entry["episode_seed"] for entry in file.episodes] == [10, 11, 12, 13, 14]
     for number, (part, place) in enumerate([("a", i) for i in range(5)] + [("b", 0), ("b", 1)]):
         # where its recording is now, not the file of one seed that it was rendered from
         trajectory = f"demos/{part}/trajectory.h5"
-        entry, source = dataset.entry(number), dataset.episode(number).scene["source"]
+        entry, source = dataset.conversion_entry(number), dataset.episode(number).scene["source"]
         assert (entry["trajectory"], entry["trajectory_episode"]) == (trajectory, place)
         assert (source["trajectory"], source["episode_id"]) == (trajectory, place)
         with TrajectoryFile(undisturbed / trajectory) as file:

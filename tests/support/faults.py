@@ -98,7 +98,9 @@ def content(command, out):
         found = [(path.name, files_of(path)) for path in sorted(out.glob("episode_*"))]
     else:  # by seed: without a skipped seed, other episodes have other numbers, which scene.json contains
         data = Dataset(out / "datasets" / "robocas")
-        folders = {data.entry(number)["seed"]: data.root / f"episode_{number:07d}" for number in data.numbers}
+        folders = {
+            data.conversion_entry(number)["seed"]: data.root / f"episode_{number:07d}" for number in data.numbers
+        }
         assert len(folders) == len(data.numbers)
         found = [(seed, {k: v for k, v in files_of(one).items() if k != "scene.json"}) for seed, one in folders.items()]
     return found

@@ -16,10 +16,10 @@ POINTS = {  # point -> (module, function, number of the call at which to kill)
     "image": (episode_folder, "write_image", 50),  # in the second episode
     "arrays": (episode_folder, "write_episode_files", 2),
     "file": (copy_episodes.FileCopier, "copy_file", 70),  # in the second episode
-    "rename": (files, "_move_in", 2),
-    "convert overview": (convert, "write_info", 1),
-    "merge overview": (copy_episodes, "write_info", 1),
-    "import overview": (import_robocas, "write_info", 1),
+    "rename": (files, "_replace_folder", 2),
+    "convert overview": (convert, "write_data_info", 1),
+    "merge overview": (copy_episodes, "write_data_info", 1),
+    "import overview": (import_robocas, "write_data_info", 1),
     "rmtree": (os, "rmdir", 3),  # --overwrite, after two folders of the old dataset are removed
 }
 

@@ -14,7 +14,17 @@ from robocas_ms3.viewer.routes import Routes
 from robocas_ms3.viewer.source import open_content
 
 MAX_DEPTH_MM = 4095  # of LeRobot's depth videos
-SOURCE = ("rate_hz", "numbers", "lengths", "cameras", "has_depth", "has_embeddings", "split", "entry", "action_space")
+SOURCE = (
+    "rate_hz",
+    "numbers",
+    "lengths",
+    "cameras",
+    "has_depth",
+    "has_embeddings",
+    "split",
+    "conversion_entry",
+    "action_space",
+)
 EPISODE = ("where", "steps", "instruction", "arrays", "read", "goals", "scene", "layout", "cameras", "rgb", "depth")
 
 
@@ -89,7 +99,7 @@ def test_unknown_episode_or_step(page):
 
 
 def test_damaged_values_of_a_source_are_omitted(folder, monkeypatch):
-    index = open_toy(folder, monkeypatch, ("lengths", "split", "entry")).index()
+    index = open_toy(folder, monkeypatch, ("lengths", "split", "conversion_entry")).index()
     (row, *_), (wanted, *_) = index["episodes"], open_content(folder).index()["episodes"]
     assert row["damage"] == "conversion.json: damaged"
     assert {**row, "damage": ""} == {**wanted, "split": ""}

@@ -66,7 +66,7 @@ def check_finite(episode: EpisodeArrays) -> Iterator[Violation]:
             yield Violation(episode.file, key, "finite numbers", f"{wrong} NaN or infinite values")
 
 
-def check_units(episode: EpisodeArrays) -> Iterator[Violation]:
+def check_unit_length(episode: EpisodeArrays) -> Iterator[Violation]:
     """Check that quaternions and embeddings have unit length."""
     for spec, array in _iter_schema_arrays(episode):
         if spec.quaternion or spec.embedding:
@@ -89,7 +89,7 @@ def check_relative_poses(episode: EpisodeArrays, keys: tuple[str, str, str, str]
     if not set(keys) <= episode.arrays.keys():
         return
     if any(np.linalg.norm(episode.arrays[key], axis=1).min() < 0.5 for key in (orientation, rel_orientation)):
-        return  # reported by `check_units`
+        return  # reported by `check_unit_length`
     shift, turn = compute_motion_errors(episode, keys)
     if (shift <= POSITION_TOLERANCE).all() and (turn <= ANGLE_TOLERANCE).all():
         return

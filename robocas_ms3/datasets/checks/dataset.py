@@ -92,7 +92,7 @@ def check_episode(folder: Path, stored: EpisodeArrays, image_options: ImageOptio
     wrong, values = list(array_checks.run_checks(stored, array_checks.FORM_CHECKS)), []
     if not wrong:
         wrong, values = (
-            list(array_checks.check_units(stored)),
+            list(array_checks.check_unit_length(stored)),
             list(array_checks.run_checks(stored, array_checks.CONTENT_CHECKS)),
         )
     wrong += check_cameras(folder, image_options)

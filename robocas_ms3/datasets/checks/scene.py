@@ -9,7 +9,7 @@ from typing import Any
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.checks.violation import Violation, check_model, read_json_object, shorten_json
+from robocas_ms3.datasets.checks.violation import Violation, check_against_model, read_json_object, shorten_json
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.arrays import EpisodeArrays, fingerprint_arrays
 from robocas_ms3.datasets.sources.file_models import ConversionRecord, SceneRecord, fill_unknown_keys
@@ -27,7 +27,7 @@ def read_valid_values(scene: Any, file: str = schema.SCENE_FILE) -> tuple[dict[s
     """
     if not isinstance(scene, Mapping):
         return {}, "" if scene is None else f"{file}: expected an object, found {shorten_json(scene)}"
-    wrong = check_model(SceneRecord, fill_unknown_keys(scene), file)
+    wrong = check_against_model(SceneRecord, fill_unknown_keys(scene), file)
     return _drop_invalid_keys(scene, wrong), "; ".join(map(str, wrong))
 
 
@@ -49,7 +49,7 @@ def read_settings(root: Path) -> tuple[dict[str, Any], ImageOptions, list[Violat
     if version != schema.SCHEMA_VERSION:
         expected = f"{schema.SCHEMA_VERSION} (convert the recording again)"
         return {}, STANDARD_CAMERAS, [Violation(CONVERSION_FILE, "schema_version", expected, str(version))]
-    wrong = check_model(ConversionRecord, content, CONVERSION_FILE)
+    wrong = check_against_model(ConversionRecord, content, CONVERSION_FILE)
     usable, image_options = _drop_invalid_keys(content, wrong), STANDARD_CAMERAS
     if usable.keys() >= {"cameras", "image_size", "depth", "image_format"}:
         size = tuple(content["image_size"]) if content["image_size"] else None

@@ -57,10 +57,10 @@ def read_json_object(
         return {}, [Violation(name, "", "JSON", one_line(error))]
     if not isinstance(content, dict):
         return {}, [Violation(name, "", "an object", type(content).__name__)]
-    return content, check_model(model, content, name) if model else []
+    return content, check_against_model(model, content, name) if model else []
 
 
-def check_model(model: type[BaseModel], content: Mapping[str, Any], file: str) -> list[Violation]:
+def check_against_model(model: type[BaseModel], content: Mapping[str, Any], file: str) -> list[Violation]:
     """Check the content of a JSON file against a model; return one violation per invalid key.
 
     Only the first invalid element of a list is reported.

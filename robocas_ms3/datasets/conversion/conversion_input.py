@@ -68,7 +68,7 @@ class ConversionInput:
 
     def _make_entry(self, number: int) -> dict[str, Any] | None:
         """Make the entry of an episode for ``conversion.json``; None if the episode is not converted."""
-        known = self.source.entry(number)
+        known = self.source.conversion_entry(number)
         if isinstance(self.source, RenderedSource):
             return dict(known) if self.include_failed or known["success"] else None
         episode = self.source.episode(number)

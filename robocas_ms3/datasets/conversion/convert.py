@@ -21,7 +21,7 @@ from robocas_ms3.core.output_folder import OutputFolder, remove_leftovers
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.conversion.conversion_input import ConversionInput, open_trajectory
-from robocas_ms3.datasets.conversion.data_info import copy_failures, write_info
+from robocas_ms3.datasets.conversion.data_info import copy_failures, write_data_info
 from robocas_ms3.datasets.conversion.episode_folder import FolderWriter, find_damaged_file
 from robocas_ms3.datasets.conversion.episode_plan import (
     DATASET,
@@ -100,7 +100,7 @@ def convert(
         if incomplete:
             write_json(out / schema.CONVERSION_FILE, move_unwritten_to_skipped(out, content, incomplete.reasons))
         copy_failures(settings.source.parent, out, source.file.env_info)
-        write_info(out, split_planned_episodes(content, previous))
+        write_data_info(out, split_planned_episodes(content, previous))
         if sheet is not None:
             rows = {episode.number: episode.row for episode in written if episode.row is not None}
             complete_contact_sheet(Dataset(out), rows)

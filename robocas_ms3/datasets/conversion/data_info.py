@@ -27,15 +27,15 @@ from robocas_ms3.demos.recordings.subgoals import group_subgoals
 _NEEDED = ("episode_length", "language_goal", "step_goal_type", "step_lang_goals", "rel_pos", "rel_orn")
 
 
-def write_info(root: Path, previous: tuple[Iterable[int], Iterable[int]] = ((), ())) -> None:
+def write_data_info(root: Path, previous: tuple[Iterable[int], Iterable[int]] = ((), ())) -> None:
     """Write ``data_info.json`` for the episodes on disk.
 
     ``previous``: training and validation episodes of the current split; they keep their split, see `split_by_seed`.
     """
-    write_json(root / schema.DATA_INFO_FILE, build_info(root, previous))
+    write_json(root / schema.DATA_INFO_FILE, build_data_info(root, previous))
 
 
-def build_info(root: Path, previous: tuple[Iterable[int], Iterable[int]] = ((), ())) -> dict[str, Any]:
+def build_data_info(root: Path, previous: tuple[Iterable[int], Iterable[int]] = ((), ())) -> dict[str, Any]:
     """Compute the content of ``data_info.json`` from the episodes on disk.
 
     ``previous``: training and validation episodes of the current split; they keep their split, see `split_by_seed`.

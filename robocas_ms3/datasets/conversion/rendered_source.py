@@ -58,7 +58,7 @@ class RenderedSource(TrajectorySource):
                 raise DatasetError(what, where=path, expected=f"the environment of {self.root}")
         super().__init__(path, rate_hz=self.rate_hz, include_failed=True, pack=self._pack)
 
-    def entry(self, number: int) -> dict[str, Any]:
+    def conversion_entry(self, number: int) -> dict[str, Any]:
         with self.file.reopen() as file:
             try:
                 return make_recording_entry(file, number)

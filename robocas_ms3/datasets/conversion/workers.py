@@ -137,11 +137,11 @@ class _Failure:
         return format_error(self.error.error).rstrip(".")
 
 
-def _make_crash_failure(task: EpisodeNumbers, why: str) -> _Failure:
+def _make_crash_failure(task: EpisodeNumbers, reason: str) -> _Failure:
     episode = episode_folder(task[0])
     return _Failure(
         episode,
-        RemoteError.from_error(DatasetError(f"its worker process crashed twice: {why}", where=episode), "a worker"),
+        RemoteError.from_error(DatasetError(f"its worker process crashed twice: {reason}", where=episode), "a worker"),
     )
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.poses import from_xyzw
+from robocas_ms3.datasets.lerobot.schema import ACTION_COLUMNS
 from robocas_ms3.datasets.schema import EPISODE_INFO
 from robocas_ms3.demos.recordings.motion import compute_relative_motion
 from robocas_ms3.robots.quantities import feature_columns, lerobot_features
@@ -38,7 +39,7 @@ def to_robocas_arrays(
     Embeddings are missing, because LeRobot datasets do not have them.
     """
     values: dict[str, Any] = {
-        "rel_pos": columns["action"][:, :3],
+        "rel_pos": columns["action"][:, ACTION_COLUMNS["rel_pos"]],
         "rel_agv_pose": columns["action.base"],
         "episode_length": len(columns["action"]),
         "language_goal": instruction,

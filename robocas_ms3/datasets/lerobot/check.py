@@ -12,7 +12,7 @@ from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets.checks.dataset import ValidationReport
-from robocas_ms3.datasets.checks.violation import Violation, check_model, read_json_object
+from robocas_ms3.datasets.checks.violation import Violation, check_against_model, read_json_object
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check_frames import TOLERANCE, KeyViolation, Ranges, check_data, find_unexpected_files
 from robocas_ms3.datasets.lerobot.file_models import MAX_EPISODES, MAX_FRAMES, InfoRecord, StatsLine, read_lines
@@ -212,7 +212,7 @@ def _check_robocas_files(dataset: LeRobotDataset) -> Iterator[Violation]:
     for number in sorted(scene_json_texts.keys() & dataset.row_by_episode.keys()):
         try:
             episode = dataset.episode(number)
-            yield from check_model(SceneRecord, episode.scene, f"{name}, episode {number}")
+            yield from check_against_model(SceneRecord, episode.scene, f"{name}, episode {number}")
             for camera in dataset.cameras:
                 episode.intrinsic(camera)
         except DatasetError as error:

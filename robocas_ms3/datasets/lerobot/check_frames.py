@@ -18,7 +18,7 @@ from robocas_ms3.datasets.checks import arrays as array_checks
 from robocas_ms3.datasets.checks.violation import Violation
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import to_frame_columns, to_robocas_arrays
-from robocas_ms3.datasets.lerobot.file_models import declared_columns
+from robocas_ms3.datasets.lerobot.file_models import declare_frame_columns
 from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, Row, parse_box, read_language_rows
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.tables import find_column_violations, open_table, read_episode_rows, to_array
@@ -56,7 +56,7 @@ def check_data(
             violations += [Violation(name, *violation) for violation in wrong]
             for row in [] if wrong else rows:  # one at a time, to bound memory
                 table, where = read_episode_rows(path, row["episode_index"]), f"episode {row['episode_index']}"
-                if wrong := list(find_column_violations(table, declared_columns(features))):
+                if wrong := list(find_column_violations(table, declare_frame_columns(features))):
                     violations += [Violation(name, *violation) for violation in wrong]
                     break
                 numeric = [key for key, feature in features.items() if feature["dtype"] not in schema.NOT_NUMERIC]
@@ -178,13 +178,14 @@ def _check_content(columns: Columns, types: list[Any], instruction: str) -> Iter
             yield "observation.state, observation.arm_base", "unit quaternions", one_line(error)
             return
         again, command = to_frame_columns(arrays), columns["action"]
-        if not np.array_equal(command[:, -1], again["action"][:, -1]):
+        gripper = schema.ACTION_COLUMNS["gripper_open"]
+        if not np.array_equal(command[:, gripper], again["action"][:, gripper]):
             yield "action", "the gripper command of the next step", "other values"
         if not np.array_equal(columns["action.joint"], again["action.joint"]):
             yield "action.joint", "joints and gripper of the next step", "other values"
-        arrays["rel_orn"] = Rotation.from_euler("xyz", command[:, 3:6]).as_quat()
+        arrays["rel_orn"] = Rotation.from_euler("xyz", command[:, schema.ACTION_COLUMNS["rel_orn"]]).as_quat()
     for wrong in array_checks.run_checks(
-        EpisodeArrays(Path(), arrays), (array_checks.check_units, *array_checks.CONTENT_CHECKS)
+        EpisodeArrays(Path(), arrays), (array_checks.check_unit_length, *array_checks.CONTENT_CHECKS)
     ):
         key = schema.SUBGOAL_TYPE.key if wrong.key == "step_goal_type" else wrong.key
         yield key, wrong.expected, wrong.found

@@ -98,7 +98,7 @@ def convert_lerobot(
                 if incomplete:
                     _log.warning("%s", incomplete)
                     plan = _drop_missing_episodes(plan, out / _EPISODES, incomplete)
-                _join(out, plan)
+                _join_dataset(out, plan)
             for name in (_EPISODES, _JOINED):
                 shutil.rmtree(out / name, ignore_errors=True)
     return ConversionResult(written, len(plan["episodes"]) - len(written), time.perf_counter() - start)
@@ -185,7 +185,7 @@ def _drop_missing_episodes(
     return {**plan, **split, "episodes": [entry for n, entry in episodes if n in place], SKIPPED_KEY: skipped}
 
 
-def _join(out: Path, plan: Mapping[str, Any]) -> None:
+def _join_dataset(out: Path, plan: Mapping[str, Any]) -> None:
     from robocas_ms3.datasets.lerobot.writer import join_episodes
 
     joined = make_folder(out / _JOINED)

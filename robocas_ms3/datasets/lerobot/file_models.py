@@ -81,7 +81,7 @@ class InfoRecord(_Record):
     video_path: str | None = None
 
     @model_validator(mode="after")
-    def _is_whole(self) -> InfoRecord:
+    def _check_consistency(self) -> InfoRecord:
         missing = [key for key in schema.INDICES if key not in self.features]
         if missing:
             raise ValueError(f"features: expected {', '.join(schema.INDICES)}, found no {', '.join(missing)}")
@@ -182,7 +182,7 @@ class SceneContent(RootModel[dict[str, Any]]):
 SCENES: Mapping[str, Column] = {"episode_index": Column(INTEGER), "scene": Column(TEXT), "cameras": Column(TEXT)}
 
 
-def episode_columns(names: Iterable[str], features: Mapping[str, Any]) -> dict[str, Column]:
+def declare_episode_columns(names: Iterable[str], features: Mapping[str, Any]) -> dict[str, Column]:
     """Return the declared columns of ``meta/episodes``.
 
     ``names``: columns in the file. Columns of FFV1 depth files are declared only if the file has them.
@@ -207,7 +207,7 @@ def episode_columns(names: Iterable[str], features: Mapping[str, Any]) -> dict[s
     return columns
 
 
-def declared_columns(features: Mapping[str, Any]) -> dict[str, Column]:
+def declare_frame_columns(features: Mapping[str, Any]) -> dict[str, Column]:
     """Return the declared columns of the data tables, from ``features`` of ``info.json``."""
     columns: dict[str, Column] = {}
     for key, dtype in ((key, feature["dtype"]) for key, feature in features.items()):

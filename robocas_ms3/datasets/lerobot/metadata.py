@@ -18,7 +18,7 @@ from robocas_ms3.datasets.lerobot.file_models import (
     EpisodeLine,
     InfoRecord,
     TaskLine,
-    episode_columns,
+    declare_episode_columns,
     read_lines,
 )
 from robocas_ms3.datasets.lerobot.tables import (
@@ -26,7 +26,7 @@ from robocas_ms3.datasets.lerobot.tables import (
     check_columns,
     open_table,
     read_columns,
-    read_objects,
+    read_small_table,
     read_texts,
     sort_by_index,
 )
@@ -34,7 +34,7 @@ from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, LAYOUTS, FileLayo
 from robocas_ms3.datasets.sources.files import read_json
 
 
-class Metadata:
+class LeRobotMetadata:
     """Content of the folder ``meta``; each file is read at first use."""
 
     def __init__(self, root: Path) -> None:
@@ -114,7 +114,7 @@ class Metadata:
             with open_table(path, most_rows=left) as file:
                 names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
                 table = read_columns(file, path, names, limit=OBJECTS_LIMIT)
-            check_columns(table, episode_columns(table.column_names, features), path)
+            check_columns(table, declare_episode_columns(table.column_names, features), path)
             left -= len(table)
             yield table
 
@@ -167,5 +167,6 @@ class Metadata:
     def scene_json_texts(self) -> dict[int, dict[str, str]]:
         """JSON texts ``scene`` and ``cameras`` by episode; empty unless ``robocas convert`` wrote the dataset."""
         path = self.root / schema.SCENES_FILE
-        rows = read_objects(path, SCENES, most_rows=self.info["total_episodes"]).to_pylist() if path.exists() else []
+        limit = self.info["total_episodes"]
+        rows = read_small_table(path, SCENES, most_rows=limit).to_pylist() if path.exists() else []
         return {row.pop("episode_index"): row for row in rows}

@@ -19,9 +19,9 @@ from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets.images.image_files import Box
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.arrays import to_robocas_arrays
-from robocas_ms3.datasets.lerobot.file_models import CameraRecord, CamerasRecord, SceneContent, declared_columns
+from robocas_ms3.datasets.lerobot.file_models import CameraRecord, CamerasRecord, SceneContent, declare_frame_columns
 from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, read_boxes, read_language_rows, read_subgoal_texts
-from robocas_ms3.datasets.lerobot.metadata import Metadata
+from robocas_ms3.datasets.lerobot.metadata import LeRobotMetadata
 from robocas_ms3.datasets.lerobot.tables import INTEGER, Column, check_columns, is_numeric, read_episode_rows, to_array
 from robocas_ms3.datasets.lerobot.video import read_frames, to_depth
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource, ImageKind, SourceEpisode, Split
@@ -33,7 +33,7 @@ from robocas_ms3.robots.cameras import Parent, standard_camera_parent
 _RootModel = TypeVar("_RootModel", SceneContent, CamerasRecord)
 
 
-class LeRobotDataset(Metadata, EpisodeSource):
+class LeRobotDataset(LeRobotMetadata, EpisodeSource):
     """LeRobot dataset, read without the package ``lerobot``.
 
     Only datasets of ``robocas convert`` have arrays, scenes and camera models.
@@ -71,7 +71,7 @@ class LeRobotDataset(Metadata, EpisodeSource):
             raise DatasetError(what, where=where, expected=expected, found=unknown[:5])
         return list(listed)
 
-    def entry(self, number: int) -> dict[str, Any]:
+    def conversion_entry(self, number: int) -> dict[str, Any]:
         entries = self.settings.get("episodes", [])
         return entries[number] if number < len(entries) else {}
 
@@ -150,7 +150,7 @@ class LeRobotEpisode(SourceEpisode):
         return group_subgoals(*self._read_subgoals()) if self.dataset.has_robocas_features else []
 
     def _read_subgoals(self) -> tuple[list[str], list[str]]:
-        key, columns = schema.SUBTASK_INDEX.key, declared_columns(self.dataset.info["features"])
+        key, columns = schema.SUBTASK_INDEX.key, declare_frame_columns(self.dataset.info["features"])
         if not self.dataset.has_language:
             columns[key] = Column(INTEGER, greatest=len(self.dataset.subtasks) - 1)
         check_columns(self.frame_table, columns, Path(self.where))

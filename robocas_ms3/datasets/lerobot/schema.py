@@ -81,6 +81,8 @@ FEATURES: tuple[Feature, ...] = (
 )
 """Numeric features, see docs/lerobot.md."""
 
+ACTION_COLUMNS = {"rel_pos": slice(0, 3), "rel_orn": slice(3, 6), "gripper_open": slice(6, 7)}
+"""Columns of the feature ``action``; `robots.quantities.feature_columns` has those of observations."""
 ROBOCAS_KEYS = tuple(feature.key for feature in FEATURES)
 """Keys that identify datasets of ``robocas convert``."""
 
@@ -148,8 +150,7 @@ def per_frame_features(variant: Variant) -> tuple[Feature, ...]:
 
 def make_modality(cameras: Sequence[str]) -> dict[str, Any]:
     """Make the content of ``meta/modality.json``, which GR00T needs with format v2.1."""
-    action = {"rel_pos": slice(0, 3), "rel_orn": slice(3, 6), "gripper_open": slice(6, 7)}
-    parts = {"state": feature_columns(STATE), "action": action}
+    parts = {"state": feature_columns(STATE), "action": ACTION_COLUMNS}
     return {
         **{
             name: {key: {"start": columns.start, "end": columns.stop} for key, columns in part.items()}

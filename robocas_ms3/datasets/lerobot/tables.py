@@ -127,7 +127,8 @@ def read_columns(
     return table
 
 
-def read_objects(path: Path, columns: Mapping[str, Column], *, most_rows: float = np.inf) -> pa.Table:
+def read_small_table(path: Path, columns: Mapping[str, Column], *, most_rows: float = np.inf) -> pa.Table:
+    """Read declared columns of a table that is small enough for Python objects; check them."""
     with open_table(path, most_rows=most_rows) as file:
         table = read_columns(file, path, columns, limit=OBJECTS_LIMIT)
         check_columns(table, columns, path)
@@ -218,17 +219,17 @@ def _read_footer(path: Path, _changed_ns: int) -> tuple[pq.FileMetaData, list[st
 
 
 def read_texts(path: Path, name: str, most_rows: float = np.inf) -> list[str]:
-    table = read_objects(path, {name: Column(INTEGER), TEXT_INDEX: Column(TEXT)}, most_rows=most_rows)
+    table = read_small_table(path, {name: Column(INTEGER), TEXT_INDEX: Column(TEXT)}, most_rows=most_rows)
     return sort_by_index(table.column(name).to_pylist(), table.column(TEXT_INDEX).to_pylist(), f"{path}, {name}")
 
 
-def sort_by_index(places: list[int], texts: list[str], where: str) -> list[str]:
-    """Sort texts by their indices ``places``; raise DatasetError if the indices are not 0, 1, 2, ..."""
-    if sorted(places) != list(range(len(places))):
-        expected = f"0 to {len(places) - 1}, each once"
-        found = sorted(places)[:5]
+def sort_by_index(indices: list[int], texts: list[str], where: str) -> list[str]:
+    """Sort texts by their indices ``indices``; raise DatasetError if the indices are not 0, 1, 2, ..."""
+    if sorted(indices) != list(range(len(indices))):
+        expected = f"0 to {len(indices) - 1}, each once"
+        found = sorted(indices)[:5]
         raise DatasetError("invalid indices of texts", where=where, expected=expected, found=found, fix=SEE_VALIDATE)
-    return [text for _, text in sorted(zip(places, texts, strict=True))]
+    return [text for _, text in sorted(zip(indices, texts, strict=True))]
 
 
 def write_texts(path: Path, name: str, texts: Sequence[str]) -> None:

@@ -23,7 +23,7 @@ from robocas_ms3.datasets.checks import arrays as array_checks
 from robocas_ms3.datasets.checks.images import check_cameras, check_images
 from robocas_ms3.datasets.checks.scene import read_settings
 from robocas_ms3.datasets.checks.violation import Violation, read_json_object
-from robocas_ms3.datasets.conversion.data_info import write_info
+from robocas_ms3.datasets.conversion.data_info import write_data_info
 from robocas_ms3.datasets.conversion.episode_plan import DATASET, SETTINGS_KEYS, make_header
 from robocas_ms3.datasets.images.image_headers import check_file_ends
 from robocas_ms3.datasets.sources.arrays import fingerprint_arrays, read_arrays
@@ -165,10 +165,12 @@ def copy_episodes(
     if options.on_start:
         folders = [out / schema.episode_folder(n) for out, members in outputs.items() for n in range(len(members))]
         options.on_start(sum(options.overwrite or not folder.is_dir() for folder in folders))
-    return [_copy(out, members, records[out], options) for out, members in outputs.items()]
+    return [_copy_dataset(out, members, records[out], options) for out, members in outputs.items()]
 
 
-def _copy(out: Path, members: Sequence[CopiedEpisode], record: Mapping[str, Any], options: CopyOptions) -> CopyResult:
+def _copy_dataset(
+    out: Path, members: Sequence[CopiedEpisode], record: Mapping[str, Any], options: CopyOptions
+) -> CopyResult:
     copier = FileCopier(options.link)
     with open_dataset_output(out, record, options.overwrite):
         missing = [n for n in range(len(members)) if not (out / schema.episode_folder(n)).is_dir()]
@@ -179,7 +181,7 @@ def _copy(out: Path, members: Sequence[CopiedEpisode], record: Mapping[str, Any]
             if options.on_episode:
                 options.on_episode(number)
         train, val = ([n for n, member in enumerate(members) if member.split == name] for name in ("train", "val"))
-        write_info(out, (train, val))
+        write_data_info(out, (train, val))
     return CopyResult(out, len(members), len(members) - len(missing), copier.linked, copier.copied)
 
 

@@ -16,7 +16,7 @@ from robocas_ms3.core.files import atomic_folder, write_json
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.core.text import format_count
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.conversion.data_info import write_info
+from robocas_ms3.datasets.conversion.data_info import write_data_info
 from robocas_ms3.datasets.conversion.episode_folder import write_episode_files
 from robocas_ms3.datasets.conversion.episode_plan import make_settings
 from robocas_ms3.datasets.manage.copy_episodes import (
@@ -75,7 +75,7 @@ def import_robocas(survey: Survey, out: Path, *, embed: Embed | None = None, opt
             if options.on_episode:
                 options.on_episode(number)
         write_json(out / REPORT_FILE, survey.as_json())
-        write_info(out, (info.get("train_eps", []), info.get("val_eps", [])))
+        write_data_info(out, (info.get("train_eps", []), info.get("val_eps", [])))
     return len(survey.importable) - len(missing)
 
 

@@ -107,7 +107,7 @@ def repair_arrays(episode: ImportedEpisode) -> None:
 
     If a repair fails, the episode gets a finding with the outcome ``skipped``, and the next repairs are omitted.
     """
-    for stage in (_repair_shapes, _repair_units, _repair_content):
+    for stage in (_repair_shapes, _drop_invalid_unit_vectors, _repair_content):
         if episode.is_importable:
             stage(episode)
 
@@ -119,15 +119,15 @@ def _repair_shapes(episode: ImportedEpisode) -> None:
             episode.set_arrays({wrong.key: SPECS[wrong.key].cast(stored.steps)})
             episode.add_finding(wrong, "repaired")
         else:
-            _drop(episode, wrong)
+            _drop_or_skip(episode, wrong)
 
 
-def _repair_units(episode: ImportedEpisode) -> None:
-    for wrong in [*array_checks.check_units(episode.stored)]:
-        _drop(episode, wrong)
+def _drop_invalid_unit_vectors(episode: ImportedEpisode) -> None:
+    for wrong in [*array_checks.check_unit_length(episode.stored)]:
+        _drop_or_skip(episode, wrong)
 
 
-def _drop(episode: ImportedEpisode, wrong: Violation) -> None:
+def _drop_or_skip(episode: ImportedEpisode, wrong: Violation) -> None:
     """Remove the invalid array if it is an embedding; otherwise mark the episode as skipped."""
     if wrong.key not in EMBEDDINGS:
         episode.add_finding(wrong, "skipped")

@@ -17,7 +17,7 @@ from robocas_ms3.core.files import write_json
 from robocas_ms3.core.locks import lock_folder
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import arrays as array_checks
-from robocas_ms3.datasets.conversion.data_info import build_info
+from robocas_ms3.datasets.conversion.data_info import build_data_info
 from robocas_ms3.datasets.manage.copy_episodes import (
     KEEP_RULE,
     CopiedEpisode,
@@ -69,7 +69,7 @@ def group_episodes(dataset: Dataset, group_by: GroupBy) -> dict[int, str]:
         target = scene.get("target") or {}
         value = {"seed": scene.get("seed"), "target": target.get("asset_id"), "task": scene.get("task")}[group_by]
         if value is None and group_by == "seed":
-            value = number  # as in `data_info.build_info`
+            value = number  # as in `data_info.build_data_info`
         if value is None:
             raise DatasetError(
                 f"unknown {group_by} of an episode",
@@ -128,7 +128,7 @@ def resplit(root: Path, options: SplitOptions | None = None) -> EpisodeSplit:
             stored = read_arrays(dataset.episode(number).folder / schema.EPISODE_FILE)
             for wrong in array_checks.run_checks(stored, (array_checks.check_file, array_checks.check_finite)):
                 raise damaged_episode_error(root, wrong)
-        info, settings = build_info(root, split), dataset.settings
+        info, settings = build_data_info(root, split), dataset.settings
         new = {**settings, **({} if options is None else {"split": options.rule})}
         if "episodes" in settings:
             on_disk = set(map(str, dataset.numbers))

@@ -213,9 +213,10 @@ class EpisodeSource(ABC):
         """
         if name == "all":
             return self.numbers
-        return split_by_seed({number: self.entry(number).get("seed") for number in self.numbers})[name == "val"]
+        seeds = {number: self.conversion_entry(number).get("seed") for number in self.numbers}
+        return split_by_seed(seeds)[name == "val"]
 
-    def entry(self, number: int) -> Mapping[str, Any]:
+    def conversion_entry(self, number: int) -> Mapping[str, Any]:
         """Return the entry of an episode in ``conversion.json``: its seed, success and recording; empty if unknown.
 
         `provenance.make_recording_entry` lists the keys.

@@ -225,7 +225,7 @@ class Dataset(EpisodeSource):
             raise DatasetError(what, where=where, expected=expected, found=f"no {unknown[:5]}", fix=SEE_VALIDATE)
         return numbers
 
-    def entry(self, number: int) -> dict[str, Any]:
+    def conversion_entry(self, number: int) -> dict[str, Any]:
         entries = self.settings.get("episodes")
         found = entries.get(str(number)) if isinstance(entries, dict) else None
         return found if isinstance(found, dict) else {}

@@ -15,17 +15,17 @@ SPLIT_RULE = (
 
 
 def split_by_seed(
-    seed_of: Mapping[int, Any], previous: tuple[Iterable[int], Iterable[int]] = ((), ())
+    seed_by_episode: Mapping[int, Any], previous: tuple[Iterable[int], Iterable[int]] = ((), ())
 ) -> tuple[list[int], list[int]]:
     """Split episodes by seed: 90 % of the seeds for training, 10 % for validation; return both lists of numbers.
 
-    ``seed_of``: seed of each episode by number; None: the number replaces the seed. The split depends on the seeds
-    alone, not on their order. With two or more seeds, validation has at least one.
+    ``seed_by_episode``: seed of each episode by number; None: the number replaces the seed. The split depends on the
+    seeds alone, not on their order. With two or more seeds, validation has at least one.
 
     ``previous``: an earlier split. Its episodes keep their split, and so do other episodes with the same seeds. New
     seeds are added to validation until it has a tenth of all seeds.
     """
-    known = {number: parse_seed(value) for number, value in seed_of.items()}
+    known = {number: parse_seed(value) for number, value in seed_by_episode.items()}
     seeds = {number: number if seed is None else seed for number, seed in known.items()}
     old = [{seeds[number] for number in numbers if number in seeds} for numbers in previous]
     ranked = sorted(set(seeds.values()), key=lambda seed: hashlib.sha256(str(seed).encode()).hexdigest())

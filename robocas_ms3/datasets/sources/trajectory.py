@@ -75,7 +75,7 @@ class TrajectorySource(EpisodeSource):
             return self.numbers
         return split_by_seed({number: self.episode_entry(number).seed for number in self.numbers})[name == "val"]
 
-    def entry(self, number: int) -> Mapping[str, Any]:
+    def conversion_entry(self, number: int) -> Mapping[str, Any]:
         with self.file.reopen() as file:
             return make_recording_entry(file, self.index[number])
 

@@ -6,7 +6,7 @@ from managing import Bomb, change, convert_made_up, edit, files_of, make
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.checks.dataset import validate
-from robocas_ms3.datasets.conversion.data_info import write_info
+from robocas_ms3.datasets.conversion.data_info import write_data_info
 from robocas_ms3.datasets.manage.merge import merge
 from robocas_ms3.datasets.sources.reader import Dataset
 
@@ -23,7 +23,7 @@ def test_pickles_are_never_loaded(dataset, tmp_path):
         lambda: Dataset(dataset).episode(1).arrays,
         lambda: Dataset(dataset).episode(0).intrinsic("base_camera"),
         lambda: merge([dataset], tmp_path / "out"),
-        lambda: write_info(dataset),
+        lambda: write_data_info(dataset),
     ):
         with pytest.raises(DatasetError):
             read()

@@ -5,7 +5,7 @@ from managing import edit
 
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.checks.scene import read_valid_values
-from robocas_ms3.datasets.checks.violation import check_model
+from robocas_ms3.datasets.checks.violation import check_against_model
 from robocas_ms3.datasets.sources.file_models import SCENE_KEYS, SceneRecord
 
 FILE = "episode_0000001/scene.json"
@@ -36,7 +36,7 @@ WHOLE = {
 
 
 def check_values(scene):
-    return check_model(SceneRecord, scene, "scene.json")
+    return check_against_model(SceneRecord, scene, "scene.json")
 
 
 def said(violation):

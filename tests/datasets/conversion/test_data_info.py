@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.actions import compute_action_space
-from robocas_ms3.datasets.conversion.data_info import write_info
+from robocas_ms3.datasets.conversion.data_info import write_data_info
 from robocas_ms3.datasets.sources.split import split_by_seed
 
 
@@ -57,6 +57,6 @@ def test_data_info_never_has_nan(dataset, new, place):
         change(dataset / f"episode_000000{number}", **new)
     before = (dataset / "data_info.json").read_bytes()
     with pytest.raises(DatasetError) as error:
-        write_info(dataset)
+        write_data_info(dataset)
     assert str(error.value.where) == f"{dataset}/{place}"
     assert (dataset / "data_info.json").read_bytes() == before

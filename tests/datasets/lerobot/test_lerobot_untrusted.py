@@ -15,7 +15,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.check import check_lerobot
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
-from robocas_ms3.datasets.lerobot.tables import TEXT, Column, read_episode_rows, read_objects
+from robocas_ms3.datasets.lerobot.tables import TEXT, Column, read_episode_rows, read_small_table
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ def test_repeated_long_text_counts_each_time(tmp_path):
     pq.write_table(pa.table({"text": pa.array(["x" * 2**20]).take(pa.array([0] * 100))}), path)
     assert path.stat().st_size < 2**21
     with pytest.raises(DatasetError):
-        read_objects(path, {"text": Column(TEXT)})
+        read_small_table(path, {"text": Column(TEXT)})
 
 
 def test_checksums_name_files_of_the_dataset(spoiled):

@@ -51,7 +51,7 @@ def test_missing_arrays_violate_one_rule_only(tmp_path):
                 (
                     array_checks.check_shapes,
                     array_checks.check_finite,
-                    array_checks.check_units,
+                    array_checks.check_unit_length,
                     *array_checks.CONTENT_CHECKS,
                 ),
             )

@@ -74,7 +74,7 @@ def test_recordings_have_every_control_step(paths):
 
 def test_a_pickled_source_reads_what_its_original_reads(paths):
     source = pickle.loads(pickle.dumps(open_source(paths["trajectory"])))
-    assert [source.entry(number)["seed"] for number in source.numbers] == [1, 2, 3]
+    assert [source.conversion_entry(number)["seed"] for number in source.numbers] == [1, 2, 3]
     for number in source.numbers:
         episode = source.episode(number)
         assert len(episode.arrays["ee_pos"]) == episode.steps == 7
