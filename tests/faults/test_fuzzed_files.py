@@ -219,11 +219,11 @@ def read_plan_folder(root):
     shutil.copy(root / OUTCOMES, folder.unit_folder(COMPLETE))
     shutil.copy(root / OUTCOME, first_seed(folder))
     assert read_status(root)
-    read_plan(root).open(shared=True).check_record()
+    read_plan(root).open_output(shared=True).check_record()
 
 
 def read_generation(root):
-    OutputFolder(root, OUTPUT, RUN).read()
+    OutputFolder(root, OUTPUT, RUN).read_record()
     count_by_reason(JsonLinesFile(root / "failures.jsonl", FailedAttempt).read())
 
 
