@@ -62,10 +62,10 @@ def check_finite(arrays: Mapping[str, NDArray], where: str) -> None:
 
 
 def compute_action_space(rel_pos: Sequence[NDArray], rel_orn: Sequence[NDArray]) -> dict[str, list[list[float]]]:
-    """Compute ``action_space`` of ``data_info.json``: 1st and 99th percentile of the motion per axis, m and rad.
+    """Compute ``action_space`` of ``data_info.json``.
 
-    ``rel_pos`` and ``rel_orn`` have one array per episode, (T, 3) and (T, 4) xyzw. Last rows are ignored, because they
-    are 0 by definition.
+    It has the 1st and 99th percentile of the motion per axis, in m and rad. ``rel_pos`` and ``rel_orn`` have one array
+    per episode, (T, 3) and (T, 4) xyzw. Last rows are ignored, because they are 0 by definition.
     """
     positions = np.concatenate([rows[:-1] for rows in rel_pos]).astype(np.float64)
     quaternions = np.concatenate([rows[:-1] for rows in rel_orn]).astype(np.float64)
@@ -78,7 +78,12 @@ def compute_action_space(rel_pos: Sequence[NDArray], rel_orn: Sequence[NDArray])
 
 @dataclass(frozen=True)
 class ActionScale:
-    """Linear scale of the motion in actions: ``low`` becomes -1 and ``high`` becomes 1, both (6,) in m and rad."""
+    """Linear scale of the motion in actions.
+
+    Attributes:
+        low: (6,) motion in m and rad that becomes -1.
+        high: (6,) motion in m and rad that becomes 1.
+    """
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]

@@ -25,7 +25,9 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Format:
-    """Dataset format; its reader, writer and checker are named as ``module:function`` and imported at first use.
+    """Dataset format.
+
+    Reader, writer and checker are named as ``module:function`` and imported at first use.
 
     Attributes:
         name: name in ``robocas convert --to``.

@@ -86,7 +86,7 @@ class DepthView:
         return grid[:-1, :-1][level & joined & known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:]]
 
     def _compute_grid(self) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the points (R, C, 3) of sampled pixels in the world frame, m, and a mask (R, C) of known depth."""
+        """Return points (R, C, 3) of sampled pixels in the world, m, and a mask (R, C) of known depth."""
         rows, columns = self._sample_pixels()
         z = self.depth[rows, columns].astype(np.float64) / 1000
         fx, fy, cx, cy = self.intrinsic
@@ -100,9 +100,10 @@ class DepthView:
 
 
 def check_depth_views(steps: Sequence[Sequence[DepthView]]) -> Iterator[tuple[int, str, str, str]]:
-    """Yield (index into ``steps``, camera, expected, found) per violation, at most one per rule and camera.
+    """Yield (index into ``steps``, camera, expected, found) per violation.
 
-    ``steps`` has the depth images of all cameras, for each checked step.
+    Each rule yields at most one violation per camera. ``steps`` has the depth images of all cameras, for each checked
+    step.
     """
     reported: set[tuple[str, str]] = set()
     agreement: dict[str, float] = {}  # camera -> highest fraction of agreeing points
@@ -151,11 +152,11 @@ def _check_floor(view: DepthView, points: Array) -> Iterator[tuple[str, str, str
 
 
 def compare_depth(points: Array, view: DepthView, edge_distances: Array) -> tuple[int, float, float]:
-    """Compare points (N, 3) in the world frame, m, that one camera sees with the depth image of another camera.
+    """Compare the points that one camera sees with the depth image of another camera.
 
-    ``edge_distances`` (N,) in m: see `DepthView.edge_distances`. Return the number of points inside the image, the
-    fraction of them that the other camera sees through (it measures a larger depth), and the fraction whose depth it
-    confirms.
+    ``points`` (N, 3) are in the world frame, m. ``edge_distances`` (N,) in m: see `DepthView.edge_distances`. Return
+    the number of points inside the image, the fraction of them that the other camera sees through (it measures a larger
+    depth), and the fraction whose depth it confirms.
     """
     local = (points - view.camera_in_world[:3, 3]) @ inverse(view.camera_in_world)[:3, :3].T
     local, edge_distances = local[local[:, 2] > NEAR], edge_distances[local[:, 2] > NEAR]

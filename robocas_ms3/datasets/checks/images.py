@@ -62,7 +62,7 @@ def check_cameras(folder: Path, image_options: ImageOptions) -> Iterator[Violati
 
 
 def check_camera_array(file: str, array: NDArray, *, pose: bool) -> Iterator[Violation]:
-    """Check the values of a pose (4, 4), or with ``pose`` False of the intrinsics (4,) of a camera."""
+    """Check the pose (4, 4) of a camera, or its intrinsics (4,) if ``pose`` is False."""
     shape = (4, 4) if pose else (4,)
     if array.shape != shape or array.dtype.kind != "f":
         yield Violation(file, "", f"floats of shape {shape}", f"{array.dtype} of shape {array.shape}")

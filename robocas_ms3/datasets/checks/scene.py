@@ -21,7 +21,7 @@ STANDARD_CAMERAS = ImageOptions(STANDARD_CAMERA_NAMES)
 
 
 def read_valid_values(scene: Any, file: str = schema.SCENE_FILE) -> tuple[dict[str, Any], str]:
-    """Return the valid keys of a ``scene.json``, and a text that lists the invalid keys (empty: none).
+    """Return a ``scene.json`` without its invalid values, and a text that lists them (empty: none).
 
     Missing keys are not invalid.
     """
@@ -37,7 +37,7 @@ def _drop_invalid_keys(content: Mapping[str, Any], wrong: list[Violation]) -> di
 
 
 def read_settings(root: Path) -> tuple[dict[str, Any], ImageOptions, list[Violation]]:
-    """Return the valid keys of ``conversion.json``, its image options, and its violations.
+    """Read ``conversion.json``; return its valid values, its image options, and its violations.
 
     Without valid image options in the file, the options of the three standard cameras are returned.
     """

@@ -47,9 +47,10 @@ class ConversionInput:
     sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
 
     def entries(self) -> list[dict[str, Any]]:
-        """Return an entry per episode to convert, as in ``conversion.json``; key ``source``: number in the source.
+        """Return one entry per episode to convert, as in ``conversion.json``.
 
-        Duplicate recordings of a trajectory file have one entry.
+        ``source`` in an entry is the number of the episode in the input. Duplicate recordings of a trajectory file have
+        one entry.
         """
         entries = ((number, self._make_entry(number)) for number in self.source.numbers)
         chosen = [{"source": number, **entry} for number, entry in entries if entry is not None]

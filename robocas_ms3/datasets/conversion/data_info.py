@@ -79,7 +79,7 @@ def build_data_info(root: Path, previous: tuple[Iterable[int], Iterable[int]] = 
 
 
 def copy_failures(run: Path, out: Path, env_info: Mapping[str, Any]) -> None:
-    """Append the ``failures.jsonl`` of a run of ``robocas generate`` to that of a dataset, without duplicates.
+    """Append the ``failures.jsonl`` of a run to the file of a dataset, without duplicates.
 
     Each new line also gets the task and the environment of the run.
     """

@@ -74,7 +74,7 @@ class EnvRenderer:
             raise_difference("", recording.instruction, instruction)
 
     def frames(self, recording: Recording, samples: NDArray[np.int64]) -> Iterator[StepImages]:
-        """Render the states with the indices ``samples`` of the loaded recording; yield the images of each state."""
+        """Render the states ``samples`` (indices) of the loaded recording; yield the images of each."""
         for index in samples:
             yield self._render_state(recording.state(int(index)))
 
@@ -175,7 +175,7 @@ def _convert_depth(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> N
 
 
 def _convert_segmentation(textures: dict[str, torch.Tensor], shader: ShaderConfig) -> NDArray[np.int16]:
-    """Convert the textures of a camera to the scene id of the actor or link in each pixel (H, W), 0 = none."""
+    """Convert the textures of a camera to the id of the actor or link per pixel (H, W), 0 = none."""
     name = next(name for name, kinds in shader.texture_names.items() if "segmentation" in kinds)
     return shader.texture_transforms[name](textures[name])["segmentation"][0, ..., 0].cpu().numpy()
 

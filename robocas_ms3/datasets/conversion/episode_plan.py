@@ -64,10 +64,11 @@ def make_header(settings: Mapping[str, Any], split_rule: str = SPLIT_RULE) -> di
 def plan_episodes(
     output: OutputFolder, entries: Entries, settings: dict[str, Any], *, append: bool
 ) -> tuple[dict[str, Any], list[tuple[int, int]]]:
-    """Assign a number in the dataset to each episode of a source; recordings in the dataset keep their number.
+    """Assign a number in the dataset to each episode of a source.
 
-    ``append`` allows new recordings; they are numbered after the existing episodes. Return the new content of
-    ``conversion.json``, and (number in the dataset, number in the source) of each episode, written or not.
+    Recordings that are in the dataset already keep their number. ``append`` allows new recordings; they are numbered
+    after the existing episodes. Return the new content of ``conversion.json``, and (number in the dataset, number in
+    the source) of each episode, written or not.
     """
     path, content = output.path / schema.CONVERSION_FILE, output.recorded
     if content is None:
@@ -101,9 +102,10 @@ def plan_episodes(
 
 
 def move_unwritten_to_skipped(out: Path, content: Mapping[str, Any], reasons: Mapping[str, str]) -> dict[str, Any]:
-    """Return the content of ``conversion.json`` with the entries of unwritten episodes moved to ``skipped``.
+    """Move the entries of unwritten episodes to ``skipped``.
 
-    ``reasons``: why episodes could not be written, by the name of the episode folder.
+    Return the new content of ``conversion.json``. ``reasons``: why episodes could not be written, by the name of the
+    episode folder.
     """
     episodes, skipped = dict(content["episodes"]), dict(content.get(SKIPPED_KEY, {}))
     for folder, reason in reasons.items():
@@ -129,7 +131,7 @@ def _recording_key(entry: Mapping[str, Any]) -> str:
 def split_planned_episodes(
     content: Mapping[str, Any], previous: tuple[list[int], list[int]]
 ) -> tuple[list[int], list[int]]:
-    """Split all episodes of ``conversion.json`` by seed, written or not; return the numbers of both splits."""
+    """Split all episodes of ``conversion.json``, written or not; return training and validation."""
     return split_by_seed({int(number): entry.get("seed") for number, entry in content["episodes"].items()}, previous)
 
 

@@ -66,7 +66,7 @@ class RenderedSource(TrajectorySource):
                 return make_entry_without_fingerprint(file, number)
 
     def list_texts(self, number: int) -> list[str]:
-        """Return the instruction of an episode and the list_texts of its sub-goals."""
+        """Return the instruction of an episode and the texts of its sub-goals."""
         entry = self.episode_entry(number)
         return [entry.instruction, *(goal.goal_description for goal in entry.subgoals)]
 

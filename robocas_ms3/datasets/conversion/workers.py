@@ -58,7 +58,7 @@ class EpisodeWriter(ABC):
         """Write the files of an episode into a folder; return its contact sheet row (H, W, 3) RGB, or None."""
 
     def write(self, number: int, conversion_input: ConversionInput, source_number: int) -> WrittenEpisode:
-        """Write episode ``source`` of the input as episode ``number`` of the dataset."""
+        """Write episode ``source_number`` of the input as episode ``number`` of the dataset."""
         with atomic_folder(self.folder(number), sync=True) as folder:
             source_episode = conversion_input.source.episode(source_number)
             episode = InputEpisode(number, source_episode, require_complete_arrays(source_episode), conversion_input)
@@ -194,7 +194,7 @@ def _affects_all_episodes(error: Exception) -> bool:
 
 @contextmanager
 def _limit_torch_threads() -> Iterator[None]:
-    """Limit PyTorch to one thread in a ``with`` statement: idle threads next to a renderer double the CPU time."""
+    """Limit PyTorch to one thread: next to a renderer, idle threads double the CPU time."""
     import torch
 
     before = torch.get_num_threads()

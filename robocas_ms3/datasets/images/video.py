@@ -53,9 +53,9 @@ def open_video(path: Path, fps: float, *options: str, quality: float = 8) -> Ite
 def write_video(
     dataset: EpisodeSource, number: int, path: Path | str, *, speed: float = 1.0, kind: ImageKind = "rgb"
 ) -> Path:
-    """Write the video of an episode (MP4, H.264): all cameras next to each other, texts below; return its path.
+    """Write the video of an episode as MP4 (H.264) and return its path.
 
-    ``speed`` 1 is real time. Depth images are shown in colours.
+    All cameras are next to each other, with texts below. ``speed`` 1 is real time. Depth images are shown in colours.
 
     Raises:
         DatasetError: the episode does not exist, or the speed is invalid.
@@ -78,9 +78,10 @@ def write_video(
 def write_contact_sheet(
     dataset: EpisodeSource, out: Path | str, *, episodes: Sequence[int] | None = None, kind: ImageKind = "rgb"
 ) -> Path:
-    """Write a contact sheet: a PNG with images of evenly spaced steps, per episode and camera; return its path.
+    """Write a contact sheet of episodes as PNG and return its path.
 
-    ``episodes``: episode numbers; default: the first ten.
+    It has the images of evenly spaced steps, for each episode and camera. ``episodes``: episode numbers; default: the
+    first ten.
     """
     numbers = dataset.numbers[:SHEET_EPISODES] if episodes is None else list(episodes)
     return _write_sheet([_draw_stored_row(dataset, number, kind) for number in numbers], out)
@@ -146,7 +147,10 @@ def _write_sheet(rows: Sequence[NDArray[np.uint8]], path: Path | str) -> Path:
 
 
 def colour_depth(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """Convert depth (H, W) in mm to colours (H, W, 3) RGB on a log scale: near red, far blue, no depth black."""
+    """Convert depth (H, W) in mm to colours (H, W, 3) RGB.
+
+    The scale is logarithmic, from red (near) to blue (far). Pixels without depth are black.
+    """
     near, far = np.log(_NEAR_MM), np.log(_FAR_MM)
     fraction = np.clip((far - np.log(np.maximum(depth, 1))) / (far - near), 0, 1)
     colours = cv2.applyColorMap((fraction * 255).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()

@@ -192,7 +192,7 @@ def _check_content(columns: Columns, types: list[Any], instruction: str) -> Iter
 
 
 def check_language(table: pa.Table, file: str, info: Mapping[str, Any]) -> Iterator[KeyViolation]:
-    """Check the language rows of an episode, which ``robocas convert`` or ``lerobot-annotate`` has written."""
+    """Check the language rows of an episode from ``robocas convert`` or ``lerobot-annotate``."""
     persistent, events = (read_language_rows(table, key, file) for key in (PERSISTENT, EVENTS))
     if any(rows != persistent[0] for rows in persistent[1:]):
         yield PERSISTENT, "the same rows in each frame", "different rows"

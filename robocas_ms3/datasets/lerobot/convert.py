@@ -175,7 +175,7 @@ def _find_missing_episodes(
 def _drop_missing_episodes(
     plan: dict[str, Any], episodes_folder: Path, incomplete: IncompleteDatasetError
 ) -> dict[str, Any]:
-    """Return the plan without episodes that could not be written; they move to ``skipped`` with the reason."""
+    """Return the plan with unwritten episodes moved to ``skipped``, each with the reason."""
     episodes = list(enumerate(plan["episodes"]))
     present = [number for number, _ in episodes if (episodes_folder / episode_folder(number)).is_dir()]
     place = {number: new for new, number in enumerate(present)}

@@ -55,7 +55,10 @@ EVENTS_TYPE = pa.list_(pa.struct([*_TEXTS, _CAMERA, _TOOL_CALLS]))
 
 
 def make_persistent_rows(goals: Sequence[SubGoal], instructions: Iterable[str], fps: int) -> list[Row]:
-    """Make the ``language_persistent`` rows of an episode, sorted as in LeRobot, without repeated instructions."""
+    """Make the ``language_persistent`` rows of an episode, sorted as in LeRobot.
+
+    Repeated instructions are dropped.
+    """
     rows = [_make_row("user", text, "task_aug", timestamp=0.0) for text in dict.fromkeys(instructions)]
     starts = [(goal, float(np.float32(goal.first / fps))) for goal in goals]
     rows += [_make_row("assistant", goal.goal_description, "subtask", timestamp=start) for goal, start in starts]
@@ -109,7 +112,10 @@ def make_paraphrases(scene: Mapping[str, Any], text: str) -> list[str]:
 
 
 def read_subgoal_texts(rows: Sequence[Row], count: int, fps: int) -> list[str]:
-    """Read the sub-goal text of each frame from ``language_persistent`` rows; empty before the first sub-goal."""
+    """Read the sub-goal text of each frame from ``language_persistent`` rows.
+
+    The text is empty before the first sub-goal.
+    """
     starts = sorted((row["timestamp"], row["content"] or "") for row in rows if row["style"] == "subtask")
     times = (np.arange(count) + 0.5) / fps
     places = np.searchsorted([time for time, _ in starts], times, side="right") - 1
@@ -139,7 +145,10 @@ class _Answer(BaseModel):
 
 
 def parse_box(answer: str | None) -> Box | None:
-    """Parse the answer of a ``vqa`` row; return its bounding box, None if it is not the JSON of one detection."""
+    """Parse the bounding box in the answer of a ``vqa`` row.
+
+    The result is None if the answer is not the JSON of one detection.
+    """
     try:
         (detection,) = validate_json(_Answer, answer or "").detections
     except ValidationError:

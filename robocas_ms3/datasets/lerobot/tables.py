@@ -101,9 +101,9 @@ def read_columns(
     groups: Sequence[int] | None = None,
     limit: int = _ARRAYS_LIMIT,
 ) -> pa.Table:
-    """Read columns (default: all) of an open file; raise DatasetError for values of more than ``limit`` bytes.
+    """Read columns (default: all) of an open file.
 
-    ``groups``: row groups to read; default: all.
+    ``groups``: row groups to read; default: all. Values of more than ``limit`` bytes raise DatasetError.
     """
     footer = file.metadata
     groups = range(footer.num_row_groups) if groups is None else groups
@@ -128,7 +128,7 @@ def read_columns(
 
 
 def read_small_table(path: Path, columns: Mapping[str, Column], *, most_rows: float = np.inf) -> pa.Table:
-    """Read declared columns of a table that is small enough for Python objects; check them."""
+    """Read and check the declared columns of a table that is converted to Python objects."""
     with open_table(path, most_rows=most_rows) as file:
         table = read_columns(file, path, columns, limit=OBJECTS_LIMIT)
         check_columns(table, columns, path)
@@ -224,7 +224,7 @@ def read_texts(path: Path, name: str, most_rows: float = np.inf) -> list[str]:
 
 
 def sort_by_index(indices: list[int], texts: list[str], where: str) -> list[str]:
-    """Sort texts by their indices ``indices``; raise DatasetError if the indices are not 0, 1, 2, ..."""
+    """Sort texts by ``indices``; raise DatasetError if the indices are not 0, 1, 2, ..."""
     if sorted(indices) != list(range(len(indices))):
         expected = f"0 to {len(indices) - 1}, each once"
         found = sorted(indices)[:5]
@@ -233,7 +233,10 @@ def sort_by_index(indices: list[int], texts: list[str], where: str) -> list[str]
 
 
 def write_texts(path: Path, name: str, texts: Sequence[str]) -> None:
-    """Write a table of texts and their numbers 0, 1, 2, ...; the texts are the pandas index, as LeRobot expects."""
+    """Write a table of texts with the numbers 0, 1, 2, ...
+
+    The texts are the pandas index, as LeRobot expects.
+    """
     text = {"pandas_type": "unicode", "numpy_type": "object"}
     number = {"pandas_type": "int64", "numpy_type": "int64"}
     about = {

@@ -78,7 +78,10 @@ def _file_sizes(folder: Path) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class TemporaryEpisodeWriter(EpisodeWriter):
-    """Writes temporary episode folders of a LeRobot conversion into ``root``; ``codec``: name of the RGB codec."""
+    """Writes temporary episode folders of a LeRobot conversion into ``root``.
+
+    ``codec`` is the name of the RGB codec.
+    """
 
     root: Path
     codec: str

@@ -40,11 +40,11 @@ SPLIT_RULE = "as in the imported dataset; episodes that it does not list are spl
 
 
 def import_robocas(survey: Survey, out: Path, *, embed: Embed | None = None, options: CopyOptions | None = None) -> int:
-    """Import the importable episodes of a survey into a new dataset; return how many episodes existed already.
+    """Import the importable episodes of a survey into a new dataset.
 
-    Episodes keep their numbers. Images are copied or hard-linked; arrays, camera files and ``import_report.json`` are
-    written. The input does not change. The same call continues an interrupted import. ``embed`` computes missing
-    embeddings.
+    Return the number of episodes that existed already. Episodes keep their numbers. Images are copied or hard-linked;
+    arrays, camera files and ``import_report.json`` are written. The input does not change. The same call continues an
+    interrupted import. ``embed`` computes missing embeddings.
 
     Raises:
         DatasetError: no episode can be imported, or the output overlaps the input.
@@ -127,7 +127,10 @@ def _write_episode(folder: Path, source: Episode, episode: ImportedEpisode, surv
 
 
 def _make_scene(source: Episode, episode: ImportedEpisode, survey: Survey) -> dict[str, Any]:
-    """Make the content of ``scene.json``; without such a file in the input, most values are None (unknown)."""
+    """Make the content of ``scene.json``.
+
+    Without such a file in the input, most values are None (unknown).
+    """
     previous = source.scene if source.scene.get("schema_version") == schema.SCHEMA_VERSION else {}
     wanted = (spec.name for spec in schema.EPISODE_INFO if not spec.embedding)
     repaired = (found for found in episode.findings if found.outcome == "repaired")

@@ -23,7 +23,9 @@ from robocas_ms3.datasets.manage.copy_episodes import (
 def merge(
     roots: Sequence[Path], out: Path, *, skip_duplicates: bool = False, options: CopyOptions | None = None
 ) -> CopyResult:
-    """Merge datasets into a new one: all episodes, numbered in the order of ``roots``; each keeps its split.
+    """Merge all episodes of several datasets into a new dataset.
+
+    Episodes are numbered from 0 in the order of ``roots``, and keep their split.
 
     Raises:
         DatasetError: a dataset is unfinished or damaged, the settings differ, or, without ``skip_duplicates``, an

@@ -186,11 +186,11 @@ _CONVENTIONS = (  # description, conversion to compare with the poses, repair
 
 
 def find_eef_rotation(camera_in_ee: NDArray) -> int:
-    """Find the rotation about z from the EEF frame of a dataset to ManiSkill's TCP: 0, 90, 180 or -90 degrees.
+    """Find the rotation about z from the EEF frame of a dataset to ManiSkill's TCP.
 
-    ``camera_in_ee`` (4, 4) is the pose of the gripper camera in the EEF frame. The camera is 0.05 m from the axis of
-    the hand, in the x direction of ManiSkill's TCP. The EEF frame of RoboCAS-v0 is rotated by -90 degrees. The result
-    is 0 for a camera in another place.
+    The result is 0, 90, 180 or -90 degrees. ``camera_in_ee`` (4, 4) is the pose of the gripper camera in the EEF frame.
+    The camera is 0.05 m from the axis of the hand, in the x direction of ManiSkill's TCP. The EEF frame of RoboCAS-v0
+    is rotated by -90 degrees. The result is 0 for a camera in another place.
     """
     x, y = camera_in_ee[:2, 3]
     if not _CAMERA_OFFSET[0] < np.hypot(x, y) < _CAMERA_OFFSET[1]:

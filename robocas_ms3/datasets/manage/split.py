@@ -81,10 +81,11 @@ def group_episodes(dataset: Dataset, group_by: GroupBy) -> dict[int, str]:
 
 
 def divide_episodes(groups: Mapping[int, str], fractions: Sequence[float], salt: str = "") -> list[list[int]]:
-    """Divide episodes into lists with about these fractions, which sum to 1; episodes of a group stay together.
+    """Divide episodes into lists with about the given fractions; a group stays in one list.
 
-    ``groups``: group of each episode, by number. No list is empty. The groups are sorted by their SHA-256 and fill the
-    last list first, so the result depends on the groups alone. Another ``salt`` gives an independent order.
+    ``fractions`` sum to 1. ``groups``: group of each episode, by number. No list is empty. The groups are sorted by
+    their SHA-256 and fill the last list first, so the result depends on the groups alone. Another ``salt`` gives an
+    independent order.
 
     Raises:
         DatasetError: there are fewer groups than fractions, or the fractions are invalid.
@@ -116,10 +117,10 @@ def check_fractions(fractions: Sequence[float], where: str = "fractions") -> Non
 
 
 def resplit(root: Path, options: SplitOptions | None = None) -> EpisodeSplit:
-    """Write ``data_info.json`` again from the episodes on disk; return the new split. Episodes do not change.
+    """Write ``data_info.json`` again from the episodes on disk; return the new split.
 
-    Episodes that are not on disk are removed from ``conversion.json``. Without options each episode keeps its split;
-    episodes that ``data_info.json`` did not list are split by seed.
+    Episodes do not change. Episodes that are not on disk are removed from ``conversion.json``. Without options each
+    episode keeps its split; episodes that ``data_info.json`` did not list are split by seed.
     """
     with lock_folder(root):
         dataset = Dataset(root)

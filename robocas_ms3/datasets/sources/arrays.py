@@ -186,7 +186,7 @@ def derive_missing_arrays(loaded: EpisodeArrays, info: Mapping[str, Any], rate_h
 
 
 def compute_motion_arrays(arrays: Mapping[str, NDArray], keys: tuple[str, str, str, str]) -> dict[str, NDArray]:
-    """Compute the two arrays of relative motion from the poses; ``keys``: one of ``schema.RELATIVE_PAIRS``."""
+    """Compute both arrays of relative motion from poses; ``keys``: one of ``schema.RELATIVE_PAIRS``."""
     poses = _read_poses(arrays, keys[0], keys[1])
     assert poses is not None
     return dict(zip(keys[2:], to_dataset_motion(poses), strict=True))

@@ -181,7 +181,7 @@ def iter_images(
 
 
 class EpisodeSource(ABC):
-    """Trajectory file or dataset that is read episode by episode; its format does not matter to the caller.
+    """Trajectory file or dataset of any format, which is read episode by episode.
 
     Reading missing or damaged data raises ``DatasetError``.
 
@@ -217,7 +217,7 @@ class EpisodeSource(ABC):
         return split_by_seed(seeds)[name == "val"]
 
     def conversion_entry(self, number: int) -> Mapping[str, Any]:
-        """Return the entry of an episode in ``conversion.json``: its seed, success and recording; empty if unknown.
+        """Return the entry of an episode in ``conversion.json``, such as its seed; empty if unknown.
 
         `provenance.make_recording_entry` lists the keys.
         """

@@ -51,7 +51,10 @@ class EnvInfoRecord(_JsonObject):
 
 
 class LayoutRecord(_JsonObject):
-    """``layout`` in ``scene.json``: the scene at the start; poses [x, y, z, qw, qx, qy, qz] in the world frame."""
+    """``layout`` in ``scene.json``: the scene at the start of the episode.
+
+    Poses are [x, y, z, qw, qx, qy, qz] in the world frame.
+    """
 
     object_ids: list[str] = []
     poses: list[Pose] = []
@@ -207,7 +210,10 @@ def fill_unknown_keys(scene: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_scene(scene: Mapping[str, Any], where: object) -> SceneRecord:
-    """Validate the content of ``scene.json``; missing keys become None. Raise DatasetError if it is invalid."""
+    """Validate the content of ``scene.json``; raise DatasetError if it is invalid.
+
+    Missing keys become None. ``where`` names the episode in the error.
+    """
     try:
         return SceneRecord.model_validate(fill_unknown_keys(scene))
     except ValidationError as problem:

@@ -72,7 +72,10 @@ def make_recorded_scene(file: TrajectoryFile, index: int) -> dict[str, Any]:
 def make_scene(
     file: TrajectoryFile, index: int, recording: Recording, scene: dict[str, Any], rate_hz: float
 ) -> dict[str, Any]:
-    """Make ``scene.json`` of a recording; ``scene``: task, config, layout and objects of the rebuilt scene."""
+    """Make the content of ``scene.json`` of a recording.
+
+    ``scene`` has the task, config, layout and objects of the rebuilt scene.
+    """
     record = {**make_recorded_scene(file, index), **scene, "rate_hz": rate_hz}
     record["source"]["recording"] = fingerprint_recording(recording)
     return {key: record.get(key) for key in SCENE_KEYS}

@@ -169,7 +169,10 @@ class Dataset(EpisodeSource):
         return read_json(self.root / schema.DATA_INFO_FILE)
 
     def _read_value(self, file: str, key: str, form: TypeAdapter[Any], default: Any, fix: str = SEE_VALIDATE) -> Any:
-        """Read and validate a value of ``conversion.json`` or ``data_info.json``; default if the key is missing."""
+        """Read and validate a value of ``conversion.json`` or ``data_info.json``.
+
+        A missing key has the value ``default``.
+        """
         content = self.settings if file == schema.CONVERSION_FILE else self.info
         try:
             return form.validate_python(content[key]) if key in content else default

@@ -17,10 +17,11 @@ SPLIT_RULE = (
 def split_by_seed(
     seed_by_episode: Mapping[int, Any], previous: tuple[Iterable[int], Iterable[int]] = ((), ())
 ) -> tuple[list[int], list[int]]:
-    """Split episodes by seed: 90 % of the seeds for training, 10 % for validation; return both lists of numbers.
+    """Split episodes by seed; return the numbers of the training and validation episodes.
 
-    ``seed_by_episode``: seed of each episode by number; None: the number replaces the seed. The split depends on the
-    seeds alone, not on their order. With two or more seeds, validation has at least one.
+    90 % of the seeds are for training, 10 % for validation. ``seed_by_episode``: seed of each episode by number; None:
+    the number replaces the seed. The split depends on the seeds alone, not on their order. With two or more seeds,
+    validation has at least one.
 
     ``previous``: an earlier split. Its episodes keep their split, and so do other episodes with the same seeds. New
     seeds are added to validation until it has a tenth of all seeds.

@@ -25,7 +25,9 @@ from robocas_ms3.scenes.layout import PARKING_HEIGHT
 
 
 class TrajectorySource(EpisodeSource):
-    """Trajectory file as an episode source, with the numbers and steps of a dataset of ``robocas convert``.
+    """Trajectory file as an episode source.
+
+    Numbers and steps of the episodes are those of a dataset that ``robocas convert`` writes.
 
     Attributes:
         file: metadata of the trajectory file; its HDF5 file is closed.

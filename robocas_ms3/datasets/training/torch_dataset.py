@@ -134,7 +134,10 @@ class RoboCASDataset(torch.utils.data.Dataset):
         return found[step - steps.start]
 
     def sampling_weights(self) -> torch.Tensor:
-        """Return weights (N,) of all samples for ``WeightedRandomSampler``; each sub-goal type has the same sum."""
+        """Return weights (N,) of the samples for ``WeightedRandomSampler``.
+
+        The weights of each sub-goal type have the same sum.
+        """
         if (self.subgoal_types < 0).all():
             raise DatasetError("this dataset has no sub-goals", where=self.source.root, expected="the array step_goals")
         _, types, counts = np.unique(self.subgoal_types, return_inverse=True, return_counts=True)
