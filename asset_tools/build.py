@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from asset_tools.decompose import Decomposition, decompose, is_hollow
+from asset_tools.decompose import Decomposition, decompose_mesh, is_hollow
 from asset_tools.glb import write_glb
 from asset_tools.grasps import sample_grasps
 from asset_tools.inertia import compute_piece_inertia, compute_principal_inertia, round_moments, round_vector
@@ -73,7 +73,7 @@ def _build_object(source: ObjectSource, folder: Path) -> ObjectAsset:
     repairs = (*source.repairs, *write_visuals(mesh, folder))
 
     if source.pieces is None:
-        parts = decompose(closed)
+        parts = decompose_mesh(closed)
     else:
         pieces = [piece + shift for piece in source.pieces]
         parts = Decomposition(pieces, compute_volume_iou(closed, pieces))

@@ -27,7 +27,7 @@ SAME = 1e-6  # of the diagonal
 
 
 @dataclass(frozen=True)
-class CleanScan:
+class CleanedScan:
     """A scan after cleaning, as two meshes with equal faces in equal order; all faces are oriented outwards.
 
     Attributes:
@@ -39,7 +39,7 @@ class CleanScan:
     welded: trimesh.Trimesh
 
 
-def clean_scan(scan: trimesh.Trimesh, repairs: list[str]) -> CleanScan:
+def clean_scan(scan: trimesh.Trimesh, repairs: list[str]) -> CleanedScan:
     """Drop the faces of a scan that are not part of the outer surface, and orient the other faces outwards.
 
     Args:
@@ -78,7 +78,7 @@ def clean_scan(scan: trimesh.Trimesh, repairs: list[str]) -> CleanScan:
         faces[turned] = faces[turned][:, ::-1]
         welded.faces = faces
     welded.remove_unreferenced_vertices()
-    return CleanScan(_shown(scan, kept, turned, repairs), welded)
+    return CleanedScan(_shown(scan, kept, turned, repairs), welded)
 
 
 def _welded(scan: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:

@@ -12,7 +12,7 @@ from sapien import physx
 from scipy.spatial import ConvexHull, QhullError
 
 from asset_tools.quality.hulls import compute_volume_iou, measure_hull_quality
-from asset_tools.solids import to_mesh, to_solid
+from asset_tools.solids import mesh_to_solid, solid_to_mesh
 from robocas_ms3.assets.cooked_hulls import MAX_SHRINKAGE, MAX_SLENDERNESS, cook_hulls
 from robocas_ms3.assets.hulls import center_of_mass, find_box, slenderness
 from robocas_ms3.assets.physics import make_convex_shape
@@ -52,7 +52,7 @@ class Decomposition:
     volume_iou: float
 
 
-def decompose(closed: trimesh.Trimesh) -> Decomposition:
+def decompose_mesh(closed: trimesh.Trimesh) -> Decomposition:
     """Decompose a closed mesh into at most 32 convex hulls that PhysX accepts on CPU and GPU; deterministic.
 
     Args:
@@ -66,7 +66,7 @@ def decompose(closed: trimesh.Trimesh) -> Decomposition:
         expected = "a watertight mesh with a volume above 0"
         raise AssetError("cannot decompose an open mesh", expected=expected, found=found)
     found = _decompose(closed)
-    hulls = [limit_for_engine(hull) for hull in found.hulls]
+    hulls = [adapt_hull_to_engine(hull) for hull in found.hulls]
     if all(hull is old for hull, old in zip(hulls, found.hulls, strict=True)):
         return found
     return Decomposition(hulls, compute_volume_iou(closed, hulls))
@@ -76,7 +76,7 @@ def _decompose(closed: trimesh.Trimesh) -> Decomposition:
     """Return one convex hull if its IoU with the mesh is large enough, otherwise the merged hulls of CoACD."""
     best: Decomposition | None = None
     if closed.volume / closed.convex_hull.volume >= WANTED_OVERLAP - 0.02:
-        hulls = [reduce_vertices(np.asarray(closed.vertices))]
+        hulls = [reduce_hull_vertices(np.asarray(closed.vertices))]
         best = Decomposition(hulls, compute_volume_iou(closed, hulls))
         if best.volume_iou >= WANTED_OVERLAP:
             return best
@@ -91,11 +91,11 @@ def _decompose(closed: trimesh.Trimesh) -> Decomposition:
         if best is None or found.volume_iou > best.volume_iou + 0.01:
             best = found
     if best is None:
-        raise AssetError("the convex decomposition found no hulls", fix="Check the mesh for slivers or zero volume.")
+        raise AssetError("the convex decomposition found no hulls", fix="Check that the mesh has a volume.")
     return best
 
 
-def reduce_vertices(points: Array, *, bevel: float = BEVEL) -> Array:
+def reduce_hull_vertices(points: Array, *, bevel: float = BEVEL) -> Array:
     """Return the few vertices (V, 3) of a simplified convex hull with the same volume.
 
     PhysX keeps few vertices of a hull. It would keep single corners of a small bevel around a base, on which a bottle
@@ -133,7 +133,7 @@ def reduce_vertices(points: Array, *, bevel: float = BEVEL) -> Array:
     return center + (kept - center) * np.cbrt(hull.volume / ConvexHull(kept).volume)
 
 
-def limit_for_engine(points: Array) -> Array:
+def adapt_hull_to_engine(points: Array) -> Array:
     """Return the vertices (V, 3) of a convex hull that PhysX can build on CPU and GPU.
 
     A box is returned unchanged. A hull that is too slender is stretched along its thin axes. If PhysX would shrink the
@@ -216,16 +216,16 @@ def _merged(closed: trimesh.Trimesh, found: Decomposition, hollow: bool) -> Deco
     least = found.volume_iou - LOST_OVERLAP
     hulls, volumes = dict(enumerate(found.hulls)), {i: ConvexHull(hull).volume for i, hull in enumerate(found.hulls)}
 
-    def added(i: int, j: int) -> float:
+    def compute_added_volume(i: int, j: int) -> float:
         return ConvexHull(np.concatenate([hulls[i], hulls[j]])).volume - volumes[i] - volumes[j]
 
-    costs = {(i, j): added(i, j) for i in hulls for j in hulls if i < j}
+    costs = {(i, j): compute_added_volume(i, j) for i in hulls for j in hulls if i < j}
     tries = 0
     while costs and tries < TRIES:
         i, j = min(costs, key=lambda pair: (costs[pair], pair))
         kept = {k: hull for k, hull in hulls.items() if k not in (i, j)}
         new = max(volumes) + 1
-        kept[new] = reduce_vertices(np.concatenate([hulls[i], hulls[j]]))
+        kept[new] = reduce_hull_vertices(np.concatenate([hulls[i], hulls[j]]))
         fewer = Decomposition(list(kept.values()), compute_volume_iou(closed, list(kept.values())))
         if not _good_enough(closed, fewer, hollow, least):
             tries += 1
@@ -233,15 +233,15 @@ def _merged(closed: trimesh.Trimesh, found: Decomposition, hollow: bool) -> Deco
             continue
         found, hulls, volumes[new], tries = fewer, kept, float(ConvexHull(kept[new]).volume), 0
         costs = {pair: cost for pair, cost in costs.items() if not {i, j} & set(pair)}
-        costs |= {(k, new): added(k, new) for k in kept if k != new}
+        costs |= {(k, new): compute_added_volume(k, new) for k in kept if k != new}
     return found
 
 
 def _smoothed(closed: trimesh.Trimesh) -> trimesh.Trimesh:
-    solid = to_solid(closed)
+    solid = mesh_to_solid(closed)
     if solid is None:
         return closed
-    return to_mesh(solid.simplify(SMOOTHED * float(np.linalg.norm(closed.extents))))
+    return solid_to_mesh(solid.simplify(SMOOTHED * float(np.linalg.norm(closed.extents))))
 
 
 def _run_coacd(body: trimesh.Trimesh, threshold: float) -> list[Array]:
@@ -263,7 +263,9 @@ def _run_coacd(body: trimesh.Trimesh, threshold: float) -> list[Array]:
         seed=0,
     )
     return [
-        reduce_vertices(points) for points in (np.array(vertices) for vertices, _ in parts) if _volume(points) > least
+        reduce_hull_vertices(points)
+        for points in (np.array(vertices) for vertices, _ in parts)
+        if _volume(points) > least
     ]
 
 

@@ -42,7 +42,7 @@ def write_glb(mesh: trimesh.Trimesh, path: Path | str) -> None:
     views: list[dict] = []
     blob = bytearray()
 
-    def view(data: bytes, **more: int) -> int:
+    def add_view(data: bytes, **more: int) -> int:
         views.append({"buffer": 0, "byteOffset": len(blob), "byteLength": len(data), **more})
         blob.extend(data + b"\0" * (-len(data) % 4))
         return len(views) - 1
@@ -51,9 +51,9 @@ def write_glb(mesh: trimesh.Trimesh, path: Path | str) -> None:
     float_view = {"componentType": 5126, "count": len(vertices)}
     whole = {"componentType": 5123 if indices.itemsize == 2 else 5125, "count": len(indices), "type": "SCALAR"}
     accessors = [
-        {"bufferView": view(vertices.tobytes(), target=34962), **float_view, "type": "VEC3", **limits},
-        {"bufferView": view(normals.tobytes(), target=34962), **float_view, "type": "VEC3"},
-        {"bufferView": view(indices.tobytes(), target=34963), **whole},
+        {"bufferView": add_view(vertices.tobytes(), target=34962), **float_view, "type": "VEC3", **limits},
+        {"bufferView": add_view(normals.tobytes(), target=34962), **float_view, "type": "VEC3"},
+        {"bufferView": add_view(indices.tobytes(), target=34963), **whole},
     ]
     shading: dict[str, Any] = {
         "baseColorFactor": (get_rgba(material.baseColorFactor) / 255).tolist(),
@@ -65,12 +65,12 @@ def write_glb(mesh: trimesh.Trimesh, path: Path | str) -> None:
     uv = getattr(mesh.visual, "uv", None)
     if material.baseColorTexture is not None and uv is not None:
         flipped = np.column_stack([uv[:, 0], 1 - uv[:, 1]]).astype("<f4")  # in glTF, v = 0 is the top
-        accessors.append({"bufferView": view(flipped.tobytes(), target=34962), **float_view, "type": "VEC2"})
+        accessors.append({"bufferView": add_view(flipped.tobytes(), target=34962), **float_view, "type": "VEC2"})
         primitive["attributes"]["TEXCOORD_0"] = 3
         jpeg = io.BytesIO()
         material.baseColorTexture.convert("RGB").save(jpeg, format="JPEG", quality=JPEG_QUALITY, optimize=True)
         shading["baseColorTexture"] = {"index": 0}
-        tree["images"] = [{"bufferView": view(jpeg.getvalue()), "mimeType": "image/jpeg"}]
+        tree["images"] = [{"bufferView": add_view(jpeg.getvalue()), "mimeType": "image/jpeg"}]
         tree["textures"] = [{"source": 0}]
     tree |= {
         "meshes": [{"primitives": [primitive]}],

@@ -15,9 +15,9 @@ import trimesh
 
 from asset_tools.build import build_object
 from asset_tools.inspection import Inspect, ModelSource, inspect_models
-from asset_tools.pipeline import AssetJob, content_hash, make_failing_job
+from asset_tools.pipeline import AssetJob, compute_content_hash, make_failing_job
 from asset_tools.prepare import prepare_scan
-from asset_tools.readers.choice import is_collision, is_mesh
+from asset_tools.readers.choice import is_collision_mesh, is_mesh_file
 from asset_tools.readers.files import find_files
 from asset_tools.scan import Unit, Up, guess_common_unit, guess_units
 from asset_tools.sources import ObjectSource
@@ -52,7 +52,7 @@ class ImportSettings:
 
 
 @dataclass
-class FoundScans:
+class ScanFolder:
     """Content of a folder of scans.
 
     Attributes:
@@ -109,11 +109,11 @@ def make_scan_jobs(
             continue
         make = partial(_make, id_, scans.models[id_], units[id_], settings)
         facts = (id_, units[id_], settings.up, settings.masses.get(id_), settings.licence, settings.attribution)
-        jobs.append(AssetJob(id_, make, content_hash(*facts, files=inspected[id_].files)))
+        jobs.append(AssetJob(id_, make, compute_content_hash(*facts, files=inspected[id_].files)))
     return jobs
 
 
-def find_scans(source: Path) -> FoundScans:
+def find_scans(source: Path) -> ScanFolder:
     """Find the scans of a folder: mesh files, and subfolders with meshes.
 
     Files with the same stem, such as ``mug.obj`` and ``mug.stl``, are versions of one object.
@@ -127,10 +127,10 @@ def find_scans(source: Path) -> FoundScans:
         )
     if not source.is_dir():
         raise AssetError("no such folder of scans", where=source, fix="Check the path.")
-    found = FoundScans()
+    found = ScanFolder()
     entries = [path for path in sorted(source.iterdir()) if not path.name.startswith(".")]
-    meshes = [path for path in entries if is_mesh(path)]
-    shown = [path for path in meshes if not is_collision(path, source)]
+    meshes = [path for path in entries if is_mesh_file(path)]
+    shown = [path for path in meshes if not is_collision_mesh(path, source)]
     if shown:
         found.skipped += [f"{path.name}: a collision mesh" for path in meshes if path not in shown]
     versions: dict[str, list[Path]] = {}
@@ -176,7 +176,7 @@ def _no_scan(folder: Path) -> str:
     """Return the reason why a folder is not a scan; empty if it is a scan."""
     if folder.name.lower() == "__macosx":
         return "a folder that macOS adds to archives"
-    if any(is_mesh(path) or path.suffix.lower() in UNREAD for path in find_files(folder)):
+    if any(is_mesh_file(path) or path.suffix.lower() in UNREAD for path in find_files(folder)):
         return ""
     return "no mesh in this folder"
 

@@ -17,7 +17,7 @@ from asset_tools.build import build_object
 from asset_tools.graspnet.catalogue import ENTRIES, NUMBERS
 from asset_tools.import_scans import estimate_mass, make_object_id
 from asset_tools.inspection import Inspect, Inspection, ModelSource, inspect_models
-from asset_tools.pipeline import AssetJob, content_hash, make_failing_job
+from asset_tools.pipeline import AssetJob, compute_content_hash, make_failing_job
 from asset_tools.prepare import prepare_scan
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset
@@ -163,7 +163,7 @@ def _job(root: Path, model: str, info: dict[str, Any], inspected: Inspection) ->
         scale = _scale(root, model, info)
     except AssetError as error:
         return make_failing_job(make_ycb_object_id(model), error)
-    content = content_hash("ycb", model, scale, files=inspected.files, packages=["graspnet"])
+    content = compute_content_hash("ycb", model, scale, files=inspected.files, packages=["graspnet"])
     return AssetJob(make_ycb_object_id(model), partial(_make, root, model), content)
 
 

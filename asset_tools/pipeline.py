@@ -63,7 +63,7 @@ class AssetJob:
     Attributes:
         id: id of the asset.
         make: writes the files of the asset to a folder and returns its manifest entry; must be picklable.
-        content: hash of all inputs of the asset, see `content_hash`.
+        content: hash of all inputs of the asset, see `compute_content_hash`.
         error: error that was found before the build, or None.
     """
 
@@ -97,7 +97,7 @@ class AssetJobResult:
 
 def make_failing_job(id_: str, error: AssetError) -> AssetJob:
     """Return a job that raises ``error`` when it runs, so that ``skip_errors`` also skips assets with early errors."""
-    return AssetJob(id_, partial(_fail, error), content_hash(str(error)), error)
+    return AssetJob(id_, partial(_fail, error), compute_content_hash(str(error)), error)
 
 
 def _fail(error: AssetError, folder: Path) -> ObjectAsset:
@@ -140,7 +140,7 @@ def build_assets(jobs: Sequence[AssetJob], out: Path, cache: Path, *, processes:
             yield AssetJobResult(made.id, None, message)
 
 
-def content_hash(*settings: object, files: Iterable[Path] = (), packages: Sequence[str] = ()) -> str:
+def compute_content_hash(*settings: object, files: Iterable[Path] = (), packages: Sequence[str] = ()) -> str:
     """Return the SHA-256 of the inputs of an asset: settings, source files, code and versions of libraries.
 
     Args:

@@ -15,8 +15,8 @@ from scipy.spatial import ConvexHull, QhullError
 from asset_tools.readers.model import read_model
 from asset_tools.readers.surface import MultiTextureMaterial
 from asset_tools.repair import close_scan
-from asset_tools.scan import METRES_PER_UNIT, PLAUSIBLE, Unit, Up, guess_common_unit, guess_up, rotate_upright
-from asset_tools.solids import to_mesh, to_solid
+from asset_tools.scan import METRES_PER_UNIT, PLAUSIBLE, Unit, Up, guess_common_unit, guess_up_axis, rotate_upright
+from asset_tools.solids import mesh_to_solid, solid_to_mesh
 from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
@@ -72,7 +72,7 @@ def prepare_scan(
     repairs += solid.repairs
     repairs += _about_colours(solid.scan)
     known = up or model.up
-    up = known or guess_up(solid.mesh)
+    up = known or guess_up_axis(solid.mesh)
     if up != "z":
         repairs.append(f"rotated {up} up" if known else f"rotated {up} up (guessed)")
     longest = float(solid.mesh.extents.max())
@@ -88,7 +88,7 @@ def prepare_scan(
     if unit != "m":
         repairs.append(f"scaled from {UNIT_NAMES[unit]}")
     mesh, closed = (rotate_upright(part, up).apply_scale(METRES_PER_UNIT[unit]) for part in (solid.scan, solid.mesh))
-    mesh, closed = level_base(mesh, closed, repairs)
+    mesh, closed = flatten_base(mesh, closed, repairs)
     return PreparedScan(mesh, closed, up, unit, tuple(repairs))
 
 
@@ -103,7 +103,7 @@ def _about_colours(mesh: trimesh.Trimesh) -> list[str]:
     return ["has no colours"]
 
 
-def level_base(
+def flatten_base(
     mesh: trimesh.Trimesh, closed: trimesh.Trimesh, repairs: list[str]
 ) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
     """Flatten a broad base that bulges downwards, so that the object does not rock.
@@ -130,8 +130,8 @@ def level_base(
             pressed = mesh.copy()
             pressed.vertices = vertices
             repairs.append(f"pressed the base flat by {1e3 * depth:.2g} mm")
-            solid: Any = to_solid(closed)  # a watertight mesh is a solid
-            return pressed, to_mesh(solid.trim_by_plane((0.0, 0.0, 1.0), low + depth))
+            solid: Any = mesh_to_solid(closed)  # a watertight mesh is a solid
+            return pressed, solid_to_mesh(solid.trim_by_plane((0.0, 0.0, 1.0), low + depth))
     return mesh, closed
 
 

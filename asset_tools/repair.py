@@ -14,7 +14,7 @@ from trimesh.visual.color import ColorVisuals
 from trimesh.visual.texture import TextureVisuals
 
 from asset_tools.clean import clean_scan
-from asset_tools.solids import to_mesh, to_solid
+from asset_tools.solids import mesh_to_solid, solid_to_mesh
 from robocas_ms3.core.errors import AssetError
 
 Array = NDArray[np.float64]
@@ -190,7 +190,7 @@ def _as_solid(mesh: trimesh.Trimesh) -> Manifold | None:
         return None
     if mesh.volume < 0:
         mesh.invert()
-    solid = to_solid(mesh)
+    solid = mesh_to_solid(mesh)
     if solid is None or solid.volume() <= 0:
         return None
     bodies = [body for body in solid.decompose() if body.volume() > 0]
@@ -291,7 +291,7 @@ def _light(solid: Manifold, diagonal: float) -> trimesh.Trimesh:
         if abs(lighter.volume() - solid.volume()) > SIMPLIFIED_VOLUME * solid.volume():
             break
         solid = lighter
-    return to_mesh(solid)
+    return solid_to_mesh(solid)
 
 
 def _open_edges(mesh: trimesh.Trimesh) -> int:

@@ -11,12 +11,12 @@ from scipy.spatial import ConvexHull, QhullError
 from asset_tools.stability import (
     BELOW,
     UPRIGHT_DEG,
+    compute_toppling_angle,
     find_stable_directions,
     merge_poses,
     pool_probabilities,
     rocks_in_place,
     select_poses,
-    toppling_angle,
 )
 from robocas_ms3.assets.hulls import find_box
 from robocas_ms3.assets.physics import (
@@ -181,7 +181,7 @@ def _firm(body: _Body, directions: Array, which: list[int]) -> tuple[Array, list
     """
     if len(directions) == 0:
         return directions, which
-    margins = np.array([toppling_angle(body.cooked, body.solid.center_of_mass, up) for up in directions])
+    margins = np.array([compute_toppling_angle(body.cooked, body.solid.center_of_mass, up) for up in directions])
     rocks = np.array([rocks_in_place(body.cooked - body.solid.center_of_mass, up) for up in directions])
     firm = np.flatnonzero((margins >= min(MIN_TOPPLING_DEG, margins.max())) | rocks)
     return directions[firm], [which[i] for i in firm]

@@ -78,7 +78,7 @@ def guess_units(longest: Mapping[str, float]) -> dict[str, Unit]:
     return units
 
 
-def guess_up(mesh: trimesh.Trimesh) -> Up:
+def guess_up_axis(mesh: trimesh.Trimesh) -> Up:
     """Guess the axis that points up: y or z, the two conventions of modelling software.
 
     If y or z is the longest axis, the object is assumed to stand along this axis, unless it is a thin box. Otherwise

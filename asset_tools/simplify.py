@@ -51,7 +51,9 @@ def simplify_mesh(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
     found = [part for part in found if len(part[1]) <= most]
     vertices, faces = next((part for part in found if keeps_parts(*part)), found[-1])
     if len(faces) == 0:
-        raise AssetError("all faces of the mesh are degenerate", expected=f"1 to {triangles} faces", found=0)
+        raise AssetError(
+            "all faces of the mesh are degenerate", expected=f"1 to {triangles} faces", found="no face left"
+        )
     body = trimesh.Trimesh(vertices * size + center, faces, process=False)
     body.update_faces(body.nondegenerate_faces())
     body.remove_unreferenced_vertices()

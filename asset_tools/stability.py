@@ -155,7 +155,7 @@ def rocks_in_place(points: Array, up: Array) -> bool:
     return bool((-(ups @ points.T).min(axis=-1)).min() >= -(points @ up).min() - SAME_HEIGHT)
 
 
-def toppling_angle(points: Array, center_of_mass: Array, up: Array) -> float:
+def compute_toppling_angle(points: Array, center_of_mass: Array, up: Array) -> float:
     """Return the smallest angle in degrees by which the body must be tilted to topple.
 
     Args:

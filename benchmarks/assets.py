@@ -25,7 +25,7 @@ import tyro
 
 from asset_tools.build import write_visuals
 from asset_tools.builtin.catalogue import load_builtin_products
-from asset_tools.decompose import decompose
+from asset_tools.decompose import decompose_mesh
 from asset_tools.grasps import sample_grasps
 from asset_tools.inertia import compute_principal_inertia
 from asset_tools.quality.drops import run_drop_test
@@ -56,11 +56,11 @@ def main(cfg: Benchmark) -> None:
 
         with timed("shape and texture"):
             shape, mesh = spec.build()
-        closed = shape.closed()
+        closed = shape.make_closed_mesh()
         with timed("display meshes"), TemporaryDirectory() as folder:
             write_visuals(mesh, Path(folder))
         with timed("hulls"):
-            hulls = list(shape.pieces) or decompose(closed).hulls
+            hulls = list(shape.pieces) or decompose_mesh(closed).hulls
         center = np.asarray(closed.center_mass)
         inertia, axes = compute_principal_inertia(closed, spec.mass)
         solid = RigidBody(hulls, spec.mass, center, np.array(inertia), np.array(axes))

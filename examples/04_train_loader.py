@@ -1,4 +1,4 @@
-"""Train a small policy on a dataset for a few steps: from images and state of two steps to a chunk of actions.
+"""Train a small policy on a dataset for 20 steps: images and robot states of two steps in, a chunk of four actions out.
 
 python examples/04_train_loader.py DATASET
 """
@@ -12,10 +12,12 @@ from torch.utils.data import DataLoader, WeightedRandomSampler
 
 from robocas_ms3.datasets import RoboCASDataset, SampleOptions
 
-OBSERVED, CHUNK, STEPS = 2, 4, 20
+OBSERVED, CHUNK, STEPS = 2, 4, 20  # observed steps, predicted actions, training steps
 
 
 class Policy(nn.Module):
+    """Convolutional network for the images, followed by a network that predicts the actions."""
+
     def __init__(self) -> None:
         super().__init__()
         layers = []
@@ -30,6 +32,7 @@ class Policy(nn.Module):
 
 
 def loss(policy: Policy, batch) -> torch.Tensor:
+    """Return the mean absolute error of the actions; actions after the end of an episode do not count."""
     chunk, is_real = batch["action"][:, -CHUNK:], batch["action_mask"][:, -CHUNK:]
     return (policy(batch) - chunk).abs()[is_real].mean()
 
@@ -49,7 +52,8 @@ if __name__ == "__main__":
         ),
     )
     print(f"{len(data.episodes)} episodes, {len(data)} samples, first: {data[0]['instruction']}")
-    sampler = WeightedRandomSampler(data.sampling_weights().tolist(), 8 * STEPS)  # each kind of sub-goal equally often
+    # draw each kind of sub-goal equally often
+    sampler = WeightedRandomSampler(data.sampling_weights().tolist(), 8 * STEPS)
     loader = DataLoader(data, batch_size=8, sampler=sampler, num_workers=2)
     policy = Policy()
     optimizer = torch.optim.AdamW(policy.parameters(), lr=1e-3)

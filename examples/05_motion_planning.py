@@ -2,6 +2,8 @@
 
 python examples/05_motion_planning.py --env PickCube-v1 --seed 0 --episodes 10
 python examples/05_motion_planning.py --env RoboCASPick-v1 --image end.png
+
+The solution of RoboCASPick-v1 imports modules of the motion planner, which are not a part of the public API.
 """
 
 from pathlib import Path
@@ -27,17 +29,19 @@ from robocas_ms3.scenes.grasp_checks import is_gripper_clear
 
 
 def solve_pick_cube(env, seed=None, debug=False, vis=False):
-    """Solve PickCube-v1; ``debug`` shows the box that the grasp is computed from."""
+    """Solve PickCube-v1; ``debug`` shows the box from which the grasp is computed."""
     env.reset(seed=seed)
     planner = PandaArmMotionPlanningSolver(env, base_pose=env.unwrapped.agent.robot.pose, vis=vis)
     env = env.unwrapped
 
+    # compute a grasp from above from the oriented bounding box of the cube
     obb = get_actor_obb(env.cube, vis=debug)
     approaching = np.array([0, 0, -1])
     target_closing = env.agent.tcp.pose.sp.to_transformation_matrix()[:3, 1]
     grasp_info = compute_grasp_info_by_obb(obb, approaching, target_closing, depth=0.025)
     grasp_pose = env.agent.build_grasp_pose(approaching, grasp_info["closing"], env.cube.pose.sp.p)
 
+    # move above the cube, then down, close the gripper, and move the cube to the goal
     planner.move_to_pose_with_screw(grasp_pose * sapien.Pose([0, 0, -0.05]))
     planner.move_to_pose_with_screw(grasp_pose)
     planner.close_gripper()
@@ -47,7 +51,7 @@ def solve_pick_cube(env, seed=None, debug=False, vis=False):
 
 
 def solve_pick(env, seed=None, debug=False, vis=False):
-    """Solve RoboCASPick-v1 with a table; ``debug`` prints why poses were rejected."""
+    """Solve RoboCASPick-v1 in a scene with a table; ``debug`` prints why poses were rejected."""
     env.reset(seed=seed)
     planner = PandaArmMotionPlanningSolver(env, base_pose=env.unwrapped.agent.robot.pose, vis=vis)
     env = env.unwrapped
@@ -55,6 +59,7 @@ def solve_pick(env, seed=None, debug=False, vis=False):
     all_obstacles, other_obstacles = scene.obstacles_in_world(), scene.obstacles_in_world(exclude=slot)
 
     def reach_and_grasp(grasp_pose):
+        # move to a pose 10 cm before the grasp without touching any object, then straight to the grasp
         planner.clear_collisions()
         planner.add_obstacles(all_obstacles)
         planner.move_to_pose_with_RRTConnect(grasp_pose * sapien.Pose([0, 0, -0.1]))
@@ -67,6 +72,7 @@ def solve_pick(env, seed=None, debug=False, vis=False):
     planner.close_gripper(t=10)
     planner.move_to_pose_with_screw(rise * grasp_pose)
 
+    # the planner must move the grasped object without collisions, too
     held = AttachedBody(
         np.concatenate(env.object_assets[0][slot].hulls), inverse(scene.tcp_in_base) @ scene.object_in_base(slot)
     )
@@ -81,7 +87,7 @@ def solve_pick(env, seed=None, debug=False, vis=False):
 
 
 def first_reachable(move, poses, debug):
-    """Return the first pose to which a motion is found."""
+    """Return the first of ``poses`` for which ``move`` finds a motion; raise PlanningError if there is none."""
     failure = PlanningError("example", "no_pose")
     for pose in poses:
         try:
@@ -95,7 +101,7 @@ def first_reachable(move, poses, debug):
 
 
 def ranked_grasps(env, scene, slot):
-    """Return the annotated grasps that touch no other object, sorted: firm, central and steep grasps first."""
+    """Return the annotated grasps of the target that touch no other object; firm, central and steep grasps first."""
     target, base = env.object_assets[0][slot], scene.arm_base_in_world
     notes, object_in_world = target.annotations, base @ scene.object_in_base(slot)
     candidates = filter_grasps(notes, object_in_world, base)
@@ -110,7 +116,7 @@ def ranked_grasps(env, scene, slot):
 
 
 def ranked_drops(env, scene, slot, held, rng):
-    """Return TCP poses with the object above the basket, sorted by overhang over the opening, then by steepness."""
+    """Return poses of the TCP with the object above the basket; poses with little overhang, then steep poses first."""
     inner = env.model.basket.asset.inner
     inside = ContainerInterior(scene.basket_in_base, np.array(inner.min), np.array(inner.max))
     center = np.array([env.object_assets[0][slot].asset.center_of_mass])

@@ -1,8 +1,8 @@
-"""Train the baseline `ppo` from Python: it learns on a CPU to reach for one of a few fruits and to hold it.
+"""Train the baseline `ppo` from Python: the policy learns on a CPU to grasp and hold one of a few fruits.
 
     python examples/ppo.py --seed 1 --out out/ppo_1
 
-does the same as `robocas train ppo --seed 1 --out out/ppo_1`. The results are in docs/rl.md.
+The result is that of `robocas train ppo --seed 1 --out out/ppo_1`; see docs/rl.md.
 """
 
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ class Args:
     out: Path = Path("out/ppo")
     """Folder of the run."""
     seed: int = 1
-    """Seed of the policy and its noise."""
+    """Seed of the weights and of the noise of the policy."""
     steps: int = 102_400
-    """Training steps, of all environments together."""
+    """Number of environment steps for training, summed over all environments."""
     batch: int = 512
-    """Steps between updates, of all environments together."""
+    """Number of environment steps between two updates, summed over all environments."""
     envs: int = 8
     """Number of environments."""
     workers: int | None = None
@@ -31,10 +31,11 @@ class Args:
     layouts: int = 64
     """Number of layouts for training."""
     test_episodes: int = 50
-    """Number of test episodes after the training, in other layouts and without noise."""
+    """Number of test episodes after the training, in other layouts and without noise of the policy."""
 
 
 def main(args: Args) -> None:
+    """Set the options of the baseline, and train it; progress is printed."""
     torch.set_num_threads(1)
     train = {"seed": args.seed, "steps": args.steps, "batch_size": args.batch}
     config = {"envs": args.envs, "workers": args.workers, "layouts": args.layouts, "test_episodes": args.test_episodes}

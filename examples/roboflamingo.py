@@ -3,6 +3,7 @@
 RoboFlamingo pins torch 2.0.1, so this file runs in a separate environment; docs/baselines_lerobot.md has the script.
 """
 
+import json
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -13,40 +14,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3 import EvaluationError
-from robocas_ms3.core.documents import load_json
 from robocas_ms3.datasets import ActionScale
 from robocas_ms3.evaluation import EpisodeSpec, Observations, PolicySpec
 
-HORIZON = 11  # frames, as in the paper's appendix
-MODEL_SIZE = (320, 256)  # width, height in pixels; the paper uses the images of its RT-1
-DATASET_SIZE = (640, 480)  # resized to MODEL_SIZE; a camera of 320 x 256 has another field of view
+HORIZON = 11  # number of frames, from the appendix of the RoboCAS paper
+MODEL_SIZE = (320, 256)  # width and height in pixels of the model's images, as for RT-1 in the RoboCAS paper
+DATASET_SIZE = (640, 480)  # images are resized to MODEL_SIZE, since a camera of 320 x 256 has another field of view
 RATE_HZ = 5.0
 
 WindowModel = Callable[[NDArray[np.uint8], NDArray[np.uint8], str], Any]
-"""Model that maps images (11, H, W, 3) of the base camera and the gripper camera, and the instruction, to actions.
+"""Function of images (11, H, W, 3) of the base camera and of the gripper camera, and of the instruction.
 
-Returns one action (7,) or one per frame (11, 7), of which the last is used: position and Euler angles from -1 to 1 over
-the dataset's ranges, and the gripper's opening from 0 to 1.
+It returns one action (7,), or one action per frame (11, 7), of which the last is used. An action has the position and
+the Euler angles from -1 to 1 relative to the ranges of the dataset, and the opening of the gripper from 0 to 1.
 """
 
 
 class StepModel(Protocol):
-    """Interface of RoboFlamingo's `ModelWrapper`, which takes one frame at a time and keeps the frames."""
+    """Interface of RoboFlamingo's `ModelWrapper`, which gets one frame per call and stores the frames."""
 
     def reset(self) -> None: ...
 
     def step(self, obs: dict[str, Any], goal: str) -> Any:
-        """Return 7 numbers from -1 to 1 for `{"rgb_obs": {"rgb_static", "rgb_gripper"}}`; gripper 1 is open."""
+        """Return an action of 7 numbers from -1 to 1, gripper 1 is open.
+
+        Args:
+            obs: `{"rgb_obs": {"rgb_static": image, "rgb_gripper": image}}`.
+            goal: the instruction.
+        """
         ...
 
 
 class Stepwise:
-    """`WindowModel` around a `StepModel`, which is reset and gets the whole window at each step.
+    """`WindowModel` that resets a `StepModel` and passes it all 11 frames for each action.
 
-    Therefore one model serves several envs, with 11 model steps per action.
+    Since the model is reset, one model can serve several envs. Each action needs 11 steps of the model.
 
     Args:
-        model: step model with `use_state` and `tcp_rel` off: no robot state, actions in the TCP frame.
+        model: step model without `use_state` and `tcp_rel`: no robot state, actions in the TCP frame.
     """
 
     def __init__(self, model: StepModel) -> None:
@@ -91,7 +96,7 @@ class RoboFlamingoPolicy:
         return {"model": type(self._model).__qualname__, "horizon": HORIZON, "ranges": ranges}
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
-        """Forget the frames of the envs that episode an episode."""
+        """Forget the frames of the envs that start an episode."""
         for episode in episodes:
             self._frames[episode.env] = deque(maxlen=HORIZON)
 
@@ -123,11 +128,10 @@ class RoboFlamingoPolicy:
 def load_scale(data_info: Path) -> ActionScale:
     """Load the action ranges from a dataset's `data_info.json`: 1st to 99th percentile of each axis, m and rad."""
     try:
-        info = load_json(data_info)
+        info = json.loads(data_info.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise EvaluationError(
-            "no readable data_info.json of a RoboCAS dataset", where=data_info, found=error
-        ) from error
+        expected = "the data_info.json of a RoboCAS dataset"
+        raise EvaluationError("cannot read this file", where=data_info, expected=expected, found=error) from error
     return ActionScale.from_action_space(
         info.get("action_space", {}) if isinstance(info, dict) else {}, where=data_info
     )

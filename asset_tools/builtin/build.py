@@ -10,7 +10,7 @@ from pathlib import Path
 from asset_tools.build import build_furniture, build_object
 from asset_tools.builtin.catalogue import load_builtin_products
 from asset_tools.builtin.furniture import MAKERS
-from asset_tools.pipeline import AssetJob, content_hash
+from asset_tools.pipeline import AssetJob, compute_content_hash
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import FurnitureAsset, ObjectAsset
 from robocas_ms3.core.errors import AssetError
@@ -43,7 +43,7 @@ def make_builtin_jobs(ids: Sequence[str] = ()) -> list[AssetJob]:
     if unknown:
         fix = "Run `robocas assets info builtin` for the ids."
         raise AssetError("unknown ids of builtin assets", found=", ".join(unknown), fix=fix, usage=True)
-    content = content_hash(packages=("builtin", "builtin/furniture", "builtin/products"))
+    content = compute_content_hash(packages=("builtin", "builtin/furniture", "builtin/products"))
     return [AssetJob(id_, partial(build_asset, id_), content) for id_ in ids or known]
 
 
@@ -63,7 +63,7 @@ def build_asset(asset_id: str, folder: Path) -> ObjectAsset | FurnitureAsset:
         name=product.name,
         category=product.category,
         mesh=mesh,
-        closed=shape.closed(),
+        closed=shape.make_closed_mesh(),
         mass=product.mass,
         graspnet_id=product.graspnet_id,
         pieces=list(shape.pieces) or None,

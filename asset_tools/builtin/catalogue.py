@@ -155,7 +155,7 @@ class Product(StrictModel):
         made: Any = MODELS[self.model]() if self.model else self
         shape = made.shape(self.size)
         image = made.paint(shape, np.random.default_rng(zlib.crc32(self.id.encode())))
-        return shape, shape.textured(image, roughness=self.roughness)
+        return shape, shape.make_textured_mesh(image, roughness=self.roughness)
 
 
 @cache

@@ -44,7 +44,7 @@ class Grid:
         x, y = np.meshgrid(right, up)
         return cls(x, y, size)
 
-    def noise(self, rng: np.random.Generator, feature: tuple[float, float], *, slope: float = 2.0) -> Array:
+    def make_noise(self, rng: np.random.Generator, feature: tuple[float, float], *, slope: float = 2.0) -> Array:
         """Return noise (h, w) with mean 0 and standard deviation 1 that continues when the image is tiled.
 
         Args:
@@ -61,7 +61,7 @@ class Grid:
         result = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(high, wide))) * weight, (high, wide))
         return result / result.std()
 
-    def cells(self, cell: tuple[float, float], *, shift: float = 0.0, phase: float = 0.5) -> Cells:
+    def make_cells(self, cell: tuple[float, float], *, shift: float = 0.0, phase: float = 0.5) -> Cells:
         """Divide the image into rows of rectangles, such as tiles or bricks, which fit a whole number of times.
 
         If a row has only one rectangle, the rectangle has no left and right edge.
@@ -99,11 +99,11 @@ class Cells:
     edge: Array
     count: tuple[int, int]
 
-    def random(self, rng: np.random.Generator) -> Array:
+    def draw_random(self, rng: np.random.Generator) -> Array:
         """Return at each pixel (h, w) a random number in -1..1 that is equal within a rectangle."""
         return rng.uniform(-1, 1, self.count)[self.row, self.column]
 
-    def shuffled(self, image: Array, rng: np.random.Generator) -> Array:
+    def shuffle_image(self, image: Array, rng: np.random.Generator) -> Array:
         """Return an image in which each rectangle shows another random place of ``image``, which can be tiled."""
         down, right = (rng.integers(0, n, self.count)[self.row, self.column] for n in image.shape[:2])
         rows, columns = np.indices(image.shape[:2])
@@ -156,16 +156,16 @@ def paint_wood(
         plank: width of the planks, m; 0: one piece.
         ring: distance of the growth rings, m.
     """
-    bend = grid.noise(rng, (1.2, 0.15), slope=2.6)
-    fibre = grid.noise(rng, (0.12, 0.0016), slope=1.6)
-    streak = grid.noise(rng, (1.0, 0.03), slope=1.7)
+    bend = grid.make_noise(rng, (1.2, 0.15), slope=2.6)
+    fibre = grid.make_noise(rng, (0.12, 0.0016), slope=1.6)
+    streak = grid.make_noise(rng, (1.0, 0.03), slope=1.7)
     growth = (grid.y + 0.022 * bend) / ring
     late = (growth % 1) ** 2 * np.clip((1 - growth % 1) / 0.12, 0, 1)  # the wood of each year becomes darker, then ends
     pores = np.clip(fibre - 1.5, 0, 1.5)
     amount = 0.26 + 0.24 * late + 0.06 * fibre + 0.13 * streak + 0.20 * pores
     if plank:
-        cells = grid.cells((grid.size[0], plank), phase=0.0)
-        amount = cells.shuffled(amount, rng) + 0.14 * cells.random(rng)
+        cells = grid.make_cells((grid.size[0], plank), phase=0.0)
+        amount = cells.shuffle_image(amount, rng) + 0.14 * cells.draw_random(rng)
         return scale_brightness(blend(amount, *tones), -0.5 * compute_joint_mask(cells.edge, 0.0007))
     return blend(amount, *tones)
 
@@ -173,23 +173,23 @@ def paint_wood(
 def paint_plain(grid: Grid, rng: np.random.Generator, *, colour: Colour, rough: float = 0.0015) -> Array:
     """Paint a surface of one colour with slight variations; return colours (h, w, 3) in 0..255."""
     return scale_brightness(
-        np.broadcast_to(np.asarray(colour, float), (*grid.x.shape, 3)), rough * grid.noise(rng, (0.05, 0.05))
+        np.broadcast_to(np.asarray(colour, float), (*grid.x.shape, 3)), rough * grid.make_noise(rng, (0.05, 0.05))
     )
 
 
 def paint_brushed_metal(grid: Grid, rng: np.random.Generator, *, colour: Colour = (196, 198, 202)) -> Array:
     """Paint paint_brushed_metal metal with strokes along x and light from above; return colours (h, w, 3) in 0..255."""
-    strokes = grid.noise(rng, (0.08, 0.0006), slope=1.2)
+    strokes = grid.make_noise(rng, (0.08, 0.0006), slope=1.2)
     gloss = 0.16 * np.cos(2 * np.pi * grid.y / grid.size[1])
     return scale_brightness(np.broadcast_to(np.asarray(colour, float), (*grid.x.shape, 3)), 0.035 * strokes + gloss)
 
 
 def paint_marble(grid: Grid, rng: np.random.Generator) -> Array:
     """Paint white stone with grey veins; return colours (h, w, 3) in 0..255."""
-    cloud = grid.noise(rng, (0.35, 0.35), slope=2.4)
+    cloud = grid.make_noise(rng, (0.35, 0.35), slope=2.4)
     veins = np.zeros_like(cloud)
     for size, weight in ((0.5, 1.0), (0.22, 0.55)):
-        field = grid.noise(rng, (size, size), slope=2.3)
+        field = grid.make_noise(rng, (size, size), slope=2.3)
         veins = np.maximum(veins, weight * np.exp(-np.abs(field) / 0.035))
     return scale_brightness(blend(0.75 * veins + 0.10 * cloud + 0.06, (240, 238, 234), (128, 130, 136)), 0.01 * cloud)
 
@@ -210,7 +210,7 @@ def paint_wickerwork(grid: Grid, rng: np.random.Generator, *, cell: tuple[float,
     across, along = np.where(level, v, u), np.where(level, u, v)
     light = np.sqrt(np.clip(1 - (2 * across) ** 2, 0, 1)) * (1 - 0.4 * (2 * along) ** 4)
     strand = np.where(level, j * 12.9898, i * 78.233)
-    tone = 1 + 0.10 * np.sin(strand * 43.7) + 0.03 * grid.noise(rng, (0.008, 0.008))
+    tone = 1 + 0.10 * np.sin(strand * 43.7) + 0.03 * grid.make_noise(rng, (0.008, 0.008))
     return np.asarray(colour) * ((0.34 + 0.72 * light) * tone)[..., None]
 
 
@@ -218,7 +218,7 @@ def paint_wrapped_rim(grid: Grid, rng: np.random.Generator, *, colour: Colour = 
     """Paint a rim that is wrapped with strands ``pitch`` m wide; return colours (h, w, 3) in 0..255."""
     count = round(grid.size[0] / pitch)
     slant = (grid.x / grid.size[0] * count + grid.y / grid.size[1] * 2) % 1
-    tone = 1 + 0.03 * grid.noise(rng, (0.008, 0.008))
+    tone = 1 + 0.03 * grid.make_noise(rng, (0.008, 0.008))
     return np.asarray(colour) * ((0.45 + 0.62 * np.sin(np.pi * slant)) * tone)[..., None]
 
 

@@ -76,12 +76,12 @@ class Shape:
     texture_size: int
     pieces: tuple[np.ndarray, ...] = ()
 
-    def closed(self) -> trimesh.Trimesh:
+    def make_closed_mesh(self) -> trimesh.Trimesh:
         """Return the watertight mesh of the surface, with vertices merged by position and without texture."""
         points, index = weld(self.vertices)
         return trimesh.Trimesh(points, index[self.faces], process=False)
 
-    def textured(self, image: Image.Image, *, roughness: float = 0.5) -> trimesh.Trimesh:
+    def make_textured_mesh(self, image: Image.Image, *, roughness: float = 0.5) -> trimesh.Trimesh:
         """Return the mesh for rendering, with vertex normals and the texture ``image``."""
         material = PBRMaterial(
             baseColorTexture=image, baseColorFactor=[255, 255, 255, 255], metallicFactor=0.0, roughnessFactor=roughness

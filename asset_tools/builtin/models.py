@@ -14,8 +14,8 @@ from scipy.ndimage import distance_transform_edt
 
 from asset_tools.builtin.blends import Field, Point, mesh_field, smooth_min
 from asset_tools.builtin.mesh import Shape, Size, make_creased_shape
-from asset_tools.builtin.textures import Colour, as_jpeg
-from asset_tools.decompose import reduce_vertices
+from asset_tools.builtin.textures import Colour, encode_jpeg
+from asset_tools.decompose import reduce_hull_vertices
 
 MM = 1e-3
 CREASE_DEG = 55.0  # simplified roundings are coarse
@@ -94,9 +94,11 @@ class Model:
         """
         factor = np.asarray(size) / (self.body.extents * MM)
         if np.abs(factor - 1).max() > 0.2:
-            raise ValueError(f"the parts give {self.body.extents} mm for a shape of {size} m")
+            raise ValueError(f"the parts do not fit the shape: expected {size} m, found {self.body.extents * MM} m")
         points = (self.body.vertices - self.body.bounds.mean(0)) * MM * factor
-        pieces = tuple(reduce_vertices((piece - self.body.bounds.mean(0)) * MM * factor) for piece in self._pieces())
+        pieces = tuple(
+            reduce_hull_vertices((piece - self.body.bounds.mean(0)) * MM * factor) for piece in self._pieces()
+        )
         return make_uv_mapped_shape(np.asarray(points), np.asarray(self.body.faces), self.texture_size, pieces)
 
     def paint(self, shape: Shape, rng: np.random.Generator) -> Image.Image:
@@ -182,7 +184,7 @@ def paint_in_space(shape: Shape, colours: Callable[[np.ndarray, np.ndarray], np.
     pixels[row, column] = np.clip(np.rint(colours(points, normals)), 0, 255)
     empty[row, column] = False
     near = distance_transform_edt(empty, return_distances=False, return_indices=True)
-    return as_jpeg(Image.fromarray(pixels[near[0], near[1]]).reduce(OVERSAMPLING), 85)  # type: ignore[index]
+    return encode_jpeg(Image.fromarray(pixels[near[0], near[1]]).reduce(OVERSAMPLING), 85)  # type: ignore[index]
 
 
 def _texels(uv: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 from asset_tools.builtin.mesh import Shape
-from asset_tools.builtin.textures import Colour, Painter, blend, noise
+from asset_tools.builtin.textures import Colour, Painter, blend, compute_noise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,59 +44,63 @@ class Fruit:
     def __call__(self, shape: Shape, rng: np.random.Generator) -> Image.Image:
         """Return the texture of a shape with the region ``skin``."""
         painter = Painter(shape, rng, self.base)
-        angle, level = painter.grid("skin")
+        angle, level = painter.compute_grid("skin")
         polar = np.pi * (1 - level)[:, None]
         points = np.stack(
             np.broadcast_arrays(np.sin(polar) * np.cos(angle), np.sin(polar) * np.sin(angle), np.cos(polar)), axis=-1
         )
         side = points @ np.array([0.5, -0.8, 0.3])
-        amount = self.blush_amount - 0.5 + 0.55 * side + 0.35 * noise(points, rng, frequency=0.5)
+        amount = self.blush_amount - 0.5 + 0.55 * side + 0.35 * compute_noise(points, rng, frequency=0.5)
         if self.streaks:
             lines = points * np.array([1.0, 1.0, 0.12]) / np.maximum(np.sin(polar), 0.15)[..., None]
-            amount = amount + self.streaks * noise(lines, rng, frequency=3.0, octaves=4)
+            amount = amount + self.streaks * compute_noise(lines, rng, frequency=3.0, octaves=4)
         colours = blend(1 / (1 + np.exp(-5 * amount)), self.base, self.blush)
         if self.poles:
             cap = np.exp(-(((1 - np.abs(points[..., 2])) / 0.09) ** 2))
-            colours = blend(cap * (0.8 + 0.2 * noise(points, rng, frequency=2.0)), colours, self.poles)
+            colours = blend(cap * (0.8 + 0.2 * compute_noise(points, rng, frequency=2.0)), colours, self.poles)
         if self.crown:
-            ragged = 0.22 * noise(points, rng, frequency=1.2)
+            ragged = 0.22 * compute_noise(points, rng, frequency=1.2)
             colours = blend(0.9 / (1 + np.exp(-9 * (points[..., 2] - 0.72 + ragged))), colours, self.crown)
         if self.bloom:
             film = (
                 0.55
-                + 0.6 * noise(points, rng, frequency=1.1)
-                + 0.25 * noise(points, rng, frequency=8.0, octaves=1, waves=30)
+                + 0.6 * compute_noise(points, rng, frequency=1.1)
+                + 0.25 * compute_noise(points, rng, frequency=8.0, octaves=1, waves=30)
             )
             colours = blend(np.clip(0.42 * film, 0, 0.6), colours, self.bloom)
         if self.groove:
             off_front = np.angle(np.exp(1j * (angle - np.pi)))[None, :]
             colours = colours * (1 - self.groove * np.exp(-((off_front / 0.09) ** 2)) * np.sin(polar))[..., None]
         if self.speckle:
-            spots = noise(points, rng, frequency=9.0, octaves=1, waves=40)
+            spots = compute_noise(points, rng, frequency=9.0, octaves=1, waves=40)
             colours = blend(np.clip(6 * (spots - 0.72), 0, 0.75), colours, self.speckle)
         if self.pores:
-            colours = colours * (1 + self.pores * noise(points, rng, frequency=14.0, octaves=2, waves=40))[..., None]
-        colours = colours * (1 + 0.05 * noise(points, rng, frequency=1.5))[..., None]
-        painter.put("skin", np.clip(colours, 0, 255).astype(np.uint8))
-        painter.fill("stem", self.stem)
-        return painter.image()
+            colours = (
+                colours * (1 + self.pores * compute_noise(points, rng, frequency=14.0, octaves=2, waves=40))[..., None]
+            )
+        colours = colours * (1 + 0.05 * compute_noise(points, rng, frequency=1.5))[..., None]
+        painter.put_pixels("skin", np.clip(colours, 0, 255).astype(np.uint8))
+        painter.fill_region("stem", self.stem)
+        return painter.make_image()
 
 
 def paint_banana(shape: Shape, rng: np.random.Generator) -> Image.Image:
     """Paint a banana: yellow, greenish at the ends, with a brown stem, tip, edges and freckles."""
     painter = Painter(shape, rng, (236, 200, 60))
-    angle, level = painter.grid("skin")
+    angle, level = painter.compute_grid("skin")
     from_stem = level[:, None]  # the bottom of the region is the start of the sweep: the stem
     points = np.stack(np.broadcast_arrays(np.cos(angle), np.sin(angle), 9 * from_stem), axis=-1)
     ends = np.clip((np.abs(from_stem - 0.5) - 0.24) / 0.2, 0, 1)
-    colours = blend(0.75 * ends * (0.8 + 0.3 * noise(points, rng, frequency=0.3)), (238, 202, 58), (176, 182, 66))
+    colours = blend(
+        0.75 * ends * (0.8 + 0.3 * compute_noise(points, rng, frequency=0.3)), (238, 202, 58), (176, 182, 66)
+    )
     ridge = np.clip(np.cos(5 * angle) - 0.93, 0, 1) / 0.07
-    colours = blend(ridge * (0.28 + 0.2 * noise(points, rng, frequency=0.6)), colours, (150, 112, 40))
-    freckles = noise(points, rng, frequency=1.6, octaves=2, waves=40)
+    colours = blend(ridge * (0.28 + 0.2 * compute_noise(points, rng, frequency=0.6)), colours, (150, 112, 40))
+    freckles = compute_noise(points, rng, frequency=1.6, octaves=2, waves=40)
     colours = blend(np.clip(5 * (freckles - 0.70), 0, 0.8), colours, (112, 74, 32))
     stem = np.clip((0.035 - from_stem) / 0.02, 0, 1) * 0.9 + np.clip((0.13 - from_stem) / 0.1, 0, 1) * 0.25
     colours = blend(stem, colours, (104, 84, 40))
     colours = blend(np.clip((from_stem - 0.95) / 0.03, 0, 1), colours, (62, 48, 34))
-    colours = colours * (1 + 0.05 * noise(points, rng, frequency=0.5))[..., None]
-    painter.put("skin", np.clip(colours, 0, 255).astype(np.uint8))
-    return painter.image()
+    colours = colours * (1 + 0.05 * compute_noise(points, rng, frequency=0.5))[..., None]
+    painter.put_pixels("skin", np.clip(colours, 0, 255).astype(np.uint8))
+    return painter.make_image()

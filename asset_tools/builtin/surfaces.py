@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from asset_tools.builtin.mesh import Patch
-from asset_tools.decompose import reduce_vertices
+from asset_tools.decompose import reduce_hull_vertices
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ def make_stacked_pieces(patches: list[Patch], cuts: Sequence[float] = ()) -> lis
             rows = np.concatenate([rows, (1 - share) * rows[i : i + 1] + share * rows[i + 1 : i + 2]])
     height = rows[:, 0, 2]
     return [
-        reduce_vertices(rows[(height >= low - 1e-9) & (height <= high + 1e-9)].reshape(-1, 3))
+        reduce_hull_vertices(rows[(height >= low - 1e-9) & (height <= high + 1e-9)].reshape(-1, 3))
         for low, high in itertools.pairwise(edges)
     ]
 
@@ -207,8 +207,8 @@ def make_prism_piece(rings: Sequence[tuple[float, float]], sides: int = 16) -> n
     """Return the points (k, 3) of a convex piece of a round, upright part: a regular polygon per circle.
 
     Each polygon has the area of its circle. All facets are equal, so that the object comes to rest on each of them. An
-    object with unequal facets, as from `reduce_vertices`, would rock for a long time. PhysX keeps all corners of up to
-    three polygons of 16 sides.
+    object with unequal facets, as from `reduce_hull_vertices`, would rock for a long time. PhysX keeps all corners of
+    up to three polygons of 16 sides.
 
     Args:
         rings: radius and height z of each circle, from the bottom to the top; convex, m.
@@ -224,7 +224,7 @@ def make_chained_pieces(patch: Patch, count: int) -> list[np.ndarray]:
     """Cut a tube of `sweep` along its length into ``count`` sections; return the points (k, 3) of each hull."""
     rows = patch.points[1:-1, :-1]
     bounds = np.round(np.linspace(0, len(rows) - 1, count + 1)).astype(int)
-    return [reduce_vertices(rows[a : b + 1].reshape(-1, 3)) for a, b in itertools.pairwise(bounds.tolist())]
+    return [reduce_hull_vertices(rows[a : b + 1].reshape(-1, 3)) for a, b in itertools.pairwise(bounds.tolist())]
 
 
 FACES = {  # (axis, sign) of the directions right and up, seen from outside

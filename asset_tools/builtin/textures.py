@@ -41,7 +41,7 @@ class Canvas:
         self.draw = ImageDraw.Draw(self.image)
         self.rng = rng
 
-    def pixels(self, box: Box) -> tuple[int, int, int, int]:
+    def to_pixels(self, box: Box) -> tuple[int, int, int, int]:
         """Convert a box (left, top, right, bottom) from fractions to pixels."""
         left, top, right, bottom = box
         return (
@@ -51,32 +51,32 @@ class Canvas:
             round(bottom * self.height),
         )
 
-    def rectangle(self, box: Box, colour: Colour, *, corner: float = 0.0) -> None:
+    def draw_rectangle(self, box: Box, colour: Colour, *, corner: float = 0.0) -> None:
         """Draw a filled rectangle; ``corner`` is the radius of its corners as a fraction of the shorter side."""
-        left, top, right, bottom = self.pixels(box)
+        left, top, right, bottom = self.to_pixels(box)
         radius = corner * min(right - left, bottom - top)
         self.draw.rounded_rectangle((left, top, right - 1, bottom - 1), radius, fill=colour)
 
-    def disc(self, x: float, y: float, radius: float, colour: Colour, *, stretch: float = 1.0) -> None:
+    def draw_disc(self, x: float, y: float, radius: float, colour: Colour, *, stretch: float = 1.0) -> None:
         """Draw a filled circle; ``radius`` is a fraction of the height, and ``stretch`` a factor of the width."""
         r = radius * self.height
         x, y = x * self.width, y * self.height
         self.draw.ellipse((x - r * stretch, y - r, x + r * stretch, y + r), fill=colour)
 
-    def polygon(self, points: list[tuple[float, float]], colour: Colour) -> None:
+    def draw_polygon(self, points: list[tuple[float, float]], colour: Colour) -> None:
         """Draw a filled polygon with corners (x, y) in fractions."""
         self.draw.polygon([(x * self.width, y * self.height) for x, y in points], fill=colour)
 
-    def wave(self, y: float, amplitude: float, periods: float, colour: Colour, *, bottom: float = 1.0) -> None:
+    def fill_wave(self, y: float, amplitude: float, periods: float, colour: Colour, *, bottom: float = 1.0) -> None:
         """Fill the area between a sine wave at ``y`` and ``bottom``.
 
         If ``periods`` is a whole number, the wave continues at the seam of a cylinder.
         """
         x = np.linspace(0, 1, 129)
         line = y + amplitude * np.sin(2 * np.pi * periods * x)
-        self.polygon([*zip(x.tolist(), line.tolist(), strict=True), (1, bottom), (0, bottom)], colour)
+        self.draw_polygon([*zip(x.tolist(), line.tolist(), strict=True), (1, bottom), (0, bottom)], colour)
 
-    def gradient(self, top: Colour, bottom: Colour) -> None:
+    def fill_gradient(self, top: Colour, bottom: Colour) -> None:
         """Fill the canvas with a gradient from the colour ``top`` to the colour ``bottom``."""
         t = np.linspace(0, 1, self.height)[:, None, None]
         rows = np.asarray(top) * (1 - t) + np.asarray(bottom) * t
@@ -86,7 +86,7 @@ class Canvas:
         """Replace the content of the canvas by colours (height, width, 3) in 0..255."""
         self.image.paste(Image.fromarray(np.clip(pixels, 0, 255).astype(np.uint8)))
 
-    def text(
+    def draw_text(
         self,
         words: str,
         box: Box,
@@ -110,7 +110,7 @@ class Canvas:
             like: other texts for boxes of this size. The letters are so small that these texts also fit.
             left_aligned: whether lines start at the left side of the box.
         """
-        left, top, right, bottom = self.pixels(box)
+        left, top, right, bottom = self.to_pixels(box)
         wide, high = (bottom - top, right - left) if turn % 180 else (right - left, bottom - top)
         wide, high = max(wide, 4), max(high, 4)
         spread = bold + (0.05 if outline else 0.0)
@@ -130,10 +130,10 @@ class Canvas:
                 pen.text((x, first + i * LINE_PITCH * size), line, 255, font, anchor=anchor, stroke_width=round(stroke))
             self.image.paste(ink, (left, top), mask.rotate(turn, expand=True))
 
-    def barcode(self, box: Box) -> None:
+    def draw_barcode(self, box: Box) -> None:
         """Draw a bar code: black bars on white."""
-        self.rectangle(box, (250, 250, 250))
-        left, top, right, bottom = self.pixels(box)
+        self.draw_rectangle(box, (250, 250, 250))
+        left, top, right, bottom = self.to_pixels(box)
         margin = max(1, (right - left) // 12)
         x = left + margin
         while x < right - margin:
@@ -141,21 +141,21 @@ class Canvas:
             self.draw.rectangle((x, top + margin, min(x + bar, right - margin) - 1, bottom - margin), fill=(20, 20, 20))
             x += bar + gap
 
-    def facts(self, box: Box, title: str, rows: list[tuple[str, str]], *, ink: Colour = (25, 25, 25)) -> None:
+    def draw_table(self, box: Box, title: str, rows: list[tuple[str, str]], *, ink: Colour = (25, 25, 25)) -> None:
         """Draw a table with a title and rows (name, amount), as on the back of a package."""
-        self.rectangle(box, (248, 248, 244))
+        self.draw_rectangle(box, (248, 248, 244))
         left, top, right, bottom = box
         step = (bottom - top) / (len(rows) + 1.6)
         inset = (right - left) * 0.06
         middle = left + (right - left) * 0.5
         names, amounts = (tuple(row[i] for row in rows) for i in (0, 1))
-        self.text(title, (left + inset, top + step * 0.2, right - inset, top + step * 1.2), ink, bold=0.03)
+        self.draw_text(title, (left + inset, top + step * 0.2, right - inset, top + step * 1.2), ink, bold=0.03)
         for i, (name, amount) in enumerate(rows):
             y = top + step * (1.5 + i)
-            self.rectangle((left + inset, y - step * 0.08, right - inset, y - step * 0.02), ink)
+            self.draw_rectangle((left + inset, y - step * 0.08, right - inset, y - step * 0.02), ink)
             low, high = y + step * 0.12, y + step * 0.8
-            self.text(name, (left + inset, low, middle, high), ink, like=names, left_aligned=True)
-            self.text(amount, (middle + inset, low, right - inset, high), ink, like=amounts, left_aligned=True)
+            self.draw_text(name, (left + inset, low, middle, high), ink, like=names, left_aligned=True)
+            self.draw_text(amount, (middle + inset, low, right - inset, high), ink, like=amounts, left_aligned=True)
 
 
 class Painter:
@@ -172,41 +172,41 @@ class Painter:
         self.pixels = np.empty((shape.texture_size, shape.texture_size, 3), dtype=np.uint8)
         self.pixels[:] = background
         for name in shape.regions:
-            self.fill(name, background)
+            self.fill_region(name, background)
 
     @contextmanager
-    def region(self, name: str, background: Colour | None = None) -> Iterator[Canvas]:
+    def open_region(self, name: str, background: Colour | None = None) -> Iterator[Canvas]:
         """Return a canvas for one region as a context manager; the canvas is copied to the texture at the end."""
         region = self.shape.regions[name]
         wide, high = _box_size(region)
         pixels = OVERSAMPLING * max(wide / region.size[0], high / region.size[1])
         canvas = Canvas(region.size, pixels, background or self.background, self.rng)
         yield canvas
-        self.put(name, np.asarray(canvas.image.resize((wide, high), Image.Resampling.LANCZOS)))
+        self.put_pixels(name, np.asarray(canvas.image.resize((wide, high), Image.Resampling.LANCZOS)))
 
-    def fill(self, name: str, colour: Colour) -> None:
+    def fill_region(self, name: str, colour: Colour) -> None:
         """Fill a region with one colour; do nothing if the shape has no such region."""
         if name in self.shape.regions:
             wide, high = _box_size(self.shape.regions[name])
-            self.put(name, np.full((high, wide, 3), colour, dtype=np.uint8))
+            self.put_pixels(name, np.full((high, wide, 3), colour, dtype=np.uint8))
 
-    def put(self, name: str, pixels: np.ndarray) -> None:
+    def put_pixels(self, name: str, pixels: np.ndarray) -> None:
         """Copy pixels (height, width, 3) to a region, and continue their border in the padding around the region."""
         left, top, right, bottom = self.shape.regions[name].box
         padded = np.pad(pixels, ((PADDING, PADDING), (PADDING, PADDING), (0, 0)), mode="edge")
         self.pixels[top - PADDING : bottom + PADDING, left - PADDING : right + PADDING] = padded
 
-    def grid(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+    def compute_grid(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return the angle (w,) in radians and the level (h,), 1 at the top to 0, of the pixels of a region."""
         wide, high = _box_size(self.shape.regions[name])
         return np.linspace(0, 2 * np.pi, wide), np.linspace(1, 0, high)
 
-    def image(self, quality: int = 88) -> Image.Image:
+    def make_image(self, quality: int = 88) -> Image.Image:
         """Return the texture as an image that is stored as JPEG with a quality in percent."""
-        return as_jpeg(Image.fromarray(self.pixels), quality)
+        return encode_jpeg(Image.fromarray(self.pixels), quality)
 
 
-def as_jpeg(image: Image.Image, quality: int = 88) -> Image.Image:
+def encode_jpeg(image: Image.Image, quality: int = 88) -> Image.Image:
     """Encode an image as JPEG and return the decoded image, so that exporters embed a JPEG file."""
     data = io.BytesIO()
     image.convert("RGB").save(data, "JPEG", quality=quality, subsampling=0, optimize=True)
@@ -216,7 +216,7 @@ def as_jpeg(image: Image.Image, quality: int = 88) -> Image.Image:
     return result
 
 
-def noise(
+def compute_noise(
     points: np.ndarray, rng: np.random.Generator, *, frequency: float, octaves: int = 3, waves: int = 12
 ) -> np.ndarray:
     """Return smooth noise (...) in about [-1, 1] at points: a sum of random waves in space, which has no seams.

@@ -11,7 +11,7 @@ from asset_tools.builtin.mesh import Patch, Shape, Size, build_fitted_shape
 from asset_tools.builtin.models import make_uv_mapped_shape, paint_in_space
 from asset_tools.builtin.surfaces import FACES
 from asset_tools.builtin.textures import Colour, Painter, compute_text_mask
-from asset_tools.decompose import reduce_vertices
+from asset_tools.decompose import reduce_hull_vertices
 
 STICKERS: dict[str, Colour] = {
     "top": (242, 242, 240),
@@ -52,18 +52,18 @@ def make_rubiks_cube(size: Size) -> Shape:
         uv = np.stack([u, v], axis=-1) / (2 * half) + 0.5
         patches.append(Patch(name, points, uv, (2 * half, 2 * half)))
     body = np.concatenate([patch.points.reshape(-1, 3) for patch in patches])
-    return build_fitted_shape([patches], size, pieces=[reduce_vertices(body)])
+    return build_fitted_shape([patches], size, pieces=[reduce_hull_vertices(body)])
 
 
 def paint_rubiks_cube(shape: Shape, rng: np.random.Generator) -> Image.Image:
     """Paint the stickers of a scramble_stickers puzzle cube on black."""
     painter = Painter(shape, rng, (16, 16, 18))
     for name, colours in scramble_stickers().items():
-        with painter.region(name) as canvas:
+        with painter.open_region(name) as canvas:
             for i, colour in enumerate(colours):
                 left, top = (i % 3) / 3, (i // 3) / 3
-                canvas.rectangle((left + 0.032, top + 0.032, left + 0.301, top + 0.301), colour, corner=0.16)
-    return painter.image()
+                canvas.draw_rectangle((left + 0.032, top + 0.032, left + 0.301, top + 0.301), colour, corner=0.16)
+    return painter.make_image()
 
 
 def scramble_stickers(turns: tuple[tuple[int, int, int], ...] = TURNS) -> dict[str, list[Colour]]:
@@ -96,7 +96,7 @@ def make_ball(size: Size, *, texture_size: int = 256) -> Shape:
     points = sphere.vertices * np.asarray(size) / sphere.extents
     middle = (points.max(0) + points.min(0)) / 2
     return make_uv_mapped_shape(
-        points - middle, np.asarray(sphere.faces), texture_size, (reduce_vertices(points - middle),)
+        points - middle, np.asarray(sphere.faces), texture_size, (reduce_hull_vertices(points - middle),)
     )
 
 

@@ -28,7 +28,7 @@ class CatalogueEntry:
     hollow: bool = False
 
     @property
-    def folder(self) -> str:
+    def folder_name(self) -> str:
         """Name of the object's folder in ``models``, and prefix of its label file: the number with three digits."""
         return f"{self.number:03d}"
 

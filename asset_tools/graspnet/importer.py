@@ -12,11 +12,11 @@ import trimesh
 
 from asset_tools.build import FEW_GRASPS, GRASPS, build_object
 from asset_tools.graspnet.catalogue import COUNT, ENTRIES, find_catalogue_entry
-from asset_tools.graspnet.labels import label_checksums, load_label_grasps
+from asset_tools.graspnet.labels import load_label_grasps, read_label_checksums
 from asset_tools.grasps import Grasps, sample_grasps
 from asset_tools.import_scans import estimate_mass
 from asset_tools.inspection import Inspect, Inspection, ModelSource, inspect_models
-from asset_tools.pipeline import AssetJob, content_hash, make_failing_job
+from asset_tools.pipeline import AssetJob, compute_content_hash, make_failing_job
 from asset_tools.prepare import prepare_scan
 from asset_tools.sources import ObjectSource
 from robocas_ms3.assets.manifest import ObjectAsset
@@ -119,10 +119,10 @@ def _job(root: Path, number: int, inspected: Inspection) -> AssetJob:
     if inspected.error is not None:
         return make_failing_job(id_, inspected.error)
     try:
-        checksums = label_checksums(labels) if labels.is_file() else ()
+        checksums = read_label_checksums(labels) if labels.is_file() else ()
     except AssetError as error:
         return make_failing_job(id_, error)
-    content = content_hash("graspnet", number, checksums, files=inspected.files, packages=["graspnet"])
+    content = compute_content_hash("graspnet", number, checksums, files=inspected.files, packages=["graspnet"])
     return AssetJob(id_, partial(_make, root, number), content)
 
 
@@ -131,7 +131,7 @@ def _make(root: Path, number: int, folder: Path) -> ObjectAsset:
 
 
 def _model(root: Path, number: int) -> Path:
-    return root / "models" / find_catalogue_entry(number).folder
+    return root / "models" / find_catalogue_entry(number).folder_name
 
 
 def _mesh(root: Path, number: int) -> Path:
@@ -141,7 +141,7 @@ def _mesh(root: Path, number: int) -> Path:
 
 
 def _labels(root: Path, number: int) -> Path:
-    return root / "grasp_label" / f"{find_catalogue_entry(number).folder}_labels.npz"
+    return root / "grasp_label" / f"{find_catalogue_entry(number).folder_name}_labels.npz"
 
 
 def _listed(numbers: Sequence[int]) -> str:

@@ -42,7 +42,7 @@ SHAPES = {
 
 
 @dataclass(frozen=True)
-class Labels:
+class GraspLabels:
     """N grasp labels in the frame of the model.
 
     Attributes:
@@ -79,7 +79,7 @@ class _Member:
     count: int
     dtype: np.dtype
 
-    def take(self, name: str, rows: int) -> NDArray:
+    def read_rows(self, name: str, rows: int) -> NDArray:
         """Read the next ``rows`` rows of the array; ``name`` is the name of the array."""
         shape = (rows, *SHAPES[name])
         size = int(np.prod(shape)) * self.dtype.itemsize
@@ -88,7 +88,7 @@ class _Member:
             raise EOFError(f"{name} is truncated")
         return np.frombuffer(data, self.dtype).reshape(shape)
 
-    def end(self) -> None:
+    def finish(self) -> None:
         """Read the end of the stream, so that zipfile verifies the checksum."""
         self.file.read(1)
 
@@ -120,7 +120,7 @@ def load_label_grasps(path: Path, closed: trimesh.Trimesh) -> tuple[Grasps, int]
     return Grasps(poses[chosen], labels.widths[clear][chosen], frictions[chosen]), len(labels)
 
 
-def label_checksums(path: Path) -> tuple[tuple[str, int, int], ...]:
+def read_label_checksums(path: Path) -> tuple[tuple[str, int, int], ...]:
     """Return name, size and CRC of each array in a label file, without reading the arrays.
 
     A file that is not a zip archive gives its own name and size. The error is raised later by `read_labels`.
@@ -132,7 +132,7 @@ def label_checksums(path: Path) -> tuple[tuple[str, int, int], ...]:
         return ((path.name, path.stat().st_size, 0),)
 
 
-def read_labels(path: Path, rng: np.random.Generator) -> Labels:
+def read_labels(path: Path, rng: np.random.Generator) -> GraspLabels:
     """Read the good labels of a file: friction 0 < f <= 0.3, at most 0.08 m wide, not in collision.
 
     RoboCAS-v0 also accepts the friction 0. This value is not a friction coefficient: valid labels start at 0.1, and
@@ -168,7 +168,7 @@ def read_labels(path: Path, rng: np.random.Generator) -> Labels:
     if not np.isfinite(kept).all():
         raise _damaged(path, "finite numbers", "NaN or infinite labels")
     _, _, point, view, angles, depths, widths, frictions = kept.T
-    return Labels(points[point.astype(int)], view.astype(np.int64), angles, depths, widths, frictions)
+    return GraspLabels(points[point.astype(int)], view.astype(np.int64), angles, depths, widths, frictions)
 
 
 def make_view_directions() -> Array:
@@ -180,7 +180,7 @@ def make_view_directions() -> Array:
     return np.column_stack([radius * np.cos(around), radius * np.sin(around), z])
 
 
-def to_tcp_poses(labels: Labels) -> Array:
+def to_tcp_poses(labels: GraspLabels) -> Array:
     """Convert labels to poses of the TCP (N, 4, 4) in the frame of the model, m.
 
     In the TCP frame, z is the approach direction, y the closing direction, and the origin is between the finger tips.
@@ -220,8 +220,8 @@ def _clear(poses: Array, points: Array) -> NDArray[np.bool_]:
 
 def _read_points(path: Path) -> Array:
     with _opened(path) as members:
-        points = members["points"].take("points", members["points"].count).astype(np.float64)
-        members["points"].end()
+        points = members["points"].read_rows("points", members["points"].count).astype(np.float64)
+        members["points"].finish()
         if not np.isfinite(points).all():
             raise _damaged(path, "finite points", "NaN or infinite points")
         return points
@@ -242,10 +242,10 @@ def _slices(path: Path, count: int) -> Iterator[tuple[NDArray, NDArray, NDArray]
         size = sum(int(np.prod(SHAPES[name])) * members[name].dtype.itemsize for name in names)
         step = max(1, int(SLICE_BYTES / size))
         for start in range(0, count, step):
-            a, b, c = (members[name].take(name, min(step, count - start)) for name in names)
+            a, b, c = (members[name].read_rows(name, min(step, count - start)) for name in names)
             yield a, b, c
         for name in names:
-            members[name].end()
+            members[name].finish()
 
 
 @contextmanager

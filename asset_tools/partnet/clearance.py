@@ -22,7 +22,7 @@ PASSES = 3  # a later pass may make a cut that was too deep before
 STOPS = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 
 
-def trim_pieces(pieces: Sequence[Array], others: Sequence[Array], joint: Joint) -> list[Array]:
+def trim_colliding_pieces(pieces: Sequence[Array], others: Sequence[Array], joint: Joint) -> list[Array]:
     """Cut the pieces of a moving part so that they do not touch the rest of the furniture while the joint moves.
 
     A piece that would touch another hull is cut by a plane; of all possible planes, the plane with the smallest depth

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 from shapely import unary_union
 from shapely.geometry import MultiPolygon, Polygon
 
-from asset_tools.decompose import reduce_vertices
+from asset_tools.decompose import reduce_hull_vertices
 from asset_tools.repair import close_scan
 from robocas_ms3.assets.cooked_hulls import MAX_SLENDERNESS
 from robocas_ms3.assets.hulls import find_box, slenderness
@@ -52,7 +52,7 @@ class CollisionPart:
     meshes: list[Array]
 
 
-def make_pieces(parts: Sequence[CollisionPart], middle: Array) -> list[Array]:
+def make_collision_pieces(parts: Sequence[CollisionPart], middle: Array) -> list[Array]:
     """Decompose the parts of a link into at most 40 convex pieces; return the corners (V, 3) of each piece, m.
 
     A part that nearly fills its convex hull becomes one piece. Another part is split into its meshes, and each mesh
@@ -72,7 +72,7 @@ def make_pieces(parts: Sequence[CollisionPart], middle: Array) -> list[Array]:
         fine = "handle" in part.name or "knob" in part.name
         # slender parts other than handles do not support objects
         found += [piece for piece in _split(part.meshes, fine, middle) if _size(piece, 0 if fine else 1) >= TINY]
-    hulls = [reduce_vertices(piece, bevel=0) for piece in found]
+    hulls = [reduce_hull_vertices(piece, bevel=0) for piece in found]
     hulls = _without_hidden(hulls)
     if not hulls:
         where, expected = ", ".join(part.name for part in parts)[:80], f"a part of at least {TINY * 1000:g} mm"
@@ -84,7 +84,7 @@ def make_pieces(parts: Sequence[CollisionPart], middle: Array) -> list[Array]:
     return hulls
 
 
-def limit_for_gpu(hull: Array) -> list[Array]:
+def split_slender_hull(hull: Array) -> list[Array]:
     """Return a hull as one or two hulls that are not too slender for PhysX on a GPU.
 
     A hull that is too slender is replaced by its two halves, or by its oriented bounding box.
@@ -97,7 +97,7 @@ def limit_for_gpu(hull: Array) -> list[Array]:
     axis = int(np.ptp(hull, axis=0).argmax())
     middle = float(hull[:, axis].min() + hull[:, axis].max()) / 2
     corners = hull[ConvexHull(hull).simplices]
-    halves = [reduce_vertices(_half(corners, axis, middle, side).reshape(-1, 3), bevel=0) for side in (1.0, -1.0)]
+    halves = [reduce_hull_vertices(_half(corners, axis, middle, side).reshape(-1, 3), bevel=0) for side in (1.0, -1.0)]
     if all(_sturdy(half) for half in halves):
         return halves
     to_middle, extents = trimesh.bounds.oriented_bounds(hull)

@@ -24,7 +24,7 @@ SCHEMES = ("package://", "model://")
 SIDES = 32  # of a cylinder
 
 
-class Geometry:
+class GeometryReader:
     """Reader of the shapes of one model, which reads each mesh file once.
 
     Args:
@@ -37,7 +37,7 @@ class Geometry:
         self._read: dict[tuple[Path, tuple[float, float, float] | None], list[Faces]] = {}
         self._left = MOST_TRIANGLES
 
-    def check(self, link: str, visuals: Sequence[Visual]) -> None:
+    def check_files(self, link: str, visuals: Sequence[Visual]) -> None:
         """Check that the mesh files of a link exist; the files are not read.
 
         Args:
@@ -49,7 +49,7 @@ class Geometry:
         """
         self._check_most(link, [self._missing(one.shape) for one in visuals])
 
-    def faces(self, link: str, visuals: Sequence[Visual]) -> list[tuple[str, str, Faces]]:
+    def read_faces(self, link: str, visuals: Sequence[Visual]) -> list[tuple[str, str, Faces]]:
         """Read the shapes of a link; return tuples of part name, file name and faces in the furniture's frame.
 
         Args:

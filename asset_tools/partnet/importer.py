@@ -13,13 +13,13 @@ from scipy.spatial import ConvexHull
 from asset_tools.build import build_furniture
 from asset_tools.import_scans import make_object_id
 from asset_tools.partnet.annotation import LARGEST, JointAnnotation, ModelAnnotation, find_annotation
-from asset_tools.partnet.clearance import trim_pieces
-from asset_tools.partnet.collision import CollisionPart, limit_for_gpu, make_pieces
-from asset_tools.partnet.geometry import Geometry
+from asset_tools.partnet.clearance import trim_colliding_pieces
+from asset_tools.partnet.collision import CollisionPart, make_collision_pieces, split_slender_hull
+from asset_tools.partnet.geometry import GeometryReader
 from asset_tools.partnet.obj import Faces
 from asset_tools.partnet.textures import merge_faces
 from asset_tools.partnet.urdf import URDF, MovingLink, PartnetModel, Visual, find_urdf, read_urdf
-from asset_tools.pipeline import AssetJob, content_hash, make_failing_job
+from asset_tools.pipeline import AssetJob, compute_content_hash, make_failing_job
 from asset_tools.readers.files import LARGEST_FILE, find_files
 from asset_tools.readers.limits import reading_limits
 from asset_tools.sources import FurnitureSource, LinkSource
@@ -56,9 +56,9 @@ def read_partnet(folder: Path, annotation: ModelAnnotation) -> FurnitureSource:
     """
     folder = folder.resolve()
     model = read_urdf(folder, annotation.joints, annotation.scale)
-    geometry = Geometry(folder)
+    geometry = GeometryReader(folder)
     with reading_limits(folder):
-        faces_by_link = {name: geometry.faces(name, visuals) for name, visuals in _groups(model)}
+        faces_by_link = {name: geometry.read_faces(name, visuals) for name, visuals in _groups(model)}
     corners = np.concatenate(
         [np.zeros((0, 3))] + [faces.corners.reshape(-1, 3) for group in faces_by_link.values() for _, _, faces in group]
     )
@@ -83,11 +83,11 @@ def read_partnet(folder: Path, annotation: ModelAnnotation) -> FurnitureSource:
     ids = _ids([link.name for link in model.links], repairs)
     joint_ids = _ids([link.joint for link in model.links], repairs)
     middle = bounds.mean(axis=0)
-    pieces = {name: _for_gpu(make_pieces(_parts(group), middle)) for name, group in faces_by_link.items()}
+    pieces = {name: _for_gpu(make_collision_pieces(_parts(group), middle)) for name, group in faces_by_link.items()}
     joints = {link.name: _joint(link, joint_ids[link.joint], annotation) for link in model.links}
     for link in model.links:
         others = [piece for name, group in pieces.items() if name not in _carried(model, link.name) for piece in group]
-        pieces[link.name] = _for_gpu(trim_pieces(pieces[link.name], others, joints[link.name]))
+        pieces[link.name] = _for_gpu(trim_colliding_pieces(pieces[link.name], others, joints[link.name]))
     links = []
     for link in model.links:
         note = annotation.joints.get(link.joint, JointAnnotation())
@@ -155,7 +155,7 @@ def _short(repairs: Sequence[str]) -> tuple[str, ...]:
 
 
 def _for_gpu(pieces: Sequence[np.ndarray]) -> list[np.ndarray]:
-    return [part for piece in pieces for part in limit_for_gpu(piece)]
+    return [part for piece in pieces for part in split_slender_hull(piece)]
 
 
 def make_partnet_jobs(folders: Sequence[Path], annotations: Path | None = None) -> list[AssetJob]:
@@ -186,10 +186,10 @@ def make_partnet_jobs(folders: Sequence[Path], annotations: Path | None = None) 
 def _job(name: str, folder: Path, annotations: Path | None) -> AssetJob:
     find_urdf(folder)  # otherwise the error would be a missing annotation
     annotation = find_annotation(folder.name, annotations)
-    model, geometry = read_urdf(folder, annotation.joints, annotation.scale), Geometry(folder)
+    model, geometry = read_urdf(folder, annotation.joints, annotation.scale), GeometryReader(folder)
     for link, visuals in _groups(model):
-        geometry.check(link, visuals)
-    content = content_hash(name, annotation, files=_files(folder), packages=("partnet", "readers"))
+        geometry.check_files(link, visuals)
+    content = compute_content_hash(name, annotation, files=_files(folder), packages=("partnet", "readers"))
     return AssetJob(name, partial(_make, folder, annotation), content)
 
 

@@ -89,9 +89,9 @@ def run_drop_test(solid: RigidBody, resting_poses: Array, *, seed: int = 0) -> D
     matches, rolling = np.full(DROPS, -1), np.zeros(DROPS, bool)
     compare = _Comparison(solid, resting_poses)
     for i in range(DROPS):
-        matches[i] = compare.find(poses[-1, i])
+        matches[i] = compare.find_match(poses[-1, i])
         if rest_times[i] > TIME_LIMIT and matches[i] >= 0:
-            since = compare.since(poses[::-CHECK_INTERVAL, i]) * CHECK_INTERVAL
+            since = compare.count_matches(poses[::-CHECK_INTERVAL, i]) * CHECK_INTERVAL
             late = moving[-last:, i]
             carried = solid.mass * (velocities[-last:, i] ** 2).sum(axis=1) >= CARRIED * energies[-last:, i]
             rolling[i] = since >= last and np.mean(carried[late]) >= MOSTLY and _advances(velocities[-since:, i])
@@ -167,12 +167,12 @@ class _Comparison:
         self._listed = [self._profile(pose) for pose in listed]
         self._trees = [KDTree(profile) for profile in self._listed]
 
-    def find(self, pose: Array) -> int:
+    def find_match(self, pose: Array) -> int:
         """Return the index of the resting pose that is most similar to ``pose`` (4, 4); -1 if none is equal."""
         apart = [self._apart(pose, index) for index in range(len(self._listed))]
         return int(np.argmin(apart)) if min(apart) <= self._limit else -1
 
-    def since(self, poses: Array) -> int:
+    def count_matches(self, poses: Array) -> int:
         """Return how many of the poses (T, 4, 4), counted from the first, are equal to a resting pose without a gap."""
         likely = list(range(len(self._listed)))
         for count, pose in enumerate(poses):

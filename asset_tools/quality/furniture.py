@@ -9,7 +9,7 @@ import numpy as np
 import sapien
 from sapien import physx
 
-from asset_tools.quality.furniture_scene import FurnitureModel, FurnitureScene, make_model
+from asset_tools.quality.furniture_scene import FurnitureModel, FurnitureScene, make_furniture_model
 from asset_tools.quality.overlap import compute_distances, compute_max_overlap, make_convex_body
 from asset_tools.quality.surfaces import BLOCKED, Probe, make_probes, measure_clearances
 from asset_tools.sources import FurnitureSource
@@ -109,7 +109,7 @@ def measure_furniture(furniture: FurnitureSource | LoadedFurniture) -> Furniture
         AssetError: the physics engine rejects a hull.
     """
     report = examine_furniture(furniture)
-    hulls = [piece for pieces in make_model(furniture).pieces.values() for piece in pieces]
+    hulls = [piece for pieces in make_furniture_model(furniture).pieces.values() for piece in pieces]
     return FurnitureQuality(
         hull_count=len(hulls),
         hull_vertices=max(len(make_convex_mesh(hull)[0]) for hull in hulls),
@@ -124,7 +124,7 @@ def examine_furniture(furniture: FurnitureSource | LoadedFurniture) -> Furniture
     Raises:
         AssetError: the physics engine rejects a hull.
     """
-    model = make_model(furniture)
+    model = make_furniture_model(furniture)
     with engine_settings():
         joints = {link.joint.name: _try_joint(model, link) for link in model.links}
         return FurnitureReport(joints, {name: _try_surface(model, surface) for name, surface in model.surfaces.items()})
@@ -144,7 +144,7 @@ def _try_joint(model: FurnitureModel, link: Link) -> JointReport:
         nonlocal fastest, bounded
         stage.scene.step()
         for other in model.links:
-            speed = abs(stage.speed(other.joint.name))
+            speed = abs(stage.get_joint_speed(other.joint.name))
             if not np.isfinite(speed) or speed > FASTEST[other.joint.kind]:
                 bounded = False
             fastest = max(fastest, speed if np.isfinite(speed) else np.inf)
@@ -154,19 +154,19 @@ def _try_joint(model: FurnitureModel, link: Link) -> JointReport:
     for _ in range(round(1 / TIME_STEP)):
         if not step():
             break
-        drifted = max(drifted, abs(stage.position(joint.name)) / abs(far))
+        drifted = max(drifted, abs(stage.get_joint_position(joint.name)) / abs(far))
     point = find_grip_point(link, model.pieces[link.name], model.handles)
     reach = _lever(link, point)
     steps = round((2 * abs(far) * reach / HAND_SPEED + 1) / TIME_STEP)
     reached = []
     for way, goal in ((np.sign(far), OPEN), (-np.sign(far), 0.0)):
         for _ in range(steps):
-            share = stage.position(joint.name) / far
+            share = stage.get_joint_position(joint.name) / far
             if not bounded or (share >= goal + 0.05 if goal else share <= 0.005):
                 break
             _pull(stage, link, point, way, reach)
             step()
-        reached.append(stage.position(joint.name) / far)
+        reached.append(stage.get_joint_position(joint.name) / far)
     return JointReport(reached[0], reached[1], drifted, fastest, bounded, _jam(model, link), _grip(model, link))
 
 
@@ -239,11 +239,11 @@ def _pull(stage: FurnitureScene, link: Link, point: Array, way: float, reach: fl
         way: 1 to increase the position of the joint, -1 to decrease it.
         reach: motion of the point in m per m or rad of the joint's position.
     """
-    pose = stage.matrix(link.name)
+    pose = stage.get_link_pose(link.name)
     axis, place = pose[:3, :3] @ link.joint.axis, pose[:3, :3] @ point + pose[:3, 3]
     if link.joint.kind == "revolute":
         axis = np.cross(axis, place - (pose[:3, :3] @ link.joint.origin + pose[:3, 3])) / reach
-    speed = way * stage.speed(link.joint.name) * reach
+    speed = way * stage.get_joint_speed(link.joint.name) * reach
     # the full force would accelerate a light part too much within a step
     force = min(FORCE, 0.5 * link.mass * HAND_SPEED / TIME_STEP) * np.clip(1 - speed / HAND_SPEED, -1, 1)
     stage.links[link.name].add_force_at_point((way * force * axis).tolist(), place.tolist())
@@ -295,7 +295,7 @@ def _put_down(
         bodies.append((body, np.linalg.inv(start) @ pose))
     for _ in range(round(1 / TIME_STEP)):
         stage.scene.step()
-    now = np.linalg.inv(stage.matrix(surface.link))
+    now = np.linalg.inv(stage.get_link_pose(surface.link))
     slid, off, speed = [0.0], [0.0], [0.0]
     for thing, (body, before) in zip(things, bodies, strict=True):
         after = now @ pose_matrix(body)

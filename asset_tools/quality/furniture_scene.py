@@ -38,7 +38,7 @@ class FurnitureModel:
     friction: float
 
 
-def make_model(furniture: FurnitureSource | LoadedFurniture) -> FurnitureModel:
+def make_furniture_model(furniture: FurnitureSource | LoadedFurniture) -> FurnitureModel:
     """Return the properties of furniture, given by its source or loaded from a pack."""
     if isinstance(furniture, LoadedFurniture):
         facts = furniture.asset
@@ -110,14 +110,14 @@ class FurnitureScene:
                 fix = "Simplify the collision mesh."
                 raise AssetError("PhysX cannot build a convex hull", found=error, fix=fix) from error
 
-    def position(self, joint: str) -> float:
+    def get_joint_position(self, joint: str) -> float:
         """Return the position of a joint in m or rad."""
         return float(self.articulation.qpos[self.order[joint]])
 
-    def speed(self, joint: str) -> float:
+    def get_joint_speed(self, joint: str) -> float:
         """Return the velocity of a joint in m/s or rad/s."""
         return float(self.articulation.qvel[self.order[joint]])
 
-    def matrix(self, link: str) -> Array:
+    def get_link_pose(self, link: str) -> Array:
         """Return the pose (4, 4) of a link in the world frame."""
         return pose_matrix(self.links[link]) if self.links else np.eye(4)

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from asset_tools.grasps import sample_surface_points
-from asset_tools.solids import to_solid
+from asset_tools.solids import mesh_to_solid
 from robocas_ms3.core.errors import AssetError
 
 Array = np.ndarray
@@ -82,7 +82,7 @@ def compute_volume_iou(closed: trimesh.Trimesh, hulls: list[Array]) -> float:
     Raises:
         AssetError: the mesh is not a solid.
     """
-    solid = to_solid(closed)
+    solid = mesh_to_solid(closed)
     if solid is None:
         expected, found = "a watertight mesh with outward faces", f"watertight: {closed.is_watertight}"
         raise AssetError("the mesh is not a solid", expected=expected, found=found, fix="Close the mesh first.")

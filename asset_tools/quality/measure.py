@@ -76,7 +76,7 @@ def measure_object(
     )
 
 
-def measure_again(loaded: LoadedObject) -> ObjectQuality:
+def measure_object_again(loaded: LoadedObject) -> ObjectQuality:
     """Measure the quality of an object of a pack again: hull sizes, drops and grasps; deterministic.
 
     The comparison of the hulls with the closed mesh is copied from the manifest, since packs do not contain this mesh.
@@ -147,7 +147,7 @@ def compare_with_manifest(loaded: LoadedObject, measured: ObjectQuality) -> list
 
     Args:
         loaded: the object.
-        measured: result of `measure_again` for this object.
+        measured: result of `measure_object_again` for this object.
     """
     asset = loaded.asset
     stored, found = asset.quality.model_dump(), measured.model_dump()

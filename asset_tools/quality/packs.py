@@ -7,7 +7,7 @@ from functools import partial
 from typing import NoReturn
 
 from asset_tools.quality.furniture import measure_furniture
-from asset_tools.quality.measure import HULL_VERTICES, Violation, measure_again
+from asset_tools.quality.measure import HULL_VERTICES, Violation, measure_object_again
 from robocas_ms3.assets.manifest import FurnitureQuality, ObjectQuality
 from robocas_ms3.assets.pack import LoadedFurniture, LoadedObject, Pack
 from robocas_ms3.core.errors import AssetError
@@ -71,7 +71,7 @@ def check_furniture(qualities: Mapping[str, FurnitureQuality]) -> list[Violation
 
 
 def _measure(asset: LoadedObject | LoadedFurniture) -> tuple[str, Quality]:
-    return asset.asset.id, measure_again(asset) if isinstance(asset, LoadedObject) else measure_furniture(asset)
+    return asset.asset.id, measure_object_again(asset) if isinstance(asset, LoadedObject) else measure_furniture(asset)
 
 
 def _raise_crash(asset: LoadedObject | LoadedFurniture, reason: str) -> NoReturn:

@@ -113,19 +113,19 @@ def find_mesh_files(folder: Path) -> list[Path]:
         fix = f"Export the mesh in one of {', '.join(FORMATS)}."
         found_types = f"files of type {', '.join(others)}" if others else "no files"
         raise AssetError("no mesh in this folder", where=folder, found=found_types, fix=fix)
-    shown = [path for path in found if not is_collision(path, folder)]
+    shown = [path for path in found if not is_collision_mesh(path, folder)]
     if len(shown) > MOST_FILES:
         fix, expected = "Use one folder per object, or join the parts into one file.", f"at most {MOST_FILES}"
         raise AssetError("too many mesh files", where=folder, expected=expected, found=len(shown), fix=fix)
     return found if shown else found[:MOST_FILES]
 
 
-def is_mesh(path: Path) -> bool:
+def is_mesh_file(path: Path) -> bool:
     """Return whether a path is a mesh file by its suffix; hidden files do not count."""
     return path.suffix.lower() in FORMATS and not path.name.startswith(".") and not path.is_dir()
 
 
-def is_collision(path: Path, folder: Path) -> bool:
+def is_collision_mesh(path: Path, folder: Path) -> bool:
     """Return whether a file is a collision mesh by its name, or by the name of a subfolder of ``folder`` around it."""
     folders = {part.lower() for part in path.relative_to(folder).parts[:-1]}
     return COLLISION.search(path.stem.lower()) is not None or bool(folders & COLLISION_FOLDERS)
@@ -175,7 +175,7 @@ def _meshes_below(folder: Path, depth: int) -> list[Path]:
     entries = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     folders = [path for path in entries if path.is_dir() and path.name.lower() not in {"__macosx", *TEXTURE_FOLDERS}]
     preferred = [path for path in folders if path.name.lower() == PREFERRED_FOLDER]
-    found = [path for path in entries if is_mesh(path)]
+    found = [path for path in entries if is_mesh_file(path)]
     for path in preferred or folders:
         found += _meshes_below(path, depth - 1) if depth else []
     return found

@@ -62,12 +62,12 @@ def read_exchange(path: Path, files: ModelFiles) -> list[MeshPart]:
         raise
     except Exception as error:  # trimesh's parsers may raise any error
         found = format_error(error, 200)
-        raise AssetError("cannot read this mesh", where=path, found=found, fix="Export it again.") from error
+        raise AssetError("cannot read this mesh", where=path, found=found, fix="Export the mesh again.") from error
     if textures.error is not None:
         raise textures.error
     count = sum(len(part.faces) for part in parts)
     if count < faces:
-        found, fix = f"{count} faces", "Copy or export it again."
+        found, fix = f"{count} faces", "Copy the file or export the mesh again."
         raise AssetError("the file is truncated", where=path, expected=f"{faces} faces", found=found, fix=fix)
     if count > MOST_FACES:
         expected = f"at most {MOST_FACES:,}"
@@ -95,7 +95,7 @@ class _Textures(Resolver):
         self._images: dict[bytes, Image.Image] = {}
         self.error: AssetError | None = None
 
-    def note(self, text: str) -> None:
+    def add_note(self, text: str) -> None:
         """Add a note to the notes of the model."""
         self._files.notes.append(text)
 
@@ -125,7 +125,7 @@ class _Textures(Resolver):
         """Raise NotImplementedError; trimesh only reads with this resolver."""
         raise NotImplementedError
 
-    def shared(self, image: Image.Image) -> Image.Image:
+    def deduplicate(self, image: Image.Image) -> Image.Image:
         """Return an image as RGB; images with equal content become one object."""
         image = image.convert("RGB")
         return self._images.setdefault(image.tobytes(), image)
@@ -143,7 +143,7 @@ def _check_archive(data: bytes, path: Path, files: ModelFiles) -> None:
             )
         models = [archive.read(info) for info in archive.infolist() if info.filename.lower().endswith(".model")]
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, RuntimeError, EOFError) as error:
-        raise AssetError("cannot read this mesh", where=path, found=error, fix="Export it again.") from error
+        raise AssetError("cannot read this mesh", where=path, found=error, fix="Export the mesh again.") from error
     if any(b"basematerials" in model or b"colorgroup" in model for model in models):
         files.notes.append(f"warning: {path.name}: ignored the colours of a 3MF file")
 
@@ -156,11 +156,11 @@ def _ply_checked(data: bytes, path: Path, textures: _Textures) -> tuple[bytes, i
     """
     end = data.find(b"end_header", 0, LONGEST_HEADER)
     if end < 0:
-        raise AssetError("cannot read this mesh", where=path, expected="a PLY header", fix="Export it again.")
+        raise AssetError("cannot read this mesh", where=path, expected="a PLY header", fix="Export the mesh again.")
     lines = [line.strip() for line in data[:end].splitlines()]
     names = [decode_text(match[1]).strip('"') for line in lines if (match := TEXTURE_COMMENT.match(line))]
     if len(names) > 1:
-        textures.note(f"warning: {path.name}: ignored textures after the first, of {len(names)}")
+        textures.add_note(f"warning: {path.name}: ignored textures after the first, of {len(names)}")
     header = [b"ply", *[line for line in lines if line.startswith(b"format")][:1]]
     header += [f"comment TextureFile {name}".encode() for name in names[:1]]
     faces = 0
@@ -190,7 +190,7 @@ def _off_faces(data: bytes, path: Path, files: ModelFiles) -> int:
         files.notes.append(f"warning: {path.name}: ignored vertex colours of an OFF file")
     counts = words[1:3] if words and words[0].upper().endswith(b"OFF") else words[:2]
     if len(counts) < 2 or not all(count.isdigit() and len(count) < 12 for count in counts):
-        raise AssetError("cannot read this mesh", where=path, expected="an OFF header", fix="Export it again.")
+        raise AssetError("cannot read this mesh", where=path, expected="an OFF header", fix="Export the mesh again.")
     if int(counts[0]) > MOST_VERTICES or int(counts[1]) > MOST_FACES:
         expected, found = f"at most {MOST_FACES:,} faces and {MOST_VERTICES:,} vertices", "{1} faces, {0} vertices"
         raise AssetError(
@@ -237,7 +237,7 @@ def _part(mesh: trimesh.Trimesh, textures: _Textures) -> MeshPart:
         if colors is not None and len(colors) == len(vertices):
             return MeshPart(vertices, faces, None, decode_srgb(_bytes(colors)[:, :3]), normals)
         return MeshPart(vertices, faces, normals=normals, material=Material(_plain(material)))
-    return MeshPart(vertices, faces, np.array(uvs, float), None, normals, Material(image=textures.shared(image)))
+    return MeshPart(vertices, faces, np.array(uvs, float), None, normals, Material(image=textures.deduplicate(image)))
 
 
 def _plain(material: Any) -> tuple[float, float, float]:

@@ -93,7 +93,7 @@ class ModelFiles:
     used: list[Path] = field(default_factory=list)
 
     @cached_property
-    def listing(self) -> list[Path]:
+    def searchable_files(self) -> list[Path]:
         """Files among which missing files are searched by name.
 
         If ``stem`` is None, these are all files below ``home``. Otherwise they are the files in ``home``, and those in
@@ -116,7 +116,7 @@ class ModelFiles:
         """Find a file by the path that is written in a model.
 
         This path may come from another machine, or differ in letter case. If no file has this path, the function
-        searches ``listing`` for the file name alone.
+        searches ``searchable_files`` for the file name alone.
 
         Args:
             name: path in the model: relative to ``folder``, or absolute; with slashes or backslashes.
@@ -126,7 +126,7 @@ class ModelFiles:
             The path of the file; None if there is no such file.
 
         Raises:
-            AssetError: the path leads out of ``root``, and no file of ``listing`` has this file name.
+            AssetError: the path leads out of ``root``, and no file of ``searchable_files`` has this file name.
         """
         name = name.strip().strip('"')
         plain = name.replace("\\", "/").removeprefix("file://")
@@ -140,7 +140,7 @@ class ModelFiles:
                 self._note(f"read {name} as {plain}")
             return path
         wanted = _letters(plain.rsplit("/", 1)[-1])
-        alike = [found for found in self.listing if _letters(found.name) == wanted]
+        alike = [found for found in self.searchable_files if _letters(found.name) == wanted]
         if alike:
             found = min(alike, key=lambda path: (len(path.parts), path.as_posix()))
             taken = found.relative_to(self.home).as_posix()
@@ -158,7 +158,7 @@ class ModelFiles:
             self.notes.append(text)
 
 
-def missing_path(name: str, folder: Path) -> Path:
+def format_missing_path(name: str, folder: Path) -> Path:
     """Return the path for the message of an error about a file that `ModelFiles.find` did not find.
 
     Args:

@@ -16,8 +16,8 @@ from pydantic import ValidationError
 
 from asset_tools.readers import gltf_schema as schema
 from asset_tools.readers.files import ModelFiles
-from asset_tools.readers.gltf_buffers import Buffers, entry
-from asset_tools.readers.gltf_materials import READ_EXTENSIONS, Materials
+from asset_tools.readers.gltf_buffers import BufferReader, get_entry
+from asset_tools.readers.gltf_materials import READ_EXTENSIONS, MaterialReader
 from asset_tools.readers.obj import MOST_FACES
 from asset_tools.readers.surface import Material, MeshPart
 from robocas_ms3.core.documents import decode_json
@@ -87,15 +87,15 @@ def _split(data: bytes, path: Path) -> tuple[Any, bytes]:
 
 
 def _parts(model: schema.Gltf, blob: bytes, path: Path, files: ModelFiles, ignored: set[str]) -> list[MeshPart]:
-    buffers = Buffers(model, blob, path, files)
-    materials = Materials(model, buffers, files.notes, ignored)
+    buffers = BufferReader(model, blob, path, files)
+    materials = MaterialReader(model, buffers, files.notes, ignored)
     found: list[MeshPart] = []
     faces = 0
     for node, pose in _placed(model):
         if node.skin is not None:
             ignored.add("a skin")
         ignored |= {f"the extension {name}" for name in node.extensions if name == "EXT_mesh_gpu_instancing"}
-        for primitive in entry(model.meshes, node.mesh, "meshes").primitives:
+        for primitive in get_entry(model.meshes, node.mesh, "meshes").primitives:
             if primitive.mode in LINES:
                 ignored.add("points or lines")
                 continue
@@ -115,7 +115,7 @@ def _placed(model: schema.Gltf) -> list[tuple[schema.Node, Array]]:
     """Return the nodes of the scene that have a mesh, and their poses (4, 4) in the frame of the scene."""
     children = {child for node in model.nodes for child in node.children}
     if model.scenes:
-        roots = entry(model.scenes, model.scene, "scenes").nodes
+        roots = get_entry(model.scenes, model.scene, "scenes").nodes
     else:
         roots = [index for index in range(len(model.nodes)) if index not in children]
     found: list[tuple[schema.Node, Array]] = []
@@ -124,9 +124,9 @@ def _placed(model: schema.Gltf) -> list[tuple[schema.Node, Array]]:
     while queue:
         index, parent = queue.pop()
         if index in seen:
-            raise ValueError(f"nodes.{index} has two parents")
+            raise ValueError(f"nodes.{index} has two parents, expected at most one")
         seen.add(index)
-        node = entry(model.nodes, index, "nodes")
+        node = get_entry(model.nodes, index, "nodes")
         pose = parent @ node.transform()
         if node.mesh is not None:
             found.append((node, pose))
@@ -134,7 +134,7 @@ def _placed(model: schema.Gltf) -> list[tuple[schema.Node, Array]]:
     return found
 
 
-def _part(primitive: schema.Primitive, buffers: Buffers, materials: Materials, ignored: set[str]) -> MeshPart:
+def _part(primitive: schema.Primitive, buffers: BufferReader, materials: MaterialReader, ignored: set[str]) -> MeshPart:
     """Return the triangles of a primitive in the frame of its node."""
     attributes = primitive.attributes
     if "POSITION" not in attributes:
@@ -142,23 +142,23 @@ def _part(primitive: schema.Primitive, buffers: Buffers, materials: Materials, i
     compressed = COMPRESSED & set(primitive.extensions)
     if compressed and not buffers.has_data(attributes["POSITION"]):
         raise ValueError(f"the triangles are compressed ({', '.join(compressed)})")
-    vertices = buffers.vectors(attributes["POSITION"], 3)
+    vertices = buffers.read_vectors(attributes["POSITION"], 3)
     if primitive.indices is None:
         faces = _triangles(np.arange(len(vertices)), primitive.mode)
     else:
-        faces = _triangles(buffers.values(primitive.indices).reshape(-1).astype(np.int64), primitive.mode)
+        faces = _triangles(buffers.read_values(primitive.indices).reshape(-1).astype(np.int64), primitive.mode)
     if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
         raise ValueError(f"a face refers to vertex {int(faces.max())}, but there are only {len(vertices)} vertices")
-    normals = buffers.vectors(attributes["NORMAL"], 3) if "NORMAL" in attributes else None
-    colors = buffers.colors(attributes["COLOR_0"]) if "COLOR_0" in attributes else None
+    normals = buffers.read_vectors(attributes["NORMAL"], 3) if "NORMAL" in attributes else None
+    colors = buffers.read_colors(attributes["COLOR_0"]) if "COLOR_0" in attributes else None
     uv_sets = {key.removeprefix("TEXCOORD_") for key in attributes if key.startswith("TEXCOORD_")}
     numbers = frozenset(int(key) for key in uv_sets if key.isascii() and key.isdigit())
-    material, mapping = materials.material(primitive.material, numbers)
+    material, mapping = materials.read_material(primitive.material, numbers)
     uvs = None
     if material.image is not None:
-        uvs = mapping.apply(buffers.coordinates(attributes[f"TEXCOORD_{mapping.uv_set}"]))
+        uvs = mapping.apply(buffers.read_coordinates(attributes[f"TEXCOORD_{mapping.uv_set}"]))
         if np.isfinite(uvs).all():
-            image, uvs = mapping.repeating(material.image, uvs)
+            image, uvs = mapping.to_repeating(material.image, uvs)
             material = material if image is material.image else Material(material.color, image)
         uvs[:, 1] = 1 - uvs[:, 1]
     for name, values in (("normals", normals), ("vertex colours", colors), ("texture coordinates", uvs)):
@@ -204,5 +204,5 @@ def _triangles(indices: Ints, mode: int) -> Ints:
 
 def _damaged(path: Path, found: str) -> AssetError:
     found = found if len(found) <= 200 else f"{found[:200]}..."
-    fix = "Export it again, without compression." if "compressed" in found else "Export it again."
+    fix = "Export the mesh again, without compression." if "compressed" in found else "Export the mesh again."
     return AssetError("cannot read this mesh", where=path, found=found, fix=fix)

@@ -23,7 +23,7 @@ DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126:
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
 
-class Buffers:
+class BufferReader:
     """Reader of the binary data of a glTF file.
 
     Args:
@@ -38,7 +38,7 @@ class Buffers:
         self._buffers: dict[int, bytes] = {}
         self._quantised = "KHR_mesh_quantization" in model.extensionsUsed
 
-    def content(self, uri: str) -> tuple[bytes, Path]:
+    def read_uri(self, uri: str) -> tuple[bytes, Path]:
         """Return the bytes of a URI, and the path of the file that contains them."""
         if uri.startswith("data:"):
             try:
@@ -51,14 +51,14 @@ class Buffers:
             raise AssetError("missing file of the mesh", where=where, fix=fix)
         return self._files.read(file), file
 
-    def view(self, index: int) -> tuple[bytes, schema.BufferView]:
+    def read_view(self, index: int) -> tuple[bytes, schema.BufferView]:
         """Return the bytes of the buffer view with an index, and the entry of the buffer view in the JSON."""
-        view = entry(self._model.bufferViews, index, "bufferViews")
+        view = get_entry(self._model.bufferViews, index, "bufferViews")
         if any("meshopt" in name for name in view.extensions):
             raise ValueError("the data is compressed (meshopt)")
         if view.buffer not in self._buffers:
-            buffer = entry(self._model.buffers, view.buffer, "buffers")
-            self._buffers[view.buffer] = self._blob if buffer.uri is None else self.content(buffer.uri)[0]
+            buffer = get_entry(self._model.buffers, view.buffer, "buffers")
+            self._buffers[view.buffer] = self._blob if buffer.uri is None else self.read_uri(buffer.uri)[0]
             if sum(map(len, self._buffers.values())) > 2 * LARGEST_FILE:
                 raise ValueError(f"the buffers have more than {2 * LARGEST_FILE >> 20} MB")
         data = self._buffers[view.buffer][view.byteOffset : view.byteOffset + view.byteLength]
@@ -66,62 +66,62 @@ class Buffers:
             raise ValueError(f"bufferViews.{index} needs {view.byteLength} bytes, but the buffer has only {len(data)}")
         return data, view
 
-    def values(self, index: int) -> NDArray:
+    def read_values(self, index: int) -> NDArray:
         """Return the values (count, width) of the accessor with an index.
 
         Integers that the file marks as normalised become floats in -1..1 or 0..1.
         """
-        accessor = entry(self._model.accessors, index, "accessors")
+        accessor = get_entry(self._model.accessors, index, "accessors")
         dtype, width = np.dtype(DTYPES[accessor.componentType]), WIDTHS[accessor.type]
         if accessor.bufferView is None:
             values = np.zeros((accessor.count, width), dtype)
         else:
-            data, view = self.view(accessor.bufferView)
+            data, view = self.read_view(accessor.bufferView)
             values = _rows(data, accessor.byteOffset, view.byteStride, dtype, width, accessor.count)
         sparse = accessor.sparse
         if sparse is not None:
             at, kind = sparse.indices, np.dtype(DTYPES[sparse.indices.componentType])
-            where = _rows(self.view(at.bufferView)[0], at.byteOffset, None, kind, 1, sparse.count)
-            new_data, new_offset = self.view(sparse.values.bufferView)[0], sparse.values.byteOffset
+            where = _rows(self.read_view(at.bufferView)[0], at.byteOffset, None, kind, 1, sparse.count)
+            new_data, new_offset = self.read_view(sparse.values.bufferView)[0], sparse.values.byteOffset
             values = values.copy()
             values[where.reshape(-1).astype(np.int64)] = _rows(new_data, new_offset, None, dtype, width, sparse.count)
         return _normalised(values) if accessor.normalized else values
 
     def has_data(self, index: int) -> bool:
         """Return whether the accessor with an index has data; an accessor of compressed data may have none."""
-        accessor = entry(self._model.accessors, index, "accessors")
+        accessor = get_entry(self._model.accessors, index, "accessors")
         return accessor.bufferView is not None or accessor.sparse is not None
 
-    def vectors(self, index: int, width: int) -> Array:
+    def read_vectors(self, index: int, width: int) -> Array:
         """Return the vectors (V, width) of the accessor with an index as floats.
 
         Raises:
             ValueError: the vectors of the file have another width.
         """
-        values = self.values(index)
+        values = self.read_values(index)
         if values.shape[1] != width:
             raise ValueError(f"accessors.{index} has {values.shape[1]} components, expected {width}")
         return values.astype(float)
 
-    def coordinates(self, index: int) -> Array:
+    def read_coordinates(self, index: int) -> Array:
         """Return the texture coordinates (V, 2), v downward, of the accessor with an index.
 
         Integers are divided by the largest value of their type, unless the file uses KHR_mesh_quantization.
         """
-        values = self.values(index)
+        values = self.read_values(index)
         if values.shape[1] != 2:
             raise ValueError(f"accessors.{index} has {values.shape[1]} components, expected 2")
         return (values if self._quantised else _normalised(values)).astype(float)
 
-    def colors(self, index: int) -> Array:
+    def read_colors(self, index: int) -> Array:
         """Return the linear vertex colours (V, 3) in 0..1 of the accessor with an index; values may be NaN."""
-        values = self.values(index)
+        values = self.read_values(index)
         if values.shape[1] not in (3, 4):
             raise ValueError(f"accessors.{index} has {values.shape[1]} components, expected 3 or 4")
         return np.clip(_normalised(values)[:, :3].astype(float), 0, 1)
 
 
-def entry(items: Sequence[Item], index: int | None, name: str) -> Item:
+def get_entry(items: Sequence[Item], index: int | None, name: str) -> Item:
     """Return the entry with an index of a list in the file.
 
     Args:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from asset_tools.readers import gltf_schema as schema
-from asset_tools.readers.gltf_buffers import Buffers, entry
+from asset_tools.readers.gltf_buffers import BufferReader, get_entry
 from asset_tools.readers.images import open_texture
 from asset_tools.readers.surface import Material, decode_srgb, encode_srgb
 
@@ -45,7 +45,7 @@ class TextureMapping:
         matrix = np.array(self.transform)
         return uvs @ matrix[:, :2].T + matrix[:, 2]
 
-    def repeating(self, image: Image.Image, uvs: Array) -> tuple[Image.Image, Array]:
+    def to_repeating(self, image: Image.Image, uvs: Array) -> tuple[Image.Image, Array]:
         """Convert the wrap modes to `REPEAT`: return an image and coordinates (V, 2) with equal colours on the mesh.
 
         Args:
@@ -65,7 +65,7 @@ class MappedImage:
     mapping: TextureMapping
 
 
-class Materials:
+class MaterialReader:
     """Reader of the materials of a glTF file.
 
     Args:
@@ -75,12 +75,12 @@ class Materials:
         ignored: set to which the names of visible features that are not read are added.
     """
 
-    def __init__(self, model: schema.Gltf, buffers: Buffers, notes: list[str], ignored: set[str]) -> None:
+    def __init__(self, model: schema.Gltf, buffers: BufferReader, notes: list[str], ignored: set[str]) -> None:
         self._model, self._buffers, self._notes, self._ignored = model, buffers, notes, ignored
         self._images: dict[int, Image.Image] = {}
         self._materials: dict[tuple[int, frozenset[int]], tuple[Material, TextureMapping]] = {}
 
-    def material(self, index: int | None, uv_sets: frozenset[int]) -> tuple[Material, TextureMapping]:
+    def read_material(self, index: int | None, uv_sets: frozenset[int]) -> tuple[Material, TextureMapping]:
         """Return a material and the mapping of its image.
 
         Args:
@@ -90,7 +90,7 @@ class Materials:
         if index is None:
             return Material(), TextureMapping(0)
         if (index, uv_sets) not in self._materials:
-            self._materials[index, uv_sets] = self._read(entry(self._model.materials, index, "materials"), uv_sets)
+            self._materials[index, uv_sets] = self._read(get_entry(self._model.materials, index, "materials"), uv_sets)
         return self._materials[index, uv_sets]
 
     def _read(self, material: schema.Material, uv_sets: frozenset[int]) -> tuple[Material, TextureMapping]:
@@ -144,10 +144,10 @@ class Materials:
         return Material(image=Image.fromarray(encode_srgb(np.asarray(total)))), shown.mapping
 
     def _image(self, info: schema.TextureInfo, uv_sets: frozenset[int]) -> MappedImage | None:
-        texture = entry(self._model.textures, info.index, "textures")
+        texture = get_entry(self._model.textures, info.index, "textures")
         mapping = _mapping(info)
         if texture.sampler is not None:
-            sampler = entry(self._model.samplers, texture.sampler, "samplers")
+            sampler = get_entry(self._model.samplers, texture.sampler, "samplers")
             mapping = replace(mapping, wrap=(sampler.wrapS, sampler.wrapT))
         if mapping.uv_set not in uv_sets:
             self._ignored.add(f"a texture without coordinates (TEXCOORD_{mapping.uv_set})")
@@ -160,11 +160,11 @@ class Materials:
             self._ignored.add("a texture without an image")
             return None
         if source not in self._images:
-            image = entry(self._model.images, source, "images")
+            image = get_entry(self._model.images, source, "images")
             if image.bufferView is not None:
-                data, where = self._buffers.view(image.bufferView)[0], f"images.{source}"
+                data, where = self._buffers.read_view(image.bufferView)[0], f"images.{source}"
             elif image.uri is not None:
-                data, where = self._buffers.content(image.uri)
+                data, where = self._buffers.read_uri(image.uri)
             else:
                 raise ValueError(f"images.{source} has neither a bufferView nor a uri")
             self._images[source] = open_texture(data, where, self._notes)
@@ -175,7 +175,7 @@ def _mapping(info: schema.TextureInfo) -> TextureMapping:
     extension = info.extensions.get("KHR_texture_transform")
     if extension is None:
         return TextureMapping(info.texCoord)
-    found = schema.Transform.model_validate(extension)
+    found = schema.TextureTransform.model_validate(extension)
     cos, sin = float(np.cos(found.rotation)), float(np.sin(found.rotation))
     (u, v), (across, down) = found.offset, found.scale
     # counter-clockwise as seen, v downward: as three.js and Khronos's viewer have it

@@ -40,7 +40,7 @@ class SparseValues(Schema):
     byteOffset: NonNegativeInt = 0
 
 
-class Sparse(Schema):
+class SparseAccessor(Schema):
     """Values of an accessor that replace values of the buffer view: count, indices and new values."""
 
     count: NonNegativeInt
@@ -57,7 +57,7 @@ class Accessor(Schema):
     normalized: bool = False
     count: int = Field(ge=0, le=3 * MOST_VERTICES)
     type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
-    sparse: Sparse | None = None
+    sparse: SparseAccessor | None = None
 
 
 class BufferView(Schema):
@@ -106,7 +106,7 @@ class TextureInfo(Schema):
     extensions: dict[str, Any] = {}
 
 
-class Transform(Schema):
+class TextureTransform(Schema):
     """The extension KHR_texture_transform: offset, rotation in rad and scale of texture coordinates."""
 
     offset: tuple[float, float] = (0.0, 0.0)

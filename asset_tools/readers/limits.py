@@ -39,7 +39,7 @@ def reading_limits(where: object) -> Iterator[None]:
         wanted = min(wanted, limit[1])
     main_thread = threading.current_thread() is threading.main_thread()
     alarm = _Alarm()
-    handler = signal.signal(signal.SIGALRM, alarm.ring) if main_thread else None
+    handler = signal.signal(signal.SIGALRM, alarm.on_signal) if main_thread else None
     try:
         resource.setrlimit(resource.RLIMIT_DATA, (wanted, limit[1]))
         if main_thread:
@@ -69,7 +69,7 @@ class _Alarm:
     def __init__(self) -> None:
         self.rung = False
 
-    def ring(self, number: int, frame: FrameType | None) -> None:
+    def on_signal(self, number: int, frame: FrameType | None) -> None:
         self.rung = True
         raise _Timeout
 

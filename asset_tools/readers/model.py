@@ -12,13 +12,20 @@ from typing import Literal
 import numpy as np
 import trimesh
 
-from asset_tools.readers.choice import FORMATS, Candidate, choose_candidates, find_mesh_files, is_collision, is_mesh
+from asset_tools.readers.choice import (
+    FORMATS,
+    Candidate,
+    choose_candidates,
+    find_mesh_files,
+    is_collision_mesh,
+    is_mesh_file,
+)
 from asset_tools.readers.exchange import read_exchange
 from asset_tools.readers.files import ModelFiles
 from asset_tools.readers.gltf import read_gltf
 from asset_tools.readers.obj import MOST_FACES
 from asset_tools.readers.obj_model import read_obj
-from asset_tools.readers.surface import MeshPart, to_mesh
+from asset_tools.readers.surface import MeshPart, join_parts
 from robocas_ms3.core.errors import AssetError, RobocasError
 
 READERS: dict[str, Callable[[Path, ModelFiles], list[MeshPart]]] = {
@@ -68,7 +75,7 @@ def read_model(path: Path | list[Path], root: Path | None = None) -> Model:
         chosen = [_candidate(paths[0], files)]
     else:
         chosen = _chosen(find_mesh_files(home) if is_folder else paths, files)
-    mesh = to_mesh([part for candidate in chosen for part in candidate.parts])
+    mesh = join_parts([part for candidate in chosen for part in candidate.parts])
     _check(mesh, paths[0])
     return Model(mesh, _up(chosen[0].path, files), tuple(files.used), tuple(dict.fromkeys(files.notes)))
 
@@ -83,7 +90,7 @@ def _chosen(paths: list[Path], files: ModelFiles) -> list[Candidate]:
     Raises:
         AssetError: no file can be read, or the files are not parts of one object.
     """
-    collision = [path for path in paths if is_collision(path, files.home)]
+    collision = [path for path in paths if is_collision_mesh(path, files.home)]
     if len(collision) == len(paths):
         collision = []
     shown = [path for path in paths if path not in collision]
@@ -114,7 +121,7 @@ def _chosen(paths: list[Path], files: ModelFiles) -> list[Candidate]:
 def _candidate(path: Path, files: ModelFiles) -> Candidate:
     if not os.path.lexists(path):
         raise AssetError("no such mesh file", where=path, fix="Check the path.")
-    if not is_mesh(path):
+    if not is_mesh_file(path):
         expected, found = f"a file of type {', '.join(FORMATS)}", path.suffix or "a file without suffix"
         raise AssetError("not a mesh file", where=path, expected=expected, found=found)
     parts = READERS.get(path.suffix.lower(), read_exchange)(path, files)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from asset_tools.readers.files import ModelFiles, missing_path
+from asset_tools.readers.files import ModelFiles, format_missing_path
 from asset_tools.readers.images import open_texture
 from asset_tools.readers.obj import MtlMaterial, ObjMesh, decode_text, find_material, parse_mtl, parse_obj
 from asset_tools.readers.surface import WHITE, Material, MeshPart, decode_srgb
@@ -194,7 +194,7 @@ def _resolve_material(
         if name not in images:
             file = files.find(name, place.parent)
             if file is None:
-                where = missing_path(name, place.parent)
+                where = format_missing_path(name, place.parent)
                 what, fix = "missing texture file of the material", "Put the file next to the mesh."
                 raise AssetError(what, where=where, fix=fix)
             images[name] = open_texture(files.read(file), file, files.notes)

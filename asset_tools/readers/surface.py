@@ -86,7 +86,7 @@ class MultiTextureMaterial(TrimeshMaterial):
         return isinstance(other, MultiTextureMaterial) and other.images == self.images
 
 
-def to_mesh(parts: Sequence[MeshPart]) -> trimesh.Trimesh:
+def join_parts(parts: Sequence[MeshPart]) -> trimesh.Trimesh:
     """Join parts to one mesh with the colours of the parts.
 
     ``mesh.visual`` depends on the parts. If all parts are white, it is undefined. If no part has an image, it has sRGB

@@ -19,7 +19,7 @@ def make_env(n_envs=1, use_async_envs=False, cfg=None):
     """Make the vector environments of each task.
 
     Args:
-        n_envs: episodes at a time.
+        n_envs: number of environments, which run at the same time.
         use_async_envs: ignored, because envs on a CPU run in processes anyway.
         cfg: an object whose attributes override `SETTINGS`, named as in `RoboCASEnvConfig`. Attributes that are None or
             that equal LeRobot's defaults (``fps=30``) are ignored.

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from models import ball_dropped_into
 
-from asset_tools.decompose import GPU_LIMIT, MAX_VERTICES, count_flat_faces, decompose, reduce_vertices
+from asset_tools.decompose import GPU_LIMIT, MAX_VERTICES, count_flat_faces, decompose_mesh, reduce_hull_vertices
 from asset_tools.prepare import prepare_scan
 from asset_tools.quality.hulls import measure_hull_quality
 from robocas_ms3.assets.cooked_hulls import find_hull_violations
@@ -30,7 +30,7 @@ def test_a_scanned_cup_stays_hollow(tmp_path):
     mesh.export(tmp_path / "cup.ply")
     closed = prepare_scan(tmp_path / "cup.ply", up="z").closed
     assert closed.volume == pytest.approx(mesh.volume, rel=0.02)
-    found = decompose(closed)
+    found = decompose_mesh(closed)
     quality = measure_hull_quality(closed, found.hulls, hollow=True)
     assert quality.surface_p95 <= 0.004
     assert quality.hull_count <= 18
@@ -52,7 +52,7 @@ def test_a_can_with_rims_takes_few_hulls():
     profile = [[0, deep], [inner, deep], [inner, 0], [rim, 0], [rim, 2 * half], [inner, 2 * half]]
     profile += [[inner, 2 * half - deep], [0, 2 * half - deep]]
     can = trimesh.creation.revolve(np.array(profile), sections=64)
-    found = decompose(can)
+    found = decompose_mesh(can)
     assert can.volume / can.convex_hull.volume == pytest.approx(1 - 0.014 * 0.03**2 / (0.08 * 0.033**2), abs=1e-6)
     assert found.volume_iou >= 0.9
     assert 2 <= len(found.hulls) <= 10
@@ -62,7 +62,7 @@ def test_a_can_with_rims_takes_few_hulls():
 def test_the_same_mesh_gives_the_same_hulls():
     bodies = [trimesh.creation.box([0.1, 0.02, 0.02]), trimesh.creation.box([0.02, 0.02, 0.1])]
     cross = trimesh.boolean.union(bodies)
-    first, second = decompose(cross), decompose(cross)
+    first, second = decompose_mesh(cross), decompose_mesh(cross)
     assert second.volume_iou == first.volume_iou
     assert all(np.array_equal(a, b) for a, b in zip(first.hulls, second.hulls, strict=True))
     assert first.volume_iou > 0.9 and len(first.hulls) <= 3
@@ -70,7 +70,7 @@ def test_the_same_mesh_gives_the_same_hulls():
 
 def test_few_vertices_keep_volume():
     ball = trimesh.creation.icosphere(subdivisions=4)
-    kept = reduce_vertices(np.asarray(ball.vertices))
+    kept = reduce_hull_vertices(np.asarray(ball.vertices))
     assert len(kept) == MAX_VERTICES == 34
     assert trimesh.convex.convex_hull(kept).volume == pytest.approx(ball.volume, rel=1e-6)
 
@@ -82,9 +82,9 @@ def test_small_bevels_are_squared_and_large_ones_kept():
     def bevelled(by):
         return np.concatenate([signs * (half - by * (np.arange(3) != axis)) for axis in range(3)])
 
-    box = reduce_vertices(bevelled(0.0009))
+    box = reduce_hull_vertices(bevelled(0.0009))
     np.testing.assert_allclose(sorted(box.tolist()), sorted((signs * half).tolist()), atol=1e-12)
-    assert len(reduce_vertices(bevelled(0.004))) == 24
+    assert len(reduce_hull_vertices(bevelled(0.004))) == 24
 
 
 def test_few_flat_faces_keep_their_vertices():
@@ -92,12 +92,12 @@ def test_few_flat_faces_keep_their_vertices():
     ring = 0.2 * np.stack([np.cos(angles), np.sin(angles)], axis=1)  # each corner is 4 mm outside of the others' hull
     column = np.concatenate([np.column_stack([ring, np.full(30, z)]) for z in (0.0, 0.5)])
     assert count_flat_faces(column) == 32
-    assert sorted(reduce_vertices(column).round(9).tolist()) == sorted(column.round(9).tolist())
+    assert sorted(reduce_hull_vertices(column).round(9).tolist()) == sorted(column.round(9).tolist())
 
 
 def test_vertices_that_the_engine_would_drop_are_removed():
     cube = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1)])
     bumps = [[0.05, 0.05, 0.1006], [0.05, 0.05, -0.0006], [0.1006, 0.05, 0.05]]
-    assert len(reduce_vertices(np.concatenate([cube, bumps]))) == 8
-    higher = reduce_vertices(np.concatenate([cube, [[0.05, 0.05, 0.102]]]))
+    assert len(reduce_hull_vertices(np.concatenate([cube, bumps]))) == 8
+    higher = reduce_hull_vertices(np.concatenate([cube, [[0.05, 0.05, 0.102]]]))
     assert len(higher) == 9

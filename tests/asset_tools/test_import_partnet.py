@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from asset_tools.partnet.annotation import BUNDLED_ANNOTATIONS, ModelAnnotation, find_annotation, load_annotation
-from asset_tools.partnet.collision import limit_for_gpu
+from asset_tools.partnet.collision import split_slender_hull
 from asset_tools.partnet.importer import make_partnet_jobs, read_partnet
 from asset_tools.partnet.template import make_template
 from asset_tools.pipeline import write_pack
@@ -102,11 +102,11 @@ def test_a_hull_too_slender_for_a_gpu_is_halved_or_becomes_a_box():
     # a bar whose section is a triangle with sides of 3, 4 and 5 cm: 8 mm from its middle to the nearest face
     section = np.array([[0, 0, 0], [0, 0.03, 0], [0, 0, 0.04]])
     bars = {length: np.concatenate([section, section + [length, 0, 0]]) for length in (1.5, 1.6, 4.0)}
-    assert [piece.tolist() for piece in limit_for_gpu(bars[1.5])] == [bars[1.5].tolist()]
-    halves = limit_for_gpu(bars[1.6])
+    assert [piece.tolist() for piece in split_slender_hull(bars[1.5])] == [bars[1.5].tolist()]
+    halves = split_slender_hull(bars[1.6])
     assert [len(half) for half in halves] == [6, 6]
     assert sorted(half[:, 0].max() for half in halves) == pytest.approx([0.8, 1.6])
-    (box,) = [find_box(piece) for piece in limit_for_gpu(bars[4.0])]
+    (box,) = [find_box(piece) for piece in split_slender_hull(bars[4.0])]
     assert box is not None and 8 * np.prod(box.half_size) == pytest.approx(4.0 * 0.03 * 0.04)
 
 

@@ -12,7 +12,7 @@ from shapely import Polygon
 from trimesh.creation import box, cone, cylinder, icosphere
 
 from asset_tools.build import build_object
-from asset_tools.decompose import decompose, limit_for_engine, reduce_vertices
+from asset_tools.decompose import adapt_hull_to_engine, decompose_mesh, reduce_hull_vertices
 from asset_tools.repair import close_scan
 from asset_tools.simplify import simplify_mesh
 from asset_tools.sources import ObjectSource
@@ -160,7 +160,7 @@ def test_dirt_is_dropped_and_its_share_reported(far):
 
 def test_pointed_parts_have_hulls():
     for mesh in (cone(0.03, 0.08), cone(0.03, 0.08, sections=200), moved(cone(0.002, 0.02), 10, 20, 30)):
-        found = decompose(mesh)
+        found = decompose_mesh(mesh)
         assert len(found.hulls) == 1 and found.volume_iou > 0.9
         assert trimesh.convex.convex_hull(found.hulls[0]).volume == pytest.approx(mesh.volume, rel=1e-6)
 
@@ -171,7 +171,7 @@ def test_small_objects_with_many_faces_have_hulls():
     radius = 0.0135 + 0.0015 * np.sign(np.sin(10 * angle + 0.01))
     outline = radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
     gear = trimesh.creation.extrude_polygon(Polygon(outline), 0.008)
-    found = decompose(close_scan(gear).mesh)
+    found = decompose_mesh(close_scan(gear).mesh)
     assert found.volume_iou > 0.8
 
 
@@ -181,12 +181,12 @@ def test_slender_hulls_are_thickened_as_a_gpu_needs_it():
         [[0, 0, 0], [0.15, 0, 0], [0, 0.03, 0], [0.15, 0.025, 0], [0, 0, 0.002], [0.15, 0, 0.002]]
     )
     for mesh in (disk, rod, blade):
-        hulls = [limit_for_engine(np.asarray(mesh.vertices))]
+        hulls = [adapt_hull_to_engine(np.asarray(mesh.vertices))]
         (cooked,) = cook_hulls(hulls)
         assert not cooked.too_slender and cooked.shrinkage <= MAX_SHRINKAGE
         np.testing.assert_allclose(np.ptp(hulls[0], axis=0), mesh.extents, atol=0.005)
     plate = box([0.1, 0.1, 0.0002])
-    assert limit_for_engine(plate.vertices) is plate.vertices and MAX_SLENDERNESS < 0.05 / 0.0001
+    assert adapt_hull_to_engine(plate.vertices) is plate.vertices and MAX_SLENDERNESS < 0.05 / 0.0001
 
 
 def test_a_mesh_that_cannot_be_simplified_to_the_limit_is_taken_with_more_faces():
@@ -246,4 +246,4 @@ def test_few_vertices_of_extreme_points_in_one_plane():
     """All extreme ones along the axes and diagonals are corners of a base; the apex is next to it."""
     base = np.array([[x, y, -0.3 * (x + y)] for x in (-0.03, 0.03) for y in (-0.03, 0.03)])
     points = np.concatenate([base, base * [0.5, 0.5, 0.5] - [0, 0, 0.0005], [[0, 0, -0.004]]])
-    assert trimesh.convex.convex_hull(reduce_vertices(points)).volume > 0
+    assert trimesh.convex.convex_hull(reduce_hull_vertices(points)).volume > 0

@@ -13,7 +13,7 @@ import trimesh
 from asset_entries import furniture_asset
 
 from asset_tools import pipeline
-from asset_tools.pipeline import AssetJob, build_assets, content_hash, is_up_to_date, write_pack
+from asset_tools.pipeline import AssetJob, build_assets, compute_content_hash, is_up_to_date, write_pack
 from robocas_ms3.assets.hulls import write_hulls
 from robocas_ms3.assets.pack import HULLS, VISUALS, load_pack, sha256
 from robocas_ms3.core.errors import AssetError, OutputExistsError
@@ -98,12 +98,12 @@ def test_a_failure_names_the_asset_and_keeps_finished_assets(tmp_path):
 def test_content_hash_depends_on_files_settings_and_code(tmp_path):
     path = tmp_path / "mesh.obj"
     path.write_text("v 0 0 0")
-    first = content_hash("m", files=[path])
-    assert first == content_hash("m", files=[path])
-    assert first != content_hash("cm", files=[path])
-    assert first != content_hash("m", files=[path], packages=["builtin"])
+    first = compute_content_hash("m", files=[path])
+    assert first == compute_content_hash("m", files=[path])
+    assert first != compute_content_hash("cm", files=[path])
+    assert first != compute_content_hash("m", files=[path], packages=["builtin"])
     path.write_text("v 0 0 1")
-    assert first != content_hash("m", files=[path])
+    assert first != compute_content_hash("m", files=[path])
 
 
 def trip(folder):
@@ -191,7 +191,7 @@ def test_content_hash_depends_on_code_and_yaml(tmp_path, monkeypatch):
     for name, text in (("toys.yaml", "a: 1"), ("toys.yaml", "a: 2"), ("toys.py", "A = 2"), ("notes.txt", "none")):
         (tmp_path / "products" / name).write_text(text)
         pipeline._code.cache_clear()
-        found.append(content_hash(packages=["products"]))
+        found.append(compute_content_hash(packages=["products"]))
     pipeline._code.cache_clear()
     assert len(set(found)) == 3 and found[2] == found[3]
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from asset_tools.decompose import decompose
+from asset_tools.decompose import decompose_mesh
 from asset_tools.inertia import compute_principal_inertia
-from asset_tools.prepare import level_base, prepare_scan
+from asset_tools.prepare import flatten_base, prepare_scan
 from asset_tools.resting_poses import find_resting_poses
 from robocas_ms3.assets.physics import RigidBody
 from robocas_ms3.core.errors import AssetError
@@ -26,13 +26,13 @@ def carton(bulge, size=0.07, height=0.19):
 
 def poses_of(closed):
     inertia, axes = compute_principal_inertia(closed, 0.3)
-    hulls = decompose(closed).hulls
+    hulls = decompose_mesh(closed).hulls
     return find_resting_poses(RigidBody(hulls, 0.3, closed.center_mass, np.array(inertia), np.array(axes)))
 
 
 def test_a_bulging_base_is_pressed_flat():
     scan, repairs = carton(0.0015), []
-    mesh, closed = level_base(scan.copy(), scan, repairs)
+    mesh, closed = flatten_base(scan.copy(), scan, repairs)
     assert len(repairs) == 1 and repairs[0].startswith("pressed the base flat by ")
     depth = float(repairs[0].split()[-2]) / 1e3
     assert depth < 0.0015
@@ -43,7 +43,7 @@ def test_a_bulging_base_is_pressed_flat():
     assert scan.volume > closed.volume > 0.99 * scan.volume
     assert poses_of(closed).display_pose >= 0
     again: list[str] = []
-    level_base(mesh, closed, again)
+    flatten_base(mesh, closed, again)
     assert again == []
 
 
@@ -62,7 +62,7 @@ def test_axis_and_unit_can_be_given(tmp_path):
 @pytest.mark.parametrize("name", ["alphabet_soup", "ketchup", "orange_juice", "salad_dressing"])
 def test_objects_that_stand_in_reality_stand_in_the_simulation(shared_dir, name):
     scan = prepare_scan(shared_dir / "scans" / "hope" / name, unit="cm")
-    found = decompose(scan.closed)
+    found = decompose_mesh(scan.closed)
     assert found.volume_iou >= 0.9
     assert len(found.hulls) <= 8
     assert poses_of(scan.closed).display_pose >= 0
@@ -84,6 +84,6 @@ QUARTER = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
 )
 def test_other_bases_are_not_flattened(body):
     repairs: list[str] = []
-    mesh, closed = level_base(body.copy(), body, repairs)
+    mesh, closed = flatten_base(body.copy(), body, repairs)
     assert repairs == []
     assert closed is body and mesh.volume == pytest.approx(body.volume)

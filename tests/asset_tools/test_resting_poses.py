@@ -8,7 +8,7 @@ import trimesh
 from sapien import physx
 
 from asset_tools.resting_poses import RestingPoses, find_resting_poses
-from asset_tools.stability import toppling_angle
+from asset_tools.stability import compute_toppling_angle
 from robocas_ms3.assets.physics import RigidBody
 from robocas_ms3.core.errors import AssetError
 
@@ -114,9 +114,9 @@ def test_toppling_angle_of_a_box_is_known():
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)], float)
     up = np.array([0, 0, 1.0])
     # 1 to the nearest edge, 3 high
-    assert toppling_angle(corners, np.zeros(3), up) == pytest.approx(np.degrees(np.arctan2(1, 3)))
-    assert toppling_angle(corners, np.array([0.9, 0, 0]), up) == pytest.approx(np.degrees(np.arctan2(0.1, 3)))
-    assert toppling_angle(corners, np.zeros(3), np.array([1, 0, 1]) / np.sqrt(2)) == 0  # on an edge
+    assert compute_toppling_angle(corners, np.zeros(3), up) == pytest.approx(np.degrees(np.arctan2(1, 3)))
+    assert compute_toppling_angle(corners, np.array([0.9, 0, 0]), up) == pytest.approx(np.degrees(np.arctan2(0.1, 3)))
+    assert compute_toppling_angle(corners, np.zeros(3), np.array([1, 0, 1]) / np.sqrt(2)) == 0  # on an edge
 
 
 def test_a_body_that_only_rocks_is_put_down_on_its_blunt_edges_too() -> None:

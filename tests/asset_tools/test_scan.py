@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from asset_tools.scan import guess_common_unit, guess_units, guess_up, rotate_upright
+from asset_tools.scan import guess_common_unit, guess_units, guess_up_axis, rotate_upright
 from robocas_ms3.core.errors import AssetError
 
 
@@ -46,7 +46,7 @@ def shape(kind, along):
 @pytest.mark.parametrize("up", ["y", "z"])
 @pytest.mark.parametrize("kind", ["cylinder", (7, 7, 19), (10, 5, 2.4)], ids=str)
 def test_up_axis_of_a_bottle_a_carton_and_a_flat_box(kind, up):
-    assert guess_up(shape(kind, up)) == up
+    assert guess_up_axis(shape(kind, up)) == up
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])

@@ -18,7 +18,7 @@ from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
 from asset_tools.glb import write_glb
-from asset_tools.readers.surface import Material, MeshPart, to_mesh
+from asset_tools.readers.surface import Material, MeshPart, join_parts
 from asset_tools.simplify import simplify_mesh
 from asset_tools.visual import make_display_mesh
 
@@ -184,7 +184,7 @@ def test_a_label_close_to_a_bottle_keeps_its_colour(triangles):
         uvs = np.full((len(wall.vertices), 2), 0.5)
         image = Image.new("RGB", (4, 4), color)
         parts.append(MeshPart(np.array(wall.vertices), np.array(wall.faces), uvs, material=Material(image=image)))
-    light = make_display_mesh(to_mesh(parts), triangles=triangles, texture_size=256)
+    light = make_display_mesh(join_parts(parts), triangles=triangles, texture_size=256)
     points, faces = trimesh.sample.sample_surface(light, 3000, seed=0)[:2]
     radius = np.linalg.norm(points[:, :2], axis=1)
     side = np.abs(light.face_normals[faces, 2]) < 0.3

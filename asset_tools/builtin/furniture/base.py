@@ -86,7 +86,7 @@ class Body:
         self.pieces: list[Array] = []
         self._solids: list[tuple[Array, str, int | None]] = []
 
-    def solid(
+    def add_solid(
         self, points: Array, material: str, *, grain: int | None = None, show: bool = True, collide: bool = True
     ) -> None:
         """Add a solid that is the convex hull of points.
@@ -103,7 +103,7 @@ class Body:
         if collide:
             self.pieces.append(points)
 
-    def board(
+    def add_board(
         self,
         low: Corner,
         high: Corner,
@@ -113,7 +113,7 @@ class Body:
         grain: int | None = None,
         collide: bool = True,
     ) -> None:
-        """Add a box, whose bevelled edges are only in the visual mesh; other arguments as in `solid`.
+        """Add a box, whose bevelled edges are only in the visual mesh; other arguments as in `add_solid`.
 
         Args:
             low: (3,) one corner, m.
@@ -123,11 +123,11 @@ class Body:
             grain: axis of the grain of the material, or None.
             collide: whether to add the box to the collision pieces.
         """
-        self.solid(make_box_corners(low, high, bevel), material, grain=grain, collide=False)
+        self.add_solid(make_box_corners(low, high, bevel), material, grain=grain, collide=False)
         if collide:
             self.pieces.append(make_box_corners(low, high))
 
-    def bar_handle(
+    def add_bar_handle(
         self, middle: Corner, length: float, material: str, *, along: Literal["y", "z"], bar: float = BAR
     ) -> None:
         """Add a handle in front of a face with the normal +x: a bar on two posts.
@@ -143,15 +143,15 @@ class Body:
         axis = 1 if along == "y" else 2
         half = np.full(3, bar / 2)
         half[axis] = length / 2
-        self.board(middle - half, middle + half, material, bevel=0.0025)
+        self.add_board(middle - half, middle + half, material, bevel=0.0025)
         for side in (-1, 1):
             post = np.array(middle, float)
             post[axis] += side * (length / 2 - bar)
             low, high = post - bar / 2, post + bar / 2
             low[0], high[0] = x - bar / 2 - BAR_GAP, x - bar / 2
-            self.board(low, high, material)
+            self.add_board(low, high, material)
 
-    def mesh(self) -> trimesh.Trimesh:
+    def make_mesh(self) -> trimesh.Trimesh:
         """Return the textured mesh of all visible solids; deterministic."""
         names = sorted({material for _, material, _ in self._solids})
         nothing = np.zeros((2, 2, 3)), np.zeros((2, 2, 2))
@@ -173,8 +173,8 @@ class Body:
             left, top, right, bottom = region.box
             grid = Grid.from_size(region.size, (right - left, bottom - top))
             rng = np.random.default_rng([ord(letter) for letter in name])
-            painter.put(name, np.clip(samples[name].paint(grid, rng), 0, 255).astype(np.uint8))
-        return shape.textured(Image.fromarray(painter.pixels), roughness=self.roughness)
+            painter.put_pixels(name, np.clip(samples[name].paint(grid, rng), 0, 255).astype(np.uint8))
+        return shape.make_textured_mesh(Image.fromarray(painter.pixels), roughness=self.roughness)
 
 
 def _cut(

@@ -25,14 +25,14 @@ def make_cabinet() -> FurnitureSource:
     plinth, floor, middle = 0.08, 0.10, 0.65
     body = Body({"oak": make_wood(OAK, (1.25, 0.5)), "dark": DARK, "inside": PALE}, seed=4, roughness=0.55)
     for side in (-1, 1):
-        body.board((back, side * half, plinth), (front, side * (half - BOARD), height - BOARD), "oak", grain=2)
-    body.board((back, -half, height - BOARD), (front + 0.028, half, height), "oak", bevel=0.002)
+        body.add_board((back, side * half, plinth), (front, side * (half - BOARD), height - BOARD), "oak", grain=2)
+    body.add_board((back, -half, height - BOARD), (front + 0.028, half, height), "oak", bevel=0.002)
     inner = half - BOARD
     for z in (floor, middle):
-        body.board((back, -inner, z - BOARD), (front, inner, z), "inside")
-    body.board((back, -BOARD / 2, floor), (front, BOARD / 2, height - BOARD), "inside", grain=2)
-    body.board((back, -inner, floor), (back + 0.008, inner, height - BOARD), "inside")
-    body.board((back + 0.02, -half + 0.03, 0), (front - 0.05, half - 0.03, plinth), "dark")
+        body.add_board((back, -inner, z - BOARD), (front, inner, z), "inside")
+    body.add_board((back, -BOARD / 2, floor), (front, BOARD / 2, height - BOARD), "inside", grain=2)
+    body.add_board((back, -inner, floor), (back + 0.008, inner, height - BOARD), "inside")
+    body.add_board((back + 0.02, -half + 0.03, 0), (front - 0.05, half - 0.03, plinth), "dark")
 
     face = front + 0.003
     bar_x = face + BOARD + BAR_GAP + BAR / 2
@@ -61,7 +61,7 @@ def make_cabinet() -> FurnitureSource:
         "cabinet",
         "cabinet",
         "cabinet",
-        body.mesh(),
+        body.make_mesh(),
         body.pieces,
         surfaces=surfaces,
         links=tuple(links),
@@ -89,9 +89,9 @@ def _door(
     """
     body = Body({"paint": SAGE, "steel": STEEL}, seed=5, texture=256, roughness=0.5)
     _framed_front(body, face, y, z)
-    body.bar_handle(np.array(grip), 0.18, "steel", along="z")
+    body.add_bar_handle(np.array(grip), 0.18, "steel", along="z")
     outer = y[0] if side < 0 else y[1]
-    return LinkSource(name, make_hinge(f"{name}_hinge", (face, outer, 0.0), side), body.mesh(), body.pieces, 6.0)
+    return LinkSource(name, make_hinge(f"{name}_hinge", (face, outer, 0.0), side), body.make_mesh(), body.pieces, 6.0)
 
 
 def _drawer(
@@ -117,15 +117,15 @@ def _drawer(
     low, high = bay[0] + 0.010, bay[1] - 0.010
     bottom, top = z[0] + 0.02, z[1] - 0.07
     _framed_front(body, face, y, (z[0] - BOARD / 2 + GAP / 2, z[1] - GAP), frame=0.035)
-    body.board((back, low, bottom - board), (face, high, bottom), "inside")
+    body.add_board((back, low, bottom - board), (face, high, bottom), "inside")
     for a, b in ((low, low + board), (high - board, high)):
-        body.board((back, a, bottom), (face, b, top), "inside")
-    body.board((back, low + board, bottom), (back + board, high - board, top), "inside")
-    body.board((face - board, low + board, bottom), (face, high - board, top), "inside")
+        body.add_board((back, a, bottom), (face, b, top), "inside")
+    body.add_board((back, low + board, bottom), (back + board, high - board, top), "inside")
+    body.add_board((face - board, low + board, bottom), (face, high - board, top), "inside")
     for a, b in ((bay[0] + 0.002, low), (high, bay[1] - 0.002)):  # runners
-        body.board((back, a, bottom + 0.03), (face - 0.02, b, bottom + 0.06), "steel", collide=False)
-    body.bar_handle(np.array(grip), 0.20, "steel", along="y")
-    return LinkSource(name, make_slide(f"{name}_slide", (1.0, 0.0, 0.0), 0.36), body.mesh(), body.pieces, 4.0)
+        body.add_board((back, a, bottom + 0.03), (face - 0.02, b, bottom + 0.06), "steel", collide=False)
+    body.add_bar_handle(np.array(grip), 0.20, "steel", along="y")
+    return LinkSource(name, make_slide(f"{name}_slide", (1.0, 0.0, 0.0), 0.36), body.make_mesh(), body.pieces, 4.0)
 
 
 def _framed_front(
@@ -142,11 +142,11 @@ def _framed_front(
     """
     out = face + BOARD
     body.pieces.append(_corners((face, y[0], z[0]), (out, y[1], z[1])))
-    body.board((face, y[0], z[0]), (out - 0.007, y[1], z[1]), "paint", collide=False)
+    body.add_board((face, y[0], z[0]), (out - 0.007, y[1], z[1]), "paint", collide=False)
     for low, high in ((z[0], z[0] + frame), (z[1] - frame, z[1])):
-        body.board((out - 0.008, y[0] + frame, low), (out, y[1] - frame, high), "paint", bevel=0.002, collide=False)
+        body.add_board((out - 0.008, y[0] + frame, low), (out, y[1] - frame, high), "paint", bevel=0.002, collide=False)
     for low, high in ((y[0], y[0] + frame), (y[1] - frame, y[1])):
-        body.board((out - 0.008, low, z[0]), (out, high, z[1]), "paint", bevel=0.002, collide=False)
+        body.add_board((out - 0.008, low, z[0]), (out, high, z[1]), "paint", bevel=0.002, collide=False)
 
 
 def _corners(low: tuple[float, float, float], high: tuple[float, float, float]) -> np.ndarray:
@@ -164,22 +164,22 @@ def make_container() -> FurnitureSource:
     body = Body({"wood": make_wood(BEECH, (1.55, 0.66)), "cream": CREAM, "dark": DARK}, seed=7, roughness=0.55)
     inner = (low + board, high - board)
     for y in (low, high - board):
-        body.board((back, y, 0), (front, y + board, height - board), "wood", grain=2)
-    body.board((back, low, height - board), (front, high, height), "wood", bevel=0.002)
-    body.board((back, inner[0], layers[0] - board), (front, inner[1], layers[0]), "wood")
-    body.board((back, divider - board, layers[0]), (0.28, divider, height - board), "wood", grain=2)
-    body.board((back, divider, layers[1] - board), (0.28, inner[1], layers[1]), "wood")
-    body.board((back, inner[0], layers[0]), (back + 0.01, inner[1], height - board), "wood")
-    body.board((0.283, inner[0], layers[0]), (0.303, divider, height - board), "cream", grain=2)
-    body.board((0.25, inner[0], 0), (0.265, inner[1], layers[0] - board), "dark")
+        body.add_board((back, y, 0), (front, y + board, height - board), "wood", grain=2)
+    body.add_board((back, low, height - board), (front, high, height), "wood", bevel=0.002)
+    body.add_board((back, inner[0], layers[0] - board), (front, inner[1], layers[0]), "wood")
+    body.add_board((back, divider - board, layers[0]), (0.28, divider, height - board), "wood", grain=2)
+    body.add_board((back, divider, layers[1] - board), (0.28, inner[1], layers[1]), "wood")
+    body.add_board((back, inner[0], layers[0]), (back + 0.01, inner[1], height - board), "wood")
+    body.add_board((0.283, inner[0], layers[0]), (0.303, divider, height - board), "cream", grain=2)
+    body.add_board((0.25, inner[0], 0), (0.265, inner[1], layers[0] - board), "dark")
 
     door = Body({"wood": make_wood(BEECH, (1.1, 0.62)), "steel": STEEL}, seed=8, texture=512, roughness=0.55)
     x, clear = 0.309, 0.004
     y = (divider - 0.03, inner[1] - clear)
     z = (layers[0] + clear, height - board - clear)
-    door.board((x, y[0], z[0]), (x + 0.021, y[1], z[1]), "wood", bevel=0.002, grain=2)
+    door.add_board((x, y[0], z[0]), (x + 0.021, y[1], z[1]), "wood", bevel=0.002, grain=2)
     grip = (0.378, 0.672, 0.557)  # as in RoboCAS-v0, whose origin is 0.557 m above the floor
-    door.bar_handle(np.array(grip), 0.30, "steel", along="z")
+    door.add_bar_handle(np.array(grip), 0.30, "steel", along="z")
     joint = make_slide("door_slide", (0.0, -1.0, 0.0), 0.55)
     ceilings = (layers[1] - board, height - board)
     surfaces = {
@@ -191,9 +191,9 @@ def make_container() -> FurnitureSource:
         "container",
         "container",
         "container",
-        body.mesh(),
+        body.make_mesh(),
         body.pieces,
         surfaces=surfaces,
-        links=(LinkSource("door", joint, door.mesh(), door.pieces, 8.0),),
+        links=(LinkSource("door", joint, door.make_mesh(), door.pieces, 8.0),),
         handles={"door": make_bar_grasp("door", grip, along="z")},
     )

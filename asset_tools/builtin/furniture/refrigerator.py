@@ -27,10 +27,10 @@ def make_refrigerator() -> FurnitureSource:
     inner = HALF - WALL
     bottom = 0.10
     for side in (-1, 1):  # the liner is visible from inside, the enamel from outside
-        body.board(
+        body.add_board(
             (BACK, side * HALF, bottom), (FRONT, side * (inner + 0.01), HEIGHT), "enamel", bevel=0.003, collide=False
         )
-        body.board(
+        body.add_board(
             (BACK + 0.02, side * (HALF - 0.02), bottom + 0.01),
             (FRONT - 0.001, side * inner, HEIGHT - 0.02),
             "liner",
@@ -39,16 +39,18 @@ def make_refrigerator() -> FurnitureSource:
         body.pieces.append(
             np.array(np.meshgrid((BACK, FRONT), (side * HALF, side * inner), (bottom, HEIGHT))).reshape(3, -1).T
         )
-    body.board((BACK, -inner, bottom), (BACK + 0.05, inner, HEIGHT), "liner")
-    body.board((BACK - 0.002, -HALF + 0.01, bottom + 0.01), (BACK, HALF - 0.01, HEIGHT - 0.01), "enamel", collide=False)
-    body.board((BACK, -inner, bottom), (FRONT, inner, 0.145), "liner")
-    body.board((BACK, -inner, 0.58), (FRONT, inner, 0.66), "liner")
-    body.board((BACK, -inner, 1.70), (FRONT, inner, HEIGHT - 0.008), "liner")
-    body.board((BACK, -HALF, HEIGHT - 0.01), (FRONT, HALF, HEIGHT), "enamel", bevel=0.003)
+    body.add_board((BACK, -inner, bottom), (BACK + 0.05, inner, HEIGHT), "liner")
+    body.add_board(
+        (BACK - 0.002, -HALF + 0.01, bottom + 0.01), (BACK, HALF - 0.01, HEIGHT - 0.01), "enamel", collide=False
+    )
+    body.add_board((BACK, -inner, bottom), (FRONT, inner, 0.145), "liner")
+    body.add_board((BACK, -inner, 0.58), (FRONT, inner, 0.66), "liner")
+    body.add_board((BACK, -inner, 1.70), (FRONT, inner, HEIGHT - 0.008), "liner")
+    body.add_board((BACK, -HALF, HEIGHT - 0.01), (FRONT, HALF, HEIGHT), "enamel", bevel=0.003)
     for z in (0.98, 1.31):
-        body.board((BACK + 0.05, -inner, z - 0.012), (0.18, inner, z), "glass")
-        body.board((0.18, -inner, z - 0.014), (0.19, inner, z + 0.002), "liner", collide=False)
-    body.board((BACK + 0.05, -HALF + 0.03, 0), (FRONT - 0.03, HALF - 0.03, bottom), "dark")
+        body.add_board((BACK + 0.05, -inner, z - 0.012), (0.18, inner, z), "glass")
+        body.add_board((0.18, -inner, z - 0.014), (0.19, inner, z + 0.002), "liner", collide=False)
+    body.add_board((BACK + 0.05, -HALF + 0.03, 0), (FRONT - 0.03, HALF - 0.03, bottom), "dark")
 
     links, handles = [], {}
     for name, (low, high), bar, mass in (
@@ -70,7 +72,7 @@ def make_refrigerator() -> FurnitureSource:
         "refrigerator",
         "refrigerator",
         "refrigerator",
-        body.mesh(),
+        body.make_mesh(),
         body.pieces,
         surfaces=surfaces,
         links=tuple(links),
@@ -99,22 +101,22 @@ def _door(
     )
     face = FRONT + DOOR_GAP
     out = face + DOOR
-    body.board((face, -HALF, low), (out, HALF, high), "enamel", bevel=0.006)
-    body.board(
+    body.add_board((face, -HALF, low), (out, HALF, high), "enamel", bevel=0.006)
+    body.add_board(
         (face - 0.003, -HALF + 0.02, low + 0.02), (face + 0.001, HALF - 0.02, high - 0.02), "dark", collide=False
     )  # seal
-    body.board(
+    body.add_board(
         (face - 0.004, -HALF + 0.035, low + 0.035), (face + 0.001, HALF - 0.035, high - 0.035), "liner", collide=False
     )
     for z in bins:
         y = HALF - 0.10
-        body.board((face - 0.10, -y, z), (face, y, z + 0.008), "liner")
-        body.board((face - 0.10, -y, z + 0.008), (face - 0.094, y, z + 0.07), "glass")
+        body.add_board((face - 0.10, -y, z), (face, y, z + 0.008), "liner")
+        body.add_board((face - 0.10, -y, z + 0.008), (face - 0.094, y, z + 0.07), "glass")
         for side in (-1, 1):
-            body.board((face - 0.10, side * y, z), (face, side * (y - 0.006), z + 0.07), "liner")
+            body.add_board((face - 0.10, side * y, z), (face, side * (y - 0.006), z + 0.07), "liner")
     if bins:  # temperature display
-        body.board((out - 0.001, -0.06, high - 0.20), (out + 0.001, 0.06, high - 0.16), "dark", collide=False)
+        body.add_board((out - 0.001, -0.06, high - 0.20), (out + 0.001, 0.06, high - 0.16), "dark", collide=False)
     grip = (out + BAR_GAP + BAR / 2, HALF - 0.055, round(sum(bar) / 2, 6))
-    body.bar_handle(np.array(grip), bar[1] - bar[0], "steel", along="z", bar=BAR)
+    body.add_bar_handle(np.array(grip), bar[1] - bar[0], "steel", along="z", bar=BAR)
     joint = make_hinge(f"{name}_hinge", (face, -HALF, 0.0), -1)
-    return LinkSource(name, joint, body.mesh(), body.pieces, mass), grip
+    return LinkSource(name, joint, body.make_mesh(), body.pieces, mass), grip

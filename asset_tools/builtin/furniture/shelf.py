@@ -28,18 +28,18 @@ def make_shelf() -> FurnitureSource:
     y, back = HALF_WIDTH, -DEPTH
     for side in (-1, 1):
         for x in (0.0, back + POST):
-            body.board((x - POST, side * y, 0), (x, side * (y - POST), TOP), "steel", bevel=0.003)
+            body.add_board((x - POST, side * y, 0), (x, side * (y - POST), TOP), "steel", bevel=0.003)
         for z in (*LAYERS, TOP):  # bars that carry the boards
-            body.board((back + POST, side * y, z - 0.05), (-POST, side * (y - POST), z), "steel")
+            body.add_board((back + POST, side * y, z - 0.05), (-POST, side * (y - POST), z), "steel")
     inner = y - POST
     for z in (*LAYERS, TOP):
-        body.board((back, -inner, z - BOARD), (0.0, inner, z), "oak", bevel=0.002)
+        body.add_board((back, -inner, z - BOARD), (0.0, inner, z), "oak", bevel=0.002)
         if z < TOP:
-            body.board((-0.004, -inner, z - 0.05), (0.006, inner, z - 0.004), "rail", collide=False)
-    body.board((back, -inner, LAYERS[0]), (back + 0.008, inner, TOP - BOARD), "back")
+            body.add_board((-0.004, -inner, z - 0.05), (0.006, inner, z - 0.004), "rail", collide=False)
+    body.add_board((back, -inner, LAYERS[0]), (back + 0.008, inner, TOP - BOARD), "back")
     ceilings = (*LAYERS[1:], TOP)
     surfaces = {
         f"layer_{i}": make_surface((back + 0.02, -0.53), (-0.01, 0.53), z, ceilings[i] - BOARD - z)
         for i, z in enumerate(LAYERS)
     }
-    return FurnitureSource("shelf", "shelf", "shelf", body.mesh(), body.pieces, surfaces=surfaces)
+    return FurnitureSource("shelf", "shelf", "shelf", body.make_mesh(), body.pieces, surfaces=surfaces)

@@ -122,8 +122,8 @@ def _painted(
     for name, region in shape.regions.items():
         left, top, right, bottom = region.box
         colours = materials[name].paint(Grid.from_size(region.size, (right - left, bottom - top)), painter.rng)
-        painter.put(name, np.clip(colours * (0.8 if name in dark else 1.0), 0, 255).astype(np.uint8))
-    return shape.textured(Image.fromarray(painter.pixels), roughness=roughness)
+        painter.put_pixels(name, np.clip(colours * (0.8 if name in dark else 1.0), 0, 255).astype(np.uint8))
+    return shape.make_textured_mesh(Image.fromarray(painter.pixels), roughness=roughness)
 
 
 def _ring(half: float, z: float, corner: float) -> np.ndarray:

@@ -22,7 +22,7 @@ def test_whole_numbers_lists_and_defaults(tmp_path):
     assert (box.name, box.mass, box.size, box.hollow, box.roughness) == ("box", 1.0, (0.1, 0.1, 0.1), False, 0.45)
     assert (box.shape.radius, box.paint.label.title, box.paint.label.style) == (0.002, "BOX", "bands")
     shape, _ = box.build()
-    assert shape.closed().extents == pytest.approx([0.1, 0.1, 0.1])
+    assert shape.make_closed_mesh().extents == pytest.approx([0.1, 0.1, 0.1])
 
 
 @pytest.mark.parametrize(

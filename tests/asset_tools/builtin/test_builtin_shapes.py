@@ -47,7 +47,7 @@ def shape_of(name):
 @each
 def test_closed_and_of_the_declared_size(spec):
     shape = shape_of(spec.id)
-    surface = shape.closed()
+    surface = shape.make_closed_mesh()
     assert surface.is_watertight and surface.is_winding_consistent and surface.body_count == 1
     assert surface.volume > 0
     np.testing.assert_allclose(surface.extents, spec.size, atol=1e-4)
@@ -58,7 +58,7 @@ def test_closed_and_of_the_declared_size(spec):
 @each
 def test_weight(spec):
     """Toys are between foam and brass; a household's things half to one and a half times as heavy as water."""
-    density = spec.mass / shape_of(spec.id).closed().volume
+    density = spec.mass / shape_of(spec.id).make_closed_mesh().volume
     if spec.id in TOYS:
         assert 300 < density < (6000 if spec.id == "padlock" else 2200)
     else:
@@ -101,7 +101,7 @@ def test_texture_is_used_and_files_are_small(spec, tmp_path):
 @parametrised([spec for spec in load_builtin_products().values() if spec.id in TOYS or shape_of(spec.id).pieces])
 def test_pieces_fill_the_shape(spec):
     shape, toy = shape_of(spec.id), spec.id in TOYS
-    closed, pieces = shape.closed(), list(shape.pieces)
+    closed, pieces = shape.make_closed_mesh(), list(shape.pieces)
     assert 1 <= len(pieces) <= (24 if toy else 13 if spec.hollow else 8)
     assert max(map(len, pieces)) <= 48 and max(map(count_flat_faces, pieces)) <= GPU_LIMIT
     if not (toy and spec.hollow):  # for thin walls 0.1 mm is a large fraction
@@ -115,19 +115,19 @@ def test_pieces_fill_the_shape(spec):
 @each_toy
 def test_stands(spec):
     """Ground contacts surround the centre of mass, except for balls and objects that lie along their length."""
-    closed = shape_of(spec.id).closed()
+    closed = shape_of(spec.id).make_closed_mesh()
     low = closed.vertices[closed.vertices[:, 2] < closed.bounds[0, 2] + 1.5e-3]
     foot = MultiPoint(low[:, :2]).convex_hull.buffer(2e-3)
     assert foot.contains(Point(closed.center_mass[:2]))
 
 
 def test_holes_are_open():
-    lock = built("padlock")[0].closed()
+    lock = built("padlock")[0].make_closed_mesh()
     # Shackle: legs 28 mm apart, 8.4 mm thick; below it the body, whose top is at 46 of 75 mm.
     assert not lock.contains([[0, 0, 0.020], [0.006, 0, 0.015], [0, 0.01, 0.02]]).any()
     assert lock.contains([[0.014, 0, 0.015], [-0.014, 0, 0.015], [0, 0, 0.0355], [0, 0, -0.01]]).all()
     assert lock.euler_number == 0  # one hole
-    scissors = built("scissors")[0].closed()
+    scissors = built("scissors")[0].make_closed_mesh()
     rings = np.array([[-0.066, 0.0245, 0], [-0.066, -0.0235, 0], [-0.08, 0.0245, 0], [-0.055, -0.0235, 0]])
     assert not scissors.contains(rings).any()
     assert scissors.euler_number == -2  # two rings, nothing else

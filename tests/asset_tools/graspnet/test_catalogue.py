@@ -50,7 +50,7 @@ def test_the_46_objects_have_unique_ids():
 
 def test_other_objects_are_named_by_their_number():
     assert find_catalogue_entry(2).id == "tomato_soup_can"
-    assert find_catalogue_entry(2).folder == "002"
+    assert find_catalogue_entry(2).folder_name == "002"
     assert find_catalogue_entry(6).id == "graspnet_006"
     assert find_catalogue_entry(87).mass is None
     with pytest.raises(ValueError, match="88"):

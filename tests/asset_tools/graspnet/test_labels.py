@@ -6,9 +6,9 @@ import pytest
 import trimesh
 
 from asset_tools.graspnet.labels import (
-    label_checksums,
     load_label_grasps,
     make_view_directions,
+    read_label_checksums,
     read_labels,
     to_tcp_poses,
 )
@@ -20,7 +20,7 @@ RNG = np.random.default_rng(0)
 
 
 def arrays(points=1, dtype=np.float32):
-    """Labels without a usable grasp."""
+    """GraspLabels without a usable grasp."""
     shape = (points, 300, 12, 4)
     return {
         "points": np.zeros((points, 3), dtype),
@@ -174,13 +174,13 @@ def test_a_damaged_file_is_one_error_that_names_it(tmp_path, damage, words):
 
 
 def test_checksums_differ_for_different_label_files(tmp_path):
-    one = label_checksums(write(tmp_path / "one.npz"))
-    assert label_checksums(write(tmp_path / "same.npz")) == one
-    other = label_checksums(write(tmp_path / "other.npz", [((0, 0, 0, 0), (0, 0.01, 0.05, 0.3, False))]))
+    one = read_label_checksums(write(tmp_path / "one.npz"))
+    assert read_label_checksums(write(tmp_path / "same.npz")) == one
+    other = read_label_checksums(write(tmp_path / "other.npz", [((0, 0, 0, 0), (0, 0.01, 0.05, 0.3, False))]))
     assert [name for name, *_ in other] == [name for name, *_ in one]
     assert [a[0] for a, b in zip(one, other, strict=True) if a != b] == ["offsets.npy", "scores.npy"]
     (tmp_path / "cut.npz").write_bytes((tmp_path / "one.npz").read_bytes()[:-10])
-    assert label_checksums(tmp_path / "cut.npz")[0][0] == "cut.npz"
+    assert read_label_checksums(tmp_path / "cut.npz")[0][0] == "cut.npz"
 
 
 MEASURE = """
