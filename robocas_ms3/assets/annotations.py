@@ -106,7 +106,7 @@ class Annotations:
 
 
 def compute_footprints(hulls: list[Array], poses: Array) -> Array:
-    """Return the vertical projections (S, K, 2) of an object in its resting poses, as `Annotations.footprints`.
+    """Return `Annotations.footprints` (S, K, 2): the vertical projection of each resting pose.
 
     Args:
         hulls: vertices (V, 3) of each convex hull of the object, m, asset frame.

@@ -98,7 +98,7 @@ def make_convex_mesh(points: Array) -> tuple[Array, NDArray[np.int64]]:
 
 
 def find_box(vertices: Array) -> Box | None:
-    """Return the box with the corners ``vertices`` (8, 3), which may be rotated; None if they do not form a box.
+    """Return the box with the corners ``vertices`` (8, 3); None if they do not form a box.
 
     The axes are ordered so that the rotation is as small as possible. An axis-aligned box has no rotation.
     """
@@ -133,7 +133,11 @@ def _box_of(corners: bytes) -> Box | None:
 
 
 def _edges(vectors: Array) -> Array | None:
-    """Return the three edges (3, 3) of a box at one corner, from the vectors (7, 3) to its other corners, or None."""
+    """Return the three edges (3, 3) at a corner of a box, or None.
+
+    Args:
+        vectors: (7, 3) vectors from this corner to all other corners, m.
+    """
     found: list[Array] = []
     for way in vectors[np.argsort(np.linalg.norm(vectors, axis=1), kind="stable")]:
         if all(abs(way @ edge) <= _BOX_TOLERANCE * np.linalg.norm(way) for edge in found):
@@ -182,7 +186,10 @@ def sample_surface(hulls: Sequence[Hull], spacing: float) -> Array:
 
 
 def sample_triangles(corners: Array, spacing: float) -> Array:
-    """Return grid points (P, 3) on triangles (F, 3, 3), at most ``spacing`` m apart, including edges and corners."""
+    """Return a grid of points (P, 3), at most ``spacing`` m apart, on triangles (F, 3, 3).
+
+    The points include corners and points on edges.
+    """
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
     longest = np.argmax(lengths, axis=1)
     rows = np.arange(len(corners))

@@ -14,7 +14,10 @@ Array = NDArray[np.float64]
 
 
 def joint_motion(joint: Joint, position: float) -> Array:
-    """Return the motion (4, 4) of a link, furniture frame, from joint position 0 to ``position`` in m or rad."""
+    """Return the motion (4, 4) of a link from joint position 0 to ``position`` (m or rad).
+
+    The motion is in the frame of the furniture.
+    """
     motion = np.eye(4)
     if joint.kind == "prismatic":
         motion[:3, 3] = np.multiply(joint.axis, position)

@@ -65,7 +65,10 @@ class BodyFiles:
         return [hull.vertices for hull in self.hull_meshes]
 
     def surface_points(self, spacing: float = 0.005) -> Array:
-        """Return points (P, 3) on the surface of all convex hulls, about ``spacing`` m apart, in the asset's frame."""
+        """Return points (P, 3) on the surface of all convex hulls, about ``spacing`` m apart.
+
+        The points are in the asset's frame, m.
+        """
         if spacing not in self._points:
             points = sample_surface(self.hull_meshes, spacing)
             points.setflags(write=False)
@@ -86,7 +89,9 @@ class LoadedObject(BodyFiles):
 
 @dataclass(frozen=True)
 class LoadedFurniture(BodyFiles):
-    """Furniture, a basket or a room, with its manifest entry. The files in its folder are those of the fixed body.
+    """Furniture, a basket or a room, with its manifest entry.
+
+    The files in its folder are those of the fixed body.
 
     Attributes:
         links: files of each moving part by name; the meshes are in the furniture's frame when all joints are at 0.
@@ -169,9 +174,12 @@ def load_pack(name_or_path: str | Path) -> Pack:
 
 
 def verify_pack(pack: Pack) -> None:
-    """Compare the sha256 of each file of a pack with the manifest; raise AssetError for the first difference.
+    """Compare the sha256 of each file of a pack with the manifest.
 
     Each process reads a file only once, unless its size or modification time changes.
+
+    Raises:
+        AssetError: a file differs, is missing, or has no entry in the manifest.
     """
     for asset in pack.manifest.assets:
         folder = pack.root / asset.id
@@ -208,7 +216,10 @@ def sha256(path: Path) -> str:
 
 
 def _iter_files(folder: str, prefix: str = "") -> Iterator[str]:
-    """Yield relative paths of the files in a folder, except hidden files, which systems and editors create."""
+    """Yield the relative paths of the files in a folder.
+
+    Hidden files, which systems and editors create, are left out.
+    """
     if not os.path.isdir(folder):
         return
     with os.scandir(folder) as entries:

@@ -112,7 +112,12 @@ def add_static_body(scene: sapien.Scene, hulls: Sequence[Array], pose: Array, fr
 
 
 def add_ground(scene: sapien.Scene, origin: Array) -> None:
-    """Add a static square of 2 x 2 m to a scene; ``origin`` (3,) is the centre of its upper side in the world, m."""
+    """Add a static ground of 2 x 2 m to a scene.
+
+    Args:
+        scene: the scene.
+        origin: (3,) centre of the upper side in the world, m.
+    """
     material = physx.PhysxMaterial(TABLE_FRICTION, TABLE_FRICTION, 0.0)
     ground = physx.PhysxRigidStaticComponent()
     ground.attach(physx.PhysxCollisionShapeBox([1.0, 1.0, 0.05], material))
@@ -133,7 +138,10 @@ def make_shape(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCol
 
 
 def make_convex_shape(vertices: Array, material: physx.PhysxMaterial) -> physx.PhysxCollisionShapeConvexMesh:
-    """Create PhysX's convex mesh of points (V, 3). It may be smaller than their convex hull (`cooked_hulls`)."""
+    """Create PhysX's convex mesh of points (V, 3).
+
+    It may be smaller than their convex hull (`cooked_hulls`).
+    """
     return physx.PhysxCollisionShapeConvexMesh(
         vertices=np.asarray(vertices, np.float32), scale=[1, 1, 1], material=material
     )

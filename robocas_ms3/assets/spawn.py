@@ -27,7 +27,9 @@ def spawn(
     finishes: Mapping[str, str] | None = None,
     scene_idxs: Sequence[int] | None = None,
 ) -> Actor:
-    """Build an asset without moving parts as an actor. The actor is dynamic if the asset has a mass, otherwise static.
+    """Build an asset without moving parts as an actor.
+
+    The actor is dynamic if the asset has a mass, otherwise static.
 
     Args:
         scene: the ManiSkill scene.

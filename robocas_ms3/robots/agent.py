@@ -217,7 +217,10 @@ class MobileManipulator(BaseAgent):
         self.robot.set_joint_drive_velocity_targets(torch.zeros(1, len(joints), device=self.device), joints)
 
     def get_proprioception(self) -> dict[str, Any]:
-        """Return ``obs["agent"]``: each observed quantity (N, D) by name, and ``controller`` if it has a state."""
+        """Return ``obs["agent"]``: each observed quantity (N, D) by name, and ``controller``.
+
+        The key ``controller`` is missing if the controller has no state.
+        """
         obs: dict[str, Any] = {quantity.name: quantity.observe(self) for quantity in QUANTITIES if quantity.observe}
         state = self.controller.get_state()
         if state:

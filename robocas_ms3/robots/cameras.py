@@ -79,7 +79,10 @@ EE_CAMERA = next(camera.name for camera in STANDARD_CAMERAS if camera.mount == "
 
 
 def standard_camera_parent(camera: str) -> Parent:
-    """Return the frame in which datasets store the pose of a camera: that of a standard camera, else ``world``."""
+    """Return the frame in which datasets store the pose of a camera of this name.
+
+    The result is ``world`` for all cameras that are not standard cameras.
+    """
     for spec in STANDARD_CAMERAS:
         if spec.name == camera:
             return spec.parent

@@ -19,7 +19,9 @@ _PER_JOINT_FIELDS = ("joints", "limits")
 
 @dataclass(frozen=True)
 class Envelope:
-    """Space that a robot occupies at the start of an episode, and its reach, for checks of scenes without a simulator.
+    """Space that a robot occupies at the start of an episode, and its reach.
+
+    Scenes are checked against this description without a simulator.
 
     Attributes:
         body_boxes: boxes around base and lowest arm link, with a margin: half sizes in x and y, height above the

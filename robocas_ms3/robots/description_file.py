@@ -77,7 +77,10 @@ class RobotXml:
         return element.attrib[key]
 
     def read_numbers(self, element: Element, key: str, count: int, default: str | None = None) -> list[float]:
-        """Return the ``count`` finite numbers of the attribute ``key``; of the text ``default`` if it is missing."""
+        """Return the ``count`` finite numbers of the attribute ``key`` of an element.
+
+        If the attribute is missing, ``default`` is used as its text.
+        """
         text = self.read_attribute(element, key) if default is None else element.attrib.get(key, default)
         try:
             numbers = [float(word) for word in text.split()]
@@ -89,7 +92,7 @@ class RobotXml:
         return numbers
 
     def read_origin(self, element: Element) -> Array:
-        """Return the pose (4, 4) in the child element ``<origin>`` of an element; the identity without this child."""
+        """Return the pose (4, 4) in the child ``<origin>`` of an element; the identity without it."""
         pose, origin = np.eye(4), element.find("origin")
         if origin is not None:
             pose[:3, :3] = Rotation.from_euler("xyz", self.read_numbers(origin, "rpy", 3, "0 0 0")).as_matrix()
@@ -101,7 +104,7 @@ class RobotXml:
         return [self._joint(element) for element in self.root.iterfind("joint")]
 
     def joints_between(self, root: str, tip: str) -> list[Joint]:
-        """Return the joints on the way from link ``root`` to link ``tip``, in this order, with fixed joints."""
+        """Return the joints from link ``root`` to link ``tip``, in this order, with fixed joints."""
         by_child, found, link = {joint.child: joint for joint in self.joints()}, [], tip
         while link != root:
             if link not in by_child:
@@ -183,5 +186,5 @@ def chain_poses(urdf: Path, root: str, tip: str, positions: Array) -> Array:
 
 @lru_cache(maxsize=8)
 def read_joints(urdf: Path, root: str, tip: str) -> tuple[Joint, ...]:
-    """Read the joints on the way from link ``root`` to link ``tip`` of a URDF, in this order, with fixed joints."""
+    """Read the joints of a URDF from link ``root`` to link ``tip``, in this order, with fixed joints."""
     return tuple(RobotXml(urdf).joints_between(root, tip))

@@ -30,7 +30,7 @@ class BatchedDrives(PDJointPosController):
 
 
 class DirectDrives(BatchedDrives):
-    """Controller that writes drive targets to SAPIEN joints on a CPU, and works on native arrays (`core.arrays`).
+    """Controller that works on native arrays (`core.arrays`), and on a CPU on SAPIEN joints.
 
     ManiSkill's joint wrappers would take longer than the physics.
     """

@@ -82,7 +82,7 @@ class _ArmChainController(PDEEPoseController):
         self._lower, self._upper = limits[:, 0], limits[:, 1]
 
     def _solve(self, target: Any, qpos: Any) -> tuple[Any, Any]:
-        """Solve inverse kinematics for target poses (N, 7), starting from joint positions ``qpos`` (N, joints).
+        """Solve inverse kinematics for target poses (N, 7), starting from ``qpos`` (N, joints).
 
         Returns:
             Joint positions (N, joints), and for each env (N,) whether they reach the target.
@@ -95,7 +95,9 @@ class _ArmChainController(PDEEPoseController):
 
 
 class RoboCASEEPoseController(InterpolatedDrives, _ArmChainController):
-    """End-effector controller: deltas in the end effector's frame, or absolute poses in the arm's base frame.
+    """End-effector controller with deltas or absolute poses.
+
+    Deltas are in the end effector's frame, absolute poses in the arm's base frame.
 
     Differences from ManiSkill's controller:
 

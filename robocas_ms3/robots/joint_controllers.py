@@ -38,7 +38,10 @@ class JointDeltaControllerConfig(PDJointPosControllerConfig):
 
 
 class FingersController(DirectDrives, PDJointPosMimicController):
-    """Gripper controller that sends one absolute position to all fingers; faster than ManiSkill's mimic controller."""
+    """Gripper controller that sends one absolute position to all fingers.
+
+    It is faster than ManiSkill's mimic controller.
+    """
 
     def set_action(self, action: Any) -> None:
         """Set the target position (N, 1) of all fingers."""
@@ -55,7 +58,9 @@ class FingersControllerConfig(PDJointPosMimicControllerConfig):
 
 
 class SmoothJointPosController(InterpolatedDrives):
-    """Joint position controller that interpolates drive targets. Actions are positions, or deltas of the last target.
+    """Joint position controller that interpolates drive targets.
+
+    Actions are positions, or deltas of the last target.
 
     Without interpolation, targets at 5 Hz would start and stop the arm in every step at twice the planned velocity.
     ManiSkill's ``interpolate`` starts from the current position instead of the last target, which causes more jerk.
@@ -109,7 +114,10 @@ class HoldJointsController(DirectDrives):
             self.set_drive_targets(held)
 
     def set_action(self, action: Any) -> None:
-        """Keep the drive targets. If the simulation state was set since the last step, hold the current positions."""
+        """Keep the drive targets.
+
+        If the simulation state was set since the last step, hold the current positions.
+        """
         assert self._target_qpos is not None, "the controller has not been reset"
         now, held = self._current_qpos(), to_native(self._target_qpos)
         self._target_qpos = as_tensor(where(abs(held - now) > BASE_RESET_DISTANCE, now, held))

@@ -108,7 +108,10 @@ class SerialChain:
             iteration += 1
 
     def _frames(self, qpos: Array) -> Array:
-        """Return pose and left product matrix of the quaternion for each joint and the tip, (n + 1, 2, N, 4, 4)."""
+        """Return two matrices for each joint and the tip, (n + 1, 2, N, 4, 4).
+
+        The first is the pose, the second the left product matrix of the orientation's quaternion.
+        """
         rows, count = len(qpos), qpos.shape[1] + 1
         angles = qpos @ self._angles + self._shift
         sines = torch.sin(angles) if isinstance(angles, Tensor) else np.sin(angles)
@@ -162,7 +165,10 @@ _QUOTIENT = (left_product_matrix(np.eye(4)) @ np.diag([1, -1, -1, -1])).reshape(
 
 
 def _transposed_jacobian(frames: Array) -> Array:
-    """Return the transposed Jacobian (N, n, 6): translation (m) and rotation (rad) of the tip per rad of each joint."""
+    """Return the transposed Jacobian (N, n, 6) of the tip.
+
+    Row i has translation (m) and rotation (rad) of the tip per rad of joint i.
+    """
     poses = frames[:, 0, :, :3]
     axes, points = poses[:-1, ..., 2], poses[..., 3]
     return concatenate([_cross(axes, points[-1:] - points[:-1]), axes]).swapaxes(0, 1)

@@ -172,7 +172,10 @@ def _adapt_finger_tips(panda: Element, extension: float) -> dict[str, tuple[tupl
 
 
 def _add_mobile_base(panda: Element) -> Element:
-    """Add the mobile base below the arm: root link, three base joints, base link, fixed joint to the arm's base."""
+    """Add the mobile base below the arm.
+
+    It has a root link, three joints, the base link, and a fixed joint to the arm's base.
+    """
     robot = Element("robot", name=c.uid)
     # reduced-coordinate solvers become unstable for mass ratios over a few hundred along a chain
     for link in ("root", "base_x_link", "base_y_link"):

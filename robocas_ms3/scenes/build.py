@@ -63,7 +63,9 @@ def _build_room(scene: ManiSkillScene, model: SceneModel, level: VisualLevel, se
 
 
 def build_lights(scene: ManiSkillScene, config: TaskConfig, seeds: Sequence[int], *, shadow: bool) -> None:
-    """Add lights to all sub-scenes. The seed of a sub-scene decides the intensity and direction of its lights.
+    """Add lights to all sub-scenes.
+
+    The seed of a sub-scene decides the intensity and direction of its lights.
 
     Args:
         scene: the ManiSkill scene.

@@ -71,7 +71,11 @@ def make_layout_source(model: SceneModel, layouts: str | Path | LayoutSource | N
 
 
 def layout_caches_folder(root: str | Path = "auto") -> Path:
-    """Return the folder of all layout caches: ``root``, or for ``auto`` ``layouts`` in the cache folder of the user."""
+    """Return the folder of all layout caches.
+
+    Args:
+        root: the folder; ``auto``: ``layouts`` in the cache folder of the user.
+    """
     return cache_dir() / "layouts" if root == "auto" else Path(root)
 
 
@@ -150,7 +154,10 @@ class LayoutCache:
         self.folder = layout_caches_folder(root) / f"{model.config.task}-{key}"
 
     def load_table(self, engine: Engine) -> LayoutTable | None:
-        """Load the layout table of an engine, mapped into memory. Return None if the file is missing or damaged."""
+        """Load the layout table of an engine, mapped into memory.
+
+        Return None if the file is missing or damaged.
+        """
         path = self.table_path(engine)
         if not path.is_file():
             return None
@@ -197,7 +204,9 @@ class LayoutCache:
         return self.folder / f"{seed // _FOLDER_SIZE:07d}" / f"{name}.npz"
 
     def get(self, objects_seed: int, seed: int) -> Layout:
-        """Return the layout of an objects seed and a seed, from its file if it exists; otherwise sample and store it.
+        """Return the layout of an objects seed and a seed.
+
+        If the layout has no file yet, sample and store it.
 
         Raises:
             LayoutError: the seeds have no layout; this result is not stored.
@@ -264,7 +273,7 @@ def _describe_crash(pair: SeedPair, why: str) -> tuple[SeedPair, str]:
 
 
 def seed_pairs(seeds: Iterable[int], objects: Iterable[int] | None = None) -> list[SeedPair]:
-    """Return the pairs (objects seed, seed) of the layouts that a vector environment or a single env needs.
+    """Return the pairs (objects seed, seed) of the layouts that environments need.
 
     Args:
         seeds: seeds of the layouts.

@@ -163,7 +163,10 @@ def _check_arm(points: Array, others: list[CollisionBody]) -> None:
 
 
 def _shoulder_positions(config: TaskConfig, robot_pose: Array, robot: RobotDescription, envelope: Envelope) -> Array:
-    """Return the possible positions (P, 3) of the arm's shoulder in the world, m: a grid if the base may drive."""
+    """Return the possible positions (P, 3) of the arm's shoulder in the world, m.
+
+    If the base may drive, the positions are a grid over the limits of the base; otherwise there is one position.
+    """
     ranges = robot.base_limits[:2] if config.base_motion else ((0.0, 0.0),) * 2
     spans = [np.arange(low, high + _STEP, _STEP) for low, high in ranges]
     x, y = (grid.ravel() for grid in np.meshgrid(*spans))
@@ -211,6 +214,12 @@ def _check_distance(distance: float, limit: float, what: str, fix: str) -> None:
 
 
 def _distance_to_box(points: Array, frame: Array, low: Array, high: Array) -> float:
-    """Return the least distance in m between points (P, 3) in the world and the box ``low`` to ``high`` in a frame."""
+    """Return the least distance in m between points (P, 3) in the world and a box.
+
+    Args:
+        points: (P, 3) in the world, m.
+        frame: (4, 4) pose of the box's frame in the world.
+        low, high: (3,) corners of the box in its frame, m.
+    """
     local = transform_points(np.asarray(np.linalg.inv(frame), dtype=np.float64), points)
     return float(np.linalg.norm(local - np.clip(local, low, high), axis=1).min())

@@ -62,7 +62,9 @@ def grasp_direction_tests(
 
 
 def is_gripper_clear(tcp_in_world: Array, points_in_world: Array, side_clearance: float = 0.0) -> NDArray[np.bool_]:
-    """Return for each grasp (G,) whether the open gripper touches no point on its way from pre-grasp to grasp.
+    """Return for each grasp (G,) whether the open gripper reaches it without touching a point.
+
+    The gripper moves on a straight line from the pre-grasp to the grasp.
 
     Args:
         tcp_in_world: (G, 4, 4) TCP poses of the grasps.
@@ -91,7 +93,7 @@ def is_gripper_clear(tcp_in_world: Array, points_in_world: Array, side_clearance
 
 
 def _bounds_around(tcp_in_world: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return bounds (G, 3) in the world of a box in each TCP frame, together with its mirror image about y = 0."""
+    """Return bounds (G, 3) in the world of a box in each TCP frame and its mirror image at y = 0."""
     low = np.array([low[0], -high[1], low[2]])
     rotations = tcp_in_world[:, :3, :3]
     centers = rotations @ ((low + high) / 2) + tcp_in_world[:, :3, 3]
@@ -100,7 +102,10 @@ def _bounds_around(tcp_in_world: Array, low: Array, high: Array) -> tuple[Array,
 
 
 def _any_inside(tcp: Array, points: Array, low: Array, high: Array) -> NDArray[np.bool_]:
-    """Return for each TCP (G,) whether any point (P, 3) is inside one of B boxes or its mirror image about y = 0."""
+    """Return for each TCP (G,) whether any point (P, 3) is inside one of B boxes in its frame.
+
+    Each box has a mirror image at y = 0, which counts, too.
+    """
     x, y, z = to_tcp_frames(tcp, points)
     y = np.abs(y)
     inside = np.zeros(len(tcp), dtype=bool)
@@ -126,7 +131,7 @@ def has_free_grasps(
     *,
     min_count: int,
 ) -> bool:
-    """Return whether at least ``min_count`` grasps of an object have an allowed direction and are collision-free.
+    """Return whether an object has ``min_count`` collision-free grasps with an allowed direction.
 
     Args:
         asset: the object.
@@ -155,7 +160,10 @@ def has_free_grasps(
 
 
 def _swept_bounds(tcp_in_world: Array) -> tuple[Array, Array]:
-    """Return bounds, two arrays (3,), of the volume that the open gripper sweeps on its way to G grasps (G, 4, 4)."""
+    """Return bounds of the volume that the open gripper sweeps on its way to G grasps.
+
+    The result is the least and the greatest corner, (3,) each, in the world, m.
+    """
     high = GRIPPER_BOXES[:, 1].max(axis=0) + (SIDE_CLEARANCE, SIDE_CLEARANCE, 0)
     low = np.array([-high[0], -high[1], GRIPPER_BOXES[:, 0, 2].min() - PREGRASP_DISTANCE])
     corners = np.array(list(itertools.product(*zip(low, high, strict=True))))

@@ -50,7 +50,9 @@ def drop_heap(
     *,
     headroom: float = np.inf,
 ) -> Array:
-    """Make a heap: drop objects into a frictionless bucket on a plane, then remove the bucket (docs/layouts.md).
+    """Make a heap: drop objects into a bucket without friction, then remove the bucket.
+
+    docs/layouts.md describes the parameters.
 
     During the drop, the collision shape of each object is one convex hull. Then each object gets all of its hulls, and
     the heap spreads, first within a fence around the region, which stops rolling objects, then without the fence.
@@ -133,7 +135,10 @@ def _spread_heap(assets: Sequence[LoadedObject], poses: Array, region: Region) -
 
 
 def outline_points(asset: LoadedObject) -> Array:
-    """Return at most 64 hull vertices (V, 3) of an object, m, whose convex hull approximates that of the object."""
+    """Return at most 64 vertices (V, 3) of an object's hulls, m.
+
+    Their convex hull approximates the convex hull of the object.
+    """
     points = np.concatenate(asset.hulls)
     return points[np.unique(np.argmax(points @ _DIRECTIONS.T, axis=0))]
 

@@ -26,7 +26,9 @@ PARKING_HEIGHT = -5.0  # z in m of the plane on which the objects of unused slot
 
 @dataclass(frozen=True)
 class Layout:
-    """Poses of objects, robot and basket at the start of an episode, and the target. K object slots; world frame, m.
+    """Poses of objects, robot and basket at the start of an episode, and the target.
+
+    K object slots; world frame, m.
 
     Attributes:
         object_ids: K ids of the object pack, one per slot.
@@ -56,7 +58,11 @@ class Layout:
             object.__setattr__(self, "visible_fractions", np.full(len(self.object_ids), np.nan))
 
     def check(self, names: Collection[str]) -> None:
-        """Raise ValueError if shapes or poses are invalid, or an object is not in ``names``, the ids of a pack."""
+        """Raise ValueError if the layout is invalid.
+
+        Args:
+            names: ids of all objects in the object pack.
+        """
         count = len(self.object_ids)
         shapes = self.object_poses.shape, self.present.shape, self.visible_fractions.shape
         if shapes != ((count, 4, 4), (count,), (count,)):

@@ -82,7 +82,10 @@ class LayoutTable:
         return LayoutStatus(int(self.find_records(np.array([pair[0]]), np.array([pair[1]]))[0][0]))
 
     def find_pairs(self, *statuses: LayoutStatus) -> list[SeedPair]:
-        """Return the seed pairs whose layouts have one of the statuses; without arguments, those of all layouts."""
+        """Return the seed pairs whose layouts have one of the statuses.
+
+        Without arguments, return the seed pairs of all layouts.
+        """
         rows, columns = np.nonzero(np.isin(self._statuses, statuses) if statuses else self._statuses)
         return [*zip(self._sets[rows].tolist(), self._seeds[columns].tolist(), strict=True)]
 
@@ -127,7 +130,10 @@ def write_table(
 
 
 def write_statuses(path: Path, names: Sequence[str], statuses: Mapping[SeedPair, LayoutStatus]) -> None:
-    """Change the statuses of seed pairs in a table file. A pair without a layout stays `LayoutStatus.MISSING`."""
+    """Change the statuses of seed pairs in a table file.
+
+    A pair without a layout stays `LayoutStatus.MISSING`.
+    """
     table = LayoutTable(path, names)
     rows = np.array(table.rows)
     for pair, state in statuses.items():

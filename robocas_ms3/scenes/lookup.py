@@ -25,7 +25,10 @@ def fixture_pose(config: PoseConfig) -> Array:
 
 
 def furniture_pose(config: AssetPlacementConfig, furniture: LoadedFurniture) -> Array:
-    """Return the pose (4, 4) of a furniture's frame in the world; the configuration has that of its lowest point."""
+    """Return the pose (4, 4) of a furniture's frame in the world.
+
+    The configuration has the pose of the lowest point instead.
+    """
     pose = fixture_pose(config.pose)
     pose[2, 3] += furniture.asset.origin_height
     return pose
@@ -168,7 +171,10 @@ def find_region(config: SurfaceConfig, furniture: LoadedFurniture) -> Region:
 
 
 def check_joints(config: TaskConfig, furniture: dict[str, LoadedFurniture]) -> None:
-    """Check that joint positions are within limits, and that the part to open starts closed and can be opened."""
+    """Check the joint positions of the furniture, and that the part to open can be opened.
+
+    Positions must be within the limits of the joints, and the part to open must start closed.
+    """
     for name, item in config.furniture.items():
         known = {link.joint.name: link.joint.limits for link in furniture[name].asset.links}
         for joint, position in item.joints.items():

@@ -133,7 +133,9 @@ class SceneModel:
         return opening.opened_at * max(joint.limits, key=abs)
 
     def joint_positions(self, name: str, *, opened: bool) -> dict[str, float]:
-        """Return the joint positions of a piece of furniture, m or rad, by joint name; all other joints are at 0.
+        """Return joint name -> position, m or rad, of a piece of furniture.
+
+        Joints that are not in the result are at 0.
 
         Args:
             name: name of the furniture in the configuration.
@@ -146,7 +148,9 @@ class SceneModel:
         return positions
 
     def support_motion(self, *, opened: bool) -> Array:
-        """Return the motion (4, 4) of the objects' surface from its pose with closed joints, in the furniture's frame.
+        """Return the motion (4, 4) of the objects' surface from its pose with closed joints.
+
+        The motion is in the frame of the furniture.
 
         Args:
             opened: whether the door or drawer of the task is open; false: positions at the start of an episode.
@@ -190,7 +194,7 @@ class SceneModel:
 
     @property
     def front_direction(self) -> Array:
-        """Direction (2,) in which columns of objects face: the axis of the furniture's frame nearest to the robot."""
+        """Direction (2,) of columns of objects: the axis of the furniture's frame towards the robot."""
         middle = np.add(self.region.min_xy, self.region.max_xy) / 2
         to_robot = (np.linalg.inv(self.support_pose) @ self.robot_pose)[:2, 3] - middle
         axis = int(np.argmax(np.abs(to_robot)))

@@ -106,7 +106,10 @@ def sample_scattered(
 
 
 def _find_tightest(outlines: NDArray, placed: list[shapely.Polygon], region: Region) -> int:
-    """Return the index of the outline with the least sum of distances to the two nearest objects or region edges."""
+    """Return the index of the outline with the least free space around it.
+
+    Free space is the sum of the distances to the two nearest objects or edges of the region.
+    """
     low, high = shapely.bounds(outlines)[:, :2], shapely.bounds(outlines)[:, 2:]
     gaps = [low - region.min_xy, np.subtract(region.max_xy, high)]
     if placed:
@@ -198,7 +201,10 @@ def sample_orderly(
 
 
 def _assign_columns(placeables: list[PlaceableObject], rows: int) -> list[tuple[str, int]]:
-    """Return the column (kind, index within the kind) of each object; a column has at most ``rows`` objects."""
+    """Return the column (kind, index within the kind) of each object.
+
+    A column has at most ``rows`` objects.
+    """
     seen: Counter[str] = Counter()
     columns = []
     for placeable in placeables:

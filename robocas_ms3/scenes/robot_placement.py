@@ -80,7 +80,7 @@ def _draw_valid_pose(
 
 
 def _draw_pose_near(pose: Array, limits: PoseRandomisation, rng: np.random.Generator) -> Array:
-    """Draw a pose (4, 4) near ``pose``, with random shifts in x and y and a random turn about the vertical axis."""
+    """Draw a pose (4, 4) with random shifts in x and y and a random yaw relative to ``pose``."""
     shift, yaw = (
         rng.uniform(-limits.position, limits.position, 2),
         np.deg2rad(rng.uniform(-limits.yaw_deg, limits.yaw_deg)),

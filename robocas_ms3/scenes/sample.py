@@ -136,7 +136,9 @@ def sample_layout(model: SceneModel, objects_seed: int, seed: int, object_ids: O
 def overlaps_basket(
     assets: list[LoadedObject], poses: Array, basket: LoadedFurniture | None, basket_pose: Array | None
 ) -> bool:
-    """Return whether the bounding box of any object overlaps the bounding box of the basket, in the basket's frame.
+    """Return whether the bounding box of any object overlaps the bounding box of the basket.
+
+    Bounding boxes are aligned with the axes of the basket.
 
     Args:
         assets: K objects.
@@ -193,7 +195,9 @@ def _draw_kinds_that_fit(rng: np.random.Generator, model: SceneModel, ids: list[
 
 
 def _find_usable_ids(model: SceneModel, ids: list[str], *, columns: bool = False) -> list[str]:
-    """Return the ids of objects that are low enough for the surface; with ``columns``, only those that can stand.
+    """Return the ids of the objects that are low enough for the surface.
+
+    With ``columns``, return only ids of objects with a display pose.
 
     If no object has a display pose, ``columns`` has no effect.
     """
@@ -222,7 +226,7 @@ def _warn_excluded(ids: tuple[str, ...]) -> None:
 
 
 def make_placeable(asset: LoadedObject, headroom: float = np.inf) -> PlaceableObject:
-    """Return an object for placement, with only those resting poses in which it is lower than ``headroom``, m."""
+    """Return an object with only those resting poses in which it is lower than ``headroom``, m."""
     notes = asset.annotations
     low = np.arange(len(notes.resting_poses))
     if np.isfinite(headroom):
@@ -240,7 +244,7 @@ def make_placeable(asset: LoadedObject, headroom: float = np.inf) -> PlaceableOb
 def _draw_poses(
     rng: np.random.Generator, model: SceneModel, assets: list[LoadedObject]
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Draw the poses (K, 4, 4) of objects in the furniture's frame, and (K,) whether there is room for each."""
+    """Draw poses (K, 4, 4) of objects in the furniture's frame, and (K,) whether each fits."""
     layout, region, everything = model.config.layout, model.region, np.ones(len(assets), dtype=bool)
     if isinstance(layout, StackedLayout):
         return drop_heap(rng, assets, region, layout, headroom=model.headroom), everything

@@ -31,7 +31,7 @@ MAX_LINEAR, MAX_ANGULAR = 0.01, 0.1  # m/s and rad/s, of an object at rest
 def settle(
     assets: Sequence[LoadedObject], poses: Array, model: SceneModel, basket_pose: Array | None, *, heap: bool = False
 ) -> tuple[Array, bool]:
-    """Simulate objects until they settle among furniture and basket, then check that the settled poses are stable.
+    """Let objects settle among furniture and basket, then check that the settled poses are stable.
 
     Each check builds a new scene, as a reset does. The reason: without contacts from an earlier step, PhysX may push a
     narrow object over. If objects move in a check, the next check starts from their new poses, since heaps creep for a
@@ -115,7 +115,10 @@ def _simulate(
 
 
 def add_furniture(scene: sapien.Scene, model: SceneModel) -> None:
-    """Add the furniture of a configuration as static bodies, with doors and drawers at their start positions."""
+    """Add the furniture of a configuration to a scene as static bodies.
+
+    Doors and drawers are at their start positions.
+    """
     for name, asset in model.furniture.items():
         frame = model.furniture_poses[name]
         add_static_body(scene, asset.hulls, frame, asset.asset.friction)

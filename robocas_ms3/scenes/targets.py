@@ -64,7 +64,7 @@ class SettledScene:
 
     @cached_property
     def opened_poses(self) -> Array:
-        """(K, 4, 4) poses of the objects after the door or drawer of the task has been opened; a drawer moves them."""
+        """(K, 4, 4) poses of the objects after the door or drawer of the task has been opened."""
         frame = self.model.support_pose
         before, after = (self.model.support_motion(opened=opened) for opened in (False, True))
         moved = frame @ after @ np.linalg.inv(frame @ before)
@@ -98,7 +98,10 @@ class SettledScene:
         return self._has_grasps(slot, others, self.model.config.target.min_free_grasps)
 
     def has_uncovered_grasps(self, slot: int) -> bool:
-        """Return whether an object would have ``target.min_uncovered_grasps`` free grasps without the other objects."""
+        """Return whether an object would have enough collision-free grasps without the other objects.
+
+        The configuration has the number, ``target.min_uncovered_grasps``.
+        """
         return self._has_grasps(slot, [], self.model.config.target.min_uncovered_grasps)
 
     def _has_grasps(self, slot: int, others: list[Array], min_count: int) -> bool:
@@ -143,7 +146,10 @@ def choose_target(rng: np.random.Generator, scene: SettledScene) -> TargetChoice
 
 
 def _choose_by_name(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
-    """Choose any object; if several objects have the same name, only the nearest of them may be the target."""
+    """Choose any object.
+
+    If several objects have the same name, only the nearest of them may be the target.
+    """
     nearest: dict[str, int] = {}
     for slot in np.argsort(np.linalg.norm(scene.xy_in_robot, axis=1), kind="stable"):
         if scene.present[slot]:
@@ -179,7 +185,9 @@ def selection_camera(model: SceneModel) -> PinholeCamera:
 
 
 def _choose_by_visibility(rng: np.random.Generator, scene: SettledScene) -> TargetChoice | None:
-    """Choose an object with a small visible fraction, with a probability proportional to 1 / distance to the robot.
+    """Choose an object with a small visible fraction.
+
+    The probability of an object is proportional to 1 / distance to the robot.
 
     RoboCAS-v0's data has this rule. An object does not qualify if furniture or basket block its grasps, even without
     the other objects. Example: a flat can that lies on its flat side.

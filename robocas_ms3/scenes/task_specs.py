@@ -14,7 +14,9 @@ STAGES = ("furniture_opened", "reached_any", "obstacles_cleared", "reached_targe
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """Specification of a task. Code is named by import path ``package.module:name``, so no simulator is imported.
+    """Specification of a task.
+
+    Code is named by import path ``package.module:name``, so no simulator is imported.
 
     Attributes:
         name: name of the task in commands, such as ``robocas generate pick``.

@@ -44,14 +44,17 @@ class PinholeCamera:
         return self.height / 2 / np.tan(self.fov_y / 2)
 
     def ray_directions(self, box: PixelBox) -> Array:
-        """Return directions (rows, columns, 3) of the rays through pixel centres, in the camera frame, with x = 1."""
+        """Return directions (rows, columns, 3) of the rays through pixel centres, camera frame, x = 1."""
         rows, columns = np.mgrid[box]
         left = (self.width / 2 - columns - 0.5) / self.focal_length
         up = (self.height / 2 - rows - 0.5) / self.focal_length
         return np.stack([np.ones(rows.shape), left, up], axis=-1)
 
     def pixel_box(self, points: Array) -> PixelBox:
-        """Return the rows and columns that contain the images of points (P, 3) in the world; empty if out of view."""
+        """Return the rows and columns of the image that contain points (P, 3) in the world.
+
+        They are empty if all points are out of view.
+        """
         local = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
         if local[:, 0].min() <= 1e-3:  # partly behind the camera: the whole image
             return slice(0, self.height), slice(0, self.width)
@@ -64,7 +67,7 @@ class PinholeCamera:
 
 
 def top_down_camera(center_xy: Array, support_z: float, *, size: int = 512) -> PinholeCamera:
-    """Return RoboCAS-v0's selection camera, which looks down from `SELECTION_CAMERA_HEIGHT` above a support.
+    """Return RoboCAS-v0's selection camera: `SELECTION_CAMERA_HEIGHT` above a support, looking down.
 
     Args:
         center_xy: (2,) point below the camera in the world, m.
@@ -85,7 +88,10 @@ def _load_mesh(path: Path, _changed_ns: int) -> trimesh.Trimesh:
 
 
 def load_visual_mesh(asset: BodyFiles, level: VisualLevel = "fast") -> trimesh.Trimesh:
-    """Load the visual mesh of an asset in the asset's frame. All callers get the same object, so do not change it."""
+    """Load the visual mesh of an asset in the asset's frame.
+
+    All callers get the same object, so do not change it.
+    """
     path = asset.visual_path(level)
     return _load_mesh(path, path.stat().st_mtime_ns)
 
@@ -102,7 +108,9 @@ class MeshScene:
         self._placed = list(zip(meshes, poses, strict=True))
 
     def visible_fractions(self, camera: PinholeCamera) -> Array:
-        """Return the visible fraction (p_vis in the paper) of each mesh (K,): visible area / whole projected area.
+        """Return the visible fraction (p_vis in the paper) of each mesh (K,).
+
+        It is the visible area of the image of the mesh / the area that it would have without the other meshes.
 
         The fraction is in [0, 1]; NaN if the mesh is out of view.
         """
@@ -129,7 +137,10 @@ class MeshScene:
 
 
 def _cast_rays(camera: PinholeCamera, mesh: trimesh.Trimesh, pose: Array) -> tuple[PixelBox, Array]:
-    """Return the pixel box that contains a mesh, and the depth (rows, columns) in it, m; infinite without a hit."""
+    """Return the pixel box of a mesh in the image, and the depth (rows, columns) in this box, m.
+
+    The depth is infinite where the mesh is not hit.
+    """
     box = camera.pixel_box(transform_points(pose, mesh.vertices))
     # rays are cast in the mesh's frame: its search tree is built once, and single precision is sufficient
     to_mesh = pose[:3, :3].T

@@ -96,7 +96,10 @@ class Composition:
         self._merge(self.values, changes, (), source, removes)
 
     def source_of(self, key: str, default: str) -> str:
-        """Return the source of a dotted key, else of its block; ``default`` if no source or several sources set it."""
+        """Return the file or option that set a dotted key, or else its block.
+
+        Return ``default`` if there is no such source, or more than one.
+        """
         names = key.split(".") if key else []
         for end in range(len(names), 0, -1):
             place = ".".join(names[:end])

@@ -89,7 +89,7 @@ def load_task_config(
 
 
 def check_no_extends(path: Path) -> None:
-    """Raise ConfigError if a configuration file of a frozen protocol has the key ``extends``, or is not readable."""
+    """Raise ConfigError if a configuration file of a frozen protocol has the key ``extends``."""
     try:
         text = read_text(path, YAML_LIMIT)
     except (OSError, DocumentError) as error:

@@ -73,7 +73,10 @@ class DistractorConfig(StrictModel):
 
 
 class RandomisationConfig(StrictModel):
-    """Properties of the scene that the seed of an episode decides. A block that is not given changes nothing."""
+    """Properties of the scene that the seed of an episode decides.
+
+    A block that is not given changes nothing.
+    """
 
     room: list[str] | None = Field(default=None, description="parts of the room (wall, floor) that get a random finish")
     finishes: dict[str, Annotated[list[str], Field(min_length=1)]] = Field(

@@ -113,7 +113,10 @@ class ScatteredLayout(StrictModel):
 
 
 class OrderlyLayout(StrictModel):
-    """Upright objects in columns that start at the front edge, one kind per column, with labels to the front."""
+    """Upright objects in columns that start at the front edge, one kind per column.
+
+    Labels face the front.
+    """
 
     kind: Literal["orderly"]
     copies: Annotated[int, Field(ge=1, le=8)] = Field(default=2, description="number of objects of each kind")

@@ -40,7 +40,9 @@ def sentence_model_source() -> str:
 
 
 class TextEmbedder:
-    """Callable that converts texts to sentence embeddings. The first call loads the model, which takes seconds.
+    """Callable that converts texts to sentence embeddings.
+
+    The first call loads the model, which takes seconds.
 
     Raises:
         MissingExtraError: the ``language`` extra is not installed.

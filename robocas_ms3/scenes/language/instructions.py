@@ -107,7 +107,7 @@ def draw_instruction(
     others: Iterable[str] = (),
     synonyms: bool = True,
 ) -> Instruction:
-    """Draw an instruction: a template of a split, and the name or a synonym for object, support and relation.
+    """Draw an instruction: a template, and the name or a synonym for object, support and relation.
 
     The splits ``train`` and ``held_out`` have no template and no synonym in common. Both may use the names themselves.
 
@@ -179,7 +179,10 @@ def part_name(link: str) -> str:
 
 
 def fits_name(word: str, name: str) -> bool:
-    """Return whether all words of ``word`` are in an object's name: 'shampoo bottle' fits 'white shampoo bottle'."""
+    """Return whether all words of ``word`` are in the name of an object.
+
+    Example: 'shampoo bottle' fits 'white shampoo bottle'.
+    """
     return set(word.lower().split()) <= set(name.lower().split())
 
 

@@ -44,7 +44,9 @@ class Templates(Synonyms):
 
     @classmethod
     def for_task(cls, spec: TaskSpec) -> Templates:
-        """Return the templates of a task: those of the `TaskSpec` if it has any, else those of ``instructions.yaml``.
+        """Return the instruction templates of a task.
+
+        They are those of the `TaskSpec` if it has any, and otherwise those of ``instructions.yaml``.
 
         Raises:
             ConfigError: a template is invalid.
@@ -67,7 +69,10 @@ class Templates(Synonyms):
 
 
 class SupportWords(Synonyms):
-    """Synonyms of a support, and whether objects are inside of it (such as a cabinet) or on it (such as a table)."""
+    """Synonyms of a support, and whether objects are inside of it.
+
+    Objects are inside of a cabinet, but on a table.
+    """
 
     inside: bool = False
 
@@ -120,7 +125,10 @@ def read_texts(path: Path, model: type[_Model]) -> _Model:
 
 
 def _check_fields(template: str, *, needed: set[str], allowed: set[str]) -> None:
-    """Raise ValueError if a field is missing, unknown or repeated. Only {it} and {on} may occur several times."""
+    """Raise ValueError if a field is missing, unknown or repeated.
+
+    Only {it} and {on} may occur several times.
+    """
     fields = [field for _, field, _, _ in Formatter().parse(template) if field is not None]
     wrong = {
         "unknown": set(fields) - allowed,
