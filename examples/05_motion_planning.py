@@ -20,7 +20,7 @@ from mani_skill.examples.motionplanning.base_motionplanner.utils import compute_
 import robocas_ms3  # noqa: F401  (registers RoboCASPick-v1)
 from robocas_ms3 import PlanningError
 from robocas_ms3.core.poses import inverse, transform_points
-from robocas_ms3.planning.grasp_choice import filter_grasps, grip_margins
+from robocas_ms3.planning.grasp_choice import compute_grip_margins, filter_grasps
 from robocas_ms3.planning.motionplanner import PandaArmMotionPlanningSolver
 from robocas_ms3.planning.protocol import AttachedBody
 from robocas_ms3.planning.scene import SPACING, PlanningScene
@@ -107,7 +107,7 @@ def ranked_grasps(env, scene, slot):
     candidates = filter_grasps(notes, object_in_world, base)
     points = transform_points(base, scene.points_in_base(exclude=slot))
     grasps_in_object = notes.grasps_tcp_in_object[candidates.index]
-    margins = grip_margins(grasps_in_object, candidates.widths, target.surface_points(SPACING))
+    margins = compute_grip_margins(grasps_in_object, candidates.widths, target.surface_points(SPACING))
     distance = np.linalg.norm(candidates.tcp_in_world[:, :3, 3] - object_in_world[:3, 3], axis=1)
     score = margins + np.exp(-distance / 0.03) - candidates.tcp_in_world[:, 2, 2]
     score[~is_gripper_clear(candidates.tcp_in_world, points)] = -np.inf

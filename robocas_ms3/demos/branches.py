@@ -114,7 +114,7 @@ def set_up_forked_process(parent: int) -> None:
     )
 
 
-def reason_not_to_fork(*, renders: bool) -> str:
+def find_reason_not_to_fork(*, renders: bool) -> str:
     """Return the reason why this process cannot be forked safely, or an empty string.
 
     ``renders`` says whether the process has an open renderer.
@@ -129,7 +129,7 @@ def reason_not_to_fork(*, renders: bool) -> str:
 
 
 @cache
-def warn_no_fork(reason: str) -> None:
+def warn_cannot_fork(reason: str) -> None:
     """Log a warning that this process cannot be forked, once per reason."""
     _log.warning(
         "cannot fork (%s): failed attempts are undone by simulating from the reset again, which is slower", reason

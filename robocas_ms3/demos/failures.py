@@ -73,7 +73,7 @@ class EpisodeResult:
     attempt_start: float = field(default_factory=time.perf_counter)
 
     @property
-    def noise_failures(self) -> int:
+    def noise_failure_count(self) -> int:
         """Number of attempts that failed only in an open-loop check with noise."""
         return sum(failure.reason.endswith(WITH_NOISE) for failure in self.failures)
 

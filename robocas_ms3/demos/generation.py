@@ -119,7 +119,7 @@ def generate(
         on_start(min(settings.episodes, sum(result.success for result in run.earlier.values())))
         results, successes = [], 0
         try:
-            with closing(_results(settings, run, make_roll_in)) as found:
+            with closing(_iterate_results(settings, run, make_roll_in)) as found:
                 while successes < settings.episodes:
                     result = next(found)
                     if result.seed not in run.earlier:
@@ -143,7 +143,7 @@ def generate(
         return run.finish(results)
 
 
-def _results(
+def _iterate_results(
     settings: GenerateSettings, run: _Run, make_roll_in: Callable[[], Worker[int, Intervention]] | None
 ) -> Generator[EpisodeResult, None, None]:
     missing = (seed for seed in count(settings.seed) if seed not in run.earlier)
@@ -171,11 +171,11 @@ def generate_seeds(
         tasks: Iterator[int | Intervention] = seeds
         if make_roll_in is not None:
             make_roll_in_worker = partial(_make_roll_in_worker, make_roll_in, settings.jobs)
-            on_crash = partial(_crashed_roll_in, settings.episode.after_policy)
+            on_crash = partial(_make_crashed_roll_in, settings.episode.after_policy)
             roll_ins = WorkerPool(make_roll_in_worker, settings.jobs, limits=limits, on_crash=on_crash)
             tasks = stack.enter_context(closing(stack.enter_context(roll_ins).map(seeds)))
         make_worker = partial(_EpisodeWorker, settings, folder)
-        pool = WorkerPool(make_worker, settings.jobs, limits=limits, on_crash=_crashed_episode)
+        pool = WorkerPool(make_worker, settings.jobs, limits=limits, on_crash=_make_crashed_episode)
         yield from stack.enter_context(pool).map(tasks)
 
 
@@ -201,11 +201,11 @@ def _make_roll_in_worker(make_roll_in: Callable[[], Worker[int, Intervention]], 
     return make_roll_in()
 
 
-def _crashed_roll_in(policy: str, seed: int, reason: str) -> Intervention:
+def _make_crashed_roll_in(policy: str, seed: int, reason: str) -> Intervention:
     return Intervention(seed, policy, 0, {}, 1.0, reason)
 
 
-def _crashed_episode(task: int | Intervention, reason: str) -> EpisodeResult:
+def _make_crashed_episode(task: int | Intervention, reason: str) -> EpisodeResult:
     seed = task if isinstance(task, int) else task.seed
     return EpisodeResult(seed, success=False, attempts=1, failures=[FailedAttempt(seed, 0, "worker", reason, 0.0)])
 
@@ -245,7 +245,7 @@ class _Run:
         for path in sorted(self.episodes_folder.glob("seed_*.h5")):
             try:
                 open_trajectory(path).close()
-                self.earlier |= self._read(path)
+                self.earlier |= self._read_results(path)
             except RobocasError:
                 path.unlink()
         self.earlier |= self._read_merged()
@@ -257,7 +257,7 @@ class _Run:
         if [line.record for line in self.failures.read_lines()] != lines:
             self.failures.rewrite(lines)
 
-    def _read(self, path: Path) -> dict[int, EpisodeResult]:
+    def _read_results(self, path: Path) -> dict[int, EpisodeResult]:
         results = {}
         for episode in read_json(path)["episodes"]:
             try:
@@ -284,7 +284,7 @@ class _Run:
             stored = [episode for episode in data["episodes"] if f"traj_{episode['episode_id']}" in file]
         if len(stored) < len(data["episodes"]):  # a merge was killed between its two files
             write_json(path.with_suffix(".json"), {**data, "episodes": stored})
-        return self._read(path)
+        return self._read_results(path)
 
     def finish(self, results: list[EpisodeResult]) -> Summary:
         merged = self._read_merged()

@@ -14,7 +14,7 @@ import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.core.errors import LayoutError, PlanningError, UnrecoverableError
 from robocas_ms3.core.extensions import import_object
 from robocas_ms3.demos.backtracking import ResimulatedDecisions
-from robocas_ms3.demos.branches import ForkedDecisions, reason_not_to_fork, warn_no_fork
+from robocas_ms3.demos.branches import ForkedDecisions, find_reason_not_to_fork, warn_cannot_fork
 from robocas_ms3.demos.failures import EpisodeResult, Intervention
 from robocas_ms3.demos.interventions import intervene
 from robocas_ms3.demos.open_loop import OpenLoopChecks, OpenLoopEnv
@@ -79,9 +79,9 @@ class EpisodeGenerator:
             self.open_loop_envs = [OpenLoopEnv(env, settings.check_rate) for _ in range(1 + settings.check_trials)]
             self.open_loop_checks = OpenLoopChecks(self.open_loop_envs, settings)
         self._fork = fork and not settings.keep_recoveries
-        reason = reason_not_to_fork(renders=base_env.scene.can_render())
+        reason = find_reason_not_to_fork(renders=base_env.scene.can_render())
         if self._fork and reason:
-            warn_no_fork(reason)
+            warn_cannot_fork(reason)
             self._fork = False
 
     def generate(self, seed: int, folder: Path, name: str, intervention: Intervention | None = None) -> EpisodeResult:
@@ -104,7 +104,7 @@ class EpisodeGenerator:
             if intervention is not None and intervention.skip_reason:
                 raise UnrecoverableError("intervention", intervention.skip_reason)
             if self.settings.keep_recoveries:
-                attempts.run_in_one_motion()
+                attempts.run_in_one_recording()
             else:
                 attempts.run_from_resets(ForkedDecisions(result) if self._fork else ResimulatedDecisions(result))
         except LayoutError as error:
@@ -135,13 +135,13 @@ class _Attempts:
 
             def attempt(number: int = number) -> None:
                 self._reset()
-                self._run_policy(self._arm(decisions, number))
+                self._run_policy(self._make_arm(decisions, number))
                 self._finish([])
 
             if decisions.run(attempt):
                 return
 
-    def run_in_one_motion(self) -> None:
+    def run_in_one_recording(self) -> None:
         """Run attempts in one continuous recording; start from the reset again if a recovery is impossible."""
         executor, result = self.executor, self.result
         decisions = IrreversibleDecisions(lambda: len(executor.actions))
@@ -149,7 +149,7 @@ class _Attempts:
         self._reset()
         while not result.has_no_attempts_left:
             first = len(executor.actions)
-            arm = self._arm(decisions, len(result.failures))
+            arm = self._make_arm(decisions, len(result.failures))
             try:
                 if first:
                     self.generator.policy(arm)
@@ -170,7 +170,7 @@ class _Attempts:
                 recoveries = []
                 self._reset()
 
-    def _arm(self, decisions: Decisions, number: int) -> Arm:
+    def _make_arm(self, decisions: Decisions, number: int) -> Arm:
         return Arm(self.generator.planner, self.generator.inverse_kinematics, self.executor, decisions, (number,))
 
     def _run_policy(self, arm: Arm) -> None:
@@ -190,21 +190,21 @@ class _Attempts:
                 self.generator.open_loop_checks.reset(self.executor.seed, self.intervention)
 
     @property
-    def _check_with_noise(self) -> bool:
-        return self.result.noise_failures < self.generator.settings.check_failures
+    def _is_noise_checked(self) -> bool:
+        return self.result.noise_failure_count < self.generator.settings.check_failures
 
     def check_open_loop(self, *, finished: bool = False) -> None:
         if self.generator.open_loop_checks is not None:
             gripper = np.array([action[7] for action in self.executor.actions])
             with self.executor.seconds.measure("check"):
                 self.generator.open_loop_checks.check(
-                    self.recorder.states, gripper, finished=finished, noise=self._check_with_noise
+                    self.recorder.states, gripper, finished=finished, noise=self._is_noise_checked
                 )
 
     def _finish(self, recoveries: list[dict[str, Any]]) -> None:
         if len(self.executor.actions) > self.generator.horizon:
             raise UnrecoverableError("horizon", "too_long")
-        if not self.executor.flag("success"):
+        if not self.executor.is_flag_set("success"):
             raise PlanningError("episode", "no_success")
         self.check_open_loop(finished=True)
         self.result.success, self.result.steps = True, len(self.executor.actions)
@@ -239,7 +239,7 @@ class _Attempts:
             "seconds": {phase: round(value, 3) for phase, value in asdict(executor.seconds).items()},
             "attempts": len(self.result.failures) + 1,
             "failed_attempts": [f"{failure.stage}: {failure.reason}" for failure in self.result.failures],
-            "check_trials": None if not checked else settings.check_trials if self._check_with_noise else 0,
+            "check_trials": None if not checked else settings.check_trials if self._is_noise_checked else 0,
             "recoveries": recoveries,
             **(
                 {"intervention": {"policy": intervention.policy, "policy_steps": intervention.policy_steps}}

@@ -44,7 +44,7 @@ def intervene(arm: Arm, policy: Callable[[Arm], None]) -> None:
 
 
 def _carry_held_target(arm: Arm, slot: int) -> None:
-    if not arm.executor.flag("target_lifted"):
+    if not arm.executor.is_flag_set("target_lifted"):
         arm.start_subgoal("move and grasp")
         with arm.planning_time():
             lift = arm.plan_rise(arm.planner.tcp(arm.qpos), LIFT, stage="lift")

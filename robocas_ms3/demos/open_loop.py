@@ -196,14 +196,14 @@ class OpenLoopChecks:
         recorded = states["articulations"][self._robot.description.uid]
         actions = Motion.from_states(self._robot, recorded, gripper, new).actions[:-1].astype(np.float64)
         for number, env in enumerate(self._envs if noise else self._envs[:1]):
-            for action in self._with_noise(actions, number) if number else actions:
+            for action in self._add_noise(actions, number) if number else actions:
                 env.step(action)
             reason = _find_deviation(env, states, int(new[-1]), finished)
             if reason:
                 raise UnrecoverableError("open_loop_check", f"{reason}{WITH_NOISE}" if number else reason)
         self._replayed += len(actions)
 
-    def _with_noise(self, actions: NDArray[np.float64], number: int) -> NDArray[np.float64]:
+    def _add_noise(self, actions: NDArray[np.float64], number: int) -> NDArray[np.float64]:
         # drawn from the first action on, so that the noise of an action does not depend on the number of checks
         rng = np.random.default_rng([self._seed, number])
         std = self._settings.check_noise_mm, self._settings.check_noise_deg

@@ -206,7 +206,7 @@ def _replay_one(env: gym.Env, settings: ReplaySettings, episode: dict[str, Any])
         *_, info = env.step(_convert_action(action, base_env) if converted else action)
         if settings.use_env_states:
             base_env.set_state_dict(state)
-    error = None if converted else state_distance(cast(Any, base_env.get_state_dict()), recorded.states[-1])
+    error = None if converted else compute_state_distance(cast(Any, base_env.get_state_dict()), recorded.states[-1])
     return ReplayResult(episode["episode_id"], recorded.seed, bool(info["success"][0]), error)
 
 
@@ -234,7 +234,7 @@ def _convert_action(action: np.ndarray, env: RoboCASEnv) -> np.ndarray:
     return np.append(np.clip(delta, -1, 1), gripper).astype(np.float32)
 
 
-def state_distance(state: dict[str, Any], recorded: dict[str, Any]) -> float:
+def compute_state_distance(state: dict[str, Any], recorded: dict[str, Any]) -> float:
     """Return the greatest absolute difference between a number of two states of all bodies; NaN if one has NaN.
 
     ``state`` and ``recorded`` are states in ManiSkill's format; their numbers are in m, rad, m/s and rad/s.

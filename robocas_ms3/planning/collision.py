@@ -168,7 +168,7 @@ class CollisionChecker:
         if not len(links) and not len(others):
             yield from (iter(()) for _ in qpos)
             return
-        rotations, positions = self._part_poses(rotations, positions, width)
+        rotations, positions = self._compute_part_poses(rotations, positions, width)
         link_ends, other_ends = (np.searchsorted(found[:, 0], np.arange(len(qpos) + 1)) for found in (links, others))
         for row in range(len(qpos)):
             own = links[link_ends[row] : link_ends[row + 1], 1].tolist()
@@ -190,19 +190,19 @@ class CollisionChecker:
 
         for pair in links:
             a, b = self._pairs[pair].tolist()
-            if self._collide(part(a), part(b)):
+            if self._is_in_contact(part(a), part(b)):
                 yield names[a], names[b]
         for index, piece in others:
-            if self._collide(part(index), self._obstacle(piece)):
+            if self._is_in_contact(part(index), self._get_obstacle(piece)):
                 yield names[index], self._obstacle_names[piece]
 
-    def _collide(self, a: Any, b: Any) -> bool:
+    def _is_in_contact(self, a: Any, b: Any) -> bool:
         if not fcl.collide(a, b, self._request, self._result):
             return False
         self._result.contacts.clear()  # python-fcl appends to the contacts of earlier checks
         return True
 
-    def _obstacle(self, index: int) -> Any:
+    def _get_obstacle(self, index: int) -> Any:
         if index not in self._obstacles:
             pieces, piece, pose = self._pieces[index]
             unused = pieces.unused[piece]
@@ -210,7 +210,7 @@ class CollisionChecker:
             found.setTransform(_fcl_pose(pose))
         return self._obstacles[index]
 
-    def _part_poses(self, rotations: Array, positions: Array, width: float) -> tuple[Array, Array]:
+    def _compute_part_poses(self, rotations: Array, positions: Array, width: float) -> tuple[Array, Array]:
         """Return rotations (P, M, 3, 3) and positions (P, M, 3) of parts from those of frames (8, M, ...)."""
         turned = rotations[self._frames]  # BASE indexes the last frame; its values are not used
         offsets = self._poses[:, :3, 3] + self._slides * (width / 2)

@@ -71,7 +71,7 @@ def read_collision_parts(urdf: Path | str, chain: ArmChain) -> list[CollisionPar
     def visit(name: str, frame: int, pose: Array, slide: Array) -> Iterator[CollisionPart]:
         if name not in links:
             raise file.make_error("missing link", f'<link name="{name}">, the child of a joint', "none")
-        for geometry, corners, origin in _collision_geometries(links[name], name, file):
+        for geometry, corners, origin in _read_collision_geometries(links[name], name, file):
             yield CollisionPart(name, frame, pose @ origin, slide, geometry, corners)
         if frame == 6:  # links that hang from link 7 are rigid with the TCP
             frame, pose = TCP, link7_in_tcp @ pose
@@ -106,15 +106,15 @@ def read_link_pairs(urdf: Path | str, srdf: Path | str, parts: list[CollisionPar
     ]
 
 
-def _collision_geometries(link: Element, name: str, file: RobotXml) -> Iterator[tuple[Any, Array, Array]]:
+def _read_collision_geometries(link: Element, name: str, file: RobotXml) -> Iterator[tuple[Any, Array, Array]]:
     for collision in link.iterfind("collision"):
         origin = file.read_origin(collision)
         for shape in collision.iterfind("geometry/*"):
-            geometry, corners = _geometry(shape, name, file)
+            geometry, corners = _read_geometry(shape, name, file)
             yield geometry, corners, origin
 
 
-def _geometry(shape: Element, link: str, file: RobotXml) -> tuple[Any, Array]:
+def _read_geometry(shape: Element, link: str, file: RobotXml) -> tuple[Any, Array]:
     if shape.tag == "mesh":
         scale = np.array(file.read_numbers(shape, "scale", 3, "1 1 1"))
         mesh = file.path.parent / file.read_attribute(shape, "filename")

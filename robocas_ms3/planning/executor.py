@@ -64,12 +64,14 @@ class MotionExecutor:
 
     @property
     def base_env(self) -> RoboCASEnv:
+        """Environment without wrappers."""
         env = self.env.unwrapped
         assert isinstance(env, RoboCASEnv)
         return env
 
     @property
     def dt(self) -> float:
+        """Duration of a control step, s."""
         return self.base_env.control_timestep
 
     def reset(self) -> None:
@@ -89,10 +91,10 @@ class MotionExecutor:
             Whether the flag is set after the last step; True without ``until``.
         """
         for qpos in trajectory.qpos:
-            if until and self.flag(until):
+            if until and self.is_flag_set(until):
                 return True
             self._step(self._action(qpos))
-        return until is None or self.flag(until)
+        return until is None or self.is_flag_set(until)
 
     def move_gripper(self, command: float, arm_qpos: Array, *, seconds: float) -> None:
         """Command the gripper (``OPEN`` or ``CLOSED``) for some seconds; the arm stays at ``arm_qpos`` (7,)."""
@@ -128,7 +130,7 @@ class MotionExecutor:
         ):
             self.segments.append(Segment(goal_type, goal_description, len(self.actions)))
 
-    def flag(self, name: str) -> bool:
+    def is_flag_set(self, name: str) -> bool:
         """Return a boolean value of ``info`` of the last step by its key, e.g. ``success``."""
         return bool(self.info[name][0])
 

@@ -72,7 +72,7 @@ def filter_grasps(
     return Grasps(tcp, annotations.grasp_widths[both], qualities, both)
 
 
-def grip_margins(tcp: Array, widths: Array, surface: Array) -> Array:
+def compute_grip_margins(tcp: Array, widths: Array, surface: Array) -> Array:
     """Return the robustness (N,) of grasps against position errors, 0 to 1.
 
     The value is 1 if at least ``PAD_POINTS`` surface points are between the pads for each offset in
@@ -112,7 +112,7 @@ def score_grasps(
     Args:
         tcp: (N, 4, 4) TCP poses in any frame with a vertical z axis.
         qualities: (N,) annotated qualities.
-        margins: (N,) result of `grip_margins`.
+        margins: (N,) result of `compute_grip_margins`.
         turns: (N,) largest joint displacement on the way to the grasp, rad, which determines the duration.
         object_center: (3,) centre of the object in the frame of ``tcp``.
         approach: direction of the approach.
@@ -124,7 +124,7 @@ def score_grasps(
     return score + MARGIN_WEIGHT * margins
 
 
-def sample_order(rng: np.random.Generator, scores: Array) -> NDArray[np.int_]:
+def sample_grasp_order(rng: np.random.Generator, scores: Array) -> NDArray[np.int_]:
     """Sample an order (N,) of grasp indices in which grasps with greater scores (N,) tend to come first.
 
     If the score of a grasp is 0.15 below that of another grasp, it comes before the other with probability 0.27.

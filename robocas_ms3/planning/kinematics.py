@@ -114,7 +114,7 @@ class ArmChain:
     def tcp(self, qpos: Array) -> Array:
         """Compute the TCP poses (M, 4, 4) in the arm's base frame at configurations (M, 7)."""
         rotations, positions = self.link_frames(qpos)
-        return _poses(rotations[7], positions[7])
+        return _to_matrices(rotations[7], positions[7])
 
     def jacobian(self, qpos: Array) -> tuple[Array, Array]:
         """Compute the TCP poses (M, 4, 4) and Jacobians (M, 6, 7) at configurations (M, 7), in the arm's base frame.
@@ -128,7 +128,7 @@ class ArmChain:
         for row, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
             jacobian[:, row] = axes[:, j] * arm[:, k] - axes[:, k] * arm[:, j]
         jacobian[:, 3:] = axes
-        return _poses(rotations[7], positions[7]), jacobian
+        return _to_matrices(rotations[7], positions[7]), jacobian
 
 
 def joint_distance(qpos: Array, near: Array) -> Array:
@@ -140,7 +140,7 @@ def joint_distance(qpos: Array, near: Array) -> Array:
     return away.max(axis=-1) + 0.2 * np.sqrt((away * away).sum(axis=-1))
 
 
-def _poses(rotation: Array, position: Array) -> Array:
+def _to_matrices(rotation: Array, position: Array) -> Array:
     pose = np.tile(np.eye(4), (len(position), 1, 1))
     pose[:, :3, :3], pose[:, :3, 3] = rotation, position
     return pose

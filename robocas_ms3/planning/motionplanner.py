@@ -93,13 +93,13 @@ class PandaArmMotionPlanningSolver:
             raise RobocasError(what, where="control_mode", expected=expected, found=self.control_mode, fix=fix)
         check_number("joint_vel_limits", joint_vel_limits, MIN_LIMIT)
         check_number("joint_acc_limits", joint_acc_limits, MIN_LIMIT)
-        spec = _robot_spec(cast("BaseAgent", self.base_env.agent))
+        spec = _find_robot_spec(cast("BaseAgent", self.base_env.agent))
         self.robot = self.base_env.agent.robot
         self.description = replace(
             spec.description, arm_velocity_limit=joint_vel_limits, arm_acceleration_limit=joint_acc_limits
         )
         self._joints = [joint.name for joint in self.robot.active_joints]
-        self._base_pose = None if base_pose is None else _matrix(base_pose, "base_pose")
+        self._base_pose = None if base_pose is None else _to_matrix(base_pose, "base_pose")
         self._obstacles: list[Obstacle] = []
         spec = replace(spec, description=self.description)
         self.planner = make_planner(backend, spec, dt=self.base_env.control_timestep)
@@ -177,7 +177,7 @@ class PandaArmMotionPlanningSolver:
             fix = "Use a small thickness for flat boxes, e.g. 0.001."
             raise RobocasError(what, where="add_box_collision", expected=expected, found=edges.tolist(), fix=fix)
         corners = np.array(list(product((-0.5, 0.5), repeat=3))) * edges
-        self.add_obstacles([Obstacle("box", Shape(hulls=(corners,)), _matrix(pose, "add_box_collision"))])
+        self.add_obstacles([Obstacle("box", Shape(hulls=(corners,)), _to_matrix(pose, "add_box_collision"))])
 
     def add_collision_pts(self, pts: Array) -> None:
         """Add surface points (P, 3) in the world frame, about 5 mm apart, to the obstacles."""
@@ -212,7 +212,7 @@ class PandaArmMotionPlanningSolver:
     def _prepare(self, pose: sapien.Pose | Pose) -> tuple[Array, Array]:
         """Set the planner's obstacles; return the arm's configuration (7,) and ``pose`` (4x4) in its base frame."""
         base = self.arm_base_in_world
-        goal = inverse(base) @ _matrix(pose, "pose")
+        goal = inverse(base) @ _to_matrix(pose, "pose")
         self.planner.set_scene(to_arm_base_frame(self._obstacles, base))
         self.planner.finger_width = float(self._qpos(self.description.finger_joints).sum())
         return self._arm_qpos, goal
@@ -237,7 +237,7 @@ class PandaArmMotionPlanningSolver:
         return step
 
 
-def _matrix(pose: sapien.Pose | Pose, where: str) -> Array:
+def _to_matrix(pose: sapien.Pose | Pose, where: str) -> Array:
     matrix = to_sapien_pose(pose).to_transformation_matrix().astype(np.float64)
     _require_finite(matrix, where)
     return matrix
@@ -250,7 +250,7 @@ def _require_finite(values: Array, where: str, fix: str = "Check the computation
         raise RobocasError("NaN or infinite values", where=where, expected="finite values", found=found, fix=fix)
 
 
-def _robot_spec(agent: BaseAgent) -> RobotSpec:
+def _find_robot_spec(agent: BaseAgent) -> RobotSpec:
     """Return the robot specification of an agent; make one from ManiSkill's URDF for its fixed-base Pandas."""
     if isinstance(agent, MobileManipulator):
         return agent.spec

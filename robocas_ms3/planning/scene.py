@@ -34,7 +34,7 @@ def get_body_shape(part: BodyFiles) -> Shape:
     return _SHAPES[id(part)][1]
 
 
-def _size(part: BodyFiles) -> float:
+def _compute_extent(part: BodyFiles) -> float:
     return max(math.sqrt(np.einsum("ij,ij->i", hull, hull).max()) for hull in part.hulls)
 
 
@@ -173,7 +173,7 @@ class PlanningScene:
         for _, part, spacing, pose in self._bodies(excluded, None):
             in_base, points = to_base @ pose, part.surface_points(spacing)
             middle = (center - in_base[:3, 3]) @ in_base[:3, :3]
-            if np.linalg.norm(middle) + _size(part) > radius:  # the body may extend beyond the radius
+            if np.linalg.norm(middle) + _compute_extent(part) > radius:  # the body may extend beyond the radius
                 away = points - middle
                 points = points[np.einsum("ij,ij->i", away, away) <= radius**2]
             if len(points):

@@ -58,16 +58,16 @@ class PlanProgress:
             if seeds - successes > max(20, 3 * successes):
                 every = (outcome for unit, done in self.done.items() if unit.part == part for outcome in done)
                 reasons = Counter(outcome.failures[-1] for outcome in every if outcome.failures)
-                found = f"{seeds - successes} of {seeds} failed, most often with {reasons.most_common(1)[0][0]}"
+                found = f"{seeds - successes} of {seeds} skipped, most often with {reasons.most_common(1)[0][0]}"
                 where, fix = (
                     self.folder.path / UNITS / self.plan.part_name(part),
                     "Fewer objects (objects.count) may help.",
                 )
-                self._failure_error = PlanError("too many seeds fail", where=where, found=found, fix=fix)
+                self._failure_error = PlanError("too many seeds are skipped", where=where, found=found, fix=fix)
         self._prefix[part] = block, seeds, successes
 
     def check_failures(self) -> None:
-        """Raise PlanError if more than 20 seeds of a plan part, and more than three times its successes, failed."""
+        """Raise PlanError if a plan part has more than 20 skipped seeds, and more than three times its successes."""
         if self._failure_error:
             raise self._failure_error
 

@@ -22,9 +22,9 @@ class PartStatus:
     requested: int  # `episodes` of the plan part
     done: int  # number of complete episodes, at most `requested`
     tried: int  # number of seeds that have an outcome
-    failed: dict[str, int]  # "stage: reason" of the last attempt -> number of failed seeds
-    record_seconds: float  # CPU time of recording per successful episode, including failed seeds
-    render_seconds: float  # CPU time of rendering per successful episode, including failed seeds
+    failed: dict[str, int]  # "stage: reason" of the last attempt -> number of skipped seeds
+    record_seconds: float  # CPU time of recording per recorded episode, including skipped seeds
+    render_seconds: float  # CPU time of rendering per recorded episode, including skipped seeds
     bytes: int  # size of the complete episodes
 
 

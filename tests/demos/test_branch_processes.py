@@ -18,7 +18,7 @@ from branch_notes import Notes
 from robocas_ms3.core.errors import PlanningError, RobocasError
 from robocas_ms3.core.remote_errors import RemoteTraceback
 from robocas_ms3.demos import branches
-from robocas_ms3.demos.branches import ForkedDecisions, reason_not_to_fork
+from robocas_ms3.demos.branches import ForkedDecisions, find_reason_not_to_fork
 from robocas_ms3.planning.decisions import SearchLimits
 
 
@@ -298,7 +298,7 @@ def alive(pid: int) -> bool:
 
 
 def test_reasons_not_to_fork(monkeypatch):
-    assert reason_not_to_fork(renders=True) == "a renderer is open"
-    assert reason_not_to_fork(renders=False) == ("" if sys.platform == "linux" else "this is not Linux")
+    assert find_reason_not_to_fork(renders=True) == "a renderer is open"
+    assert find_reason_not_to_fork(renders=False) == ("" if sys.platform == "linux" else "this is not Linux")
     monkeypatch.setattr(sys, "platform", "darwin")
-    assert reason_not_to_fork(renders=False) == "this is not Linux"
+    assert find_reason_not_to_fork(renders=False) == "this is not Linux"

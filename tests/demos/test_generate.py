@@ -134,8 +134,8 @@ def test_action_replay_is_exact_and_ee_deltas_succeed(run):
 
 def accept_all_attempts(monkeypatch):
     """Accept all attempts as successful, to test how attempts are kept or undone."""
-    flag = MotionExecutor.flag
-    monkeypatch.setattr(MotionExecutor, "flag", lambda self, name: name == "success" or flag(self, name))
+    flag = MotionExecutor.is_flag_set
+    monkeypatch.setattr(MotionExecutor, "is_flag_set", lambda self, name: name == "success" or flag(self, name))
     monkeypatch.setattr(OpenLoopChecks, "check", lambda *args, **how: None)
 
 

@@ -11,7 +11,7 @@ import torch
 from synthetic import STEPS, write_trajectory
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.demos.trajectory_replay import RecordedEpisode, state_distance
+from robocas_ms3.demos.trajectory_replay import RecordedEpisode, compute_state_distance
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def tensors(state):
 
 
 def test_state_distance_is_the_greatest_difference():
-    assert state_distance(tensors(state((1.0, 2.0), robot=(0.0, -0.5))), state((1.25, 2.0))) == 0.5
+    assert compute_state_distance(tensors(state((1.0, 2.0), robot=(0.0, -0.5))), state((1.25, 2.0))) == 0.5
 
 
 @pytest.mark.parametrize("where", [{"cube": (np.nan, 0.0)}, {"cup": (0.0, np.nan)}, {"robot": (np.nan, 1.0)}])
@@ -68,4 +68,4 @@ def test_state_distance_is_nan_for_nan(where, swapped):
     sides = tensors(state(**{"cube": (0.0, 0.0), **where})), state((9.0, 0.0))
     if swapped:
         sides = tensors(sides[1]), state(**{"cube": (0.0, 0.0), **where})
-    assert np.isnan(state_distance(*sides))
+    assert np.isnan(compute_state_distance(*sides))

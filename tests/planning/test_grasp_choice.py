@@ -10,7 +10,7 @@ from grasp_poses import BASE, CENTER, grasp
 
 from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.poses import inverse
-from robocas_ms3.planning.grasp_choice import filter_grasps, sample_order, score_grasps
+from robocas_ms3.planning.grasp_choice import filter_grasps, sample_grasp_order, score_grasps
 from robocas_ms3.scenes.grasp_checks import SIDE_CLEARANCE, has_free_grasps, is_gripper_clear
 
 OBJECT = np.eye(4)
@@ -62,11 +62,11 @@ def test_scores(poses, qualities, turns, approach, order):
 
 
 def test_order_depends_on_the_random_generator_only():
-    orders = [sample_order(np.random.default_rng(seed), np.ones(20)).tolist() for seed in (0, 0, 1)]
+    orders = [sample_grasp_order(np.random.default_rng(seed), np.ones(20)).tolist() for seed in (0, 0, 1)]
     assert orders[0] == orders[1] != orders[2]
     assert sorted(orders[0]) == list(range(20))
     # Scores 0.15 apart at temperature 0.15: the lesser comes first with probability 1 / (1 + e) = 0.27.
-    first = [sample_order(np.random.default_rng(seed), np.array([1.0, 0.85]))[0] for seed in range(1000)]
+    first = [sample_grasp_order(np.random.default_rng(seed), np.array([1.0, 0.85]))[0] for seed in range(1000)]
     assert np.mean(first) == pytest.approx(1 / (1 + np.e), abs=0.04)
 
 

@@ -165,7 +165,7 @@ def test_arm_rises_clear_of_furniture_and_basket_after_a_push(generator, monkeyp
         board = Obstacle("board", Shape((corners,)), pose)
         monkeypatch.setattr(push, "_fixed_bodies", lambda arm: [*fixed(arm), board])
 
-    board_at(push.surface_in_base(arm)[0][2, 3] + 0.3)  # across hand or wrist
+    board_at(push.read_surface(arm)[0][2, 3] + 0.3)  # across hand or wrist
     with pytest.raises(PlanningError, match="push"):
         push.plan_push(arm, pushed, target)
     board_at(arm.scene.tcp_in_base[2, 3] + 0.12)

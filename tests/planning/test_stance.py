@@ -47,14 +47,14 @@ def grasps_in_world(arm) -> np.ndarray:
 
 def test_thorough_check_finds_free_configurations_other_than_the_nearest(arm):
     grasps, here = grasps_in_world(arm), np.zeros(3)
-    assert base_placement.reachable_fraction(arm, here, grasps, []) == 1.0
-    assert base_placement.reachable_fraction(arm, here, grasps, [], thorough=True) == 1.0
+    assert base_placement.estimate_reachable_fraction(arm, here, grasps, []) == 1.0
+    assert base_placement.estimate_reachable_fraction(arm, here, grasps, [], thorough=True) == 1.0
     poses = base_placement._sample_grasp_poses(arm, arm_base_in_world(arm, here), grasps, len(grasps))
     solved, nearest = arm.inverse_kinematics.nearest_solutions(poses, REST)
     assert solved.all()
     arm.planner.blocked = nearest
-    assert base_placement.reachable_fraction(arm, here, grasps, []) == 0.0
-    assert base_placement.reachable_fraction(arm, here, grasps, [], thorough=True) == 1.0
+    assert base_placement.estimate_reachable_fraction(arm, here, grasps, []) == 0.0
+    assert base_placement.estimate_reachable_fraction(arm, here, grasps, [], thorough=True) == 1.0
 
 
 def test_a_grasp_counts_only_with_its_pregrasp(arm):
@@ -63,14 +63,14 @@ def test_a_grasp_counts_only_with_its_pregrasp(arm):
     half = len(poses) // 2
     everything, of_pose = arm.inverse_kinematics.all_solutions(poses, REST)
     arm.planner.blocked = everything[of_pose >= half]  # each way in
-    assert base_placement.reachable_fraction(arm, here, grasps, [], thorough=True) == 0.0
+    assert base_placement.estimate_reachable_fraction(arm, here, grasps, [], thorough=True) == 0.0
     one_and_its_half_turn = np.isin(of_pose, [half, half + len(grasps)])
     arm.planner.blocked = everything[one_and_its_half_turn]
-    assert base_placement.reachable_fraction(arm, here, grasps, [], thorough=True) == pytest.approx(7 / 8)
+    assert base_placement.estimate_reachable_fraction(arm, here, grasps, [], thorough=True) == pytest.approx(7 / 8)
 
 
 def test_unreachable_grasps_and_no_grasps_score_zero(arm):
     grasps = grasps_in_world(arm)
     for far in (grasps + np.array([[0, 0, 0, 2.0]] + [[0, 0, 0, 0]] * 3), grasps[:0]):
-        assert base_placement.reachable_fraction(arm, np.zeros(3), far, []) == 0.0
-        assert base_placement.reachable_fraction(arm, np.zeros(3), far, [], thorough=True) == 0.0
+        assert base_placement.estimate_reachable_fraction(arm, np.zeros(3), far, []) == 0.0
+        assert base_placement.estimate_reachable_fraction(arm, np.zeros(3), far, [], thorough=True) == 0.0

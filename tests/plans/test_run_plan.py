@@ -159,7 +159,7 @@ def test_too_many_failures_are_an_error(tmp_path):
     plan_faults(tmp_path / "out", {seed: ["fail"] for seed in range(200)})
     with pytest.raises(PlanError) as error:
         run_here(tmp_path / "out", plan)
-    assert error.value.found == "25 of 25 failed, most often with grasp: slipped"
+    assert error.value.found == "25 of 25 skipped, most often with grasp: slipped"
 
 
 def test_episodes_with_truncated_files_are_recorded_again(undisturbed, out):

@@ -22,7 +22,7 @@ from robocas_ms3.planning.executor import MotionExecutor
 from robocas_ms3.planning.skills.base_placement import drive_to_handle
 from robocas_ms3.planning.skills.drive import current_base_pose, drive
 from robocas_ms3.planning.skills.grasp import plan_grasp
-from robocas_ms3.planning.skills.handles import MovingPart, open_furniture_part, pull_fraction
+from robocas_ms3.planning.skills.handles import MovingPart, estimate_pull_fraction, open_furniture_part
 from robocas_ms3.scenes.config import bundled_configs, load_task_config
 from robocas_ms3.scenes.language.templates import make_subgoal
 
@@ -54,9 +54,9 @@ def test_furniture_is_open_from_the_configured_fraction(name):
 @contextmanager
 def accept_unfinished_episodes():
     """Make the generator accept episodes that end before the task is solved."""
-    flag = MotionExecutor.flag
+    flag = MotionExecutor.is_flag_set
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(MotionExecutor, "flag", lambda self, name: name == "success" or flag(self, name))
+        patch.setattr(MotionExecutor, "is_flag_set", lambda self, name: name == "success" or flag(self, name))
         patch.setattr(OpenLoopChecks, "check", lambda *_, **how: None)
         yield
 
@@ -180,7 +180,7 @@ def test_robot_drives_to_a_handle_out_of_reach(tmp_path):
     def measure_pull(arm) -> float:
         part = MovingPart.from_task(arm)
         others = arm.scene.obstacles(exclude_link=(part.furniture, part.handle.link))
-        return pull_fraction(arm, part, arm.scene.arm_base_in_world, others)
+        return estimate_pull_fraction(arm, part, arm.scene.arm_base_in_world, others)
 
     def policy(arm) -> None:
         assert measure_pull(arm) < 0.5

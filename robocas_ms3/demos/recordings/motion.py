@@ -189,14 +189,14 @@ class Motion:
         """
         root_in_world, qpos, qvel = split_robot_states(robot_states[samples])
         width = float(split_robot_states(robot_states[:1])[1][0, robot.description.finger_slice].sum())
-        opened = sample_gripper_commands(robot.description, gripper, samples, initial_width=width)
-        return cls.from_joints(robot, root_in_world, qpos, qvel, opened)
+        gripper_open = sample_gripper_commands(robot.description, gripper, samples, initial_width=width)
+        return cls.from_joints(robot, root_in_world, qpos, qvel, gripper_open)
 
     @classmethod
     def from_joints(
-        cls, robot: RobotSpec, root_in_world: Array, qpos: Array, qvel: Array, opened: NDArray[np.bool_]
+        cls, robot: RobotSpec, root_in_world: Array, qpos: Array, qvel: Array, gripper_open: NDArray[np.bool_]
     ) -> Motion:
-        return cls(qpos, qvel, root_in_world, *tcp_and_arm_base_poses(robot, root_in_world, qpos), opened)
+        return cls(qpos, qvel, root_in_world, *tcp_and_arm_base_poses(robot, root_in_world, qpos), gripper_open)
 
     @cached_property
     def tcp_in_base(self) -> Array:

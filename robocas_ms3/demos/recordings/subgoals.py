@@ -35,14 +35,16 @@ class SubGoal(BaseModel):
 
     @property
     def first(self) -> int:
+        """Index of the first action or step."""
         return self.goal_range[0]
 
     @property
     def last(self) -> int:
+        """Index of the last action or step."""
         return self.goal_range[1]
 
     @model_validator(mode="after")
-    def _is_range(self) -> SubGoal:
+    def _check_range(self) -> SubGoal:
         if self.first > self.last:
             raise ValueError(f"goal_range: expected [first, last] with first <= last, found {self.goal_range}")
         return self

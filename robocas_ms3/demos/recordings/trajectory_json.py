@@ -41,11 +41,11 @@ class _Record(BaseModel):
     model_config = ConfigDict(strict=True, extra="allow", frozen=True)  # other tools may add keys
 
 
-def _single_seed(value: Any) -> Any:
+def _to_single_seed(value: Any) -> Any:
     return value if parse_seed(value) is None else parse_seed(value)
 
 
-Seed = Annotated[int, BeforeValidator(_single_seed), Field(ge=0, le=MAX_SEED)]
+Seed = Annotated[int, BeforeValidator(_to_single_seed), Field(ge=0, le=MAX_SEED)]
 """A seed of ``env.reset``; ManiSkill writes a list with one seed."""
 
 

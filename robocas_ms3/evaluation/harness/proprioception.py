@@ -58,10 +58,10 @@ class Proprioception:
         """
         qpos, qvel = (obs["agent"][name][env][None].astype(np.float64) for name in ("qpos", "qvel"))
         commands, width = np.array([] if gripper is None else [gripper]), float(self._widths[env])
-        opened = sample_gripper_commands(
+        gripper_open = sample_gripper_commands(
             self._spec.description, commands, np.array([len(commands)]), initial_width=width
         )
-        motion = Motion.from_joints(self._spec, self._roots[env][None], qpos, qvel, opened)
+        motion = Motion.from_joints(self._spec, self._roots[env][None], qpos, qvel, gripper_open)
         columns = to_frame_columns(make_episode_arrays(motion, "", []))
         found = {name: columns[column][0] for name, column in KEYS.items()}
         self._last[env] = _remove_jumps(self._last[env], found) if env in self._last else found

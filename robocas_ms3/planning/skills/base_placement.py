@@ -27,7 +27,7 @@ from robocas_ms3.planning.skills.drive import (
     sample_base_poses,
 )
 from robocas_ms3.planning.skills.grasp import grasp
-from robocas_ms3.planning.skills.handles import MovingPart, open_furniture_part, pull_fraction
+from robocas_ms3.planning.skills.handles import MovingPart, estimate_pull_fraction, open_furniture_part
 from robocas_ms3.planning.skills.place import (
     attach_held_object,
     carry_to_basket,
@@ -98,20 +98,23 @@ def drive_to_object(arm: Arm, slot: int, *, relocate: bool = False) -> None:
         return
     with arm.planning_time():
         others, grasps = arm.scene.obstacles_in_world(exclude=slot), find_clear_grasps(arm, slot)
-        if not relocate and reachable_fraction(arm, current_base_pose(arm), grasps, others) >= MIN_GRASP_FRACTION:
+        if (
+            not relocate
+            and estimate_reachable_fraction(arm, current_base_pose(arm), grasps, others) >= MIN_GRASP_FRACTION
+        ):
             return
     around = _fold_arm(arm)
     with arm.planning_time():
         center = (arm.scene.arm_base_in_world @ arm.scene.object_in_base(slot))[:3, 3]
         goals = sample_base_poses(arm, center)
-        seen = np.array([len(_graspable_from(arm, arm_base_in_world(arm, goal), grasps)) for goal in goals])
+        seen = np.array([len(_select_near_side(arm, arm_base_in_world(arm, goal), grasps)) for goal in goals])
         goals = goals[seen >= max(1, 0.3 * seen.max(initial=0))]
 
         def route_to(mode: tuple[bool, float]) -> list[Array]:
             thorough, enough = mode
 
             def fraction(goal: Array) -> float:
-                return reachable_fraction(arm, goal, grasps, others, thorough=thorough)
+                return estimate_reachable_fraction(arm, goal, grasps, others, thorough=thorough)
 
             return find_best_route(arm, goals, around, fraction, enough=enough)
 
@@ -134,7 +137,7 @@ def drive_to_handle(arm: Arm, *, relocate: bool = False) -> None:
         frame = arm_base_in_world(arm, goal)
         if not is_body_clear(arm.robot, frame, swept):  # the opening part would hit the robot
             return 0.0
-        return pull_fraction(arm, part, frame, to_arm_base_frame(others, frame))
+        return estimate_pull_fraction(arm, part, frame, to_arm_base_frame(others, frame))
 
     with arm.planning_time():
         others = arm.scene.obstacles_in_world(exclude_link=(part.furniture, part.handle.link))
@@ -215,7 +218,7 @@ def find_clear_grasps(arm: Arm, slot: int) -> Array:
     return poses[is_gripper_clear(poses, transform_points(base, near))]
 
 
-def reachable_fraction(
+def estimate_reachable_fraction(
     arm: Arm, base: Array, grasps: Array, others: list[Obstacle], *, thorough: bool = False
 ) -> float:
     """Estimate the fraction of grasps that the arm reaches from a base pose, together with their pre-grasp poses.
@@ -247,12 +250,12 @@ def _sample_grasp_poses(arm: Arm, frame: Array, grasps: Array, count: int) -> Ar
 
     The K <= ``count`` grasps are evenly spaced in ``grasps``.
     """
-    chosen = _graspable_from(arm, frame, grasps)
+    chosen = _select_near_side(arm, frame, grasps)
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(count, len(chosen))).round().astype(int)]
     poses = inverse(frame) @ np.concatenate([chosen, chosen @ HALF_TURN])
     return np.concatenate([poses, shift_back(poses, PREGRASP_DISTANCE)])
 
 
-def _graspable_from(arm: Arm, frame: Array, grasps: Array) -> Array:
+def _select_near_side(arm: Arm, frame: Array, grasps: Array) -> Array:
     center = grasps[:, :3, 3].mean(axis=0) if len(grasps) else np.zeros(3)
     return grasps[grasp_direction_tests(grasps, center - frame[:3, 3], arm.approach)[SIDE]]

@@ -138,14 +138,14 @@ def find_free_route(
     is ``start``: the robot first drives straight back. Otherwise it is ``goal``: the robot drives straight forward at
     the end.
     """
-    for route in _routes(start, goal, back_first, arm.robot.base_limits):
+    for route in _generate_routes(start, goal, back_first, arm.robot.base_limits):
         poses = [start, *route]
-        if all(_leg_is_free(arm, a, b, around) for a, b in zip(poses[:-1], poses[1:], strict=True)):
+        if all(_is_leg_free(arm, a, b, around) for a, b in zip(poses[:-1], poses[1:], strict=True)):
             return route
     return None
 
 
-def _routes(start: Array, goal: Array, back_first: bool, limits: Limits) -> Iterator[list[Array]]:
+def _generate_routes(start: Array, goal: Array, back_first: bool, limits: Limits) -> Iterator[list[Array]]:
     yield [goal]
     narrow = start if back_first else goal
     for distance in BACK_DISTANCES:
@@ -154,7 +154,7 @@ def _routes(start: Array, goal: Array, back_first: bool, limits: Limits) -> Iter
             yield [via, goal]
 
 
-def _leg_is_free(arm: Arm, start: Array, goal: Array, around: Surroundings) -> bool:
+def _is_leg_free(arm: Arm, start: Array, goal: Array, around: Surroundings) -> bool:
     count = max(2, int(np.ceil(np.abs(goal - start).max() / CHECK_STEP)) + 1)
     width = arm.planner.finger_width
     for pose in np.linspace(start, goal, count)[1:]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import inverse
-from robocas_ms3.planning.grasp_choice import filter_grasps, grip_margins, sample_order, score_grasps
+from robocas_ms3.planning.grasp_choice import compute_grip_margins, filter_grasps, sample_grasp_order, score_grasps
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.scene import SPACING
 from robocas_ms3.planning.skills.arm import CLEARANCE, Arm, shift_back, shift_up
@@ -138,12 +138,12 @@ def grasp_candidates(arm: Arm, slot: int, skip_kinds: int) -> Iterator[Array]:
     scores = score_grasps(
         tcp_in_base[reachable],
         kept.qualities[reachable],
-        grip_margins(notes.grasps_tcp_in_object[kept.index[reachable]], kept.widths[reachable], surface),
+        compute_grip_margins(notes.grasps_tcp_in_object[kept.index[reachable]], kept.widths[reachable], surface),
         np.abs(qpos[reachable] - arm.qpos).max(axis=1),
         object_in_base[:3, 3],
         arm.approach,
     )
-    ranks = sample_order(arm.rng, scores)
+    ranks = sample_grasp_order(arm.rng, scores)
     near = arm.scene.points_in_base(exclude=slot, radius=NEIGHBOURHOOD, around=object_in_base[:3, 3])
     clear = _filter_clear(tcp_in_base, reachable[ranks], near)
     if arm.approach == "front":  # first grasps whose arm configurations are collision-free

@@ -219,7 +219,7 @@ def _plan_pull(arm: Arm, part: MovingPart, depth_offset: float) -> tuple[Traject
     return plan_first_feasible(order[:PULLS_PLANNED], plan, PlanningError("pull", "no_plan"))
 
 
-def pull_fraction(arm: Arm, part: MovingPart, arm_base_in_world: Array, others: list[Obstacle]) -> float:
+def estimate_pull_fraction(arm: Arm, part: MovingPart, arm_base_in_world: Array, others: list[Obstacle]) -> float:
     """Estimate how far the arm can pull the handle from another base pose, 0 to 1.
 
     1 means that the pull opens the door or drawer with a margin (``COMFORT_FRACTION``).

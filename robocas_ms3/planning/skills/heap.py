@@ -12,8 +12,8 @@ from robocas_ms3.core.errors import PlanningError, UnrecoverableError
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.look import hidden_fraction
-from robocas_ms3.planning.skills.push import push_away, surface_in_base
+from robocas_ms3.planning.skills.look import measure_hidden_fraction
+from robocas_ms3.planning.skills.push import push_away, read_surface
 from robocas_ms3.planning.skills.remove import count_clear_grasps, find_grasp_blockers, remove_object
 from robocas_ms3.tasks.occlusion import MAX_HIDDEN_FRACTION
 from robocas_ms3.tasks.search import RoboCASSearchEnv
@@ -73,7 +73,7 @@ class Heap:
     def target_visible(self) -> bool:
         """Whether the gripper camera sees at least four fifths of the target."""
         with self.arm.planning_time():
-            return hidden_fraction(self.arm, self.target) <= MAX_HIDDEN_FRACTION
+            return measure_hidden_fraction(self.arm, self.target) <= MAX_HIDDEN_FRACTION
 
     @property
     def target_uncovered(self) -> bool:
@@ -152,7 +152,7 @@ class Heap:
 
     def check_objects_on_surface(self) -> None:
         """Raise PlanningError if an object is at the edge of the surface, UnrecoverableError if one has fallen off."""
-        frame, half = surface_in_base(self.arm)
+        frame, half = read_surface(self.arm)
         present = np.flatnonzero(self.env.present[0].cpu().numpy()).tolist()
         positions = np.stack([self.arm.scene.object_in_base(slot)[:3, 3] for slot in present])
         if (positions[:, 2] < frame[2, 3] - FALLEN).any():

@@ -67,7 +67,7 @@ def load_object_meshes(arm: Arm) -> None:
             make_ray_scene(load_visual_mesh(asset))
 
 
-def hidden_fraction(arm: Arm, slot: int) -> float:
+def measure_hidden_fraction(arm: Arm, slot: int) -> float:
     """Return the fraction of an object that other objects hide from the gripper camera; 1 for an object out of view.
 
     The fraction is computed by ray casting without the robot, so that no renderer is needed.

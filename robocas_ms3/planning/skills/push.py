@@ -123,7 +123,7 @@ def _plan_starts(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tupl
     """
     arm.planner.set_scene(arm.scene.obstacles())
     failure, starts = PlanningError("push", "no_free_push"), []
-    for push, qpos in reachable_pushes(arm, slot, target, arm.scene.points_in_base(exclude=slot), turn_deg):
+    for push, qpos in find_reachable_pushes(arm, slot, target, arm.scene.points_in_base(exclude=slot), turn_deg):
         try:
             starts.append((push, qpos, arm.planner.plan_straight(qpos, push.start, stage="push")))
         except PlanningError as error:
@@ -165,7 +165,7 @@ def _plan_push_and_lift(arm: Arm, starts: list[tuple[Push, Array, Trajectory]], 
     return PushPlan(planner.join(arm.qpos, reach, down), along, lift, direction=first)
 
 
-def reachable_pushes(
+def find_reachable_pushes(
     arm: Arm, slot: int, target: int, others: Array, turn_deg: float = 0.0
 ) -> Iterator[tuple[Push, Array]]:
     """Yield pushes that the arm reaches, with the configuration (7,) above their start, the paper's direction first.
@@ -174,7 +174,7 @@ def reachable_pushes(
     """
     points, middle = arm.scene.object_points(slot), arm.scene.object_points(target).mean(axis=0)
     fixed = arm.scene.points_in_base(exclude=range(len(arm.env.objects)))
-    pushes = list(generate_push_candidates(arm.rng, points, middle, others, surface_in_base(arm), fixed, turn_deg))
+    pushes = list(generate_push_candidates(arm.rng, points, middle, others, read_surface(arm), fixed, turn_deg))
     if not pushes:
         return
     starts, ends = np.stack([push.start for push in pushes]), np.stack([push.end for push in pushes])
@@ -186,7 +186,7 @@ def reachable_pushes(
     yield from [(pushes[i], qpos[i]) for i in order if reachable[i]][:PUSHES_TRIED]
 
 
-def surface_in_base(arm: Arm) -> tuple[Array, Array]:
+def read_surface(arm: Arm) -> tuple[Array, Array]:
     """Return the surface on which the objects stand: pose (4x4) of its centre and half size (2,) in m."""
     model = arm.env.model
     config = model.config.surface

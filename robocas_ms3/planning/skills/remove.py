@@ -16,7 +16,7 @@ from robocas_ms3.planning.shapes import convex_hull
 from robocas_ms3.planning.skills.arm import Arm, plan_first_feasible, plan_retreat, shift_back, shift_up
 from robocas_ms3.planning.skills.grasp import grasp
 from robocas_ms3.planning.skills.place import attach_held_object
-from robocas_ms3.planning.skills.push import surface_in_base
+from robocas_ms3.planning.skills.push import read_surface
 from robocas_ms3.scenes.grasp_checks import MAX_WIDTH, grasp_direction_tests, is_gripper_clear
 
 GRID = 0.04  # m between candidate positions
@@ -114,7 +114,7 @@ def plan_placement(arm: Arm, slot: int) -> Trajectory:
 
     def free_poses() -> Iterator[Array]:
         for turn, margin in itertools.product((standing, np.eye(4)), EDGE_MARGINS):
-            motions = find_free_places(transform_points(turn, vertices), others, *surface_in_base(arm), margin) @ turn
+            motions = find_free_places(transform_points(turn, vertices), others, *read_surface(arm), margin) @ turn
             if len(motions):
                 yield motions @ scene.tcp_in_base
 
