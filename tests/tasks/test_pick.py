@@ -115,7 +115,7 @@ def test_arm_starts_in_the_configured_pose():
         ({"surface": {"furniture": "table", "name": "roof"}}, ["surface.name", "roof", "top"]),
         (
             {"surface": {"furniture": "table", "name": "top", "min_xy": [0.0, 0.0], "max_xy": [0.9, 0.3]}},
-            ["outside surface 'top'", "0.9"],
+            ["within surface 'top'", "0.9"],
         ),
     ],
 )
