@@ -1,4 +1,4 @@
-"""Build the files of an asset from a source: visual meshes, hulls, annotations, mass properties, quality."""
+"""Build the files of an asset: visual meshes, hulls, annotations, mass properties, quality."""
 
 from __future__ import annotations
 
@@ -213,7 +213,7 @@ def _write_body(mesh: trimesh.Trimesh, pieces: list[np.ndarray], folder: Path) -
 
 
 def _light(values: Any) -> Any:
-    """Convert numbers to an array of float32, which halves the file size; lengths change by less than 1e-6 m."""
+    """Convert numbers to float32, which halves the file size; lengths change by less than 1e-6 m."""
     return np.asarray(values, dtype=np.float32)
 
 

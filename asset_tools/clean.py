@@ -1,4 +1,4 @@
-"""Clean the faces of a scan: duplicates, walls between touching parts, dirt, inner shells, inward faces."""
+"""Clean the faces of a scan: duplicates, inner walls and shells, scanner dirt, inward faces."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ SAME = 1e-6  # of the diagonal
 
 @dataclass(frozen=True)
 class CleanedScan:
-    """A scan after cleaning, as two meshes with equal faces in equal order; all faces are oriented outwards.
+    """A scan after cleaning, as two meshes with equal faces in equal order.
+
+    All faces are oriented outwards.
 
     Attributes:
         scan: mesh with the colours and UV seams of the input.
@@ -40,7 +42,7 @@ class CleanedScan:
 
 
 def clean_scan(scan: trimesh.Trimesh, repairs: list[str]) -> CleanedScan:
-    """Drop the faces of a scan that are not part of the outer surface, and orient the other faces outwards.
+    """Keep the faces of the outer surface of a scan, and orient these faces outwards.
 
     Args:
         scan: mesh in any unit; UV seams are allowed.
@@ -98,7 +100,7 @@ def _welded(scan: trimesh.Trimesh, repairs: list[str]) -> trimesh.Trimesh:
 
 
 def _outer_boundary(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, Ints]:
-    """Remove edges of more than two faces: drop inner walls and fins, and separate parts that share an edge.
+    """Remove edges of more than two faces: drop inner walls, and separate parts that share an edge.
 
     The faces divide space into cells. Two faces that are neighbours around an edge enclose a cell between them. A face
     belongs to the outer surface if exactly one side of the face is in the unbounded cell.
@@ -141,7 +143,7 @@ def _outer_boundary(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, Ints]:
 
 
 def _around_edges(mesh: trimesh.Trimesh, outside_ahead: NDArray[np.bool_]) -> Ints:
-    """Return the half-edges (3 F,) sorted by edge, and around each edge by the angle of the half-edge's face.
+    """Return the half-edges (3 F,) sorted by edge, and around an edge by the angle of their faces.
 
     If two faces have the same angle, a face with the outside towards larger angles comes first: this face ends a part,
     and the other face starts the next part. If the outsides are equal, the face of the larger surface is outermost.
@@ -163,7 +165,9 @@ def _around_edges(mesh: trimesh.Trimesh, outside_ahead: NDArray[np.bool_]) -> In
 
 
 def _neighbours(order: Ints, edge: Ints) -> tuple[Ints, Ints]:
-    """Return pairs (H,), (H,) of half-edges that follow each other around an edge; edges of one face have none.
+    """Return pairs (H,), (H,) of half-edges that follow each other around an edge.
+
+    Edges of one face have none.
 
     Args:
         order: (3 F,) half-edges, sorted by edge and around each edge.
@@ -177,7 +181,7 @@ def _neighbours(order: Ints, edge: Ints) -> tuple[Ints, Ints]:
 
 
 def _outermost_side(mesh: trimesh.Trimesh, faces: Ints) -> int:
-    """Return a side that is on the outside: the side through which a ray from the largest face leaves the mesh.
+    """Return an outer side, through which a ray from the largest face leaves the mesh.
 
     Returns:
         2 f for the front of face f, 2 f + 1 for its back.
@@ -210,7 +214,10 @@ def _box_change(mesh: trimesh.Trimesh, faces: Ints, kept: Ints) -> float:
 
 
 def _pieces(mesh: trimesh.Trimesh) -> Ints:
-    """Return the number (F,) of the connected piece of each face; edges of more than two faces connect no faces."""
+    """Return the number (F,) of the connected piece of each face.
+
+    Edges of more than two faces connect no faces.
+    """
     one, other = np.asarray(mesh.face_adjacency).reshape(-1, 2).T
     return _components(one, other, len(mesh.faces))
 
@@ -295,7 +302,7 @@ def _measure_pieces(mesh: trimesh.Trimesh, piece: Ints) -> _Pieces:
 
 
 def _are_parts(pieces: _Pieces) -> NDArray[np.bool_]:
-    """Return which pieces are parts of the object instead of scanner dirt (N,).
+    """Return a mask (N,) of the pieces that are parts of the object, not scanner dirt.
 
     Pieces of at least 2 % of the surface are parts. A smaller piece next to a part is also a part if it is closed and
     not tiny, or sticks out. Other pieces are dirt. If dirt has more than 5 % of the surface, its largest pieces are
@@ -360,7 +367,7 @@ def _runs_along(faces: Ints, edges: Ints) -> NDArray[np.bool_]:
 
 
 def _shown(scan: trimesh.Trimesh, kept: Ints, turned: NDArray[np.bool_], repairs: list[str]) -> trimesh.Trimesh:
-    """Return the scan with only the faces ``kept``, with its colours and, if they fit the faces, its normals.
+    """Return the scan with only the faces ``kept``, with colours and, if they fit, normals.
 
     Args:
         scan: the scan before cleaning.

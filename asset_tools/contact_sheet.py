@@ -1,4 +1,4 @@
-"""Draw contact sheets: all assets of a pack in one PNG, with appearance, hulls, resting poses, grasps and joints."""
+"""Draw contact sheets: one image with all assets of a pack, their hulls, poses, grasps and joints."""
 
 from __future__ import annotations
 

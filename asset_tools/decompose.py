@@ -1,4 +1,4 @@
-"""Decompose a closed mesh into convex hulls: one hull if it is close to the mesh, otherwise merged hulls of CoACD."""
+"""Decompose a closed mesh into convex hulls: one hull if it is close, otherwise hulls of CoACD."""
 
 from __future__ import annotations
 
@@ -53,7 +53,9 @@ class Decomposition:
 
 
 def decompose_mesh(closed: trimesh.Trimesh) -> Decomposition:
-    """Decompose a closed mesh into at most 32 convex hulls that PhysX accepts on CPU and GPU; deterministic.
+    """Decompose a closed mesh into at most 32 convex hulls that PhysX accepts on CPU and GPU.
+
+    The result is deterministic.
 
     Args:
         closed: watertight mesh, metres.
@@ -73,7 +75,7 @@ def decompose_mesh(closed: trimesh.Trimesh) -> Decomposition:
 
 
 def _decompose(closed: trimesh.Trimesh) -> Decomposition:
-    """Return one convex hull if its IoU with the mesh is large enough, otherwise the merged hulls of CoACD."""
+    """Return one convex hull if its IoU with the mesh is large, otherwise the merged hulls of CoACD."""
     best: Decomposition | None = None
     if closed.volume / closed.convex_hull.volume >= WANTED_OVERLAP - 0.02:
         hulls = [reduce_hull_vertices(np.asarray(closed.vertices))]
@@ -180,7 +182,9 @@ def _without_bevels(points: Array, bevel: float) -> Array:
 
 
 def _outside(points: Array, corners: Array) -> Array:
-    """Return the signed distances (P,) of points (P, 3) from the convex hull of corners (V, 3), m; negative inside.
+    """Return the signed distances (P,) of points (P, 3) from the convex hull of corners (V, 3), m.
+
+    The distances are negative inside.
 
     If the corners are coplanar, the result is the distance from the plane of the corners plus 1 m.
     """
@@ -212,7 +216,10 @@ def _good_enough(closed: trimesh.Trimesh, found: Decomposition, hollow: bool, le
 
 
 def _merged(closed: trimesh.Trimesh, found: Decomposition, hollow: bool) -> Decomposition:
-    """Merge pairs of hulls as long as the decomposition stays good enough; pairs that add little volume come first."""
+    """Merge pairs of hulls as long as the decomposition stays good enough.
+
+    Pairs that add little volume come first.
+    """
     least = found.volume_iou - LOST_OVERLAP
     hulls, volumes = dict(enumerate(found.hulls)), {i: ConvexHull(hull).volume for i, hull in enumerate(found.hulls)}
 

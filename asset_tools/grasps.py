@@ -32,7 +32,7 @@ CHUNK = 128
 
 @dataclass(frozen=True)
 class Grasps:
-    """Grasps of an object. Each grasp is the best of the remaining grasps by quality and distance from earlier grasps.
+    """Grasps of an object; the order is by quality and by distance from earlier grasps.
 
     Attributes:
         tcp_in_object: (G, 4, 4) poses of the TCP in the object's frame, m. z is the approach direction, y is the
@@ -74,7 +74,7 @@ class _Pairs:
 def sample_grasps(
     closed: trimesh.Trimesh, center_of_mass: Array, rng: np.random.Generator, *, count: int = 400
 ) -> Grasps:
-    """Sample grasps that the open gripper reaches on a straight path, spread over directions and positions.
+    """Sample grasps that the open gripper reaches straight, spread over directions and positions.
 
     Args:
         closed: watertight mesh, m; may be concave.
@@ -168,7 +168,7 @@ def _contact_pairs(mesh: trimesh.Trimesh, rng: np.random.Generator) -> _Pairs:
 
 
 def _reachable(pairs: _Pairs, points: Array, rng: np.random.Generator) -> tuple[NDArray[np.int_], Array, Array]:
-    """Rotate the gripper about each closing axis, and keep poses that the open gripper reaches on a straight path.
+    """Rotate the gripper about each closing axis, and keep poses that it reaches on a straight path.
 
     Args:
         pairs: pairs of contacts.
@@ -205,7 +205,7 @@ def _reachable(pairs: _Pairs, points: Array, rng: np.random.Generator) -> tuple[
 def _touched(
     pairs: _Pairs, pair: NDArray[np.int_], rotations: Array, depths: Array, points: Array, area: float
 ) -> tuple[Array, Array]:
-    """Return the required distance (K,) of the fingers in m, and the fraction (K,) of the pads that touches the object.
+    """Return the required distance (K,) of the fingers in m, and the touching fraction (K,) of the pads.
 
     The fraction is that of the pad with less contact. It is 0 if a finger would touch the object elsewhere before it
     reaches the contacts.

@@ -168,7 +168,7 @@ def make_object_id(name: str) -> str:
 
 
 def estimate_mass(closed: trimesh.Trimesh) -> float:
-    """Estimate the mass of a household product in kg from its volume: 600 kg/m3, at least 0.03 and at most 0.8 kg."""
+    """Estimate the mass of a product in kg from its volume: 600 kg/m3, limited to 0.03 to 0.8 kg."""
     return round(min(max(DENSITY * float(closed.volume), MASS_RANGE[0]), MASS_RANGE[1]), 4)
 
 

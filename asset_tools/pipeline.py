@@ -96,7 +96,7 @@ class AssetJobResult:
 
 
 def make_failing_job(id_: str, error: AssetError) -> AssetJob:
-    """Return a job that raises ``error`` when it runs, so that ``skip_errors`` also skips assets with early errors."""
+    """Return a job that raises ``error`` when it runs, so that ``skip_errors`` can skip the asset."""
     return AssetJob(id_, partial(_fail, error), compute_content_hash(str(error)), error)
 
 
@@ -112,7 +112,9 @@ def check_jobs(jobs: Iterable[AssetJob]) -> None:
 
 
 def build_assets(jobs: Sequence[AssetJob], out: Path, cache: Path, *, processes: int = 1) -> Iterator[AssetJobResult]:
-    """Build assets in ``out/<id>``, or copy them from the cache; yield each result as soon as it is available.
+    """Build assets in ``out/<id>``, or copy them from the cache.
+
+    Yield each result as soon as it is available.
 
     An interrupted run continues where it stopped, since every finished asset is cached.
 
@@ -141,7 +143,7 @@ def build_assets(jobs: Sequence[AssetJob], out: Path, cache: Path, *, processes:
 
 
 def compute_content_hash(*settings: object, files: Iterable[Path] = (), packages: Sequence[str] = ()) -> str:
-    """Return the SHA-256 of the inputs of an asset: settings, source files, code and versions of libraries.
+    """Return the SHA-256 of the inputs of an asset: settings, files, code and versions of libraries.
 
     Args:
         settings: values that affect the asset; each ``repr`` must contain the complete value.
@@ -203,7 +205,9 @@ def _failed_result(job: AssetJob, message: str) -> AssetJobResult:
 
 
 def _copy_from_cache(place: Path, folder: Path) -> ObjectAsset | FurnitureAsset | None:
-    """Copy an asset from the cache and return its manifest entry; None if the cached asset is missing or damaged.
+    """Copy an asset from the cache and return its manifest entry.
+
+    Return None if the cached asset is missing or damaged.
 
     Args:
         place: folder of the asset in the cache.
@@ -279,7 +283,9 @@ def write_pack(
 
 
 def _remove_hull_violations(results: list[AssetJobResult], folder: Path, skip_errors: bool) -> list[AssetJobResult]:
-    """Remove assets with hulls that PhysX shrinks or rejects from the pack; without ``skip_errors``, raise AssetError.
+    """Remove assets with hulls that PhysX shrinks or rejects from the pack.
+
+    Without ``skip_errors``, raise AssetError.
 
     Returns:
         ``results``, with failures in place of the removed assets.

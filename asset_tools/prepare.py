@@ -1,4 +1,4 @@
-"""Prepare a raw scan for an asset: a textured mesh and a closed mesh in metres with z up, and a list of repairs."""
+"""Prepare a raw scan: a textured mesh and a closed mesh in metres with z up, and repairs."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class PreparedScan:
 def prepare_scan(
     path: Path | Sequence[Path], *, root: Path | None = None, up: Up | None = None, unit: Unit | None = None
 ) -> PreparedScan:
-    """Read a scan, repair its faces, close its holes, flatten its base, and convert it to metres with z up.
+    """Read a scan, repair faces, close holes, flatten the base, and convert it to metres with z up.
 
     Args:
         path: a mesh file, a folder of mesh files, or several mesh files, which may be versions of one mesh.
@@ -136,7 +136,7 @@ def flatten_base(
 
 
 def _reach(closed: trimesh.Trimesh, height: float, center: Array) -> float:
-    """Return the smallest horizontal distance in m from the centre of mass to the outline of a horizontal section.
+    """Return the smallest distance in m from the centre of mass to the outline of a section.
 
     Args:
         closed: watertight mesh, metres, z up.
@@ -148,7 +148,7 @@ def _reach(closed: trimesh.Trimesh, height: float, center: Array) -> float:
 
 
 def _edge_distance(flat: Array, center: Array) -> float:
-    """Return the distance from a point, xy of ``center``, to the nearest edge of the convex outline of points (N, 2).
+    """Return the distance from xy of ``center`` to the nearest edge of the outline of points (N, 2).
 
     The distance is negative if the point is outside, and 0 if the points enclose no area.
     """

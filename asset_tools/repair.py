@@ -154,7 +154,7 @@ def _filled(
 
 
 def _patched(shown: trimesh.Trimesh, face: Ints, corner: Ints, middles: Array) -> trimesh.Trimesh:
-    """Add triangles that fill holes: one from each edge of a rim to the centre of the hole, in the colours of the edge.
+    """Fill holes with triangles from each edge of a rim to the centre, in the colours of the edges.
 
     Args:
         shown: textured or coloured mesh.
@@ -185,7 +185,10 @@ def _patched(shown: trimesh.Trimesh, face: Ints, corner: Ints, middles: Array) -
 
 
 def _as_solid(mesh: trimesh.Trimesh) -> Manifold | None:
-    """Convert a mesh to a solid with outward faces; return None if the mesh is not closed or has no volume."""
+    """Convert a mesh to a solid with outward faces.
+
+    Return None if the mesh is not closed or has no volume.
+    """
     if not mesh.is_watertight:
         return None
     if mesh.volume < 0:
@@ -261,7 +264,7 @@ def _remeshed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def compute_winding_numbers(points: Array, samples: Array, normals: Array, area: float) -> Array:
-    """Return the winding number (N,) of a surface at N points: 1 inside, 0 outside, between 0 and 1 near a hole.
+    """Return the winding number (N,) of a surface at points: 1 inside, 0 outside, between near a hole.
 
     Samples approximate the surface. The result is accurate at points farther from the surface than twice the distance
     between neighbouring samples.
@@ -283,7 +286,7 @@ def compute_winding_numbers(points: Array, samples: Array, normals: Array, area:
 
 
 def _light(solid: Manifold, diagonal: float) -> trimesh.Trimesh:
-    """Return the closed surface of a solid, simplified to at most 5000 faces if this keeps 95 % of the volume."""
+    """Return the surface of a solid, simplified to at most 5000 faces if this keeps 95 % of the volume."""
     for tolerance in TOLERANCES:
         if solid.num_tri() <= FACES:
             break

@@ -1,4 +1,4 @@
-"""Find resting poses of an object on a plane from its convex hull, and verify them in the physics engine."""
+"""Find resting poses of an object on a plane from its convex hull, and verify them in PhysX."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class _Body:
     cooked: Array  # (L, 3) corners of the hull of the engine's shapes
 
     def place_with_up(self, up: Array) -> Array:
-        """Return the pose (4, 4) of the object on the plane z = 0 in which ``up``, (3,) in its frame, points up."""
+        """Return the pose (4, 4) on the plane z = 0 in which ``up``, (3,) in the object's frame, is up."""
         pose = np.eye(4)
         pose[:3, :3] = _turn_up(up)
         pose[:2, 3] = -(pose[:2, :3] @ self.solid.center_of_mass)
@@ -134,7 +134,7 @@ def _turn_up(up: Array) -> Array:
 
 
 def _settle(body: _Body, directions: Array) -> tuple[Array, list[int]]:
-    """Simulate the object from each pose until it stays; after a motion, place it again in the pose that it reached.
+    """Simulate the object from each pose, and again from the pose that it reached, until it stays.
 
     Args:
         body: the object.
@@ -188,7 +188,10 @@ def _firm(body: _Body, directions: Array, which: list[int]) -> tuple[Array, list
 
 
 def _simulate(body: _Body, starts: Array) -> Array:
-    """Simulate N separate copies of an object from poses (N, 4, 4); return their poses (N, 4, 4) after 1 s."""
+    """Simulate N separate copies of an object from poses (N, 4, 4).
+
+    Return their poses (N, 4, 4) after 1 s.
+    """
     offsets = grid_origins(len(starts))
     with engine_settings():
         scene = make_scene()

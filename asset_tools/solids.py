@@ -8,7 +8,10 @@ from manifold3d import Error, Manifold, Mesh64
 
 
 def mesh_to_solid(mesh: trimesh.Trimesh) -> Manifold | None:
-    """Convert a watertight mesh with outward faces to a solid of manifold3d; return None if the solid is invalid."""
+    """Convert a watertight mesh with outward faces to a solid of manifold3d.
+
+    Return None if the solid is invalid.
+    """
     # copies, since manifold3d requires writable arrays
     vertices, faces = np.array(mesh.vertices, np.float64, order="C"), np.array(mesh.faces, np.uint64, order="C")
     solid = Manifold(Mesh64(vertices, faces))

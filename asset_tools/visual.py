@@ -129,7 +129,7 @@ class Appearance:
 
     @property
     def layered(self) -> bool:
-        """Whether surfaces with different images or tints may be close to each other, such as a label on a bottle."""
+        """Whether surfaces with different images may be close to each other, as a label on a bottle."""
         return len(self.images) > 1 or self.tints is not None
 
     @property
@@ -171,7 +171,7 @@ def _shrunk(image: Image.Image, size: int) -> Image.Image:
 
 
 def _shaded(mesh: trimesh.Trimesh) -> tuple[Array, NDArray, Array, NDArray]:
-    """Return a mesh with vertex normals: the normals of the file, or else normals with sharp edges above 40 deg.
+    """Return a mesh with the normals of the file, or with normals that have sharp edges above 40 deg.
 
     Returns:
         Vertices (V, 3), faces (F, 3), normals (V, 3), and for each vertex the index (V,) of a vertex of ``mesh``.
@@ -190,7 +190,7 @@ def _shaded(mesh: trimesh.Trimesh) -> tuple[Array, NDArray, Array, NDArray]:
 
 
 def _crease_normals(body: trimesh.Trimesh) -> Array:
-    """Return a normal per corner of each face (F, 3, 3): the mean over adjacent faces within 40 deg of the face."""
+    """Return a normal per corner (F, 3, 3): the mean over adjacent faces within 40 deg of the face."""
     faces = np.asarray(body.faces)
     corner_vertex = faces.reshape(-1)
     order = np.argsort(corner_vertex, kind="stable")
@@ -238,7 +238,7 @@ def _baked(
     *,
     same_faces: bool = False,
 ) -> Image.Image:
-    """Bake a texture for a simplified mesh: each texel gets the colour of the closest point of the original mesh.
+    """Bake a texture for a simplified mesh from the closest points of the original mesh.
 
     Args:
         mesh: original mesh.
@@ -360,7 +360,7 @@ def _double_area(corners: Array) -> Array:
 
 
 def _bilinear(image: NDArray[np.float32], uv: Array) -> Array:
-    """Return bilinear samples (N, 3) of an image at UVs (N, 2) with v upward; the image repeats outside of 0..1."""
+    """Return bilinear samples (N, 3) of a repeating image at UVs (N, 2), v upward."""
     height, width = image.shape[:2]
     column, row = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
     left, top = np.floor(column).astype(int), np.floor(row).astype(int)

@@ -1,1 +1,1 @@
-"""Generate the builtin pack: everyday objects and furniture from Python code, so that no download is needed."""
+"""Generate the builtin pack, everyday objects and furniture, from Python code without downloads."""

@@ -12,7 +12,10 @@ BLACK, WHITE, IVORY = (22, 20, 20), (245, 245, 242), (238, 228, 200)
 
 
 def _dots(points: np.ndarray, colours: np.ndarray, colour: Colour, *spots: tuple[float, float, float, float]) -> None:
-    """Paint the points (n, 3) inside balls (x, |y|, z, radius) with one colour; ``colours`` (n, 3) is changed."""
+    """Paint the points (n, 3) inside balls (x, |y|, z, radius) with one colour.
+
+    ``colours`` (n, 3) is changed.
+    """
     folded = points * np.array([1, 0, 1], np.float32) + np.abs(points) * np.array([0, 1, 0], np.float32)
     for *center, radius in spots:
         colours[((folded - np.array(center, np.float32)) ** 2).sum(1) < radius**2] = colour
@@ -111,7 +114,7 @@ def make_large_elephant() -> Model:
 
 
 def make_small_elephant() -> Model:
-    """Make a small, light blue elephant with a large head, round ears with pink insides and a raised trunk."""
+    """Make a small, light blue elephant with a large head, pink insides of the ears and a raised trunk."""
     blue: Colour = (142, 186, 216)
     legs = ((16.0, 10.5), (-19.0, 10.5))
     ears = mirror_y(ellipsoid((16, 17, 42), (13, 2.8, 14), (10, 0, -42)))
@@ -280,7 +283,7 @@ def make_monkey() -> Model:
 
 
 def _heart(y: float, z: float, half_width: float, half_height: float) -> np.ndarray:
-    """Return the outline (n, 2) of a face, centred at (y, z): two lobes at the top, round at the bottom, mm."""
+    """Return the outline (n, 2) in mm of a face, centred at (y, z), with two lobes at the top."""
     t = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     bulge = 1 - 0.22 * np.exp(-(((t - np.pi / 2) / 0.4) ** 2))
     return np.column_stack([y + half_width * np.cos(t) * bulge, z + half_height * np.sin(t) * bulge])

@@ -139,7 +139,9 @@ def plate(
 
 
 def hoop(center: tuple[float, float], radii: tuple[float, float], half_width: float, half_height: float) -> Field:
-    """Return the field of a ring in the plane z = 0 along an ellipse; the section of the ring is also an ellipse.
+    """Return the field of a ring in the plane z = 0 along an ellipse.
+
+    The section of the ring is also an ellipse.
 
     Args:
         center: x and y of the centre of the ring.

@@ -154,7 +154,7 @@ def make_upended_bottle(size: Size) -> Shape:
 
 
 def make_tube(size: Size, *, cap_radius: float, cap_height: float, flare: float = 1.0) -> Shape:
-    """Make a squeeze tube that stands on its cap: round at the cap, flat at the top; regions: side, cap, lid.
+    """Make a squeeze tube that stands on its cap and is flat at the top; regions: side, cap, lid.
 
     As in a real tube, the circumference is constant: the flat end is pi / 2 times as wide as the round end.
 

@@ -22,7 +22,7 @@ FORMULAS_HASH = "formulas.sha256"
 
 
 def compute_formulas_hash() -> str:
-    """Return the SHA-256 of the Python and YAML files of this package, from which the bundled pack is built."""
+    """Return the SHA-256 of the Python and YAML files from which the bundled pack is built."""
     digest, here = hashlib.sha256(), Path(__file__).parent
     for path in sorted(path for path in here.rglob("*") if path.suffix in (".py", ".yaml")):
         digest.update(path.relative_to(here).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
@@ -48,7 +48,9 @@ def make_builtin_jobs(ids: Sequence[str] = ()) -> list[AssetJob]:
 
 
 def build_asset(asset_id: str, folder: Path) -> ObjectAsset | FurnitureAsset:
-    """Write the files of a builtin asset to a folder and return the manifest entry of the asset; deterministic.
+    """Write the files of a builtin asset to a folder and return the manifest entry of the asset.
+
+    The result is deterministic.
 
     Raises:
         KeyError: the id is unknown.

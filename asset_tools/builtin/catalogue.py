@@ -1,4 +1,7 @@
-"""Read the products of the builtin pack from ``products/*.yaml``; these files refer to functions by name."""
+"""Read the products of the builtin pack from ``products/*.yaml``.
+
+These files refer to functions by name.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ FOLDER = Path(__file__).parent / "products"
 
 
 class Formula(StrictModel):
-    """A function or class in a product file: its name is ``kind``, and the other keys are its keyword arguments."""
+    """Call in a product file: ``kind`` names a function, the other keys are its keyword arguments."""
 
     function: ClassVar[Callable[..., Any]]
 

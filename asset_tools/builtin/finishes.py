@@ -33,7 +33,10 @@ def paint_plaster(grid: Grid, rng: np.random.Generator, *, colour: Colour) -> Ar
 
 
 def paint_bricks(grid: Grid, rng: np.random.Generator) -> Array:
-    """Paint red bricks with light joints, each row shifted by half a brick; return colours (h, w, 3) in 0..255."""
+    """Paint red bricks with light joints, each row shifted by half a brick.
+
+    Return colours (h, w, 3) in 0..255.
+    """
     cells = grid.make_cells((TILE / 9, TILE / 26), shift=0.5)
     tone, hue = cells.draw_random(rng), cells.draw_random(rng)
     grit = grid.make_noise(rng, (0.02, 0.02), slope=2.6)
@@ -56,7 +59,10 @@ def paint_boards(grid: Grid, rng: np.random.Generator) -> Array:
 
 
 def paint_glazed_tiles(grid: Grid, rng: np.random.Generator) -> Array:
-    """Paint glazed tiles of 0.2 x 0.1 m, each row shifted by half a tile; return colours (h, w, 3) in 0..255."""
+    """Paint glazed tiles of 0.2 x 0.1 m, each row shifted by half a tile.
+
+    Return colours (h, w, 3) in 0..255.
+    """
     cells = grid.make_cells((0.2, 0.1), shift=0.5)
     sheen = grid.make_noise(rng, (0.15, 0.08), slope=2.5)
     colours = scale_brightness(_even(grid, (222, 232, 230)), 0.025 * cells.draw_random(rng) + 0.012 * sheen)

@@ -12,7 +12,10 @@ from asset_tools.builtin.surfaces import Section, loft, make_chained_pieces, mak
 
 
 def _spline_rings(points: Sequence[tuple[float, float]], count: int) -> np.ndarray:
-    """Return ``count`` rings (count, 4) of a smooth profile through points (radius, z); its ends are horizontal."""
+    """Return ``count`` rings (count, 4) of a smooth profile through points (radius, z).
+
+    Its ends are horizontal.
+    """
     line = np.array(points)
     t = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     spline = CubicSpline(t, line, bc_type=((1, [1.0, 0.0]), (1, [-1.0, 0.0])))  # pyright: ignore[reportArgumentType]
@@ -32,7 +35,7 @@ def make_fruit(
     cuts: Sequence[float] = (),
     rings: int = 25,
 ) -> Shape:
-    """Make a fruit, a slightly irregular body of revolution; regions: skin (angle to the right, profile upwards), stem.
+    """Make a fruit, a slightly irregular body of revolution; regions: skin, stem.
 
     Args:
         size: outer size (x, y, z) with the stem, m.
@@ -92,7 +95,7 @@ def make_round_fruit(
 
 
 def make_banana(size: Size) -> Shape:
-    """Make a banana that lies on its side, bent in the xy plane; region: skin (angle to the right, tip at the top)."""
+    """Make a banana that lies on its side, bent in the xy plane; region: skin (tip at the top)."""
     chord, thick = size[0], size[2] / 2
     t = np.linspace(0, 1, 37)
     # the bend is stronger in the middle, and the stem is straight

@@ -1,4 +1,4 @@
-"""Paint labels on packages: one ``Label`` per product, on cartons, round packages, tubes, soap and mugs."""
+"""Paint the label of a product on cartons, round packages, tubes, soap and mugs."""
 
 from __future__ import annotations
 
@@ -210,7 +210,7 @@ def _background(canvas: Canvas, label: Label) -> None:
 
 
 def _front(canvas: Canvas, box: Box, label: Label) -> None:
-    """Draw motif, title, subtitle and amount in a box: one below the other, or, in a wide box, side by side.
+    """Draw motif, title, subtitle and amount in a box, in a column or, if the box is wide, in a row.
 
     The whole drawing is rotated by ``label.turn``.
     """

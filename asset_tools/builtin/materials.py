@@ -62,7 +62,7 @@ class Grid:
         return result / result.std()
 
     def make_cells(self, cell: tuple[float, float], *, shift: float = 0.0, phase: float = 0.5) -> Cells:
-        """Divide the image into rows of rectangles, such as tiles or bricks, which fit a whole number of times.
+        """Divide the image into rows of equal rectangles, such as tiles or bricks.
 
         If a row has only one rectangle, the rectangle has no left and right edge.
 
@@ -178,7 +178,10 @@ def paint_plain(grid: Grid, rng: np.random.Generator, *, colour: Colour, rough: 
 
 
 def paint_brushed_metal(grid: Grid, rng: np.random.Generator, *, colour: Colour = (196, 198, 202)) -> Array:
-    """Paint paint_brushed_metal metal with strokes along x and light from above; return colours (h, w, 3) in 0..255."""
+    """Paint brushed metal with strokes along x and light from above.
+
+    Return colours (h, w, 3) in 0..255.
+    """
     strokes = grid.make_noise(rng, (0.08, 0.0006), slope=1.2)
     gloss = 0.16 * np.cos(2 * np.pi * grid.y / grid.size[1])
     return scale_brightness(np.broadcast_to(np.asarray(colour, float), (*grid.x.shape, 3)), 0.035 * strokes + gloss)

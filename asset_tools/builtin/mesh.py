@@ -56,7 +56,9 @@ class Region:
 
 @dataclass(frozen=True)
 class Shape:
-    """A closed surface with texture coordinates; vertices are split at seams of the texture and at sharp edges.
+    """A closed surface with texture coordinates.
+
+    Vertices are split at seams of the texture and at sharp edges.
 
     Args:
         vertices: (n, 3) vertices, m.
@@ -112,7 +114,7 @@ def build_shape(parts: list[list[Patch]], *, texture_size: int = 512, crease_deg
 def build_fitted_shape(
     parts: list[list[Patch]], size: Size, *, pieces: Sequence[np.ndarray] = (), tolerance: float = 0.2
 ) -> Shape:
-    """Return the union of closed parts as a shape that is centred and scaled along each axis to an exact size.
+    """Return the union of closed parts as a shape, centred and scaled along each axis to an exact size.
 
     Args:
         parts: patches of each part, m.
@@ -158,7 +160,10 @@ def make_creased_shape(
 
 
 def weld(vertices: np.ndarray, tolerance: float = WELD) -> tuple[np.ndarray, np.ndarray]:
-    """Merge vertices (n, 3) by position; return distinct positions (k, 3) and the index (n,) of each position."""
+    """Merge vertices (n, 3) by position.
+
+    Return distinct positions (k, 3) and the index (n,) of each position.
+    """
     _, first, index = np.unique(
         np.round(vertices / tolerance).astype(np.int64), axis=0, return_index=True, return_inverse=True
     )
@@ -166,7 +171,7 @@ def weld(vertices: np.ndarray, tolerance: float = WELD) -> tuple[np.ndarray, np.
 
 
 def pack_regions(patches: list[Patch], texture_size: int) -> dict[str, Region]:
-    """Pack the regions of patches into a texture, in rows and with the largest possible number of pixels per metre.
+    """Pack the regions of patches in rows into a texture, as large as possible.
 
     Args:
         patches: all patches of a shape.
@@ -210,7 +215,9 @@ def pack_regions(patches: list[Patch], texture_size: int) -> dict[str, Region]:
 def _join(
     part: list[Patch], regions: dict[str, Region], texture_size: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Triangulate the patches of a part; return vertices (n, 3), UVs (n, 2) in the texture and triangles (f, 3).
+    """Triangulate the patches of a part.
+
+    Return vertices (n, 3), UVs (n, 2) in the texture and triangles (f, 3).
 
     Triangles without area, at poles, are left out.
     """

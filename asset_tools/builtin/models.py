@@ -1,4 +1,4 @@
-"""Make objects from coloured parts: blend the parts into one closed body, unwrap it, and paint it without seams."""
+"""Make objects from coloured parts, which are blended, unwrapped and painted without seams."""
 
 from __future__ import annotations
 
@@ -87,10 +87,10 @@ class Model:
         return body
 
     def shape(self, size: Size) -> Shape:
-        """The body, centred and stretched to its exact size.
+        """Return the body as a shape, centred and scaled along each axis to an exact size (x, y, z) in m.
 
         Raises:
-            ValueError: it would have to be stretched by more than a fifth.
+            ValueError: the size along an axis would change by more than 20 %.
         """
         factor = np.asarray(size) / (self.body.extents * MM)
         if np.abs(factor - 1).max() > 0.2:
@@ -102,7 +102,7 @@ class Model:
         return make_uv_mapped_shape(np.asarray(points), np.asarray(self.body.faces), self.texture_size, pieces)
 
     def paint(self, shape: Shape, rng: np.random.Generator) -> Image.Image:
-        """The texture of a shape that this model made."""
+        """Return the texture of a shape that `shape` returned."""
         extents = np.ptp(shape.vertices, axis=0)
         back, middle = self.body.extents / extents, self.body.bounds.mean(0)
         palette = np.array([part.colour for part in self.parts], np.float32)

@@ -1,4 +1,4 @@
-"""Draw small images on labels: each function draws one motif around the centre (x, y) with radius r, in pixels."""
+"""Draw small images on labels, centred at (x, y), with radius r, in pixels."""
 
 from __future__ import annotations
 

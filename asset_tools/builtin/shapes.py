@@ -1,4 +1,4 @@
-"""Make boxes, cans, jars and mugs of a given size: each function returns a closed shape with texture coordinates.
+"""Make boxes, cans, jars and mugs of a given size, as closed shapes with texture coordinates.
 
 The centre of the bounding box is the origin. Shapes are upright, with the front towards -y. ``size`` is the outer size
 (x, y, z) in metres. The docstrings name the regions of the texture. The region ``side`` is unrolled, and its middle is

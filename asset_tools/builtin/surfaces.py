@@ -221,7 +221,10 @@ def make_prism_piece(rings: Sequence[tuple[float, float]], sides: int = 16) -> n
 
 
 def make_chained_pieces(patch: Patch, count: int) -> list[np.ndarray]:
-    """Cut a tube of `sweep` along its length into ``count`` sections; return the points (k, 3) of each hull."""
+    """Cut a tube of `sweep` along its length into ``count`` sections.
+
+    Return the points (k, 3) of each hull.
+    """
     rows = patch.points[1:-1, :-1]
     bounds = np.round(np.linspace(0, len(rows) - 1, count + 1)).astype(int)
     return [reduce_hull_vertices(rows[a : b + 1].reshape(-1, 3)) for a, b in itertools.pairwise(bounds.tolist())]
@@ -246,7 +249,7 @@ def make_rounded_box(
     regions: dict[str, str] | None = None,
     detail: float = 1.0,
 ) -> list[Patch]:
-    """Return the patches of a box with rounded edges, one per face: front (-y), back, right (+x), left, top, bottom.
+    """Return the patches of a box with rounded edges, one per face: front is -y, right is +x.
 
     Args:
         size: outer size (x, y, z), m.

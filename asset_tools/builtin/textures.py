@@ -1,4 +1,4 @@
-"""Draw textures of packages: one canvas per region of the texture, text that fits in a box, noise without seams.
+"""Draw textures of packages: a canvas per region, text that fits in a box, noise without seams.
 
 Canvas coordinates are fractions of the region: x to the right, y downwards. A canvas has the proportions of the region
 on the object, so circles and letters are not distorted. It is larger than the region and is reduced at the end.
@@ -191,7 +191,7 @@ class Painter:
             self.put_pixels(name, np.full((high, wide, 3), colour, dtype=np.uint8))
 
     def put_pixels(self, name: str, pixels: np.ndarray) -> None:
-        """Copy pixels (height, width, 3) to a region, and continue their border in the padding around the region."""
+        """Copy pixels (height, width, 3) to a region, and their border to the padding around the region."""
         left, top, right, bottom = self.shape.regions[name].box
         padded = np.pad(pixels, ((PADDING, PADDING), (PADDING, PADDING), (0, 0)), mode="edge")
         self.pixels[top - PADDING : bottom + PADDING, left - PADDING : right + PADDING] = padded
@@ -219,7 +219,7 @@ def encode_jpeg(image: Image.Image, quality: int = 88) -> Image.Image:
 def compute_noise(
     points: np.ndarray, rng: np.random.Generator, *, frequency: float, octaves: int = 3, waves: int = 12
 ) -> np.ndarray:
-    """Return smooth noise (...) in about [-1, 1] at points: a sum of random waves in space, which has no seams.
+    """Return smooth noise (...) in about [-1, 1] at points, a sum of random waves in space.
 
     Args:
         points: (..., 3) points.
@@ -262,7 +262,7 @@ def _extents(words: str, spread: float) -> tuple[float, float, float, float]:
 
 
 def compute_text_mask(words: str, x: np.ndarray, y: np.ndarray, height: float) -> np.ndarray:
-    """Return whether points (n,), (n,) are on the letters of a line of text, centred at 0 and ``height`` tall."""
+    """Return a mask (n,) of the points on the letters of a text that is centred at 0, ``height`` tall."""
     font = ImageFont.load_default(64)
     left, top, right, bottom = (round(v) for v in font.getbbox(words, stroke_width=2))
     image = Image.new("L", (right - left, bottom - top))

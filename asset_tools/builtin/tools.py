@@ -27,7 +27,10 @@ SILVER: Colour = (206, 208, 212)
 
 
 def make_power_drill() -> Model:
-    """Make a cordless power drill with an orange housing and a black chuck and grip; it stands on the battery."""
+    """Make a cordless power drill with an orange housing and a black chuck and grip.
+
+    It stands on the battery.
+    """
     orange: Colour = (236, 98, 22)
 
     def decorate(points, normals, colours, rng):
@@ -81,7 +84,7 @@ def make_power_drill() -> Model:
 
 
 def make_scissors() -> Model:
-    """Make slightly open scissors with two steel blades, a screw and red handles with rings of different length."""
+    """Make slightly open scissors with steel blades and red handles with rings of different length."""
     red: Colour = (206, 36, 34)
     opening = 5.5
     blade = [(-32, -4.0), (-20, -7.5), (10, -8), (60, -4.2), (93, 1.0), (93, 1.8), (60, 2.2), (10, 4), (-32, 6)]

@@ -29,7 +29,7 @@ class CatalogueEntry:
 
     @property
     def folder_name(self) -> str:
-        """Name of the object's folder in ``models``, and prefix of its label file: the number with three digits."""
+        """Name of the object's folder, and prefix of its label file: the number with three digits."""
         return f"{self.number:03d}"
 
 
@@ -96,7 +96,9 @@ NUMBERS: dict[str, int] = {entry.id: number for number, entry in ENTRIES.items()
 
 
 def find_catalogue_entry(number: int) -> CatalogueEntry:
-    """Return the entry of the object with a number; objects that RoboCAS-v0 does not use have generic names.
+    """Return the entry of the object with a number.
+
+    Objects that RoboCAS-v0 does not use have generic names.
 
     Raises:
         ValueError: the number is not between 0 and 87.

@@ -27,7 +27,9 @@ ATTRIBUTION = "GraspNet-1Billion (H.-S. Fang, C. Wang, M. Gou, C. Lu, CVPR 2020)
 
 
 def make_graspnet_jobs(root: Path, ids: Sequence[int] = (), inspect: Inspect = inspect_models) -> list[AssetJob]:
-    """Return one job per object of GraspNet-1Billion; the job of an unreadable model raises an error when it runs.
+    """Return one job per object of GraspNet-1Billion.
+
+    The job of an unreadable model raises an error when it runs.
 
     Args:
         root: folder of the dataset, which contains ``models``.
@@ -135,7 +137,10 @@ def _model(root: Path, number: int) -> Path:
 
 
 def _mesh(root: Path, number: int) -> Path:
-    """Return the path of ``textured.obj`` of a model; if this file is missing, the path of the model's folder."""
+    """Return the path of ``textured.obj`` of a model.
+
+    If this file is missing, return the path of the model's folder.
+    """
     textured = _model(root, number) / "textured.obj"
     return textured if textured.is_file() else _model(root, number)
 

@@ -1,4 +1,4 @@
-"""Read GraspNet-1Billion's grasp labels (``NNN_labels.npz``, hundreds of MB each) and convert them to TCP poses.
+"""Read grasp labels of GraspNet-1Billion (``NNN_labels.npz``) and convert them to TCP poses.
 
 For each point of the object, 300 views on a Fibonacci lattice, 12 in-plane angles and 4 depths, a label has the width
 of the gripper, a collision flag, and the smallest friction coefficient with which the grasp holds.
@@ -201,7 +201,7 @@ def to_tcp_poses(labels: GraspLabels) -> Array:
 
 
 def _clear(poses: Array, points: Array) -> NDArray[np.bool_]:
-    """Return whether the open gripper reaches each pose (N,) on a straight path without touching the object.
+    """Return whether the open gripper reaches each pose (N,) straight without touching the object.
 
     Args:
         poses: (N, 4, 4) poses of the TCP.
@@ -250,7 +250,10 @@ def _slices(path: Path, count: int) -> Iterator[tuple[NDArray, NDArray, NDArray]
 
 @contextmanager
 def _opened(path: Path) -> Iterator[dict[str, _Member]]:
-    """Open the arrays of a label file and check their shapes; each stream is at the first value of its array."""
+    """Open the arrays of a label file and check their shapes.
+
+    Each stream is at the first value of its array.
+    """
     try:
         with ExitStack() as stack:
             archive = stack.enter_context(zipfile.ZipFile(path))

@@ -1,4 +1,4 @@
-"""Annotations of PartNet-Mobility models: YAML files ``<id>.yaml`` with surfaces, handles and corrections of joints."""
+"""Read annotation files ``<id>.yaml`` of PartNet-Mobility models: surfaces, handles and joints."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Scale = Annotated[float, Field(ge=1e-4, le=1e4)]
 
 
 class HandleAnnotation(StrictModel):
-    """Grasp of a moving part: pose of the TCP in the furniture's frame with all joints closed, m; width in m."""
+    """Grasp of a moving part: width, and pose of the TCP in the furniture's frame, joints closed; m."""
 
     joint: str
     position: Vec3

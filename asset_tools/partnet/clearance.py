@@ -23,7 +23,7 @@ STOPS = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.4, 0.
 
 
 def trim_colliding_pieces(pieces: Sequence[Array], others: Sequence[Array], joint: Joint) -> list[Array]:
-    """Cut the pieces of a moving part so that they do not touch the rest of the furniture while the joint moves.
+    """Cut the pieces of a moving part so that they never touch the rest of the furniture.
 
     A piece that would touch another hull is cut by a plane; of all possible planes, the plane with the smallest depth
     is used. A piece stays unchanged if the cut would be deeper than 3 cm, or would leave less than 20 % of the piece.
@@ -73,7 +73,9 @@ def _passed(other: Array, joint: Joint, span: tuple[float, float]) -> ConvexBody
 
 
 def _below(points: Array, plane: Array) -> Array | None:
-    """Cut a hull by a plane; return the corners (V, 3) below the plane, or None if this part has no volume.
+    """Cut a hull by a plane.
+
+    Return the corners (V, 3) below the plane, or None if this part has no volume.
 
     Args:
         points: (P, 3) corners of the hull.

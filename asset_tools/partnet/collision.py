@@ -53,7 +53,9 @@ class CollisionPart:
 
 
 def make_collision_pieces(parts: Sequence[CollisionPart], middle: Array) -> list[Array]:
-    """Decompose the parts of a link into at most 40 convex pieces; return the corners (V, 3) of each piece, m.
+    """Decompose the parts of a link into at most 40 convex pieces.
+
+    Return the corners (V, 3) of each piece, m.
 
     A part that nearly fills its convex hull becomes one piece. Another part is split into its meshes, and each mesh
     into its connected components. A component that is an open shell is split into walls. Other components are cut by
@@ -109,7 +111,7 @@ def _sturdy(hull: Array) -> bool:
 
 
 def _size(points: Array, rank: int) -> float:
-    """Return the longest (``rank`` 0), middle (1) or shortest (2) extent of points (P, 3) along x, y and z, m."""
+    """Return the longest (``rank`` 0), middle (1) or shortest (2) extent of points (P, 3), m."""
     return float(np.sort(np.ptp(points, axis=0))[2 - rank])
 
 
@@ -140,7 +142,9 @@ def _is_shell(body: trimesh.Trimesh) -> bool:
 
 
 def _cut(triangles: Array, fine: bool, depth: int) -> list[Array]:
-    """Cut a closed mesh by planes across x, y or z into nearly convex pieces; return the points (P, 3) of each piece.
+    """Cut a closed mesh by planes across x, y or z into nearly convex pieces.
+
+    Return the points (P, 3) of each piece.
 
     Args:
         triangles: (F, 3, 3) triangles, m.
@@ -171,7 +175,7 @@ def _cut(triangles: Array, fine: bool, depth: int) -> list[Array]:
 
 
 def _places(triangles: Array, across: Array) -> list[tuple[int, float]]:
-    """Return axis and position of each cut to try: at the largest faces across x, y and z, then at even steps.
+    """Return axis and position of each cut to try: at the largest faces, then at even steps.
 
     Args:
         triangles: (F, 3, 3) triangles, m.
@@ -230,7 +234,7 @@ def _flat_hull(points: Array, middle: Array) -> Array | None:
 
 
 def _thickness(normal: Array, inward: Array) -> Array:
-    """Return the vector (3,) in m from a sheet to the other side of its slab: down, or, if vertical, to the inside."""
+    """Return the vector (3,) in m from a sheet to the other side of its slab: down, or to the inside."""
     level = abs(normal[2]) > LEVEL
     return normal * (SHEET if (-normal[2] if level else normal @ inward) > 0 else -SHEET)
 

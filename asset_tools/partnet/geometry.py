@@ -1,4 +1,7 @@
-"""Read the faces of the shapes of a model: mesh files and primitives. Unusable shapes are skipped and noted."""
+"""Read the faces of the shapes of a model: mesh files and primitives.
+
+Unusable shapes are skipped and noted.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Import PartNet-Mobility models: convert a model and its annotation to the source of a piece of furniture."""
+"""Import PartNet-Mobility models: convert a model and its annotation to a furniture source."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Make an annotation file with the links and joints of a model, in which the user replaces example values."""
+"""Make an annotation file with the links and joints of a model and example values."""
 
 from __future__ import annotations
 

@@ -202,7 +202,7 @@ def _tiles(corners: Array, uv: Array, image: Image.Image) -> tuple[list[_Tile], 
 
 
 def _charts(corners: Array, uv: Array) -> Array:
-    """Return the number (F,) of the chart of each face: faces with common corners, in 3D and UV, form a chart."""
+    """Return the number (F,) of the chart of each face; a chart has common corners in 3D and UV."""
     keys = np.round(np.concatenate([corners, uv], axis=2).reshape(-1, 5) * 1e4).astype(np.int64)
     nodes = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1, 3)
     links = np.concatenate([nodes[:, [0, 1]], nodes[:, [1, 2]]])

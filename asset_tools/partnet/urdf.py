@@ -1,4 +1,4 @@
-"""Read ``mobility.urdf`` of PartNet-Mobility: the shapes and joints of all links in one frame, with closed joints."""
+"""Read ``mobility.urdf`` of PartNet-Mobility: shapes and joints of all links in one frame."""
 
 from __future__ import annotations
 
@@ -231,7 +231,10 @@ class _Reader:
         return closed, (low - closed, high - closed)
 
     def _limits(self, joint: _Joint, note: JointAnnotation, unit: float) -> tuple[float, float]:
-        """Return the limits of a joint in m or rad, relative to the zero position of the URDF; infinite if missing."""
+        """Return the limits of a joint in m or rad, relative to the zero position of the URDF.
+
+        Missing limits are infinite.
+        """
         limit = joint.element.find("limit")
         if limit is None or joint.kind == "continuous":
             return -np.inf, np.inf
@@ -258,7 +261,10 @@ class _Reader:
         return list(names)
 
     def _visuals(self, name: str, link: ET.Element) -> list[Visual]:
-        """Return the visual shapes of a link in the frame of the link; without visual shapes, the collision shapes."""
+        """Return the visual shapes of a link in the frame of the link.
+
+        A link without visual shapes gets its collision shapes.
+        """
         found, tag = link.findall("visual"), "visual"
         if not found and link.find("collision") is not None:
             found, tag = link.findall("collision"), "collision"
@@ -291,7 +297,10 @@ class _Reader:
         return Shape(shape.tag, tuple(sizes.tolist()))
 
     def _color(self, material: ET.Element) -> tuple[float, float, float] | None:
-        """Return the RGB colour of a material in 0..1; a material without a colour has one elsewhere by its name."""
+        """Return the RGB colour of a material in 0..1.
+
+        A material without a colour gets the colour of a material with its name elsewhere in the file.
+        """
         name, color = material.get("name", ""), material.find("color")
         if color is None:
             return self._colors.get(name)

@@ -63,7 +63,9 @@ class DropReport:
 
 
 def run_drop_test(solid: RigidBody, resting_poses: Array, *, seed: int = 0) -> DropReport:
-    """Drop an object 20 times from 5 cm onto a table in random orientations and simulate 3 s; deterministic.
+    """Drop an object 20 times from 5 cm onto a table in random orientations and simulate 3 s.
+
+    The result is deterministic.
 
     An object is at rest as soon as its kinetic energy stays below 4.5e-4 J/kg until the end. An object that trembles is
     never at rest.
@@ -102,7 +104,7 @@ def run_drop_test(solid: RigidBody, resting_poses: Array, *, seed: int = 0) -> D
 
 
 def _advances(velocities: Array) -> bool:
-    """Return whether an object with velocities (T, 2) in m/s moves mainly in one direction, by at least 1 cm."""
+    """Return whether a motion with velocities (T, 2) in m/s has mainly one direction, over 1 cm."""
     path = TIME_STEP * np.linalg.norm(velocities, axis=1).sum()
     ahead = TIME_STEP * np.linalg.norm(velocities.sum(axis=0))
     return bool(path >= LEAST_PATH and ahead >= ONE_WAY * path)
@@ -173,7 +175,7 @@ class _Comparison:
         return int(np.argmin(apart)) if min(apart) <= self._limit else -1
 
     def count_matches(self, poses: Array) -> int:
-        """Return how many of the poses (T, 4, 4), counted from the first, are equal to a resting pose without a gap."""
+        """Return how many of the first poses of (T, 4, 4) are equal to a resting pose without a gap."""
         likely = list(range(len(self._listed)))
         for count, pose in enumerate(poses):
             found = next((index for index in likely if self._apart(pose, index) <= self._limit), None)
@@ -189,7 +191,7 @@ class _Comparison:
         return float(max(np.percentile(there, 95), np.percentile(back, 95)))
 
     def _profile(self, pose: Array) -> Array:
-        """Return (P, 2) for points on the surface: height above the table, and distance from the vertical line, m.
+        """Return height above the table and distance from the vertical line (P, 2) of surface points, m.
 
         The vertical line passes through the centre of mass of the object in ``pose`` (4, 4).
         """

@@ -62,7 +62,7 @@ class JointReport:
 
     @property
     def works(self) -> bool:
-        """Whether the joint opens, closes and stays closed without force, without overlaps and with usable handles."""
+        """Whether the joint opens, closes and stays closed, without overlaps and with usable handles."""
         moves = self.bounded and self.opened >= OPEN and abs(self.closed) <= CLOSED and self.drifted <= STILL
         return moves and self.overlap <= JAMMED and self.grip <= GRIP
 
@@ -103,7 +103,9 @@ class FurnitureReport:
 
 
 def measure_furniture(furniture: FurnitureSource | LoadedFurniture) -> FurnitureQuality:
-    """Measure the quality of furniture: hull counts and fractions of working joints and surfaces; deterministic.
+    """Measure the quality of furniture: hull counts and fractions of working joints and surfaces.
+
+    The result is deterministic.
 
     Raises:
         AssetError: the physics engine rejects a hull.
@@ -171,7 +173,7 @@ def _try_joint(model: FurnitureModel, link: Link) -> JointReport:
 
 
 def _jam(model: FurnitureModel, link: Link) -> float:
-    """Return the largest overlap in m of a moving part with the rest of the furniture, at any position of its joint.
+    """Return the largest overlap in m of a moving part with the rest, at any position of its joint.
 
     Links that are attached to the part move with it. All other joints are closed.
     """
@@ -190,7 +192,9 @@ def _jam(model: FurnitureModel, link: Link) -> float:
 
 
 def _grip(model: FurnitureModel, link: Link) -> float:
-    """Return the largest distance in m of a handle's grasp from the moving part; infinite if a finger would collide.
+    """Return the largest distance in m of a handle's grasp from the moving part.
+
+    The result is infinite if a finger would collide.
 
     Without handles, the result is 0.
     """
@@ -208,7 +212,7 @@ def _grip(model: FurnitureModel, link: Link) -> float:
 
 
 def find_grip_point(link: Link, pieces: Sequence[Array], handles: Mapping[str, Handle]) -> Array:
-    """Return the point (3,) of a moving part at which the test pulls, in the furniture's frame with closed joints, m.
+    """Return the point (3,) at which the test pulls a moving part, in the furniture's frame, m.
 
     The point is the first handle of the part. Without a handle, the point is the centre of mass of a drawer, or the
     corner of a door farthest from the hinge.
@@ -230,7 +234,7 @@ def _lever(link: Link, point: Array) -> float:
 
 
 def _pull(stage: FurnitureScene, link: Link, point: Array, way: float, reach: float) -> None:
-    """Apply a pulling force to a moving part for one simulation step, in the direction in which the joint moves.
+    """Apply a pulling force to a moving part for one simulation step, along the motion of the joint.
 
     Args:
         stage: scene with the furniture.
@@ -250,7 +254,10 @@ def _pull(stage: FurnitureScene, link: Link, point: Array, way: float, reach: fl
 
 
 def _try_surface(model: FurnitureModel, surface: Surface) -> SurfaceReport:
-    """Test a surface with all joints closed; if the surface moves and stays level, also with its part open."""
+    """Test a surface with all joints closed.
+
+    If the surface moves and stays level, the test is repeated with its part open.
+    """
     states: list[dict[str, float]] = [{}]
     for link in model.links:
         level = link.joint.kind == "prismatic" or abs(link.joint.axis[2]) > 1 - 1e-6

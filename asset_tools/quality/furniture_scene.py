@@ -1,4 +1,4 @@
-"""Build a scene in PhysX with one piece of furniture, whose body is fixed and whose joints move freely."""
+"""Build a PhysX scene with one piece of furniture with a fixed body and free joints."""
 
 from __future__ import annotations
 

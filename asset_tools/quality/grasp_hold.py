@@ -1,4 +1,4 @@
-"""Hold test: close the gripper around an object in each grasp, lift and shake it, and check whether it stays."""
+"""Hold test: close the gripper around an object, lift and shake it, and check whether it stays."""
 
 from __future__ import annotations
 

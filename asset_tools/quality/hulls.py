@@ -96,7 +96,7 @@ def _union(hulls: list[Array]) -> Manifold:
 
 
 def compute_mean_thickness(closed: trimesh.Trimesh) -> float:
-    """Return 2 * volume / area in m: the thickness of a plate, 1/2 of a rod's diameter, or 1/3 of a ball's diameter."""
+    """Return 2 * volume / area in m: the thickness of a plate, or 1/2 of the diameter of a rod."""
     return float(2 * closed.volume / closed.area)
 
 

@@ -220,7 +220,7 @@ def _physics(solid: RigidBody, annotations: Annotations) -> dict[str, Any]:
 
 
 def _jitter(dropped: DropReport) -> float:
-    """Return the largest kinetic energy in J in the last second of all drops in which the object does not roll."""
+    """Return the largest kinetic energy in J in the last second of all drops without rolling."""
     return float(max(dropped.jitters[~dropped.rolling], default=0.0))
 
 

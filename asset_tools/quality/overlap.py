@@ -73,12 +73,17 @@ def compute_overlap(moving: ConvexBody, other: ConvexBody, gap: float = 0.0) -> 
 
 
 def compute_max_overlap(bodies: Sequence[ConvexBody], others: Sequence[ConvexBody]) -> float:
-    """Return the largest overlap in m of one of ``bodies`` with one of ``others``; 0 if no two of them overlap."""
+    """Return the largest overlap in m of one of ``bodies`` with one of ``others``.
+
+    The result is 0 if no bodies overlap.
+    """
     return max((compute_overlap(body, other)[0] for body in bodies for other in others), default=0.0)
 
 
 def compute_distances(pieces: Sequence[Array], points: Array) -> Array:
-    """Return the distance (P,) in m of each point from the nearest convex hull; 0 inside, infinite without hulls.
+    """Return the distance (P,) in m of each point from the nearest convex hull.
+
+    The distance is 0 inside a hull, and infinite without hulls.
 
     Args:
         pieces: corners (V, 3) of each hull, m.

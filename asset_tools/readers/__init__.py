@@ -1,1 +1,1 @@
-"""Reading meshes of others: which files, what they name, formats, materials; to one mesh with its colours."""
+"""Read mesh files of other programs: choose files, find textures, and convert all formats to one mesh."""

@@ -1,4 +1,4 @@
-"""Choose the mesh files of a folder that form one object: the best of several versions, or all of several parts."""
+"""Choose the mesh files of a folder that form one object: the best version, or all parts."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Candidate:
 
     @cached_property
     def samples(self) -> Array:
-        """Points (N, 3) on the surface: 20,000 random points and the vertices at the sides of the bounding box."""
+        """Points (N, 3) on the surface: 20,000 random points and the extreme vertices."""
         offsets = np.cumsum([0] + [len(part.vertices) for part in self.parts[:-1]])
         vertices = np.concatenate([part.vertices for part in self.parts])
         faces = np.concatenate([part.faces + offset for part, offset in zip(self.parts, offsets, strict=True)])
@@ -126,7 +126,7 @@ def is_mesh_file(path: Path) -> bool:
 
 
 def is_collision_mesh(path: Path, folder: Path) -> bool:
-    """Return whether a file is a collision mesh by its name, or by the name of a subfolder of ``folder`` around it."""
+    """Return whether a file is a collision mesh by its name or by its subfolder of ``folder``."""
     folders = {part.lower() for part in path.relative_to(folder).parts[:-1]}
     return COLLISION.search(path.stem.lower()) is not None or bool(folders & COLLISION_FOLDERS)
 
@@ -202,7 +202,7 @@ def _without_hulls(candidates: list[Candidate], ignored: dict[Path, str]) -> lis
 
 
 def _are_versions(first: Candidate, second: Candidate) -> bool:
-    """Return whether two files are versions of one mesh, possibly in different units or with different up axes."""
+    """Return whether two files are versions of one mesh, also with other units or up axes."""
     one, other = (_version_name(candidate.path) for candidate in (first, second))
     alike = one == other and first.path.parent == second.path.parent
     if alike and np.abs(first.bounds - second.bounds).max() <= SAME * first.diagonal:
@@ -218,7 +218,7 @@ def _are_versions(first: Candidate, second: Candidate) -> bool:
 
 
 def _same_surface(first: Candidate, second: Candidate, transform: Array) -> bool:
-    """Return whether the surface of ``second``, transformed by a matrix (3, 3), equals the surface of ``first``."""
+    """Return whether ``second``, transformed by a matrix (3, 3), has the surface of ``first``."""
     if not first.contains(second.samples[:TRIED] @ transform.T):
         return False
     return second.contains(first.samples[:TRIED] @ np.linalg.inv(transform).T)

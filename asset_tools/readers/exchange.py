@@ -78,7 +78,7 @@ def read_exchange(path: Path, files: ModelFiles) -> list[MeshPart]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Disable the log of trimesh during the block, since it has tracebacks of problems that become errors or notes."""
+    """Disable the log of trimesh during the block; problems are reported by errors and notes."""
     logger = logging.getLogger("trimesh")
     disabled, logger.disabled = logger.disabled, True
     try:
@@ -88,7 +88,7 @@ def _quiet() -> Iterator[None]:
 
 
 class _Textures(Resolver):
-    """Resolver that gives trimesh the textures of a model, found by name anywhere below the model's folder."""
+    """Resolver that finds the textures of a model for trimesh, anywhere below the model's folder."""
 
     def __init__(self, path: Path, files: ModelFiles) -> None:
         self._path, self._files = path, files
@@ -184,7 +184,10 @@ def _ply_checked(data: bytes, path: Path, textures: _Textures) -> tuple[bytes, i
 
 
 def _off_faces(data: bytes, path: Path, files: ModelFiles) -> int:
-    """Return the number of faces in the header of an OFF file; add a warning if the file has vertex colours."""
+    """Return the number of faces in the header of an OFF file.
+
+    Add a warning if the file has vertex colours.
+    """
     words = re.sub(rb"#[^\n]*", b"", data[:LONGEST_HEADER]).split()
     if words and words[0].upper().startswith(b"C"):
         files.notes.append(f"warning: {path.name}: ignored vertex colours of an OFF file")

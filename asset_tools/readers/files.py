@@ -183,7 +183,7 @@ def find_files(folder: Path) -> Iterator[Path]:
 
 
 def _is_for(folder: str, stem: str) -> bool:
-    """Return whether a folder may contain the textures of a mesh file with the stem ``stem`` next to the folder."""
+    """Return whether a folder may contain the textures of the mesh file ``stem`` next to the folder."""
     return folder.lower() in TEXTURE_FOLDERS or _letters(folder).startswith(_letters(stem))
 
 

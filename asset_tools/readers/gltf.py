@@ -68,7 +68,10 @@ def read_gltf(path: Path, files: ModelFiles) -> list[MeshPart]:
 
 
 def _split(data: bytes, path: Path) -> tuple[Any, bytes]:
-    """Return the JSON value of a glTF file, and the binary chunk of a GLB file; the chunk of a .gltf file is empty."""
+    """Return the JSON value of a glTF file, and the binary chunk of a GLB file.
+
+    The chunk of a .gltf file is empty.
+    """
     blob, text = b"", data
     if data[:4] == b"glTF":
         if len(data) < 20:

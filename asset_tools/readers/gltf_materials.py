@@ -1,4 +1,4 @@
-"""Convert each material of a glTF file to one image and one colour, the sum of base colour and emitted light."""
+"""Convert materials of a glTF file to one image and one colour: base colour plus emitted light."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class TextureMapping:
         return uvs @ matrix[:, :2].T + matrix[:, 2]
 
     def to_repeating(self, image: Image.Image, uvs: Array) -> tuple[Image.Image, Array]:
-        """Convert the wrap modes to `REPEAT`: return an image and coordinates (V, 2) with equal colours on the mesh.
+        """Return an image and coordinates (V, 2) that give equal colours with the wrap mode `REPEAT`.
 
         Args:
             image: texture image.
@@ -189,7 +189,7 @@ def _triple(color: Array) -> tuple[float, float, float]:
 
 
 def _repeating(image: Image.Image, values: Array, wrap: int, axis: int) -> tuple[Image.Image, Array]:
-    """Convert an image with any wrap mode to an image and coordinates for the mode `REPEAT`, along one axis.
+    """Convert an image with any wrap mode to an image and coordinates for `REPEAT`, along one axis.
 
     An image with the mode `MIRROR` is joined to its mirror image. An image with the mode `CLAMP` is extended with the
     colours of its edges, at each side by at most its own size.

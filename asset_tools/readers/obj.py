@@ -78,7 +78,10 @@ class ObjMesh:
 
 
 def decode_text(data: bytes) -> str:
-    """Decode bytes as UTF-8, with or without a byte order mark; if they are not valid UTF-8, as Windows-1252."""
+    """Decode bytes as UTF-8, with or without a byte order mark.
+
+    If the bytes are not valid UTF-8, decode them as Windows-1252.
+    """
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -123,7 +126,10 @@ def parse_mtl(text: str) -> dict[str, MtlMaterial]:
 
 
 def find_material(name: str, materials: dict[str, MtlMaterial]) -> MtlMaterial | None:
-    """Return the material with a name; if there is none, the material whose name differs only in letter case."""
+    """Return the material with a name.
+
+    If there is none, return the material whose name differs only in letter case.
+    """
     if name in materials:
         return materials[name]
     alike = [material for other, material in materials.items() if other.casefold() == name.casefold()]
@@ -216,7 +222,9 @@ def _statements(text: str) -> Iterator[tuple[str, str]]:
 
 
 def _corner(word: str, points: int, uvs: int, normals: int) -> tuple[int, int, int]:
-    """Parse the corner ``v/vt/vn`` of a face: return three indices that start at 0; -1 for a missing index.
+    """Parse the corner ``v/vt/vn`` of a face: return three indices that start at 0.
+
+    A missing index is -1.
 
     Args:
         word: text of the corner.
@@ -326,7 +334,10 @@ def _color(rest: str) -> tuple[float, float, float] | None:
 
 
 def _map(rest: str) -> tuple[str, tuple[float, float], tuple[float, float]]:
-    """Parse a map statement of an MTL file; return the file name, which may have spaces, and UV scale and offset."""
+    """Parse a map statement of an MTL file.
+
+    Return the file name, which may have spaces, and UV scale and offset.
+    """
     vectors: dict[str, list[float]] = {}
     left = rest.strip()
     while left.startswith("-"):

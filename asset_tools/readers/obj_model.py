@@ -88,13 +88,13 @@ def _libraries(mesh: ObjMesh, path: Path, files: ModelFiles) -> dict[str, tuple[
 
 
 def _find_sibling(path: Path, suffixes: tuple[str, ...]) -> Path | None:
-    """Return the file in the folder of ``path`` with an equal stem, ignoring case, and one of the suffixes, or None."""
+    """Return the file next to ``path`` with an equal stem and one of the suffixes, or None."""
     alike = {file.suffix.lower(): file for file in path.parent.iterdir() if file.stem.lower() == path.stem.lower()}
     return next((alike[suffix] for suffix in suffixes if suffix in alike), None)
 
 
 def _only_library(mesh: ObjMesh, path: Path, files: ModelFiles) -> Path | None:
-    """Return the MTL file in the folder of an OBJ file if it is the only one and has all materials of the faces."""
+    """Return the only MTL file next to an OBJ file if it has all materials of the faces, or None."""
     found = [file for file in path.parent.iterdir() if file.suffix.lower() == ".mtl"]
     if len(found) != 1 or not mesh.material_names:
         return None

@@ -1,4 +1,4 @@
-"""Make the furniture of the builtin pack: one function per piece returns the source from which it is built."""
+"""Make the furniture of the builtin pack: one function per piece returns its source."""
 
 from collections.abc import Callable
 

@@ -244,7 +244,7 @@ def make_hinge(name: str, origin: Vec3, side: Literal[-1, 1], angle: float = 1.9
 
 
 def make_bar_grasp(link: str, middle: Vec3, *, along: Literal["y", "z"], bar: float = BAR) -> Handle:
-    """Return the grasp of a bar from the front, with approach direction -x and the fingers on both sides of the bar.
+    """Return the grasp of a bar from the front, with approach direction -x.
 
     Args:
         link: name of the link with the bar.

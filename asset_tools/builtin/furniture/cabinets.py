@@ -20,7 +20,10 @@ PALE = make_wood(BEECH, (0.6, 0.42))
 
 
 def make_cabinet() -> FurnitureSource:
-    """Make a cabinet with two drawers above two doors; the origin is on the floor below the centre of the body."""
+    """Make a cabinet with two drawers above two doors.
+
+    The origin is on the floor below the centre of the body.
+    """
     back, front, half, height = -0.25, 0.22, 0.60, 0.92
     plinth, floor, middle = 0.08, 0.10, 0.65
     body = Body({"oak": make_wood(OAK, (1.25, 0.5)), "dark": DARK, "inside": PALE}, seed=4, roughness=0.55)

@@ -22,7 +22,10 @@ GLASS = make_coating((196, 218, 216))
 
 
 def make_refrigerator() -> FurnitureSource:
-    """Make a refrigerator with two doors with hinges at the left edge; the origin is on the floor below the centre."""
+    """Make a refrigerator with two doors with hinges at the left edge.
+
+    The origin is on the floor below the centre.
+    """
     body = Body({"enamel": ENAMEL, "liner": LINER, "glass": GLASS, "dark": DARK}, seed=9, texture=256, roughness=0.35)
     inner = HALF - WALL
     bottom = 0.10

@@ -22,7 +22,9 @@ Quad = tuple[np.ndarray, np.ndarray, np.ndarray]  # lower left corner, vector to
 
 
 def make_room(pixels: int = PIXELS) -> FurnitureSource:
-    """Make a closed room around the origin of the world frame, without a door; its faces are visible from inside.
+    """Make a closed room around the origin of the world frame, without a door.
+
+    Its faces are visible from inside.
 
     Args:
         pixels: width and height of the images of the finishes, for 2 x 2 m.

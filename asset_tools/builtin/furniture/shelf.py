@@ -14,7 +14,10 @@ BOARD = 0.022
 
 
 def make_shelf() -> FurnitureSource:
-    """Make a shelf that is open at the front, x = 0; the origin is on the floor at the middle of the front."""
+    """Make a shelf that is open at the front, x = 0.
+
+    The origin is on the floor at the middle of the front.
+    """
     body = Body(
         {
             "oak": make_wood(OAK, (1.2, 0.45)),

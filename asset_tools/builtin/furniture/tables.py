@@ -1,4 +1,4 @@
-"""Make three tables: an oak table, a dining table with painted legs, and a round table of marble and steel."""
+"""Make three tables: an oak table, a dining table, and a round table of marble and steel."""
 
 from __future__ import annotations
 
@@ -96,7 +96,10 @@ def make_side_table() -> FurnitureSource:
 
 
 def _square(corner: np.ndarray, opposite: np.ndarray) -> np.ndarray:
-    """Return the corners (4, 3) of a horizontal rectangle, given by opposite corners; z is that of ``corner``."""
+    """Return the corners (4, 3) of a horizontal rectangle, given by opposite corners.
+
+    The height of the rectangle is the z of ``corner``.
+    """
     return np.array([(x, y, corner[2]) for x in (corner[0], opposite[0]) for y in (corner[1], opposite[1])])
 
 

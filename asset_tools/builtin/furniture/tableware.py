@@ -49,7 +49,10 @@ def make_basket() -> FurnitureSource:
 
 
 def make_plate() -> FurnitureSource:
-    """Make a deep, square, white plate with a blue rim, as large as in RoboCAS-v0; the origin is at its bottom."""
+    """Make a deep, square, white plate with a blue rim, as large as in RoboCAS-v0.
+
+    The origin is at its bottom.
+    """
     white = Material((0.3, 0.3), partial(paint_plain, colour=(240, 240, 236)))
     paints = {"rim": Material((1.2, 0.02), partial(paint_plain, colour=(38, 62, 122)))}
     paints |= dict.fromkeys(("side", "inside", "floor", "bottom"), white)
@@ -127,7 +130,9 @@ def _painted(
 
 
 def _ring(half: float, z: float, corner: float) -> np.ndarray:
-    """Return points (n, 3) around a square with rounded corners, counterclockwise; the last point is the first point.
+    """Return points (n, 3) around a square with rounded corners, counterclockwise.
+
+    The last point is the first point.
 
     Args:
         half: half of the width of the square, m.
