@@ -18,7 +18,9 @@ T = TypeVar("T")
 
 
 class CandidatesExhaustedError(Exception):
-    """The episode failed with each candidate of a decision; the search must backtrack to the previous decision.
+    """The episode failed with each candidate of a decision.
+
+    The search must backtrack to the previous decision.
 
     `EpisodeResult.failures` contains the failures already.
     """
@@ -27,7 +29,9 @@ class CandidatesExhaustedError(Exception):
 def order_candidates(
     candidates: Iterable[T], limits: SearchLimits, result: EpisodeResult
 ) -> Generator[tuple[T, bool], float | PlanningError | None, None]:
-    """Yield the candidates of a decision in search order, each with a flag that says what the caller has to do.
+    """Yield the candidates of a decision in search order, each with a flag.
+
+    The flag says what the caller has to do.
 
     False: run the candidate, and send its score, or the PlanningError of its motions.
     True: continue the episode from the candidate. If the episode fails, send None.

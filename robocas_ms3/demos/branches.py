@@ -103,7 +103,10 @@ def fork() -> ForkedProcess | Connection:
 
 
 def set_up_forked_process(parent: int) -> None:
-    """Prepare a child process right after the fork, so that it ends with the process ``parent`` (process id)."""
+    """Prepare a child process right after the fork.
+
+    The child is killed when the process with the id ``parent`` ends.
+    """
     die_with_parent(parent)
     gc.freeze()  # a garbage collection of all objects would copy the parent's memory
     torch.set_num_threads(1)  # fork keeps one thread only; a parallel loop would wait for the others forever

@@ -57,7 +57,10 @@ def _carry_held_target(arm: Arm, slot: int) -> None:
 
 
 def _retreat(arm: Arm) -> None:
-    """Open the gripper and move until the arm touches nothing: up, or back after an approach from the front."""
+    """Open the gripper and move until the arm touches nothing.
+
+    The arm moves up, or back after an approach from the front.
+    """
     if arm.executor.gripper != OPEN:
         arm.open_gripper()
     if arm.approach == "top":
@@ -76,7 +79,9 @@ def _retreat(arm: Arm) -> None:
 
 
 def _plan_shortest_retreat(arm: Arm, tcp_in_base: Array) -> Trajectory:
-    """Plan the shortest straight retreat (back, up or towards the robot) that ends in a collision-free pose.
+    """Plan the shortest straight retreat that ends in a collision-free pose.
+
+    The retreat leads back, up or towards the robot.
 
     The path itself may collide.
     """

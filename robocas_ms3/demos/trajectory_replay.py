@@ -235,7 +235,9 @@ def _convert_action(action: np.ndarray, env: RoboCASEnv) -> np.ndarray:
 
 
 def compute_state_distance(state: dict[str, Any], recorded: dict[str, Any]) -> float:
-    """Return the greatest absolute difference between a number of two states of all bodies; NaN if one has NaN.
+    """Return the greatest absolute difference between a number of two states of all bodies.
+
+    The result is NaN if a state contains NaN.
 
     ``state`` and ``recorded`` are states in ManiSkill's format; their numbers are in m, rad, m/s and rad/s.
     """

@@ -104,7 +104,10 @@ class CollisionChecker:
         self._low, self._high = np.concatenate(low), np.concatenate(high)
 
     def is_obstacle_point(self, points: Array) -> NDArray[np.bool_]:
-        """Return which points (P, 3) of a cloud are obstacles, as a mask (P,): in reach and outside the robot base."""
+        """Return a mask (P,) of the points (P, 3) of a cloud that are obstacles.
+
+        Obstacles are in reach and outside the robot's base.
+        """
         keep = np.einsum("ij,ij->i", points, points) <= REACH**2
         for low, high in self._closed_bounds[self._frames == BASE]:
             keep &= ~np.all((points >= low - BASE_MARGIN) & (points <= high + BASE_MARGIN), axis=1)

@@ -121,7 +121,10 @@ class MotionExecutor:
         return np.concatenate([qpos, [self.gripper], base]).astype(np.float32)
 
     def start_subgoal(self, goal_type: str, goal_description: str) -> None:
-        """Start a segment with a sub-goal at the next action, unless the current segment has the same sub-goal."""
+        """Start a segment with a sub-goal at the next action.
+
+        There is no effect if the current segment has the same sub-goal.
+        """
         if self.segments and self.segments[-1].first == len(self.actions):
             self.segments.pop()
         if not self.segments or (self.segments[-1].goal_type, self.segments[-1].goal_description) != (

@@ -31,7 +31,9 @@ TEMPERATURE = 0.15
 
 @dataclass(frozen=True)
 class Grasps:
-    """Candidate grasps of an object: K annotated grasps, then the same grasps with the wrist turned by 180 deg.
+    """Candidate grasps of an object.
+
+    The first K rows are annotated grasps; the other K rows are the same grasps with the wrist turned by 180 deg.
 
     Attributes:
         tcp_in_world: (2K, 4, 4) TCP poses.

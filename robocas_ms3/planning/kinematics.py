@@ -117,7 +117,9 @@ class ArmChain:
         return _to_matrices(rotations[7], positions[7])
 
     def jacobian(self, qpos: Array) -> tuple[Array, Array]:
-        """Compute the TCP poses (M, 4, 4) and Jacobians (M, 6, 7) at configurations (M, 7), in the arm's base frame.
+        """Compute the TCP poses (M, 4, 4) and Jacobians (M, 6, 7) at configurations (M, 7).
+
+        Both are in the arm's base frame.
 
         The first three rows of a Jacobian are linear, the last three angular.
         """
@@ -147,7 +149,9 @@ def _to_matrices(rotation: Array, position: Array) -> Array:
 
 
 class InverseKinematics:
-    """Inverse kinematics of an arm for batches of TCP poses in the arm's base frame, without collision checks.
+    """Inverse kinematics of an arm for batches of TCP poses in the arm's base frame.
+
+    Collisions are not checked.
 
     The class samples positions of joint 7 and calls the closed-form solver that the robot description names.
 
@@ -283,7 +287,9 @@ def solve_straight_line(chain: ArmChain, start: Array, tcp_in_base: Array, *, st
 
 
 def _solve_simultaneously(chain: ArmChain, start: Array, goals: Array) -> Array | None:
-    """Return a path (n + 1, 7) from ``start`` through all poses (n, 4, 4) of a line, solved at once, or None.
+    """Return a path (n + 1, 7) from ``start`` through all poses (n, 4, 4) of a line, or None.
+
+    All poses are solved at once.
 
     Initial estimates come from one Newton step to every ``ESTIMATE_STRIDE``-th pose.
     """

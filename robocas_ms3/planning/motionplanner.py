@@ -191,7 +191,10 @@ class PandaArmMotionPlanningSolver:
             self.add_obstacles([Obstacle("points", Shape(points=points), np.eye(4))])
 
     def add_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
-        """Add obstacles whose poses are in the world frame, such as those of `PlanningScene.obstacles_in_world`."""
+        """Add obstacles whose poses are in the world frame.
+
+        `PlanningScene.obstacles_in_world` returns such obstacles.
+        """
         self._obstacles += obstacles
 
     def clear_collisions(self) -> None:
@@ -210,7 +213,10 @@ class PandaArmMotionPlanningSolver:
         return qpos[[self._joints.index(name) for name in joints]]
 
     def _prepare(self, pose: sapien.Pose | Pose) -> tuple[Array, Array]:
-        """Set the planner's obstacles; return the arm's configuration (7,) and ``pose`` (4x4) in its base frame."""
+        """Set the obstacles of the planner, and return start and goal of a motion.
+
+        The start is the arm's configuration (7,), the goal is ``pose`` (4x4) in the arm's base frame.
+        """
         base = self.arm_base_in_world
         goal = inverse(base) @ _to_matrix(pose, "pose")
         self.planner.set_scene(to_arm_base_frame(self._obstacles, base))
@@ -251,7 +257,10 @@ def _require_finite(values: Array, where: str, fix: str = "Check the computation
 
 
 def _find_robot_spec(agent: BaseAgent) -> RobotSpec:
-    """Return the robot specification of an agent; make one from ManiSkill's URDF for its fixed-base Pandas."""
+    """Return the robot specification of an agent.
+
+    For ManiSkill's fixed-base Panda agents it is made from ManiSkill's URDF.
+    """
     if isinstance(agent, MobileManipulator):
         return agent.spec
     uid, description = str(agent.uid), replace(MOBILE_PANDA, uid=str(agent.uid), finger_extension=0.0, envelope=None)

@@ -69,7 +69,9 @@ class PathSearch:
         self._remaining_checks = 0
 
     def _edge_points(self, a: Array, b: Array) -> Array:
-        """Return configurations (M, n) to check on the edge from ``a`` to ``b``, without ``a``; reduce the budget by M.
+        """Return configurations (M, n) to check on the edge from ``a`` to ``b``, without ``a``.
+
+        The budget of collision checks is reduced by M.
 
         Raises:
             BudgetExceededError: the budget is smaller than M.
@@ -92,7 +94,9 @@ class PathSearch:
     def connect(
         self, start: Array, goals: list[Array], rng: np.random.Generator, *, max_checks: int
     ) -> list[Array] | None:
-        """Return waypoints (n,) from ``start`` to one of ``goals``, or None after ``max_checks`` collision checks.
+        """Return waypoints (n,) from ``start`` to one of ``goals``, or None.
+
+        None means that no path was found with ``max_checks`` collision checks.
 
         ``start`` and ``goals`` are collision-free configurations (n,).
         """
@@ -126,7 +130,9 @@ class PathSearch:
         return rng.uniform(np.maximum(low, self._lower), np.minimum(high, self._upper))
 
     def _extend(self, tree: _Tree, target: Array, *, greedy: bool) -> tuple[int | None, bool]:
-        """Extend a tree towards ``target`` by one step, or with ``greedy`` as far as the edge is collision-free.
+        """Extend a tree towards ``target`` by one step.
+
+        With ``greedy`` the tree is extended as far as the edge is collision-free.
 
         Returns:
             Index of the last new node, or None if the first configuration collides; whether the target is reached.

@@ -66,7 +66,10 @@ def count_reached_poses(path: Array) -> NDArray[np.int_]:
 
 
 def _solve(chain: ArmChain, starts: Array, goals: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Solve TCP poses (M, 4, 4) by damped least squares; return configurations (M, 7) and a success mask (M,)."""
+    """Solve TCP poses (M, 4, 4) by damped least squares.
+
+    Returns configurations (M, 7) and a mask (M,) of the solved poses.
+    """
     qpos, lower, upper = starts.copy(), chain.lower, chain.upper
     middle, half = (lower + upper) / 2, (upper - lower) / 2
     solved = np.zeros(len(qpos), dtype=bool)

@@ -220,7 +220,10 @@ class RRTConnectPlanner(CollisionChecker):
         return self._time_motion(partial(time_with_stops, corners)) if self.is_path_free(_densify(corners)) else None
 
     def _time_motion(self, time: Callable[..., Timed], speed: float = 1.0) -> Timed:
-        """Call ``time`` with the joint limits times ``speed``; repeat with lower limits if the TCP is too fast."""
+        """Compute a trajectory by ``time`` with the joint limits times ``speed``.
+
+        If the TCP exceeds its speed limit, ``time`` is called again with lower joint limits.
+        """
         limits = {name: value * speed for name, value in self._limits.items()}
         trajectory = time(**limits, dt=self._dt)
         if trajectory is not None and len(trajectory.qpos) > 1:

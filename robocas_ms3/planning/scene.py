@@ -1,4 +1,7 @@
-"""Read obstacles and poses of an environment for motion planning; obstacles are bodies or point clouds."""
+"""Read obstacles and poses of an environment for motion planning.
+
+Obstacles are bodies or point clouds.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +53,9 @@ def to_arm_base_frame(obstacles_in_world: Iterable[Obstacle], arm_base_in_world:
 
 
 class PlanningScene:
-    """Current poses (4x4) and bodies of one environment, in the arm's base frame unless the name says otherwise.
+    """Current poses (4x4) and bodies of one environment.
+
+    They are in the arm's base frame, unless the name says ``in_world``.
 
     Planners use bodies (`obstacles`); geometric tests use surface points (`points_in_base`).
     """

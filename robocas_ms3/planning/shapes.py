@@ -56,7 +56,10 @@ class CollisionShapes:
         return sizes[clearance]
 
     def cloud_pieces(self, points: Array) -> ConvexPieces:
-        """Return one piece, an octree of points (P, 3), or no piece if all points are outside the octree's range."""
+        """Return an octree of points (P, 3) as one piece.
+
+        There is no piece if all points are outside the range of the octree.
+        """
         return self._get_cached(points, self._tree)
 
     def hull_pieces(self, vertices: Array) -> ConvexPieces:
@@ -111,7 +114,9 @@ def convex_hull(vertices: Array) -> tuple[Array, NDArray[np.int32], Array]:
 
 
 def inflate_hull(vertices: Array, margin: float) -> tuple[Array, NDArray[np.int32]]:
-    """Move the faces of the convex hull of points (P, 3) out by ``margin`` m; corners move at most twice as far.
+    """Move the faces of the convex hull of points (P, 3) out by ``margin`` m.
+
+    Corners move by at most twice the margin.
 
     Returns:
         Corners (V, 3); triangles (F, 3) as indices of corners, counter-clockwise seen from outside.
@@ -133,7 +138,9 @@ def _normals(vertices: Array, faces: NDArray[np.integer]) -> NDArray[np.floating
 
 
 def encode_octree(points: Array, voxel: float) -> list[int]:
-    """Encode the voxels that contain points (P, 3) as an octomap stream of signed bytes, as python-fcl expects.
+    """Encode the voxels that contain points (P, 3) as an octomap stream.
+
+    python-fcl expects signed bytes.
 
     The octree has 2^16 voxels of edge ``voxel`` (m) per axis and is centred at the origin; points outside are dropped.
     The stream lists the inner nodes depth first with 16 bits per node: two bits per child.

@@ -66,7 +66,10 @@ class JointPath:
 
 
 def round_corners(waypoints: Array, radius: float) -> JointPath:
-    """Round the corners of a polyline (m, n) by parabolas that start at most ``radius`` rad before a corner."""
+    """Round the corners of a polyline (m, n) by parabolas.
+
+    A parabola starts at most ``radius`` rad before its corner.
+    """
     points = np.asarray(waypoints, dtype=np.float64)
     steps = np.diff(points, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
@@ -151,7 +154,7 @@ def _bounds(dof: int, velocity: float, acceleration: float) -> list[Any]:
 
 
 def time_with_stops(waypoints: Array, *, velocity: float, acceleration: float, dt: float) -> Trajectory:
-    """Compute a trajectory along a polyline (m, n) that stops at each waypoint and stays exactly on the lines.
+    """Compute a trajectory that stays on the lines of a polyline (m, n) and stops at each waypoint.
 
     Args:
         waypoints: (m, n) configurations, rad, or other positions with equal limits.

@@ -104,7 +104,9 @@ class RecordedEnv:
         return known[self.env_id]
 
     def make(self, **kwargs: Any) -> Any:
-        """Create the environment; ``kwargs`` are arguments of ``gym.make`` that add to or replace recorded ones.
+        """Create the environment.
+
+        ``kwargs`` are arguments of ``gym.make`` that add to the recorded arguments or replace them.
 
         Raises:
             DatasetError: task, configuration, robot or pack is not installed.

@@ -57,7 +57,10 @@ class EpisodeRecorder(gym.Wrapper):
         return observation, info
 
     def start_at(self, state: dict[str, Any]) -> None:
-        """Set a state of the present scene (argument of ``set_state_dict``), and start the recording again there."""
+        """Set a state of the present scene, and start the recording again from this state.
+
+        ``state`` is an argument of ``set_state_dict``.
+        """
         self._base_env.set_state_dict(state)
         self._steps = _Steps()
         self._store(self._base_env.get_obs())

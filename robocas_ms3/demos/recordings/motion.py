@@ -49,7 +49,9 @@ def sample_stride(control_freq: float, rate_hz: float) -> int:
 
 
 def sample_states(control_steps: int, stride: int) -> NDArray[np.int64]:
-    """Return the indices (T,) of the states that a dataset contains: every ``stride``-th state, and the last state.
+    """Return the indices (T,) of the states that a dataset contains.
+
+    These are every ``stride``-th state, and the last state.
 
     An episode of ``control_steps`` has ``control_steps + 1`` states.
     """
@@ -101,7 +103,9 @@ def to_dataset_motion(poses: Array) -> tuple[NDArray[np.float32], NDArray[np.flo
 
 
 def to_dataset_actions(positions: NDArray, turns: NDArray, gripper_status: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return dataset actions (T, 7); row t leads from step t to step t + 1, and the last row holds the pose.
+    """Return dataset actions (T, 7); row t leads from step t to step t + 1.
+
+    The last row holds the pose.
 
     An action has a translation in m, Euler angles about the fixed axes x, y, z in rad ("xyz" in scipy), and the gripper
     command, 1 open or 0 closed.
@@ -233,7 +237,7 @@ def select_gripper_commands(actions: NDArray[np.floating], control_mode: str) ->
 
 
 def split_robot_states(states: NDArray[np.floating]) -> tuple[Array, Array, Array]:
-    """Split ManiSkill robot states (T, 37) into poses of the root (T, 4, 4), qpos (T, 12) and qvel (T, 12)."""
+    """Split ManiSkill robot states (T, 37) into root poses (T, 4, 4), qpos (T, 12), qvel (T, 12)."""
     states = np.asarray(states, dtype=np.float64)
     return (
         from_wxyz(states[:, :7]),

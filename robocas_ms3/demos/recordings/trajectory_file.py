@@ -134,7 +134,10 @@ class TrajectoryFile:
         return read_entry(self.episodes[index], self._where(index))
 
     def read_recording(self, index: int, *, bodies: bool = True) -> Recording:
-        """Read the episode at a position in ``episodes``; without ``bodies`` only the states of the robot are read."""
+        """Read the episode at a position in ``episodes``.
+
+        Without ``bodies`` only the states of the robot are read.
+        """
         where, uid = self._where(index), self.robot.description.uid
         group = open_episode(self._file, self.episodes[index]["episode_id"])
         actions, found = read_steps(group, body=None if bodies else uid)

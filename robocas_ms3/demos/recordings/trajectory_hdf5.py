@@ -54,7 +54,10 @@ def write_hdf5(path: Path, fill: Callable[[h5py.File], None]) -> None:
 
 @contextmanager
 def open_reserved(path: Path, size: int) -> Iterator[h5py.File]:
-    """Create an HDF5 file with ``size`` bytes reserved on the disk, and open it; raise OSError if the disk is full."""
+    """Create an HDF5 file with ``size`` bytes reserved on the disk, and open it.
+
+    Raises OSError if the disk is full.
+    """
     write_hdf5(path, lambda file: None)
     with path.open("r+b") as file:
         try:

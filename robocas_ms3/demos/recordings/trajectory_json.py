@@ -31,7 +31,10 @@ def package_versions() -> dict[str, str]:
 
 
 def parse_seed(value: Any) -> int | None:
-    """Return a seed as an integer, or None if the value is invalid; ManiSkill may write a list with one seed."""
+    """Return a seed as an integer, or None if the value is invalid.
+
+    ManiSkill may write a list with one seed.
+    """
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
     return value if type(value) is int else None
@@ -56,7 +59,10 @@ class ResetRecord(_Record):
 
 
 class EpisodeHeader(_Record):
-    """Keys of an episode entry, in trajectories of any ManiSkill task, that define the reset of the episode."""
+    """Keys of an episode entry that define the reset of the episode.
+
+    Trajectories of all ManiSkill tasks have these keys.
+    """
 
     episode_id: int
     episode_seed: Seed
@@ -65,7 +71,7 @@ class EpisodeHeader(_Record):
 
 
 class TaskRecord(SubGoals):
-    """Value of the key ``robocas`` of an episode entry: instruction, sub-goals and other data of this package."""
+    """Value of the key ``robocas`` of an episode entry, with the data of this package."""
 
     instruction: str
 
@@ -151,13 +157,19 @@ def read_entry(episode: Mapping[str, Any], where: object) -> EpisodeEntry:
 
 
 def is_intervention(episode: Mapping[str, Any]) -> bool:
-    """Return whether an episode entry is an expert intervention, which starts in a state of another policy."""
+    """Return whether an episode entry is an expert intervention.
+
+    Such an episode starts in a state that another policy reached.
+    """
     recorded = episode.get("robocas")
     return isinstance(recorded, Mapping) and recorded.get("intervention") is not None
 
 
 def read_reset(episode: Mapping[str, Any], where: object) -> tuple[int, dict[str, Any], str]:
-    """Read seed, reset options and control mode from an episode entry; raise DatasetError if it is invalid."""
+    """Read seed, reset options and control mode from an episode entry.
+
+    Raises DatasetError if the entry is invalid.
+    """
     found = parse(EpisodeHeader, episode, DatasetError, where=where, about=_ENTRY)
     return found.episode_seed, _options(found.reset_kwargs), found.control_mode
 

@@ -85,7 +85,10 @@ class Arm:
         return self.decisions.choose(enumerate(candidates), run_numbered, limits)[1]
 
     def add_backtracking_point(self) -> None:
-        """Make a decision whose candidates differ only in their random seed; later failures return to this state."""
+        """Make a decision whose candidates differ only in their random seed.
+
+        After a later failure, the search returns to this state.
+        """
         self.choose(range(MAX_CONTINUED_CANDIDATES), lambda _: 0.0)
 
     @property
@@ -217,7 +220,9 @@ def shift_back(tcp_in_base: Array, distance: float) -> Array:
 
 
 def plan_retreat(arm: Arm, start: Array, goals: list[Array]) -> Trajectory:
-    """Plan a straight line from ``start`` (7,) to the first feasible TCP pose (4x4) of ``goals``, through obstacles.
+    """Plan a straight line to the first feasible TCP pose (4x4) of ``goals``, through obstacles.
+
+    The line starts at the configuration ``start`` (7,).
 
     Only self-collisions are checked, since the gripper touches an object at the start.
     """

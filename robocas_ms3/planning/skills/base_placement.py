@@ -66,12 +66,14 @@ def drive_and_grasp(arm: Arm, slot: int) -> None:
 
 
 def drive_and_open(arm: Arm) -> None:
-    """Drive to a base pose from which the arm reaches the handle during a whole pull, and open the door or drawer."""
+    """Drive to a base pose that allows a whole pull of the handle, and open the door or drawer."""
     _try_base_poses(arm, lambda relocate: drive_to_handle(arm, relocate=relocate), lambda: open_furniture_part(arm))
 
 
 def _try_base_poses(arm: Arm, drive_to: Callable[[bool], None], act: Callable[[], None]) -> None:
-    """Drive to a base pose and act there; if ``act`` fails before it moves anything, repeat at another base pose.
+    """Drive to a base pose and act there.
+
+    If ``act`` fails before it moves anything, both steps are repeated with another base pose.
 
     Args:
         arm: context of the attempt.
@@ -204,7 +206,9 @@ def _fold_arm(arm: Arm) -> Surroundings:
 
 
 def find_clear_grasps(arm: Arm, slot: int) -> Array:
-    """Return annotated grasps (G, 4, 4) of an object in the world whose gripper touches nothing on its approach.
+    """Return annotated grasps (G, 4, 4) of an object whose gripper approaches without contact.
+
+    Grasps are TCP poses in the world frame.
 
     The robot's base pose is not taken into account.
     """
@@ -221,7 +225,9 @@ def find_clear_grasps(arm: Arm, slot: int) -> Array:
 def estimate_reachable_fraction(
     arm: Arm, base: Array, grasps: Array, others: list[Obstacle], *, thorough: bool = False
 ) -> float:
-    """Estimate the fraction of grasps that the arm reaches from a base pose, together with their pre-grasp poses.
+    """Estimate the fraction of grasps that the arm reaches from a base pose.
+
+    A grasp counts if the arm reaches its pre-grasp pose too.
 
     Args:
         arm: context of the attempt.
@@ -246,7 +252,9 @@ def estimate_reachable_fraction(
 
 
 def _sample_grasp_poses(arm: Arm, frame: Array, grasps: Array, count: int) -> Array:
-    """Return TCP poses (4K, 4, 4) in the arm's base frame: K grasps, their half turns, and the pre-grasps of both.
+    """Return TCP poses (4K, 4, 4) of K grasps, their half turns, and the pre-grasps of both.
+
+    Poses are in the arm's base frame.
 
     The K <= ``count`` grasps are evenly spaced in ``grasps``.
     """

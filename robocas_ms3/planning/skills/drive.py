@@ -62,7 +62,9 @@ def arm_base_in_world(arm: Arm, base: Array) -> Array:
 
 
 def drive(arm: Arm, *goals: Array) -> None:
-    """Drive straight to base poses (3,), one after the other, and wait at each pose until the base settles.
+    """Drive straight to base poses (3,), one after the other.
+
+    The robot waits at each pose until the base settles.
 
     Raises:
         PlanningError: reason ``blocked``: the base did not reach its goal.
@@ -81,7 +83,10 @@ def drive(arm: Arm, *goals: Array) -> None:
 
 
 def sample_base_poses(arm: Arm, center: Array) -> Array:
-    """Sample base poses (N, 3) that face a point (3,) in the world at a comfortable distance, the best first."""
+    """Sample base poses (N, 3) that face a point (3,) in the world, the best first.
+
+    The arm's base is at a comfortable distance from the point.
+    """
     low, high = np.array(arm.robot.base_limits).T + np.array([[LIMIT_MARGIN], [-LIMIT_MARGIN]])
     high[2], low[2] = MAX_YAW, -MAX_YAW
     goals = arm.rng.uniform(low, high, (SAMPLES, 3))
@@ -96,7 +101,9 @@ def sample_base_poses(arm: Arm, center: Array) -> Array:
 def find_best_route(
     arm: Arm, goals: Array, around: Surroundings, score_pose: Callable[[Array], float], *, enough: float
 ) -> list[Array]:
-    """Return the route to the base pose with the greatest score of the first ``POSES_SCORED`` free base poses.
+    """Return the route to the base pose with the greatest score.
+
+    Scores are computed for the first ``POSES_SCORED`` collision-free base poses.
 
     Args:
         arm: context of the attempt.

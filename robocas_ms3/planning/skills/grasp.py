@@ -61,7 +61,9 @@ def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, skip_kinds: int = 0
 
 
 def plan_grasp(arm: Arm, slot: int, lift_height: float, skip_kinds: int = 0) -> tuple[Trajectory, ExitMotions]:
-    """Plan the approach to the best feasible grasp, and the motions that move the object out of its surroundings.
+    """Plan the approach to the best feasible grasp, and the exit with the object.
+
+    The exit moves the object out of its surroundings.
 
     Args:
         arm: context of the attempt.
@@ -196,7 +198,10 @@ def _plan_approach_and_exit(
 
 
 def _plan_withdrawal(arm: Arm, slot: int, start: Array, tcp_in_base: Array) -> tuple[Trajectory, Trajectory]:
-    """Plan a lift and a horizontal line straight back with the object, with the smallest lift that allows the line."""
+    """Plan a lift and a horizontal line straight back with the object.
+
+    The lift is the smallest one that allows the line.
+    """
     failure = PlanningError("withdraw", "no_exit")
     vertices = np.concatenate(arm.env.object_assets[0][slot].hulls)
     held = AttachedBody(vertices, inverse(tcp_in_base) @ arm.scene.object_in_base(slot))

@@ -289,7 +289,9 @@ def _filter_grasps(
     others: list[Obstacle],
     depth_offset: float = 0.0,
 ) -> list[int]:
-    """Return the indices from ``order`` of grasps that are collision-free with the handle between the open fingers.
+    """Return the indices from ``order`` of usable grasps of the handle.
+
+    A usable grasp is collision-free, with the handle between the open fingers.
 
     ``starts`` (N, 7) has the configurations of all grasps; ``order`` has indices of ``starts``, the best first.
     """
@@ -329,7 +331,9 @@ def _count_free_poses(arm: Arm, part: MovingPart, path: Array, frames: Array, ot
 
 
 def _find_retreatable_length(arm: Arm, path: Array, least: int) -> int:
-    """Return the greatest length of a pull, at most that of ``path`` (T, 7), after which the gripper can retreat.
+    """Return the greatest length of a pull after which the gripper can retreat.
+
+    The length is a number of configurations of ``path`` (T, 7).
 
     Raises:
         PlanningError: reason ``no_retreat``: there is no such length of at least ``least`` configurations.

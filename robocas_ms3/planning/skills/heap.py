@@ -86,7 +86,9 @@ class Heap:
         return self.target_uncovered and self.target_visible
 
     def candidate_moves(self) -> Iterator[Move]:
-        """Yield candidate moves of the obstacles, the most promising first; docs/policies.md describes the order.
+        """Yield candidate moves of the obstacles, the most promising first.
+
+        docs/policies.md describes the order.
 
         Raises:
             UnrecoverableError: reason ``too_many_obstacles``: ``MAX_MOVES`` moves have been made.
@@ -151,7 +153,10 @@ class Heap:
             return cost + COST_WITHOUT_GRASP * (not count_clear_grasps(self.arm, self.target))
 
     def check_objects_on_surface(self) -> None:
-        """Raise PlanningError if an object is at the edge of the surface, UnrecoverableError if one has fallen off."""
+        """Check that all objects are on the surface.
+
+        Raises PlanningError if an object is at the edge, and UnrecoverableError if an object has fallen off.
+        """
         frame, half = read_surface(self.arm)
         present = np.flatnonzero(self.env.present[0].cpu().numpy()).tolist()
         positions = np.stack([self.arm.scene.object_in_base(slot)[:3, 3] for slot in present])

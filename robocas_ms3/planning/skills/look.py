@@ -68,7 +68,9 @@ def load_object_meshes(arm: Arm) -> None:
 
 
 def measure_hidden_fraction(arm: Arm, slot: int) -> float:
-    """Return the fraction of an object that other objects hide from the gripper camera; 1 for an object out of view.
+    """Return the fraction of an object that other objects hide from the gripper camera.
+
+    The fraction is 1 for an object out of view.
 
     The fraction is computed by ray casting without the robot, so that no renderer is needed.
     """

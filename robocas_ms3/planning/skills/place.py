@@ -119,7 +119,10 @@ def _rank_drops(arm: Arm, slot: int, drops: Array, qpos: Array) -> NDArray[np.in
 
 
 def _plan_to_first_feasible(arm: Arm, drops: Array, qpos: Array) -> Trajectory:
-    """Plan a motion to the first feasible pose of ``drops`` (N, 4, 4), with configurations ``qpos`` (N, 7)."""
+    """Plan a motion to the first feasible drop pose.
+
+    ``drops`` (N, 4, 4) are TCP poses, ``qpos`` (N, 7) the configurations at these poses.
+    """
     start = arm.qpos
     chosen = np.flatnonzero(arm.planner.is_free(qpos[:DROPS_CHECKED], arm.planner.finger_width))[:DROPS_PLANNED]
     if not len(chosen):
@@ -201,7 +204,9 @@ def _failure_reason(arm: Arm) -> str:
 def sample_poses_above_container(
     rng: np.random.Generator, count: int, inside: ContainerInterior, vertices: Array, center_of_mass: Array
 ) -> Array:
-    """Sample TCP poses (count, 4, 4), in the arm's base frame, with a held object above the rim of a container.
+    """Sample TCP poses (count, 4, 4) with a held object above the rim of a container.
+
+    Poses are in the arm's base frame.
 
     The approach axis is tilted away from the arm, so that far containers are within reach; half of the samples are
     steep, for near containers.

@@ -42,7 +42,9 @@ class PushPlan:
 
 
 def push_away(arm: Arm, slot: int, target: int, *, turn_deg: float = 0.0) -> None:
-    """Push an object away from the target, and rise; the push stops early if the contact force is too great.
+    """Push an object away from the target, and rise.
+
+    The push stops early if the contact force is too great.
 
     Args:
         arm: context of the attempt.
@@ -168,7 +170,9 @@ def _plan_push_and_lift(arm: Arm, starts: list[tuple[Push, Array, Trajectory]], 
 def find_reachable_pushes(
     arm: Arm, slot: int, target: int, others: Array, turn_deg: float = 0.0
 ) -> Iterator[tuple[Push, Array]]:
-    """Yield pushes that the arm reaches, with the configuration (7,) above their start, the paper's direction first.
+    """Yield pushes that the arm reaches, with the configuration (7,) above their start.
+
+    Pushes in the paper's direction come first.
 
     ``others`` (Q, 3) has surface points of all bodies except the pushed object.
     """

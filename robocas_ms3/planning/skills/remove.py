@@ -60,7 +60,10 @@ def raise_held_object(arm: Arm, slot: int) -> None:
 
 
 def compute_lift_height(arm: Arm, slot: int) -> float:
-    """Return the lift height after which an object is above all bodies around it, m, within ``LIFT_RANGE``."""
+    """Return the lift height after which an object is above all bodies around it, m.
+
+    The height is within ``LIFT_RANGE``.
+    """
     points = transform_points(arm.scene.object_in_base(slot), np.concatenate(arm.env.object_assets[0][slot].hulls))
     middle = points.mean(axis=0)
     radius = float(np.linalg.norm((points - middle)[:, :2], axis=1).max())
@@ -70,7 +73,7 @@ def compute_lift_height(arm: Arm, slot: int) -> float:
 
 
 def count_clear_grasps(arm: Arm, slot: int) -> int:
-    """Return the number of grasps of an object from above whose gripper touches no other body, of a sample."""
+    """Return the number of sampled grasps from above whose gripper touches no other body."""
     grasps = _grasps_from_above(arm, slot)
     near = arm.scene.points_in_base(exclude=slot)
     return int(is_gripper_clear(grasps, near).sum())
@@ -166,7 +169,9 @@ def compute_upright_rotation(vertices: Array, center_of_mass: Array) -> Array:
 def find_free_places(
     vertices: Array, others: Array, frame: Array, half: Array, margin: float = EDGE_MARGINS[-1]
 ) -> Array:
-    """Return transforms (n, 4, 4), in the arm's base frame, that move a held object to free positions on a surface.
+    """Return transforms (n, 4, 4) that move a held object to free positions on a surface.
+
+    Transforms are in the arm's base frame.
 
     Args:
         vertices: (V, 3) vertices of the held object in the arm's base frame, m.

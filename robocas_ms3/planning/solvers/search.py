@@ -59,7 +59,7 @@ def attempt(arm: Arm) -> None:
 
 
 def max_continued_moves(moves_made: int) -> int:
-    """Return the number of candidate moves to continue from before the search backtracks to the previous decision.
+    """Return the number of candidate moves to continue from before the search backtracks.
 
     The number decreases with the moves made, since later failures have earlier causes.
     """
