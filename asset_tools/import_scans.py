@@ -90,7 +90,7 @@ def make_scan_jobs(
     unknown = sorted(set(settings.masses) - set(ids))
     if unknown:
         expected = f"ids among {', '.join(ids)}"
-        raise AssetError("masses are given for unknown scans", expected=expected, found=", ".join(unknown))
+        raise AssetError("masses are given for unknown scans", expected=expected, found=", ".join(unknown), usage=True)
     inspected = inspect(scans.models)
     errors = {**scans.errors, **{id_: found.error for id_, found in inspected.items() if found.error is not None}}
     units: dict[str, Unit] = {}

@@ -98,6 +98,7 @@ def make_ycb_jobs(
             expected=f"names such as {min(info)}",
             found=_listed(unknown),
             fix="The names are the keys of this file.",
+            usage=True,
         )
     models = sorted(set(ids) or info)
     missing = [model for model in models if not _mesh(root, model).is_file()]

@@ -55,7 +55,7 @@ class Args:
     configs: Annotated[tuple[str, ...], tyro.conf.Positional] = ("pick_table_scattered",)
     """Task configurations."""
     seeds: str = "60000:60020"
-    """FIRST:END."""
+    """Range of seeds, FIRST:END without END."""
     pack: str = "builtin"
     """Object pack."""
     draws: int = 5
@@ -65,9 +65,9 @@ class Args:
     jobs: int = 1
     """Number of processes. To compare times, use 1 on an idle machine."""
     fork: bool = True
-    """Undo failed decisions by forked processes."""
+    """Use forked processes to return to the state before a failed decision."""
     memory: bool = False
-    """Sample the memory of the process and its branches (PSS); this takes time."""
+    """Sample the memory (PSS) of this process and of forked processes; this takes time."""
 
 
 @dataclass

@@ -40,15 +40,15 @@ class Args:
     inference_ms: float = 100
     """Time that a server takes per request, or per call of the policy."""
     rounds: int = 20
-    """Observations per env."""
+    """Number of observations per env."""
     envs: tuple[int, ...] = (1, 2, 4, 8, 16)
     """Numbers of envs."""
     images: int = 224
     """Side of the images of two cameras, in pixels; 0: no images."""
     servers: tuple[str, ...] = SERVERS
-    """Which servers: serial, parallel, batched."""
+    """Servers to measure: serial, parallel, batched."""
     in_turn: bool = False
-    """Ask for one env after another: max_in_flight=1, and batches of one env."""
+    """Send the requests of the envs one after another: max_in_flight=1, and batches of one env."""
 
 
 class SlowPolicy:

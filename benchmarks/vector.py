@@ -47,7 +47,7 @@ class Args:
     obs_mode: str = "state"
     """Observation mode; for images, leave out --render-backend none."""
     render_backend: str = "none"
-    """None needs no renderer."""
+    """Render backend; `none` needs no renderer."""
     turns: int = 5
     """Number of rounds of each case."""
     steps: int = 100
@@ -55,7 +55,7 @@ class Args:
     envs: tuple[int, ...] = (8,)
     """Numbers of environments."""
     memory_of: str = ""
-    """Case whose memory to print; the script passes it to itself."""
+    """Only print the memory of this case; used by the benchmark itself."""
 
 
 def main(args: Args) -> None:

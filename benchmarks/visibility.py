@@ -40,9 +40,9 @@ class Args:
     pack: str = "builtin"
     """Object pack."""
     config: str = "search_table_stacked"
-    """Configuration."""
+    """Task configuration."""
     repeats: int = 10
-    """Views per heap and size."""
+    """Number of views per heap and image size."""
 
 
 def measure_milliseconds(work: Callable[[], object], repeats: int) -> float:

@@ -38,7 +38,7 @@ OUTPUT = "made"
 
 @dataclass
 class Run:
-    """A run of the plan and its outcome; ``kill`` is called when a third of the episodes are recorded."""
+    """A run of the plan; ``kill`` is called when a third of the episodes are recorded."""
 
     name: str
     words: list[str]
@@ -72,7 +72,7 @@ class Run:
 
 
 def seeds_done(out: Path) -> int:
-    """Return the number of finished seeds, or a few less."""
+    """Return the number of finished seeds; the newest few may be missing."""
     return len(list(out.glob("units/*/*/*/outcome.json")))
 
 
@@ -82,7 +82,7 @@ def leftover_files(out: Path) -> list[str]:
 
 
 def differences(first: Path, second: Path) -> list[str]:
-    """Return the product files that differ, or that are in one folder only."""
+    """Return the output files that differ between two runs, or that only one run has."""
     ours, theirs = files(first), files(second)
     found = [f"{path}: in one folder only" for path in sorted(ours ^ theirs)]
     return found + [f"{path}: differs" for path in sorted(ours & theirs) if not is_equal(first / path, second / path)]
@@ -94,7 +94,7 @@ def is_equal(first: Path, second: Path) -> bool:
 
 
 def files(out: Path) -> set[Path]:
-    """Return the paths of all products, relative to the folder of a run."""
+    """Return the paths of all output files, relative to the folder of a run."""
     found = [path for name in PRODUCTS for path in [out / name, *(out / name).rglob("*")] if path.is_file()]
     return {path.relative_to(out) for path in found}
 

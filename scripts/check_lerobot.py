@@ -52,7 +52,7 @@ def load(root: Path) -> LeRobotDataset:
 
 
 def check_items(dataset: LeRobotDataset) -> None:
-    """Index the first, middle and last frame of each episode; compare texts and statistics with the tables."""
+    """Read the first, middle and last frame of each episode; compare texts and statistics with the tables."""
     starts, subgoals = np.cumsum([0, *lengths(dataset)]), subtask_texts(dataset)
     for episode, (first, end) in enumerate(zip(starts, starts[1:], strict=False)):
         for number in (first, (first + end) // 2, end - 1):
@@ -165,18 +165,18 @@ class StubHandler(BaseHTTPRequestHandler):
     """OpenAI-compatible server that gives one answer to every prompt."""
 
     def do_GET(self) -> None:  # noqa: N802
-        """List the one model."""
+        """Reply with the list of models, which has one entry."""
         self.reply({"object": "list", "data": [{"id": "stub", "object": "model"}]})
 
     def do_POST(self) -> None:  # noqa: N802
-        """Answer a prompt."""
+        """Reply to a prompt with the fixed answer."""
         self.rfile.read(int(self.headers["Content-Length"]))
         message = {"role": "assistant", "content": json.dumps(ANSWERS)}
         choice = {"index": 0, "message": message, "finish_reason": "stop"}
         self.reply({"id": "0", "object": "chat.completion", "created": 0, "model": "stub", "choices": [choice]})
 
     def reply(self, content: dict) -> None:
-        """Send JSON."""
+        """Send a dictionary as JSON."""
         body = json.dumps(content).encode()
         self.send_response(200)
         self.send_header("Content-Type", "application/json")
@@ -185,7 +185,7 @@ class StubHandler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, *_: object) -> None:
-        """Log nothing."""
+        """Do not log requests."""
 
 
 def check_annotations(dataset: LeRobotDataset, root: Path) -> None:
@@ -250,7 +250,7 @@ def check_train(dataset: LeRobotDataset, root: Path) -> None:
 
 
 def feature_of(feature: dict) -> dict:
-    """Return a feature of a dataset as a policy's configuration has it: images are (C, H, W)."""
+    """Convert a feature of a dataset to a feature of a policy configuration: images are (C, H, W)."""
     shape = list(feature["shape"])
     if feature["dtype"] == "video":
         return {"type": "VISUAL", "shape": [shape[2], *shape[:2]]}

@@ -148,7 +148,7 @@ def check_recorded_actions(folder: Path) -> None:
 
 
 class ReplayModule(torch.nn.Module):
-    """Replays the recorded actions of each episode of an environment."""
+    """Policy module that returns the recorded actions of each episode of an environment."""
 
     def __init__(self, env, actions) -> None:
         super().__init__()
@@ -159,7 +159,7 @@ class ReplayModule(torch.nn.Module):
         self.step = 0
 
     def select_action(self, batch: dict) -> torch.Tensor:
-        """Return actions (E, 7)."""
+        """Return the next recorded actions (E, 7)."""
         self.instructions = self.instructions or list(batch["task"])
         assert batch["observation.state"].shape == (2, 18)
         assert batch["observation.images.base_camera"].shape == (2, 3, 48, 64)

@@ -95,7 +95,7 @@ class ReplayServer(PredictModelServer):
         await super().on_episode_start(config, ctx)
 
     def predict(self, obs: dict, ctx: Any) -> dict:
-        """Return the next recorded actions (CHUNK, 7) after a comparison of the observation."""
+        """Compare the observation with the recorded observation; return the next actions (CHUNK, 7)."""
         name, number = self.task["name"], self.task["episode_idx"]
         if ctx.is_first:
             with self.log.open("a") as file:
@@ -230,7 +230,7 @@ def compare(theirs: Path, ours: Result, instructions: list) -> None:
 
 
 def check_errors(folder: Path) -> None:
-    """Check that other step limits and surplus episodes give errors, not scores."""
+    """Check that other step limits and too many episodes are errors."""
     aggregate = json.loads((folder / "RoboCAS_aggregate.json").read_text())
     episodes = aggregate["tasks"][0]["episodes"]
     assert aggregate["num_errors"] == EPISODES_PER_TASK + 1

@@ -19,7 +19,7 @@ Schema = dict[str, Any]
 
 
 def markdown() -> str:
-    """Return a section with a table for each block of keys, that of the file first, separated by empty lines."""
+    """Return Markdown with a table of keys per block; the block of the whole file is first."""
     schema = TaskConfig.model_json_schema()
     places: dict[str, list[str]] = {"": [""]}  # definition -> keys that use it, in the order of the file
     _collect(schema, schema, "", places)

@@ -44,7 +44,7 @@ def project_requirements() -> list[str]:
 
 
 def pip_report(interpreter: str, *arguments: str) -> dict:
-    """Return the JSON report of what pip would install for an interpreter."""
+    """Return pip's JSON report of the packages that it would install for an interpreter."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.json"
         command = [sys.executable, "-m", "pip", "--python", interpreter, "install", "--quiet", "--dry-run"]
@@ -79,7 +79,7 @@ def resolve(interpreter: str) -> tuple[str, dict[str, str]]:
 
 
 def merge(by_python: dict[str, dict[str, str]]) -> str:
-    """Return one line per package where all Pythons agree, else one line per version with a marker for its Pythons."""
+    """Return the lines of the lock file: one per package, or one per version with a Python marker."""
     lines = []
     for name in sorted({name for packages in by_python.values() for name in packages}):
         pythons: dict[str, list[str]] = {}

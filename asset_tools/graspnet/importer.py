@@ -43,7 +43,7 @@ def make_graspnet_jobs(root: Path, ids: Sequence[int] = (), inspect: Inspect = i
     unknown = [number for number in numbers if not 0 <= number < COUNT]
     if unknown:
         what = "unknown numbers of GraspNet-1Billion objects"
-        raise AssetError(what, expected=f"numbers from 0 to {COUNT - 1}", found=_listed(unknown))
+        raise AssetError(what, expected=f"numbers from 0 to {COUNT - 1}", found=_listed(unknown), usage=True)
     missing = [number for number in numbers if not _model(root, number).is_dir()]
     if missing:
         raise AssetError(
