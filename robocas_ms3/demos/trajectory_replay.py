@@ -80,7 +80,7 @@ class RecordedEpisode:
         converted = env.control_mode != self.control_mode
         width = _JOINT_TARGETS if converted else cast(Any, env.single_action_space).shape[0]
         if self.actions.shape[1] != width:
-            found = self.actions.shape[1]
+            found = f"{self.actions.shape[1]} numbers"
             raise DatasetError(
                 "actions do not fit the robot", where=self.where, expected=f"{width} numbers per action", found=found
             )
