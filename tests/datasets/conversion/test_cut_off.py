@@ -84,7 +84,7 @@ def test_truncated_split_is_made_again_after_deleting_it(whole, trajectory, tmp_
 
 
 @pytest.mark.parametrize("name", ["episode.json", "frames.parquet", "rgb_base_camera.mp4"])
-def test_parts_of_a_lerobot_dataset(trajectory, tmp_path, monkeypatch, name):
+def test_temporary_episode_folders_of_a_lerobot_conversion(trajectory, tmp_path, monkeypatch, name):
     pytest.importorskip("av", reason="needs the extra 'lerobot'")
     pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
     from robocas_ms3.datasets.lerobot import convert as lerobot
@@ -93,7 +93,7 @@ def test_parts_of_a_lerobot_dataset(trajectory, tmp_path, monkeypatch, name):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(lerobot, "_join", killed)
+        patch.setattr(lerobot, "_join_dataset", killed)
         lerobot.convert_lerobot(ConversionSettings(trajectory, tmp_path / "out", open_renderer=RayCaster))
     harm(tmp_path / "out" / ".episodes" / "episode_0000001" / name, 0.5)
     done = lerobot.convert_lerobot(ConversionSettings(trajectory, tmp_path / "out", open_renderer=RayCaster))
