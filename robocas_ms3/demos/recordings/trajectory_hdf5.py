@@ -89,10 +89,11 @@ def open_trajectory(path: Path) -> h5py.File:
         check_regular_file(path)
         return h5py.File(path, "r")
     except FileNotFoundError as error:
-        raise DatasetError("no such trajectory file", where=path) from error
+        fix = "Record one with robocas generate."
+        raise DatasetError("no such trajectory file", where=path, fix=fix) from error
     except (OSError, DocumentError) as error:
         raise DatasetError(
-            "not a readable HDF5 file: truncated, damaged or another format",
+            "not a readable HDF5 file",
             where=path,
             found=one_line(error),
             fix="Record the file again.",
