@@ -27,34 +27,38 @@ def as_tensor(array: Array) -> Tensor:
 
 
 def where(condition: Array, yes: Array, no: Array) -> Array:
-    """Return ``yes`` where the condition holds, ``no`` elsewhere."""
+    """Choose per element: ``yes`` if the condition is True, ``no`` otherwise, as `numpy.where`."""
     if isinstance(condition, Tensor):
         return torch.where(condition, yes, no)  # pyright: ignore[reportCallIssue, reportArgumentType]
     return np.where(condition, yes, no)
 
 
 def as_float32(values: Array) -> Array:
+    """Convert values to float32."""
     return values.float() if isinstance(values, Tensor) else np.asarray(values, np.float32)
 
 
 def as_float64(values: Array) -> Array:
+    """Convert values to float64."""
     return values.double() if isinstance(values, Tensor) else np.asarray(values, np.float64)
 
 
 def clamp(values: Array, low: Array | float, high: Array | float) -> Array:
-    """Clamp values to limits, which are numbers or arrays."""
+    """Limit values to the range ``low`` to ``high``; the limits are numbers, or arrays that broadcast."""
     if isinstance(values, Tensor):
         return values.clamp(low, high)  # pyright: ignore[reportCallIssue, reportArgumentType]
     return np.minimum(np.maximum(values, low), high)  # `np.clip` takes three times as long
 
 
 def maximum(first: Array, second: Array) -> Array:
+    """Return the larger value per element."""
     if isinstance(first, Tensor):
         return torch.maximum(first, second)  # pyright: ignore[reportArgumentType]
     return np.maximum(first, second)
 
 
 def concatenate(arrays: list[Array], axis: int = -1) -> Array:
+    """Concatenate arrays along an axis."""
     if isinstance(arrays[0], Tensor):
         return torch.cat(arrays, dim=axis)  # pyright: ignore[reportArgumentType]
     return np.concatenate(arrays, axis=axis)
@@ -73,12 +77,18 @@ def norm(vectors: Array) -> Array:
 
 
 def known_all_false(conditions: Array) -> bool:
-    """Return whether all flags are False; False on a GPU, where reading them would synchronize with the device."""
+    """Return whether all flags are False, if the flags are on the CPU.
+
+    Return False for flags on a GPU, since reading them would synchronize with the device.
+    """
     return not isinstance(conditions, Tensor) and not conditions.any()
 
 
 def known_all_true(conditions: Array) -> bool:
-    """Return whether all flags are True; False on a GPU, where reading them would synchronize with the device."""
+    """Return whether all flags are True, if the flags are on the CPU.
+
+    Return False for flags on a GPU, since reading them would synchronize with the device.
+    """
     return not isinstance(conditions, Tensor) and bool(conditions.all())
 
 

@@ -32,7 +32,7 @@ INTEGER_LIMIT = 2**63
 JSON_DEPTH = YAML_DEPTH = 64
 YAML_NODES = 500_000
 """Values, with aliases expanded: nested aliases can expand a short file to a billion values."""
-_TOO_DEEP = f"nested more than {JSON_DEPTH} deep"
+_TOO_DEEP = f"values are nested more than {JSON_DEPTH} levels deep"
 _INTEGER_LENGTH = 64  # characters; the parse time of base 60 ("1:1:1") is quadratic in the length
 _SHOWN_KEYS = 8  # of the path to an invalid value
 _CONTAINERS = (dict, list, tuple)
@@ -48,7 +48,10 @@ DAMAGED_FILE_ERRORS = (
 
 
 class DocumentError(ValueError):
-    """A file that is too large, nested too deeply, or not valid JSON, YAML or NumPy data; the message is one line."""
+    """The content of a file is too large, nested too deeply, or not valid JSON, YAML or NumPy data.
+
+    The message is one line without the path; ``filename`` is the path.
+    """
 
     filename: str = ""  # as in OSError; empty if a string was parsed
 
@@ -63,7 +66,7 @@ def _add_filename(path: Path) -> Iterator[None]:
 
 
 def load_json(path: Path) -> Any:
-    """Read a JSON file of bounded size and depth; numbers must be finite, and integers fit in 64 bits."""
+    """Read a JSON file; raise DocumentError if it is too large, or for values that `find_invalid_value` reports."""
     with _add_filename(path):
         return decode_json(read_text(path, JSON_LIMIT))
 
@@ -83,9 +86,12 @@ def decode_json(text: str | bytes) -> Any:
 
 
 def find_invalid_value(values: Any, depth: int = 0) -> tuple[tuple[Any, ...], str] | None:
-    """Return the keys and a description of the first value that JSON files of this package must not have, or None.
+    """Find the first value that JSON files of this package must not contain.
 
-    Invalid are NaN, infinity, integers over 64 bits, lone surrogates, and values nested too deeply.
+    Such values are NaN, infinity, integers of more than 64 bits, lone surrogates, and values nested too deeply.
+
+    Returns:
+        The path of keys and indices to the value, and a description of the value; None if all values are valid.
     """
     if not isinstance(values, _CONTAINERS):
         return ((), found) if (found := _describe_invalid_scalar(values)) else None
@@ -124,9 +130,13 @@ def load_yaml(path: Path) -> Any:
 
 
 def open_npz(path: Path) -> Any:
-    """Open an ``.npz`` file without pickled objects; return NumPy's reader, a context manager.
+    """Open an ``.npz`` file without pickled objects.
 
-    Raises one of `DAMAGED_FILE_ERRORS`.
+    Returns:
+        NumPy's reader of the file, a context manager.
+
+    Raises:
+        Exception: one of `DAMAGED_FILE_ERRORS` if the file is damaged.
     """
     import numpy as np  # slow to import, and not needed by every command
     from numpy.lib.npyio import NpzFile
@@ -154,15 +164,16 @@ def load_npy(path: Path, limit: int = ARRAYS_LIMIT) -> Any:
 
 
 def check_regular_file(path: Path, limit: int | None = None) -> None:
-    """Raise DocumentError for a file over ``limit`` bytes, and for pipes, devices and sockets, which may block."""
+    """Raise DocumentError if a path is a pipe, device or socket, which may block, or a file over ``limit`` bytes."""
     status = path.stat()
     if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
-        raise DocumentError("not a regular file")
+        raise DocumentError("expected a regular file, found a pipe, device or socket")
     if limit is not None and status.st_size > limit:
         raise DocumentError(_describe_size(limit))
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
+    """Read a file of at most ``limit`` bytes; raise DocumentError if it is larger or not a regular file."""
     with _add_filename(path):
         check_regular_file(path, limit)
         with path.open("rb") as file:
@@ -182,11 +193,11 @@ def read_text(path: Path, limit: int) -> str:
 
 
 def _describe_size(limit: int) -> str:
-    return f"more than {limit >> 20} MB" if limit >= 2**20 else f"more than {limit} bytes"
+    return f"the file has more than {limit >> 20} MB" if limit >= 2**20 else f"the file has more than {limit} bytes"
 
 
 class _LimitedLoader(yaml.SafeLoader):
-    """YAML loader that limits the number and depth of values, and refuses duplicate keys."""
+    """YAML loader that limits the number and the depth of values, and raises for duplicate keys of a mapping."""
 
     def __init__(self, stream: Any) -> None:
         super().__init__(stream)

@@ -13,11 +13,11 @@ class RobocasError(Exception):
     """Base class of all errors that this package raises; the command line prints them without a traceback.
 
     Args:
-        what: what went wrong.
-        where: the file, key, option or object that is wrong.
-        expected: which values are valid.
-        found: the value that was found.
-        fix: a sentence that says how to correct it.
+        what: the problem, such as "unknown policy".
+        where: the file, key, option or object with the problem.
+        expected: the valid values.
+        found: the invalid value.
+        fix: a sentence that tells the user how to solve the problem.
         usage: whether the caller passed an unknown name or path; `robocas` then exits with status 2 instead of 1.
     """
 
@@ -70,17 +70,17 @@ class DatasetError(RobocasError):
 
 
 class EmptySplitError(DatasetError):
-    """A split of a dataset has no episodes."""
+    """A split of a dataset (training or validation) has no episodes."""
 
 
 class IncompleteDatasetError(DatasetError):
-    """Some episodes of a dataset cannot be written; ``reasons`` maps episode folders to reasons."""
+    """Some episodes of a dataset cannot be written; ``reasons`` has the reason per name of an episode folder."""
 
     reasons: Mapping[str, str] = {}
 
 
 class PlanError(RobocasError):
-    """Invalid plan of datasets, or a dataset that cannot be made from its plan."""
+    """Invalid plan of a dataset (`robocas plan`), or a plan whose dataset cannot be generated."""
 
 
 class MissingExtraError(RobocasError):
@@ -101,7 +101,10 @@ def require_extra(extra: str, purpose: str, *modules: str, fix: str = "", load: 
         MissingExtraError: a module is not installed, or its import fails.
     """
     if missing := [module for module in modules if importlib.util.find_spec(module) is None]:
-        what, install = f"missing for {purpose}: {', '.join(missing)}", f'In the clone: pip install -e ".[{extra}]".'
+        what, install = (
+            f"modules for {purpose} are not installed: {', '.join(missing)}",
+            f'In the clone: pip install -e ".[{extra}]".',
+        )
         raise MissingExtraError(what, fix=f"{install} {fix}".rstrip())
     for module in modules if load else ():
         try:
@@ -115,7 +118,7 @@ def require_extra(extra: str, purpose: str, *modules: str, fix: str = "", load: 
 
 
 class WorkerCrashError(RobocasError):
-    """A worker process crashed, or was killed because a task exceeded a limit; ``found`` is the reason."""
+    """A worker process crashed, or was killed because a task exceeded a limit; ``found`` has the reason."""
 
 
 class WorkerStartError(RobocasError):
@@ -133,7 +136,7 @@ class VectorEnvCrashError(VectorEnvError):
 
 
 class EvaluationError(RobocasError):
-    """Invalid protocol, policy, result or figure of an evaluation."""
+    """Invalid protocol, policy, setting or result of an evaluation."""
 
 
 class WireError(EvaluationError):
@@ -144,14 +147,16 @@ class PolicyError(EvaluationError):
     """A policy could not act in some envs; only the episodes of these envs end.
 
     Args:
-        reasons: the reason for each failed env, by index of the env.
+        reasons: reason of the failure by env index, for each failed env.
         actions: (E, A) or (E, H, A) as `Policy.act` returns them, for all envs of the request; rows of failed envs are
             ignored. None: all envs failed.
     """
 
     def __init__(self, reasons: Mapping[int, str], actions: Any = None) -> None:
         self.reasons, self.actions = dict(reasons), actions
-        super().__init__("a policy failed", found="; ".join(f"env {env}: {why}" for env, why in reasons.items()))
+        super().__init__(
+            "the policy could not act", found="; ".join(f"env {env}: {why}" for env, why in reasons.items())
+        )
 
 
 class TrainingError(RobocasError):
@@ -166,8 +171,9 @@ class PlanningError(RobocasError):
     """A scripted policy could not plan or run a motion.
 
     Args:
-        stage: the stage of the task: ``grasp_sampling``, ``reach``, ``approach``, ``grasp``, ``lift``, ...
-        reason: a short fixed text, which reports count.
+        stage: stage of the task at which the error occurred: ``grasp_sampling``, ``reach``, ``approach``, ``grasp``,
+            ``lift``, ...
+        reason: a short fixed text, such as ``no_goals``; reports count the failures per reason.
     """
 
     def __init__(self, stage: str, reason: str) -> None:

@@ -23,10 +23,11 @@ class Registry(Mapping[str, T]):
     Access to an entry point that cannot be loaded raises an error. Iteration skips it and logs one warning.
 
     Args:
-        kind: noun for the objects in messages, such as ``planner``.
-        group: group of the entry points, such as ``robocas_ms3.tasks``. An entry point has the name of its object.
+        kind: noun that names an object in messages, such as ``planner``.
+        group: group of the entry points, such as ``robocas_ms3.tasks``. The name of an entry point is the name of its
+            object in the registry.
         type_: required type of the objects.
-        builtin: objects of this package; other packages cannot replace them.
+        builtin: objects of this package by name; other packages cannot replace them.
     """
 
     def __init__(self, kind: str, group: str, type_: Any, builtin: Mapping[str, T]) -> None:
@@ -66,11 +67,14 @@ class Registry(Mapping[str, T]):
 
     @cached_property
     def entry_points(self) -> dict[str, list[EntryPoint]]:
-        """Entry points of other packages by name, not loaded; several per name if packages conflict."""
+        """Entry points of other packages by name, not loaded; a name has several if packages conflict."""
         found: dict[str, list[EntryPoint]] = {}
         for point in sorted(entry_points(group=self.group), key=lambda point: (point.name, package_name(point))):
             if point.name in self.builtin:
-                _log.warning("%s %r of %s is ignored: the name is builtin", self.kind, point.name, point.value)
+                _log.warning(
+                    "ignored %s %r of %s: this name belongs to a %s of robocas_ms3. Rename the entry point.",
+                    *(self.kind, point.name, point.value, self.kind),
+                )
             elif point.value not in {other.value for other in found.setdefault(point.name, [])}:
                 found[point.name].append(point)
         return found
@@ -82,7 +86,7 @@ class Registry(Mapping[str, T]):
                 f"several packages define a {self.kind} with this name",
                 ", ".join(map(package_name, points)),
             )
-            raise ExtensionError(what, where=point.name, found=packages, fix="Uninstall all but one.")
+            raise ExtensionError(what, where=point.name, found=packages, fix="Uninstall all of these packages but one.")
         fix = f"Repair or uninstall {package_name(point)}."
         try:
             with forbid_exit(f"{self.kind} {where}"):
@@ -99,7 +103,7 @@ class Registry(Mapping[str, T]):
 
 
 def package_name(point: EntryPoint) -> str:
-    """Return the name of the package that declares an entry point."""
+    """Return the name of the installed package that declares an entry point."""
     return point.dist.name if point.dist else point.module.partition(".")[0]
 
 

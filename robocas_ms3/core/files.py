@@ -33,9 +33,9 @@ _TRIES = 5  # renames of a folder that other processes replace at the same time
 
 @contextmanager
 def add_path_to_errors(path: Path | str) -> Iterator[None]:
-    """Add a path to each OSError without one, such as an error of writing to an open file.
+    """Add a path to each OSError that has no path, such as an error of writing to an open file.
 
-    An error of a full disk while copying names the source file; it is replaced by this path.
+    If the disk is full while a file is copied, the OSError names the source file; the path replaces this name.
     """
     try:
         yield
@@ -87,7 +87,7 @@ def open_for_append(path: Path) -> BufferedRandom:
         if error.errno != errno.ELOOP:
             raise
         found = f"a symbolic link to {os.readlink(path)}"
-    what, fix = "refusing to write to this file", "Remove it, or choose another output folder."
+    what, fix = "this path is not a regular file and is not written to", "Remove it, or choose another output folder."
     raise RobocasError(what, where=path, expected="a regular file", found=found, fix=fix)
 
 
@@ -131,7 +131,7 @@ def atomic_folder(path: Path | str, *, sync: bool = False) -> Iterator[Path]:
 
 
 def cannot_be_renamed(folder: Path) -> bool:
-    """Return whether a folder cannot be renamed: a mount point, or a folder whose parent is read-only."""
+    """Return whether a folder cannot be renamed, because it is a mount point or its parent is read-only."""
     return folder.is_dir() and (os.path.ismount(folder) or not os.access(folder.resolve().parent, os.W_OK | os.X_OK))
 
 
@@ -151,7 +151,7 @@ def delete_path(path: Path) -> None:
 
 
 def _replace_folder(tmp: Path, path: Path) -> None:
-    """Replace a folder by renaming; other processes may replace it at the same time."""
+    """Replace the folder ``path`` by ``tmp`` with renames; other processes may replace ``path`` at the same time."""
     for tries_left in reversed(range(_TRIES)):
         old = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".old", dir=path.parent))
         try:
@@ -186,7 +186,7 @@ def make_folder(path: Path | str) -> Path:
         path.mkdir(parents=True, exist_ok=True)
         if os.access(path, os.W_OK | os.X_OK):
             return path
-        what, found = "folder is not writable", ""
+        what, found = "this folder is not writable", ""
     except OSError as error:
         what, found = "cannot create this folder", error.strerror or ""
     variable = find_path_variable(path)
@@ -195,7 +195,7 @@ def make_folder(path: Path | str) -> Path:
 
 
 def flush_to_disk(folder: Path | str) -> None:
-    """Flush the file system of a folder to the disk in one call, so that its files survive a power failure."""
+    """Flush the file system that contains a folder to the disk, so that the files survive a power failure."""
     syncfs = getattr(ctypes.CDLL(None, use_errno=True), "syncfs", None)
     if syncfs is None:
         os.sync()
@@ -209,7 +209,7 @@ def flush_to_disk(folder: Path | str) -> None:
 
 
 def write_json(path: Path | str, data: Any, *, sync: bool = False) -> None:
-    """Write a JSON file atomically; ``sync`` as in `atomic_file`, errors as in `encode_json`."""
+    """Write values to a JSON file with `atomic_file`, as text from `encode_json`."""
     text = encode_json(data, path, indent=2) + "\n"
     with atomic_file(path, sync=sync) as tmp:
         tmp.write_text(text, encoding="utf-8")
@@ -220,7 +220,8 @@ def encode_json(
 ) -> str:
     """Return values as JSON text that `documents.load_json` and pydantic accept, on one line if ``indent`` is None.
 
-    Raises ``error``, whose ``where`` names the key, for a value that a reader would refuse, such as NaN.
+    Raises:
+        RobocasError: an ``error`` for a value that these readers refuse, such as NaN; its ``where`` has the key.
     """
     from robocas_ms3.core.documents import find_invalid_value  # imports YAML, which `robocas --help` does not need
 

@@ -27,7 +27,7 @@ _LIMIT = 2**30  # bytes; a million lines have about 300 MB
 
 @dataclass(frozen=True)
 class Line(Generic[Record]):
-    """A line of a JSON Lines file."""
+    """A line of a JSON Lines file, with its record or the reason why it is damaged."""
 
     number: int  # from 1 on
     record: Record | None  # None: the line is damaged
@@ -51,7 +51,7 @@ class JsonLinesFile(Generic[Record]):
         self._form: TypeAdapter[Record] = _type_adapter(record)
 
     def read_lines(self) -> list[Line[Record]]:
-        """Return all lines except empty ones, including damaged lines; [] without a file. Raises as `read_bytes`."""
+        """Read all lines except empty ones, including damaged lines; return [] if the file does not exist."""
         try:
             pieces = read_bytes(self.path, _LIMIT).split(b"\n")
         except FileNotFoundError:
@@ -59,11 +59,16 @@ class JsonLinesFile(Generic[Record]):
         return [self._parse_line(number, piece, len(pieces)) for number, piece in enumerate(pieces, 1) if piece.strip()]
 
     def read(self) -> list[Record]:
-        """Return the records of all undamaged lines."""
+        """Read the records of all lines that are not damaged."""
         return [line.record for line in self.read_lines() if line.record is not None]
 
     def append(self, records: Iterable[Record], *, sync: bool = False) -> None:
-        """Append lines; ``sync`` flushes them to the disk. Without records the file is not touched."""
+        """Append one line per record; do nothing without records.
+
+        Args:
+            records: the records.
+            sync: whether to flush the file to the disk.
+        """
         text = _encode_lines(records, self.path)
         if not text:
             return
@@ -75,11 +80,12 @@ class JsonLinesFile(Generic[Record]):
                 os.fsync(file.fileno())
 
     def rewrite(self, records: Iterable[Record]) -> None:
+        """Replace the file atomically by a file with one line per record."""
         with atomic_file(self.path) as tmp:
             tmp.write_bytes(_encode_lines(records, self.path))
 
     def make_line_error(self, line: Line[Record], error: type[_Error], about: str) -> _Error:
-        """Return an ``error`` for a damaged line of this file; ``about`` is the start of its message."""
+        """Make an ``error`` for a damaged line of this file; ``about`` is the start of the message."""
         assert line.problem is not None
         return error_from_validation(line.problem, self._form, error, where=f"{self.path}:{line.number}", about=about)
 

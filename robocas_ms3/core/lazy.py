@@ -11,13 +11,13 @@ from typing import Any
 def make_lazy_exports(
     package: str, names: Mapping[str, Sequence[str]]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """Return `__getattr__`, `__dir__` and `__all__` of a package whose public names are imported at first use.
+    """Make `__getattr__`, `__dir__` and `__all__` of a package that imports its public names at first use.
 
     Type checkers do not run this function: the package repeats the imports under `TYPE_CHECKING`.
 
     Args:
         package: import path of the package.
-        names: public names by the import path of the module that defines them.
+        names: import path of a module -> public names that the module defines.
     """
     modules = {name: module for module, defined in names.items() for name in defined}
 

@@ -25,9 +25,12 @@ _log = logging.getLogger(__name__)
 
 @contextmanager
 def lock_folder(path: Path | str) -> Iterator[None]:
-    """Lock a folder, which need not exist; errors as in `lock_file`.
+    """Lock a folder, which need not exist, during the context.
 
-    Parent folders created for the lock file are removed if the folder does not exist at the end.
+    Parent folders that were created for the lock file are removed if the folder does not exist at the end.
+
+    Raises:
+        RobocasError: another process holds the lock, or the folder cannot be locked.
     """
     path = Path(path)
     new = [folder for folder in path.parents if not folder.exists()]
@@ -51,7 +54,13 @@ def lock_folder(path: Path | str) -> Iterator[None]:
 def lock_file(file: IO[Any], path: Path, *, wait: bool) -> None:
     """Lock an open file until it is closed; log a warning if the file system has no locks.
 
-    Raises RobocasError, which names ``path``, if another process holds the lock and ``wait`` is not set.
+    Args:
+        file: the lock file.
+        path: the folder that the lock protects, for messages.
+        wait: whether to wait while another process holds the lock.
+
+    Raises:
+        RobocasError: another process holds the lock and ``wait`` is False, or the file cannot be locked.
     """
     until = time.monotonic() + _DYING
     while True:
@@ -60,7 +69,7 @@ def lock_file(file: IO[Any], path: Path, *, wait: bool) -> None:
             return
         except BlockingIOError as error:
             if time.monotonic() > until:
-                what, fix = "another process writes to this folder", "Wait until that process ends."
+                what, fix = "another process writes to this folder", "Wait until the other process ends."
                 raise RobocasError(what, where=path, fix=fix) from error
             time.sleep(0.02)
         except OSError as error:

@@ -30,7 +30,7 @@ _SHOWN_VALUE = 60  # characters
 
 @dataclass(frozen=True)
 class FolderKind:
-    """How to recognize the output folders of a command."""
+    """Kind of output folder: the files and keys by which a command recognizes its output folders."""
 
     command: str  # name of the command, such as "robocas generate"
     records: tuple[str, ...]  # possible paths of the JSON file with the settings; a new run writes the first
@@ -42,8 +42,8 @@ class FolderKind:
 class OutputFolder:
     """A locked output folder, which a later run with the same settings continues.
 
-    Entering locks and checks the folder without changing it. Call `start` before writing the first file. If an error
-    leaves the block, a started folder without results is removed::
+    On entry, the context manager locks and checks the folder without changing it. Call `start` before writing the first
+    file. If the block raises an error, a started folder without results is removed::
 
         with OutputFolder(out, KIND, settings, overwrite=overwrite) as output:
             output.start(record)
@@ -52,10 +52,11 @@ class OutputFolder:
     Args:
         path: of the folder, which may be missing or empty.
         kind: how to recognize the folders of the command.
-        settings: JSON values that must match the record to continue, by key. None: `check_settings` is called later.
+        settings: JSON values by key, which must equal the values in the record if a run is continued. None: the caller
+            calls `check_settings` later.
         overwrite: whether to delete the content and start again.
-        shared: whether other processes of the same run write to the folder; then it is not locked, and an existing
-            record and leftovers stay.
+        shared: whether other processes of the same run write to the folder. If so, the folder is not locked, and an
+            existing record and temporary files stay.
 
     Attributes:
         path: of the folder.
@@ -106,13 +107,13 @@ class OutputFolder:
                     self.path.rmdir()
 
     def read_record(self) -> None:
-        """Read and check the record without locking the folder, for further processes of the same run."""
+        """Read and check the record without locking the folder; for additional processes of the same run."""
         self.recorded = self._load_matching()
         if self._settings is not None:
             self.check_settings(self._settings)
 
     def check_settings(self, settings: Mapping[str, Any]) -> None:
-        """Raise OutputExistsError if the recorded settings differ, unless the folder is overwritten."""
+        """Raise OutputExistsError if these settings differ from the recorded ones; with ``overwrite`` do nothing."""
         if self.recorded is not None:
             self._compare(self.recorded, settings)
 
@@ -129,7 +130,7 @@ class OutputFolder:
             )
 
     def start(self, record: Mapping[str, Any]) -> None:
-        """Create the folder, delete overwritten content and leftovers of killed runs, and write the record."""
+        """Create the folder, delete overwritten content and temporary files of killed runs, and write the record."""
         if self._overwrite and not self._started and self.path.is_dir():
             self._hide_content()
         self._started = True
@@ -151,7 +152,7 @@ class OutputFolder:
                 os.replace(entry, old / entry.name)
 
     def check_exists(self) -> None:
-        """Raise RobocasError if the folder was removed, since writers would create it again and continue."""
+        """Raise RobocasError if the folder was removed during the run; otherwise writers would create it again."""
         if not self._record_path().is_file():
             raise self._make_removed_error()
 
@@ -160,7 +161,7 @@ class OutputFolder:
         return RobocasError(what, where=self.path, expected=self._record_path().name, fix=fix)
 
     def check_record(self) -> None:
-        """Raise RobocasError if the record was removed, or if another run started here with other settings."""
+        """Raise RobocasError if the record was removed, or if a run with other settings started in this folder."""
         record = self._load_record()
         if record is None:
             raise self._make_removed_error()
@@ -213,7 +214,7 @@ def _is_hidden(path: Path) -> bool:
 
 
 def is_empty(path: Path) -> bool:
-    """Return whether a path is missing, or a folder with at most a lock file and leftovers of killed runs."""
+    """Return whether a path is missing, or a folder with at most a lock file and temporary files of killed runs."""
     try:
         return all(map(_is_hidden, path.iterdir()))
     except FileNotFoundError:
@@ -238,10 +239,12 @@ def check_replaceable(path: Path | str, *, overwrite: bool | None = None, marker
         return
     if not overwrite:
         fix = "Choose another path." if overwrite is None else "Pass --overwrite to replace it, or choose another path."
-        raise OutputExistsError("the output exists", where=path, fix=fix)
+        raise OutputExistsError("the output exists already", where=path, fix=fix)
     if markers and not any((path / marker).exists() for marker in markers):
-        what = "refusing to replace a path that this command did not write"
-        raise OutputExistsError(what, where=path, expected=" or ".join(markers), fix="Choose another path.")
+        what = "this path was not written by this command and is not replaced"
+        raise OutputExistsError(
+            what, where=path, expected=f"a folder that contains {' or '.join(markers)}", fix="Choose another path."
+        )
 
 
 def remove_leftovers(folder: Path) -> None:
@@ -252,7 +255,14 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def list_setting_changes(before: Any, now: Any, path: str, tolerance: float = 0.0) -> list[str]:
-    """Return ``path: before -> now`` for each JSON value that differs; floats may differ by ``tolerance``."""
+    """List the differences of two JSON values as ``PATH: OLD -> NEW``.
+
+    Args:
+        before: old value.
+        now: new value.
+        path: dotted path of keys to the two values, the start of each ``PATH``.
+        tolerance: difference up to which two floats count as equal.
+    """
     if isinstance(before, dict) and isinstance(now, dict):
         pairs = [(key, before.get(key), now.get(key)) for key in dict.fromkeys([*before, *now])]
     elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):

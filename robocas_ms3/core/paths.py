@@ -48,7 +48,10 @@ def _find_user_folder(find: Callable[[str], Path]) -> Path:
 
 
 def ensure_home() -> None:
-    """Set ``HOME``, which libraries need, to the user's home folder, or to a folder in the cache if there is none."""
+    """Set ``HOME``, which libraries need, if it is not an absolute path.
+
+    The value is the user's home folder, or a folder in the cache if the user has none.
+    """
     home = os.environ.get("HOME", "")
     if not os.path.isabs(home):
         with suppress(KeyError):  # a user id without an entry, as in many containers
@@ -63,12 +66,18 @@ def ensure_home() -> None:
 def _choose_cache(usual: Path) -> Path:
     if is_writable(usual) or (instead := make_temporary_cache()) is None:
         return usual
-    _log.warning("%s is not writable: the cache is %s. Set %s to choose another folder.", usual, instead, CACHE)
+    _log.warning(
+        "the cache folder %s is not writable; %s is used instead. Set %s to choose a folder.", usual, instead, CACHE
+    )
     return instead
 
 
 def make_temporary_cache() -> Path | None:
-    """Create and return a private cache folder in the temporary directory; None if another user owns the path."""
+    """Create a private cache folder in the temporary directory.
+
+    Returns:
+        The folder, or None if it cannot be created or is not private to this user.
+    """
     folder = Path(tempfile.gettempdir()) / f"robocas-{os.getuid()}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
@@ -80,13 +89,13 @@ def make_temporary_cache() -> Path | None:
 
 
 def is_writable(folder: Path) -> bool:
-    """Return whether a folder is writable, or can be created."""
+    """Return whether files can be created in a folder; a folder that does not exist must be creatable."""
     existing = next(parent for parent in (folder, *folder.parents) if os.path.lexists(parent))
     return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
 
 
 def find_path_variable(path: Path | str) -> str:
-    """Return the environment variable that moves a path (cache or data folder); empty if there is none."""
+    """Return the environment variable that sets the cache or data folder which contains a path; empty if none does."""
     path = Path(path).absolute()
     for name, folder_of in ((CACHE, cache_dir), (DATA, data_dir)):
         with suppress(RobocasError):  # no home folder
@@ -102,12 +111,15 @@ def task_configs_dir() -> Path:
 
 
 def builtin_packs_dir() -> Path:
+    """Return the folder of the bundled asset packs."""
     return PACKAGE_DIR / "data" / "packs"
 
 
 def protocols_dir() -> Path:
+    """Return the folder of the bundled protocols."""
     return PACKAGE_DIR / "data" / "protocols"
 
 
 def plans_dir() -> Path:
+    """Return the folder of the bundled plans."""
     return PACKAGE_DIR / "data" / "plans"

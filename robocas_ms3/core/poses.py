@@ -61,21 +61,23 @@ def from_xyz_yaw(x: float, y: float, z: float, yaw: float) -> Array:
 
 
 def transform_points(pose: Array, points: Array) -> Array:
-    """Transform points (..., P, 3) by one transform (4, 4), or by one per batch element (..., 4, 4)."""
+    """Transform points (..., P, 3) by one transform (4, 4), or by one transform per batch element (..., 4, 4)."""
     offset = pose[..., None, :3, 3] if pose.ndim > 2 else pose[:3, 3]
     return points @ pose[..., :3, :3].swapaxes(-1, -2) + offset
 
 
 def wxyz_to_xyzw(quaternions: Array) -> Array:
+    """Convert quaternions (..., 4) from wxyz to xyzw."""
     return np.roll(quaternions, -1, axis=-1)
 
 
 def xyzw_to_wxyz(quaternions: Array) -> Array:
+    """Convert quaternions (..., 4) from xyzw to wxyz."""
     return np.roll(quaternions, 1, axis=-1)
 
 
 def _single_from_wxyz(px: float, py: float, pz: float, w: float, x: float, y: float, z: float) -> Array:
-    """Return bit for bit the transform (4, 4) that SciPy gives, in a tenth of the time."""
+    """Return the transform (4, 4) of one pose; equal to SciPy's result bit for bit, in a tenth of the time."""
     length = math.sqrt(x * x + y * y + z * z + w * w)
     w, x, y, z = w / length, x / length, y / length, z / length
     xx, yy, zz, ww = x * x, y * y, z * z, w * w

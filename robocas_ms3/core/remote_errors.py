@@ -13,7 +13,7 @@ from robocas_ms3.core.signals import make_exit_error
 
 @dataclass(frozen=True)
 class RemoteError:
-    """A picklable copy of an error and its traceback."""
+    """Picklable copy of an error and its traceback, to send to another process."""
 
     error: BaseException  # a RuntimeError with the same message if the error cannot be pickled
     where: str  # the process that raised the error, such as "a worker"
@@ -21,9 +21,11 @@ class RemoteError:
 
     @classmethod
     def from_error(cls, error: BaseException, where: str) -> RemoteError:
-        """Convert an error; an error that cannot be pickled becomes a RuntimeError.
+        """Make a picklable copy of an error; an error that cannot be pickled becomes a RuntimeError.
 
-        ``where`` names this process; an error that came from another process keeps the name of that process.
+        Args:
+            error: the error. If it came from another process, the copy keeps the name of that process.
+            where: name of this process, such as "a worker".
         """
         if isinstance(error, SystemExit):  # a SystemExit would end the receiving process without a message
             error = make_exit_error(error, where).with_traceback(error.__traceback__)
@@ -35,16 +37,17 @@ class RemoteError:
         return cls(RuntimeError(f"{type(error).__name__}: {error}"), *place)
 
     def make_error(self) -> BaseException:
-        """Return the error with a `RemoteTraceback` as its cause."""
+        """Return the original error, with a `RemoteTraceback` as its cause."""
         self.error.__cause__ = RemoteTraceback(self.where, self.traceback)
         return self.error
 
     def reraise(self) -> NoReturn:
+        """Raise the original error, with a `RemoteTraceback` as its cause."""
         raise self.make_error()
 
 
 class RemoteTraceback(Exception):  # noqa: N818  (the cause of an error, as in `concurrent.futures`)
-    """The traceback of another process as text, since tracebacks cannot be pickled."""
+    """Traceback of an error in another process, as text, because tracebacks cannot be pickled."""
 
     def __str__(self) -> str:
         where, text = self.args

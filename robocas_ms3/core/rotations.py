@@ -39,7 +39,7 @@ def multiply(first: Array, second: Array) -> Array:
 
 
 def rotate_float64(quaternion: Array, vector: Array) -> Array:
-    """Rotate vectors (N, 3) by unit quaternions (N, 4), computed in float64 and returned in float32."""
+    """Rotate vectors (N, 3) by unit quaternions (N, 4); compute in float64, return float32."""
     left = left_product_matrix(as_float64(quaternion))
     half = matmul(left[:, :, 1:], as_float64(vector)[:, :, None])
     return as_float32(matmul(left, concatenate([-half[:, :1], half[:, 1:]], axis=1))[:, 1:, 0])
@@ -51,7 +51,7 @@ def standardize(quaternion: Array) -> Array:
 
 
 def left_product_matrix(quaternion: Array) -> Array:
-    """Return matrices (N, 4, 4) of the product with a quaternion (N, 4) on the left: q * p = L(q) p."""
+    """Return the matrices L(q) (N, 4, 4) of quaternions q (N, 4), so that q * p = L(q) p for every quaternion p."""
     if isinstance(quaternion, Tensor):
         return torch.stack(_left_product_elements(*quaternion.T), 1).reshape(-1, 4, 4)
     return (quaternion @ _LEFT).reshape(-1, 4, 4)

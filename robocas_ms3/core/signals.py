@@ -27,9 +27,9 @@ _PR_SET_PDEATHSIG = 1
 class _InterruptHandler:
     """Handler of Ctrl-C and SIGTERM in a command: the first signal ends the command within seconds.
 
-    Python calls a signal handler only when native code returns or a deferral ends. Until then a second SIGINT ends the
-    process at once: a thread, woken by the first SIGINT, ignores SIGINT for half a second, and then restores the
-    system's default action. Signals after the call of the handler are ignored.
+    Python calls a signal handler only when native code returns or a `defer_interrupts` block ends. Until then, a second
+    SIGINT ends the process at once: the first SIGINT wakes a thread, which ignores SIGINT for half a second, and then
+    restores the system's default action. When the handler was called, further signals are ignored.
     """
 
     def __init__(self) -> None:
@@ -61,10 +61,11 @@ class _InterruptHandler:
         raise KeyboardInterrupt
 
     def is_armed(self) -> bool:
+        """Return whether this handler is installed, and no signal was handled yet."""
         return self.installed and signal.getsignal(signal.SIGINT) == self.handle
 
     def arm(self) -> None:
-        """Let the system restore its default action at the first SIGINT, if the C library has ``sysv_signal``.
+        """Make the system restore the default action of SIGINT at the first SIGINT, if ``sysv_signal`` exists.
 
         A second SIGINT then ends the process even while native code keeps the thread of `_watch` from running.
         """
@@ -94,7 +95,7 @@ def handle_interrupts() -> None:
 
 
 def exit_command(code: int) -> NoReturn:
-    """Exit the process with an exit status; skip the teardown of libraries if it was interrupted."""
+    """Exit the process with an exit status; skip the teardown of libraries if the command was interrupted."""
     if code == INTERRUPTED:
         exit_immediately(_command.code)
     sys.exit(code)
@@ -104,8 +105,8 @@ def exit_command(code: int) -> NoReturn:
 def defer_interrupts(*, second_ends: bool = True) -> Iterator[list[Any]]:
     """Defer SIGINT and SIGTERM until the end of the block; yield the list of signals received so far.
 
-    Only the first signal is handled. A signal mask does not suffice: the system delivers the signal to another thread,
-    and Python runs the handler in the main thread.
+    At the end of the block, the handler runs for the first of these signals only. A signal mask does not suffice: the
+    system would deliver the signal to another thread, and Python would run the handler in the main thread.
 
     Args:
         second_ends: whether a second SIGINT, at least half a second after the first, ends the command at once.
@@ -139,7 +140,7 @@ def exit_immediately(code: int) -> NoReturn:
 
 
 def die_with_parent(parent: int) -> None:
-    """Ask Linux to kill this process when the thread of process ``parent`` (an id) that started it ends."""
+    """Ask Linux to kill this process when its parent ends: the thread of process id ``parent`` that started it."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:
@@ -148,7 +149,13 @@ def die_with_parent(parent: int) -> None:
 
 @contextmanager
 def forbid_exit(source: str) -> Iterator[None]:
-    """Convert SystemExit, and KeyboardInterrupt without a signal, from the code of ``source`` to ExtensionError."""
+    """Convert attempts of an extension to end the process to ExtensionError.
+
+    Such attempts are SystemExit, and KeyboardInterrupt without a signal.
+
+    Args:
+        source: name of the extension, for the message.
+    """
     try:
         yield
     except (SystemExit, KeyboardInterrupt) as error:
@@ -158,10 +165,10 @@ def forbid_exit(source: str) -> Iterator[None]:
 
 
 def make_exit_error(error: BaseException, source: str) -> ExtensionError:
-    """Return an error with the line of an extension's code that tried to end the process."""
+    """Make an ExtensionError that names the line of the extension's code that tried to end the process."""
     frames = extract_tb(error.__traceback__)
     line = f" at {frames[-1].filename}:{frames[-1].lineno}" if frames else ""
-    fix = "Raise an Exception there instead."
+    fix = "Raise an Exception instead of ending the process."
     return ExtensionError("this code tried to end the process", where=source, found=f"{error!r}{line}", fix=fix)
 
 

@@ -42,7 +42,7 @@ _OUT_OF_RANGE = re.compile(rb"NaN|Infinity|\d[eE]\+?\d{3}|\d{19}")  # possibly a
 
 
 class StrictModel(BaseModel):
-    """Base class of immutable pydantic models that refuse unknown keys and numbers over `MAX_NUMBER`."""
+    """Base class of immutable pydantic models; unknown keys and numbers over `MAX_NUMBER` are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -55,7 +55,13 @@ class StrictModel(BaseModel):
 
 
 def _find_large_number(value: Any) -> float | None:
-    """Return a number in a value whose magnitude exceeds `MAX_NUMBER`, or None; nested models check themselves."""
+    """Find a number in a value whose magnitude exceeds `MAX_NUMBER`.
+
+    Nested models are not searched, because they check their numbers themselves.
+
+    Returns:
+        The number, or None.
+    """
     if isinstance(value, int | float):
         return value if abs(value) > MAX_NUMBER else None
     inside = value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ()
@@ -64,7 +70,7 @@ def _find_large_number(value: Any) -> float | None:
 
 @dataclass(frozen=True)
 class InvalidValue:
-    """An error of pydantic with one-line texts."""
+    """One invalid value of a file: key, problem, expected and found value, as one-line texts of a pydantic error."""
 
     key: str  # dotted path in the file; empty: top level
     kind: str  # error type of pydantic
@@ -77,24 +83,24 @@ class InvalidValue:
 
 
 def parse(model: type[_Model], data: Any, error: type[RobocasError], *, where: object, about: str = "") -> _Model:
-    """Validate values read from YAML and return them as a model.
+    """Validate values that were read from YAML, and return them as a model.
 
     Args:
         model: class of the model.
         data: a mapping.
         error: type of the error to raise.
-        where: file or option of the values, for messages; or a function that returns it for the key of an error.
+        where: file or option of the values, for messages; or a function that returns the file or option of a key.
         about: start of the message, such as "not a valid plan".
 
     Raises:
-        RobocasError: an ``error`` for the first invalid value, with the number of further ones.
+        RobocasError: an ``error`` for the first invalid value, with the number of further invalid values.
     """
     try:
         text = json.dumps(
             data, default=lambda value: {type(value).__name__: str(value)}
         )  # such as a date, which no model accepts
     except (TypeError, ValueError) as problem:  # a key of another type, or a YAML alias of its own parent
-        what = "unsupported keys or recursive aliases"
+        what = "a key that is not text, or a YAML alias that contains itself"
         where = where("") if callable(where) else where
         raise error(f"{about}: {what}" if about else what, where=where, found=problem) from problem
     # strict JSON mode accepts lists as tuples and integers as floats, as needed for YAML
@@ -104,7 +110,7 @@ def parse(model: type[_Model], data: Any, error: type[RobocasError], *, where: o
 def parse_json(
     model: type[_Model], text: str | bytes, error: type[RobocasError], *, where: object, about: str = ""
 ) -> _Model:
-    """Validate a JSON text and return it as a model; see `parse`."""
+    """Validate a JSON text and return it as a model; the arguments and errors are those of `parse`."""
     try:
         return validate_json(model, text)
     except ValidationError as problem:
@@ -112,7 +118,11 @@ def parse_json(
 
 
 def validate_json(form: type[BaseModel] | TypeAdapter[Any], text: str | bytes) -> Any:
-    """Validate JSON strictly; raise ValidationError, also for NaN, infinity and integers over 64 bits."""
+    """Validate a JSON text strictly and return its values in the type of ``form``.
+
+    Raises:
+        ValidationError: a value is invalid, or NaN, infinite, or an integer of more than 64 bits.
+    """
     validate = form.validate_json if isinstance(form, TypeAdapter) else form.model_validate_json
     found = validate(text, strict=True)
     if _OUT_OF_RANGE.search(text.encode() if isinstance(text, str) else text):  # rarely true
@@ -133,7 +143,16 @@ def error_from_validation(
     about: str = "",
     fix: str = "",
 ) -> _Error:
-    """Convert a pydantic error to an ``error`` with its first invalid value and the number of others; see `parse`."""
+    """Convert a pydantic error to an ``error`` with the first invalid value and the number of other invalid values.
+
+    Args:
+        problem: error of pydantic.
+        form: model or type that was validated.
+        error: type of the error to make.
+        where: as in `parse`.
+        about: start of the message.
+        fix: sentence that tells the user how to solve the problem.
+    """
     first, *others = list_invalid_values(problem, form)
     # a union reports one error per type, at its own key or at an outer key
     more = sum(not f"{first.key}.".startswith(f"{other.key}." if other.key else "") for other in others)
@@ -148,12 +167,13 @@ def list_invalid_values(
     form: type[BaseModel] | TypeAdapter[Any] | None = None,
     words: Mapping[str, str] | None = None,
 ) -> list[InvalidValue]:
-    """Return the invalid values of a pydantic error, one per key, unknown keys first.
+    """List the invalid values of a pydantic error, one per key, unknown keys first.
 
     Args:
         problem: error of pydantic.
-        form: model or type that was validated; may be None if it has no unions, whose types pydantic reports as keys.
-        words: further texts of expected values by error type of pydantic.
+        form: model or type that was validated. It is needed for types with unions, because pydantic reports the types
+            of a union as keys.
+        words: texts for expected values by error type of pydantic, in addition to the standard ones.
     """
     schema: dict[str, Any] = {}
     if form is not None:
@@ -168,7 +188,7 @@ def list_invalid_values(
 
 
 def check_name(name: str, error: type[RobocasError], *, where: object, fix: str = "") -> str:
-    """Return a name if it is valid for a file or folder; raise ``error`` otherwise."""
+    """Return a name unchanged; raise ``error`` if the name is not valid for a file or folder."""
     try:
         return _check_name(name)
     except ValueError as problem:
@@ -229,9 +249,9 @@ def _describe_expected(details: Any, words: Mapping[str, str]) -> str:
 
 
 def _locate_value(location: tuple[int | str, ...], schema: dict[str, Any]) -> tuple[list[str], dict[str, Any]]:
-    """Return the keys of an invalid value as in the file, and the JSON schema of this value, or {}.
+    """Return the path of keys to an invalid value in its file, and the JSON schema of the value ({} if unknown).
 
-    The location of pydantic also has tags of tagged unions, types of values, and "[key]" for an invalid key.
+    ``location`` of pydantic also has tags of tagged unions, types of values, and "[key]" for an invalid key.
     """
     node = _resolve_reference(schema, schema)
     keys: list[str] = []

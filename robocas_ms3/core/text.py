@@ -30,7 +30,7 @@ _MARKDOWN = re.compile(
 
 
 def format_ranges(numbers: Iterable[int]) -> str:
-    """Format integers as ranges, such as ``0-3, 7``; show at most six ranges."""
+    """Format integers as ranges, such as ``0-3, 7``; at most six ranges, then the number of remaining integers."""
     runs: list[list[int]] = []
     for number in sorted(set(numbers)):
         if runs and number == runs[-1][1] + 1:
@@ -54,7 +54,7 @@ def escape_controls(text: str, *, lines: bool = False) -> str:
 
 
 def one_line(text: object, max_length: int | None = None) -> str:
-    """Return a text or the message of an error as one printable line.
+    """Convert a text, or the message of an error, to one printable line.
 
     Args:
         text: untrusted text, or an error; an error without a message is shown by the name of its type.
@@ -67,18 +67,18 @@ def one_line(text: object, max_length: int | None = None) -> str:
 
 
 def format_error(error: BaseException, max_length: int | None = None) -> str:
-    """Format an error as one line; prefix the name of its type unless it is a RobocasError."""
+    """Format an error as one line; the line starts with the type of the error, unless it is a RobocasError."""
     return one_line(error if isinstance(error, RobocasError) else f"{type(error).__name__}: {error}", max_length)
 
 
 def escape_markdown(text: str) -> str:
-    """Escape a text for one line of Markdown, so that it shows no HTML, links, emphasis or table cells."""
+    """Escape a text for one line of Markdown, so that it creates no HTML, links, emphasis or table cells."""
     return _MARKDOWN.sub(r"\\\g<0>", escape_controls(text))
 
 
 class _EscapingFormatter(logging.Formatter):
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  (logging's name)
-        """Escape the message; only messages of other packages may have several lines."""
+        """Format a log record with control characters escaped; only records of other packages keep line breaks."""
         return escape_controls(super().formatMessage(record), lines=not record.name.startswith("robocas_ms3"))
 
     def formatException(self, ei: Any) -> str:  # noqa: N802
@@ -119,6 +119,11 @@ def format_count(count: int, noun: str) -> str:
 
 
 def format_object_name(asset_id: str, name: str = "") -> str:
-    """Return an object's name in instructions, with its asset id if that differs; unknown parts are empty."""
+    """Format an object for tables and messages: its name in instructions, with its asset id if the two differ.
+
+    Args:
+        asset_id: id of the asset, such as ``tomato_soup_can``; empty: unknown.
+        name: name in instructions; empty: unknown.
+    """
     plain = asset_id.replace("_", " ")
     return f"{name} ({plain})" if name and plain and name != plain else name or plain

@@ -43,7 +43,7 @@ _PROGRAM = "import sys; sys.path[:] = {path!r}; from robocas_ms3.core.worker_pro
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of one task."""
+    """Limits of time and memory of one task; a task that exceeds a limit is killed."""
 
     seconds: float = math.inf  # wall-clock time
     memory_gb: float = math.inf  # GiB of resident memory, for the worker process and for each of its forks
@@ -53,33 +53,39 @@ NO_LIMITS = Limits()
 
 
 class ProcessCrashError(WorkerCrashError):
-    """The worker process ``pid`` died during a task. A task that itself raises `WorkerCrashError` is not meant."""
+    """The worker process ``pid`` died during a task.
+
+    The separate type distinguishes this error from a `WorkerCrashError` that the code of a task raises.
+    """
 
     pid = 0
 
 
 class Worker(Protocol[Task_contra, Result_co]):
-    """An object that runs tasks one after the other and keeps their shared resources."""
+    """Interface of workers, which run tasks one after the other and keep resources between tasks."""
 
     def run(self, task: Task_contra, /) -> Result_co: ...
 
     def close(self) -> None:
-        """Free the resources; called after a task that raised an error, and when a pool without processes closes."""
+        """Free the resources.
+
+        Called after a task that raised an error, and when a pool without processes closes.
+        """
         ...
 
 
 class WorkerProcess(Generic[Task, Result]):
     """A process that runs tasks one after the other.
 
-    Keep the starting thread alive: Linux kills the process when that thread ends.
+    Linux kills the process when the thread that started it ends, so this thread must stay alive.
 
     Args:
         make_worker: creates the worker; called in the process.
-        limits: of each task.
+        limits: limits of each task.
         stop: a `Connection` that becomes readable when the running task must be killed.
 
     Attributes:
-        connection: to the process, a `Connection`.
+        connection: the `Connection` to the process; None: the process does not run.
     """
 
     def __init__(self, make_worker: Callable[[], Worker[Task, Result]], limits: Limits, stop: Any) -> None:
@@ -94,6 +100,7 @@ class WorkerProcess(Generic[Task, Result]):
         return self._process.pid
 
     def run(self, task: Task) -> Result:
+        """Run a task and return its result; start the process if it does not run."""
         if self._process is None or self._process.poll() is not None:
             try:
                 self.launch()
@@ -103,7 +110,7 @@ class WorkerProcess(Generic[Task, Result]):
             except ProcessCrashError as crash:
                 what, fix = (
                     "a worker process crashed before its first task",
-                    "See its output above, and run robocas doctor.",
+                    "See the output of the process above, and run robocas doctor.",
                 )
                 raise WorkerStartError(what, found=crash.found, fix=fix) from crash
             except BaseException:
@@ -113,7 +120,7 @@ class WorkerProcess(Generic[Task, Result]):
         return self._receive(self._limits.seconds)
 
     def quit(self) -> None:
-        """Let an idle process exit; kill it if it is busy or the exit takes too long."""
+        """Let an idle process exit; kill the process if it is busy or does not exit within a second."""
         if self._process is not None:
             self.connection.close()
             with suppress(subprocess.TimeoutExpired):
@@ -122,11 +129,11 @@ class WorkerProcess(Generic[Task, Result]):
 
     @property
     def pickled_worker(self) -> bytes:
-        """First message to the process; the process answers None, or the error of creating the worker."""
+        """First message to the process, which creates the worker; the answer is None, or the error."""
         return cloudpickle.dumps(self._make_worker)
 
     def launch(self) -> None:
-        """Start the process, which sends None when it is ready to read."""
+        """Start the process; the process sends None when it is ready to read messages."""
         self.end()
         try:
             self.connection, theirs = Pipe()
@@ -157,7 +164,11 @@ class WorkerProcess(Generic[Task, Result]):
         return self.read()
 
     def check_limits(self, deadline: float) -> None:
-        """Kill the process and raise ProcessCrashError if it exceeds the deadline (`time.monotonic`) or the memory."""
+        """Kill the process and raise ProcessCrashError if it exceeds a limit.
+
+        Args:
+            deadline: end of the time limit, by `time.monotonic`.
+        """
         now = time.monotonic()
         if now > deadline:
             raise self._crash("time limit exceeded")
@@ -167,7 +178,12 @@ class WorkerProcess(Generic[Task, Result]):
                 raise self._crash("memory limit exceeded")
 
     def read(self) -> Any:
-        """Read a waiting answer; raise ProcessCrashError, or the error of the task."""
+        """Read the answer of the process, which must have arrived.
+
+        Raises:
+            ProcessCrashError: the process died.
+            Exception: the error of the task.
+        """
         try:
             answer = self.connection.recv()
         except (EOFError, OSError) as error:
@@ -177,7 +193,7 @@ class WorkerProcess(Generic[Task, Result]):
         return answer
 
     def _crash(self, reason: str = "") -> ProcessCrashError:
-        """Kill the process and return the error with the reason."""
+        """Kill the process and return a ProcessCrashError with the reason."""
         assert self._process is not None
         if not reason:
             with suppress(subprocess.TimeoutExpired):
@@ -192,7 +208,7 @@ class WorkerProcess(Generic[Task, Result]):
         return error
 
     def end(self) -> None:
-        """Kill the process and its forks, if it runs."""
+        """Kill the process and its forks, if the process runs."""
         if self._process is not None:
             _kill_tree(self._process)
             self._process = None
@@ -202,14 +218,17 @@ class WorkerProcess(Generic[Task, Result]):
 
 
 def make_worker_error(error: BaseException, where: str) -> RemoteError:
-    """Convert an error of code in a worker, where KeyboardInterrupt cannot come from Ctrl-C."""
+    """Convert an error in a worker to a RemoteError.
+
+    A KeyboardInterrupt in a worker is an attempt of the code to end the process, because workers ignore Ctrl-C.
+    """
     return RemoteError.from_error(
         make_exit_error(error, where) if isinstance(error, KeyboardInterrupt) else error, where
     )
 
 
 def _exceeds_memory(pid: int, memory_gb: float) -> bool:
-    """Return whether a process or one of its forks uses more than ``memory_gb`` GiB."""
+    """Return whether a process, or one of its forks, uses more than ``memory_gb`` GiB of resident memory."""
     if memory_gb == math.inf:
         return False
     try:
@@ -222,7 +241,7 @@ def _exceeds_memory(pid: int, memory_gb: float) -> bool:
 
 
 def _kill_tree(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process and its forks, which must not continue to write files, and wait for its end."""
+    """Kill a process and its forks, so that none continues to write files; wait until the process has ended."""
     if process.poll() is not None:
         return  # another process may have this id by now
     with suppress(psutil.Error):
@@ -233,7 +252,7 @@ def _kill_tree(process: subprocess.Popen[bytes]) -> None:
 
 
 def main(descriptor: int, parent: int) -> None:
-    """Run tasks sent by process ``parent`` through the file descriptor, until the connection is closed."""
+    """Run the tasks that process ``parent`` (an id) sends through a file descriptor, until the connection is closed."""
     for number in (signal.SIGINT, signal.SIGTERM):  # terminals and batch systems send these signals to all processes
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
@@ -248,7 +267,7 @@ def main(descriptor: int, parent: int) -> None:
 
 
 def _serve(connection: Connection) -> None:
-    """Create the worker and run tasks; answer each message with a result or a `RemoteError`."""
+    """Create the worker and run the tasks; answer each message with its result or a `RemoteError`."""
     make_worker: Any = None
     worker: Any = None
 

@@ -59,8 +59,8 @@ class WorkerPool(Generic[Task, Result]):
         num_workers: number of processes, started on demand; 0: tasks run in this process, without limits.
         limits: limits of each task.
         retries: number of retries of a task whose process crashed.
-        on_crash: called with a task whose last process crashed and the reason; returns its result or raises an error.
-            Default: raise `WorkerCrashError`.
+        on_crash: called with a task and the reason when the process of its last retry crashed; returns a result for the
+            task, or raises an error. Default: raise `WorkerCrashError`.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class WorkerPool(Generic[Task, Result]):
         """Run tasks and yield their results; take tasks from the iterable as workers become free.
 
         Args:
-            tasks: may be infinite.
+            tasks: the tasks; the iterable may be infinite.
             ordered: whether to yield results in task order instead of in order of completion.
 
         Raises:
@@ -99,7 +99,7 @@ class WorkerPool(Generic[Task, Result]):
         return self._map_in_processes(tasks, ordered)
 
     def run(self, task: Task) -> Result:
-        """Run one task and return its result; errors as in `map`."""
+        """Run one task and return its result; raise the errors of `map`."""
         (result,) = self.map([task])
         return result
 
@@ -164,7 +164,7 @@ class WorkerPool(Generic[Task, Result]):
                 return
 
     def _supervise(self) -> None:
-        """Run jobs in one worker process; each process has its own supervising thread."""
+        """Run tasks in one worker process; the pool has one such thread per process."""
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # inherited by the process, until it ignores Ctrl-C
         process: WorkerProcess[Task, Result] = WorkerProcess(self._make_worker, self._limits, self._stop_reader)
         while (job := self._jobs.get()) is not None and not self._stopped:
@@ -188,7 +188,9 @@ class WorkerPool(Generic[Task, Result]):
             except ProcessCrashError as crash:
                 reason = str(crash.found)
                 if retries_left:
-                    _log.warning("%.80s: the worker process crashed (%s); the task is retried", task, reason)
+                    _log.warning(
+                        "%.80s: the worker process of this task crashed (%s); the task is retried", task, reason
+                    )
         return self._on_crash(task, reason)
 
     def stop(self) -> None:
@@ -221,7 +223,7 @@ class WorkerPool(Generic[Task, Result]):
 
 
 class _PendingTask(Generic[Task, Result]):
-    """A task, its result, and a queue that is notified when the task is done."""
+    """A task of `map` that waits, runs or is done: the task, its result, and a queue that is notified at the end."""
 
     def __init__(self, task: Task, finished: SimpleQueue[None]) -> None:
         self.task, self.finished = task, finished
@@ -231,12 +233,12 @@ class _PendingTask(Generic[Task, Result]):
 
 
 def use_one_torch_thread() -> None:
-    """Limit torch to one thread, since threads slow down small operations."""
+    """Limit torch to one thread in this process, because threads slow down small operations."""
     import torch
 
     torch.set_num_threads(1)
 
 
 def _raise_crash(task: Any, reason: str) -> Any:
-    what, fix = "the worker process crashed", "If the memory is short, use fewer --jobs."
+    what, fix = "the worker process of this task crashed", "Use fewer --jobs if the memory is short."
     raise WorkerCrashError(what, where=f"{task}"[:80], found=reason, fix=fix)

@@ -128,7 +128,7 @@ def test_a_folder_that_is_not_a_pack_is_not_replaced(tmp_path):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter").write_text("1")
     todo = jobs(tmp_path / "log", a="1" * 64)
-    with pytest.raises(OutputExistsError, match="refusing to replace"):
+    with pytest.raises(OutputExistsError, match="was not written by this command"):
         write_pack(todo, tmp_path / "thesis", tmp_path / "kept")
     with pytest.raises(AssetError, match="invalid name of a pack"):
         write_pack(todo, tmp_path / "My.Pack", tmp_path / "kept")

@@ -55,7 +55,7 @@ def test_static_page(trajectory, tmp_path, capsys):
 def test_overwrite_replaces_only_static_pages(trajectory, tmp_path, capsys):
     (tmp_path / "notes.txt").write_text("mine")
     assert run(["view", str(trajectory), "--static", str(tmp_path), "--overwrite"]) == 1
-    assert "refusing to replace" in capsys.readouterr().err
+    assert "was not written by this command" in capsys.readouterr().err
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 

@@ -49,7 +49,7 @@ def test_yaml_with_aliases_for_a_billion_values_is_an_error(file, merged):
 def test_yaml_nested_beyond_the_limit_is_an_error(file):
     load_yaml(file("[" * YAML_DEPTH + "]" * YAML_DEPTH))
     for depth in (YAML_DEPTH + 1, 100_000):
-        with pytest.raises(DocumentError, match=f"nested more than {YAML_DEPTH} deep"):
+        with pytest.raises(DocumentError, match=f"nested more than {YAML_DEPTH} levels deep"):
             load_yaml(file("[" * depth + "]" * depth))
 
 
