@@ -65,9 +65,9 @@ class ImportScans(_ImportOptions):
 
 @dataclass(kw_only=True)
 class ImportGraspNet(_ImportOptions):
-    """Import the models of GraspNet-1Billion as a pack, with grasps from grasp_label/ if this folder exists.
+    """Import the models of GraspNet-1Billion as a pack, with its grasps if the folder grasp_label/ exists.
 
-    The objects have the same ids as their stand-ins in the builtin pack, so a task configuration runs on both packs.
+    The objects have the ids of their stand-ins in the builtin pack, so a task configuration runs with either pack.
 
     Example: robocas assets import-graspnet downloads/graspnet
     """
@@ -244,7 +244,7 @@ def _import_pack(jobs: list[Job], command: _ImportOptions, out: Path, what: str)
         except AssetError as error:
             print_line(f"the pack {out.name} is damaged and is imported again: {error}")
         else:
-            print_line(f"{out} is up to date")
+            print_line(f"{out}: unchanged, nothing to import")
             if not (out / CONTACT_SHEET).exists():
                 _draw_sheet(out)
             return 0
@@ -305,7 +305,7 @@ def _draw_sheet(folder: Path) -> None:
         with spinner(f"rendering {format_count(len(ids[:MAX_SHEET_ASSETS]), 'asset')}"):
             write_contact_sheet(pack, folder / CONTACT_SHEET, ids[:MAX_SHEET_ASSETS])
     except AssetError as error:
-        print_line(f"no contact sheet: {error}")
+        print_line(f"the contact sheet was not rendered: {error}")
         return
     rest = f"; all {len(ids)} assets: robocas assets sheet {folder.name}" if len(ids) > MAX_SHEET_ASSETS else ""
     print_line(f"contact sheet: {folder / CONTACT_SHEET}{rest}")

@@ -37,7 +37,7 @@ class Info:
 
 @dataclass
 class Verify:
-    """Check the files and collision hulls of a pack; with --physics, check each asset in simulation.
+    """Check the files and collision hulls of a pack, and with --physics each asset in simulation.
 
     Files are compared with the hashes of the manifest. PhysX must be able to build each hull on CPU and GPU.
 
@@ -51,7 +51,7 @@ class Verify:
     jobs: Jobs = CORES
     """With --physics: number of processes. Default: one per CPU core."""
     json: Maybe[Path] = None
-    """With --physics: JSON file for the measurements."""
+    """With --physics: write the measurements to this JSON file."""
 
 
 @dataclass
@@ -129,7 +129,7 @@ def info(command: Info) -> int:
 
 
 def verify(command: Verify) -> int:
-    """Run ``verify``; return 1 if an asset violates the requirements of packs."""
+    """Check a pack; return exit status 1 if an asset violates the requirements of packs."""
     from robocas_ms3.assets.cooked_hulls import find_hull_violations
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.cli.terminal import console, print_line
@@ -137,14 +137,14 @@ def verify(command: Verify) -> int:
     pack = load_pack(command.pack)
     for loaded in pack.objects.values():
         _ = loaded.annotations
-    faults = find_hull_violations(pack.root)
+    violations = find_hull_violations(pack.root)
     print_line(f"{pack.name}: {format_count(len(pack.manifest.assets), 'asset')}, all files match the manifest")
-    for fault in faults:
-        console().print(escape_controls(str(fault)), style="red", soft_wrap=True)
+    for violation in violations:
+        console().print(escape_controls(str(violation)), style="red", soft_wrap=True)
     if command.physics:
         check_number("--jobs", command.jobs, 1)
-        return max(_verify_physics(pack, command.jobs, command.json), int(bool(faults)))
-    return int(bool(faults))
+        return max(_verify_physics(pack, command.jobs, command.json), int(bool(violations)))
+    return int(bool(violations))
 
 
 def sheet(command: Sheet) -> int:

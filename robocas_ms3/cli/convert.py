@@ -25,19 +25,21 @@ def main(settings: ConversionSettings) -> int:
         done = write(settings, on_start=bar.start, on_episode=bar.advance)
     count = len(done.episodes)
     words = [f"{settings.out}: {format_count(count, 'episode')}"]
-    words += [f"{done.existing} already there"] if done.existing else []
+    words += [f"{done.existing} existed already"] if done.existing else []
     if count:
         megabytes = sum(episode.size for episode in done.episodes) / 1e6
         steps = format_count(sum(episode.steps for episode in done.episodes), "step")
         words += [steps, f"{megabytes:.0f} MB", f"{done.seconds / count:.1f} s per episode"]
     print_line(", ".join(words))
     if count and settings.video and settings.to == "robocas" and not done.previews:
-        print_line("no preview videos (more than 20 episodes): pass --all-videos, or run robocas video")
+        print_line(
+            "no videos were written, because there are more than 20 episodes: pass --all-videos, or run robocas video"
+        )
     return 0
 
 
 def _find_format(settings: ConversionSettings) -> Format:
-    """Return the format to write; raise DatasetError if it is unknown or an option does not apply to it."""
+    """Return the format of --to; raise DatasetError if it is unknown, or if an option does not apply to it."""
     from robocas_ms3.core.text import did_you_mean
     from robocas_ms3.datasets.formats import FORMATS
 
@@ -50,5 +52,5 @@ def _find_format(settings: ConversionSettings) -> Format:
     for field in fields(settings):
         if field.name in of_others and getattr(settings, field.name) != field.default:
             flag = f"--{field.name.replace('_', '-')}"
-            raise DatasetError(f"this option does not apply to a {chosen.title}", where=flag, fix="Omit it.")
+            raise DatasetError(f"this option does not apply to a {chosen.title}", where=flag, fix="Omit the option.")
     return chosen

@@ -13,7 +13,9 @@ if TYPE_CHECKING:
 
 @dataclass
 class Doctor:
-    """Check versions, render device, physics, planner, asset packs and disk; exit status 1 if a required check fails.
+    """Check the installation: versions, render device, physics, planner, asset packs and disk.
+
+    Exit status 1 if a required check fails.
 
     Example: robocas doctor
     """

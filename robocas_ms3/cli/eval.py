@@ -46,7 +46,7 @@ class Freeze:
 
 @resumable
 def run(settings: EvaluationSettings) -> int:
-    """Run the episodes that the result does not have yet; return 1 if an episode of the result ended with an error."""
+    """Run the episodes that the result does not have yet; return exit status 1 if an episode ended with an error."""
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.core.text import did_you_mean
     from robocas_ms3.scenes.task_specs import TASKS

@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 @dataclass
 class Results:
-    """Result folders to read."""
+    """Options of commands that read results."""
 
     folders: Folders
-    """Folder of a result, or folders of partial results, such as shards."""
+    """Folder of a result, or folders of partial results of one evaluation, such as shards."""
     protocol: Annotated[Maybe[str], tyro.conf.arg(metavar="PROTOCOL")] = None
-    """Folder of the protocol, if the protocol is not bundled."""
+    """Protocol folder. Required if the protocol of the result is not bundled."""
 
 
 @dataclass
@@ -34,7 +34,7 @@ class Report(Results):
     """
 
     out: Maybe[Path] = None
-    """Output folder of the reports. Default: the result folder; required for several folders."""
+    """Output folder of report.html. Default: the result folder; required for several folders."""
 
 
 @dataclass(kw_only=True)
@@ -52,7 +52,7 @@ class Merge(Results):
 class Compare(Results):
     """Compare results over the same scenes with exact paired tests; with one result, compare its splits.
 
-    Of more than two folders, folders with equal settings count as partial results of one evaluation.
+    With more than two folders, the folders with equal settings are partial results of one evaluation.
 
     Example: robocas eval compare eval/small eval/rt1
     """
@@ -60,7 +60,7 @@ class Compare(Results):
 
 @dataclass
 class Verify(Results):
-    """Check that a result is complete and consistent with its protocol; exit status 1 if not.
+    """Check that a result is complete and consistent with its protocol (exit status 1 if not).
 
     Example: robocas eval verify eval/pick
     """
@@ -76,11 +76,11 @@ class Videos:
     folder: Annotated[Path, tyro.conf.Positional]
     """Folder of the result."""
     protocol: Annotated[Maybe[str], tyro.conf.arg(metavar="PROTOCOL")] = None
-    """Folder of the protocol, if the protocol is not bundled."""
+    """Protocol folder. Required if the protocol of the result is not bundled."""
     policy: Annotated[Maybe[str], tyro.conf.arg(metavar="POLICY")] = None
-    """Name of the policy, required for policies that are not installed: confirms that its code may run."""
+    """Repeat the policy of the result to allow its code to run. Required unless `robocas list` names the policy."""
     count: int = 8
-    """Number of videos, alternating between configurations and kinds of failures."""
+    """Number of videos. The episodes alternate between configurations and kinds of failures."""
 
 
 def report(cfg: Report) -> int:
@@ -90,7 +90,7 @@ def report(cfg: Report) -> int:
     result = _read(cfg.folders)
     print_text(render_markdown(result))
     if cfg.out is None and len(cfg.folders) > 1:
-        print_line("no report.html for several folders: pass --out DIR")
+        print_line("report.html was not written: pass --out DIR for several result folders")
     else:
         write_pages(result, cfg.out or result.folder, cfg.protocol)
     return 0
@@ -131,7 +131,7 @@ def verify(cfg: Verify) -> int:
     for violation in found:
         print_line(violation)
     if broken := result.count_errors():
-        print_line(f"note: {format_count(broken, 'episode')} ended by an error, counted as failed")
+        print_line(f"note: {format_count(broken, 'episode')} ended with an error and counted as failed")
     valid = f"{format_count(len(result.outcomes), 'episode')} of {result.run.protocol}, no violations"
     print_line(f"{', '.join(map(str, cfg.folders))}: {format_count(len(found), 'violation') if found else valid}")
     return 1 if found else 0
@@ -149,7 +149,7 @@ def videos(cfg: Videos) -> int:
     protocol, name = _protocol_of(result, cfg.protocol), result.run.policy.name
     if name not in {*POLICIES.builtin, *POLICIES.entry_points} and cfg.policy != name:
         fix = f"Pass --policy {name} if you trust its code."
-        raise EvaluationError("the policy of the result is not installed", where=cfg.folder, found=name, fix=fix)
+        raise EvaluationError("the policy of this result is not installed", where=cfg.folder, found=name, fix=fix)
     from robocas_ms3.core.workers import use_one_torch_thread
     from robocas_ms3.evaluation.report.videos import choose_failed_episodes, record_videos
 
@@ -160,13 +160,13 @@ def videos(cfg: Videos) -> int:
             print_line(str(path) + ("" if same else ": the outcome differs from the recorded outcome"))
             bar.update(done, len(numbers))
     if not numbers:
-        print_line("no failed episodes")
+        print_line("the result has no failed episodes")
     write_pages(result, cfg.folder, cfg.protocol)
     return 0
 
 
 def write_pages(result: Result, out: Path, protocol: str | None) -> None:
-    """Write the reports of a result into a folder and print their names."""
+    """Write report.html and the other reports of a result into a folder, and print their names."""
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.report import write_report
@@ -179,7 +179,9 @@ def write_pages(result: Result, out: Path, protocol: str | None) -> None:
     written = write_report(result, out, loaded if matches else None)
     print_line(f"{out}: {', '.join(path.name for path in written)}")
     if not any(path.suffix == ".parquet" for path in written):
-        print_line('episodes.parquet was not written: pyarrow is missing; in the clone: pip install -e ".[lerobot]"')
+        print_line(
+            'episodes.parquet was not written, because pyarrow is missing. In the clone: pip install -e ".[lerobot]"'
+        )
 
 
 def _check_folders(folders: tuple[Path, ...]) -> None:
@@ -198,7 +200,7 @@ def _read(folders: tuple[Path, ...]) -> Result:
 
 
 def _protocol_of(result: Result, given: str | None) -> LoadedProtocol:
-    """Load the given protocol, or the bundled protocol of a result; a result names no folder."""
+    """Load the protocol of --protocol, or the bundled protocol that the result names."""
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
     from robocas_ms3.evaluation.protocol import load_protocol

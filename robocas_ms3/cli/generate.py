@@ -33,7 +33,7 @@ def main(settings: GenerateSettings) -> int:
                 bar.advance()
             else:
                 last = result.failures[-1]
-                bar.add_note(f"seed {result.seed} skipped ({last.stage}: {last.reason})")
+                bar.add_note(f"seed {result.seed} is skipped ({last.stage}: {last.reason})")
 
         def on_start(present: int) -> None:
             if present >= settings.episodes:

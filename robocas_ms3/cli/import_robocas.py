@@ -19,10 +19,9 @@ if TYPE_CHECKING:
 class ImportRobocas:
     """Repair a dataset in the format of RoboCAS-v0 and write it as a valid dataset.
 
-    Without --out the dataset is only checked.
-
-    Repairs: types, missing arrays that follow from others, names of camera pose files, a rotated EEF frame. Episodes
-    that can't be repaired are skipped and listed. Exit status 1 if no episode can be imported.
+    Without --out the command only checks the dataset. It repairs types, missing arrays that follow from other arrays,
+    names of camera pose files, and a rotated EEF frame. It skips and lists episodes that it can't repair. Exit status 1
+    if no episode can be imported.
 
     Example: robocas import-robocas downloads/robocas --out datasets/robocas
     """
@@ -32,7 +31,7 @@ class ImportRobocas:
     out: Maybe[Path] = None
     """Folder of the new dataset; episodes keep their numbers."""
     rate: Maybe[float] = None
-    """Rate of the dataset in Hz. Default: the rate in conversion.json, or 5 Hz (RoboCAS-v0) without that file."""
+    """Rate of the dataset in Hz. Default: the rate in conversion.json; without this file 5 Hz, as RoboCAS-v0."""
     turn_eef: bool = True
     """Rotate the EEF frame to the TCP frame of ManiSkill if the pose of the gripper camera shows a rotation."""
     embeddings: bool = False
@@ -77,7 +76,7 @@ def main(cfg: ImportRobocas) -> int:
         options = CopyOptions(cfg.link, cfg.overwrite, bar.start, bar.advance)
         kept = import_robocas(found, cfg.out, embed=embed, options=options)
     if not cfg.json:
-        existing = f", {kept} already there" if kept else ""
+        existing = f", {kept} existed already" if kept else ""
         print_line(f"{cfg.out}: {format_count(len(found.importable), 'episode')}{existing}")
     return 0
 

@@ -19,9 +19,9 @@ from robocas_ms3.core.text import format_count
 
 @dataclass
 class Build:
-    """Sample the layouts of a range of seeds in advance, so that a reset only sets poses.
+    """Sample the layouts of a range of seeds in advance, so that a reset only sets the poses of the objects.
 
-    Existing layouts are kept: after an interruption, the same command continues.
+    Existing layouts are kept. After an interruption, the same command continues.
 
     A single environment takes the objects and their poses from one seed. A vector environment is built with the objects
     of seeds 0, 1, ... and keeps them; only the poses change. For num_envs=4, `--objects 0:4 --seeds 0:100` covers all
@@ -111,18 +111,18 @@ def build(command: Build) -> int:
 
 
 def choose_engine(engine: Literal["auto", "cpu", "gpu"]) -> Engine:
-    """Return the engine of the vector environment; raise ConfigError if it is a GPU and there is none."""
+    """Return the physics engine of a vector environment; raise ConfigError for ``gpu`` on a machine without a GPU."""
     from torch.cuda import is_available
 
     from robocas_ms3.core.errors import ConfigError
 
     if engine == "gpu" and not is_available():
-        raise ConfigError("needs a GPU", where="--engine", found="no CUDA device", fix="Pass --engine cpu.")
+        raise ConfigError("this engine needs a GPU", where="--engine", found="no CUDA device", fix="Pass --engine cpu.")
     return "gpu" if engine != "cpu" and is_available() else "cpu"
 
 
 def check_stability(cache: LayoutCache, engine: Engine, **packs: str) -> int:
-    """Simulate the unchecked layouts of the table; return the number of layouts whose objects move."""
+    """Simulate the layouts of the layout table that were not checked; return how many of them have moving objects."""
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.scenes.layout_table import LayoutStatus
     from robocas_ms3.tasks.layout_stability import find_unchecked_layouts, measure_layout_shifts, status_from_shift

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 class List:
     """List the tasks, bundled task configurations, robots, policies, baselines and asset packs.
 
-    The column "needs pack" of a configuration names packs that are not bundled: import them by `robocas assets`.
+    The column "needs pack" names asset packs that a configuration needs and that are not bundled. Import them with
+    `robocas assets`.
 
     Example: robocas list --json
     """
@@ -38,10 +39,10 @@ def main(cfg: List) -> int:
 
 
 def list_all() -> dict[str, list[dict[str, Any]]]:
-    """Return the rows of each list by its title: dicts with the same keys.
+    """Return the rows of each table by title; the rows of a table are dicts with equal keys.
 
-    Each asset pack is loaded; a damaged pack has an ``error`` and no objects. Policies and baselines of other packages
-    are not imported: an error in such a package shows only when its policy or baseline is chosen.
+    Each asset pack is loaded. The row of a damaged pack has an ``error`` and no objects. Policies and baselines of
+    other packages are not imported, so an error in such a package appears only when its policy or baseline is used.
     """
     from robocas_ms3.assets.pack import find_packs, load_pack
     from robocas_ms3.baselines.registry import BASELINES
@@ -93,7 +94,7 @@ def list_all() -> dict[str, list[dict[str, Any]]]:
 
 
 def _packs_to_import(config: TaskConfig) -> list[str]:
-    """Return the packs of a configuration's furniture (``pack/id``) that are not bundled."""
+    """Return the names of the packs that a configuration needs for furniture and that are not bundled."""
     assets = [item.asset for item in (*config.furniture.values(), config.room, config.basket) if item is not None]
     packs = {asset.rpartition("/")[0] for asset in assets if "/" in asset}
     return sorted(pack for pack in packs if not (builtin_packs_dir() / pack).is_dir())

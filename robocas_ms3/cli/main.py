@@ -82,7 +82,7 @@ _ENVIRONMENT = {
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run ``robocas`` and end the process with its exit status; the default of ``argv`` is ``sys.argv[1:]``."""
+    """Run ``robocas`` with arguments ``argv`` (default: ``sys.argv[1:]``), and end the process with its exit status."""
     escape_tracebacks()
     handle_interrupts()
     exit_command(run(sys.argv[1:] if argv is None else argv))
@@ -161,12 +161,12 @@ def parse(words: Sequence[str]) -> tuple[Callable[[Any], int], Any]:
 
 
 def module_of(name: str) -> ModuleType:
-    """Import the module of a command."""
+    """Import and return the module of a command, given by the name of the command."""
     return importlib.import_module(f"robocas_ms3.cli.{name.replace('-', '_')}")
 
 
 def settings_type(command: Callable[[Any], int]) -> type:
-    """Return the dataclass of a command's options: the type of the parameter of its function."""
+    """Return the dataclass of the options of a command, which is the type of the parameter of its function."""
     (parameter, *_) = get_type_hints(command).values()
     return parameter
 
@@ -176,14 +176,17 @@ def _parse_settings(command: Callable[[Any], int], prog: str, words: Sequence[st
 
 
 def _accepts(command: Callable[[Any], int], words: Sequence[str]) -> bool:
-    """Return whether a command may accept these words: the first is an option, or it has positional arguments."""
+    """Return whether a command may accept these words.
+
+    It may if there are none, if the first word is an option, or if the command has positional arguments.
+    """
     types = get_type_hints(settings_type(command), include_extras=True).values()
     positional = any(tyro.conf.Positional in getattr(found, "__metadata__", ()) for found in types)
     return positional or not words or words[0].startswith("-")
 
 
 def _check_command(words: Sequence[str], prog: str, commands: Iterable[str]) -> None:
-    """Exit with 2 if the first word is neither a command nor an option for help."""
+    """Exit with status 2 if the first word is neither a command nor an option for help."""
     if words and words[0] not in ("-h", "--help"):
         what = "unknown option" if words[0].startswith("-") else "unknown command"
         error = RobocasError(
@@ -197,7 +200,7 @@ def _check_command(words: Sequence[str], prog: str, commands: Iterable[str]) -> 
 
 
 def _summary(command: Callable[[Any], int]) -> str:
-    """Return the first line of the docstring of a command's settings."""
+    """Return the first line of the docstring of a command's settings, without the full stop."""
     return (inspect.getdoc(settings_type(command)) or "").split("\n\n")[0].replace("\n", " ").rstrip(".")
 
 
@@ -208,7 +211,7 @@ def _exit_with_help(
     example: str,
     options: Mapping[str, str] = MappingProxyType({}),
 ) -> NoReturn:
-    """Print the commands of a command, one per line, and exit with 0."""
+    """Print the subcommands of a command, one per line, and exit with status 0."""
     width = min(shutil.get_terminal_size().columns, 120)
     indent = 4 + max(len(name) for group in (*groups.values(), options) for name in group)
     lines = [f"usage: {prog} COMMAND [OPTIONS]", ""]
@@ -237,14 +240,14 @@ def _set_library_folders() -> None:
 
 
 def _suggest_fix(error: OSError) -> str:
-    """Return how to fix an error of the system, with the free space if the disk is full."""
+    """Return a sentence on how to fix an error of the system, with the free space if the disk is full."""
     variable = find_path_variable(error.filename) if error.filename else ""
     if error.errno not in DISK_FULL_ERRNOS:
-        return f". Set {variable} to a folder that can be written to." if variable else ""
+        return f". Set {variable} to a writable folder." if variable else ""
     folders = [folder for folder in Path(error.filename or "").absolute().parents if folder.is_dir()]
     free = f" ({shutil.disk_usage(folders[0]).free / 2**20:.0f} MB free)" if error.filename else ""
-    elsewhere = f", or set {variable} to a folder that has some" if variable else ""
-    return f"{free}. Make room{elsewhere}, then run the command again."
+    elsewhere = f", or set {variable} to a folder on another disk" if variable else ""
+    return f"{free}. Free disk space{elsewhere}, then run the command again."
 
 
 def _write_line(text: str, stream: TextIO, code: int) -> int:

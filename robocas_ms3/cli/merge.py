@@ -10,9 +10,9 @@ from robocas_ms3.cli.options import Folders
 
 @dataclass
 class Merge:
-    """Merge several datasets into one.
+    """Merge several datasets into one dataset.
 
-    Episodes are numbered from 0 in the order of the folders and keep their split.
+    Episodes are numbered from 0 in the order of the folders, and keep their split (training or validation).
 
     Example: robocas merge datasets/pick datasets/search --out datasets/both
     """
@@ -23,7 +23,7 @@ class Merge:
     out: Path
     """Folder of the new dataset."""
     skip_duplicates: bool = False
-    """Keep one copy of a recording that is in several datasets. Default: stop with an error."""
+    """Keep only the first copy of an episode that is in several datasets. Default: stop with an error."""
     copy: bool = False
     """Copy files instead of hard-linking them."""
     overwrite: bool = False

@@ -64,15 +64,15 @@ def _metavar_rule(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructor
 
 
 def with_absolute_paths(settings: _T) -> _T:
-    """Return settings with absolute paths: libraries may change the working directory.
+    """Return settings with absolute paths, because libraries may change the working directory.
 
-    The paths in the environment variables of cache and data folder become absolute, too.
+    The paths in the environment variables of the cache and data folders become absolute, too.
     """
     try:
         os.getcwd()
     except FileNotFoundError as error:
         raise RobocasError(
-            "the working directory does not exist any more", fix="Change to an existing folder."
+            "the working directory does not exist any more", fix="Change to an existing folder (cd)."
         ) from error
     for variable in (CACHE, DATA):
         if path := os.environ.get(variable):
@@ -104,9 +104,9 @@ def _absolute(value: Any) -> Any:
 
 
 def resumable(command: Callable[_P, int]) -> Callable[_P, int]:
-    """Decorate a command that continues its work when it is run again: Ctrl-C prints that.
+    """Decorate a command that continues its work when it is run again; Ctrl-C then prints how to continue.
 
-    A command that was run with ``overwrite`` continues without this option.
+    If the command ran with --overwrite, the message says to omit this option.
     """
 
     @wraps(command)
@@ -115,6 +115,6 @@ def resumable(command: Callable[_P, int]) -> Callable[_P, int]:
             return command(*args, **kwargs)
         except KeyboardInterrupt:
             without = " without --overwrite" if any(getattr(cfg, "overwrite", False) for cfg in args) else ""
-            raise KeyboardInterrupt(f"the same command{without} continues") from None
+            raise KeyboardInterrupt(f"run the same command{without} to continue") from None
 
     return run

@@ -18,7 +18,7 @@ from robocas_ms3.core.text import format_count
 class Run:
     """Generate the dataset of a plan: record episodes, render them and join them.
 
-    After Ctrl-C or a crash, the same command continues; finished episodes are kept. docs/scale.md.
+    After Ctrl-C or a crash, the same command continues; finished episodes are kept. Details: docs/scale.md.
 
     Example: robocas plan run tiny --out runs/tiny --jobs 2
     """
@@ -28,22 +28,21 @@ class Run:
     out: Path
     """Output folder of the plan."""
     executor: Literal["local", "slurm", "ray"] = "local"
-    """Where work units run: processes of this machine, jobs of Slurm, or tasks of Ray."""
+    """Executor of the plan: processes of this machine (local), jobs of Slurm, or tasks of Ray."""
     jobs: Jobs = CORES
-    """Maximum number of work units in progress at the same time: processes (local), jobs (Slurm) or tasks (Ray).
-    Default: the number of CPU cores of this machine."""
+    """Maximum number of jobs of the executor that run at the same time. Default: one per CPU core of this machine."""
     executor_option: Overrides = ()
-    """Option of the executor, such as `--executor-option partition=cpu`; repeatable (docs/scale.md)."""
+    """Option of the executor, such as `--executor-option partition=cpu`; repeatable (list: docs/scale.md)."""
     shard: Annotated[Maybe[str], tyro.conf.arg(metavar="K/N")] = None
-    """Run shard K of N (work units whose number is K modulo N) on this machine and do not join.
-    Join at the end with `robocas plan join`. Default: run all work units and join."""
+    """Run only shard K of N on this machine, 0 <= K < N: the blocks of seeds whose number is K modulo N.
+    When all shards have ended, join the dataset with `robocas plan join`. Default: run everything and join."""
     overwrite: bool = False
-    """Replace the output folder if it exists."""
+    """Delete the output and start again. Default: continue a run of the same plan."""
 
 
 @dataclass
 class Join:
-    """Join the episodes of a plan after all shards of `robocas plan run --shard` have ended.
+    """Join the episodes of a plan to a dataset, after all shards of `robocas plan run --shard` have ended.
 
     Example: robocas plan join runs/tiny
     """
@@ -56,7 +55,7 @@ class Join:
 
 @dataclass
 class Status:
-    """Print the progress of a plan, on any machine that has access to its folder.
+    """Print the progress of a plan, on any machine that has access to the output folder.
 
     Example: robocas plan status runs/tiny
     """
@@ -90,8 +89,9 @@ def run(command: Run) -> int:
     shard = parse_shard(command.shard, PlanError) if command.shard is not None else None
     if shard and (command.overwrite or command.executor != "local"):
         found = "--overwrite" if command.overwrite else f"--executor {command.executor}"
-        expected = "--executor local, without --overwrite"
-        raise PlanError("invalid combination of options", where="--shard", expected=expected, found=found)
+        expected, fix = "--executor local, without --overwrite", f"Omit {found}."
+        what = "cannot be combined with another option"
+        raise PlanError(what, where="--shard", expected=expected, found=found, fix=fix)
     options = dict(_parse_option(word) for word in command.executor_option)
     plan = load_plan(command.plan)
     executor = open_executor(command.executor, PlanFolder(plan, command.out), command.jobs, options)
@@ -111,7 +111,7 @@ def run(command: Run) -> int:
         else:
             report = run_plan(executor, overwrite=command.overwrite, on_status=show, on_stage=show_stage)
     if shard:
-        then = f"next: robocas plan join {command.out}" if complete else "work units of other shards are missing"
+        then = f"next: robocas plan join {command.out}" if complete else "other shards are not complete"
         print_line(f"{command.out}: shard {command.shard} is complete; {then}")
     else:
         _print_products(command.out, report)
@@ -158,7 +158,7 @@ def show_status(command: Status) -> int:
     elif found.seconds_left is not None:
         left, idle = found.seconds_left / 60, found.idle_seconds or 0.0
         rate = format_count(round(found.episodes_per_hour), "episode")
-        print_line(f"{rate} per hour, {left:.0f} min left, last episode {idle:.0f} s ago")
+        print_line(f"{rate} per hour, {left:.0f} min left, the last episode ended {idle:.0f} s ago")
     return 0
 
 
@@ -175,9 +175,9 @@ def _parse_option(word: str) -> tuple[str, str]:
 
     name, sign, value = word.partition("=")
     if not (name and sign):
-        raise PlanError("invalid option of the executor", where="--executor-option", expected="NAME=VALUE", found=word)
+        raise PlanError("invalid option", where="--executor-option", expected="NAME=VALUE", found=word)
     return name, value
 
 
-DESCRIPTION = "Generate large datasets from a plan, a YAML file; docs/scale.md."
+DESCRIPTION = "Generate a large dataset from a plan, a YAML file. Details: docs/scale.md."
 COMMANDS = {"run": run, "join": join, "status": show_status, "list": list_plans}

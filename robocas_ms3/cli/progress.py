@@ -25,7 +25,7 @@ class ProgressDisplay:
     """Progress bars on a terminal, or lines of a log if stderr is not a terminal.
 
     Args:
-        transient: remove the bars at the end, and write nothing to a log in the first minute.
+        transient: whether to remove the bars at the end, and to write nothing to a log in the first minute.
     """
 
     def __init__(self, *, transient: bool = False) -> None:
@@ -39,8 +39,8 @@ class ProgressDisplay:
 
         Args:
             bars: name, total and number done of each bar.
-            text: the progress, for a log.
-            speed: speed and time left.
+            text: the progress as text, which a log shows instead of the bars.
+            speed: text with the speed and the time left.
         """
         first, self._text, self._speed = not self._text, text, speed
         now = time.monotonic()
@@ -71,7 +71,7 @@ class ProgressDisplay:
             self._write_line()
 
     def close(self) -> None:
-        """Remove the bars, or write the last line."""
+        """Stop the bars, or write the last line of a log."""
         self.flush()
         if self.bars is not None and self._text:  # stopping bars that never started prints an empty line
             self.bars.stop()
@@ -88,7 +88,7 @@ class ProgressBar:
 
     Args:
         description: label of the bar, such as "episodes recorded".
-        transient: remove the bar at the end, and write nothing to a log in the first minute.
+        transient: whether to remove the bar at the end, and to write nothing to a log in the first minute.
     """
 
     def __init__(self, description: str, *, transient: bool = False) -> None:
@@ -103,7 +103,7 @@ class ProgressBar:
         self.close()
 
     def start(self, total: int, initial: int = 0) -> None:
-        """Show the bar for ``total`` items, ``initial`` of which are done already; show nothing for 0 items."""
+        """Show the bar for ``total`` items, of which ``initial`` are done already; show nothing if ``total`` is 0."""
         if total:
             self._start, self._initial, self._total = time.monotonic(), initial, total
             self._show(initial)
@@ -113,7 +113,10 @@ class ProgressBar:
         self.update(self._done + 1, self._total)
 
     def update(self, done: int, total: int) -> None:
-        """Set the number of items done; the first call starts the bar, and its items do not count for the speed."""
+        """Set the number of items done.
+
+        The first call starts the bar. The items of the first call do not count for the speed.
+        """
         if not self._total:
             self.start(total, initial=done)
         elif done != self._done:
@@ -127,7 +130,7 @@ class ProgressBar:
 
 
 def show_plan(display: ProgressDisplay, status: PlanStatus) -> None:
-    """Show the status of a plan: one bar per part, and one for all."""
+    """Show the status of a plan: one bar per plan part, and one bar for the whole plan."""
     bars = [(part.name, part.requested, part.done) for part in status.parts]
     total, done = sum(part.requested for part in status.parts), sum(part.done for part in status.parts)
     parts = [f"{name} {done}/{requested}" for name, requested, done in bars if 0 < done < requested]
@@ -141,7 +144,14 @@ def show_plan(display: ProgressDisplay, status: PlanStatus) -> None:
 
 
 def format_speed(done: float, total: float, initial: float, seconds: float) -> str:
-    """Format speed and time left: ``1.5 s/it, 7 min left``; ``initial`` items were done before ``seconds`` started."""
+    """Format the speed and the time left, such as ``1.5 s/it, 7 min left``.
+
+    Args:
+        done: number of items done, including the initial ones.
+        total: number of all items.
+        initial: number of items that were done before the time began.
+        seconds: elapsed time.
+    """
     if done <= initial or seconds <= 0:
         return ""
     per_item = seconds / (done - initial)
@@ -150,7 +160,7 @@ def format_speed(done: float, total: float, initial: float, seconds: float) -> s
 
 
 def format_duration(seconds: float) -> str:
-    """Format a duration: ``45 s``, ``6 min``, ``3 h 20 min``, ``2.1 days``."""
+    """Format a duration in s, such as ``45 s``, ``6 min``, ``3 h 20 min`` or ``2.1 days``."""
     minutes = round(seconds / 60)
     if seconds < 59.5:
         return f"{seconds:.0f} s"

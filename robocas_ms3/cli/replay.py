@@ -33,5 +33,7 @@ def main(settings: ReplaySettings) -> int:
     print_line(f"{successes} of {format_count(len(done), 'episode')} succeeded")
     errors = [result.state_error for result in done if result.state_error is not None]
     if errors:
-        print_line(f"largest error of a final state: {np.max(errors):.3g}")  # NaN if an error is NaN
+        print_line(
+            f"largest deviation of a final state from the recording: {np.max(errors):.3g}"
+        )  # NaN if an error is NaN
     return 0 if successes == len(done) else 1

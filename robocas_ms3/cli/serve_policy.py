@@ -16,9 +16,10 @@ from robocas_ms3.cli.options import Several
 class ServePolicy:
     """Serve a policy to evaluations on other machines; stop with Ctrl-C.
 
-    The evaluation runs with robocas eval --policy ws://HOST:PORT.
+    On the other machine, run robocas eval --policy ws://HOST:PORT.
 
-    There is no password: everyone who can reach the port can use the policy. Keep the loopback address and use ssh -L.
+    The server has no password: everyone who can reach the port can use the policy. Keep the loopback address of --host,
+    and forward the port with ssh -L.
 
     Example: robocas serve-policy runs/pick --port 8000
     """
@@ -27,13 +28,13 @@ class ServePolicy:
     """Policy to serve, as in robocas eval: a name from robocas list, a run folder of robocas train,
     replay:TRAJECTORY.h5, or module:Class of your own code."""
     host: str = "127.0.0.1"
-    """Address to listen on; 0.0.0.0: all addresses of the machine."""
+    """Address on which the server listens; 0.0.0.0: all addresses of the machine."""
     port: int = 8000
-    """Port to listen on; 0: a free port. The address is printed."""
+    """Port on which the server listens; 0: a free port. The command prints the address."""
     protocol: Several[Path] = ()
     """Folders of your own protocols.
-    Needed only if the policy reads task configurations (such as scripted) and clients evaluate on these protocols;
-    bundled protocols always work."""
+    Required if the policy reads task configurations, as scripted does, and clients evaluate on these protocols.
+    Bundled protocols need no option."""
     max_batch: int = 64
     """Maximum number of environments per call of the policy; less if the images exceed the message limit (64 MiB)."""
 
@@ -54,10 +55,10 @@ def main(cfg: ServePolicy) -> int:
     packs = [load_protocol(folder).rules.pack for folder in cfg.protocol]
     files = ServedFiles.collect(cfg.protocol, packs)
     if not _is_loopback(strip_brackets(cfg.host)):
-        print_line(f"warning: {cfg.host} is no loopback address: everyone who can reach it can use the policy")
+        print_line(f"warning: everyone who can reach {cfg.host} can use the policy, because it is no loopback address")
     with open_policy(cfg.policy) as policy:
         server = PolicyServer(policy, cfg.host, cfg.port, files, cfg.max_batch)
-        server.run(lambda url: print_line(f"{cfg.policy} at {url}"))
+        server.run(lambda url: print_line(f"serving {cfg.policy} at {url}"))
     return 0
 
 

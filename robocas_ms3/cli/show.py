@@ -71,7 +71,7 @@ def main(cfg: Show) -> int:
     base_env = env.unwrapped
     assert isinstance(base_env, RoboCASEnv)
     if not base_env.scene.can_render():
-        raise RobocasError("no render device found", fix="Install a Vulkan driver; see robocas doctor.")
+        raise RobocasError("there is no render device", fix="Install a Vulkan driver, then run robocas doctor.")
     from PIL import Image
 
     obs, _ = env.reset(seed=cfg.seed)
@@ -102,7 +102,7 @@ def print_config(config: TaskConfig) -> int:
 
 
 def _require_gpu(shader: str) -> None:
-    """Raise RobocasError if there is no GPU: a software renderer would take hours per image."""
+    """Raise RobocasError if there is no GPU, because ray tracing in software takes hours per image."""
     import sapien
 
     from robocas_ms3.core.errors import RobocasError

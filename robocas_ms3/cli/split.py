@@ -33,9 +33,9 @@ class Split:
     fractions: Several[float] = ()
     """Fractions of the episodes, one per new dataset; they sum to 1."""
     out: Maybe[Path] = None
-    """Folder in which the folders of the new datasets are made."""
+    """Folder that gets one subfolder per new dataset."""
     in_place: bool = False
-    """Rewrite data_info.json of the dataset instead of writing new datasets."""
+    """Rewrite data_info.json (the split) of the dataset instead of writing new datasets."""
     val_fraction: Maybe[float] = None
     """Draw a new validation split with this fraction of the episodes. Default: keep the split of each episode."""
     group_by: Maybe[Literal["seed", "target", "task"]] = None
@@ -93,7 +93,9 @@ def _check(cfg: Split) -> None:
     if cfg.fractions:
         check_fractions(cfg.fractions, "--fractions")
         if cfg.out is None:
-            raise DatasetError("missing output folder", where="--fractions", expected="--out DIR")
+            raise DatasetError(
+                "missing output folder", where="--fractions", expected="--out PATH", fix="Add --out PATH."
+            )
     if len(chosen) != 1:
         what, expected = (
             "wrong number of output options",
@@ -102,11 +104,15 @@ def _check(cfg: Split) -> None:
         raise DatasetError(what, where="--out", expected=expected, found=", ".join(chosen) or "none")
     if train_val and (cfg.out_train is None or cfg.out_val is None):
         where, expected = ("--out-train", "--out-val DIR") if cfg.out_train else ("--out-val", "--out-train DIR")
-        raise DatasetError("missing second output folder", where=where, expected=expected)
+        raise DatasetError("missing second output folder", where=where, expected=expected, fix=f"Add {expected}.")
     if cfg.out is not None and not cfg.fractions and cfg.group_by in (None, "seed"):
-        raise DatasetError("unclear how to split", where="--out", expected="--fractions, or --group-by task or target")
+        expected = "--fractions, or --group-by task or target"
+        raise DatasetError(
+            "missing rule of the split", where="--out", expected=expected, fix="Add one of these options."
+        )
     if cfg.in_place and cfg.group_by and cfg.val_fraction is None:
-        raise DatasetError("missing fraction", where="--group-by", expected="--val-fraction F")
+        what, fix = "missing fraction of the validation episodes", "Add --val-fraction, such as 0.1."
+        raise DatasetError(what, where="--group-by", expected="--val-fraction X", fix=fix)
     if cfg.val_fraction is not None and not 0 < cfg.val_fraction < 1:
         expected = "> 0 and < 1"
         raise DatasetError("invalid fraction", where="--val-fraction", expected=expected, found=cfg.val_fraction)

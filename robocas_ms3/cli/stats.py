@@ -14,15 +14,15 @@ from robocas_ms3.core.text import format_count
 
 @dataclass
 class Stats:
-    """Write statistics of a dataset as plots and JSON.
+    """Write statistics of a dataset or a trajectory file as plots and JSON.
 
-    They cover lengths, objects, layouts, instructions, actions and sub-goals.
+    The statistics cover lengths, objects, layouts, instructions, actions and sub-goals.
 
     Example: robocas stats datasets/pick
     """
 
     path: Annotated[Path, tyro.conf.Positional]
-    """Folder of a dataset, or a trajectory.h5 (failed episodes are counted too)."""
+    """Folder of a dataset, or a trajectory.h5. Failed episodes of a trajectory.h5 are included."""
     out: Maybe[Path] = None
     """Output folder. Default: DATASET/preview/stats, or TRAJECTORY_stats next to a trajectory."""
     json: bool = False

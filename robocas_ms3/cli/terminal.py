@@ -17,12 +17,12 @@ _PIPED_WIDTH = 200  # columns; 80 would wrap long names, and grep would not find
 
 
 def console(**options: Any) -> Console:
-    """Return a rich console that prints control characters as escapes and ignores markup."""
+    """Return a rich console that prints control characters as escapes, and markup as plain text."""
     return _printable_console()(**{"markup": False, "emoji": False, "highlight": False, **options})
 
 
 def table_console() -> Console:
-    """Return a console for tables: the width of the terminal, or 200 columns in a pipe or a file."""
+    """Return a console for tables, as wide as the terminal; 200 columns if stdout is a pipe or a file."""
     found = console()
     return found if found.is_terminal else console(width=_PIPED_WIDTH)
 
@@ -51,7 +51,7 @@ def print_table(
 
 
 def terminal_of_stderr() -> Console | None:
-    """Return a console of stderr, or None if stderr is no interactive terminal, whatever FORCE_COLOR says."""
+    """Return a console of stderr, or None if stderr is not an interactive terminal (even with FORCE_COLOR)."""
     if not sys.stderr.isatty():
         return None
     found = console(stderr=True)

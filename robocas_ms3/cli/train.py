@@ -11,20 +11,20 @@ from typing import Any, Literal
 from robocas_ms3.baselines.registry import BASELINES
 from robocas_ms3.cli.options import Maybe, Overrides, resumable
 
-DESCRIPTION = """Train a baseline policy. The folder of the run is a policy: `robocas eval TASK --policy RUN`.
+DESCRIPTION = """Train a baseline policy. Evaluate the run folder with `robocas eval TASK --policy RUN`.
 
-Several GPUs: `accelerate launch --no_python robocas train ...`. More: docs/baselines.md.
+Several GPUs: `accelerate launch --no_python robocas train ...`. Details: docs/baselines.md.
 """
 
 
 @dataclass(kw_only=True)
 class Training:
-    """Options of every baseline."""
+    """Options of all baselines."""
 
     out: Maybe[Path] = None
     """Output folder of the run. Default: runs/BASELINE-DATA, or runs/BASELINE without data."""
     config: Maybe[Path] = None
-    """YAML file with configuration values that differ from the defaults."""
+    """YAML file with the values of the configuration that differ from the defaults."""
     set: Overrides = ()
     """Set a configuration value, such as `--set chunk=4` or `--set train.learning_rate=3e-4`; repeatable."""
     steps: Maybe[int] = None
@@ -38,7 +38,7 @@ class Training:
     folder named small). The configuration of that run replaces the defaults of this baseline. Default: random
     weights."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device of the network. auto: a GPU if there is one."""
+    """Device of the network. auto: a GPU if there is one, else the CPU."""
     overwrite: bool = False
     """Replace an existing run. Default: continue a run that has the same settings."""
 
@@ -48,12 +48,14 @@ class DatasetBaseline(Training):
     """Options of a baseline that learns from demonstrations."""
 
     data: Path
-    """Dataset folder, made by `robocas convert`."""
+    """Dataset folder that `robocas convert` wrote."""
 
 
 @dataclass(kw_only=True)
 class Small(DatasetBaseline):
-    """Train `small`: base and gripper camera, language; action chunks by a small transformer. Trains on two CPU cores.
+    """Train `small`: a small transformer that predicts action chunks from two cameras and the instruction.
+
+    Two CPU cores suffice for training.
 
     Example: robocas train small --data datasets/pick --out runs/pick
     """
@@ -61,7 +63,7 @@ class Small(DatasetBaseline):
 
 @dataclass(kw_only=True)
 class BCState(Training):
-    """Train `bc-state`: privileged state of the simulator; action chunks by a residual MLP.
+    """Train `bc-state`: a residual MLP that predicts action chunks from the privileged state of the simulator.
 
     Example: robocas train bc-state --data demos/pick/trajectory.h5 --steps 4000
     """
@@ -72,7 +74,7 @@ class BCState(Training):
 
 @dataclass(kw_only=True)
 class RT1(DatasetBaseline):
-    """Train `rt1`, RT-1 as in the RoboCAS paper: base and gripper camera, language; action tokens.
+    """Train `rt1`: RT-1 of the RoboCAS paper, which predicts action tokens from two cameras and the instruction.
 
     Example: robocas train rt1 --data datasets/pick --set train.workers=4
     """
@@ -80,7 +82,9 @@ class RT1(DatasetBaseline):
 
 @dataclass(kw_only=True)
 class PPO(Training):
-    """Train `ppo` in simulation, without data: dense rewards, privileged state of the simulator. More: docs/rl.md.
+    """Train `ppo` in simulation, without data, with dense rewards and the privileged state of the simulator.
+
+    Details: docs/rl.md.
 
     Example: robocas train ppo --seed 1 --out runs/ppo
     """
@@ -88,14 +92,19 @@ class PPO(Training):
 
 @dataclass(kw_only=True)
 class PluginBaseline(Training):
-    """Train a baseline that another package registers."""
+    """Train a baseline of another package."""
 
     data: Maybe[Path] = None
     """Dataset folder or trajectory.h5, if the baseline learns from data."""
 
 
 def command(baseline: str, settings: type[Training]) -> Callable[[Any], int]:
-    """Make the function of a subcommand, which trains a baseline with options of a type."""
+    """Make the function of a subcommand that trains a baseline.
+
+    Args:
+        baseline: name of the baseline.
+        settings: dataclass of the options.
+    """
 
     def run(cfg: Training) -> int:
         return train(baseline, cfg)
@@ -144,7 +153,7 @@ def train(baseline: str, cfg: Training) -> int:
         train_run(options, progress)
     if first:
         protocol = "paper-v1" if data else "PROTOCOL"
-        print_line(f"{out}: trained. Next: robocas eval TASK --policy {out} --protocol {protocol}")
+        print_line(f"{out}: training is complete. Next: robocas eval TASK --policy {out} --protocol {protocol}")
     return 0
 
 
@@ -156,7 +165,7 @@ def _default_out(baseline: str, data: Path | None) -> Path:
 
 
 def config_layers(cfg: Training) -> list[tuple[str, dict[str, Any]]]:
-    """Return (source, values) of the file of --config and of the options, which override the file."""
+    """Return (source, values) of the file of --config, then of the other options, which override the file."""
     from robocas_ms3.baselines.training.session import merge_configs
     from robocas_ms3.core.checks import check_number
     from robocas_ms3.core.documents import load_yaml

@@ -22,10 +22,11 @@ if TYPE_CHECKING:
 
 @dataclass
 class Validate:
-    """Check a dataset against its format and list every violation; exit status 1 if there is one.
+    """Check a dataset against its format and list every violation (exit status 1 if there is one).
 
-    With --replay, each episode is also replayed open loop from its 7-D actions in its rebuilt scene. The report gives
-    the success rate and the tracking error of the gripper. The exit status depends on them only with --min-success.
+    With --replay, the command also replays the 7-D actions of each episode open loop in its scene. It reports the
+    success rate and the tracking error of the gripper. The exit status depends on the success rate only with
+    --min-success.
 
     Example: robocas validate datasets/pick --replay
     """
@@ -35,8 +36,8 @@ class Validate:
     replay: bool = False
     """Replay the 7-D actions of each episode in simulation, without rendering (RoboCAS folders only)."""
     min_success: Maybe[float] = None
-    """With --replay: lowest accepted success rate per task, 0 to 1. Exit status 1 if a task is below it or if none of
-    its episodes could be replayed."""
+    """With --replay: lowest accepted success rate per task, 0 to 1. Exit status 1 if the rate of a task is lower, or if
+    no episode of a task could be replayed."""
     pack: Annotated[Maybe[str], tyro.conf.arg(metavar="PACK")] = None
     """With --replay: name or folder of the object pack to use instead of the recorded one."""
     json: bool = False
@@ -91,7 +92,7 @@ def _replay(root: Path, pack: str | None) -> ReplayReport:
 def _lines(report: ReplayReport) -> Iterator[str]:
     for episode in report.episodes:
         if episode.skipped:
-            yield f"episode {episode.number}: not replayed: {episode.skipped}"
+            yield f"episode {episode.number} was not replayed: {episode.skipped}"
         elif not episode.success:
             error = f"largest tracking error {episode.max_error * 1000:.0f} mm"
             yield f"episode {episode.number}: the replay does not succeed; {error}"

@@ -27,7 +27,7 @@ class Video:
     episodes: Several[int] = ()
     """Episode numbers. Default: all; the contact sheet shows the first ten."""
     kind: Literal["rgb", "depth"] = "rgb"
-    """Kind of images; depth is shown in colours."""
+    """Images of the video; the video shows depth as colours."""
     speed: float = 1.0
     """Playback speed as a multiple of real time."""
 
@@ -40,7 +40,7 @@ def main(cfg: Video) -> int:
     from robocas_ms3.datasets.schema import PREVIEW_FOLDER, episode_folder
 
     if not 0 < cfg.speed < math.inf:
-        raise DatasetError("invalid speed", where="--speed", expected="> 0", found=cfg.speed)
+        raise DatasetError("invalid playback speed", where="--speed", expected="a finite number > 0", found=cfg.speed)
     dataset = open_source(cfg.dataset)
     out = cfg.out or cfg.dataset / PREVIEW_FOLDER
     numbers = list(cfg.episodes) or dataset.numbers

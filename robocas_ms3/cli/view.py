@@ -26,13 +26,13 @@ class View:
     open: bool = True
     """Open the page in the default browser."""
     static: Maybe[Path] = None
-    """Output folder of a static page, instead of a server. Open PATH/index.html in a browser."""
+    """Write a static page to this folder instead of starting a server. Open PATH/index.html in a browser."""
     episodes: Several[int] = ()
     """With --static: episode numbers. Default: all."""
     width: int = 480
     """With --static: width of the images in pixels."""
     depth: bool = True
-    """With --static: write depth images too."""
+    """With --static: also write depth images."""
     overwrite: bool = False
     """With --static: replace an existing folder."""
 
@@ -82,5 +82,5 @@ def _write(cfg: View, out: Path, source) -> int:
         )
     for number, wrong in damaged.items():
         print_line(f"episode {number} is damaged: {wrong}")
-    print_line(f"{format_count(count, 'episode')}: {out / 'index.html'}")
+    print_line(f"wrote {out / 'index.html'}: {format_count(count, 'episode')}")
     return 0

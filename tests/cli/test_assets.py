@@ -36,7 +36,7 @@ def test_import_verify_repair_and_replace(scans, tmp_path, capsys):
     assert code == 0 and "red_box" in shown
     pack = tmp_path / "data" / "packs" / "mine"
     assert (pack / "contact_sheet.png").is_file() or "no contact sheet" in shown
-    assert run(capsys, *importing)[1].strip().endswith("is up to date")
+    assert run(capsys, *importing)[1].strip().endswith("unchanged, nothing to import")
     code, shown = run(capsys, "verify", "mine", "--physics", "--jobs", 1, "--json", tmp_path / "quality.json")
     measured = json.loads((tmp_path / "quality.json").read_text())
     assert code == 0, shown

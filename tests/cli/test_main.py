@@ -251,7 +251,7 @@ def test_exit_inside_a_command_is_an_error(failing, capsys):
 def test_full_disk_is_one_line_and_a_bug_a_traceback(failing, capsys):
     failing(OSError(errno.ENOSPC, "No space left on device", "out/x.h5"))
     assert cli.run(["list"]) == 1
-    said = r"error: out/x.h5: No space left on device \(\d+ MB free\)\. Make room, then run the command again\.\n"
+    said = r"error: out/x.h5: No space left on device \(\d+ MB free\)\. Free disk space, then run the command again\.\n"
     assert re.fullmatch(said, capsys.readouterr().err)
 
     failing(OSError(errno.EIO, "Input/output error", "out/x.h5"))  # as a file server may raise it
@@ -278,9 +278,9 @@ def test_full_or_read_only_cache_names_its_variable(failing, monkeypatch, tmp_pa
     for number, said in (
         (
             errno.ENOSPC,
-            r"No space left on device \(\d+ MB free\)\. Make room, or set ROBOCAS_CACHE to a folder that has",
+            r"No space left on device \(\d+ MB free\)\. Free disk space, or set ROBOCAS_CACHE to a folder on another disk",
         ),
-        (errno.EACCES, r"Permission denied\. Set ROBOCAS_CACHE to a folder that can be written to"),
+        (errno.EACCES, r"Permission denied\. Set ROBOCAS_CACHE to a writable folder"),
     ):
         failing(OSError(number, os.strerror(number), str(tmp_path / "robots" / "x")))
         assert cli.run(["list"]) == 1

@@ -44,7 +44,7 @@ def test_page_is_served_until_interrupted(trajectory, ending):
 def test_static_page(trajectory, tmp_path, capsys):
     out = tmp_path / "page"
     assert run(["view", str(trajectory), "--static", str(out)]) == 0
-    assert capsys.readouterr().out.strip() == f"2 episodes: {out / 'index.html'}"
+    assert capsys.readouterr().out.strip() == f"wrote {out / 'index.html'}: 2 episodes"
     assert {path.name for path in out.iterdir()} == {"index.html", "page", "data"}
     assert run(["view", str(trajectory), "--static", str(out)]) == 1
     assert "--overwrite" in capsys.readouterr().err

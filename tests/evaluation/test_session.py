@@ -257,7 +257,7 @@ def test_interrupted_command_prints_how_to_continue_and_uses_one_thread(tmp_path
         assert cli(["eval", "--protocol", "smoke", "--policy", "noop", "--out", str(tmp_path / "out")]) == 130
     finally:
         torch.set_num_threads(before)
-    assert capsys.readouterr().err.splitlines()[-1] == "interrupted; the same command continues"
+    assert capsys.readouterr().err.splitlines()[-1] == "interrupted; run the same command to continue"
     assert threads == [1]
 
 

@@ -164,7 +164,7 @@ def test_moving_base_and_damaged_scene_are_skipped(dataset):
 def test_command_reports_replays_and_checks_min_success(dataset, capsys):
     assert run(["validate", str(dataset), "--replay"]) == 0
     out = capsys.readouterr().out
-    assert "episode 1: the replay does not succeed" in out
+    assert "episode 1: the replay failed" in out
     assert "pick: 1 of 2 replayed episodes succeed (50%)" in out
     assert run(["validate", str(dataset), "--replay", "--min-success", "0.9"]) == 1
     assert run(["validate", str(dataset), "--replay", "--min-success", "0.5"]) == 0

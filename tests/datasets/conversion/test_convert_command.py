@@ -24,7 +24,7 @@ def test_a_conversion_and_its_repetition(trajectory, stub_images, tmp_path, caps
     assert printed.out.startswith(f"{tmp_path / 'out'}: 2 episodes, 14 steps, ")
     assert "episodes written: 2/2" in printed.err
     assert run(command) == 0
-    assert capsys.readouterr().out.endswith(": 0 episodes, 2 already there\n")
+    assert capsys.readouterr().out.endswith(": 0 episodes, 2 existed already\n")
 
 
 def tried(path, *rates):
@@ -81,8 +81,8 @@ def test_invalid_options(made, trajectory, capsys, flags, code, said):
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        ((), "; the same command continues"),
-        (("--overwrite",), "; the same command without --overwrite continues"),
+        ((), "; run the same command to continue"),
+        (("--overwrite",), "; run the same command without --overwrite to continue"),
     ],
 )
 def test_interrupted_conversion_prints_how_to_continue(monkeypatch, tmp_path, capsys, flags, said):

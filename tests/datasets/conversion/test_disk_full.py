@@ -69,7 +69,7 @@ def ends_in_one_line(command, capsys):
     error = "".join(line for line in said if not line.startswith("episodes written: "))
     assert error.startswith("error: ")
     assert ": No space left on device (" in error
-    assert "Make room" in error
+    assert "Free disk space" in error
     assert error.count("\n") == 1
 
 

@@ -72,7 +72,7 @@ def test_preview_of_new_episodes(stub_images, tmp_path):
 
 
 def test_previews_of_many_episodes_with_all_videos(stub_images, tmp_path, monkeypatch, capsys):
-    hint = "no preview videos (more than 20 episodes): pass --all-videos"
+    hint = "no videos were written, because there are more than 20 episodes: pass --all-videos"
     monkeypatch.setattr(conversion, "MAX_PREVIEWS", 2)  # of 20 they take seconds
     monkeypatch.setattr(video, "SHEET_EPISODES", 2)
     path = write_trajectory(tmp_path / "three.h5", seeds=(1, 2, 3))

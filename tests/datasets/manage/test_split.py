@@ -184,7 +184,7 @@ def test_invalid_options(six, tmp_path, capsys):
         (["--out-train", out], 2, "--out-train: missing second output folder"),
         (["--in-place", "--out", out, "--group-by", "task"], 2, "found --in-place, --out)"),
         (["--fractions", "0.5", "0.5", "--in-place"], 2, "--fractions: missing output folder"),
-        (["--out", out], 2, "--out: unclear how to split"),
+        (["--out", out], 2, "--out: missing rule of the split"),
         (["--out-train", out, "--out-val", f"{out}/val"], 1, "overlaps the validation folder"),
         (["--in-place", "--group-by", "seed"], 2, "--group-by: missing fraction"),
         (
