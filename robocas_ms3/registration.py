@@ -15,18 +15,18 @@ _log = logging.getLogger(__name__)
 
 
 def register_envs() -> None:
-    """Register the environments of all tasks, those of other packages too. Registered ids are left as they are."""
+    """Register the environments of all tasks, also those of other packages; keep ids that are registered already."""
     for task in TASKS.values():
         if task.env_id in gym.registry:
             continue
         try:
             _register(task)
         except Exception as error:  # of another package: an id or numbers that gymnasium refuses
-            _log.warning("the task %s can't be registered: %s", task.name, error)
+            _log.warning("the environment of the task %s can't be registered: %s", task.name, error)
 
 
 def _register(task: TaskSpec) -> None:
-    """Register one task as ``mani_skill.utils.registration.register_env`` does: its time limit returns tensors."""
+    """Register one task as ``mani_skill.utils.registration.register_env`` does: time limits return tensors."""
     limit = WrapperSpec(
         "MSTimeLimit",
         entry_point="mani_skill.utils.registration:TimeLimitWrapper",

@@ -25,7 +25,7 @@ def main(settings: ConversionSettings) -> int:
         done = write(settings, on_start=bar.start, on_episode=bar.advance)
     count = len(done.episodes)
     words = [f"{settings.out}: {format_count(count, 'episode')}"]
-    words += [f"{done.existing} existed already"] if done.existing else []
+    words += [f"{done.existing} already there"] if done.existing else []
     if count:
         megabytes = sum(episode.size for episode in done.episodes) / 1e6
         steps = format_count(sum(episode.steps for episode in done.episodes), "step")

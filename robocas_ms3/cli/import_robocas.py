@@ -76,7 +76,7 @@ def main(cfg: ImportRobocas) -> int:
         options = CopyOptions(cfg.link, cfg.overwrite, bar.start, bar.advance)
         kept = import_robocas(found, cfg.out, embed=embed, options=options)
     if not cfg.json:
-        existing = f", {kept} existed already" if kept else ""
+        existing = f", {kept} already there" if kept else ""
         print_line(f"{cfg.out}: {format_count(len(found.importable), 'episode')}{existing}")
     return 0
 

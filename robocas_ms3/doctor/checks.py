@@ -1,7 +1,7 @@
 """The checks of ``robocas doctor``.
 
-They import no package that may be damaged: versions are read from metadata, and all else runs in a child process
-(``probes.py``), so a crash is a finding.
+The checks import no package that may be damaged. They read versions from metadata, and run everything else in a child
+process (``probes.py``), so that a crash becomes a finding.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ GPU_PHYSICS_FIX = (
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of a check."""
+    """Result of a check: a row of the report."""
 
     name: str  # of the package, device or folder
     status: Literal["ok", "limited", "fail"]  # limited: an optional feature does not work
@@ -73,10 +73,12 @@ def run_checks() -> list[Finding]:
         check_packages,
         lambda: [check_extra(extra) for extra in EXTRAS],
         lambda: [run_probe("render device", "render", required=False, fix=RENDERER_FIX)],
-        lambda: [run_probe("physics on CPU", "physx_cpu", fix=_reinstall("sapien"))],
+        lambda: [run_probe("physics on CPU", "physx_cpu", fix=_reinstall_command("sapien"))],
         lambda: [run_probe("physics on GPU", "physx_cuda", required=False, fix=GPU_PHYSICS_FIX)],
         lambda: [
-            run_probe("planner", "planner", fix="Fix the failing rows above first, then " + _reinstall("python-fcl"))
+            run_probe(
+                "planner", "planner", fix="Fix the failing rows above first, then " + _reinstall_command("python-fcl")
+            )
         ],
         lambda: [run_probe("asset packs", "packs", fix="Restore the pack, or delete its folder.")],
         check_folders,
@@ -87,7 +89,7 @@ def run_checks() -> list[Finding]:
 
 
 def check_python() -> list[Finding]:
-    """Check that this Python is supported."""
+    """Check that the version of Python is supported."""
     try:
         supported = SpecifierSet(metadata.metadata(DISTRIBUTION)["Requires-Python"])
     except metadata.PackageNotFoundError:
@@ -99,7 +101,7 @@ def check_python() -> list[Finding]:
 
 def check_packages() -> list[Finding]:
     """Check the versions of the required packages."""
-    required = {_key(item.name): item for item in requirements(DISTRIBUTION)}
+    required = {_normalise_name(item.name): item for item in list_requirements(DISTRIBUTION)}
     if not required:
         return [Finding(DISTRIBUTION, "fail", "not installed", "Run bash scripts/setup.sh, or pip install -e .")]
     named = [check_package(required.pop(name)) for name in PACKAGES_WITH_ROW if name in required]
@@ -110,7 +112,7 @@ def check_packages() -> list[Finding]:
 
 def check_package(requirement: Requirement) -> Finding:
     """Check that a package is installed in a supported version."""
-    name = _key(requirement.name)
+    name = _normalise_name(requirement.name)
     fix = f"pip install '{requirement.name}{requirement.specifier}'"
     try:
         found = metadata.version(requirement.name)
@@ -123,8 +125,8 @@ def check_package(requirement: Requirement) -> Finding:
 
 
 def check_extra(extra: str) -> Finding:
-    """Check that the packages of an extra, which is optional, are installed."""
-    findings = [check_package(item) for item in requirements(DISTRIBUTION, extra)]
+    """Check that the packages of an optional extra are installed in supported versions."""
+    findings = [check_package(item) for item in list_requirements(DISTRIBUTION, extra)]
     name, bad = f"extra {extra}", [finding for finding in findings if finding.status != "ok"]
     if not findings or bad:
         found = ", ".join(f"{finding.name} {finding.found}" for finding in bad) or "not installed"
@@ -142,7 +144,14 @@ def check_folders() -> list[Finding]:
 
 
 def check_writable(name: str, folder: Path, variable: str, *, required: bool) -> Finding:
-    """Check that a file can be created in a folder, or in its nearest parent that exists."""
+    """Check that files can be created in a folder, or in its nearest existing parent.
+
+    Args:
+        name: name of the finding.
+        folder: the folder.
+        variable: environment variable that sets another folder, for the fix.
+        required: whether a folder that is not writable is a failure.
+    """
     existing = next((parent for parent in (folder, *folder.parents) if parent.exists()), Path("/"))
     try:
         with tempfile.TemporaryDirectory(dir=existing):
@@ -154,7 +163,7 @@ def check_writable(name: str, folder: Path, variable: str, *, required: bool) ->
 
 
 def check_disk(folder: Path) -> Finding:
-    """Check the free space of the disk of a folder."""
+    """Check the free space of the disk that contains a folder."""
     free = shutil.disk_usage(folder).free / GIGABYTE
     found = f"{free:.1f} GB free in {folder}"
     if free < MIN_DISK_GB:
@@ -165,7 +174,14 @@ def check_disk(folder: Path) -> Finding:
 
 
 def run_probe(name: str, probe: str, *, fix: str, required: bool = True) -> Finding:
-    """Run one of `probes.PROBES` in a child process; a probe that fails is ``limited`` if it is not required."""
+    """Run one of `probes.PROBES` in a child process.
+
+    Args:
+        name: name of the finding.
+        probe: key of `probes.PROBES`.
+        fix: how to fix a failure.
+        required: whether a failure has the status ``fail``; otherwise the status is ``limited``.
+    """
     bad: Literal["fail", "limited"] = "fail" if required else "limited"
     try:
         done = subprocess.run(
@@ -183,8 +199,8 @@ def run_probe(name: str, probe: str, *, fix: str, required: bool = True) -> Find
     return Finding(name, bad, error_lines[-1] if error_lines else f"exit status {done.returncode}", fix)
 
 
-def requirements(distribution: str, extra: str = "") -> Iterator[Requirement]:
-    """Yield the requirements of an installed distribution on this Python, or those that only an extra has."""
+def list_requirements(distribution: str, extra: str = "") -> Iterator[Requirement]:
+    """Yield the requirements of an installed distribution on this machine, or only those that an extra adds."""
     try:
         lines = metadata.requires(distribution) or []
     except metadata.PackageNotFoundError:
@@ -203,9 +219,9 @@ def _run_check(check: Callable[[], list[Finding]]) -> list[Finding]:
         return [Finding(name, "fail", f"{type(error).__name__}: {error}", "Report this bug.")]
 
 
-def _reinstall(package: str) -> str:
+def _reinstall_command(package: str) -> str:
     return f"pip install --force-reinstall --no-deps {package}"
 
 
-def _key(name: str) -> str:
+def _normalise_name(name: str) -> str:
     return name.lower().replace("_", "-")

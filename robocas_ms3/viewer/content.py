@@ -17,9 +17,9 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource, ImageKind
 from robocas_ms3.demos.failures import FailedAttempt
 from robocas_ms3.demos.recordings.trajectory_json import parse_seed
-from robocas_ms3.viewer.damage import as_dataset_error, join_reasons, read_or_default, read_scene
-from robocas_ms3.viewer.episode import facts_of, round_values, show_arrays
-from robocas_ms3.viewer.episode_table import Failures, Row, describe, stages
+from robocas_ms3.viewer.damage import convert_damage_errors, join_reasons, read_or_default, read_scene
+from robocas_ms3.viewer.episode import collect_facts, make_episode_content, round_values
+from robocas_ms3.viewer.episode_table import Failures, Row, describe_failures, list_failed_stages
 from robocas_ms3.viewer.images import EncodedImage, encode_jpeg
 
 CAMERA_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")
@@ -27,9 +27,15 @@ CAMERA_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")
 
 
 class PageContent:
-    """Content of the page, thread-safe. Damaged values are omitted and reported in the row of the episode.
+    """Content of the page for one dataset or trajectory file; the methods are thread-safe.
 
-    Subclasses add content of one format; ``kind`` is the title of the format.
+    Damaged values are omitted. The row of the episode in the table reports them. Subclasses add the content that only
+    one format has.
+
+    Args:
+        source: reader of the episodes.
+        kind: title of the format, such as "LeRobot dataset".
+        notes: sentences for the top of the page.
     """
 
     scene_name = schema.SCENE_FILE
@@ -39,20 +45,21 @@ class PageContent:
 
     def __init__(self, source: EpisodeSource, kind: str, notes: Sequence[str] = ()) -> None:
         self.root, self.source, self._kind = source.root, source, kind
-        self.failures = Failures.read(self.root if self.root.is_dir() else self.root.parent)
+        self.failures = Failures.load(self.root if self.root.is_dir() else self.root.parent)
         self._note = " ".join(filter(None, (*notes, self.failures.note)))
         self._reading = threading.Lock()
 
     def index(self) -> dict[str, Any]:
-        """Return the content of the table; arrays are read only for episodes without a listed length.
+        """Return the content of the table of episodes, as JSON values.
 
-        Skipped seeds, from ``failures.jsonl``, come last.
+        The last rows are skipped seeds from ``failures.jsonl``. Arrays are read only for episodes whose length is not
+        in the files of the dataset.
         """
-        source, split = self.source, self._splits()
+        source, split = self.source, self._read_splits()
         lengths, _ = read_or_default(lambda: source.lengths, {})
-        found = [self._row(number, lengths.get(number, 0), split.get(number, "")) for number in source.numbers]
+        found = [self._make_row(number, lengths.get(number, 0), split.get(number, "")) for number in source.numbers]
         rows = [row for row, _ in found]
-        rows += self.failures.skipped_seeds(rows, [env_info for _, env_info in found])
+        rows += self.failures.make_skipped_rows(rows, [env_info for _, env_info in found])
         path = self.root.resolve()
         return {
             "name": path.name if path.is_dir() else f"{path.parent.name}/{path.name}",
@@ -65,11 +72,11 @@ class PageContent:
         }
 
     def episode(self, number: int) -> dict[str, Any]:
-        """Return the content of the page of an episode; raise DatasetError if it is damaged."""
+        """Return the content of the page of an episode, as JSON values; raise DatasetError if it is damaged."""
         where = f"{self.root.name}, episode {number}"
-        with as_dataset_error(where):
-            scene, _ = self._scene(number)  # the table reports errors
-            shown = {"facts": facts_of(scene), **self._show(number, scene)}
+        with convert_damage_errors(where):
+            scene, _ = self._read_scene(number)  # the table reports errors
+            shown = {"facts": collect_facts(scene), **self._make_content(number, scene)}
             if shown["steps"] < 1:
                 raise DatasetError("this episode has no steps", where=where)
             return {
@@ -78,21 +85,21 @@ class PageContent:
                 "times": round_values(np.arange(shown["steps"]) / self.source.rate_hz),
                 "plots": [one for one in shown["plots"] if one["series"]],
                 "facts": {name: value for name, value in shown["facts"].items() if value not in (None, "", {}, [])},
-                "failures": describe(self._failures(scene), scene.get("recorded") or {}),
+                "failures": describe_failures(self._find_failures(scene), scene.get("recorded") or {}),
             }
 
     def rgb(self, number: int, camera: str, step: int) -> EncodedImage:
-        """Return an RGB image."""
+        """Return an RGB image of an episode."""
         return encode_jpeg(self._image(number, camera, "rgb", step))
 
     def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
-        """Return a depth image (H, W) in mm."""
+        """Return a depth image (H, W) of an episode, uint16 in mm."""
         return self._image(number, camera, "depth", step)
 
-    def _row(self, number: int, steps: int, split: str) -> tuple[Row, Any]:
-        """Return the row of an episode, and its ``env_info`` if known."""
-        scene, wrong = self._scene(number)
-        entry, wrong_entry = read_scene(lambda: self._entry(number), self.entry_name)
+    def _make_row(self, number: int, steps: int, split: str) -> tuple[Row, Any]:
+        """Return the table row of an episode, and the ``env_info`` of the episode (None if unknown)."""
+        scene, wrong = self._read_scene(number)
+        entry, wrong_entry = read_scene(lambda: self._read_entry(number), self.entry_name)
         wrong_steps = ""
         if steps < 1:
             steps, wrong_steps = read_or_default(lambda: self.source.episode(number).steps, 0)
@@ -109,14 +116,14 @@ class PageContent:
             seed=parse_seed(scene.get("seed")),
             success=scene.get("success"),
             split=split,
-            stages=stages(self._failures(scene), recorded),
+            stages=list_failed_stages(self._find_failures(scene), recorded),
             attempts=recorded.get("attempts"),
             damage=join_reasons(wrong, wrong_entry, wrong_steps),
         )
         return row, scene.get("env_info")
 
-    def _scene(self, number: int) -> tuple[dict[str, Any], str]:
-        """Return the valid values of the scene of an episode, and a text on invalid values."""
+    def _read_scene(self, number: int) -> tuple[dict[str, Any], str]:
+        """Read the scene of an episode; return the valid values, and a text that describes invalid values."""
         return read_scene(lambda: self.source.episode(number).scene, self.scene_name)
 
     def _entry(self, number: int) -> Any:
@@ -124,19 +131,19 @@ class PageContent:
         known = ("seed", "success", "target")
         return {key: entry[key] for key in known if key in entry} if isinstance(entry, Mapping) else entry
 
-    def _splits(self) -> Mapping[int, str]:
+    def _read_splits(self) -> Mapping[int, str]:
         train, _ = read_or_default(lambda: self.source.split("train"), [])
         val, _ = read_or_default(lambda: self.source.split("val"), [])
         return {**dict.fromkeys(train, "train"), **dict.fromkeys(val, "val")}
 
-    def _failures(self, scene: Mapping[str, Any]) -> Sequence[FailedAttempt]:
-        return self.failures.of_seed(parse_seed(scene.get("seed")), scene.get("env_info"))
+    def _find_failures(self, scene: Mapping[str, Any]) -> Sequence[FailedAttempt]:
+        return self.failures.find_attempts(parse_seed(scene.get("seed")), scene.get("env_info"))
 
-    def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the content of an episode, see `show_arrays`; it may replace ``facts``."""
-        return show_arrays(self.source.episode(number).arrays, scene)
+    def _make_content(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the content of an episode as `make_episode_content` does; ``facts`` in it replace the default ones."""
+        return make_episode_content(self.source.episode(number).arrays, scene)
 
     def _image(self, number: int, camera: str, kind: ImageKind, step: int) -> NDArray:
-        with as_dataset_error(f"{self.root.name}, episode {number}"), self._reading:
+        with convert_damage_errors(f"{self.root.name}, episode {number}"), self._reading:
             episode = self.source.episode(number)
             return episode.rgb(camera, step) if kind == "rgb" else episode.depth(camera, step)

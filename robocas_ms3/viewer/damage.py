@@ -1,4 +1,4 @@
-"""Reading of data that may be damaged: usable content, and a text on the damage."""
+"""Read data that may be damaged: return the usable content, and a text that describes the damage."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ _WRONG = (*DAMAGED_FILE_ERRORS, ArithmeticError, AttributeError, AssertionError,
 
 
 @contextmanager
-def as_dataset_error(where: object) -> Iterator[None]:
-    """Convert errors of damaged data to DatasetError with the place ``where``."""
+def convert_damage_errors(where: object) -> Iterator[None]:
+    """Convert the errors that damaged data raise to DatasetError; ``where`` is the file or episode."""
     try:
         yield
     except _WRONG as error:
@@ -28,28 +28,28 @@ def as_dataset_error(where: object) -> Iterator[None]:
 
 
 def read_or_default(read: Callable[[], T], otherwise: T) -> tuple[T, str]:
-    """Return the result of ``read`` and an empty text, or ``otherwise`` and the reason of the failure."""
+    """Call ``read``; return its result and "", or ``otherwise`` and a text on the damage if the data are damaged."""
     try:
-        with as_dataset_error(""):
+        with convert_damage_errors(""):
             return read(), ""
     except DatasetError as error:
-        return otherwise, reason(error)
+        return otherwise, describe_error(error)
 
 
-def reason(error: DatasetError) -> str:
-    """Return the message of an error without the place."""
+def describe_error(error: DatasetError) -> str:
+    """Return the message of an error without the file or episode."""
     return f"{error.what}, {error.found}" if str(error.found) else error.what
 
 
 def join_reasons(*reasons: str) -> str:
-    """Join distinct, non-empty reasons to one text."""
+    """Join the distinct, non-empty reasons, separated by semicolons."""
     return "; ".join(dict.fromkeys(filter(None, reasons)))
 
 
 def read_object(read: Callable[[], Any], name: str) -> tuple[dict[Any, Any], str]:
-    """Return a JSON object of a dataset and an empty note; for a damaged one an empty object and a note."""
+    """Read a JSON object; return the object and "", or {} and a note for the page if the object is damaged."""
     try:
-        with as_dataset_error(name):
+        with convert_damage_errors(name):
             found = read()
     except DatasetError as error:
         return {}, f"`{name}` is damaged: {error.found}."

@@ -26,18 +26,21 @@ _NEEDED = (
 Plot = dict[str, Any]
 
 
-def show_arrays(
+def make_episode_content(
     a: Mapping[str, NDArray],
     scene: Mapping[str, Any],
     *,
     actions: list[Plot] | None = None,
     moving: list[dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
-    """Return the content of an episode from its arrays, by the keys of the schema.
+    """Return the content of the page of an episode, made from its arrays.
 
-    ``actions`` are plots of recorded actions; the default plots the motion of the TCP. ``moving`` are objects {name,
-    target, path} with paths in the world frame, (T, 3), or (1, 3) without motion; the default shows the objects at
-    their start positions.
+    Args:
+        a: arrays of the episode by their names in the schema.
+        scene: valid values of ``scene.json``.
+        actions: plots of recorded actions; None: plots of the motion of the TCP per step.
+        moving: objects {name, target, path} with paths (T, 3) in the world frame, or (1, 3) without motion; None: the
+            objects at their start positions.
 
     Raises:
         LookupError: an array is missing.
@@ -45,12 +48,12 @@ def show_arrays(
     """
     lengths = {len(a[key]) for key in _NEEDED}
     if len(lengths) > 1:
-        raise ValueError(f"arrays of different lengths: {sorted(lengths)}")
+        raise ValueError(f"the arrays of this episode have different lengths: {sorted(lengths)}")
     if actions is None:
         turns = np.degrees(Rotation.from_quat(a["rel_orn"]).as_euler("xyz"))
         actions = [
-            plot("Action: TCP translation per step", "mm", XYZ, a["rel_pos"] * 1000),
-            plot("Action: TCP rotation per step", "deg", ROLL_PITCH_YAW, turns),
+            make_plot("Action: TCP translation per step", "mm", XYZ, a["rel_pos"] * 1000),
+            make_plot("Action: TCP rotation per step", "deg", ROLL_PITCH_YAW, turns),
         ]
     goals = group_subgoals([str(v) for v in a["step_goal_type"]], [str(v) for v in a["step_lang_goals"]])
     base = from_xyzw(a["base_pos"].astype(float), a["base_orn"].astype(float))
@@ -64,12 +67,14 @@ def show_arrays(
             for goal in goals
         ],
         "plots": [
-            plot("TCP position, arm base", "m", XYZ, a["ee_pos"]),
-            plot("TCP orientation, arm base", "quaternion", ("x", "y", "z", "w"), continuous(a["ee_orn"])),
-            plot("Arm joints", "rad", ARM, a["robot_joints"]),
-            gripper_plot(a[GRIPPER_WIDTH], a.get("gripper_status")),
+            make_plot("TCP position, arm base", "m", XYZ, a["ee_pos"]),
+            make_plot(
+                "TCP orientation, arm base", "quaternion", ("x", "y", "z", "w"), make_signs_continuous(a["ee_orn"])
+            ),
+            make_plot("Arm joints", "rad", ARM, a["robot_joints"]),
+            make_gripper_plot(a[GRIPPER_WIDTH], a.get("gripper_status")),
             *actions,
-            *(base_plot(a["agv_pose"]) if "agv_pose" in a else []),
+            *(make_base_plot(a["agv_pose"]) if "agv_pose" in a else []),
         ],
         "trace": {
             "tcp": round_values(tcp[:, :3, 3]),
@@ -92,8 +97,8 @@ def _objects(scene: Mapping[str, Any]) -> list[dict[str, Any]]:
     return [*found, {"name": "basket", "target": False, "path": [basket[:3]]}] if basket else found
 
 
-def facts_of(scene: Mapping[str, Any]) -> dict[str, Any]:
-    """Return facts on an episode that the table does not show, by title."""
+def collect_facts(scene: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values of ``scene.json`` that the page lists below the table, by title."""
     recorded, source = scene.get("recorded") or {}, scene.get("source") or {}
     recording = f"{source['trajectory']}, episode {source.get('episode_id')}" if source.get("trajectory") else None
     kwargs = (scene.get("env_info") or {}).get("env_kwargs") or {}
@@ -108,38 +113,38 @@ def facts_of(scene: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def continuous(xyzw: NDArray) -> NDArray:
-    """Return quaternions (T, 4) xyzw of the same orientations with continuous signs."""
+def make_signs_continuous(xyzw: NDArray) -> NDArray:
+    """Flip signs of quaternions (T, 4) xyzw so that consecutive quaternions are close to each other."""
     if len(xyzw) and xyzw[0][np.abs(xyzw[0]).argmax()] < 0:
         xyzw = -xyzw
     flips = np.cumsum(np.sum(xyzw[1:] * xyzw[:-1], axis=1) < 0) % 2
     return np.concatenate([xyzw[:1], xyzw[1:] * np.where(flips, -1, 1)[:, None]])
 
 
-def gripper_plot(width: NDArray, is_open: NDArray | None) -> Plot:
-    """Return a plot of the gripper width (T,) in m and the commanded width."""
+def make_gripper_plot(width: NDArray, is_open: NDArray | None) -> Plot:
+    """Return a plot of the gripper width (T,) in m; ``is_open`` (T,) adds the commanded width."""
     columns: dict[str, NDArray] = {"width": np.ravel(width)}
     if is_open is not None:
         columns["command"] = np.where(np.asarray(is_open, bool), _OPEN_WIDTH, 0.0)
-    return plot("Gripper", "mm", list(columns), np.column_stack(list(columns.values())) * 1000)
+    return make_plot("Gripper", "mm", list(columns), np.column_stack(list(columns.values())) * 1000)
 
 
-def base_plot(pose: NDArray) -> list[Plot]:
-    """Return a plot of the mobile base (T, 3), x, y in m and yaw in rad; none if it does not move."""
+def make_base_plot(pose: NDArray) -> list[Plot]:
+    """Return a list with a plot of the base pose (T, 3), x, y in m and yaw in rad; [] if the base does not move."""
     pose = np.column_stack([pose[:, :2], np.unwrap(pose[:, 2])])
     moves = len(pose) > 0 and np.ptp(pose, axis=0).max() > 1e-3
-    return [plot("Mobile base, world", "m, rad", ("x", "y", "yaw"), pose)] if moves else []
+    return [make_plot("Mobile base, world", "m, rad", ("x", "y", "yaw"), pose)] if moves else []
 
 
-def plot(title: str, unit: str, names: Sequence[str], values: NDArray, *, steps: bool = False) -> Plot:
-    """Return a plot of (T, N) values; ``steps`` draws a step function."""
+def make_plot(title: str, unit: str, names: Sequence[str], values: NDArray, *, steps: bool = False) -> Plot:
+    """Return a plot of N curves from values (T, N); ``steps`` draws the curves as step functions."""
     columns = np.atleast_2d(np.asarray(values, float).T)
     series = [{"name": name, "values": round_values(column)} for name, column in zip(names, columns, strict=True)]
     return {"title": title, "unit": unit, "series": series, "steps": steps}
 
 
 def round_values(values: Any) -> list:
-    """Return nested lists of rounded numbers; NaN and infinity become None, as JSON lacks them."""
+    """Return numbers as nested lists, rounded; NaN and infinity become None, because JSON has no such numbers."""
     array = np.round(np.asarray(values, float), 5) + 0.0  # + 0.0: no -0.0
     if np.isfinite(array).all():
         return array.tolist()

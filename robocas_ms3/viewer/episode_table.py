@@ -15,10 +15,12 @@ from robocas_ms3.demos.failures import FAILURES_FILE, FailedAttempt
 
 @dataclass(frozen=True)
 class Row:
-    """Row of the table.
+    """Row of the table: an episode, or a skipped seed.
 
-    ``n`` is the episode number, None for a skipped seed. ``stages`` are the stages at which attempts failed. ``damage``
-    is a text on values that can't be shown.
+    Attributes:
+        n: episode number; None: a skipped seed.
+        stages: stages at which attempts failed.
+        damage: text on damaged values, which the page does not show.
     """
 
     n: int | None
@@ -36,12 +38,13 @@ class Row:
 
 @dataclass(frozen=True)
 class TaskFailedAttempt(FailedAttempt):
-    """A line of ``failures.jsonl``, with task and environment of the run, None: unknown."""
+    """Line of ``failures.jsonl`` with the task and the environment of the run; None: unknown."""
 
     task: str | None = None
     environment: str | None = None
 
-    def is_of(self, env_info: Any) -> bool:
+    def belongs_to(self, env_info: Any) -> bool:
+        """Return whether the attempt may belong to an episode with this ``env_info``."""
         if not self.environment or not isinstance(env_info, Mapping):
             return True
         return compute_environment_id(env_info) in ("", self.environment)
@@ -49,13 +52,14 @@ class TaskFailedAttempt(FailedAttempt):
 
 @dataclass(frozen=True)
 class Failures:
-    """Lines of ``failures.jsonl`` by seed, and a note on damaged lines."""
+    """Failed attempts of ``failures.jsonl`` by seed, and a note on damaged lines for the page."""
 
     by_seed: Mapping[int, list[TaskFailedAttempt]] = field(default_factory=dict)
     note: str = ""
 
     @classmethod
-    def read(cls, folder: Path) -> Failures:
+    def load(cls, folder: Path) -> Failures:
+        """Read ``failures.jsonl`` of a folder; a missing file gives no attempts."""
         try:
             lines = JsonLinesFile[TaskFailedAttempt](folder / FAILURES_FILE, TaskFailedAttempt).read_lines()
         except OSError as error:
@@ -68,12 +72,19 @@ class Failures:
         listed = ", ".join(damaged[:5]) + (", ..." if len(damaged) > 5 else "")
         return cls(dict(found), f"Damaged lines are not shown: {listed} of `{FAILURES_FILE}`." if damaged else "")
 
-    def of_seed(self, seed: int | None, env_info: Any = None) -> list[TaskFailedAttempt]:
-        """Return the failed attempts of a seed in an environment; none if the seed is unknown."""
-        return [] if seed is None else [failure for failure in self.by_seed.get(seed, []) if failure.is_of(env_info)]
+    def find_attempts(self, seed: int | None, env_info: Any = None) -> list[TaskFailedAttempt]:
+        """Return the failed attempts of a seed that belong to an environment; [] if the seed is None."""
+        return (
+            [] if seed is None else [failure for failure in self.by_seed.get(seed, []) if failure.belongs_to(env_info)]
+        )
 
-    def skipped_seeds(self, rows: Sequence[Row], env_infos: Sequence[Any]) -> list[Row]:
-        """Return the rows of skipped seeds, which have no episode."""
+    def make_skipped_rows(self, rows: Sequence[Row], env_infos: Sequence[Any]) -> list[Row]:
+        """Return the rows of skipped seeds, which have no episode.
+
+        Args:
+            rows: rows of the episodes.
+            env_infos: ``env_info`` of each episode, None if unknown.
+        """
         environments: dict[int | None, list[Any]] = defaultdict(list)
         for row, env_info in zip(rows, env_infos, strict=True):
             environments[row.seed].append(env_info)
@@ -85,22 +96,24 @@ class Failures:
             for failure in of_seed:
                 runs[failure.environment].append(failure)
             for of_run in runs.values():
-                recorded = any(of_run[0].is_of(env_info) for env_info in environments[seed])
+                recorded = any(of_run[0].belongs_to(env_info) for env_info in environments[seed])
                 if recorded or not any(failure.skipped for failure in of_run):
                     continue
                 tried = [failure for failure in of_run if not failure.skipped]
-                named = stages(tried, {}) or ["skipped"]
+                named = list_failed_stages(tried, {}) or ["skipped"]
                 of_task = of_run[0].task or task
                 lost.append(Row(None, task=of_task, seed=seed, success=False, stages=named, attempts=len(tried)))
         return lost
 
 
-def stages(failures: Iterable[FailedAttempt], recorded: Mapping[str, Any]) -> list[str]:
+def list_failed_stages(failures: Iterable[FailedAttempt], recorded: Mapping[str, Any]) -> list[str]:
+    """List the stages at which attempts failed: undone attempts, and recoveries ``recorded`` in the episode."""
     named = {failure.stage for failure in failures if not failure.skipped}
     return sorted(named | {recovery["stage"] for recovery in recorded.get("recoveries") or ()})
 
 
-def describe(failures: Iterable[FailedAttempt], recorded: Mapping[str, Any]) -> list[dict[str, str]]:
+def describe_failures(failures: Iterable[FailedAttempt], recorded: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Describe failed attempts by stage, reason and text: undone ones, then recoveries ``recorded`` in the episode."""
     lines = [
         {"stage": f.stage, "reason": f.reason, "text": f"attempt {f.attempt + 1}, {f.seconds:.1f} s, undone"}
         for f in failures

@@ -11,9 +11,9 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import atomic_folder, make_folder
 from robocas_ms3.core.text import format_ranges
 from robocas_ms3.viewer.content import PageContent
-from robocas_ms3.viewer.damage import as_dataset_error, join_reasons, reason
-from robocas_ms3.viewer.images import EncodedImage, depth_image, shrink_image
-from robocas_ms3.viewer.routes import PAGE_FILES, make_thumbnail, page_file, script
+from robocas_ms3.viewer.damage import convert_damage_errors, describe_error, join_reasons
+from robocas_ms3.viewer.images import EncodedImage, render_depth, shrink_image
+from robocas_ms3.viewer.routes import PAGE_FILES, make_script, make_thumbnail, read_page_file
 
 
 def export(
@@ -25,10 +25,21 @@ def export(
     depth: bool = True,
     on_episode: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[int, dict[int, str]]:
-    """Write ``index.html`` and its files; an existing folder is replaced without a check.
+    """Write the page with its data and images to a folder; an existing folder is replaced without a check.
 
-    Return the number of episodes, and a text on each damaged episode by number. Raise DatasetError if a requested
-    episode does not exist. ``on_episode`` is called with (done, total).
+    Args:
+        source: content of the page.
+        out: output folder; ``index.html`` in it opens from disk.
+        episodes: numbers of the episodes; empty: all.
+        width: maximum width of the images in pixels.
+        depth: whether to write depth images.
+        on_episode: called with (episodes done, all episodes).
+
+    Returns:
+        The number of written episodes, and a text on the damage per number of a damaged episode.
+
+    Raises:
+        DatasetError: one of ``episodes`` does not exist.
     """
     index = source.index()
     known = [entry["n"] for entry in index["episodes"] if entry["n"] is not None]
@@ -43,7 +54,7 @@ def export(
     with atomic_folder(out) as folder:
         for name in PAGE_FILES:
             target = folder / name if name == "index.html" else make_folder(folder / "page") / name
-            target.write_bytes(page_file(name))
+            target.write_bytes(read_page_file(name))
         make_folder(folder / "data")
         for done, number in enumerate(chosen):
             on_episode(done, len(chosen))
@@ -51,7 +62,7 @@ def export(
             if wrong:
                 damaged[number] = join_reasons(damaged.get(number, ""), wrong)
         index["episodes"] = [{**row, "damage": damaged.get(row["n"], "")} for row in rows]
-        (folder / "data" / "index.js").write_bytes(script("index", index))
+        (folder / "data" / "index.js").write_bytes(make_script("index", index))
         on_episode(len(chosen), len(chosen))
     return len(chosen), damaged
 
@@ -63,11 +74,11 @@ def _write_episode(source: PageContent, index: dict[str, Any], number: int, fold
     try:
         content = source.episode(number)
     except DatasetError as error:
-        return reason(error)
-    (folder / "data" / f"episode_{number}.js").write_bytes(script(f"episode_{number}", content))
+        return describe_error(error)
+    (folder / "data" / f"episode_{number}.js").write_bytes(make_script(f"episode_{number}", content))
     make = {"rgb": lambda *place: shrink_image(source.rgb(number, *place), width)}
     if index["depth"]:
-        make["depth"] = lambda *place: depth_image(source.depth(number, *place), width)
+        make["depth"] = lambda *place: render_depth(source.depth(number, *place), width)
     for camera in index["cameras"]:
         for step in range(content["steps"]):
             for kind, image in make.items():
@@ -77,9 +88,9 @@ def _write_episode(source: PageContent, index: dict[str, Any], number: int, fold
 
 
 def _write(path: Path, make: Callable[[], EncodedImage]) -> str:
-    """Write an image; return the reason if that fails, an empty text otherwise."""
+    """Write the image that ``make`` returns; return "", or a text on the damage if the image is damaged."""
     try:
-        with as_dataset_error(path.name):
+        with convert_damage_errors(path.name):
             image = make()
     except DatasetError as error:
         return f"images: {error.what}"

@@ -20,34 +20,41 @@ _QUALITY = 85
 
 @dataclass(frozen=True)
 class EncodedImage:
-    """Encoded image with its media type."""
+    """Content of an image file, and its media type."""
 
     media_type: str
     data: bytes
 
 
 def check_inside(path: Path, root: Path) -> Path:
-    """Return a path; raise DatasetError if it is a link to a file outside the dataset."""
+    """Return a path unchanged; raise DatasetError if it is a link to a file outside the dataset ``root``."""
     if not path.resolve().is_relative_to(root.resolve()):
-        raise DatasetError("link to a file outside the dataset", where=path)
+        raise DatasetError(
+            "this link points to a file outside the dataset", where=path, fix="Copy the file into the dataset."
+        )
     return path
 
 
-def depth_image(depth: NDArray[np.uint16], width: int | None = None) -> EncodedImage:
-    """Return depth in colours on a log scale, at most ``width`` pixels wide: near red, far blue."""
+def render_depth(depth: NDArray[np.uint16], width: int | None = None) -> EncodedImage:
+    """Return a depth image (H, W) in mm as colours on a log scale: near is red, far is blue.
+
+    Args:
+        depth: depth in mm; 0: no depth.
+        width: maximum width of the result in pixels; None: the width of the image.
+    """
     return encode_jpeg(_shrink(colour_depth(depth), width))
 
 
 def shrink_image(image: EncodedImage, width: int) -> EncodedImage:
-    return encode_jpeg(_shrink(decode(image), width))
+    return encode_jpeg(_shrink(decode_image(image), width))
 
 
-def thumbnail(image: EncodedImage) -> EncodedImage:
-    small = cv2.resize(decode(image, cv2.IMREAD_REDUCED_COLOR_4), THUMBNAIL, interpolation=cv2.INTER_AREA)
+def shrink_to_thumbnail(image: EncodedImage) -> EncodedImage:
+    small = cv2.resize(decode_image(image, cv2.IMREAD_REDUCED_COLOR_4), THUMBNAIL, interpolation=cv2.INTER_AREA)
     return encode_jpeg(np.asarray(small, np.uint8))
 
 
-def decode(image: EncodedImage, flags: int = cv2.IMREAD_COLOR) -> NDArray[np.uint8]:
+def decode_image(image: EncodedImage, flags: int = cv2.IMREAD_COLOR) -> NDArray[np.uint8]:
     pixels = cv2.imdecode(np.frombuffer(image.data, np.uint8), flags) if image.data else None
     if pixels is None:
         raise DatasetError("damaged image", fix=SEE_VALIDATE)

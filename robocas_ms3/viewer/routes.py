@@ -47,7 +47,7 @@ _CONTROL = re.compile(  # of `text.escape_controls`, but for surrogates, of whic
 
 @dataclass(frozen=True)
 class Response:
-    """HTTP response; ``max_age``: seconds for which a browser may cache it."""
+    """HTTP response; a browser may cache it for ``max_age`` seconds."""
 
     status: int
     media_type: str
@@ -56,7 +56,7 @@ class Response:
 
 
 class Routes:
-    """Responses for one dataset, thread-safe."""
+    """Responses of the HTTP server for one dataset; the methods are thread-safe."""
 
     def __init__(self, source: PageContent) -> None:
         self.source = source
@@ -74,10 +74,10 @@ class Routes:
         return self.source.index()
 
     def respond(self, path: str) -> Response:
-        """Return the response for the path of a URL."""
+        """Return the response for the path of a URL; status 404 for an unknown path or damaged data."""
         name = "index.html" if path in ("/", "/index.html") else path.removeprefix("/page/")
         if name in PAGE_FILES and (path.startswith("/page/") or name == "index.html"):
-            return Response(200, PAGE_FILES[name], page_file(name))
+            return Response(200, PAGE_FILES[name], read_page_file(name))
         try:
             return self._data(path) or _not_found("not found")
         except DatasetError as error:
@@ -85,10 +85,10 @@ class Routes:
 
     def _data(self, path: str) -> Response | None:
         if path == "/data/index.js":
-            return Response(200, _SCRIPT, script("index", {**self.index, "version": self.version}))
+            return Response(200, _SCRIPT, make_script("index", {**self.index, "version": self.version}))
         if match := _EPISODE.fullmatch(path):
             number = int(match[1])
-            return Response(200, _SCRIPT, script(f"episode_{number}", self.source.episode(number)))
+            return Response(200, _SCRIPT, make_script(f"episode_{number}", self.source.episode(number)))
         if match := _THUMBNAIL.fullmatch(path):
             return _image(self._thumbnail(int(match[1])))
         if match := _IMAGE.fullmatch(path):
@@ -97,21 +97,21 @@ class Routes:
                 return None
             if kind == "rgb":
                 return _image(self.source.rgb(number, camera, step))
-            return _image(images.depth_image(self.source.depth(number, camera, step)))
+            return _image(images.render_depth(self.source.depth(number, camera, step)))
         return None
 
 
 def make_thumbnail(source: PageContent, index: dict[str, Any], number: int) -> EncodedImage:
-    """Return a thumbnail of the first image of an episode, of the static camera if there is one."""
+    """Return a thumbnail of the first image of an episode, from the static camera if there is one."""
     cameras = index["cameras"]
     if not cameras:
         raise DatasetError("this dataset has no images", where=source.root)
     camera = next((name for name in cameras if "static" in name), cameras[0])
-    return images.thumbnail(source.rgb(number, camera, 0))
+    return images.shrink_to_thumbnail(source.rgb(number, camera, 0))
 
 
-def script(name: str, content: Any) -> bytes:
-    r"""Return content as a script that passes it to the page.
+def make_script(name: str, content: Any) -> bytes:
+    r"""Return a JavaScript file that passes JSON content to the page under a name.
 
     The script is ASCII. Control characters are escaped for display: ``\u202e`` becomes ``\\u202e``.
     """
@@ -120,7 +120,7 @@ def script(name: str, content: Any) -> bytes:
     return f'robocas.put("{name}",{shown});\n'.encode()
 
 
-def page_file(name: str) -> bytes:
+def read_page_file(name: str) -> bytes:
     return files("robocas_ms3.viewer").joinpath("page", name).read_bytes()
 
 

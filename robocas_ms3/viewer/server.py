@@ -21,9 +21,10 @@ _POLICY = "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancest
 
 
 class Viewer(ThreadingHTTPServer):
-    """HTTP server of a dataset, for a ``with`` statement; raises RobocasError if the port is used.
+    """HTTP server of the page of a dataset; a context manager.
 
-    Closing waits for all threads, because the interpreter would crash if it stopped a thread inside OpenCV.
+    Closing waits for all threads, because the interpreter would crash if it stopped a thread inside OpenCV. Raises
+    RobocasError if the port cannot be used.
     """
 
     daemon_threads = False
@@ -37,18 +38,18 @@ class Viewer(ThreadingHTTPServer):
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or str(error)
             fix = "Choose another port, or omit --port."
-            raise RobocasError("the port can't be used", where=port, found=reason, fix=fix) from error
+            raise RobocasError("this port can't be used", where=port, found=reason, fix=fix) from error
 
     @property
     def url(self) -> str:
         return f"http://{HOST}:{self.server_port}/"
 
     def warm_up(self) -> None:
-        """Compute the table in a thread, before the first request."""
+        """Start a thread that computes the content of the table, so that the first request is fast."""
         self._warming.start()
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Keep the connection; refuse it if there are too many, as each has a thread."""
+        """Accept a connection, unless there are too many; each connection has a thread."""
         if len(self._connections) >= MAX_CONNECTIONS:
             return self.shutdown_request(request)
         self._connections.add(request)
@@ -116,4 +117,4 @@ class _Handler(BaseHTTPRequestHandler):
             return Response(500, "text/plain; charset=utf-8", text.encode())
 
     def log_message(self, format: str, *args: object) -> None:
-        """Log nothing: a page requests thousands of images."""
+        """Log nothing, because a page requests thousands of images."""

@@ -22,8 +22,8 @@ from robocas_ms3.datasets.sources.reader import DEFAULT_RATE, Dataset
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.demos.recordings.trajectory_file import Recording, TrajectoryFile
 from robocas_ms3.viewer.content import PageContent
-from robocas_ms3.viewer.damage import as_dataset_error, read_object, read_or_default
-from robocas_ms3.viewer.episode import ARM, ROLL_PITCH_YAW, XYZ, Plot, facts_of, plot, show_arrays
+from robocas_ms3.viewer.damage import convert_damage_errors, read_object, read_or_default
+from robocas_ms3.viewer.episode import ARM, ROLL_PITCH_YAW, XYZ, Plot, collect_facts, make_episode_content, make_plot
 from robocas_ms3.viewer.images import EncodedImage, check_inside
 
 MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".webp": "image/webp"}
@@ -35,7 +35,7 @@ _CACHE_BYTES = 128e6  # of decoded images
 
 
 def open_content(path: Path | str) -> PageContent:
-    """Open a trajectory file or its folder, or a dataset of any format, as page content."""
+    """Open a trajectory file (or its folder), or a dataset of any format, as content of the page."""
     path = Path(path)
     inside = path / "trajectory.h5"
     path = inside if inside.is_file() else path
@@ -58,7 +58,7 @@ def open_content(path: Path | str) -> PageContent:
 
 
 class FolderContent(PageContent):
-    """Page content of a RoboCAS folder, also of RoboCAS-v0; images are sent as stored."""
+    """Page content of a RoboCAS folder, also of RoboCAS-v0; the server sends images as they are stored."""
 
     def __init__(self, root: Path) -> None:
         self.dataset = dataset = Dataset(root)
@@ -71,7 +71,7 @@ class FolderContent(PageContent):
         notes = wrong_settings, assumed if wrong else "", wrong_info
         super().__init__(dataset, "RoboCAS folder", notes)
 
-    def _splits(self) -> Mapping[int, str]:
+    def _read_splits(self) -> Mapping[int, str]:
         splits, _ = read_or_default(lambda: self.dataset.splits, ([], []))  # includes missing episodes
         return {number: name for name, listed in zip(("train", "val"), splits, strict=True) for number in listed}
 
@@ -90,12 +90,12 @@ class FolderContent(PageContent):
 
 
 class TrajectoryContent(PageContent):
-    """Page content of a trajectory file at its control frequency, with recorded actions and object paths."""
+    """Page content of a trajectory file, one step per control step, with recorded actions and object paths."""
 
     scene_name = entry_name = "JSON entry"
 
     def __init__(self, path: Path) -> None:
-        with as_dataset_error(path):
+        with convert_damage_errors(path):
             with TrajectoryFile(path) as file:
                 task = parse_task_name(file.env_info["env_id"])
                 self._entries = [
@@ -104,13 +104,13 @@ class TrajectoryContent(PageContent):
             self.recordings = TrajectorySource(path, rate_hz=file.control_freq, include_failed=True)
         super().__init__(self.recordings, "trajectory file", [_NO_IMAGES.format(name=path.name)])
 
-    def _entry(self, number: int) -> dict[str, Any]:
+    def _read_entry(self, number: int) -> dict[str, Any]:
         return {key: self._entries[number][key] for key in ("task", "seed", "success", "target")}
 
-    def _splits(self) -> Mapping[int, str]:
+    def _read_splits(self) -> Mapping[int, str]:
         return {}
 
-    def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
+    def _make_content(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
         episode = self.recordings.episode(number)
         recording, arrays = episode.recording(), episode.arrays
         base = from_xyzw(arrays["base_pos"][:1].astype(float), arrays["base_orn"][:1].astype(float))[0]
@@ -120,13 +120,13 @@ class TrajectoryContent(PageContent):
 
 
 class LeRobotContent(PageContent):
-    """Page content of a LeRobot dataset; images are decoded from its videos."""
+    """Page content of a LeRobot dataset; images are decoded from the videos of the dataset."""
 
     def __init__(self, root: Path) -> None:
         from robocas_ms3.datasets.lerobot import schema as lerobot  # needs the extra `lerobot`
         from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 
-        with as_dataset_error(root):
+        with convert_damage_errors(root):
             self.dataset = dataset = LeRobotDataset(root)
             _ = dataset.has_robocas_features, dataset.lengths, dataset.rate_hz, dataset.cameras, dataset.has_depth
         self.entry_name, self._indices = lerobot.CONVERSION_FILE, {*lerobot.INDICES, lerobot.SUBTASK_INDEX.key}
@@ -146,7 +146,7 @@ class LeRobotContent(PageContent):
         episode = self.dataset.episode(number)
         features = self.dataset.info["features"]
         plots = [
-            plot(name, "", _names(features.get(name, {}), values.shape[1]), values)
+            make_plot(name, "", _label_columns(features.get(name, {}), values.shape[1]), values)
             for name, values in episode.columns.items()
             if name not in self._indices and values.dtype != bool
         ]
@@ -176,36 +176,36 @@ class LeRobotContent(PageContent):
             return self._decoded[key][step - first]
 
 
-def _names(feature: dict[str, Any], width: int) -> list[str]:
+def _label_columns(feature: dict[str, Any], width: int) -> list[str]:
     names = feature.get("names")
     if isinstance(names, dict):
         names = [str(word) for part in names.values() for word in (part if isinstance(part, list) else [part])]
     return [str(name) for name in names] if names and len(names) == width else [str(i) for i in range(width)]
 
 
-def _action_plots(recording: Recording) -> list[Plot]:
-    """Return plots of the recorded actions: arm, gripper, and base if it moves.
+def _make_action_plots(recording: Recording) -> list[Plot]:
+    """Return plots of the recorded actions: arm, gripper, and mobile base if it moves.
 
-    The last state has no action; its plot repeats the one before.
+    The last state has no action, so the plots repeat the last action there.
     """
     values = np.concatenate([recording.actions, recording.actions[-1:]])
     arm = {7: 6, 8: 7, 10: 6, 11: 7}.get(values.shape[1])  # 6: end-effector deltas
     if arm is None:
-        return [plot("Actions", "", [f"a{i + 1}" for i in range(values.shape[1])], values, steps=True)]
+        return [make_plot("Actions", "", [f"a{i + 1}" for i in range(values.shape[1])], values, steps=True)]
     names = ARM if arm == 7 else (*XYZ, *ROLL_PITCH_YAW)
     unit = "rad" if recording.control_mode == "pd_joint_pos" else ""
     plots = [
-        plot(f"Action: arm, {recording.control_mode}", unit, names, values[:, :arm], steps=True),
-        plot("Action: gripper, 1 = open", "", ("gripper",), values[:, arm : arm + 1], steps=True),
+        make_plot(f"Action: arm, {recording.control_mode}", unit, names, values[:, :arm], steps=True),
+        make_plot("Action: gripper, 1 = open", "", ("gripper",), values[:, arm : arm + 1], steps=True),
     ]
     base = values[:, arm + 1 :]
-    return plots + ([plot("Action: mobile base", "", ("x", "y", "yaw"), base, steps=True)] if base.any() else [])
+    return plots + ([make_plot("Action: mobile base", "", ("x", "y", "yaw"), base, steps=True)] if base.any() else [])
 
 
-def _object_paths(
+def _list_object_paths(
     recording: Recording, scene: Mapping[str, Any], ids: Any, base_in_world: NDArray
 ) -> list[dict[str, Any]]:
-    """Return the objects of the scene with their paths, (T, 3) or, without motion, (1, 3)."""
+    """Return the objects {name, target, path} of the scene; a path is (T, 3), or (1, 3) without motion, world frame."""
     target = scene.get("target") or {}
     target_actor = f"object_{target['slot']}" if target else ""
     names = {thing["slot"]: thing["name"] for thing in scene.get("objects") or ()}

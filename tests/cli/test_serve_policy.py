@@ -34,7 +34,7 @@ def serving(policy, folder, *options):
     try:
         assert served.stdout is not None
         line = served.stdout.readline()
-        assert line.startswith(f"{policy} at ws://127.0.0.1:")
+        assert line.startswith(f"serving {policy} at ws://127.0.0.1:")
         yield served, line.split()[-1]
     finally:
         served.kill()

@@ -9,7 +9,7 @@ import pytest
 from robocas_ms3.cli.view import View, main
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.viewer.episode_table import Failures
-from robocas_ms3.viewer.routes import Routes, script
+from robocas_ms3.viewer.routes import Routes, make_script
 from robocas_ms3.viewer.source import open_content
 
 
@@ -163,7 +163,7 @@ def test_a_static_page_of_a_damaged_dataset(spoilt, tmp_path, capsys):
 
 def test_control_characters_reach_the_page_as_escapes():
     texts = ["\x1b[31m\x9b\x7f", "\u202eevil\u2069\u2028", "\\u202e", "\\\u202e\u202e", "é 😀 \u0645", "two\nlines"]
-    data = script("index", {"name": texts})
+    data = make_script("index", {"name": texts})
     assert data.isascii()
     read = json.loads(data[len(b'robocas.put("index",') : -len(b");\n")])
     assert read["name"] == [
@@ -176,10 +176,10 @@ LINE = '{"seed": 4, "attempt": 0, "stage": "grasp", "reason": "slipped", "second
 
 
 def test_damaged_lines_of_failures_are_omitted_with_a_note(tmp_path, spoilt):
-    assert Failures.read(tmp_path) == Failures({}, "")
+    assert Failures.load(tmp_path) == Failures({}, "")
     wrong = ['{"seed": "x"', LINE.replace("4", '"4"'), "[]", LINE.replace('"grasp"', "null"), "\xff\x00"]
     (tmp_path / "failures.jsonl").write_bytes("\n".join([LINE, *wrong, "", LINE, LINE[:30]]).encode("latin-1"))
-    read = Failures.read(tmp_path)
+    read = Failures.load(tmp_path)
     assert [len(failures) for failures in read.by_seed.values()] == [2]
     assert read.note == "Damaged lines are not shown: 2, 3, 4, 5, 6, ... of `failures.jsonl`."
     with (spoilt / "failures.jsonl").open("a") as file:

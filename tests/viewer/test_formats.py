@@ -9,7 +9,7 @@ import pytest
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import formats
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.viewer.images import decode
+from robocas_ms3.viewer.images import decode_image
 from robocas_ms3.viewer.routes import Routes
 from robocas_ms3.viewer.source import open_content
 
@@ -88,7 +88,7 @@ def test_images_belong_to_the_requested_step(page, folder):
         shown = page.rgb(1, "static_camera", step)
         assert shown.media_type == "image/jpeg"
         stored = episode.rgb("static_camera", step)
-        assert np.abs(decode(shown).astype(float) - stored).mean() < 12  # video and JPEG lose a little
+        assert np.abs(decode_image(shown).astype(float) - stored).mean() < 12  # video and JPEG lose a little
         depth = episode.depth("static_camera", step).clip(max=MAX_DEPTH_MM)
         np.testing.assert_array_equal(page.depth(1, "static_camera", step).clip(max=MAX_DEPTH_MM), depth)
 

@@ -11,7 +11,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.conversion.convert import convert
 from robocas_ms3.datasets.conversion.settings import ConversionSettings
 from robocas_ms3.datasets.sources.reader import Dataset
-from robocas_ms3.viewer.episode import base_plot, continuous, plot, round_values
+from robocas_ms3.viewer.episode import make_base_plot, make_plot, make_signs_continuous, round_values
 from robocas_ms3.viewer.source import open_content
 
 ROW = {"n", "steps", "instruction", "task", "object", "seed", "success", "split", "stages", "attempts", "damage"}
@@ -28,7 +28,7 @@ def test_numbers_are_rounded_and_nan_becomes_none():
     assert round_values([[1.000001, -0.000001]]) == [[1.0, 0.0]]
     assert str(round_values([-0.000001])) == "[0.0]"
     assert round_values([0.5, np.nan, np.inf]) == [0.5, None, None]
-    assert plot("p", "m", ("x",), np.array([[1.0], [2.0]]))["series"] == [{"name": "x", "values": [1.0, 2.0]}]
+    assert make_plot("p", "m", ("x",), np.array([[1.0], [2.0]]))["series"] == [{"name": "x", "values": [1.0, 2.0]}]
 
 
 def test_camera_names_with_slashes_are_omitted(folder):
@@ -40,10 +40,12 @@ def test_camera_names_with_slashes_are_omitted(folder):
 def test_orientation_and_yaw_are_continuous():
     turn = np.array([[0.0, 0, 0, 1], [0, 0, -0.1, -0.995], [0, 0, 0.2, 0.98]])
     expected = [[0, 0, 0, 1], [0, 0, 0.1, 0.995], [0, 0, 0.2, 0.98]]
-    assert continuous(turn).tolist() == continuous(-turn).tolist() == expected  # for both signs at the start
-    (base,) = base_plot(np.array([[0, 0, 3.1], [0, 0, -3.1]]))
+    assert (
+        make_signs_continuous(turn).tolist() == make_signs_continuous(-turn).tolist() == expected
+    )  # for both signs at the start
+    (base,) = make_base_plot(np.array([[0, 0, 3.1], [0, 0, -3.1]]))
     assert base["series"][2]["values"] == [3.1, round(2 * np.pi - 3.1, 5)]
-    assert base_plot(np.ones((3, 3))) == []
+    assert make_base_plot(np.ones((3, 3))) == []
 
 
 @pytest.mark.parametrize("made", ["run_folder", "folder"])  # the run's folder is its trajectory

@@ -24,7 +24,7 @@ def test_a_conversion_and_its_repetition(trajectory, stub_images, tmp_path, caps
     assert printed.out.startswith(f"{tmp_path / 'out'}: 2 episodes, 14 steps, ")
     assert "episodes written: 2/2" in printed.err
     assert run(command) == 0
-    assert capsys.readouterr().out.endswith(": 0 episodes, 2 existed already\n")
+    assert capsys.readouterr().out.endswith(": 0 episodes, 2 already there\n")
 
 
 def tried(path, *rates):

@@ -271,6 +271,6 @@ def test_command(copy, tmp_path, capsys):
     image = "episode_0000001/base_camera/rgb/0003.png"
     assert (root / image).stat().st_ino == (out / image).stat().st_ino
     assert run(["import-robocas", str(root), "--out", str(out)]) == 0
-    assert "3 episodes, 3 existed already" in capsys.readouterr().out
+    assert "3 episodes, 3 already there" in capsys.readouterr().out
     assert run(["import-robocas", str(root), "--out", str(out), "--rate", "10"]) == 1
     assert "rate_hz: 5.0 -> 10.0" in capsys.readouterr().err
