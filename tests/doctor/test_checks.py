@@ -62,11 +62,11 @@ def test_versions_of_packages(monkeypatch, requirement, version, status):
 
 
 def test_requirements_are_those_of_the_metadata():
-    names = {item.name for item in checks.requirements("robocas-ms3")}
+    names = {item.name for item in checks.list_requirements("robocas-ms3")}
     assert {"numpy", "mani-skill", "sapien", "torch"} <= names
     assert "pytest" not in names
-    assert {item.name for item in checks.requirements("robocas-ms3", "language")} == {"sentence-transformers"}
-    assert list(checks.requirements("no-such-distribution")) == []
+    assert {item.name for item in checks.list_requirements("robocas-ms3", "language")} == {"sentence-transformers"}
+    assert list(checks.list_requirements("no-such-distribution")) == []
 
 
 def test_missing_distribution_is_one_finding(monkeypatch):
