@@ -95,7 +95,7 @@ def _lines(report: ReplayReport) -> Iterator[str]:
             yield f"episode {episode.number} was not replayed: {episode.skipped}"
         elif not episode.success:
             error = f"largest tracking error {episode.max_error * 1000:.0f} mm"
-            yield f"episode {episode.number}: the replay does not succeed; {error}"
+            yield f"episode {episode.number}: the replay failed; {error}"
     for task, of_task in report.summarize_by_task().items():
         name = task or "unknown task"
         if not of_task["replayed"]:

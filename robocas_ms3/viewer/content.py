@@ -126,7 +126,7 @@ class PageContent:
         """Read the scene of an episode; return the valid values, and a text that describes invalid values."""
         return read_scene(lambda: self.source.episode(number).scene, self.scene_name)
 
-    def _entry(self, number: int) -> Any:
+    def _read_entry(self, number: int) -> Any:
         entry = self.source.conversion_entry(number)
         known = ("seed", "success", "target")
         return {key: entry[key] for key in known if key in entry} if isinstance(entry, Mapping) else entry

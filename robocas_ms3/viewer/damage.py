@@ -57,6 +57,6 @@ def read_object(read: Callable[[], Any], name: str) -> tuple[dict[Any, Any], str
 
 
 def read_scene(read: Callable[[], Any], name: str) -> tuple[dict[str, Any], str]:
-    """Return the valid values of an object with keys of ``scene.json``, and a text on invalid values."""
+    """Read an object with keys of ``scene.json``; return the valid values, and a text on invalid values."""
     (found, wrong), failed = read_or_default(lambda: read_valid_values(read(), name), ({}, ""))
     return found, f"{name}: {failed}" if failed else wrong

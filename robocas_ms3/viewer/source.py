@@ -114,9 +114,9 @@ class TrajectoryContent(PageContent):
         episode = self.recordings.episode(number)
         recording, arrays = episode.recording(), episode.arrays
         base = from_xyzw(arrays["base_pos"][:1].astype(float), arrays["base_orn"][:1].astype(float))[0]
-        objects = _object_paths(recording, scene, self.recordings.object_ids(number), base)
-        shown = show_arrays(arrays, scene, actions=_action_plots(recording), moving=objects)
-        return {**shown, "facts": facts_of({**scene, "source": None})}  # the source is this file
+        objects = _list_object_paths(recording, scene, self.recordings.object_ids(number), base)
+        shown = make_episode_content(arrays, scene, actions=_make_action_plots(recording), moving=objects)
+        return {**shown, "facts": collect_facts({**scene, "source": None})}  # the source is this file
 
 
 class LeRobotContent(PageContent):
@@ -139,10 +139,10 @@ class LeRobotContent(PageContent):
             OrderedDict()
         )  # least recently used first
 
-    def _show(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the content of an episode; datasets of other tools get one plot per numeric column."""
+    def _make_content(self, number: int, scene: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the content of an episode; a dataset of another tool gets one plot per numeric column."""
         if self.dataset.has_robocas_features:
-            return super()._show(number, scene)
+            return super()._make_content(number, scene)
         episode = self.dataset.episode(number)
         features = self.dataset.info["features"]
         plots = [

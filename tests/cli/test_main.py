@@ -278,7 +278,7 @@ def test_full_or_read_only_cache_names_its_variable(failing, monkeypatch, tmp_pa
     for number, said in (
         (
             errno.ENOSPC,
-            r"No space left on device \(\d+ MB free\)\. Free disk space, or set ROBOCAS_CACHE to a folder on another disk",
+            r"No space left on device \(\d+ MB free\)\. Free disk space, or set ROBOCAS_CACHE to a folder on another",
         ),
         (errno.EACCES, r"Permission denied\. Set ROBOCAS_CACHE to a writable folder"),
     ):
