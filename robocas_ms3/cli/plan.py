@@ -151,7 +151,7 @@ def show_status(command: Status) -> int:
         rows.append(
             (part.name, f"{part.done} of {part.requested}", part.tried, failed, *seconds, f"{part.bytes / 1e6:.0f}")
         )
-    columns = ("part", "episodes", "seeds", "skipped seeds", "record (CPU s/episode)", "render (CPU s/episode)", "MB")
+    columns = ("plan part", "episodes", "seeds", "skipped seeds", "record (CPU s/ep.)", "render (CPU s/ep.)", "MB")
     print_table(columns, rows, no_wrap=columns[:3])
     if found.finished:
         print_line(f"{command.out}: complete")
