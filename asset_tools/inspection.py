@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
-from asset_tools.readers.limits import MAX_SECONDS, reading_limits
+from asset_tools.readers.limits import MAX_SECONDS, limit_time_and_memory
 from asset_tools.readers.model import read_model
 from robocas_ms3.core.errors import AssetError, RobocasError
 from robocas_ms3.core.workers import FunctionWorker, Limits, WorkerPool
@@ -75,7 +75,7 @@ def inspect_models(
 def _inspect(task: tuple[str, ModelSource]) -> tuple[str, Inspection]:
     id_, source = task
     try:
-        with reading_limits(source.paths[0]):
+        with limit_time_and_memory(source.paths[0]):
             model = read_model(list(source.paths), source.root)
             return id_, Inspection(float(model.mesh.extents.max()), model.files)
     except RobocasError as error:

@@ -102,7 +102,7 @@ class Model:
         return make_uv_mapped_shape(np.asarray(points), np.asarray(self.body.faces), self.texture_size, pieces)
 
     def paint(self, shape: Shape, rng: np.random.Generator) -> Image.Image:
-        """Return the texture of a shape that `shape` returned."""
+        """Paint the colours of the parts on a shape made by `shape`, and return the texture."""
         extents = np.ptp(shape.vertices, axis=0)
         back, middle = self.body.extents / extents, self.body.bounds.mean(0)
         palette = np.array([part.colour for part in self.parts], np.float32)

@@ -56,7 +56,7 @@ def make_rubiks_cube(size: Size) -> Shape:
 
 
 def paint_rubiks_cube(shape: Shape, rng: np.random.Generator) -> Image.Image:
-    """Paint the stickers of a scramble_stickers puzzle cube on black."""
+    """Paint the stickers of a scrambled Rubik's Cube on a black background."""
     painter = Painter(shape, rng, (16, 16, 18))
     for name, colours in scramble_stickers().items():
         with painter.open_region(name) as canvas:

@@ -21,7 +21,7 @@ from asset_tools.partnet.textures import merge_faces
 from asset_tools.partnet.urdf import URDF, MovingLink, PartnetModel, Visual, find_urdf, read_urdf
 from asset_tools.pipeline import AssetJob, compute_content_hash, make_failing_job
 from asset_tools.readers.files import LARGEST_FILE, find_files
-from asset_tools.readers.limits import reading_limits
+from asset_tools.readers.limits import limit_time_and_memory
 from asset_tools.sources import FurnitureSource, LinkSource
 from robocas_ms3.assets.manifest import BODY, FurnitureAsset, Handle, Joint, Surface
 from robocas_ms3.core.errors import AssetError
@@ -57,7 +57,7 @@ def read_partnet(folder: Path, annotation: ModelAnnotation) -> FurnitureSource:
     folder = folder.resolve()
     model = read_urdf(folder, annotation.joints, annotation.scale)
     geometry = GeometryReader(folder)
-    with reading_limits(folder):
+    with limit_time_and_memory(folder):
         faces_by_link = {name: geometry.read_faces(name, visuals) for name, visuals in _groups(model)}
     corners = np.concatenate(
         [np.zeros((0, 3))] + [faces.corners.reshape(-1, 3) for group in faces_by_link.values() for _, _, faces in group]

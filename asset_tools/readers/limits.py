@@ -18,7 +18,7 @@ MAX_MEMORY = 2 * 2**30  # bytes
 
 
 @contextmanager
-def reading_limits(where: object) -> Iterator[None]:
+def limit_time_and_memory(where: object) -> Iterator[None]:
     """Abort the block after 25 s, or if the block needs more than 2 GB of additional memory.
 
     The time limit applies only in the main thread, since other threads cannot set an alarm.

@@ -203,7 +203,7 @@ class _Attempts:
 
     def _finish(self, recoveries: list[dict[str, Any]]) -> None:
         if len(self.executor.actions) > self.generator.horizon:
-            raise UnrecoverableError("horizon", "too_long")
+            raise UnrecoverableError("episode", "too_long")
         if not self.executor.is_flag_set("success"):
             raise PlanningError("episode", "no_success")
         self.check_open_loop(finished=True)

@@ -201,7 +201,7 @@ class InverseKinematics:
         return kept[:MAX_SOLUTIONS]
 
     def _solve(self, poses: Array, near: Array, step: float) -> Array:
-        """Return the solutions (N, K, 7) of poses (N, 4, 4) for positions of joint 7 ``step`` rad apart."""
+        """Return the IK solutions (N, K, 7) of poses (N, 4, 4), with joint 7 sampled every ``step`` rad; NaN: none."""
         first, last = np.ceil((self.lower[6] - near[6]) / step), np.floor((self.upper[6] - near[6]) / step)
         turns = np.clip(near[6] + step * np.arange(first, last + 1), self.lower[6], self.upper[6])
         solved = self._geometry.solve(np.repeat(poses, len(turns), axis=0), np.tile(turns, len(poses)))

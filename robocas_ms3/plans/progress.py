@@ -66,7 +66,7 @@ class PlanProgress:
                 self._failure_error = PlanError("too many seeds are skipped", where=where, found=found, fix=fix)
         self._prefix[part] = block, seeds, successes
 
-    def check_failures(self) -> None:
+    def check_skipped_seeds(self) -> None:
         """Raise PlanError if a plan part has more than 20 skipped seeds, and more than three times its successes."""
         if self._failure_error:
             raise self._failure_error

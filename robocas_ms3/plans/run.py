@@ -143,7 +143,7 @@ def _run_units(
         if time.monotonic() > shown:
             output.check_exists()
             progress.read_outcomes()
-            progress.check_failures()
+            progress.check_skipped_seeds()
             status = compute_status(progress)
             on_status(status)
             shown = time.monotonic() + max(
@@ -165,7 +165,7 @@ def _run_units(
                         "all jobs of this work unit were killed at the same seed", where=where, found=found, fix=fix
                     )
                 break  # the job was killed in this unit
-        progress.check_failures()
+        progress.check_skipped_seeds()
 
 
 def _wait_for_jobs(running: dict[Any, Sequence[WorkUnit]], until: float) -> list[Any]:

@@ -287,7 +287,7 @@ def lerobot_features() -> dict[str, list[Quantity]]:
 
 
 def feature_columns(feature: str) -> dict[str, slice]:
-    """Return the columns of each quantity, by name, in a LeRobot feature (T, D)."""
+    """Return name of a quantity -> slice of its columns in a LeRobot feature (T, D)."""
     columns, first = {}, 0
     for quantity in lerobot_features()[feature]:
         columns[quantity.name] = slice(first, first := first + quantity.width)

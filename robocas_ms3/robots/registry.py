@@ -43,7 +43,7 @@ def find_robot(name: str | None, *, where: object = "robot") -> RobotSpec:
     """Return the registered robot of this name, or the default robot for None."""
     spec = ROBOTS.find(name or DEFAULT_ROBOT, where=where)
     if spec.description.uid != (name or DEFAULT_ROBOT):
-        fix = "Give the entry point the name uid of the robot's description."
+        fix = "Rename the entry point to the uid in the robot's description."
         raise ExtensionError(
             "the name of the entry point differs from the uid of the robot",
             where=where,

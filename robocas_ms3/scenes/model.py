@@ -194,7 +194,10 @@ class SceneModel:
 
     @property
     def front_direction(self) -> Array:
-        """Direction (2,) of columns of objects: the axis of the furniture's frame towards the robot."""
+        """Unit vector (2,) out of the front edge of the region, in the furniture's frame.
+
+        It is the signed axis of that frame that is nearest to the direction of the robot.
+        """
         middle = np.add(self.region.min_xy, self.region.max_xy) / 2
         to_robot = (np.linalg.inv(self.support_pose) @ self.robot_pose)[:2, 3] - middle
         axis = int(np.argmax(np.abs(to_robot)))

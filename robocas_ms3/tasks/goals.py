@@ -74,7 +74,7 @@ class Goal(ABC):
         """Return success conditions in addition to `is_at_goal`, by name, (N,) bool each; default: none."""
         return {}
 
-    def is_unreachable(self, basket_pose: Array | None, conditions: dict[str, Array]) -> Array | None:
+    def is_success_impossible(self, basket_pose: Array | None, conditions: dict[str, Array]) -> Array | None:
         """Return (N,) bool, whether the goal can't be reached any more; None: it can be reached in every env.
 
         Args:
@@ -149,7 +149,7 @@ class InBasketGoal(Goal):
         start = to_native(self.env.basket_start_poses)
         return {"basket_stands": terms.is_basket_standing(*_split_pose(basket_pose), *_split_pose(start))}
 
-    def is_unreachable(self, basket_pose: Array | None, conditions: dict[str, Array]) -> Array | None:
+    def is_success_impossible(self, basket_pose: Array | None, conditions: dict[str, Array]) -> Array | None:
         if known_all_true(conditions["basket_stands"]):  # the usual case
             return None
         start = to_native(self.env.basket_start_poses)

@@ -18,7 +18,7 @@ _BACKENDS = {"cpu": "physx_cpu", "gpu": "physx_cuda"}
 
 
 def find_unchecked_layouts(cache: LayoutCache, engine: Engine) -> dict[int, list[int]]:
-    """Return the layout seeds of unchecked layouts in the table of a physics engine, by objects seed."""
+    """Return, by objects seed, the layout seeds whose stability is unchecked in the layout table of ``engine``."""
     table = cache.load_table(engine)
     seeds: dict[int, list[int]] = {}
     for objects_seed, seed in table.find_pairs(LayoutStatus.UNCHECKED) if table else ():

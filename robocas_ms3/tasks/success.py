@@ -196,7 +196,7 @@ class SuccessCheck:
         """Return ``fail`` (N,) bool: the target has fallen, or the goal can't be reached any more."""
         goal, slot = self._env.goal, to_native(self._env.target_slot)
         height = terms.select_target(objects[..., 2], slot)
-        low, lost = height < self.fallen_below, goal.is_unreachable(basket, conditions)
+        low, lost = height < self.fallen_below, goal.is_success_impossible(basket, conditions)
         if lost is None and known_all_false(low):  # the usual case
             return low
         caught = goal.is_above_goal(terms.select_target(objects[..., :3], slot), basket)

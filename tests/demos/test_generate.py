@@ -29,7 +29,7 @@ pytestmark = pytest.mark.slow
 PICK, SEARCH = EpisodeSettings("pick"), EpisodeSettings("search", "search_table_small_heap")
 SEEDS = 2
 SEARCH_SEED = 3
-TOO_LONG = "horizon", "too_long"
+TOO_LONG = "episode", "too_long"
 
 
 @pytest.fixture(scope="module")

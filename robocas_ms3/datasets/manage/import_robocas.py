@@ -48,7 +48,8 @@ def import_robocas(survey: Survey, out: Path, *, embed: Embed | None = None, opt
 
     Raises:
         DatasetError: no episode can be imported, or the output overlaps the input.
-        OutputExistsError: ``out`` is another dataset, or not a dataset.
+        OutputExistsError: ``out`` is a dataset that a different call wrote (unless ``options.overwrite``), or a
+            folder with other content.
     """
     if not survey.importable or survey.image_options is None:
         found = f"{format_count(survey.episodes, 'episode')}, none importable"

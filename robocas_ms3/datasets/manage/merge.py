@@ -30,7 +30,8 @@ def merge(
     Raises:
         DatasetError: a dataset is unfinished or damaged, the settings differ, or, without ``skip_duplicates``, an
             episode is in several datasets.
-        OutputExistsError: ``out`` is another dataset, or not a dataset.
+        OutputExistsError: ``out`` is a dataset that a different call wrote (unless ``options.overwrite``), or a
+            folder with other content.
     """
     if not roots:
         what, fix = "missing dataset folders", "Run robocas merge A B --out C."

@@ -200,9 +200,9 @@ def check_options(source: EpisodeSource, options: SampleOptions) -> None:
         expected, found = f"some of {', '.join(available) or 'none'}, each once", ", ".join(cameras)
         raise DatasetError("unknown or repeated camera", where=source.root, expected=expected, found=found, fix=fix)
     if options.depth and not (source.has_depth and cameras):
-        found = "no cameras" if source.has_depth else "no depth"
-        what = "depth images are not available"
-        raise DatasetError(what, where=source.root, found=found, fix="Pass depth=False.")
+        found = "no requested cameras" if source.has_depth else "a dataset without depth"
+        fix = "Pass cameras, or depth=False." if source.has_depth else "Pass depth=False."
+        raise DatasetError("depth images are not available", where=source.root, found=found, fix=fix)
     if options.embedding and not source.has_embeddings:
         fix = "Pass embedding=False, or convert the trajectory file with embeddings."
         raise DatasetError("this dataset has no embeddings", where=source.root, fix=fix)

@@ -243,7 +243,7 @@ def _where(episode: h5py.Group) -> str:
 
 
 def _external_reference(where: str, found: str) -> DatasetError:
-    what, fix = "reference to other data, outside of the recording", "Record the episode again."
+    what, fix = "the recording refers to data outside of its file", "Record the episode again."
     return DatasetError(what, where=where, expected="arrays stored in this file", found=found, fix=fix)
 
 

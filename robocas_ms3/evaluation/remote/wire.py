@@ -73,7 +73,7 @@ def decode_message(data: bytes, max_bytes: int = MAX_BYTES) -> Any:
 
 def _encode_array(value: Any) -> dict[bytes, Any]:
     if not isinstance(value, np.ndarray | np.generic):
-        raise TypeError(f"a {type(value).__name__}")
+        raise TypeError(f"a value of type {type(value).__name__}")
     if not _DTYPE.fullmatch(value.dtype.str):
         raise TypeError(f"an array of {value.dtype}")
     if isinstance(value, np.generic):

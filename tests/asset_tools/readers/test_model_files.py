@@ -7,7 +7,7 @@ from models import RED, image_file, shown_colors, write_obj
 
 from asset_tools.inspection import ModelSource, inspect_models
 from asset_tools.readers.files import ModelFiles, read_file
-from asset_tools.readers.limits import reading_limits
+from asset_tools.readers.limits import limit_time_and_memory
 from asset_tools.readers.model import read_model
 from robocas_ms3.core.errors import AssetError
 
@@ -40,17 +40,17 @@ def test_names_with_accents(tmp_path, encoding):
 
 
 def test_reading_is_bounded_in_memory():
-    with pytest.raises(AssetError) as caught, reading_limits("mug"):
+    with pytest.raises(AssetError) as caught, limit_time_and_memory("mug"):
         bytearray(5 * 2**30)
     assert caught.value.where == "mug"
 
 
 def test_reading_is_bounded_in_time(monkeypatch):
     monkeypatch.setattr("asset_tools.readers.limits.MAX_SECONDS", 0.05)
-    with pytest.raises(AssetError), reading_limits("mug"):
+    with pytest.raises(AssetError), limit_time_and_memory("mug"):
         while True:
             pass
-    with pytest.raises(AssetError), reading_limits("mug"):
+    with pytest.raises(AssetError), limit_time_and_memory("mug"):
         try:
             while True:
                 pass
