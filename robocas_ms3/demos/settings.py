@@ -136,7 +136,7 @@ class GenerateSettings:
     """Time limit per episode in seconds.
     An episode whose process exceeds a limit or crashes is retried once; then its seed is skipped."""
     memory_gb: float = 8.0
-    """Memory limit per process in GB."""
+    """Memory limit per process in GiB."""
     check_noise: Annotated[tuple[float, float] | None, _NO_HINT] = None
     """Noise of the noise checks: standard deviation of each component of an action, in mm (translation) and degrees
     (rotation). Default: 0.5 0.2."""

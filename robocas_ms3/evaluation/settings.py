@@ -48,7 +48,7 @@ class EvaluationSettings:
     An episode whose worker exceeds it or crashes is repeated once. After a second failure it counts as failed, with
     an error."""
     memory_gb: float = 8.0
-    """Memory limit per worker process in GB."""
+    """Memory limit per worker process in GiB."""
     backend: Literal["auto", "processes", "gpu"] = "auto"
     """Where the simulation runs. auto: on a GPU if there is one, else in worker processes."""
     shard: Annotated[str, tyro.conf.arg(metavar="K/N")] = "0/1"

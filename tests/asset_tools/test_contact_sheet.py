@@ -51,7 +51,7 @@ def test_the_camera_renders_from_the_given_direction(studio):
             (make_box_faces((-0.5, -2, -0.5), (0.5, -1, 0.5)), (0.05, 0.05, 0.9)),
         )
     ]
-    image = studio.image(cubes, 0, 0)
+    image = studio.render(cubes, 0, 0)
     left, right = image.crop((0, 0, 32, 64)), image.crop((32, 0, 64, 64))
     # 4 m and a margin of 6 % across 64 pixels, so that a cube of 1 m is 15 pixels high
     assert share(right, 0) == pytest.approx(0.11, abs=0.02)  # 15 x 15 of 32 x 64 pixels

@@ -213,7 +213,7 @@ def stirring_policy(log):
         with log.open("a") as file:
             file.write(json.dumps(found) + "\n")
         stir(arm, 6)
-        if arm.path == (0, 0):
+        if arm.decision_path == (0, 0):
             raise PlanningError("stir", "enough")
 
     return policy

@@ -98,7 +98,7 @@ def test_demonstrations_are_recorded_and_replayed(site, recorded):
     with h5py.File(recorded) as file:
         assert list(file["traj_0/env_states/articulations"]) == ["twin"]
     assert "2 of 2 episodes succeed" in (output := robocas(site, "replay", recorded))
-    assert "final state: 0\n" in output
+    assert "from the recording: 0\n" in output
     assert "2 of 2 episodes succeed" in robocas(site, "replay", recorded, "--control-mode", "pd_ee_delta_pose")
 
 

@@ -36,7 +36,7 @@ def cache(tmp_path, monkeypatch):
     layout = Layout(
         tuple(cache._names[:3]), poses, from_xyz_yaw(0.7, 0.15, 0, 1.5), from_xyz_yaw(1.3, 0.9, 0.6, 0), target=1
     )
-    monkeypatch.setattr(cache._sample, "make", lambda *_: layout)
+    monkeypatch.setattr(cache._sample, "sample", lambda *_: layout)
     return cache
 
 

@@ -222,7 +222,7 @@ def test_relations_of_three_objects_need_three(relations):
             "randomisation.finishes.wall",
             "gold",
         ),
-        ({"randomisation": {"cameras": {"min_position": 0.05}}}, "min_position 0.05", "position 0.02"),
+        ({"randomisation": {"cameras": {"min_position": 0.05}}}, "min_position 0.05", "position, 0.02"),
         ({"randomisation": {"object_sets": [["spam"]]}}, "randomisation.object_sets.0", "spam"),
         ({"randomisation": {"distractors": {"ids": ["spam"]}}}, "randomisation.distractors.ids", "spam"),
         ({"randomisation": {"distractors": {"ids": []}}}, "randomisation.distractors.ids", ""),

@@ -73,7 +73,7 @@ class ConversionSettings:
     """Time limit per episode in seconds. An episode that exceeds the time or memory limit, or crashes its process, is
     retried once. If it fails again, it can't be written; see --skip-errors."""
     memory_gb: float = 8.0
-    """Memory limit per process in GB."""
+    """Memory limit per process in GiB."""
     pack: Annotated[str | None, tyro.conf.arg(metavar="PACK"), _NO_HINT] = None
     """Name or folder of the object pack to use instead of the recorded one."""
     boxes: Annotated[bool, tyro.conf.Suppress] = False
@@ -97,7 +97,7 @@ class ConversionSettings:
                 "invalid time limit", where="--episode-seconds", expected=expected, found=self.episode_seconds
             )
         if not self.memory_gb > 0:
-            raise DatasetError("invalid memory limit", where="--memory-gb", expected="> 0 GB", found=self.memory_gb)
+            raise DatasetError("invalid memory limit", where="--memory-gb", expected="> 0 GiB", found=self.memory_gb)
         if len(set(self.cameras)) < len(self.cameras):
             found = " ".join(self.cameras)
             raise DatasetError("repeated camera", where="--cameras", expected="each name once", found=found)

@@ -164,7 +164,7 @@ class DataInfoRecord(_JsonObject):
     )
     action_space: _ActionSpace = Field(
         description="{relative_position: [1st percentile (3), 99th percentile (3)] of rel_pos in m,"
-        " relative_rotation: the same of rel_orn as Euler angles about fixed axes x, y, z in rad};"
+        " relative_rotation: these percentiles of the Euler angles of rel_orn (fixed axes x, y, z) in rad};"
         " without the last rows, which are 0 by definition"
     )
 

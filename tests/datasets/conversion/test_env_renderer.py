@@ -162,7 +162,7 @@ def test_depth_agrees_with_the_cameras(source, recording):
             [
                 geometry.DepthView(
                     *(n, frame.depth[n], m.intrinsic, parents.get(n, np.eye(4)) @ m.camera_in_parent),
-                    on_hand=m.parent == "ee",
+                    on_gripper=m.parent == "ee",
                 )
                 for n, m in source.cameras().items()
             ]
@@ -182,13 +182,13 @@ def test_different_scene_is_refused(source, recording):
     moved = {kind: dict(arrays) for kind, arrays in recording.states.items()}
     moved["actors"]["object_3"] = moved["actors"]["object_3"] + np.float32(0.01)
     with pytest.raises(DatasetError, match="seed 11, object_3: the rebuilt scene differs.* 17.3 mm off"):
-        source.load(spoiled(states=moved))
+        source.load_scene(spoiled(states=moved))
     fewer = {kind: dict(arrays) for kind, arrays in recording.states.items()}
     del fewer["actors"]["object_3"]
     with pytest.raises(DatasetError, match="the rebuilt scene differs"):
-        source.load(spoiled(states=fewer))
+        source.load_scene(spoiled(states=fewer))
     with pytest.raises(DatasetError, match="expected fly away"):
-        source.load(spoiled(instruction="fly away"))
+        source.load_scene(spoiled(instruction="fly away"))
     source.load_scene(recording)
 
 

@@ -163,7 +163,10 @@ def test_an_imported_folder_can_be_resumed(dataset, tmp_path):
 def test_from_the_command_line(made, tmp_path, capsys):
     command = ["convert", str(made), "--to", "lerobot", "--out", str(tmp_path / "out")]
     assert main.run([*command, "--append"]) == 2
-    assert capsys.readouterr().err == "error: --append: this option does not apply to a LeRobot dataset. Omit it.\n"
+    assert (
+        capsys.readouterr().err
+        == "error: --append: this option does not apply to a LeRobot dataset. Omit the option.\n"
+    )
     assert main.run([*command, "--codec", "av1", "--cameras", "static_camera", "--no-depth"]) == 0
     assert "2 episodes, 14 steps" in capsys.readouterr().out
     dataset = LeRobotDataset(tmp_path / "out")
@@ -174,7 +177,7 @@ def test_from_the_command_line(made, tmp_path, capsys):
     assert main.run(other) == 2
     assert (
         capsys.readouterr().err
-        == "error: --lerobot-version: this option does not apply to a RoboCAS folder. Omit it.\n"
+        == "error: --lerobot-version: this option does not apply to a RoboCAS folder. Omit the option.\n"
     )
 
 

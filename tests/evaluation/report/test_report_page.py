@@ -123,7 +123,7 @@ def test_columns(result, monkeypatch, capsys):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "pyarrow" else find(name))
     assert report(Report((result.folder,))) == 0
     assert not (result.folder / PARQUET).exists()
-    assert "episodes.parquet was not written: pyarrow is missing" in capsys.readouterr().out
+    assert "episodes.parquet was not written, because pyarrow is missing" in capsys.readouterr().out
 
 
 def test_commands_on_partial_results(tmp_path, capsys):
