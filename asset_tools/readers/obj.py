@@ -309,9 +309,9 @@ def _numbers(rows: list[str], columns: int, fill: float | None = None) -> Array:
 
 
 def _colors(rows: list[str]) -> Array | None:
-    """Return the colours (V, 3) in 0..1 of vertices "x y z r g b"; None if no vertex has a colour.
+    """Return the colours (V, 3) in 0..1 of vertices "x y z r g b", or None.
 
-    A vertex without a colour is white.
+    The result is None if the first, the middle and the last vertex have no colour. A vertex without a colour is white.
     """
     if len(rows) == 0 or not any(len(row.split()) in (6, 7) for row in (rows[0], rows[len(rows) // 2], rows[-1])):
         return None

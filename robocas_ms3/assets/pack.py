@@ -144,11 +144,12 @@ def find_packs() -> dict[str, Path]:
     return found
 
 
-def load_pack(name_or_path: str | Path) -> Pack:
+def load_pack(name_or_path: str | Path, *, usage: bool = True) -> Pack:
     """Load and verify a pack.
 
     Args:
         name_or_path: name of a bundled or imported pack, or its folder.
+        usage: whether the user passed the name; False if a file contains it (`RobocasError.usage`).
 
     Raises:
         AssetError: the pack is unknown, or one of its files is missing, changed, damaged or not listed.
@@ -162,7 +163,7 @@ def load_pack(name_or_path: str | Path) -> Pack:
             expected=f"one of {', '.join(known)}, or a folder with a {MANIFEST}",
             fix="See `robocas assets list`, or make one: `robocas assets import-scans` for objects, "
             "`robocas assets import-partnet` for furniture.",
-            usage=True,
+            usage=usage,
         )
     path = folder / MANIFEST
     status = path.stat()

@@ -107,7 +107,7 @@ def run(argv: Sequence[str]) -> int:
         _set_library_folders()
         with forbid_exit(f"robocas {arguments[0]}"):
             settings = with_absolute_paths(settings)
-            check_inputs(settings, fix=f"See robocas {arguments[0]} --help.")
+            check_inputs(settings, fix=f"See {_program_name(arguments)} --help.")
             return command(settings)
     except KeyboardInterrupt as interrupt:  # its argument: how to continue
         return _write_line("; ".join(["interrupted", *map(str, interrupt.args)]), sys.stderr, INTERRUPTED)
@@ -163,6 +163,12 @@ def parse(words: Sequence[str]) -> tuple[Callable[[Any], int], Any]:
 def module_of(name: str) -> ModuleType:
     """Import and return the module of a command, given by the name of the command."""
     return importlib.import_module(f"robocas_ms3.cli.{name.replace('-', '_')}")
+
+
+def _program_name(words: Sequence[str]) -> str:
+    """Return the words that name the command, such as "robocas eval report"."""
+    subcommands = getattr(module_of(words[0]), "COMMANDS", {})
+    return " ".join(["robocas", words[0], *(word for word in words[1:2] if word in subcommands)])
 
 
 def settings_type(command: Callable[[Any], int]) -> type:

@@ -57,13 +57,16 @@ class Registry(Mapping[str, T]):
     def __len__(self) -> int:
         return sum(1 for _ in self)
 
-    def find(self, name: str, *, where: object = "") -> T:
-        """Return an object by name; raise ExtensionError if the name is unknown or its entry point cannot be loaded."""
+    def find(self, name: str, *, where: object = "", usage: bool = True) -> T:
+        """Return an object by name; raise ExtensionError if the name is unknown or its entry point cannot be loaded.
+
+        ``usage``: whether the user passed the name; False if a file contains it (`RobocasError.usage`).
+        """
         if name in self:
             return self[name]
         known = list(self)
         what, expected, fix = f"no such {self.kind}", f"one of {known}", did_you_mean(name, known)
-        raise ExtensionError(what, where=where, expected=expected, found=repr(name), fix=fix, usage=True)
+        raise ExtensionError(what, where=where, expected=expected, found=repr(name), fix=fix, usage=usage)
 
     @cached_property
     def entry_points(self) -> dict[str, list[EntryPoint]]:

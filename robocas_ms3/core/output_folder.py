@@ -22,7 +22,7 @@ from robocas_ms3.core.errors import OutputExistsError, RobocasError
 from robocas_ms3.core.files import clear_folder, delete_path, encode_json, make_folder, write_json
 from robocas_ms3.core.locks import LOCK, lock_folder
 
-_LEFTOVERS = (".*.tmp*", ".*.old")  # of `files.atomic_file` and `files.atomic_folder` in a killed process
+_TEMPORARY = (".*.tmp*", ".*.old")  # of `files.atomic_file` and `files.atomic_folder` in a killed process
 _OVERWRITTEN = "overwritten"  # key of the record while the old content is moved away; a run that finds it starts again
 _SHOWN_CHANGES = 8
 _SHOWN_VALUE = 60  # characters
@@ -138,11 +138,11 @@ class OutputFolder:
             return
         make_folder(self.path)
         if not self._shared:
-            remove_leftovers(self.path)
+            remove_temporary_files(self.path)
         write_json(self._record_path(), record, sync=True)
 
     def _hide_content(self) -> None:
-        """Move the content into a temporary folder, which `remove_leftovers` deletes; move the record last."""
+        """Move the content into a temporary folder, which `remove_temporary_files` deletes; move the record last."""
         record = self._record_path()
         make_folder(record.parent)
         write_json(record, {self._kind.key: None, _OVERWRITTEN: True}, sync=True)
@@ -210,7 +210,7 @@ def _list_files(folder: Path) -> Iterator[Path]:
 
 
 def _is_hidden(path: Path) -> bool:
-    return any(fnmatchcase(path.name, pattern) for pattern in (LOCK, *_LEFTOVERS))
+    return any(fnmatchcase(path.name, pattern) for pattern in (LOCK, *_TEMPORARY))
 
 
 def is_empty(path: Path) -> bool:
@@ -247,9 +247,9 @@ def check_replaceable(path: Path | str, *, overwrite: bool | None = None, marker
         )
 
 
-def remove_leftovers(folder: Path) -> None:
+def remove_temporary_files(folder: Path) -> None:
     """Remove temporary files and folders of killed runs; the folder must be locked."""
-    for pattern in _LEFTOVERS:
+    for pattern in _TEMPORARY:
         for leftover in folder.glob(pattern):
             delete_path(leftover)
 

@@ -22,14 +22,17 @@ DESCRIPTIONS = {
         "Training: 6 objects, in pick at least 3 cm apart."
     ),
     "furniture-v1": (
-        "Other furniture: pick from a dining table, a shelf and a cabinet; open a drawer. "
+        "Other furniture: pick from a dining table, a shelf and the top of a cabinet; open a drawer. "
         "Training: a table, and a container to open."
     ),
     "instructions-v1": (
         "Other sentences and synonyms than in training (paraphrase), the name of another object (wrong), no text "
         "(empty). A language-conditioned policy should fail with wrong and empty instructions."
     ),
-    "looks-v1": "Other walls and floors (texture), or dim light from another direction (light), than in training.",
+    "looks-v1": (
+        "Other walls and floors (texture), or less ambient light and stronger light from the opposite side (light), "
+        "than in training."
+    ),
     "ms3-v1": "All four tasks in their default scenes, 200 episodes per task. Time limit: 40 to 120 s per episode.",
     "objects-v1": "Objects that are not in training: new objects of known kinds (new) and of new kinds (new_kind).",
     "paper-v1": (

@@ -108,7 +108,7 @@ def freeze_protocol(source: ProtocolSource, folder: Path, overrides: Sequence[st
     Yields the number of sampled episodes and the number of all episodes, after each episode. ``overrides``:
     ``KEY=VALUE`` texts, set in all configurations (`load_task_config`).
     """
-    pack = load_pack(str(source.rules.get("pack", "builtin")))
+    pack = load_pack(str(source.rules.get("pack", "builtin")), usage=False)
     values = {**source.rules, "pack_hash": sha256(pack.root / MANIFEST)}
     rules = parse(Protocol, values, EvaluationError, where="rules", about=INVALID_RULES)
     configs, train = _load_configs(source.parts, overrides), _load_configs(source.train, overrides)

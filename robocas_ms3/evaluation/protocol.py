@@ -159,7 +159,7 @@ class LoadedProtocol:
         """Return what the protocol measures; for a bundled protocol, the text of `DESCRIPTIONS`."""
         name = self.rules.name
         is_bundled = self.folder == bundled_protocols().get(name)
-        return DESCRIPTIONS[name] if is_bundled else self.rules.description
+        return DESCRIPTIONS.get(name, self.rules.description) if is_bundled else self.rules.description
 
     @property
     def splits(self) -> list[str]:
@@ -230,7 +230,7 @@ class LoadedProtocol:
 
     def check_cameras(self, spec: PolicySpec, episodes: Sequence[ProtocolEpisode]) -> None:
         """Raise `EvaluationError` if the configuration of an episode lacks a camera that a policy observes."""
-        robot = find_robot(self.rules.robot).description
+        robot = find_robot(self.rules.robot, usage=False).description
         for config in dict.fromkeys(episode.config for episode in episodes):
             known = [camera.name for camera in load_task_config(self.config_file(config)).cameras_of(robot)]
             for name in spec.cameras:

@@ -97,7 +97,7 @@ class EvaluationSession:
         self.run_record = self._make_run_record(backend)
         self.folder = settings.choose_folder(rules.name, self.played_as)
         self.outcomes: dict[int, Outcome] = {}
-        objects = load_pack(rules.pack).objects
+        objects = load_pack(rules.pack, usage=False).objects
         self._layouts_of = cache(lambda config: FrozenLayouts(self.protocol.layouts_file(config), objects))
         self._refill = backend != "gpu"
         self._env: Any = None
@@ -335,7 +335,7 @@ class EvaluationSession:
 
     def _make_run_record(self, backend: str) -> results.RunRecord:
         rules, name = self.protocol.rules, self.settings.policy
-        pack = sha256(load_pack(rules.pack).root / MANIFEST)
+        pack = sha256(load_pack(rules.pack, usage=False).root / MANIFEST)
         if pack != rules.pack_hash:
             what, fix = (
                 f"the object pack {rules.pack} differs from the pack of the protocol",

@@ -127,8 +127,8 @@ def time_path(path: JointPath, *, velocity: float, acceleration: float, dt: floa
 
     Args:
         path: path in joint space.
-        velocity: velocity limit of each joint, rad/s.
-        acceleration: acceleration limit of each joint, rad/s^2.
+        velocity: velocity limit of each joint, rad/s; `SAFETY` times this value is used.
+        acceleration: acceleration limit of each joint, rad/s^2; `SAFETY` times this value is used.
         dt: time between rows, s.
     """
     from toppra.algorithm import TOPPRA  # imports matplotlib (0.2 s)
@@ -158,8 +158,8 @@ def time_with_stops(waypoints: Array, *, velocity: float, acceleration: float, d
 
     Args:
         waypoints: (m, n) configurations, rad, or other positions with equal limits.
-        velocity: velocity limit of each joint, rad/s.
-        acceleration: acceleration limit of each joint, rad/s^2.
+        velocity: velocity limit of each joint, rad/s; `SAFETY` times this value is used.
+        acceleration: acceleration limit of each joint, rad/s^2; `SAFETY` times this value is used.
         dt: time between rows, s.
     """
     points = np.asarray(waypoints, dtype=np.float64)

@@ -16,7 +16,7 @@ from typing import Any
 from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, load_json, load_npy
 from robocas_ms3.core.errors import PlanError
 from robocas_ms3.core.files import atomic_file, encode_json, flush_to_disk, make_folder, write_json
-from robocas_ms3.core.output_folder import remove_leftovers
+from robocas_ms3.core.output_folder import remove_temporary_files
 from robocas_ms3.core.text import format_count, one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.conversion.data_info import write_data_info
@@ -95,17 +95,17 @@ def _join_files(folder: PlanFolder, files: EpisodeFiles, on_stage: OnStage) -> N
     seeds = {part: [each.seed for each in episodes] for part, episodes in files.items()}
     for part, episodes in files.items() if "layouts" in plan.stages else ():
         path, layouts = out / LAYOUTS / f"{plan.part_name(part)}.npy", [each.layout_path for each in episodes]
-        remove_leftovers(make_folder(path.parent))
+        remove_temporary_files(make_folder(path.parent))
         damage, write = partial(_find_layouts_damage, path, seeds[part]), partial(join_frozen_layouts, path, layouts)
         _join_file(path, layouts, damage, write, partial(on_stage, f"joining layouts, {plan.part_name(part)}"))
     if "datasets" in plan.stages:
         root, count = out / DATASETS / "robocas", sum(map(len, files.values()))
-        remove_leftovers(make_folder(root))
+        remove_temporary_files(make_folder(root))
         damage, write = partial(_find_dataset_damage, root, count), partial(_join_dataset, plan, root, files)
         _join_file(root, _dataset_sources(plan, root, files), damage, write, partial(on_stage, "joining the dataset"))
     for part, episodes in files.items() if "demonstrations" in plan.stages else ():
         path, recordings = out / DEMOS / plan.part_name(part) / TRAJECTORY, [each.recording_path for each in episodes]
-        remove_leftovers(make_folder(path.parent))
+        remove_temporary_files(make_folder(path.parent))
         damage, write = partial(find_violation, path, seeds[part]), partial(merge, recordings, path)
         _join_file(
             path, recordings, damage, write, partial(on_stage, f"joining demonstrations, {plan.part_name(part)}")

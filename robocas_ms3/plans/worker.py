@@ -27,7 +27,7 @@ from robocas_ms3.core.errors import (
     WorkerStartError,
 )
 from robocas_ms3.core.files import delete_path, write_json
-from robocas_ms3.core.output_folder import remove_leftovers
+from robocas_ms3.core.output_folder import remove_temporary_files
 from robocas_ms3.core.text import format_error
 from robocas_ms3.core.workers import Limits, WorkerPool, use_one_torch_thread
 from robocas_ms3.datasets.conversion import rendered_source
@@ -248,7 +248,7 @@ class WorkUnitWorker:
                     raise
                 reason = format_error(error, 200)
             crashes.append(f"{stage}: {reason}")
-            remove_leftovers(files.folder)
+            remove_temporary_files(files.folder)
         return {"success": False, "failures": [crashes[-1]]}
 
     def stop(self) -> None:

@@ -39,9 +39,12 @@ ROBOTS = Registry(
 )
 
 
-def find_robot(name: str | None, *, where: object = "robot") -> RobotSpec:
-    """Return the registered robot of this name, or the default robot for None."""
-    spec = ROBOTS.find(name or DEFAULT_ROBOT, where=where)
+def find_robot(name: str | None, *, where: object = "robot", usage: bool = True) -> RobotSpec:
+    """Return the registered robot of this name, or the default robot for None.
+
+    ``usage``: whether the user passed the name; False if a file contains it (`RobocasError.usage`).
+    """
+    spec = ROBOTS.find(name or DEFAULT_ROBOT, where=where, usage=usage)
     if spec.description.uid != (name or DEFAULT_ROBOT):
         fix = "Rename the entry point to the uid in the robot's description."
         raise ExtensionError(

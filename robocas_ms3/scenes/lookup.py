@@ -53,7 +53,7 @@ def find_furniture(pack: Pack, asset_id: str, *, key: str) -> LoadedFurniture:
     """
     other, _, name = asset_id.rpartition("/")
     if other:
-        pack = load_pack(other)
+        pack = load_pack(other, usage=False)
     _check_known(f"{key}: no such furniture in pack {pack.name!r}", name, pack.furniture)
     return pack.furniture[name]
 

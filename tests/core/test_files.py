@@ -112,7 +112,7 @@ def test_sync_flushes_files_before_the_rename(tmp_path, monkeypatch):
     (_, temporary), *_ = done[1:]
     assert done[1:] == [("sync", temporary), ("rename", temporary), ("sync", tmp_path.name)]
     assert temporary.startswith(".b.")
-    assert temporary.endswith(".tmp.json")  # the pattern of `output_folder.remove_leftovers`
+    assert temporary.endswith(".tmp.json")  # the pattern of `output_folder.remove_temporary_files`
     done.clear()
     with atomic_folder(tmp_path / "folder", sync=True) as folder:
         (folder / "file").write_text("")

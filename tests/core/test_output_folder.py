@@ -13,7 +13,7 @@ import pytest
 from robocas_ms3.core.errors import OutputExistsError, RobocasError
 from robocas_ms3.core.files import atomic_folder
 from robocas_ms3.core.locks import lock_folder
-from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, is_empty, remove_leftovers
+from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, is_empty, remove_temporary_files
 
 KIND = FolderKind("robocas test", ("run.json",), "rate", markers=("old_format",))
 SETTINGS = {"rate": 5, "camera": {"size": [640, 480], "depth": True}}
@@ -197,7 +197,7 @@ def test_leftovers_are_removed_and_links_are_not_followed(tmp_path):
     (tmp_path / "disk").mkdir()
     (tmp_path / "disk" / "file").touch()
     (tmp_path / ".link.tmp").symlink_to(tmp_path / "disk")
-    remove_leftovers(tmp_path)
+    remove_temporary_files(tmp_path)
     assert names(tmp_path) == ["disk", "kept.tmp"]
     assert (tmp_path / "disk" / "file").exists()
 

@@ -63,7 +63,7 @@ def prepare_dataset(source: Path, out: Path, embed: Embed | None) -> None:
 
     Raises:
         DatasetError: the source is another dataset, or the base of the robot moves in it.
-        OutputExistsError: the output folder has other files.
+        OutputExistsError: the output folder exists and is not empty.
     """
     check_replaceable(out)
     dataset = _open_export(source)

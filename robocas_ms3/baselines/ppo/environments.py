@@ -105,7 +105,8 @@ class PpoEnvironments:
         self._config, self._device = config, device
         self._kwargs: dict[str, Any] = kwargs | {"max_episode_steps": horizon}
         self.name = f"episodes of {config.scenes or f'one fruit, {config.task}'}"
-        scene = {"task": config.task, "scenes": scenes.model_dump(mode="json"), "horizon": horizon}
+        settings = scenes.model_dump(mode="json", exclude={"description"})
+        scene = {"task": config.task, "scenes": settings, "horizon": horizon}
         self.hash = hashlib.sha256(json.dumps(scene, sort_keys=True).encode()).hexdigest()
         self.episodes = config.layouts
         name = Path(config.scenes).stem if config.scenes else "one fruit"

@@ -104,7 +104,8 @@ def read_run(folder: Path) -> RunRecord:
         raise TrainingError("unreadable JSON file", where=path, found=error, fix=fix) from error
     if not isinstance(record, dict) or record.get("kind") != RunRecord.model_fields["kind"].default:
         kind = f'"kind": "{RunRecord.model_fields["kind"].default}"'
-        raise TrainingError("not the run.json of a training run", where=path, expected=kind, found="another kind")
+        found = f'"kind": {record.get("kind")!r:.80}' if isinstance(record, dict) else type(record).__name__
+        raise TrainingError("not the run.json of a training run", where=path, expected=kind, found=found)
     return parse(RunRecord, record, TrainingError, where=path)
 
 

@@ -93,7 +93,8 @@ def train_run(options: RunOptions, progress: ProgressCallbacks | None = None) ->
         OutputExistsError: the folder has a run with other settings, versions or data, or files of other origin.
         KeyboardInterrupt: Ctrl-C; the same call continues the run.
     """
-    require_extra("train", "baselines", "accelerate", "safetensors", "tensorboard", "transformers")
+    require_extra("train", "baselines", "accelerate", "safetensors", "tensorboard")
+    require_extra("train", "baselines", "transformers", load=False)  # only rt1 imports it
     from robocas_ms3.baselines.training.run_folder import RunFolder, describe_hardware, make_accelerator
     from robocas_ms3.baselines.training.supervised import train_supervised
 

@@ -31,7 +31,7 @@ _HEADERS = {"rgb": (8, 3), "depth": (16, 1)}
 Sizes = dict[str, tuple[int, int]]
 """Camera -> width and height of its images."""
 ReadHeader = Callable[[Path], ImageHeader | None]
-"""`read_header`, or `check_ends`, which returns None; raises ValueError or OSError for a damaged image."""
+"""`read_header`, or `check_file_ends`, which returns None; raises ValueError or OSError for a damaged image."""
 
 
 def check_cameras(folder: Path, image_options: ImageOptions) -> Iterator[Violation]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import write_json
-from robocas_ms3.core.output_folder import OutputFolder, remove_leftovers
+from robocas_ms3.core.output_folder import OutputFolder, remove_temporary_files
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.conversion.conversion_input import ConversionInput, open_trajectory
@@ -79,7 +79,7 @@ def convert(
         settings.require_renderer()
         embed = partial(_look_up_embeddings, embed_texts(source, entries)) if settings.embeddings else None
         output.start(content)
-        remove_leftovers(out / schema.PREVIEW_FOLDER)
+        remove_temporary_files(out / schema.PREVIEW_FOLDER)
         previous = _read_previous_split(out)
         for folder in (out / schema.episode_folder(number) for number, _ in tasks):
             if folder.is_dir() and (path := find_damaged_file(folder, image_options)):
@@ -96,7 +96,7 @@ def convert(
             written, incomplete = write_episodes(pending, output, on_episode)
         finally:
             for folder in (out, out / schema.PREVIEW_FOLDER):
-                remove_leftovers(folder)  # of workers that crashed
+                remove_temporary_files(folder)  # of workers that crashed
         if incomplete:
             write_json(out / schema.CONVERSION_FILE, move_unwritten_to_skipped(out, content, incomplete.reasons))
         copy_failures(settings.source.parent, out, source.file.env_info)

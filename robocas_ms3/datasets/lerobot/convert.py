@@ -15,7 +15,7 @@ from typing import Any
 
 from robocas_ms3.core.errors import DatasetError, IncompleteDatasetError, OutputExistsError
 from robocas_ms3.core.files import add_path_to_errors, delete_path, flush_to_disk, make_folder
-from robocas_ms3.core.output_folder import FolderKind, OutputFolder, remove_leftovers
+from robocas_ms3.core.output_folder import FolderKind, OutputFolder, remove_temporary_files
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.core.text import format_count
 from robocas_ms3.datasets.conversion.conversion_input import ConversionInput, open_input
@@ -81,14 +81,14 @@ def convert_lerobot(
         plan = _make_plan(conversion_input, settings.codec, variant)
         recorded_settings = {key: plan[key] for key in ("settings", "made_with")}
         with OutputFolder(out, _OUTPUT, recorded_settings, overwrite=settings.overwrite) as output:
-            _check_episodes(output, plan)  # everything that may fail runs before the output changes
+            _check_same_episodes(output, plan)  # everything that may fail runs before the output changes
             settings.require_renderer()
             if output.recorded is None or not (out / INFO_FILE).is_file():
                 output.start(plan)
                 for name in (_JOINED, *_FOLDERS):  # incomplete, from an interrupted conversion
                     if os.path.lexists(out / name):
                         delete_path(out / name)
-                remove_leftovers(out / _EPISODES)
+                remove_temporary_files(out / _EPISODES)
                 pending = _find_missing_episodes(settings, variant, plan["episodes"])
                 if on_start:
                     on_start(len(pending.tasks))
@@ -129,7 +129,7 @@ def _make_plan(conversion_input: ConversionInput, codec: str, variant: Variant) 
     return json.loads(json.dumps(plan))
 
 
-def _check_episodes(output: OutputFolder, plan: Mapping[str, Any]) -> None:
+def _check_same_episodes(output: OutputFolder, plan: Mapping[str, Any]) -> None:
     """Raise OutputExistsError if the output has other episodes than the plan.
 
     A recording that could not be read before may be readable now.

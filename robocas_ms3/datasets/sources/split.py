@@ -19,12 +19,13 @@ def split_by_seed(
 ) -> tuple[list[int], list[int]]:
     """Split episodes by seed; return the numbers of the training and validation episodes.
 
-    90 % of the seeds are for training, 10 % for validation. ``seed_by_episode``: seed of each episode by number; None:
-    the number replaces the seed. The split depends on the seeds alone, not on their order. With two or more seeds,
-    validation has at least one.
+    90 % of the seeds are for training, 10 % for validation. The split depends on the seeds alone, not on their order.
+    Without ``previous``, two or more seeds give at least one validation seed.
 
-    ``previous``: an earlier split. Its episodes keep their split, and so do other episodes with the same seeds. New
-    seeds are added to validation until it has a tenth of all seeds.
+    Args:
+        seed_by_episode: number of an episode -> its seed; for None, the number is the seed.
+        previous: training and validation episodes of an earlier split. They keep their split, and so do other episodes
+            with the same seeds. New seeds are added to validation until it has a tenth of all seeds.
     """
     known = {number: parse_seed(value) for number, value in seed_by_episode.items()}
     seeds = {number: number if seed is None else seed for number, seed in known.items()}

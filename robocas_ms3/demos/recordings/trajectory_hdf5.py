@@ -216,7 +216,7 @@ def _collect_arrays(node: Any, depth: int) -> Any:
         _check_stored_in_file(node)
         return node
     if not depth:
-        raise ValueError(f"groups are nested more than {_MAX_DEPTH} levels deep")
+        raise ValueError("expected an array, found a group; groups are nested too deeply")
     # not node.items(), which holds the lock of h5py as long as the traceback of an error exists
     return {name: _collect_arrays(node[name], depth - 1) for name in node}
 

@@ -202,8 +202,8 @@ def message_file_name(path: str) -> str:
 
     Returns the whole path if the name would mean a file of a bundled protocol, but the path is another file.
     """
-    parts, shipped = Path(path).parts[-FILE_NAME_PARTS:], protocols_dir()
-    if len(parts) < FILE_NAME_PARTS or ((shipped / parts[0]).exists() and not Path(path).is_relative_to(shipped)):
+    parts, bundled = Path(path).parts[-FILE_NAME_PARTS:], protocols_dir()
+    if len(parts) < FILE_NAME_PARTS or ((bundled / parts[0]).exists() and not Path(path).is_relative_to(bundled)):
         return path
     return "/".join(parts)
 

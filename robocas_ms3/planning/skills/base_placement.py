@@ -22,7 +22,7 @@ from robocas_ms3.planning.skills.drive import (
     drive,
     find_best_route,
     find_free_route,
-    is_body_clear,
+    is_base_clear,
     read_surroundings,
     sample_base_poses,
 )
@@ -137,7 +137,7 @@ def drive_to_handle(arm: Arm, *, relocate: bool = False) -> None:
 
     def fraction(goal: Array) -> float:
         frame = arm_base_in_world(arm, goal)
-        if not is_body_clear(arm.robot, frame, swept):  # the opening part would hit the robot
+        if not is_base_clear(arm.robot, frame, swept):  # the opening part would hit the robot
             return 0.0
         return estimate_pull_fraction(arm, part, frame, to_arm_base_frame(others, frame))
 

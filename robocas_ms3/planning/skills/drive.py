@@ -121,7 +121,7 @@ def find_best_route(
     best: tuple[float, list[Array]] = (0.0, [])
     scored = 0
     for goal in goals:
-        if not is_body_clear(arm.robot, arm_base_in_world(arm, goal), around.cloud):
+        if not is_base_clear(arm.robot, arm_base_in_world(arm, goal), around.cloud):
             continue
         scored += 1
         if scored > POSES_SCORED:
@@ -166,7 +166,7 @@ def _is_leg_free(arm: Arm, start: Array, goal: Array, around: Surroundings) -> b
     width = arm.planner.finger_width
     for pose in np.linspace(start, goal, count)[1:]:
         frame = arm_base_in_world(arm, pose)
-        if not is_body_clear(arm.robot, frame, around.cloud):
+        if not is_base_clear(arm.robot, frame, around.cloud):
             return False
         arm.planner.set_scene(to_arm_base_frame(around.obstacles, frame))
         if arm.planner.find_collisions(arm.qpos, width):
@@ -174,8 +174,8 @@ def _is_leg_free(arm: Arm, start: Array, goal: Array, around: Surroundings) -> b
     return True
 
 
-def is_body_clear(robot: RobotDescription, arm_base_in_world: Array, cloud: Array) -> bool:
-    """Return whether no point of ``cloud`` (P, 3), in the world frame, is inside the mobile base."""
+def is_base_clear(robot: RobotDescription, arm_base_in_world: Array, cloud: Array) -> bool:
+    """Return whether no point of ``cloud`` (P, 3), world frame, is inside the body; see `scenes.robot_placement`."""
     root = arm_base_in_world.copy()
     root[2, 3] -= robot.arm_base_height  # on the floor
     return robot_placement.is_body_clear(root, cloud)

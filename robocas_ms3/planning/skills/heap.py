@@ -94,7 +94,7 @@ class Heap:
             UnrecoverableError: reason ``too_many_obstacles``: ``MAX_MOVES`` moves have been made.
         """
         if self.moves_made >= MAX_MOVES:
-            raise UnrecoverableError("horizon", "too_many_obstacles")
+            raise UnrecoverableError("episode", "too_many_obstacles")
         with self.arm.planning_time():
             slots = self._find_obstacles()
         yield from (Move(skill, slot) for slot in slots[:2] for skill in ("push", "lift"))

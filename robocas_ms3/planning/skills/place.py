@@ -93,7 +93,7 @@ def plan_carry(arm: Arm, slot: int) -> Trajectory:
 
     def plan(clearance: float) -> Trajectory:
         arm.planner.set_scene(arm.scene.obstacles(exclude=slot, clearance=clearance))
-        return _plan_to_first_feasible(arm, drops, qpos)
+        return _plan_to_first_drop(arm, drops, qpos)
 
     return plan_first_feasible((CARRY_CLEARANCE, 0.0), plan, PlanningError("transfer", "no_plan"))
 
@@ -118,7 +118,7 @@ def _rank_drops(arm: Arm, slot: int, drops: Array, qpos: Array) -> NDArray[np.in
     return np.lexsort((cost, np.ceil(overhang / 0.015)))
 
 
-def _plan_to_first_feasible(arm: Arm, drops: Array, qpos: Array) -> Trajectory:
+def _plan_to_first_drop(arm: Arm, drops: Array, qpos: Array) -> Trajectory:
     """Plan a motion to the first feasible drop pose.
 
     ``drops`` (N, 4, 4) are TCP poses, ``qpos`` (N, 7) the configurations at these poses.

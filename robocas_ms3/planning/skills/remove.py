@@ -122,10 +122,10 @@ def plan_placement(arm: Arm, slot: int) -> Trajectory:
                 yield motions @ scene.tcp_in_base
 
     failure = PlanningError("remove", "no_free_position")
-    return plan_first_feasible(free_poses(), lambda places: _plan_to_first_feasible(arm, places), failure)
+    return plan_first_feasible(free_poses(), lambda places: _plan_to_first_place(arm, places), failure)
 
 
-def _plan_to_first_feasible(arm: Arm, places: Array) -> Trajectory:
+def _plan_to_first_place(arm: Arm, places: Array) -> Trajectory:
     """Plan a motion to above the first feasible TCP pose of ``places`` (N, 4, 4) and down to this pose."""
     start = arm.qpos
     nearest = np.argsort(np.linalg.norm(places[:, :2, 3] - arm.scene.tcp_in_base[:2, 3], axis=1), kind="stable")

@@ -169,21 +169,21 @@ def _read(path: Path) -> dict[Any, Any]:
 
 def _find_file(config: str | Path, folder: Path | None = None, where: str = "") -> Path:
     """Return the file of a bundled configuration or of a path, which is relative to ``folder`` if given."""
-    shipped, name = bundled_configs(), str(config)
-    if name in shipped:
-        return shipped[name]
+    configs, name = bundled_configs(), str(config)
+    if name in configs:
+        return configs[name]
     path = Path(config) if folder is None else folder / config
     is_yaml = path.suffix in _SUFFIXES
     with suppress(OSError, ValueError):  # such as a name that is too long
         if is_yaml and path.is_file():
             return path
-    likely = did_you_mean(path.stem if is_yaml else name, shipped)
+    likely = did_you_mean(path.stem if is_yaml else name, configs)
     what, expected = "no such task configuration", "a YAML file (.yaml, .yml) or a bundled configuration"
     if folder is not None:
         files = [str(path.relative_to(folder)) for end in _SUFFIXES for path in sorted(folder.glob(f"*{end}"))]
         expected = f"a bundled configuration or a YAML file (.yaml, .yml) relative to {folder}"
         what = "no such base configuration"
-        likely = did_you_mean(name, [*shipped, *files]) or did_you_mean(f"{name}.yaml", files) or likely
+        likely = did_you_mean(name, [*configs, *files]) or did_you_mean(f"{name}.yaml", files) or likely
     if is_yaml and not likely:
         raise ConfigError(
             "no such configuration file", where=where or name, expected=expected, found=path.absolute(), usage=not where
@@ -191,7 +191,7 @@ def _find_file(config: str | Path, folder: Path | None = None, where: str = "") 
     raise ConfigError(
         what,
         where=where or name,
-        expected=expected + ("" if likely else f": {', '.join(sorted(shipped))}"),
+        expected=expected + ("" if likely else f": {', '.join(sorted(configs))}"),
         found=repr(name) if where else "",
         fix=f"{likely} All names: `robocas list`." if likely else "",
         usage=not where,
