@@ -29,8 +29,8 @@ class _ImportOptions:
     skip_errors: bool = False
     """Skip models with errors. Default: stop at the first error."""
     overwrite: bool = False
-    """Replace a pack of this name that was imported from other files or with other settings. Unchanged assets are
-    copied from the cache."""
+    """Replace a pack of this name that was imported from other files or with other settings.
+    Unchanged assets are copied from the cache."""
 
     def __post_init__(self) -> None:
         check_number("--jobs", self.jobs, 1)
@@ -109,8 +109,8 @@ class ImportPartNet(_ImportOptions):
     pack: str = "partnet"
     """Name of the new pack."""
     annotations: Maybe[Path] = None
-    """Folder with an annotation file ID.yaml for each model; ID is the name of the model's folder. Default: bundled
-    annotations of the six models of RoboCAS-v0."""
+    """Folder with an annotation file ID.yaml for each model; ID is the name of the model's folder.
+    Default: bundled annotations of the six models of RoboCAS-v0."""
 
 
 @dataclass(kw_only=True)

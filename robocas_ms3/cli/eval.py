@@ -35,13 +35,13 @@ class Freeze:
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE.yaml")]
-    """Protocol source: a YAML file with rules and groups of episodes. scripts/protocols has the sources of the
-    bundled protocols."""
+    """Protocol source: a YAML file with rules and groups of episodes.
+    scripts/protocols has the sources of the bundled protocols."""
     out: Path
     """Folder of the protocol."""
     set: Overrides = ()
-    """Set a key in all configurations of the protocol, such as `--set objects.count=12`; repeatable
-    (docs/configuration.md)."""
+    """Set a key in all configurations of the protocol, such as `--set objects.count=12`; repeatable.
+    docs/configuration.md lists the keys."""
 
 
 @resumable

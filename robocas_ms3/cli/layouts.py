@@ -42,8 +42,8 @@ class Build:
     seeds: Annotated[str, tyro.conf.arg(metavar="FIRST:END")] = "0:100"
     """Range of seeds, without END. With --objects, the layout of each object seed itself is added."""
     objects: Annotated[Maybe[str], tyro.conf.arg(metavar="SEEDS")] = None
-    """Objects seeds of a vector environment with fixed objects: a range such as 0:4 (0, 1, 2, 3) or a list such as
-    3,7. Default: build layouts for a single environment, whose objects change with the seed."""
+    """Objects seeds of a vector environment with fixed objects: 0:4 (0, 1, 2, 3), or 3,7.
+    Default: build layouts for a single environment, whose objects change with the seed."""
     engine: Literal["auto", "cpu", "gpu"] = "auto"
     """With --objects: physics engine of the vector environment; auto takes a GPU if there is one."""
     jobs: Jobs = CORES

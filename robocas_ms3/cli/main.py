@@ -11,6 +11,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields, make_dataclass
 from pathlib import Path
 from types import MappingProxyType, ModuleType
 from typing import Any, NoReturn, TextIO, get_type_hints
@@ -178,7 +179,18 @@ def settings_type(command: Callable[[Any], int]) -> type:
 
 
 def _parse_settings(command: Callable[[Any], int], prog: str, words: Sequence[str]) -> Any:
-    return tyro.cli(settings_type(command), prog=prog, args=words, config=CLI_STYLE, registry=METAVARS)
+    """Parse the options of a command.
+
+    Settings without fields of their own that inherit from several dataclasses have one group of options per base class
+    in the help: the base class FormatOptions is the group "format options".
+    """
+    settings, style = settings_type(command), {"prog": prog, "args": words, "config": CLI_STYLE, "registry": METAVARS}
+    bases = settings.__bases__
+    if len(bases) == 1:
+        return tyro.cli(settings, **style)
+    groups = make_dataclass("Groups", [(base.__name__.removesuffix("Options").lower(), base) for base in bases])
+    parsed = vars(tyro.cli(groups, description=inspect.getdoc(settings), **style)).values()
+    return settings(**{field.name: getattr(group, field.name) for group in parsed for field in fields(group)})
 
 
 def _accepts(command: Callable[[Any], int], words: Sequence[str]) -> bool:

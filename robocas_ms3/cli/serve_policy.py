@@ -25,8 +25,8 @@ class ServePolicy:
     """
 
     policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
-    """Policy to serve, as in robocas eval: a name from robocas list, a run folder of robocas train,
-    replay:TRAJECTORY.h5, or module:Class of your own code."""
+    """Policy to serve, as in robocas eval: a name from robocas list, a run folder of robocas train;
+    also replay:TRAJECTORY.h5, or module:Class of your own code."""
     host: str = "127.0.0.1"
     """Address on which the server listens; 0.0.0.0: all addresses of the machine."""
     port: int = 8000

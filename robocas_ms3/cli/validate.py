@@ -36,8 +36,8 @@ class Validate:
     replay: bool = False
     """Replay the 7-D actions of each episode in simulation, without rendering (RoboCAS folders only)."""
     min_success: Maybe[float] = None
-    """With --replay: lowest accepted success rate per task, 0 to 1. Exit status 1 if the rate of a task is lower, or if
-    no episode of a task could be replayed."""
+    """With --replay: lowest accepted success rate per task, 0 to 1.
+    Exit status 1 if the rate of a task is lower, or if no episode of a task could be replayed."""
     pack: Annotated[Maybe[str], tyro.conf.arg(metavar="PACK")] = None
     """With --replay: name or folder of the object pack to use instead of the recorded one."""
     json: bool = False

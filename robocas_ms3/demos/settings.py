@@ -59,8 +59,8 @@ class EpisodeSettings:
     robot: Annotated[str, tyro.conf.arg(metavar="ROBOT")] = DEFAULT_ROBOT
     """Name of the robot (`robocas list`); docs/extending.md shows how to add one."""
     after_policy: Annotated[str, tyro.conf.arg(metavar="POLICY"), _NO_HINT] = ""
-    """Record expert interventions (DAgger): this policy acts first, the scripted policy completes the task, and
-    only the scripted part is recorded. Values as `robocas eval --policy`.
+    """Record expert interventions (DAgger): this policy acts first, then the scripted policy completes the task.
+    Only the scripted part is recorded. Values as `robocas eval --policy`.
     Seeds in which the policy has succeeded or failed already are skipped."""
     after_steps: tuple[int, int] = (5, 60)
     """Minimum and maximum number of policy steps before the scripted policy continues; drawn uniformly per seed."""
@@ -138,12 +138,12 @@ class GenerateSettings:
     memory_gb: float = 8.0
     """Memory limit per process in GiB."""
     check_noise: Annotated[tuple[float, float] | None, _NO_HINT] = None
-    """Noise of the noise checks: standard deviation of each component of an action, in mm (translation) and degrees
-    (rotation). Default: 0.5 0.2."""
+    """Noise of the noise checks: standard deviation of each component of an action, in mm and degrees.
+    Default: 0.5 0.2."""
     fork: bool = True
     """Undo a failed attempt with a forked copy of the process.
-    --no-fork records the same episodes by simulating them again, which is slower; this is automatic where a fork is
-    unsafe (not Linux, CUDA in use, renderer open)."""
+    --no-fork records the same episodes by simulating them again, which is slower.
+    This is automatic where a fork is unsafe (not Linux, CUDA in use, renderer open)."""
     overwrite: bool = False
     """Delete the output and start again.
     Default: resume a run with the same settings, or add episodes to a finished run."""

@@ -17,20 +17,16 @@ _NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text states the defa
 
 
 @dataclass(frozen=True)
-class EvaluationSettings:
-    """Evaluate a policy in the episodes of a protocol and write the outcome of each episode as it ends.
-
-    Example: robocas eval pick --policy runs/pick --protocol paper-v1 --out eval/pick
-    """
+class EvaluationOptions:
+    """Policy, protocol and result."""
 
     tasks: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[TASK ...]"), _NO_HINT] = ()
     """Tasks to evaluate, such as pick.
-    Default: all tasks of the protocol. In paper-v1, select runs in the episodes of
-    pick, as in RoboCAS-v0."""
+    Default: all tasks of the protocol. In paper-v1, select runs in the episodes of pick, as in RoboCAS-v0."""
     policy: Annotated[str, tyro.conf.arg(metavar="POLICY")] = "scripted"
-    """Policy to evaluate: scripted (joint targets), scripted-ee-delta (7-D actions), scripted-perturbed (7-D actions
-    with an offset of 1 to 5 cm), random, noop, another name from `robocas list`, replay:TRAJECTORY.h5, a run folder
-    of `robocas train`, module:Class of your own code, or the address ws://HOST:PORT of `robocas serve-policy`."""
+    """Policy to evaluate: a name from `robocas list`, such as scripted (joint targets) or scripted-ee-delta;
+    a run folder of `robocas train`; module:Class of your own code; replay:TRAJECTORY.h5;
+    or the address ws://HOST:PORT of `robocas serve-policy`."""
     protocol: Annotated[str, tyro.conf.arg(metavar="PROTOCOL")] = "ms3-v1"
     """Name of a bundled protocol (`robocas eval protocols`), or a protocol folder."""
     out: Annotated[Path | None, _NO_HINT] = None
@@ -39,18 +35,18 @@ class EvaluationSettings:
     """Delete an existing result and start again. Default: continue a result that has the same settings."""
     retry_errors: bool = False
     """Repeat episodes that ended with an error, such as a lost connection to a policy server."""
-    envs: int = 2
-    """Number of environments that run at the same time; outcomes do not depend on it."""
-    workers: Annotated[int | None, _NO_HINT] = None
-    """Number of worker processes. Default: one per environment, at most one per CPU core."""
-    step_seconds: float = 300.0
-    """Time limit in seconds per environment step or reset of a worker process; the policy has no limit.
-    An episode whose worker exceeds it or crashes is repeated once. After a second failure it counts as failed, with
-    an error."""
-    memory_gb: float = 8.0
-    """Memory limit per worker process in GiB."""
-    backend: Literal["auto", "processes", "gpu"] = "auto"
-    """Where the simulation runs. auto: on a GPU if there is one, else in worker processes."""
+    weld: bool = False
+    """Fix lifted objects to the hand until the gripper is commanded to open, as RoboCAS-v0 does.
+    Only for protocols with RoboCAS-v0's steps (paper-v1), in worker processes.
+    Results with and without the weld are not comparable."""
+    render_size: Annotated[tuple[int, int] | None, tyro.conf.Suppress] = None
+    """Width and height in pixels of the images of ``env.render``; None: no images."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelectionOptions:
+    """Subset of the episodes of the protocol. Default: all."""
+
     shard: Annotated[str, tyro.conf.arg(metavar="K/N")] = "0/1"
     """Run shard K of N: the episodes whose number is K modulo N, 0 <= K < N.
     `robocas eval merge` joins the results."""
@@ -58,11 +54,32 @@ class EvaluationSettings:
     """Run only the episodes of this split, such as `seen`; `robocas eval protocols` lists the splits. Default: all."""
     episodes: Annotated[int | None, _NO_HINT] = None
     """Run only the first N episodes of each configuration. Default: all."""
-    weld: bool = False
-    """Fix lifted objects to the hand until the gripper is commanded to open, as RoboCAS-v0 does. Only for protocols
-    with RoboCAS-v0's steps (paper-v1), in worker processes. Results with and without the weld are not comparable."""
-    render_size: Annotated[tuple[int, int] | None, tyro.conf.Suppress] = None
-    """Width and height in pixels of the images of ``env.render``; None: no images."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationOptions:
+    """Processes and limits; outcomes do not depend on them."""
+
+    envs: int = 2
+    """Number of environments that run at the same time; outcomes do not depend on it."""
+    workers: Annotated[int | None, _NO_HINT] = None
+    """Number of worker processes. Default: one per environment, at most one per CPU core."""
+    backend: Literal["auto", "processes", "gpu"] = "auto"
+    """Where the simulation runs. auto: on a GPU if there is one, else in worker processes."""
+    step_seconds: float = 300.0
+    """Time limit in seconds per environment step or reset of a worker process; the policy has no limit.
+    An episode whose worker exceeds it or crashes is repeated once.
+    After a second failure it counts as failed, with an error."""
+    memory_gb: float = 8.0
+    """Memory limit per worker process in GiB."""
+
+
+@dataclass(frozen=True)
+class EvaluationSettings(EvaluationOptions, SelectionOptions, SimulationOptions):
+    """Evaluate a policy in the episodes of a protocol and write the outcome of each episode as it ends.
+
+    Example: robocas eval pick --policy runs/pick --protocol paper-v1 --out eval/pick
+    """
 
     def __post_init__(self) -> None:
         for name in ("envs", "episodes", "workers"):

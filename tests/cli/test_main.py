@@ -16,6 +16,7 @@ from robocas_ms3.cli import main as cli
 from robocas_ms3.cli.list import List
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.datasets import ConversionSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 HEAVY = {"torch", "scipy", "sapien", "mani_skill", "pydantic", "h5py", "trimesh"}
@@ -79,6 +80,26 @@ def test_every_command_has_a_help_that_fits_a_narrow_terminal_and_a_valid_exampl
     if len(words) == 2 or not subcommands(words[0]):
         (example,) = re.findall(r"Example: robocas (.+)", inspect.getdoc(cli.settings_type(command_of(*words))) or "")
         assert cli.parse(shlex.split(example))[0] == command_of(*words)
+
+
+@pytest.mark.parametrize(
+    ("words", "groups"),
+    [
+        ("eval run", ["evaluation", "selection", "simulation"]),
+        ("convert", ["conversion", "format", "render", "process"]),
+        ("generate", ["episode"]),
+    ],
+)
+def test_help_groups_the_options_of_large_commands(words, groups, capsys):
+    with pytest.raises(SystemExit):
+        cli.run([*words.split(), "--help"])
+    assert re.findall(r"^\W*(\w+) options\W*$", capsys.readouterr().out, re.MULTILINE) == groups
+
+
+def test_grouped_options_are_fields_of_the_settings():
+    _, settings = cli.parse(shlex.split("convert demos/F.h5 --out data --to lerobot --size 64 48 --no-depth --jobs 2"))
+    expected = ConversionSettings(Path("demos/F.h5"), Path("data"), to="lerobot", size=(64, 48), depth=False, jobs=2)
+    assert settings == expected
 
 
 MISTAKES = {  # arguments -> text of the error, printed before anything heavy is imported

@@ -23,42 +23,13 @@ _NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text states the defa
 
 
 @dataclass(frozen=True)
-class ConversionSettings:
-    """Convert a trajectory file to a dataset, or a RoboCAS dataset to a LeRobot dataset.
-
-    Example: robocas convert demos/pick/trajectory.h5 --out datasets/pick --jobs 2
-    """
+class ConversionOptions:
+    """Input, output and episodes."""
 
     source: Annotated[Path, tyro.conf.Positional]
     """Trajectory file F.h5 (with F.json next to it). With --to lerobot also the folder of a dataset with images."""
     out: Path
     """Output folder of the dataset."""
-    to: Annotated[str, tyro.conf.arg(metavar="FORMAT")] = "robocas"
-    """Output format: robocas, lerobot (needs the extra 'lerobot'), or a format of another package."""
-    lerobot_version: Version = NEWEST
-    """LeRobot version that will read the dataset. 0.6: LeRobot 0.6 and later (format v3.0 with language columns and
-    depth videos); 0.5: LeRobot 0.4.4 to 0.5.1 (format v3.0 with subtask_index); 2.1: openpi, GR00T and other readers
-    of format v2.1."""
-    codec: Literal["h264", "av1"] = "h264"
-    """Video codec of a LeRobot dataset; av1 needs half the disk space of h264."""
-    rate_hz: Annotated[float | None, tyro.conf.arg(name="rate", help_behavior_hint="")] = None
-    """Rate of the dataset in Hz; must divide the control frequency. Default: 5, or the rate of the input dataset."""
-    embeddings: bool = True
-    """Store embeddings of the instruction and the sub-goals (needs the extra 'language'; not for lerobot)."""
-    video: bool = True
-    """Write a video per episode and a contact sheet to OUT/preview, if there are at most 20 episodes (not for
-    lerobot)."""
-    all_videos: bool = False
-    """Write videos and a contact sheet for more than 20 episodes too."""
-    cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]"), _NO_HINT] = ()
-    """Names of the cameras. Default: all cameras of the input; with --append those of the output dataset."""
-    size: Annotated[tuple[int, int] | None, _NO_HINT] = None
-    """Image width and height in pixels. Default: the size in the task configuration (640 480); with --append the size
-    of the dataset."""
-    depth: bool = True
-    """Store depth images in addition to RGB."""
-    image_format: Literal["png", "jpg", "webp"] = "png"
-    """Format of RGB images (not for lerobot); the RoboCAS-v0 loader reads png only."""
     include_failed: bool = False
     """Convert failed episodes too."""
     overwrite: bool = False
@@ -67,19 +38,73 @@ class ConversionSettings:
     """Add episodes to an existing dataset. The existing episodes keep their numbers and their split."""
     skip_errors: bool = False
     """Skip episodes that can't be written, with a warning. Default: write the other episodes, then report an error."""
+    pack: Annotated[str | None, tyro.conf.arg(metavar="PACK"), _NO_HINT] = None
+    """Name or folder of the object pack to use instead of the recorded one."""
+    open_renderer: Annotated[Any, tyro.conf.Suppress, tyro.conf.Fixed] = None
+    """Function that opens a renderer, see `rendered_source.OpenRenderer`. Default: `env_renderer.EnvRenderer`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FormatOptions:
+    """Format and content of the dataset."""
+
+    to: Annotated[str, tyro.conf.arg(metavar="FORMAT")] = "robocas"
+    """Output format: robocas, lerobot (needs the extra 'lerobot'), or a format of another package."""
+    lerobot_version: Version = NEWEST
+    """LeRobot version that will read the dataset.
+    0.6: LeRobot 0.6 and later (format v3.0 with language columns and depth videos);
+    0.5: LeRobot 0.4.4 to 0.5.1 (format v3.0 with subtask_index);
+    2.1: openpi, GR00T and other readers of format v2.1."""
+    codec: Literal["h264", "av1"] = "h264"
+    """Video codec of a LeRobot dataset; av1 needs half the disk space of h264."""
+    rate_hz: Annotated[float | None, tyro.conf.arg(name="rate", help_behavior_hint="")] = None
+    """Rate of the dataset in Hz; must divide the control frequency. Default: 5, or the rate of the input dataset."""
+    embeddings: bool = True
+    """Store embeddings of the instruction and the sub-goals (needs the extra 'language'; not for lerobot)."""
+    video: bool = True
+    """Write a video per episode and a contact sheet to OUT/preview, if there are at most 20 episodes.
+    Not for lerobot."""
+    all_videos: bool = False
+    """Write videos and a contact sheet for more than 20 episodes too."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderOptions:
+    """Images of the dataset."""
+
+    cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]"), _NO_HINT] = ()
+    """Names of the cameras. Default: all cameras of the input; with --append those of the output dataset."""
+    size: Annotated[tuple[int, int] | None, _NO_HINT] = None
+    """Image width and height in pixels.
+    Default: the size in the task configuration (640 480); with --append the size of the dataset."""
+    depth: bool = True
+    """Store depth images in addition to RGB."""
+    image_format: Literal["png", "jpg", "webp"] = "png"
+    """Format of RGB images (not for lerobot); the RoboCAS-v0 loader reads png only."""
+    boxes: Annotated[bool, tyro.conf.Suppress] = False
+    """Compute the bounding box of the target in each image."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProcessOptions:
+    """Processes and limits; the dataset does not depend on them."""
+
     jobs: int = 1
     """Number of processes that render."""
     episode_seconds: float = 3600.0
-    """Time limit per episode in seconds. An episode that exceeds the time or memory limit, or crashes its process, is
-    retried once. If it fails again, it can't be written; see --skip-errors."""
+    """Time limit per episode in seconds.
+    An episode that exceeds the time or memory limit, or crashes its process, is retried once.
+    If it fails again, it can't be written; see --skip-errors."""
     memory_gb: float = 8.0
     """Memory limit per process in GiB."""
-    pack: Annotated[str | None, tyro.conf.arg(metavar="PACK"), _NO_HINT] = None
-    """Name or folder of the object pack to use instead of the recorded one."""
-    boxes: Annotated[bool, tyro.conf.Suppress] = False
-    """Compute the bounding box of the target in each image."""
-    open_renderer: Annotated[Any, tyro.conf.Suppress, tyro.conf.Fixed] = None
-    """Function that opens a renderer, see `rendered_source.OpenRenderer`. Default: `env_renderer.EnvRenderer`."""
+
+
+@dataclass(frozen=True)
+class ConversionSettings(ConversionOptions, FormatOptions, RenderOptions, ProcessOptions):
+    """Convert a trajectory file to a dataset, or a RoboCAS dataset to a LeRobot dataset.
+
+    Example: robocas convert demos/pick/trajectory.h5 --out datasets/pick --jobs 2
+    """
 
     def __post_init__(self) -> None:
         for first, second, both in (
