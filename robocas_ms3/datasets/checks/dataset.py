@@ -55,6 +55,9 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
         DatasetError: the folder does not exist, or is not a dataset.
     """
     root = Path(root)
+    if root.is_file():
+        expected, fix = "a folder of robocas convert", "Check a recording with robocas replay."
+        raise DatasetError("not a dataset", where=root, expected=expected, found="a file", fix=fix, usage=True)
     if not root.is_dir():
         raise DatasetError("no such folder", where=root)
     marked = any((root / mark).exists() for mark in MARKER_FILES)

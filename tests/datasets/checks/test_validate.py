@@ -60,6 +60,13 @@ def test_an_empty_folder(tmp_path):
         validate(tmp_path / "no folder")
 
 
+def test_a_file_is_wrong_usage(tmp_path):
+    (tmp_path / "trajectory.h5").touch()
+    with pytest.raises(DatasetError) as caught:
+        validate(tmp_path / "trajectory.h5")
+    assert (caught.value.found, caught.value.usage) == ("a file", True)
+
+
 @pytest.mark.parametrize(
     ("key", "value", "text"),
     [
