@@ -115,10 +115,17 @@ class Episode(SourceEpisode):
         return schema.image_path(self.folder, camera, kind, step, self.image_format)
 
     def rgb(self, camera: str, step: int) -> NDArray[np.uint8]:
-        return read_image(self.image_path(camera, "rgb", step))
+        return self._read_image(camera, "rgb", step)
 
     def depth(self, camera: str, step: int) -> NDArray[np.uint16]:
-        return read_image(self.image_path(camera, "depth", step))
+        return self._read_image(camera, "depth", step)
+
+    def _read_image(self, camera: str, kind: str, step: int) -> NDArray:
+        path = self.image_path(camera, kind, step)
+        if not path.is_file() and camera not in self.cameras:
+            expected = f"one of {', '.join(self.cameras)}" if self.cameras else "an episode with images"
+            raise DatasetError("no such camera", where=self.where, expected=expected, found=camera, usage=True)
+        return read_image(path)
 
     def intrinsic(self, camera: str) -> NDArray[np.float64]:
         array = read_array(self.folder / camera / schema.INTRINSIC_FILE)

@@ -41,3 +41,12 @@ def test_error_suggests_a_nearby_dataset(tmp_path, ask, file, meant):
     with pytest.raises(DatasetError) as error:
         ask(tmp_path / "here")
     assert not meant or f"Did you mean {tmp_path / 'here' / meant}?" in str(error.value)
+
+
+def test_unknown_camera_is_wrong_usage(dataset):
+    episode = Dataset(dataset).episode(0)
+    for read in (episode.rgb, episode.depth):
+        with pytest.raises(DatasetError) as error:
+            read("base_cam", 0)
+        assert (error.value.found, error.value.usage) == ("base_cam", True)
+        assert episode.cameras and all(camera in error.value.expected for camera in episode.cameras)
