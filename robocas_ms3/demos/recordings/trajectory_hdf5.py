@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import math
 import os
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -92,12 +93,10 @@ def open_trajectory(path: Path) -> h5py.File:
         fix = "Record one with robocas generate."
         raise DatasetError("no such trajectory file", where=path, fix=fix) from error
     except (OSError, DocumentError) as error:
-        raise DatasetError(
-            "not a readable HDF5 file",
-            where=path,
-            found=one_line(error),
-            fix="Record the file again.",
-        ) from error
+        sizes = re.search(r"truncated file: eof = (\d+),.* stored_eof = (\d+)", str(error))
+        found = f"a truncated file: {sizes[1]} of {sizes[2]} bytes" if sizes else one_line(error)
+        fix = "Copy or record it again."
+        raise DatasetError("not a readable HDF5 file", where=path, found=found, fix=fix) from error
 
 
 def open_episode(file: h5py.File, number: int) -> h5py.Group:

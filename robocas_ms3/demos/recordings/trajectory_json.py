@@ -198,6 +198,7 @@ def read_json(trajectory: Path) -> dict[str, Any]:
     try:
         metadata = load_json(path)
     except (ValueError, RecursionError) as error:
-        raise DatasetError(about, where=path, expected="keys env_info and episodes", found=one_line(error)) from error
+        expected, fix = "keys env_info and episodes", "Copy or record it again."
+        raise DatasetError(about, where=path, expected=expected, found=one_line(error), fix=fix) from error
     parse(TrajectoryRecord, metadata, DatasetError, where=path, about=about)
     return metadata

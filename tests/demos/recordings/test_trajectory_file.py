@@ -59,12 +59,12 @@ def fails(path, *words):
 def test_missing_or_truncated_files_are_errors(tmp_path, own):
     fails(tmp_path / "G.h5", "G.h5: no such trajectory file")
     data, json_file = own.read_bytes(), own.with_suffix(".json")
-    for share in (0.5, 0):
+    for share, found in ((0.5, f"{len(data) // 2} of {len(data)} bytes"), (0, "F.h5")):
         own.write_bytes(data[: int(len(data) * share)])
-        fails(own, "F.h5")
-    for text in ('{"env_info": ', "[]"):
+        fails(own, "F.h5", found, "again")
+    for text, word in (('{"env_info": ', "again"), ("[]", "")):
         json_file.write_text(text)
-        fails(own, "F.json")
+        fails(own, "F.json", word)
     json_file.unlink()
     fails(own, "F.json: missing JSON file of the trajectory")
 
