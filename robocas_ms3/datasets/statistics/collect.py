@@ -21,6 +21,7 @@ from robocas_ms3.datasets.sources.file_models import LayoutRecord, RecordedDetai
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.provenance import parse_task_name
 from robocas_ms3.datasets.statistics.layouts import (
+    CELL,
     LayoutMap,
     ObjectPositions,
     find_surface,
@@ -114,15 +115,17 @@ class DatasetStatistics:
         """Return the most important statistics as one line of text."""
         tasks = ", ".join(f"{task} {len(lengths)}" for task, lengths in sorted(self.lengths.items()))
         covered = [layout.coverage for layout in self.layouts.values() if layout.coverage is not None]
+        targets, objects = len(self.targets), format_count(len(self.objects | self.targets), "object")
         parts = [
             f"{format_count(self.episodes, 'episode')} ({tasks})",
             f"{format_count(self.steps, 'step')} ({self.steps / self.rate_hz / 60:.1f} min at {self.rate_hz:g} Hz)",
-            f"{format_count(len(self.targets), 'target')} of {format_count(len(self.objects), 'object')}",
+            f"{targets} of {objects} {'is a target' if targets == 1 else 'are targets'}",
             format_count(len(self.instructions), "instruction"),
         ]
         if covered:
             low, high = f"{min(covered):.0%}", f"{max(covered):.0%}"
-            parts.append("layouts cover " + (low if low == high else f"{low} to {high}") + " of the surface")
+            covered_range = low if low == high else f"{low} to {high}"
+            parts.append(f"objects in {covered_range} of the {CELL * 100:g} cm cells of the sampled region")
         return ", ".join(parts)
 
     def as_json(self) -> dict[str, Any]:

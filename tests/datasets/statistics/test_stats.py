@@ -118,6 +118,7 @@ def test_images_and_json(described, tmp_path, capsys):
         assert (pixels < 200).mean() > 0.002, f"{name} is blank"
     line = capsys.readouterr().out.strip()
     assert "2 episodes (pick 2), 14 steps" in line
+    assert "1 of 2 objects is a target" in line and "objects in 38% of the 5 cm cells" in line
     assert line.endswith(f"{out}: stats.json and 6 images")
     assert main(Command(described, json=True)) == 0
     assert json.loads(capsys.readouterr().out) == json.loads((out / "stats.json").read_text())
