@@ -3,17 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.baselines.baseline import Split, make_empty_split_error
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.datasets.formats import detect_format, open_source
 from robocas_ms3.datasets.manage.repairs import find_eef_rotation
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource
 from robocas_ms3.robots.cameras import EE_CAMERA
 
 _MAX_BASE_MOTION = 0.005  # m or rad; a standing base moves by less than 0.1 mm
+
+
+def open_image_dataset(path: Path) -> EpisodeSource:
+    """Open a dataset with images; raise DatasetError for a recording or for a folder with only a recording."""
+    found, recording = detect_format(path), path
+    if found is None and (path / "trajectory.h5").is_file():
+        found, recording = detect_format(path / "trajectory.h5"), path / "trajectory.h5"
+    if found and found.name == "trajectory" and recording.is_file():
+        raise DatasetError(
+            "not a dataset with images",
+            where=path,
+            found="a recording",
+            fix=f"Render it first: robocas convert {recording} --size 512 384 --out DIR.",
+        )
+    return open_source(path)
 
 
 def check_dataset(

@@ -55,6 +55,16 @@ def test_missing_cameras_embeddings_or_another_rate_are_refused(name, values, fo
 
 
 @pytest.mark.parametrize("name", LEARNERS)
+def test_a_recording_is_not_a_dataset_with_images(name, tmp_path):
+    recording = write_trajectory(tmp_path / "trajectory.h5")
+    for path in (tmp_path, recording):
+        with pytest.raises(DatasetError) as caught:
+            read(name, path)
+        assert (caught.value.where, caught.value.found) == (path, "a recording")
+        assert f"robocas convert {recording} " in caught.value.fix
+
+
+@pytest.mark.parametrize("name", LEARNERS)
 def test_empty_split_is_refused(name, folder, tmp_path):
     copy = shutil.copytree(folder, tmp_path / "dataset")
     set_values(copy, "data_info.json", val_eps=[])

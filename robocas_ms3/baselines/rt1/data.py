@@ -8,11 +8,10 @@ from typing import Any
 import torch
 
 from robocas_ms3.baselines.baseline import Batch, OnRead, Split
-from robocas_ms3.baselines.dataset_checks import check_dataset
+from robocas_ms3.baselines.dataset_checks import check_dataset, open_image_dataset
 from robocas_ms3.baselines.rt1.config import RT1Config
 from robocas_ms3.baselines.training.scenes import read_training_scenes
 from robocas_ms3.datasets.actions import ActionScale
-from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.training.options import SampleOptions
 from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset, read_sample_arrays
 
@@ -34,7 +33,7 @@ class RT1Samples:
     """
 
     def __init__(self, config: RT1Config, folder: Path, split: Split, on_read: OnRead) -> None:
-        source = open_source(folder)
+        source = open_image_dataset(folder)
         check_dataset(source, split, config.cameras, config.rate_hz, language=True)
         self._data = RoboCASDataset(
             folder,

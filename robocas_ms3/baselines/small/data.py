@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
@@ -25,7 +25,7 @@ from robocas_ms3.baselines.chunks import (
     encode_next_key_poses,
     encode_proprioception,
 )
-from robocas_ms3.baselines.dataset_checks import check_dataset
+from robocas_ms3.baselines.dataset_checks import check_dataset, open_image_dataset
 from robocas_ms3.baselines.small.config import CameraView, SmallConfig
 from robocas_ms3.baselines.small.localization import project_points_to_view
 from robocas_ms3.baselines.small.objects import (
@@ -38,7 +38,6 @@ from robocas_ms3.baselines.small.objects import (
 from robocas_ms3.baselines.training.scenes import read_training_scenes
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import Array, from_xyzw
-from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 
 _log = logging.getLogger(__name__)
@@ -51,13 +50,14 @@ class SmallSamples:
     """Training samples of `small`, one per policy step of a split of a dataset."""
 
     def __init__(self, config: SmallConfig, path: Path, split: Split, on_read: OnRead) -> None:
-        self._config, self._source = config, open_source(path)
+        self._config, self._source = config, open_image_dataset(path)
         source, views = self._source, config.views
         numbers = check_dataset(source, split, views, config.rate_hz, language=config.language)
         self.episodes, self.scenes = len(numbers), read_training_scenes(source, numbers)
         first = source.episode(numbers[0])
         shapes = {camera: first.rgb(camera, 0).shape for camera in views}
         sizes = {camera: (shape[1], shape[0]) for camera, shape in shapes.items()}
+        _check_image_sizes(sizes, views, source.root)
         base = first.read(["base_pos", "base_orn"])
         self._calibration = {
             camera: read_calibration(first, camera, base, sizes[camera], view) for camera, view in views.items()
@@ -259,6 +259,33 @@ def _text_statistics(embeddings: NDArray[np.floating]) -> dict[str, Any]:
     }
 
 
+def _can_scale(size: tuple[int, int], view: CameraView) -> bool:
+    """Return whether images of this size (width, height) can be scaled down to ``view.image_size``."""
+    width, height = view.image_size
+    return size[0] * height == size[1] * width and size[0] >= width
+
+
+def _make_size_error(size: tuple[int, int], view: CameraView, where: object, options: str = "") -> DatasetError:
+    """Make the error for images of a wrong size (width, height); ``options``: the options to train with this size."""
+    (width, height), found = view.image_size, f"{size[0]} x {size[1]}"
+    fix = f"Convert again with `robocas convert --size {width} {height}`" + (options and f", or train with `{options}`")
+    return DatasetError("wrong image size", where=where, expected=f"{width} x {height}", found=found, fix=f"{fix}.")
+
+
+def _check_image_sizes(sizes: Mapping[str, tuple[int, int]], views: Mapping[str, CameraView], where: object) -> None:
+    """Raise DatasetError if the images of a camera can't be scaled to its view.
+
+    Args:
+        sizes: width and height of the images in the dataset, by camera.
+        views: the view of each camera.
+        where: the dataset; the error shows it.
+    """
+    wrong = [camera for camera, view in views.items() if not _can_scale(sizes[camera], view)]
+    if wrong:
+        sets = (f"--set views.{camera}.image_size=[{sizes[camera][0]},{sizes[camera][1]}]" for camera in wrong)
+        raise _make_size_error(sizes[wrong[0]], views[wrong[0]], where, " ".join(sets))
+
+
 def crop_image(image: NDArray[Any], view: CameraView, where: object = "") -> NDArray[Any]:
     """Crop an image (H, W, 3) and scale it to the size of a view (h, w, 3).
 
@@ -268,18 +295,9 @@ def crop_image(image: NDArray[Any], view: CameraView, where: object = "") -> NDA
     """
     width, height = view.image_size
     if image.shape[1::-1] != (width, height):
-        if image.shape[1] * height != image.shape[0] * width or image.shape[1] < width:
-            found, fix = (
-                f"{image.shape[1]} x {image.shape[0]}",
-                f"Convert again with `robocas convert --size {width} {height}`",
-            )
-            raise DatasetError(
-                "wrong image size",
-                where=where,
-                expected=f"{width} x {height}",
-                found=found,
-                fix=f"{fix}, or train with `--set views.CAMERA.image_size=[W,H]`.",
-            )
+        size = image.shape[1], image.shape[0]
+        if not _can_scale(size, view):
+            raise _make_size_error(size, view, where)
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     left, top, right, bottom = view.crop_box()
     crop = image[top:bottom, left:right]

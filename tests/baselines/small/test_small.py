@@ -1,5 +1,6 @@
 """`small`: samples of a dataset, training, policy, and refused datasets."""
 
+import re
 import shutil
 import threading
 from types import SimpleNamespace
@@ -132,6 +133,17 @@ def test_images_are_cropped_and_scaled():
     assert crop_image(image, view).shape == (16, 16, 3)
     larger = np.repeat(np.repeat(image, 2, 0), 2, 1)
     assert (crop_image(larger, view) == 200).all()  # scaled to ``image_size`` first
+
+
+def test_error_of_the_image_size_names_the_options_of_each_camera(folder):
+    """The options are valid: the dataset is read with them."""
+    views = {name: CameraView(image_size=(512, 384)) for name in TINY["views"]}
+    with pytest.raises(DatasetError) as caught:
+        read(folder, views=views)
+    options = re.findall(r"--set views\.(\w+)\.image_size=\[(\d+),(\d+)\]", caught.value.fix)
+    assert [name for name, *_ in options] == list(views)
+    views = {name: CameraView(image_size=(int(width), int(height))) for name, width, height in options}
+    assert len(read(folder, views=views)) > 0
 
 
 def test_shifts_move_images_as_a_whole():
