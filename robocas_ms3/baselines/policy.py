@@ -58,6 +58,11 @@ class RunPolicy:
         with _convert_fact_errors(folder / RUN):
             self._policy: Policy = baseline.policy(config, record.facts, model)
         self._name, self._scenes, self._has_warned = f"policy {folder.name}", record.data.scenes, False
+        steps = config.train.steps
+        self._stopped = ""
+        if weights.step < steps:
+            again = "Continue it with the same robocas train command."
+            self._stopped = f"{self._name}: training stopped at step {weights.step} of {steps}. {again}"
         self._description = {
             "baseline": record.baseline,
             "version": record.version,
@@ -84,17 +89,26 @@ class RunPolicy:
         self._policy.reset(episodes)
 
     def protocol_warnings(self, configs: dict[str, TaskConfig]) -> list[str]:
-        """Warn if task configurations have tasks, scenes, objects or cameras that the training data lacks.
+        """Warn if the training stopped early, or if its data lacks tasks, scenes, objects or cameras of configurations.
 
         Returns:
-            One warning; empty if there is nothing to warn about, or if this object has warned before.
+            At most two warnings; empty after the first call.
         """
-        differences = [] if self._has_warned else self._scenes.list_differences(configs, self.spec.cameras)
-        if not differences:
+        if self._has_warned:
             return []
         self._has_warned = True
-        what = f"{self._name} was not trained for {', '.join(configs)}: expect a low success rate"
-        return [f"{what}. Not in the training data: {'; '.join(differences)}. Trained for: {self._scenes.summarize()}."]
+        warnings = [self._stopped] if self._stopped else []
+        cameras, scenes = self.spec.cameras, self._scenes
+        new = {name: one for name, one in configs.items() if scenes.list_differences({name: one}, cameras)}
+        differences = scenes.list_differences(new, cameras)
+        if len(differences) == 1 and differences[0].startswith("task "):  # another task in known scenes
+            trained, other = ", ".join(scenes.tasks), differences[0].removeprefix("task ")
+            warnings.append(f"{self._name} was trained for {trained}, not for {other}.")
+        elif differences:
+            what = f"{self._name} was not trained for {', '.join(new)}: expect a low success rate"
+            lacks = f"Not in the training data: {'; '.join(differences)}"
+            warnings.append(f"{what}. {lacks}. Trained for: {scenes.summarize()}.")
+        return warnings
 
     def act(self, observations: Observations) -> Any:
         """Return one action per env (E, A), or one chunk of H actions per env (E, H, A)."""

@@ -148,8 +148,8 @@ def videos(cfg: Videos) -> int:
     result = _read((cfg.folder,))
     protocol, name = _protocol_of(result, cfg.protocol), result.run.policy.name
     if name not in {*POLICIES.builtin, *POLICIES.entry_points} and cfg.policy != name:
-        fix = f"Pass --policy {name} if you trust its code."
-        raise EvaluationError("the policy of this result is not installed", where=cfg.folder, found=name, fix=fix)
+        fix = f"Add --policy {name} if you trust its code."
+        raise EvaluationError("the policy of this result has no registered name", where=cfg.folder, found=name, fix=fix)
     from robocas_ms3.core.workers import use_one_torch_thread
     from robocas_ms3.evaluation.report.videos import choose_failed_episodes, record_videos
 

@@ -120,7 +120,7 @@ class PolicySpec:
             ("convention", self.convention in CONVENTIONS, f"one of {sorted(CONVENTIONS)}"),
             ("reference", self.reference in get_args(Reference), f"one of {list(get_args(Reference))}"),
             ("language", self.language in get_args(Language), f"one of {list(get_args(Language))}"),
-            ("cameras", not wrong_cameras, "names such as side_camera"),
+            ("cameras", not wrong_cameras, "camera names that end in _camera, such as side_camera"),
             ("observe_every", self.observe_every >= 1, "at least 1"),
         ):
             if not fits:
@@ -214,14 +214,16 @@ class Policy(Protocol):
         ...
 
 
-def as_action_chunks(actions: ArrayLike, count: int, size: int | None, *, where: str = "") -> NDArray[np.float32]:
+def as_action_chunks(
+    actions: ArrayLike, count: int, size: int | None, *, where: str = "", fix: str = ""
+) -> NDArray[np.float32]:
     """Return actions (E, A) or (E, H, A) as chunks (E, H, A) float32.
 
     Args:
         actions: actions of a policy.
         count: expected number E of envs.
         size: expected number A of numbers per action; None: any number.
-        where: name of the policy or function, for the error.
+        where, fix: name of the policy or function, and fix, for the error.
 
     Raises:
         EvaluationError: the actions are not numeric or have another shape.
@@ -232,7 +234,9 @@ def as_action_chunks(actions: ArrayLike, count: int, size: int | None, *, where:
     if found.dtype.kind not in "iuf" or not fits:
         expected = f"numbers of shape ({count}, {size or 'A'}) or ({count}, H, {size or 'A'})"
         what = f"{found.shape} {found.dtype}"
-        raise EvaluationError("the actions have an invalid shape or type", where=where, expected=expected, found=what)
+        raise EvaluationError(
+            "the actions have an invalid shape or type", where=where, expected=expected, found=what, fix=fix
+        )
     return chunks.astype(np.float32)
 
 
@@ -259,21 +263,22 @@ def policy_spec_to_dict(spec: PolicySpec) -> dict[str, Any]:
 
 def describe_policy(policy: Policy) -> dict[str, Any]:
     """Return the class, the specification and the result of ``describe()`` of a policy, for ``run.json``."""
-    where = f"policy {_class_name(policy)}, describe()"
+    where = f"policy {get_class_name(policy)}, describe()"
     with forbid_policy_exit(policy):
         spec, added = policy_spec_to_dict(policy.spec), getattr(policy, "describe", dict)()
     if not isinstance(added, dict):
         raise EvaluationError(
             "the description of the policy is invalid", where=where, expected="a dict", found=type(added).__name__
         )
-    description = {"class": _class_name(policy), "spec": spec, **added}
+    description = {"class": get_class_name(policy), "spec": spec, **added}
     return json.loads(encode_json(description, where, error=EvaluationError))
 
 
 def forbid_policy_exit(policy: Policy) -> AbstractContextManager[None]:
     """Open a context in which an attempt of the policy to end the process raises an error (`forbid_exit`)."""
-    return forbid_exit(f"policy {_class_name(policy)}")
+    return forbid_exit(f"policy {get_class_name(policy)}")
 
 
-def _class_name(policy: Policy) -> str:
+def get_class_name(policy: Policy) -> str:
+    """Return the class of a policy as ``module:Class``."""
     return f"{type(policy).__module__}:{type(policy).__qualname__}"

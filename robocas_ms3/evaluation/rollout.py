@@ -24,6 +24,7 @@ from robocas_ms3.evaluation.policy import (
     as_action_chunks,
     concatenate_privileged_state,
     forbid_policy_exit,
+    get_class_name,
 )
 from robocas_ms3.evaluation.protocol import ProtocolEpisode
 from robocas_ms3.scenes.language.embed import TextEmbedder
@@ -263,12 +264,13 @@ def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list
             return
         actions = failed.actions
     seconds = (time.perf_counter() - started) / len(envs)
-    new = as_action_chunks(actions, len(envs), batch.action_size, where=type(policy).__name__)
+    where, fix = get_class_name(policy), "Return one row per env: len(observations.envs)."
+    new = as_action_chunks(actions, len(envs), batch.action_size, where=where, fix=fix)
     period = policy.spec.observe_every
     if new.shape[1] > 1 and new.shape[1] % period:
         raise EvaluationError(
             "the chunk length of the policy does not fit its observe_every",
-            where=type(policy).__name__,
+            where=where,
             expected=f"a multiple of {period} actions, so that each chunk starts with images",
             found=f"{new.shape[1]} actions",
         )

@@ -290,8 +290,10 @@ class EvaluationSession:
         warn: Callable[[dict[str, TaskConfig]], list[str]] | None = getattr(self.policy, "protocol_warnings", None)
         if warn is None:
             return
-        names = dict.fromkeys(episode.config for episode in self.episodes)
-        configs = {name: load_task_config(self.protocol.config_file(name)) for name in names}
+        configs: dict[str, TaskConfig] = {}
+        for name, task in dict.fromkeys((episode.config, self._find_task(episode)) for episode in self.episodes):
+            config = load_task_config(self.protocol.config_file(name))
+            configs[name] = config if config.task == task else config.model_copy(update={"task": task})
         with forbid_policy_exit(self.policy):
             for warning in warn(configs):
                 _log.warning("%s", warning)
@@ -304,8 +306,11 @@ class EvaluationSession:
     def _make_outcome(self, ended: Rollout, episode: ProtocolEpisode) -> Outcome:
         layouts = self._layouts_of(episode.config)
         outcome = ended.make_outcome(episode, layouts(episode.seed, episode.seed).object_ids)
-        task = next((task for task, other in self.played_as.items() if other == episode.task), episode.task)
-        return replace(outcome, task=task)
+        return replace(outcome, task=self._find_task(episode))
+
+    def _find_task(self, episode: ProtocolEpisode) -> str:
+        """Return the task that is evaluated in an episode."""
+        return next((task for task, other in self.played_as.items() if other == episode.task), episode.task)
 
     def _make_env(self, episode: ProtocolEpisode, num_envs: int) -> Any:
         rules, settings = self.protocol.rules, self.settings

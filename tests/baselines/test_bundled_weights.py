@@ -13,8 +13,10 @@ from robocas_ms3.baselines.training.record import BUNDLED, CHECKPOINT, read_run
 from robocas_ms3.baselines.training.session import load_initial_weights
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import TrainingError
+from robocas_ms3.evaluation import session
 from robocas_ms3.evaluation.policies import make_policy
 from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.scenes.config import load_task_config
 
 
@@ -65,6 +67,20 @@ def test_one_warning_in_other_scenes(protocol, task, expected):
     (message,) = policy.protocol_warnings(configs)
     assert re.search(expected, message) and set(configs) <= set(re.findall(r"[\w-]+", message))
     assert policy.protocol_warnings(configs) == []
+
+
+def test_warning_names_only_configurations_with_differences():
+    configs = configs_of("paper-v1", "pick") | configs_of("paper-v1", "search")
+    (message,) = make_policy("small").protocol_warnings(configs)
+    assert message.startswith("policy small was not trained for search_upstream_eval: ")
+
+
+def test_warning_about_another_task_in_the_scenes_of_the_training_data(caplog, monkeypatch):
+    monkeypatch.setattr(session, "require_renderer", lambda: None)
+    settings = EvaluationSettings(("select",), "small", "paper-v1", backend="processes")
+    session.EvaluationSession(make_policy("small"), settings)
+    (record,) = caplog.records
+    assert record.getMessage() == "policy small was trained for pick, not for select."
 
 
 def test_initial_weights_by_name(tmp_path, monkeypatch):

@@ -65,6 +65,8 @@ def test_invalid_specifications_name_the_field():
         with pytest.raises(EvaluationError) as error:
             PolicySpec(**wrong)
         assert error.value.where == next(iter(wrong))
+    with pytest.raises(EvaluationError, match="end in _camera.*found 'wrist'"):
+        PolicySpec(cameras={"wrist": (64, 48)})
 
 
 def test_policy_modules_in_the_working_directory_are_found(here):

@@ -99,3 +99,4 @@ def test_actions_of_another_shape_are_refused():
     with pytest.raises(EvaluationError) as error:
         run_policy(CountingEnv(1, None), policy, starts(4), 7)
     assert error.value.expected == "numbers of shape (1, 7) or (1, H, 7)"
+    assert error.value.where == f"{__name__}:CountingPolicy"

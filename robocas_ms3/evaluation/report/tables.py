@@ -19,9 +19,11 @@ WELD_NOTE = (
     "Do not compare with results without the weld."
 )
 PAPER_NOTE = (
-    "Comparison with the RoboCAS paper: the object meshes are stand-ins, success is stricter than the paper's rule, "
-    "and a policy trained on pick_upstream_eval or search_upstream_eval is evaluated in its training distribution."
+    "Comparison with the RoboCAS paper: the object meshes are replacements made by this project, success is stricter "
+    "than the paper's rule, and a policy trained on pick_upstream_eval or search_upstream_eval is evaluated in its "
+    "training distribution."
 )
+FAILURE_NOTE = "Failed episodes by the first stage that was not reached."
 _STAGE_NOTE = "RA: any object touched; PA: any object lifted; RR: target touched; CO: obstacles cleared."
 STAGE_NAMES = {
     "furniture_opened": "furniture opened",
@@ -98,7 +100,8 @@ def render_markdown(result: Result) -> str:
     ]
     for table in make_tables(result) if result.outcomes else ():
         heads = " | ".join(escape_markdown(head.rstrip("#%")) for head in table.heads)
-        lines += ["", f"## {table.title}", "", f"| {heads} |", "|" + "---|" * len(table.heads)]
+        note = [FAILURE_NOTE, ""] if table.note == FAILURE_NOTE else []  # the head has the notes of the other tables
+        lines += ["", f"## {table.title}", "", *note, f"| {heads} |", "|" + "---|" * len(table.heads)]
         for row in table.rows:
             cells = (_render_cell(cell, head) for cell, head in zip(row, table.heads, strict=True))
             lines.append(f"| {' | '.join(cells)} |")
@@ -114,7 +117,7 @@ def make_title(result: Result) -> str:
 def list_notes(result: Result) -> list[str]:
     """Return the notes under the title of a report: weld, task aliases, and differences from the paper."""
     played_as = [
-        f"{task} was evaluated in the episodes of {other} (played_as), as RoboCAS-v0's evaluator does."
+        f"{task} was evaluated in the episodes of {other}, as RoboCAS-v0's evaluator does."
         for task, other in result.run.played_as.items()
     ]
     paper = [PAPER_NOTE] if result.run.protocol.startswith("paper-") else []
@@ -198,8 +201,7 @@ def _make_failure_table(result: Result) -> Table:
         cells = (FailureCount(count[stage], n) for stage in stages)
         rows.append((config, str(n), str(n - count[""]), *cells))
     heads = ("configuration", "n#", "failed#", *(f"{get_failure_name(stage)}#" for stage in stages))
-    note = "Number of failed episodes by failure stage: the stage after the last reached stage."
-    return Table("Where episodes failed", note, heads, rows)
+    return Table("Where episodes failed", FAILURE_NOTE, heads, rows)
 
 
 def _make_occlusion_table(hidden: list[Outcome]) -> Table:

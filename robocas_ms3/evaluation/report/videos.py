@@ -55,8 +55,11 @@ def record_videos(
         )
     require_renderer()
     recorder = _VideoRecorder()
-    settings = EvaluationSettings(
-        tuple(result.run.played_as),
+    outcomes = result.outcomes.values()
+    splits = {one.split for one in outcomes}
+    settings = EvaluationSettings(  # only the tasks and splits of the result, for the warnings of the policy
+        tuple(dict.fromkeys(one.task for one in outcomes)),
+        split=splits.pop() if len(splits) == 1 else "",
         protocol=str(protocol.folder),
         envs=1,
         backend="processes",

@@ -60,8 +60,12 @@ def test_a_stopped_run_continues_bit_identically(whole, data, tmp_path, step, er
     out, steps = tmp_path / "again", []
     with pytest.raises(error):
         train("stub", data, out, progress=stop_at(step, error("stopped")))
+    if continued_at:
+        (warning,) = make_policy(str(out)).protocol_warnings({})
+        assert f"training stopped at step {continued_at} of 40" in warning
     train("stub", data, out, progress=ProgressCallbacks(on_step=lambda done, total: steps.append(done)))
     assert steps[0] == continued_at
+    assert make_policy(str(out)).protocol_warnings({}) == []
     assert_same(whole, out)
 
 

@@ -44,7 +44,7 @@ def test_without_failed_episodes_no_video_is_recorded(tmp_path, capsys, installe
 def test_a_policy_named_in_a_result_is_not_imported_without_confirmation(tmp_path, capsys):
     result = of_protocol(tmp_path / "b", load_protocol("smoke"))
     with pytest.raises(
-        EvaluationError, match=r"the policy of this result is not installed \(found mine\).*--policy mine"
+        EvaluationError, match=r"the policy of this result has no registered name \(found mine\).*--policy mine"
     ):
         videos(Videos(result.folder))
     with pytest.raises(EvaluationError, match="mine: unknown policy"):  # confirmed

@@ -28,6 +28,7 @@ def test_tables_of_successes_failures_and_occlusion(result, tmp_path):
     said = render_markdown(result).partition("Where episodes failed")[2]
     assert row(said, "configuration") == ["configuration", "n", "failed", "an object touched", "placed, at rest"]
     assert row(said, "table") == ["table", "4", "2", "1", "1"]
+    assert "first stage that was not reached" in said
     assert "weld" not in render_markdown(result)
     assert "played_as" not in render_markdown(result)
     assert "**With RoboCAS-v0's weld: " in render_markdown(write(tmp_path / "b", [outcome(0)], weld=True))
@@ -41,7 +42,7 @@ def test_notes_name_task_aliases_and_the_conditions_of_the_paper(tmp_path):
     outcomes = [outcome(0, task="select", config="pick_upstream_eval")]
     text = render_markdown(write(tmp_path / "a", outcomes, protocol="paper-v1", played_as={"select": "pick"}))
     assert "select was evaluated in the episodes of pick" in text
-    assert "stand-ins" in text and "training distribution" in text
+    assert "replacements made by this project" in text and "played_as" not in text and "training distribution" in text
 
 
 def test_stage_rates_count_only_episodes_with_the_stage(tmp_path):
