@@ -37,8 +37,8 @@ def main(settings: GenerateSettings) -> int:
 
         def on_start(present: int) -> None:
             if present >= settings.episodes:
-                bar.add_note(f"{settings.out} already has {format_count(present, 'episode')}")
-            bar.start(settings.episodes, present)
+                bar.add_note(f"{settings.out} already has {format_count(present, 'episode')} (-n {settings.episodes})")
+            bar.start(settings.episodes, min(present, settings.episodes))
 
         summary = generate(settings, on_start=on_start, on_result=on_result, make_roll_in=make_roll_in, weights=weights)
         bar.update(settings.episodes, settings.episodes)  # episodes of a continued run may count only now

@@ -116,7 +116,7 @@ def generate(
     with OutputFolder(settings.out, OUTPUT, record, overwrite=settings.overwrite) as output:
         output.start(record)
         run = _Run(output.path)
-        on_start(min(settings.episodes, sum(result.success for result in run.earlier.values())))
+        on_start(sum(result.success for result in run.earlier.values()))
         results, successes = [], 0
         try:
             with closing(_iterate_results(settings, run, make_roll_in)) as found:
