@@ -126,7 +126,14 @@ def load_yaml(path: Path) -> Any:
         try:
             return yaml.load(text, Loader=_LimitedLoader)  # noqa: S506  (a SafeLoader)
         except (yaml.YAMLError, ValueError, AttributeError, LookupError, TypeError, OverflowError) as error:
-            raise DocumentError(one_line(error)) from error
+            raise DocumentError(_format_yaml_error(error)) from error
+
+
+def _format_yaml_error(error: Exception) -> str:
+    """Format an error of PyYAML as one line that starts with its place, without an excerpt of the file."""
+    if isinstance(error, yaml.MarkedYAMLError) and (mark := error.problem_mark):
+        return one_line(f"line {mark.line + 1}, column {mark.column + 1}: {error.problem}")
+    return one_line(error)
 
 
 def open_npz(path: Path) -> Any:

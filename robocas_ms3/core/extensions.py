@@ -65,7 +65,7 @@ class Registry(Mapping[str, T]):
         if name in self:
             return self[name]
         known = list(self)
-        what, expected, fix = f"no such {self.kind}", f"one of {known}", did_you_mean(name, known)
+        what, expected, fix = f"no such {self.kind}", f"one of {', '.join(known)}", did_you_mean(name, known)
         raise ExtensionError(what, where=where, expected=expected, found=repr(name), fix=fix, usage=usage)
 
     @cached_property

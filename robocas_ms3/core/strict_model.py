@@ -217,13 +217,13 @@ def _make_invalid_value(key: str, same: list[Any], schema: dict[str, Any], words
             one_line(name, _FOUND_LENGTH),
             sorted(_locate_value(tuple(outer), schema)[1].get("properties", {})),
         )
-        what, expected = f"unknown key {key!r}", f"one of {known}" if known else "no such key"
+        what, expected = f"unknown key {key!r}", f"one of {', '.join(known)}" if known else "no such key"
         found, fix = repr(name), did_you_mean(name, known)
     elif kind in {"union_tag_invalid", "union_tag_not_found"}:
         discriminator = _locate_value(details["loc"], schema)[1]["discriminator"]
         tag, kinds = discriminator["propertyName"], sorted(discriminator["mapping"])
         name = one_line(context.get("tag", ""), _FOUND_LENGTH)
-        what, expected = f"invalid value for '{f'{key}.{tag}' if key else tag}'", f"one of {kinds}"
+        what, expected = f"invalid value for '{f'{key}.{tag}' if key else tag}'", f"one of {', '.join(kinds)}"
         found, fix = repr(name) if name else "nothing", did_you_mean(name, kinds)
     elif kind == "value_error":
         message = one_line(details["msg"].removeprefix("Value error, "))

@@ -36,7 +36,9 @@ def furniture_pose(config: AssetPlacementConfig, furniture: LoadedFurniture) -> 
 
 def _check_known(what: str, found: str, known: Collection[str]) -> None:
     if found not in known:
-        raise ConfigError(what, expected=f"one of {sorted(known)}", found=found, fix=did_you_mean(found, known))
+        raise ConfigError(
+            what, expected=f"one of {', '.join(sorted(known))}", found=found, fix=did_you_mean(found, known)
+        )
 
 
 def find_furniture(pack: Pack, asset_id: str, *, key: str) -> LoadedFurniture:
@@ -144,7 +146,7 @@ def resolve_ids(pack: Pack, ids_or_numbers: list[str | int] | list[str], *, key:
     ids = [numbers.get(i, str(i)) if isinstance(i, int) else i for i in ids_or_numbers]
     unknown = [i for i in ids if i not in pack.objects]
     if unknown:
-        expected = f"one of {sorted(pack.objects)}" + (
+        expected = f"one of {', '.join(sorted(pack.objects))}" + (
             f", or a GraspNet number of {sorted(numbers)}" if numbers else ""
         )
         likely = " ".join(filter(None, (did_you_mean(i, pack.objects) for i in unknown)))

@@ -121,7 +121,12 @@ def test_invalid_syntax_gives_a_one_line_error(file, load, text):
 
 @pytest.mark.parametrize(
     ("text", "match"),
-    [("a: 1\na: 2", "duplicate key 'a'"), ("? [1]\n: 2", "unhashable key"), ("d: 2020-02-30", "day is out of range")],
+    [
+        ("a: 1\nb: c: 2", "^line 2, column 5: mapping values are not allowed here$"),
+        ("a: 1\na: 2", "^line 2, column 1: duplicate key 'a'$"),
+        ("? [1]\n: 2", "unhashable key"),
+        ("d: 2020-02-30", "day is out of range"),
+    ],
 )
 def test_invalid_yaml_is_an_error(file, text, match):
     with pytest.raises(DocumentError, match=match):

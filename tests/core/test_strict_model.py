@@ -73,7 +73,7 @@ def test_valid_values_are_read_from_yaml():
         ({"boards": 3}, "boards: an even number (found 3)"),
         (
             {"boards": 3, "bords": 2},
-            "unknown key 'bords' (expected one of ['boards', 'name', 'names', 'things'], found 'bords'). "
+            "unknown key 'bords' (expected one of boards, name, names, things, found 'bords'). "
             "Did you mean boards? 1 more error.",
         ),
         ({"names": {"x y": 1}}, "invalid value for 'names.x y' (expected a string like ^[a-z]+$, found 'x y')"),
@@ -91,7 +91,7 @@ def test_valid_values_are_read_from_yaml():
         ),
         (
             {"things": [{"kind": "bal"}]},
-            "invalid value for 'things.0.kind' (expected one of ['ball', 'crate'], found 'bal'). Did you mean ball?",
+            "invalid value for 'things.0.kind' (expected one of ball, crate, found 'bal'). Did you mean ball?",
         ),
     ],
 )

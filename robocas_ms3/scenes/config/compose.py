@@ -121,7 +121,8 @@ class Composition:
             place, old = (*path, " ".join(str(key).split())), values.get(key)
             if new is None and removes and (declared := _declaration(place)) in {"key", "name"}:
                 if declared == "name" and key not in values:
-                    expected, fix = f"one of {sorted(map(str, values))}", did_you_mean(str(key), map(str, values))
+                    known = sorted(map(str, values))
+                    expected, fix = f"one of {', '.join(known)}", did_you_mean(str(key), known)
                     what = f"null cannot remove {'.'.join(place)!r}, which does not exist"
                     raise ConfigError(what, where=source, expected=expected, fix=fix)
                 values.pop(key, None)
