@@ -41,26 +41,52 @@ Overrides = Annotated[tuple[str, ...], _NO_DEFAULT, tyro.conf.UseAppendAction, t
 """``KEY=VALUE`` of an option that may be given several times; default: none."""
 
 METAVARS = tyro.constructors.ConstructorRegistry()
-"""Rules for tyro: the metavar of a number is N or X, of a path PATH, of other text NAME."""
+"""Rules for tyro: the metavar of a number is N or X, of a path PATH, of other text NAME.
+
+They hold for optional values and for pairs too, so that a message about an invalid value names no Python types.
+"""
 
 
 @METAVARS.primitive_rule
 def _metavar_rule(info: tyro.constructors.PrimitiveTypeInfo) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
-    for kind, metavar, accepted in (
-        (int, "N", int),
-        (float, "X", int | float),
-        (str, "NAME", str),
-        (Path, "PATH", Path),
+    for kind, metavar, noun in (
+        (int, "N", "a whole number"),
+        (float, "X", "a number"),
+        (str, "NAME", "a text"),
+        (Path, "PATH", "a path"),
     ):
-        if info.type is kind:
-            return tyro.constructors.PrimitiveConstructorSpec(
-                nargs=1,
-                metavar=metavar,
-                instance_from_str=lambda words, kind=kind: kind(words[0]),
-                is_instance=lambda value, accepted=accepted: isinstance(value, accepted),
-                str_from_instance=lambda value: [str(value)],
-            )
+        for accepted, count in ((kind, 1), (kind | None, 1), (tuple[kind, kind], 2), (tuple[kind, kind] | None, 2)):
+            if info.type == accepted:
+                return _make_constructor(kind, metavar, noun, count)
     return None
+
+
+def _make_constructor(
+    kind: type, metavar: str, noun: str, count: int
+) -> tyro.constructors.PrimitiveConstructorSpec[Any]:
+    """Make the rule for one value of a type (``count`` 1), or for a tuple of ``count`` values; None is valid too."""
+    accepted = (int, float) if kind is float else kind
+
+    def convert(words: list[str]) -> Any:
+        try:
+            values = tuple(map(kind, words))
+        except ValueError:
+            expected = noun if count == 1 else f"{count} values, each {noun}"
+            raise ValueError(f"expected {expected}, found {' '.join(words)!r}") from None
+        return values[0] if count == 1 else values
+
+    def is_instance(value: Any) -> bool:
+        if value is None or count == 1:
+            return value is None or isinstance(value, accepted)
+        return isinstance(value, tuple) and len(value) == count and all(isinstance(part, accepted) for part in value)
+
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=count,
+        metavar=" ".join([metavar] * count),
+        instance_from_str=convert,
+        is_instance=is_instance,
+        str_from_instance=lambda value: [str(part) for part in (value if isinstance(value, tuple) else (value,))],
+    )
 
 
 def with_absolute_paths(settings: _T) -> _T:

@@ -16,16 +16,16 @@ from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ, TASKS
 _NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text describes the default
 
 
-def _task_names() -> type:
-    """Return a Literal type of all task names, including tasks of other packages."""
-    return tyro.extras.literal_type_from_choices(TASKS)
+def _task_type() -> Any:
+    """Return a type of text whose metavar is the names of all tasks, including tasks of other packages."""
+    return Annotated[str, tyro.conf.arg(metavar=f"{{{','.join(TASKS)}}}")]
 
 
 @dataclass(frozen=True)
 class EpisodeSettings:
     """Settings of the episodes of a run, equal for all seeds."""
 
-    task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(constructor_factory=_task_names)]
+    task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(constructor_factory=_task_type)]
     """Task to record."""
     config: Annotated[str | dict[str, Any], tyro.conf.arg(metavar="CONFIG", constructor=str, help_behavior_hint="")] = (
         ""
@@ -66,7 +66,8 @@ class EpisodeSettings:
     """Minimum and maximum number of policy steps before the scripted policy continues; drawn uniformly per seed."""
 
     def __post_init__(self) -> None:
-        config = self.config or TASKS[self.task].default_config
+        spec = TASKS.find(self.task, where="TASK")
+        config = self.config or spec.default_config
         rate = self.check_rate
         if rate is None:
             rate = 5 if self.control_freq % 5 == 0 else self.control_freq
@@ -108,7 +109,7 @@ class EpisodeSettings:
         check_number("--after-steps", self.after_steps[0], 1)
         check_number("--after-steps", self.after_steps[1], self.after_steps[0])
         PLANNERS.find(self.planner, where="planner")
-        robot, config = find_robot(self.robot), load_config_for(TASKS[self.task], self.config)
+        robot, config = find_robot(self.robot), load_config_for(TASKS[self.task], self.config, usage=True)
         SceneModel.load(config, load_pack(self.pack), load_pack("builtin"), robot=robot.description)
 
 

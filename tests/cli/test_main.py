@@ -104,6 +104,8 @@ def test_grouped_options_are_fields_of_the_settings():
 
 MISTAKES = {  # arguments -> text of the error, printed before anything heavy is imported
     "generate pick --config pick_tabel_scattered": "Did you mean pick_table_scattered",
+    "generate pik -n 3": "found 'pik'). Did you mean pick?",
+    "show pick": "pick is a task, not a task configuration. Its default configuration is pick_table_scattered",
     "show pick_tabel_scattered": "Did you mean pick_table_scattered",
     "show --pack builtn": "builtn: no such asset pack",
     "show --seed -1": "--seed: number out of range (expected 0 to 4294967295, found -1)",
@@ -168,6 +170,7 @@ SLOW_MISTAKES = [  # reported after the imports of their commands
     "eval --policy noop --split missing",
     "eval open_pick --policy noop --protocol paper-v1",
     "generate pick --pack missing",
+    "generate search --config pick_upstream_eval",
     "generate pick --robot missing",
     "generate pick --planner missing",
     "generate pick --after-policy missing",
@@ -216,7 +219,10 @@ def test_list_commands_import_nothing_heavy(tmp_path):
     [
         ("generat pick", "generate"),
         ("generate pick --episodez=3", "--episodes"),
-        ("generate pik -n 3", "pick"),
+        ("generate pick -n three", "expected a whole number, found 'three'"),
+        ("convert a.h5 --out o --rate five", "expected a number, found 'five'"),
+        ("convert a.h5 --out o --size 64", "'--size'. Expected 2 values"),
+        ("convert a.h5 --out o --size 64 x", "expected 2 values, each a whole number, found '64 x'"),
         ("convert", "--out"),
         ("plan rn", "run"),
         ("plan run tiny --out x --jbos 3", "--jobs"),

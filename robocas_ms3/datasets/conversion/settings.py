@@ -74,7 +74,7 @@ class RenderOptions:
 
     cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]"), _NO_HINT] = ()
     """Names of the cameras. Default: all cameras of the input; with --append those of the output dataset."""
-    size: Annotated[tuple[int, int] | None, _NO_HINT] = None
+    size: Annotated[tuple[int, int] | None, tyro.conf.arg(metavar="W H"), _NO_HINT] = None
     """Image width and height in pixels.
     Default: the size in the task configuration (640 480); with --append the size of the dataset."""
     depth: bool = True

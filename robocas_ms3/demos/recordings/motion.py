@@ -44,6 +44,7 @@ def sample_stride(control_freq: float, rate_hz: float) -> int:
             where="rate",
             expected=f"one of {', '.join(rates)} Hz at {control_freq:g} Hz",
             found=f"{rate_hz:g} Hz",
+            usage=True,
         )
     return stride
 

@@ -16,7 +16,7 @@ from robocas_ms3.core.strict_model import did_you_mean, parse
 from robocas_ms3.scenes.config.compose import EXTENDS, Composition, parse_set_option
 from robocas_ms3.scenes.config.task import TaskConfig
 from robocas_ms3.scenes.language.texts import load_synonym_texts
-from robocas_ms3.scenes.task_specs import TaskSpec
+from robocas_ms3.scenes.task_specs import TASKS, TaskSpec
 
 CHAIN_LIMIT = 8
 """Greatest number of files of a configuration and its bases."""
@@ -29,12 +29,15 @@ def bundled_configs() -> dict[str, Path]:
     return {path.stem: path for path in sorted(task_configs_dir().glob("*.yaml"))}
 
 
-def load_config_for(spec: TaskSpec, config: str | Path | dict | TaskConfig | None = None) -> TaskConfig:
+def load_config_for(
+    spec: TaskSpec, config: str | Path | dict | TaskConfig | None = None, *, usage: bool = False
+) -> TaskConfig:
     """Load a task configuration, and check that it belongs to a task.
 
     Args:
         spec: the task.
         config: as in `load_task_config`; default: the default configuration of the task.
+        usage: whether the user chose the configuration for this task, see `RobocasError`.
 
     Raises:
         ConfigError: the configuration is invalid, or belongs to another task.
@@ -44,7 +47,7 @@ def load_config_for(spec: TaskSpec, config: str | Path | dict | TaskConfig | Non
         name = f" {config}" if isinstance(config, str) else ""
         what = f"{spec.env_id} can't run the configuration{name}"
         fix = "Choose a configuration of this task: `robocas list`."
-        raise ConfigError(what, expected=f"task: {spec.name}", found=f"task: {loaded.task}", fix=fix)
+        raise ConfigError(what, expected=f"task: {spec.name}", found=f"task: {loaded.task}", fix=fix, usage=usage)
     return loaded
 
 
@@ -162,7 +165,7 @@ def _read(path: Path) -> dict[Any, Any]:
         raise ConfigError(what, where=path, expected="a mapping of keys to values", found=type(data).__name__)
     for key in data:
         if key != EXTENDS and key not in TaskConfig.model_fields and (likely := did_you_mean(str(key), [EXTENDS])):
-            expected = f"one of {[EXTENDS, *sorted(TaskConfig.model_fields)]}"
+            expected = f"one of {', '.join([EXTENDS, *sorted(TaskConfig.model_fields)])}"
             raise ConfigError(f"unknown key {key!r}", where=path, expected=expected, fix=likely)
     return data
 
@@ -172,6 +175,10 @@ def _find_file(config: str | Path, folder: Path | None = None, where: str = "") 
     configs, name = bundled_configs(), str(config)
     if name in configs:
         return configs[name]
+    if folder is None and name in TASKS:
+        what = f"{name} is a task, not a task configuration"
+        fix = f"Its default configuration is {TASKS[name].default_config}; all names: `robocas list`."
+        raise ConfigError(what, fix=fix, usage=True)
     path = Path(config) if folder is None else folder / config
     is_yaml = path.suffix in _SUFFIXES
     with suppress(OSError, ValueError):  # such as a name that is too long

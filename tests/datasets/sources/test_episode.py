@@ -129,8 +129,9 @@ def test_strides():
     assert sample_stride(20, 5) == 4
     assert sample_stride(5, 5) == 1
     for rate in (3, 0, -5, 40):
-        with pytest.raises(DatasetError, match="one of 20, 10, 5, 4, 2, 1 Hz at 20 Hz"):
+        with pytest.raises(DatasetError, match="one of 20, 10, 5, 4, 2, 1 Hz at 20 Hz") as caught:
             sample_stride(20, rate)
+        assert caught.value.usage
 
 
 def test_step_belongs_to_the_action_that_starts_there():

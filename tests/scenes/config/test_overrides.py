@@ -58,7 +58,7 @@ def test_overrides_are_merged_over_a_file_in_order(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("objects.cout=3", ["'objects.cout'", "'count'", "Did you mean count?"]),
+        ("objects.cout=3", ["'objects.cout'", "one of count, ids", "Did you mean count?"]),
         ("room=null", ["'room'", "this key"]),
         ("furniture.tabel=null", ["furniture.tabel", "Did you mean table?"]),
         ("extends=pick_heap", ["extends", "YAML files"]),
