@@ -49,7 +49,7 @@ def test_generate_records_with_the_planner(site, tmp_path):
 
 
 def test_planner_is_unknown_without_its_package(tmp_path):
-    with pytest.raises(AssertionError, match=r"error: planner: no such planner .*'rrt_connect'.*'straight'"):
+    with pytest.raises(AssertionError, match=r"error: planner: no such planner .*rrt_connect.*'straight'"):
         robocas(tmp_path, "generate", "pick", "--planner", "straight", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
     assert "--planner straight" in PAGE

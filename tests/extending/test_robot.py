@@ -184,7 +184,7 @@ def test_evaluation_uses_the_robot_of_the_protocol(site, tmp_path):
 
 
 def test_unknown_robot_is_an_error(site, tmp_path):
-    with pytest.raises(AssertionError, match="error: robot: no such robot .*'twin'.*Did you mean twin"):
+    with pytest.raises(AssertionError, match="error: robot: no such robot .* twin, .*Did you mean twin"):
         robocas(site, "generate", "pick", "--robot", "twins", "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
     assert "--robot twin" in PAGE
