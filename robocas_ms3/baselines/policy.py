@@ -47,7 +47,7 @@ class RunPolicy:
                 found=f"version {record.version}",
                 fix="Train again, or install the release of robocas-ms3 in run.json (versions).",
             )
-        config = parse(baseline.Config, record.config, TrainingError, where=folder / RUN)
+        config: Any = parse(baseline.Config, record.config, TrainingError, where=folder / RUN)
         weights = checkpoints.load_checkpoint(folder / WEIGHTS, record.metadata)
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"

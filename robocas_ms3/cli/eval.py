@@ -48,7 +48,7 @@ class Freeze:
 def run(settings: EvaluationSettings) -> int:
     """Run the episodes that the result does not have yet; return exit status 1 if an episode ended with an error."""
     from robocas_ms3.core.errors import EvaluationError
-    from robocas_ms3.core.text import did_you_mean
+    from robocas_ms3.core.text import did_you_mean, one_line
     from robocas_ms3.scenes.task_specs import TASKS
 
     for word in settings.tasks:  # before the slow imports
@@ -70,18 +70,23 @@ def run(settings: EvaluationSettings) -> int:
     from robocas_ms3.evaluation.session import EvaluationSession
 
     use_one_torch_thread()
-    outcomes = []
+    count = 0
     with open_policy(settings.policy) as policy, ProgressBar("episodes run") as bar:
         session = EvaluationSession(policy, settings)
-        for outcome in session.run(bar.start):
-            outcomes.append(outcome)
+        for _ in session.run(bar.start):
+            count += 1
             bar.advance()
     result = read_result(session.folder)
-    print_text(render_markdown(result))
-    errors, successes = result.count_errors(), sum(outcome.success for outcome in outcomes)
-    print_line(f"{format_count(len(outcomes), 'episode')} run, {successes} succeeded")
-    note = f", {errors} ended with an error (run them again with --retry-errors)" if errors else ""
-    print_line(f"{session.folder}: {format_count(len(result.outcomes), 'episode')}{note}")
+    print_text(render_markdown(result, session.protocol))
+    total = len(session.episodes)
+    successes = sum(result.outcomes[one.episode].success for one in session.episodes)
+    done = f"{count} of {format_count(total, 'episode')} run" if count else "no episode run"
+    existing = f", {total - count} already there" if count < total else ""
+    print_line(f"{done}{existing}; {successes} of {total} succeeded")
+    if errors := [one_line(one.error, 200) for one in result.outcomes.values() if one.error]:
+        more = " and other errors" if len(set(errors)) > 1 else ""
+        ended = format_count(len(errors), "episode")
+        print_line(f"{ended} ended with an error ({errors[0]}{more}). Repeat with --retry-errors.")
     eval_results.write_pages(result, session.folder, settings.protocol)
     return 1 if errors else 0
 

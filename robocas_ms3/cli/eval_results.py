@@ -88,7 +88,7 @@ def report(cfg: Report) -> int:
     from robocas_ms3.evaluation.report.tables import render_markdown
 
     result = _read(cfg.folders)
-    print_text(render_markdown(result))
+    print_text(render_markdown(result, _find_protocol(result, cfg.protocol)))
     if cfg.out is None and len(cfg.folders) > 1:
         print_line("report.html was not written: pass --out DIR for several result folders")
     else:
@@ -168,16 +168,10 @@ def videos(cfg: Videos) -> int:
 def write_pages(result: Result, out: Path, protocol: str | None) -> None:
     """Write report.html and the other reports of a result into a folder, and print their names."""
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.report import write_report
 
-    try:
-        loaded = _protocol_of(result, protocol)
-    except EvaluationError:
-        loaded = None  # not bundled
-    matches = loaded is not None and loaded.hash == result.run.protocol_hash
-    written = write_report(result, out, loaded if matches else None)
-    print_line(f"{out}: {', '.join(path.name for path in written)}")
+    written = write_report(result, out, _find_protocol(result, protocol))
+    print_line(f"wrote {out}: {', '.join(path.name for path in written)}")
     if not any(path.suffix == ".parquet" for path in written):
         print_line(
             'episodes.parquet was not written, because pyarrow is missing. In the clone: pip install -e ".[lerobot]"'
@@ -197,6 +191,17 @@ def _read(folders: tuple[Path, ...]) -> Result:
 
     _check_folders(folders)
     return read_result(*folders)
+
+
+def _find_protocol(result: Result, given: str | None) -> LoadedProtocol | None:
+    """Load the protocol of a result; None if it is not bundled and not given, or has other files."""
+    from robocas_ms3.core.errors import EvaluationError
+
+    try:
+        loaded = _protocol_of(result, given)
+    except EvaluationError:
+        return None
+    return loaded if loaded.hash == result.run.protocol_hash else None
 
 
 def _protocol_of(result: Result, given: str | None) -> LoadedProtocol:

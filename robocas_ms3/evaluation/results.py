@@ -20,7 +20,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict
 
 from robocas_ms3.core.documents import load_json
-from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.core.files import atomic_folder, write_json
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, list_setting_changes
@@ -186,7 +186,10 @@ def open_result(
         OutputExistsError: the result has other settings, or the folder holds no result.
         RobocasError: another process writes to the folder, or the folder was removed.
     """
-    with OutputFolder(folder, OUTPUT, run.resume_settings(), overwrite=overwrite) as output:
+    with OutputFolder(folder, OUTPUT, overwrite=overwrite) as output:
+        if output.recorded is not None:
+            _check_policy(folder, output.recorded, run)
+            output.check_settings(run.resume_settings())
         output.start(output.recorded or run.to_dict())
         outcomes = _read_outcomes(folder)
         if retry_errors and any(one.error for one in outcomes.values()):
@@ -263,11 +266,25 @@ def get_package_versions() -> dict[str, str]:
     return {name: version(name) for name in _PACKAGES}
 
 
+def _check_policy(folder: Path, recorded: dict[str, Any], run: RunRecord) -> None:
+    """Raise `OutputExistsError` if the result in a folder has another policy."""
+    found, expected = (one["policy"].get("name") for one in (_parse_settings(recorded), run.merge_settings()))
+    if found != expected:  # None: a policy server, whose address may differ
+        what, fix = "the output folder has the result of another policy", "Choose another --out, or pass --overwrite."
+        expected, found = run.policy.name, recorded["policy"]["name"]
+        raise OutputExistsError(what, where=folder, expected=expected, found=found, fix=fix)
+
+
 def _outcomes_file(folder: Path) -> JsonLinesFile[Outcome]:
     return JsonLinesFile(folder / OUTCOMES, Outcome)
 
 
 def _read_folder(folder: Path) -> Result:
+    if folder.is_dir() and not (folder / RUN).exists():
+        records = sorted(path for depth in ("*", "*/*") for path in folder.glob(f"{depth}/{RUN}"))
+        meant = next((path.parent for path in records if (path.parent / OUTCOMES).exists()), None)
+        fix = f"Did you mean {meant}?" if meant else "Pass the output folder of robocas eval."
+        raise EvaluationError("no evaluation result here", where=folder, expected=RUN, fix=fix)
     try:
         record = load_json(folder / RUN)
         run = parse(RunRecord, record, EvaluationError, where=folder / RUN, about=_NO_RESULT)

@@ -83,6 +83,8 @@ def test_policy_modules_in_the_working_directory_are_found(here):
         ("json:Nothing", "unknown policy"),
         ("http://127.0.0.1:9", "unknown policy .*ws://host:port"),
         ("own_policy.py:Mine", "unknown policy.*Omit the suffix .py: own_policy:Mine"),
+        ("./own_policy.py:Mine", "unknown policy.*Did you mean own_policy:Mine"),
+        ("runs/pik", "unknown policy.*no such folder"),
         ("own_nowhere:Mine", "unknown policy .*No module named 'own_nowhere'.*PYTHONPATH"),
         ("own_policy:Yours", "unknown policy .*Yours"),
         ("own_spoilt:Mine", "own_spoilt: cannot import the module of the policy .*SyntaxError"),

@@ -52,8 +52,27 @@ def test_damaged_line_is_an_error_with_its_number(tmp_path):
 def test_folder_without_a_valid_record_is_refused(tmp_path, record):
     if record is not None:
         (tmp_path / RUN).write_text(json.dumps(record))
-    with pytest.raises(EvaluationError, match="invalid evaluation result"):
+    what = "no evaluation result here" if record is None else "invalid evaluation result"
+    with pytest.raises(EvaluationError, match=what):
         read_result(tmp_path)
+
+
+def test_folder_of_results_suggests_a_result(tmp_path):
+    write(tmp_path / "protocol" / "random", [outcome(0)])
+    for folder in (tmp_path, tmp_path / "protocol"):
+        with pytest.raises(EvaluationError) as error:
+            read_result(folder)
+        assert error.value.fix == f"Did you mean {tmp_path / 'protocol' / 'random'}?"
+
+
+def test_result_of_another_policy_is_not_continued(tmp_path):
+    """The error names both policies, and no other settings."""
+    write(tmp_path / "a", [outcome(0)])
+    other = {**RUN_OF, "policy": {"name": "other", "spec": {"rate_hz": 5}}}
+    with pytest.raises(OutputExistsError) as error:
+        start(tmp_path / "a", other)
+    assert (error.value.found, error.value.expected) == ("mine", "other")
+    assert start(tmp_path / "a", other, overwrite=True) == []
 
 
 @pytest.mark.parametrize(

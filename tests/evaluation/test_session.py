@@ -197,7 +197,9 @@ def evaluate(folder, policy="random", **settings) -> dict[int, dict]:
 
 
 @pytest.mark.parametrize("times", [1, 2])
-def test_episode_is_repeated_once_after_a_crash_and_then_counts_as_failed(short, tmp_path, monkeypatch, caplog, times):
+def test_episode_is_repeated_once_after_a_crash_and_then_counts_as_failed(
+    short, tmp_path, monkeypatch, caplog, capsys, times
+):
     protocol, made, deaths, out = load_protocol(short), [], [times], tmp_path / "out"
 
     def make_vec(env_id, count, **_):
@@ -219,7 +221,12 @@ def test_episode_is_repeated_once_after_a_crash_and_then_counts_as_failed(short,
     assert not [one for one in violations if one.startswith("episode 1:") and times == 2]
     command = ["eval", "--policy", "noop", "--protocol", short, "--backend", "processes", "--out", out]
     assert cli([str(word) for word in command]) == times - 1  # the failed episode is not repeated
+    said = capsys.readouterr().out
+    assert "\n4 of 8 episodes run, 4 already there; " in said and " of 8 succeeded\n" in said
+    assert ("(the worker process crashed: SIGSEGV). Repeat with --retry-errors." in said) == (times == 2)
     assert results.read_result(out).count_errors() == times - 1
+    assert cli([str(word) for word in command]) == times - 1
+    assert "\nno episode run, 8 already there; " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("times", [1, 2])
@@ -286,7 +293,7 @@ def test_interrupted_run_continues_with_more_envs_and_equal_outcomes(sequential,
     playing.close()
     path = tmp_path / "episodes.jsonl"
     path.write_text(path.read_text() + path.read_text()[:100])  # an incomplete line
-    with pytest.raises(OutputExistsError, match="policy.name"):
+    with pytest.raises(OutputExistsError, match="result of another policy .expected noop, found random"):
         evaluate(tmp_path, "noop", protocol=str(short))
     assert evaluate(tmp_path, protocol=str(short), **PICK) == sequential
 

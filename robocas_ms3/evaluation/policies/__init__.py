@@ -91,7 +91,12 @@ def find_policy(name: str) -> Callable[[], Policy]:
     if re.fullmatch(r"\w+(\.\w+)*", kind) and rest.isidentifier():
         return partial(_make_from_module, name, kind, rest)
     expected = f"{', '.join(known)}, a folder of robocas train, replay:TRAJECTORY.h5, module:Class or ws://host:port"
-    raise EvaluationError("unknown policy", where=name, expected=expected, fix=did_you_mean(name, known), usage=True)
+    found, fix = None, did_you_mean(name, known)
+    if kind.endswith(".py") and rest.isidentifier():
+        fix = f"Did you mean {Path(kind).stem}:{rest}? Run in the folder of the module."
+    elif not rest and len(folder.parts) > 1 and not folder.exists():
+        found = "no such folder"
+    raise EvaluationError("unknown policy", where=name, expected=expected, found=found, fix=fix, usage=True)
 
 
 def make_policy(name: str) -> Policy:

@@ -29,11 +29,11 @@ def write_report(result: Result, folder: Path, protocol: LoadedProtocol | None =
     Args:
         result: the result.
         folder: output folder; the page links the videos in its folder ``videos``.
-        protocol: protocol of the result; the page then also lists missing episodes.
+        protocol: protocol of the result; adds its number of episodes, and to the page the missing episodes.
     """
     make_folder(folder)
     written = []
-    for name, text in ((MARKDOWN, render_markdown(result)), (PAGE, render_page(result, folder, protocol))):
+    for name, text in ((MARKDOWN, render_markdown(result, protocol)), (PAGE, render_page(result, folder, protocol))):
         written.append(folder / name)
         with atomic_file(folder / name) as tmp:
             tmp.write_text(escape_controls(text, lines=True), encoding="utf-8")

@@ -57,7 +57,7 @@ def compare_results(results: Sequence[Result]) -> str:
         raise EvaluationError(what, where=results[-1].folder, fix=fix)
     names = [chr(ord("A") + number) for number in range(len(results))]
     measured = first.run.protocol + (" with RoboCAS-v0's weld" if first.run.weld else "")
-    runs = [f"{name}: {one.run.policy.name} ({one.folder})" for name, one in zip(names, results, strict=True)]
+    runs = [f"{name}: {_name_policy(one, results)} ({one.folder})" for name, one in zip(names, results, strict=True)]
     both = "both" if len(results) == 2 else "all"
     head = escape_markdown(
         f"{', '.join(runs)}; {format_count(len(shared), 'episode')} of {measured} in {both} results."
@@ -77,6 +77,16 @@ def compare_results(results: Sequence[Result]) -> str:
             found = compare_successes(successes[other], successes[one])
             rows.append(ComparisonRow(config, (names[one], names[other]), found))
     return _render_table(head, "configuration", rows)
+
+
+def _name_policy(result: Result, results: Sequence[Result]) -> str:
+    """Return the policy of a result; also its tasks, if the results have other tasks in the same episodes."""
+    name, played_as = result.run.policy.name, result.run.played_as
+    if all(one.run.played_as == played_as for one in results):
+        return name
+    tasks = dict.fromkeys(one.task for one in result.outcomes.values())
+    texts = (f"{task} in the episodes of {played_as[task]}" if task in played_as else task for task in tasks)
+    return f"{name}, {' and '.join(texts)}"
 
 
 def compare_splits(result: Result, protocol: LoadedProtocol) -> str:

@@ -21,6 +21,7 @@ from robocas_ms3.evaluation.report.tables import (
     Cell,
     FailureCount,
     Table,
+    count_episodes,
     get_failure_name,
     get_stage_names,
     list_notes,
@@ -71,7 +72,6 @@ def render_page(result: Result, folder: Path | None = None, protocol: LoadedProt
 def _render_lead(result: Result, protocol: LoadedProtocol | None) -> str:
     count = len(result.outcomes)
     total = count if protocol is None else len(protocol.episodes)
-    episodes = format_count(count, "episode") if protocol is None else f"{count} of {format_count(total, 'episode')}"
     texts = [escape(note, quote=False) for note in list_notes(result)]
     if protocol is not None and count < total:
         missing = Counter(episode.config for episode in protocol.episodes if episode.episode not in result.outcomes)
@@ -79,7 +79,7 @@ def _render_lead(result: Result, protocol: LoadedProtocol | None) -> str:
         texts.append(f"Incomplete result: {format_count(missing.total(), 'episode')} of the protocol missing ({of}).")
     if broken := result.count_errors():
         texts.append(f"Ended by an error: {format_count(broken, 'episode')}, counted as failed.")
-    lead = f"{episodes}, protocol hash <code>{escape(result.run.protocol_hash[:16])}</code>."
+    lead = f"{count_episodes(result, protocol)}, protocol hash <code>{escape(result.run.protocol_hash[:16])}</code>."
     return f'<p class="lead">{lead}</p>\n' + "".join(f'<p class="note">{note}</p>\n' for note in texts)
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from robocas_ms3.core.text import escape_markdown, format_count
 from robocas_ms3.evaluation.outcomes import PAPER_STAGES, Outcome
+from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import SuccessRate, bin_success_rates
 from robocas_ms3.scenes.task_specs import STAGES as DEFAULT_STAGES
@@ -85,15 +86,18 @@ def make_tables(result: Result) -> Iterator[Table]:
     yield from _make_retrieval_table(result)
 
 
-def render_markdown(result: Result) -> str:
-    """Return the report of a result as Markdown: title, notes, settings and tables."""
+def render_markdown(result: Result, protocol: LoadedProtocol | None = None) -> str:
+    """Return the report of a result as Markdown: title, notes, settings and tables.
+
+    ``protocol``: protocol of the result; adds its number of episodes.
+    """
     run, broken = result.run, result.count_errors()
     versions = ", ".join(f"{name} {number}" for name, number in run.versions.items())
     lines = [
         f"# {escape_markdown(make_title(result))}",
         "",
         *(line for note in list_notes(result) for line in (f"**{escape_markdown(note)}**", "")),
-        f"Protocol hash {escape_markdown(run.protocol_hash[:16])}, {format_count(len(result.outcomes), 'episode')}, "
+        f"Protocol hash {escape_markdown(run.protocol_hash[:16])}, {count_episodes(result, protocol)}, "
         f"{escape_markdown(run.backend)}; {escape_markdown(versions)}. "
         f"Intervals are Clopper-Pearson's, 95 %. {_STAGE_NOTE}",
         *(["", f"**Ended by an error: {format_count(broken, 'episode')}, counted as failed.**"] if broken else []),
@@ -106,6 +110,14 @@ def render_markdown(result: Result) -> str:
             cells = (_render_cell(cell, head) for cell, head in zip(row, table.heads, strict=True))
             lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def count_episodes(result: Result, protocol: LoadedProtocol | None) -> str:
+    """Return the number of episodes of a result, such as ``2 of 400 episodes`` if the protocol is known."""
+    count = len(result.outcomes)
+    if protocol is None:
+        return format_count(count, "episode")
+    return f"{count} of {format_count(len(protocol.episodes), 'episode')}"
 
 
 def make_title(result: Result) -> str:

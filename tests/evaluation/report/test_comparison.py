@@ -30,6 +30,13 @@ def test_comparison_uses_the_common_episodes(tmp_path):
     assert float(p) == float(adjusted) == pytest.approx(2 * 0.5**7, rel=0.01)
 
 
+def test_comparison_names_the_task_that_is_evaluated_in_other_episodes(tmp_path):
+    one = write(tmp_path / "a", [outcome(0)])
+    other = write(tmp_path / "b", [outcome(0, task="select")], played_as={"select": "pick"})
+    expected = f"A: mine, pick ({one.folder}), B: mine, select in the episodes of pick ({other.folder}); "
+    assert compare_results([one, other]).startswith(expected)
+
+
 def test_p_values_of_several_comparisons_are_adjusted(tmp_path):
     """Three results over two configurations; the rows over all configurations are a separate family."""
 

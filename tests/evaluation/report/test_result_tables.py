@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 from synthetic_results import outcome, write
 
+from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.report.tables import render_markdown
 
 
@@ -28,6 +29,8 @@ def test_tables_of_successes_failures_and_occlusion(result, tmp_path):
     said = render_markdown(result).partition("Where episodes failed")[2]
     assert row(said, "configuration") == ["configuration", "n", "failed", "an object touched", "placed, at rest"]
     assert row(said, "table") == ["table", "4", "2", "1", "1"]
+    assert ", 6 episodes," in render_markdown(result)
+    assert ", 6 of 8 episodes," in render_markdown(result, load_protocol("smoke"))
     assert "first stage that was not reached" in said
     assert "weld" not in render_markdown(result)
     assert "played_as" not in render_markdown(result)
