@@ -91,7 +91,7 @@ def find_policy(name: str) -> Callable[[], Policy]:
     if re.fullmatch(r"\w+(\.\w+)*", kind) and rest.isidentifier():
         return partial(_make_from_module, name, kind, rest)
     expected = f"{', '.join(known)}, a folder of robocas train, replay:TRAJECTORY.h5, module:Class or ws://host:port"
-    found, fix = None, did_you_mean(name, known)
+    found, fix = "", did_you_mean(name, known)
     if kind.endswith(".py") and rest.isidentifier():
         fix = f"Did you mean {Path(kind).stem}:{rest}? Run in the folder of the module."
     elif not rest and len(folder.parts) > 1 and not folder.exists():

@@ -10,6 +10,7 @@ from robocas_ms3.cli.eval import run
 from robocas_ms3.cli.eval_results import Videos, videos
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policies.plain import RandomPolicy
+from robocas_ms3.evaluation.policy import ExternalPolicy, PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.report.videos import SIZE, choose_failed_episodes, record_videos
 from robocas_ms3.evaluation.settings import EvaluationSettings
@@ -30,6 +31,24 @@ def test_result_of_another_protocol_is_refused(tmp_path):
     result.run.protocol_hash = "0"
     with pytest.raises(EvaluationError, match="other files of the protocol"):
         next(record_videos(result, load_protocol("smoke"), RandomPolicy(), [0]))
+
+
+def test_policy_gets_only_configurations_of_the_result_for_its_warnings(tmp_path, monkeypatch):
+    protocol, found = load_protocol("paper-v1"), []
+
+    class Specialist(ExternalPolicy):
+        def protocol_warnings(self, configs) -> list[str]:
+            found.extend((name, config.task) for name, config in configs.items())
+            return []
+
+    monkeypatch.setattr("robocas_ms3.evaluation.report.videos.require_renderer", lambda: None)
+    config = "pick_upstream_eval"
+    for task, played_as in (("pick", {}), ("select", {"select": "pick"})):
+        outcomes = [outcome(0, task=task, config=config, split=protocol.episodes[0].split)]
+        run = {"protocol": "paper-v1", "protocol_hash": protocol.hash, "played_as": played_as}
+        result = write(tmp_path / task, outcomes, **run)
+        assert not list(record_videos(result, protocol, Specialist(PolicySpec(reference="tcp", rate_hz=5)), []))
+    assert found == [(config, "pick"), (config, "select")]
 
 
 @pytest.mark.parametrize("installed", ["random", "small"])
