@@ -85,7 +85,7 @@ def test_work_unit_that_kills_its_jobs_ends_the_run(jobs, tmp_path):
         jobs.run(out, units_per_job="1")
     assert error.value.where == PlanFolder(PLAN, out).unit_folder(WorkUnit(0, 0))
     if jobs.name == "slurm":
-        assert any(Path(word.rstrip(";")).is_file() for word in str(error.value.fix).split())  # the job's log
+        assert any(Path(word.rstrip(".")).is_file() for word in str(error.value.fix).split())  # the job's log
 
 
 def test_error_of_all_seeds_ends_the_run(jobs, undisturbed, tmp_path):
