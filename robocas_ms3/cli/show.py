@@ -40,7 +40,6 @@ class Show:
 def main(cfg: Show) -> int:
     from robocas_ms3.assets.pack import load_pack
     from robocas_ms3.core.checks import MAX_SEED, check_number
-    from robocas_ms3.core.errors import RobocasError
     from robocas_ms3.scenes.config import load_task_config
 
     check_number("--seed", cfg.seed, 0, MAX_SEED)
@@ -55,9 +54,11 @@ def main(cfg: Show) -> int:
     import robocas_ms3.tasks  # noqa: F401  (registers the environments)
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.files import atomic_file, make_folder
+    from robocas_ms3.datasets.conversion.env_renderer import require_renderer
     from robocas_ms3.scenes.task_specs import TASKS
     from robocas_ms3.tasks.base import RoboCASEnv
 
+    require_renderer()
     shader = {"shader_pack": cfg.shader}
     env = gym.make(
         TASKS[config.task].env_id,
@@ -70,8 +71,6 @@ def main(cfg: Show) -> int:
     )
     base_env = env.unwrapped
     assert isinstance(base_env, RoboCASEnv)
-    if not base_env.scene.can_render():
-        raise RobocasError("there is no render device", fix="Install a Vulkan driver, then run robocas doctor.")
     from PIL import Image
 
     obs, _ = env.reset(seed=cfg.seed)
