@@ -10,6 +10,8 @@ from robocas_ms3.core.extensions import Registry
 SIM_FREQ = 100  # Hz, physics
 STANDARD_FREQ = 20  # Hz, control; the horizon registered with gymnasium assumes this rate
 STAGES = ("furniture_opened", "reached_any", "obstacles_cleared", "reached_target", "target_grasped", "target_lifted")
+MAX_HIDDEN_FRACTION = 0.2  # greatest hidden fraction of a cleared target (paper)
+MAX_OBSTACLES = 1  # greatest number of obstacles around a cleared target (paper)
 
 
 @dataclass(frozen=True)

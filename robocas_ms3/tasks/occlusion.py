@@ -18,11 +18,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from robocas_ms3.scenes.task_specs import MAX_HIDDEN_FRACTION, MAX_OBSTACLES
+
 CELL = 0.005  # edge of a cell at the target's depth, m
 CELLS = 64  # cells per side: the grid extends 0.16 m from the target's middle
 NEAREST = 0.05  # m below the camera; points that are higher are treated as if they were at this depth
-MAX_HIDDEN_FRACTION = 0.2  # greatest hidden fraction of a cleared target (paper)
-MAX_OBSTACLES = 1  # greatest number of obstacles around a cleared target (paper)
 REACH = 2  # cells (1 cm) around the target's outline in which an object can be an obstacle
 LEAST_MOTION = 1e-4  # m and quaternion components; less motion has no effect in cells of 5 mm
 PUSH_START_DISTANCE = 0.02  # m between an obstacle and the point where its push starts

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from robocas_ms3.core.arrays import Array, as_float32, as_tensor, clamp, norm, to_native, where
-from robocas_ms3.tasks.occlusion import MAX_HIDDEN_FRACTION, MAX_OBSTACLES
+from robocas_ms3.scenes.task_specs import MAX_HIDDEN_FRACTION, MAX_OBSTACLES
 from robocas_ms3.tasks.terms import BASKET_SHIFT
 
 _MANY_OBSTACLES = 5  # obstacles beyond those that a cleared target may have; more of them change no reward

@@ -107,11 +107,6 @@ def open_episode(file: h5py.File, number: int) -> h5py.Group:
     """
     name = f"traj_{number}"
     where = f"{file.filename}, {name}"
-    bad_links: list[bytes] = []
-
-    def is_bad_link(name: bytes, link: Any) -> bool | None:
-        return None if link.type == _HARD_LINK else bad_links.append(name) or True
-
     with convert_read_errors(where):
         links: Any = file.id.links
         if not links.exists(name.encode()):
@@ -119,16 +114,27 @@ def open_episode(file: h5py.File, number: int) -> h5py.Group:
         group: Any = file[name] if links.get_info(name.encode()).type == _HARD_LINK else None
         if group is None:
             raise _external_reference(where, "a link")
-        if group.id.links.visit(is_bad_link, info=True):  # visits each group once, even in cycles
-            raise _external_reference(f"{where}/{bad_links[0].decode(errors='replace')}", "a link")
+        check_links(group, where)
     return group
+
+
+def check_links(group: h5py.Group, where: object) -> None:
+    """Raise ``DatasetError`` if a group contains soft or external links, also in its subgroups."""
+    bad_links: list[bytes] = []
+
+    def is_bad_link(name: bytes, link: Any) -> bool | None:
+        return None if link.type == _HARD_LINK else bad_links.append(name) or True
+
+    links: Any = group.id.links
+    if links.visit(is_bad_link, info=True):  # visits each group once, even in cycles
+        raise _external_reference(f"{where}/{bad_links[0].decode(errors='replace')}", "a link")
 
 
 def copy_episode(source: h5py.File, number: int, target: h5py.File, new_number: int) -> None:
     """Copy the group of an episode to another trajectory file under a new number."""
     group = open_episode(source, number)
     with convert_read_errors(f"{source.filename}, traj_{number}"):
-        group.visititems(lambda _, item: _check_stored_in_file(item) if isinstance(item, h5py.Dataset) else None)
+        group.visititems(lambda _, item: check_stored_in_file(item) if isinstance(item, h5py.Dataset) else None)
         source.copy(group, target, name=f"traj_{new_number}")
 
 
@@ -212,7 +218,7 @@ def _check_orientations(rows: NDArray[Any], name: str, where: str) -> None:
 def _collect_arrays(node: Any, depth: int) -> Any:
     """Convert nested groups to dicts of HDF5 datasets, without reading their values."""
     if isinstance(node, h5py.Dataset):
-        _check_stored_in_file(node)
+        check_stored_in_file(node)
         return node
     if not depth:
         raise ValueError("expected an array, found a group; groups are nested too deeply")
@@ -231,7 +237,8 @@ def _load(found: Any) -> Any:
     return {name: _load(inner) for name, inner in found.items()} if isinstance(found, dict) else found[()]
 
 
-def _check_stored_in_file(array: h5py.Dataset) -> None:
+def check_stored_in_file(array: h5py.Dataset) -> None:
+    """Raise ``DatasetError`` if the values of an array are in other files."""
     if array.external or array.is_virtual:
         where = f"{array.file.filename}, {str(array.name).strip('/')}"
         raise _external_reference(where, "an array stored in other files")

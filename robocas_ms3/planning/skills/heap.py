@@ -9,13 +9,14 @@ from typing import Literal
 import numpy as np
 
 from robocas_ms3.core.errors import PlanningError, UnrecoverableError
+from robocas_ms3.planning.clearing_cost import compute_clearing_cost
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.look import measure_hidden_fraction
 from robocas_ms3.planning.skills.push import push_away, read_surface
 from robocas_ms3.planning.skills.remove import count_clear_grasps, find_grasp_blockers, remove_object
-from robocas_ms3.tasks.occlusion import MAX_HIDDEN_FRACTION
+from robocas_ms3.scenes.task_specs import MAX_HIDDEN_FRACTION
 from robocas_ms3.tasks.search import RoboCASSearchEnv
 from robocas_ms3.tasks.terms import FALLEN
 
@@ -26,8 +27,7 @@ MAX_OBSTACLES = 4  # obstacles that are considered, the highest first
 TURNS_DEG = (30.0, -30.0)  # offsets from the paper's push direction
 EDGE_MARGIN = 0.01  # m from every object to the edge of the surface
 
-# costs of the state after a move, in s of the demonstration
-COST_PER_OBSTACLE, COST_PER_HIDDEN_FRACTION, COST_WITHOUT_GRASP, COST_PER_METRE_OF_TARGET = 10.0, 30.0, 8.0, 400.0
+COST_PER_METRE_OF_TARGET = 400.0  # s per metre that a move displaces the target
 COST_PER_PUSH = 8.0  # s; the result of a push is less repeatable than that of a removal
 
 
@@ -148,9 +148,8 @@ class Heap:
         with self.arm.planning_time():
             clutter = self.env.measure_clutter()
             hidden, obstacles = float(clutter.hidden_fraction[0]), int(clutter.obstacles[0].sum())
-            cost = COST_PER_OBSTACLE * max(0, obstacles - 1)
-            cost += COST_PER_HIDDEN_FRACTION * max(0.0, hidden - MAX_HIDDEN_FRACTION)
-            return cost + COST_WITHOUT_GRASP * (not count_clear_grasps(self.arm, self.target))
+            grasps = count_clear_grasps(self.arm, self.target)
+            return float(compute_clearing_cost(obstacles, hidden, grasps))
 
     def check_objects_on_surface(self) -> None:
         """Check that all objects are on the surface.
