@@ -89,8 +89,9 @@ def generate(
 
     The function writes ``trajectory.h5`` and ``.json``, ``failures.jsonl``, ``run.json`` (settings and versions) and
     ``summary.json`` to the output folder. Each finished episode is a separate file in ``episodes`` until the end of the
-    run. A second call resumes an interrupted run, or adds episodes to a finished run. Seeds are consecutive and results
-    are taken in their order, so neither ``jobs`` nor an interruption changes the episodes.
+    run. A second call resumes an interrupted run, or adds episodes to a finished run. It keeps the episodes of the
+    first seeds without a gap, also if there are more than requested. Seeds are consecutive and results are taken in
+    their order, so neither ``jobs`` nor an interruption changes the episodes.
 
     Args:
         settings: options of the run.
@@ -118,9 +119,10 @@ def generate(
         run = _Run(output.path)
         on_start(sum(result.success for result in run.earlier.values()))
         results, successes = [], 0
+        kept = next(n for n in count() if settings.seed + n not in run.earlier)  # seeds that a resumed run always keeps
         try:
             with closing(_iterate_results(settings, run, make_roll_in)) as found:
-                while successes < settings.episodes:
+                while successes < settings.episodes or len(results) < kept:
                     result = next(found)
                     if result.seed not in run.earlier:
                         output.check_exists()
@@ -128,12 +130,13 @@ def generate(
                         on_result(result)
                     results.append(result)
                     successes += result.success
-                    if len(results) - successes > max(20, 3 * successes):
+                    skipped, limit = len(results) - successes, max(20, 3 * successes)
+                    if skipped > limit and successes < settings.episodes:
                         raise RobocasError(
                             "too many seeds are skipped",
                             where=output.path,
-                            expected=f"at most {max(20, 3 * successes)} for {format_count(successes, 'episode')}",
-                            found=f"{len(results) - successes} skipped seeds",
+                            expected=f"at most {limit} for {format_count(successes, 'episode')}",
+                            found=f"{skipped} skipped seeds",
                             fix=f"See {FAILURES_FILE} for the reasons; fewer objects (--set objects.count=N) may help.",
                         )
         except BaseException:

@@ -170,6 +170,16 @@ def test_request_for_fewer_episodes_than_exist(tmp_path, made):
     assert made == [0, 1, 2, 3, 4]
 
 
+def test_request_for_fewer_episodes_than_an_interrupted_run_has(tmp_path, made):
+    """The episodes were finished for a larger request, so none of them may be deleted."""
+    write_killed_run(tmp_path / "out", (0, 1, 3, 4), [*lines_of(1), *lines_of(2), *lines_of(4)])
+    started = []
+    summary = generate(tmp_path / "out", episodes=2, on_start=started.append)
+    assert (started, made) == ([4], [])
+    assert seeds_of(tmp_path / "out") == [0, 1, 3, 4]
+    assert (summary.episodes, summary.seeds, summary.skipped) == (4, 5, [SKIPPED])
+
+
 def test_removed_output_folder_is_a_one_line_error(tmp_path, made):
     out = tmp_path / "out"
     with pytest.raises(RobocasError):
