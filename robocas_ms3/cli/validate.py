@@ -16,13 +16,14 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import format_count
 
 if TYPE_CHECKING:
+    from robocas_ms3.datasets.checks.candidates import CandidatesReport
     from robocas_ms3.datasets.checks.dataset import ValidationReport
     from robocas_ms3.datasets.checks.replay import ReplayReport
 
 
 @dataclass
 class Validate:
-    """Check a dataset against its format and list every violation (exit status 1 if there is one).
+    """Check a dataset or candidates.h5 against its format and list every violation (exit status 1 if there is one).
 
     With --replay, the command also replays the 7-D actions of each episode open loop in its scene. It reports the
     success rate and the tracking error of the gripper. The exit status depends on the success rate only with
@@ -32,7 +33,7 @@ class Validate:
     """
 
     dataset: Annotated[Path, tyro.conf.Positional]
-    """Folder of the dataset."""
+    """Folder of the dataset, or a candidates.h5."""
     replay: bool = False
     """Replay the 7-D actions of each episode in simulation, without rendering (RoboCAS folders only)."""
     min_success: Maybe[float] = None
@@ -58,13 +59,12 @@ def main(cfg: Validate) -> int:
         raise DatasetError(what, where="--replay", expected=expected, found=f"{cfg.dataset}, a {found.title}")
     with ProgressBar("episodes checked", transient=True) as bar:
         check = found.import_function("checker") if found and found.checker else validate
-        report: ValidationReport = check(cfg.dataset, on_episode=bar.update)
+        report: ValidationReport | CandidatesReport = check(cfg.dataset, on_episode=bar.update)
     if not cfg.json:
         for violation in report.violations:
             print_line(str(violation))
         verdict = format_count(len(report.violations), "violation") if report.violations else "valid"
-        counts = f"{format_count(report.episodes, 'episode')}, {format_count(report.steps, 'step')}"
-        print_line(f"{cfg.dataset}: {counts}, {verdict}")
+        print_line(f"{cfg.dataset}: {report.describe_size()}, {verdict}")
     content, wrong = report.as_json(), bool(report.violations)
     if cfg.replay:
         replays = _replay(cfg.dataset, cfg.pack)

@@ -20,6 +20,8 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource
 
 ENTRY_POINT_GROUP = "robocas_ms3.formats"
+CANDIDATES = "candidates"
+"""Format of ``candidates.h5``, which has decisions and no episodes (docs/candidates.md)."""
 _log = logging.getLogger(__name__)
 
 
@@ -33,10 +35,11 @@ class Format:
         name: name in ``robocas convert --to``.
         title: name in messages, such as "LeRobot dataset".
         matches: function that returns whether a path has this format, complete or not; it should read little.
-        reader: (path, *, rate_hz=None, include_failed=False) -> `EpisodeSource`.
+        reader: (path, *, rate_hz=None, include_failed=False) -> `EpisodeSource`; empty: the format has no episodes.
         writer: (`conversion.settings.ConversionSettings`, *, on_start=None, on_episode=None) -> `ConversionResult`, see
             `conversion.convert.convert`; empty: the format can't be written.
-        checker: (root, *, on_episode=None) -> `checks.dataset.ValidationReport`; empty: the format can't be checked.
+        checker: (root, *, on_episode=None) -> `checks.dataset.ValidationReport`, or a report with the same methods;
+            empty: the format can't be checked.
         options: options of ``robocas convert`` that apply to this format and not to all formats.
     """
 
@@ -66,6 +69,14 @@ def _is_robocas(path: Path) -> bool:
     return marked or (path.is_dir() and any(path.glob("episode_" + "[0-9]" * 7)))
 
 
+def _has_candidates(path: Path) -> bool:
+    if not path.is_file() or path.suffix not in {".h5", ".hdf5"}:
+        return False
+    from robocas_ms3.demos.candidates.candidates_file import is_candidates_file  # imports h5py
+
+    return is_candidates_file(path)
+
+
 _PACKAGE = "robocas_ms3.datasets"
 _BUILTIN = (
     Format(
@@ -73,6 +84,13 @@ _BUILTIN = (
         "trajectory file",
         lambda path: path.is_file() or path.suffix in {".h5", ".hdf5"},
         f"{_PACKAGE}.sources.trajectory:TrajectorySource",
+    ),
+    Format(
+        CANDIDATES,
+        "file of candidates",
+        _has_candidates,
+        "",
+        checker=f"{_PACKAGE}.checks.candidates:validate_candidates",
     ),
     Format(
         "lerobot",

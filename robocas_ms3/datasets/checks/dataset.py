@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.text import format_count
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.actions import compute_action_space
 from robocas_ms3.datasets.checks import arrays as array_checks
@@ -36,6 +37,10 @@ class ValidationReport:
     episodes: int
     steps: int
     violations: list[Violation]
+
+    def describe_size(self) -> str:
+        """Return the numbers of checked episodes and steps as text."""
+        return f"{format_count(self.episodes, 'episode')}, {format_count(self.steps, 'step')}"
 
     def as_json(self) -> dict[str, Any]:
         return {

@@ -46,6 +46,16 @@ _MAX_BYTES = 2**32  # of all arrays: a small compressed file can declare terabyt
 _MAX_TEXT = 4096  # bytes
 
 
+def is_candidates_file(path: Path) -> bool:
+    """Return whether a path is a file of candidates, by its attribute ``format``."""
+    try:
+        check_regular_file(path)
+        with h5py.File(path, "r") as file:
+            return file.attrs.get("format") == FORMAT
+    except (OSError, DocumentError, RuntimeError, ValueError, TypeError):
+        return False
+
+
 def write_candidates(
     path: Path, records: Sequence[DecisionRecord], env_info: Mapping[str, Any], settings: Mapping[str, Any]
 ) -> None:

@@ -19,7 +19,8 @@ MIN_BENEFIT = 3.0
 class Labels:
     """Labels of N candidates for each of K object slots as the target.
 
-    Costs are those of `compute_clearing_cost`; slots without an object have NaN.
+    Costs are those of `compute_clearing_cost`, and 0 for an object that is held or that the candidate has released into
+    the basket. Slots without an object have NaN.
 
     Attributes:
         cost_before: (N, K) clearing cost of each object before the candidate, s.
@@ -42,9 +43,12 @@ class Labels:
 
 def compute_labels(tables: Tables) -> Labels:
     """Compute the labels of all candidates of a file."""
-    rows = tables.candidates["decision_row"]
-    before = _clearing_cost(tables.decisions)[rows]
-    after = _clearing_cost(tables.candidates)
+    rows, slots = tables.candidates["decision_row"], np.arange(tables.slots)
+    held_before = tables.decisions["held_slot"][:, None] == slots
+    own = tables.candidates["slot"][:, None] == slots  # slot of the object that the candidate moves
+    delivered = tables.candidates["held"][:, None] | tables.candidates["in_basket"]
+    before = np.where(held_before, 0.0, _clearing_cost(tables.decisions))[rows]
+    after = np.where(own & delivered, 0.0, _clearing_cost(tables.candidates))
     benefit = before - after
     helped = (benefit >= MIN_BENEFIT) & ~tables.candidates["fallen"].any(axis=1, keepdims=True)
     return Labels(before, after, benefit, helped, tables.decisions["target_slot"][rows].astype(np.int64))

@@ -26,7 +26,7 @@ def test_benefit_is_the_decrease_of_the_clearing_cost(tmp_path):
     record.values |= {"obstacles": [3, 0], "hidden_fraction": [0.4, 0.0], "free_grasps": [0, 9]}  # 34 and 0 s
     after = {"obstacles": [1, 2], "hidden_fraction": [0.4, 0.0], "free_grasps": [0, 9]}  # 14 and 10 s
     for candidate in record.candidates:
-        candidate.update(after)
+        candidate.update(after | {"held": False})
     record.candidates[1]["hidden_fraction"] = [0.975, 0.0]  # 31.25 s
     record.candidates[1]["fallen"] = [False, True]
     record.candidates[2]["obstacles"] = [3, 0]  # 34 s
@@ -47,3 +47,18 @@ def test_candidates_that_drop_an_object_do_not_help(tmp_path):
     record.candidates[0]["fallen"] = [False, True]
     write_candidates(tmp_path / "c.h5", [record], ENV_INFO, SETTINGS)
     assert not CandidateFile(tmp_path / "c.h5").labels.helped.any()
+
+
+def test_held_and_delivered_objects_need_no_clearing(tmp_path):
+    grasp, release = make_record(3, 0, slots=2, candidates=1), make_record(3, 1, slots=2, candidates=1)
+    clutter = {"obstacles": [3, 0], "hidden_fraction": [0.0, 0.0], "free_grasps": [9, 9]}  # 20 and 0 s
+    for record in (grasp, release):
+        record.values |= clutter
+        record.candidates[0] |= {"slot": 0, **clutter}
+    grasp.candidates[0]["held"] = True
+    release.values["held_slot"] = 0
+    release.candidates[0]["in_basket"] = [True, False]
+    write_candidates(tmp_path / "c.h5", [grasp, release], ENV_INFO, SETTINGS)
+    labels = CandidateFile(tmp_path / "c.h5").labels
+    assert labels.benefit.tolist() == [[20, 0], [0, 0]]
+    assert labels.helped.tolist() == [[True, False], [False, False]]
