@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -14,17 +14,18 @@ from robocas_ms3.core.text import format_count
 
 @dataclass
 class Stats:
-    """Write statistics of a dataset or a trajectory file as plots and JSON.
+    """Write statistics of a dataset, a trajectory file or a candidates.h5 as plots and JSON.
 
-    The statistics cover lengths, objects, layouts, instructions, actions and sub-goals.
+    The statistics cover lengths, objects, layouts, instructions, actions and sub-goals. Those of candidates.h5 cover
+    outcomes, benefits, choices and failures; a table is printed.
 
     Example: robocas stats datasets/pick
     """
 
     path: Annotated[Path, tyro.conf.Positional]
-    """Folder of a dataset, or a trajectory.h5. Failed episodes of a trajectory.h5 are included."""
+    """Folder of a dataset, a trajectory.h5, or a candidates.h5. Failed episodes of a trajectory.h5 are included."""
     out: Maybe[Path] = None
-    """Output folder. Default: DATASET/preview/stats, or TRAJECTORY_stats next to a trajectory."""
+    """Output folder. Default: DATASET/preview/stats, or NAME_stats next to a file NAME.h5."""
     json: bool = False
     """Print the statistics as JSON; files are written only with --out."""
     rate: Maybe[float] = None
@@ -32,20 +33,46 @@ class Stats:
 
 
 def main(cfg: Stats) -> int:
-    from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_json, print_line
+    from robocas_ms3.datasets.formats import CANDIDATES, detect_format
+
+    found = detect_format(cfg.path)
+    out = cfg.out or (None if cfg.json else _default_folder(cfg.path))
+    write_statistics = _write_candidate_statistics if found and found.name == CANDIDATES else _write_statistics
+    content, summary, images = write_statistics(cfg, out)
+    if cfg.json:
+        print_json(content)
+    else:
+        print_line(f"{cfg.path}: {summary}; {out}: stats.json and {format_count(images, 'image')}")
+    return 0
+
+
+def _default_folder(path: Path) -> Path:
     from robocas_ms3.datasets.schema import PREVIEW_FOLDER
+
+    return path / PREVIEW_FOLDER / "stats" if path.is_dir() else path.with_name(f"{path.stem}_stats")
+
+
+def _write_statistics(cfg: Stats, out: Path | None) -> tuple[dict[str, Any], str, int]:
+    """Write the statistics of a dataset; return the content of the JSON, a summary and the number of images."""
+    from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.datasets.statistics.collect import collect_statistics
     from robocas_ms3.datasets.statistics.plots import write_stats
 
     with ProgressBar("episodes read") as bar:
         stats = collect_statistics(cfg.path, rate_hz=cfg.rate, on_episode=bar.update)
-    default = cfg.path / PREVIEW_FOLDER / "stats" if cfg.path.is_dir() else cfg.path.with_name(f"{cfg.path.stem}_stats")
-    out = cfg.out or (None if cfg.json else default)
     paths = write_stats(stats, out) if out else []
-    if cfg.json:
-        print_json(stats.as_json())
-        return 0
-    images = len(paths) - 1
-    print_line(f"{cfg.path}: {stats.summary()}; {out}: stats.json and {format_count(images, 'image')}")
-    return 0
+    return stats.as_json(), stats.summary(), len(paths) - 1
+
+
+def _write_candidate_statistics(cfg: Stats, out: Path | None) -> tuple[dict[str, Any], str, int]:
+    from robocas_ms3.cli.terminal import print_table
+    from robocas_ms3.datasets.statistics.candidate_plots import write_candidate_stats
+    from robocas_ms3.datasets.statistics.candidates import COLUMNS, compute_candidate_statistics
+
+    stats = compute_candidate_statistics(cfg.path)
+    if not cfg.json:
+        print_table(COLUMNS, stats.rows())
+        print_table(("decision", "best chosen", "mean regret s"), stats.choice_rows())
+    paths = write_candidate_stats(stats, out) if out else []
+    return stats.as_json(), stats.summary(), len(paths) - 1

@@ -3,78 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from robocas_ms3.core.errors import require_extra
-from robocas_ms3.core.files import atomic_file, make_folder, write_json
-from robocas_ms3.core.text import escape_controls, format_count, format_object_name
+from robocas_ms3.core.text import format_count, format_object_name
 from robocas_ms3.datasets.actions import ACTION_NAMES
 from robocas_ms3.datasets.statistics.collect import DatasetStatistics, compute_histogram, sort_counts
+from robocas_ms3.datasets.statistics.figures import (
+    BLUE,
+    GREY,
+    ORANGE,
+    grid_shape,
+    make_axes,
+    make_figure,
+    shorten_label,
+    use_integer_ticks,
+    write_figures,
+)
 from robocas_ms3.datasets.statistics.layouts import LayoutMap
 
-DPI = 110
-BLUE, ORANGE, GREY = "#2f6fa8", "#e08a2e", "#9aa3ab"
 MAX_ROWS = 50  # bars per plot; stats.json has all
-_TEXT = 84  # characters of a label
 
 
 def write_stats(stats: DatasetStatistics, out: Path) -> list[Path]:
     """Write ``stats.json`` and the plots as PNG into a folder; return the paths."""
-    require_extra("plots", "statistics", "matplotlib")
-    make_folder(out)
-    paths = [out / "stats.json"]
-    write_json(paths[0], stats.as_json())
-    for name, draw in PLOTS.items():
-        figure = draw(stats)
-        if figure is None:
-            (out / f"{name}.png").unlink(missing_ok=True)  # of an earlier run
-            continue
-        paths.append(out / f"{name}.png")
-        with atomic_file(paths[-1]) as tmp:
-            figure.savefig(tmp, dpi=DPI)
-    return paths
-
-
-def _make_figure(width: float, height: float) -> Any:
-    from matplotlib import rc_context
-    from matplotlib.figure import Figure
-
-    with rc_context({"font.size": 9, "axes.titlesize": 10}):
-        return Figure(figsize=(width, height), layout="constrained")
-
-
-def _make_axes(figure: Any, rows: int, columns: int, count: int) -> list[Any]:
-    grid = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel()
-    for axes in grid[count:]:
-        axes.remove()
-    for axes in grid[:count]:
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.set_axisbelow(True)
-    return list(grid[:count])
-
-
-def _grid_shape(count: int, columns: int) -> tuple[int, int]:
-    columns = min(count, columns)
-    return -(-count // columns), columns
-
-
-def _shorten_label(text: str) -> str:
-    """Shorten a text to a label of one line; dollar signs are escaped for matplotlib."""
-    text = escape_controls(text)
-    return (text if len(text) <= _TEXT else text[: _TEXT - 1].rstrip() + "…").replace("$", r"\$")
-
-
-def _use_integer_ticks(axis: Any) -> None:
-    axis.get_major_locator().set_params(integer=True)
+    return write_figures(stats.as_json(), {name: partial(draw, stats) for name, draw in PLOTS.items()}, out)
 
 
 def draw_lengths(stats: DatasetStatistics) -> Any:
-    rows, columns = _grid_shape(len(stats.lengths), 2)
-    figure = _make_figure(4.6 * columns + 0.4, 2.7 * rows + 0.3)
-    panels = _make_axes(figure, rows, columns, len(stats.lengths))
+    rows, columns = grid_shape(len(stats.lengths), 2)
+    figure = make_figure(4.6 * columns + 0.4, 2.7 * rows + 0.3)
+    panels = make_axes(figure, rows, columns, len(stats.lengths))
     for axes, (task, lengths) in zip(panels, sorted(stats.lengths.items()), strict=True):
         low, high = min(lengths), max(lengths)
         edges = np.linspace(low - 0.5, high + 0.5, min(30, high - low + 1) + 1)
@@ -82,10 +44,10 @@ def draw_lengths(stats: DatasetStatistics) -> Any:
         median = float(np.median(lengths))
         axes.axvline(median, color=ORANGE, linestyle="--", linewidth=1)
         about = f"median {median:.0f} steps = {median / stats.rate_hz:.0f} s"
-        axes.set_title(f"{_shorten_label(task)}: {format_count(len(lengths), 'episode')}, {about}")
+        axes.set_title(f"{shorten_label(task)}: {format_count(len(lengths), 'episode')}, {about}")
         axes.set(xlabel=f"steps of {stats.rate_hz:g} Hz", ylabel="episodes")
-        _use_integer_ticks(axes.xaxis)
-        _use_integer_ticks(axes.yaxis)
+        use_integer_ticks(axes.xaxis)
+        use_integer_ticks(axes.yaxis)
     return figure
 
 
@@ -94,15 +56,15 @@ def draw_objects(stats: DatasetStatistics) -> Any:
         return None
     everything = sort_counts(stats.objects | stats.targets)
     ids = list(everything)[:MAX_ROWS]
-    figure = _make_figure(7, 1.2 + 0.2 * len(ids))
-    axes = _make_axes(figure, 1, 1, 1)[0]
+    figure = make_figure(7, 1.2 + 0.2 * len(ids))
+    axes = make_axes(figure, 1, 1, 1)[0]
     rows = np.arange(len(ids))
-    names = [_shorten_label(format_object_name(i, stats.names.get(i, ""))) for i in ids]
+    names = [shorten_label(format_object_name(i, stats.names.get(i, ""))) for i in ids]
     axes.barh(rows, [stats.objects[i] for i in ids], color=GREY, height=0.8, label="in the scene")
     axes.barh(rows, [stats.targets[i] for i in ids], color=ORANGE, height=0.45, label="target")
     axes.set_yticks(rows, names)
     axes.set_ylim(len(ids) - 0.4, -0.6)
-    _use_integer_ticks(axes.xaxis)
+    use_integer_ticks(axes.xaxis)
     more = f", the first {len(ids)} of {len(everything)}" if len(everything) > len(ids) else ""
     never = sum(1 for asset in everything if not stats.targets[asset])
     axes.set(xlabel="episodes", title=f"Objects{more}; {never} never the target")
@@ -115,9 +77,9 @@ def draw_layouts(stats: DatasetStatistics) -> Any:
     """Draw a heat map of object positions per configuration, with the targets; x is up, y is left."""
     if not stats.layouts:
         return None
-    rows, columns = _grid_shape(len(stats.layouts), 3)
-    figure = _make_figure(4.2 * columns, 2.6 * rows + 0.3)
-    panels = _make_axes(figure, rows, columns, len(stats.layouts))
+    rows, columns = grid_shape(len(stats.layouts), 3)
+    figure = make_figure(4.2 * columns, 2.6 * rows + 0.3)
+    panels = make_axes(figure, rows, columns, len(stats.layouts))
     for axes, (name, layout) in zip(panels, sorted(stats.layouts.items()), strict=True):
         _draw_layout(figure, axes, name, layout)
     figure.suptitle("Objects per cell at the start; dots: targets", fontsize=9)
@@ -147,11 +109,11 @@ def _draw_layout(figure: Any, axes: Any, name: str, layout: LayoutMap) -> None:
     axes.set_ylim(layout.x_edges[0], layout.x_edges[-1])
     axes.locator_params(nbins=5)
     covered = "" if layout.coverage is None else f", {layout.coverage:.0%} covered"
-    axes.set_title(f"{_shorten_label(name)}\n{format_count(layout.episodes, 'episode')}{covered}")
+    axes.set_title(f"{shorten_label(name)}\n{format_count(layout.episodes, 'episode')}{covered}")
     axes.set(xlabel=f"y of {layout.frame} (m)", ylabel="x (m)")
     bar = figure.colorbar(mesh, cax=axes.inset_axes((1.04, 0.0, 0.04, 1.0)))  # as high as the map
     bar.ax.set_ylim(0, max(1, layout.counts.max()))
-    _use_integer_ticks(bar.ax.yaxis)
+    use_integer_ticks(bar.ax.yaxis)
 
 
 def draw_instructions(stats: DatasetStatistics) -> Any:
@@ -162,15 +124,15 @@ def draw_instructions(stats: DatasetStatistics) -> Any:
     }
     tables = {title: list(sort_counts(table).items())[: MAX_ROWS // 2] for title, table in tables.items() if table}
     heights = [0.8 + 0.2 * len(rows) for rows in tables.values()]
-    figure = _make_figure(10, sum(heights))
+    figure = make_figure(10, sum(heights))
     panels = np.atleast_1d(figure.subplots(len(tables), 1, height_ratios=heights))
     for axes, (title, rows) in zip(panels, tables.items(), strict=True):
         axes.spines[["top", "right"]].set_visible(False)
         places = np.arange(len(rows))
         axes.barh(places, [count for _, count in rows], color=BLUE, height=0.7)
-        axes.set_yticks(places, [_shorten_label(text) for text, _ in rows])
+        axes.set_yticks(places, [shorten_label(text) for text, _ in rows])
         axes.set_ylim(len(rows) - 0.4, -0.6)
-        _use_integer_ticks(axes.xaxis)
+        use_integer_ticks(axes.xaxis)
         axes.set_title(title, loc="left")
     panels[-1].set_xlabel("episodes")
     return figure
@@ -179,9 +141,9 @@ def draw_instructions(stats: DatasetStatistics) -> Any:
 def draw_actions(stats: DatasetStatistics) -> Any:
     if not len(stats.actions):
         return None
-    figure = _make_figure(11, 5.2)
+    figure = make_figure(11, 5.2)
     units = ("m", "m", "m", "rad", "rad", "rad", "")
-    for axes, name, column, unit in zip(_make_axes(figure, 2, 4, 7), ACTION_NAMES, stats.actions.T, units, strict=True):
+    for axes, name, column, unit in zip(make_axes(figure, 2, 4, 7), ACTION_NAMES, stats.actions.T, units, strict=True):
         bins = compute_histogram(column)
         edges, counts = np.array(bins["edges"]), np.array(bins["counts"])
         if name == "gripper":
@@ -204,8 +166,8 @@ def draw_subgoals(stats: DatasetStatistics) -> Any:
     if not stats.subgoals:
         return None
     kinds = sorted(stats.subgoals, key=lambda kind: -len(stats.subgoals[kind]))
-    figure = _make_figure(7.5, 1.2 + 0.55 * len(kinds))
-    axes = _make_axes(figure, 1, 1, 1)[0]
+    figure = make_figure(7.5, 1.2 + 0.55 * len(kinds))
+    axes = make_axes(figure, 1, 1, 1)[0]
     seconds = [np.array(stats.subgoals[kind]) / stats.rate_hz for kind in kinds]
     boxes = axes.boxplot(
         seconds,
@@ -218,7 +180,7 @@ def draw_subgoals(stats: DatasetStatistics) -> Any:
     for box in boxes["boxes"]:
         box.set(facecolor="#b9d3ea", edgecolor=BLUE)
     labels = [
-        f"{_shorten_label(kind)}\n{format_count(len(s), 'time')}, median {np.median(s):.1f} s"
+        f"{shorten_label(kind)}\n{format_count(len(s), 'time')}, median {np.median(s):.1f} s"
         for kind, s in zip(kinds, seconds, strict=True)
     ]
     axes.set_yticks(np.arange(1, len(kinds) + 1), labels)
