@@ -47,6 +47,8 @@ PUBLIC = {
     ],
     "robocas_ms3.datasets": [
         "ActionScale",
+        "CandidateDataset",
+        "CandidateOptions",
         "ConversionResult",
         "ConversionSettings",
         "Dataset",
@@ -67,6 +69,7 @@ PUBLIC = {
         "validate",
     ],
     "robocas_ms3.demos": [
+        "CandidateFile",
         "EpisodeSettings",
         "GenerateSettings",
         "ReplayResult",

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from robocas_ms3.datasets.sources.episode_source import EpisodeSource as EpisodeSource
     from robocas_ms3.datasets.sources.episode_source import SourceEpisode as SourceEpisode
     from robocas_ms3.datasets.sources.reader import Dataset as Dataset
+    from robocas_ms3.datasets.training.candidate_dataset import CandidateDataset as CandidateDataset
+    from robocas_ms3.datasets.training.candidate_dataset import CandidateOptions as CandidateOptions
     from robocas_ms3.datasets.training.options import SampleOptions as SampleOptions
     from robocas_ms3.datasets.training.torch_dataset import RoboCASDataset as RoboCASDataset
 
@@ -42,6 +44,7 @@ __getattr__, __dir__, __all__ = make_lazy_exports(
         "robocas_ms3.datasets.lerobot.reader": ["LeRobotDataset"],
         "robocas_ms3.datasets.sources.episode_source": ["EpisodeSource", "SourceEpisode"],
         "robocas_ms3.datasets.sources.reader": ["Dataset"],
+        "robocas_ms3.datasets.training.candidate_dataset": ["CandidateDataset", "CandidateOptions"],
         "robocas_ms3.datasets.training.options": ["SampleOptions"],
         "robocas_ms3.datasets.training.torch_dataset": ["RoboCASDataset"],
     },

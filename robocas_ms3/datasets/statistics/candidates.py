@@ -175,8 +175,7 @@ def compute_candidate_statistics(path: Path) -> CandidateStatistics:
     decisions, candidates, labels = file.decisions, file.candidates, file.labels
     tasks = {spec.env_id: name for name, spec in TASKS.items()}
     benefit, helped = labels.for_target(labels.benefit), labels.for_target(labels.helped)
-    fell, feasible = candidates["fallen"].any(axis=1), candidates["feasible"]
-
+    fell, feasible = np.asarray(candidates["fallen"].any(axis=1)), candidates["feasible"]
     moves = np.isin(candidates["primitive"], MOVES)
 
     def describe(rows: NDArray[np.bool_]) -> PrimitiveStatistics:
@@ -193,7 +192,7 @@ def compute_candidate_statistics(path: Path) -> CandidateStatistics:
     primitives: dict[str, dict[str, PrimitiveStatistics]] = {}
     for primitive in PRIMITIVES:
         rows = np.asarray(candidates["primitive"] == primitive)
-        sources = {source: rows & (candidates["source"] == source) for source in SOURCES}
+        sources = {source: np.logical_and(rows, candidates["source"] == source) for source in SOURCES}
         if rows.any():
             found = {source: describe(of_source) for source, of_source in sources.items() if of_source.any()}
             primitives[primitive] = {ALL_SOURCES: describe(rows), **found}

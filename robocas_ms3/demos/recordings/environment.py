@@ -21,6 +21,7 @@ from robocas_ms3.core.strict_model import StrictModel, list_invalid_values
 from robocas_ms3.robots.cameras import CameraSpec
 from robocas_ms3.robots.registry import RobotSpec, find_robot
 from robocas_ms3.scenes.config.load import bundled_configs, load_config_for
+from robocas_ms3.scenes.config.task import TaskConfig
 from robocas_ms3.scenes.task_specs import TASKS, TaskSpec
 
 _PREFIX = "robocas_ms3:"  # makes gymnasium import this package, which ManiSkill's tools need
@@ -92,7 +93,11 @@ class RecordedEnv:
 
     def cameras(self) -> tuple[CameraSpec, ...]:
         """Return the cameras of task and robot; raise ``DatasetError`` if one of them is not installed."""
-        return load_config_for(self._task(), self.kwargs.get("config")).cameras_of(self.robot().description)
+        return self.task_config().cameras_of(self.robot().description)
+
+    def task_config(self) -> TaskConfig:
+        """Return the task configuration; raise ``DatasetError`` if task or configuration is not installed."""
+        return load_config_for(self._task(), self.kwargs.get("config"))
 
     def _task(self) -> TaskSpec:
         known, config = {spec.env_id: spec for spec in TASKS.values()}, self.kwargs.get("config")
