@@ -32,6 +32,7 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
         "generate": "Record demonstrations of a task with a scripted policy",
         "replay": "Replay recorded demonstrations",
         "convert": "Render demonstrations into a dataset",
+        "render-candidates": "Render the images of decisions with candidates",
     },
     "datasets": {
         "validate": "Check a dataset and list its violations",

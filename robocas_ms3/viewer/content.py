@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +28,33 @@ CAMERA_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,79}")
 """Pattern of the camera names that are shown; names become parts of URLs and paths."""
 
 
-class PageContent:
+class Content(ABC):
+    """Content of the page; the methods are thread-safe.
+
+    Attributes:
+        root: file or folder that the page shows.
+    """
+
+    root: Path
+
+    @abstractmethod
+    def index(self) -> dict[str, Any]:
+        """Return the content of the table, as JSON values."""
+
+    @abstractmethod
+    def episode(self, number: int) -> dict[str, Any]:
+        """Return the content of the page of a row, as JSON values; raise DatasetError if it is damaged."""
+
+    @abstractmethod
+    def rgb(self, number: int, camera: str, step: int) -> EncodedImage:
+        """Return an RGB image of a row of the table."""
+
+    @abstractmethod
+    def depth(self, number: int, camera: str, step: int) -> NDArray[np.uint16]:
+        """Return a depth image (H, W) of a row of the table, uint16 in mm."""
+
+
+class PageContent(Content):
     """Content of the page for one dataset or trajectory file; the methods are thread-safe.
 
     Damaged values are omitted. The row of the episode in the table reports them. Subclasses add the content that only

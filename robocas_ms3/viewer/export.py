@@ -10,14 +10,14 @@ from typing import Any
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.files import atomic_folder, make_folder
 from robocas_ms3.core.text import format_ranges
-from robocas_ms3.viewer.content import PageContent
+from robocas_ms3.viewer.content import Content
 from robocas_ms3.viewer.damage import convert_damage_errors, describe_error, join_reasons
 from robocas_ms3.viewer.images import EncodedImage, render_depth, shrink_image
 from robocas_ms3.viewer.routes import PAGE_FILES, make_script, make_thumbnail, read_page_file
 
 
 def export(
-    source: PageContent,
+    source: Content,
     out: Path,
     *,
     episodes: Sequence[int] = (),
@@ -46,7 +46,8 @@ def export(
     missing = sorted(set(episodes) - set(known))
     if missing:
         expected, found = format_ranges(known), format_ranges(missing)
-        raise DatasetError("no such episode", where=source.root, expected=expected, found=found, usage=True)
+        what = "no such decision" if index.get("decisions") else "no such episode"
+        raise DatasetError(what, where=source.root, expected=expected, found=found, usage=True)
     chosen = [number for number in known if not episodes or number in set(episodes)]
     rows = [e for e in index["episodes"] if e["n"] in set(chosen) or (e["n"] is None and not episodes)]
     index = {**index, "depth": index["depth"] and depth}
@@ -67,7 +68,7 @@ def export(
     return len(chosen), damaged
 
 
-def _write_episode(source: PageContent, index: dict[str, Any], number: int, folder: Path, width: int) -> str:
+def _write_episode(source: Content, index: dict[str, Any], number: int, folder: Path, width: int) -> str:
     lost = ""
     if index["cameras"]:
         lost = _write(folder / "thumbnails" / f"{number}.jpg", lambda: make_thumbnail(source, index, number))

@@ -26,7 +26,7 @@ from typing import Any
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import escape_controls
 from robocas_ms3.viewer import images
-from robocas_ms3.viewer.content import CAMERA_NAME, PageContent
+from robocas_ms3.viewer.content import CAMERA_NAME, Content
 from robocas_ms3.viewer.images import EncodedImage
 
 _SCRIPT = "text/javascript; charset=utf-8"
@@ -34,7 +34,7 @@ PAGE_FILES = {
     "index.html": "text/html; charset=utf-8",
     "style.css": "text/css; charset=utf-8",
     "icon.svg": "image/svg+xml",
-    **{f"{name}.js": _SCRIPT for name in ("data", "table", "plots", "space", "player", "episode", "main")},
+    **{f"{name}.js": _SCRIPT for name in ("data", "table", "plots", "space", "player", "episode", "decision", "main")},
 }
 _NUMBER = r"(0|[1-9][0-9]{0,8})"
 _EPISODE = re.compile(rf"/data/episode_{_NUMBER}\.js")
@@ -58,7 +58,7 @@ class Response:
 class Routes:
     """Responses of the HTTP server for one dataset; the methods are thread-safe."""
 
-    def __init__(self, source: PageContent) -> None:
+    def __init__(self, source: Content) -> None:
         self.source = source
         self.version = secrets.token_hex(4)
         self._making = threading.Lock()
@@ -101,7 +101,7 @@ class Routes:
         return None
 
 
-def make_thumbnail(source: PageContent, index: dict[str, Any], number: int) -> EncodedImage:
+def make_thumbnail(source: Content, index: dict[str, Any], number: int) -> EncodedImage:
     """Return a thumbnail of the first image of an episode, from the static camera if there is one."""
     cameras = index["cameras"]
     if not cameras:

@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.text import escape_controls, print_traceback
-from robocas_ms3.viewer.content import PageContent
+from robocas_ms3.viewer.content import Content
 from robocas_ms3.viewer.routes import Response, Routes
 
 HOST = "127.0.0.1"
@@ -29,7 +29,7 @@ class Viewer(ThreadingHTTPServer):
 
     daemon_threads = False
 
-    def __init__(self, source: PageContent, port: int = 0) -> None:
+    def __init__(self, source: Content, port: int = 0) -> None:
         self.routes = Routes(source)
         self._connections: set[Any] = set()
         self._warming = threading.Thread(target=self.routes.respond, args=("/data/index.js",), daemon=True)

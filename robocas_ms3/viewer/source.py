@@ -14,15 +14,17 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_xyzw, inverse, transform_points
 from robocas_ms3.core.text import format_object_name
 from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.formats import detect_format
+from robocas_ms3.datasets.formats import CANDIDATES, detect_format
 from robocas_ms3.datasets.images.image_headers import read_image_bytes
 from robocas_ms3.datasets.sources.episode_source import ImageKind
 from robocas_ms3.datasets.sources.provenance import make_entry_without_fingerprint, parse_task_name
 from robocas_ms3.datasets.sources.reader import DEFAULT_RATE, Dataset
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.demos.recordings.trajectory_file import Recording, TrajectoryFile
-from robocas_ms3.viewer.content import PageContent
+from robocas_ms3.viewer.content import Content, PageContent
 from robocas_ms3.viewer.damage import convert_damage_errors, read_object, read_or_default
+from robocas_ms3.viewer.decisions.content import DecisionContent
+from robocas_ms3.viewer.decisions.decision_source import DecisionSource
 from robocas_ms3.viewer.episode import ARM, ROLL_PITCH_YAW, XYZ, Plot, collect_facts, make_episode_content, make_plot
 from robocas_ms3.viewer.images import EncodedImage, check_inside
 
@@ -34,18 +36,25 @@ _AT_ONCE = 8  # images decoded together, because opening and seeking a video is 
 _CACHE_BYTES = 128e6  # of decoded images
 
 
-def open_content(path: Path | str) -> PageContent:
-    """Open a trajectory file (or its folder), or a dataset of any format, as content of the page."""
+def open_content(path: Path | str, *, images: Path | None = None) -> Content:
+    """Open a trajectory file (or its folder), candidates.h5, or a dataset of any format, as content of the page.
+
+    ``images`` is the file with the images of candidates.h5; None: the default file, if it exists.
+    """
     path = Path(path)
     inside = path / "trajectory.h5"
     path = inside if inside.is_file() else path
     found = detect_format(path)
+    if found is not None and found.name == CANDIDATES:
+        return DecisionContent(DecisionSource(path, images))
+    if images is not None:
+        raise DatasetError("only candidates.h5 has a file with images", where=path, fix="Omit --images.", usage=True)
     other_file = found is None or (found.name == "trajectory" and path.suffix not in (".h5", ".hdf5"))
     if other_file and not path.is_dir():
         raise DatasetError(
             "nothing to view",
             where=path,
-            expected="a trajectory.h5, a RoboCAS folder or a LeRobot dataset",
+            expected="a trajectory.h5, a candidates.h5, a RoboCAS folder or a LeRobot dataset",
             found="no such file or folder" if not path.exists() else "another kind of file",
         )
     if found is None or found.name == "robocas":

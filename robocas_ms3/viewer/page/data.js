@@ -5,11 +5,13 @@ const robocas = (() => {
   const store = new Map();
   const waiting = new Map();
   const KEEP = 12; // episodes in memory
+  let noun = "episode"; // of a row of the table: "episode" or "decision"
   let query = ""; // of image URLs: browsers cache images, and another server may use the same port
 
   function put(name, content) {
     store.set(name, content);
     if (name === "index" && content.version) query = `?${content.version}`;
+    if (name === "index" && content.decisions) noun = "decision";
     const episodes = [...store.keys()].filter((key) => key !== "index");
     for (const key of episodes.slice(0, Math.max(0, episodes.length - KEEP))) store.delete(key);
   }
@@ -65,5 +67,5 @@ const robocas = (() => {
     return { ctx, width, height };
   }
 
-  return { put, load, imageUrl, thumbnailUrl, byId, element, colour, seriesColour, context };
+  return { noun: () => noun, put, load, imageUrl, thumbnailUrl, byId, element, colour, seriesColour, context };
 })();

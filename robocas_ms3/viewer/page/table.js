@@ -2,9 +2,18 @@
 // The episode table: filters, sorting, and rows created when visible.
 
 robocas.table = (() => {
-  const { byId, element, thumbnailUrl } = robocas;
+  const { byId, element, noun, thumbnailUrl } = robocas;
   const HEIGHT = 52; // of a row, as in style.css
   const SPARE = 6; // rows beyond the visible ones
+  const EPISODES = {
+    tasks: "All tasks", objects: "All objects", stages: "Any attempts", stage: "failed at ", outcomes: "Any outcome", counted: "Steps",
+    object: "Object", count: "Steps", outcome: "Outcome",
+  };
+  const DECISIONS = {
+    tasks: "All kinds", objects: "All targets", stages: "Any candidates", stage: "with ", outcomes: "Any chosen", counted: "Candidates",
+    object: "Target", count: "Cand.", outcome: "Chosen",
+  };
+  let words = EPISODES;
   let index = null;
   let shown = []; // rows that pass the filters, sorted
   let chosen = null;
@@ -15,12 +24,14 @@ robocas.table = (() => {
   function start(content, open) {
     index = content;
     onOpen = open;
+    words = noun() === "decision" ? DECISIONS : EPISODES;
+    byId("f-counted").textContent = words.counted;
     const values = (key) => [...new Set(index.episodes.flatMap((e) => e[key]).filter((v) => v !== "" && v !== null))].sort();
-    options("f-task", "All tasks", values("task"), 2);
-    options("f-object", "All objects", values("object"), 2);
-    options("f-stage", "Any attempts", values("stages"), 1, "failed at ");
+    options("f-task", words.tasks, values("task"), 2);
+    options("f-object", words.objects, values("object"), 2);
+    options("f-stage", words.stages, values("stages"), noun() === "decision" ? 2 : 1, words.stage);
     const damaged = index.episodes.some((e) => e.damage) ? ["damaged"] : [];
-    options("f-success", "Any outcome", [...values("success").map((v) => (v ? "success" : "failure")), ...damaged], 1);
+    options("f-success", words.outcomes, [...values("success").map((v) => (v ? "success" : "failure")), ...damaged], 1);
     heads();
     byId("filters").addEventListener("input", apply);
     byId("filters").addEventListener("submit", (event) => event.preventDefault());
@@ -39,14 +50,14 @@ robocas.table = (() => {
   }
 
   function heads() {
-    const columns = [["", ""], ["n", "#"], ["object", "Object"], ["steps", "Steps"], ["success", "Outcome"]];
+    const columns = [["", ""], ["n", "#"], ["object", words.object], ["steps", words.count], ["success", words.outcome]];
     const box = byId("heads");
     box.classList.toggle("plain", !index.cameras.length);
     box.replaceChildren();
     for (const [key, title] of index.cameras.length ? columns : columns.slice(1)) {
       if (!key) { box.append(element("span")); continue; }
       const arrow = sort.key === key ? (sort.down ? " \u2193" : " \u2191") : "";
-      const button = element("button", { textContent: title + arrow, title: `Sort by ${key === "n" ? "episode" : title.toLowerCase()}` });
+      const button = element("button", { textContent: title + arrow, title: `Sort by ${key === "n" ? noun() : title.toLowerCase()}` });
       if (key === "n" || key === "steps") button.className = "number";
       button.onclick = () => {
         sort = { key, down: sort.key === key && !sort.down };
@@ -88,7 +99,7 @@ robocas.table = (() => {
     shown = index.episodes.filter(passes()).sort(order);
     const isSkipped = (e) => e.n === null;
     const skipped = counted(isSkipped, "seed");
-    byId("count").textContent = counted((e) => !isSkipped(e), "episode") + (skipped ? `, ${skipped} skipped` : "");
+    byId("count").textContent = counted((e) => !isSkipped(e), noun()) + (skipped ? `, ${skipped} skipped` : "");
     byId("f-reset").hidden = shown.length === index.episodes.length;
     byId("spacer").style.height = `${shown.length * HEIGHT}px`;
     for (const row of made.values()) row.remove();
@@ -99,7 +110,7 @@ robocas.table = (() => {
   // "3 episodes", "1 of 3 episodes"; empty without skipped seeds.
   function counted(which, name) {
     const [some, all] = [shown.filter(which).length, index.episodes.filter(which).length];
-    if (!all && name !== "episode") return "";
+    if (!all && name !== noun()) return "";
     return `${some === all ? all : `${some} of ${all}`} ${name}${all === 1 ? "" : "s"}`;
   }
 
@@ -129,7 +140,7 @@ robocas.table = (() => {
     row.classList.toggle("skipped", isSkipped);
     row.classList.toggle("chosen", !isSkipped && e.n === chosen);
     if (!isSkipped) {
-      row.href = `#episode=${e.n}`;
+      row.href = `#${noun()}=${e.n}`;
       row.dataset.episode = e.n;
       row.onclick = (event) => {
         if (event.ctrlKey || event.metaKey || event.shiftKey) return;
@@ -140,9 +151,10 @@ robocas.table = (() => {
     if (index.cameras.length) {
       row.append(isSkipped ? element("span") : element("img", { src: thumbnailUrl(e.n), alt: "", loading: "lazy" }));
     }
-    const title = isSkipped ? `seed ${e.seed}, skipped` : e.object || e.instruction || `seed ${e.seed ?? "unknown"}`;
+    const object = noun() === "decision" ? `${e.task}: ${e.object}` : e.object;
+    const title = isSkipped ? `seed ${e.seed}, skipped` : object || e.instruction || `seed ${e.seed ?? "unknown"}`;
     const attempts = e.attempts > 1 ? `${e.attempts} attempts` : "";
-    const failed = e.stages.length ? `failed at ${e.stages.join(", ").replaceAll("_", " ")}` : "";
+    const failed = e.stages.length && noun() === "episode" ? `failed at ${e.stages.join(", ").replaceAll("_", " ")}` : "";
     const second = isSkipped ? [attempts, failed].filter(Boolean).join(", ") : e.damage || e.instruction;
     const what = element("div", { class: "what", title: second }, element("div", { textContent: title }), element("div", { textContent: second }));
     const outcome = element("div", { class: "outcome", title: [attempts, failed].filter(Boolean).join(", ") });

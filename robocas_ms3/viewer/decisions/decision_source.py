@@ -1,0 +1,213 @@
+"""Decisions of a candidates file with their outcome classes, images and views, for the page and the contact sheet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.core.errors import AssetError, DatasetError
+from robocas_ms3.core.poses import from_wxyz, transform_points
+from robocas_ms3.core.text import format_object_name
+from robocas_ms3.datasets.candidate_images.images_file import CandidateImages, hash_decisions, images_path
+from robocas_ms3.demos.candidates.candidates_file import CandidateFile, Decision
+from robocas_ms3.viewer.decisions.outcomes import classify_outcomes
+from robocas_ms3.viewer.decisions.strokes import Stroke, make_strokes
+from robocas_ms3.viewer.decisions.views import CameraView, Region, View, find_region, make_top_view, project_stroke
+
+Array = NDArray[np.float64]
+_NEARLY_ALL = 0.8  # of the candidates that the best camera shows
+_IN_FRONT = 0.08  # m; a surface that is nearer by this distance hides a candidate
+
+
+@dataclass(frozen=True)
+class Line:
+    """Line of a candidate in a view: pixels (P, 2), and whether it is dashed."""
+
+    pixels: Array
+    dashed: bool
+
+
+@dataclass(frozen=True)
+class ObjectOutline:
+    """Object in a view.
+
+    Attributes:
+        name: name of the object, with its id if the two differ.
+        target: whether it is the instructed target.
+        pixel: (2,) position; NaN: behind the camera.
+        outline: (P, 2) outline; empty: unknown.
+    """
+
+    name: str
+    target: bool
+    pixel: Array
+    outline: Array
+
+
+@dataclass(frozen=True)
+class DecisionView:
+    """View of a decision with its objects and candidates.
+
+    Attributes:
+        view: the projection.
+        candidates: lines of each candidate; empty: not visible.
+        objects: the objects, lowest first.
+        region: part of the image with the candidates and the target.
+        visible: number of candidates that are inside the image and start in front of all surfaces.
+    """
+
+    view: View
+    candidates: list[list[Line]]
+    objects: list[ObjectOutline]
+    region: Region
+    visible: int
+
+
+class DecisionSource:
+    """Decisions of a candidates file.
+
+    Args:
+        path: file ``candidates.h5``.
+        images: file with the images; None: the default file next to it, if it exists.
+
+    Attributes:
+        file: the candidates file.
+        images: the images; None: there are none.
+        outcomes: outcome class (N,) of each candidate.
+
+    Raises:
+        DatasetError: a file is damaged, or the images show other decisions.
+    """
+
+    def __init__(self, path: Path, images: Path | None = None) -> None:
+        self.file = CandidateFile(path)
+        self.outcomes = classify_outcomes(self.file)
+        if images is None and images_path(self.file.path).is_file():
+            images = images_path(self.file.path)
+        self.images = CandidateImages(images, hash_decisions(self.file)) if images else None
+
+    def __len__(self) -> int:
+        return len(self.file)
+
+    def decision(self, row: int) -> Decision:
+        """Return the decision in a row; raise DatasetError if there is none."""
+        if not 0 <= row < len(self):
+            raise DatasetError("no such decision", where=self.file.path, expected=f"0 to {len(self) - 1}", found=row)
+        return self.file.decision(row)
+
+    def name_object(self, decision: Decision, slot: int) -> str:
+        """Return the name of the object in a slot, "" if there is none."""
+        if not 0 <= slot < len(decision.values["present"]) or not decision.values["present"][slot]:
+            return ""
+        return format_object_name(*(str(decision.values[key][slot]) for key in ("object_id", "object_name")))
+
+    def views(self, row: int) -> list[DecisionView]:
+        """Return the views of a decision: those of the cameras, if there are images, and the plot from above."""
+        decision = self.decision(row)
+        strokes = [
+            make_strokes(str(primitive), start, end)
+            for primitive, start, end in zip(
+                *(decision.candidates[key] for key in ("primitive", "start_in_base", "end_in_base")), strict=True
+            )
+        ]
+        found = []
+        if images := self.images:
+            for name in images.cameras:
+                view = CameraView(name, images.size, images.intrinsic(row, name), images.camera_in_base(row, name))
+                depth = images.depth(row, name) if images.has_depth else None
+                found.append(self._make_view(view, decision, strokes, depth))
+        top = make_top_view(_list_points(decision, strokes))
+        return [*found, self._make_view(top, decision, strokes, None)]
+
+    def _make_view(
+        self, view: View, decision: Decision, strokes: Sequence[list[Stroke]], depth: NDArray[np.uint16] | None
+    ) -> DecisionView:
+        lines = [
+            [
+                Line(pixels, stroke.dashed and part == 0)
+                for stroke in of
+                for part, pixels in enumerate(project_stroke(view, stroke))
+            ]
+            for of in strokes
+        ]
+        poses = decision.values["object_in_base"]
+        objects = []
+        present = np.flatnonzero(decision.values["present"])
+        for slot in present[np.argsort(poses[present, 2])]:
+            pixel = view.project(poses[slot : slot + 1, :3].astype(np.float64))[0][0]
+            outline = self._find_outline(view, str(decision.values["object_id"][slot]), poses[slot])
+            target = slot == decision.values["target_slot"]
+            objects.append(ObjectOutline(self.name_object(decision, slot), bool(target), pixel, outline))
+        shown = [line.pixels for of in lines for line in of if not line.dashed]
+        shown += [thing.pixel[None] for thing in objects if thing.target]
+        hidden = _find_hidden(view, decision.candidates["start_in_base"][:, :3], depth)
+        visible = sum(_is_inside(of, view.size) and not behind for of, behind in zip(lines, hidden, strict=True))
+        return DecisionView(view, lines, objects, find_region(view, shown), visible)
+
+    def _find_outline(self, view: View, asset: str, pose: NDArray) -> Array:
+        """Return the convex outline (P, 2) of an object in a view; empty if it is unknown or behind the camera."""
+        corners = self._corners.get(asset)
+        if corners is None or not np.isfinite(pose).all():
+            return np.empty((0, 2))
+        pixels, _ = view.project(transform_points(from_wxyz(pose.astype(np.float64)), corners))
+        return pixels[ConvexHull(pixels).vertices] if np.isfinite(pixels).all() else np.empty((0, 2))
+
+    @cached_property
+    def _corners(self) -> dict[str, Array]:
+        """Corners (P, 3) of the convex hull of each object of the pack by id; empty if the pack is not installed."""
+        try:
+            pack = load_pack(self.file.recorded_env.kwargs.get("pack", "builtin"), usage=False)
+        except AssetError:
+            return {}
+        found = {}
+        for asset in np.unique(self.file.decisions["object_id"][self.file.decisions["present"]]):
+            if str(asset) in pack.objects:
+                points = np.concatenate(pack.objects[str(asset)].hulls)
+                found[str(asset)] = points[ConvexHull(points).vertices]
+        return found
+
+
+def choose_view(views: Sequence[DecisionView]) -> DecisionView:
+    """Return the camera view that shows most candidates, and of about as good ones the closest.
+
+    Without cameras the result is the plot from above, which is the last view.
+    """
+    cameras = views[:-1] or views
+    most = max(shown.visible for shown in cameras)
+    good = [shown for shown in cameras if shown.visible >= _NEARLY_ALL * most]
+    return min(good, key=lambda shown: shown.region[2] / shown.view.size[0])
+
+
+def _is_inside(lines: Sequence[Line], size: tuple[int, int]) -> bool:
+    """Return whether a candidate is visible, and all its lines that are not dashed are inside the image."""
+    pixels = [line.pixels for line in lines if not line.dashed]
+    return bool(pixels) and all(((points >= 0) & (points <= size)).all() for points in pixels)
+
+
+def _find_hidden(view: View, points: NDArray, depth: NDArray[np.uint16] | None) -> NDArray[np.bool_]:
+    """Return which points (P, 3) are hidden behind a surface; none without a depth image (H, W) in mm."""
+    if not isinstance(view, CameraView) or depth is None:
+        return np.zeros(len(points), bool)
+    pixels, scale = view.project(points.astype(np.float64))
+    hidden = np.zeros(len(points), bool)
+    for index, (column, row) in enumerate(pixels):
+        if np.isfinite(column) and 0 <= column < view.size[0] and 0 <= row < view.size[1]:
+            surface = depth[int(row), int(column)] / 1000
+            hidden[index] = 0 < surface < view.intrinsic[0] / scale[index] - _IN_FRONT
+    return hidden
+
+
+def _list_points(decision: Decision, strokes: Sequence[list[Stroke]]) -> Array:
+    """Return all finite points (P, 3) of objects and candidates, and of the TCP."""
+    values = decision.values
+    points = [values["object_in_base"][values["present"], :3], values["tcp_in_base"][None, :3]]
+    points += [stroke.points for of in strokes for stroke in of]
+    found = np.concatenate(points).astype(np.float64)
+    return found[np.isfinite(found).all(axis=1)]
