@@ -312,3 +312,47 @@ class ForkedDecisions:
                 _log.error("a branch failed\n%s", answer.traceback)
         finally:  # even an interrupt must not return to the code that the parent runs too
             os._exit(0)
+
+
+def run_in_forked_process(function: Callable[[], T]) -> T:
+    """Run a function in a forked child process and return its result; this process does not change.
+
+    A child that crashes is run once more. The limit is ``CANDIDATE_TIMEOUT``.
+
+    Raises:
+        ForkedProcessError: the child crashed twice or exceeded its time limit.
+    """
+    try:
+        return _run_once(function)
+    except ForkedProcessCrashError:
+        return _run_once(function)
+
+
+def _run_once(function: Callable[[], T]) -> T:
+    parent = os.getpid()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        forked = fork()
+        if not isinstance(forked, ForkedProcess):
+            try:
+                set_up_forked_process(parent)
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+                forked.send(_call(function))
+            finally:  # even an interrupt must not return to the code that the parent runs too
+                os._exit(0)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    try:
+        answer = forked.receive(CANDIDATE_TIMEOUT)
+    finally:
+        forked.kill()
+    if isinstance(answer, RemoteError):
+        answer.reraise()
+    return answer
+
+
+def _call(function: Callable[[], T]) -> T | RemoteError:
+    try:
+        return function()
+    except BaseException as error:  # noqa: BLE001  (the parent raises it)
+        return RemoteError.from_error(error, "a candidate")

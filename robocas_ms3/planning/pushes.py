@@ -97,13 +97,25 @@ def generate_push_candidates(
             shift = (length - STAND_OFF) * direction
             if not _ends_on_surface(points + shift, frame, half) or _hits(tree, points, shift):
                 continue
-            yaw = np.arctan2(direction[1], direction[0])
-            for k in range(YAWS):
-                start = np.eye(4)
-                start[:3, :3] = (Rotation.from_euler("z", yaw + k * np.pi / YAWS) * _DOWN).as_matrix()
-                start[:3, 3] = tool
-                yield Push(start, direction, length)
+            yield from push_yaws(tool, direction, length)
             break  # a push higher up would tip the object
+
+
+def push_yaws(tool: Array, direction: Array, length: float) -> list[Push]:
+    """Return the same push with ``YAWS`` yaw angles of the tool.
+
+    Args:
+        tool: (3,) position of the TCP at the start, m.
+        direction: (3,) horizontal unit vector.
+        length: length of the line, m.
+    """
+    yaw, pushes = np.arctan2(direction[1], direction[0]), []
+    for k in range(YAWS):
+        start = np.eye(4)
+        start[:3, :3] = (Rotation.from_euler("z", yaw + k * np.pi / YAWS) * _DOWN).as_matrix()
+        start[:3, 3] = tool
+        pushes.append(Push(start, direction, length))
+    return pushes
 
 
 _DOWN = Rotation.from_euler("x", np.pi)

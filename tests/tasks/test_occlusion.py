@@ -198,7 +198,7 @@ def test_hidden_fractions_agree_with_ray_casting():
     from robocas_ms3.scenes.config import load_task_config
     from robocas_ms3.scenes.model import SceneModel
     from robocas_ms3.scenes.targets import selection_camera
-    from robocas_ms3.tasks.search import _sample_points
+    from robocas_ms3.tasks.occlusion import sample_points
 
     pack = load_pack("builtin")
     model = SceneModel.load(load_task_config("search_table_stacked"), pack, pack)
@@ -207,7 +207,7 @@ def test_hidden_fractions_agree_with_ray_casting():
     for seed in range(3):
         layout = make_layout_source(model)(seed, seed)
         poses = torch.as_tensor(to_wxyz(layout.object_poses), dtype=torch.float32)[None]
-        sampled = [_sample_points(pack.objects[i].annotations.surface_points) for i in layout.object_ids]
+        sampled = [sample_points(pack.objects[i].annotations.surface_points) for i in layout.object_ids]
         points = torch.as_tensor(np.array(sampled).swapaxes(1, 2), dtype=torch.float32)[None]
         count = len(sampled)
         world = surface_points_in_world(poses, points).expand(count, -1, -1, -1)

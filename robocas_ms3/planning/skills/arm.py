@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -30,6 +31,27 @@ RETREAT_DISTANCES = (0.25, 0.15, 0.10, 0.06)  # m against the approach axis; the
 MAX_TOP_APPROACH_Z = -0.7  # z component of the approach axis below which a grasp counts as from above
 
 
+@dataclass(frozen=True)
+class PlannedPrimitive:
+    """Motion primitive of a skill whose motions have been planned.
+
+    Attributes:
+        primitive: ``grasp``, ``push``, ``lift`` (lift and place elsewhere), ``release`` or ``pull``.
+        slot: slot of the object; -1 for a pull.
+        start_in_base: (4x4) TCP pose of the grasp or of the release, or at the start of the push.
+        end_in_base: (4x4) TCP pose at the end of the push or pull, or at the placement; None for grasp and release.
+    """
+
+    primitive: str
+    slot: int
+    start_in_base: Array
+    end_in_base: Array | None = None
+
+
+def _ignore(*_: object) -> None:
+    pass
+
+
 @dataclass
 class Arm:
     """Context of one attempt: the arm with its planner, motion executor and decisions.
@@ -42,6 +64,10 @@ class Arm:
         executor: motion executor, which steps the environment.
         decisions: search that runs the candidates of `choose`.
         decision_path: number of the attempt, followed by the index of the chosen candidate of each decision.
+        on_decision: function that is called before a decision, with its kind (``move``, ``grasp``, ``release`` or
+            ``pull``) and each candidate with a function that runs it. It must not change the scene.
+        on_choice: function that is called with the index of the chosen candidate of the last decision.
+        planned: primitive of the last skill.
         scene: poses and obstacles of the environment.
         rng: random generator, seeded from ``decision_path``, so that results do not depend on rejected candidates.
         qpos: (7,) last commanded configuration, rad; initially the actual configuration.
@@ -52,6 +78,9 @@ class Arm:
     executor: MotionExecutor
     decisions: Decisions
     decision_path: tuple[int, ...] = (0,)
+    on_decision: Callable[[str, Sequence[tuple[object, Callable[[], object]]]], None] = _ignore
+    on_choice: Callable[[int], None] = _ignore
+    planned: PlannedPrimitive | None = None
     rng: np.random.Generator = field(init=False)
     qpos: Array = field(init=False)
 
@@ -71,9 +100,17 @@ class Arm:
         self.rng = np.random.default_rng(entropy)
 
     def choose(
-        self, candidates: Iterable[T], run_candidate: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE
+        self,
+        candidates: Iterable[T],
+        run_candidate: Callable[[T], float],
+        limits: SearchLimits = FIRST_FEASIBLE,
+        *,
+        kind: str = "",
     ) -> T:
-        """Choose a candidate with `Decisions.choose`; each candidate has its own random seed."""
+        """Choose a candidate with `Decisions.choose`; each candidate has its own random seed.
+
+        If ``kind`` is given, ``on_decision`` and ``on_choice`` are called before and after.
+        """
         decision_path = self.decision_path
 
         def run_numbered(numbered: tuple[int, T]) -> float:
@@ -82,7 +119,20 @@ class Arm:
             self._seed()
             return run_candidate(candidate)
 
-        return self.decisions.choose(enumerate(candidates), run_numbered, limits)[1]
+        if not kind:
+            return self.decisions.choose(enumerate(candidates), run_numbered, limits)[1]
+        numbered = list(enumerate(candidates))
+        self.on_decision(kind, [(one[1], partial(run_numbered, one)) for one in numbered])
+        index, chosen = self.decisions.choose(numbered, run_numbered, limits)
+        self.on_choice(index)
+        return chosen
+
+    def run_only_candidate(self, kind: str, run: Callable[[], T]) -> T:
+        """Call ``run``, as the only candidate of a decision of a kind."""
+        self.on_decision(kind, [(None, run)])
+        result = run()
+        self.on_choice(0)
+        return result
 
     def add_backtracking_point(self) -> None:
         """Make a decision whose candidates differ only in their random seed.

@@ -30,8 +30,7 @@ from robocas_ms3.planning.skills.grasp import grasp
 from robocas_ms3.planning.skills.handles import MovingPart, estimate_pull_fraction, open_furniture_part
 from robocas_ms3.planning.skills.place import (
     attach_held_object,
-    carry_to_basket,
-    release_into_basket,
+    carry_and_release,
     sample_drop_poses,
 )
 from robocas_ms3.scenes.grasp_checks import (
@@ -61,7 +60,7 @@ def drive_and_grasp(arm: Arm, slot: int) -> None:
     _try_base_poses(
         arm,
         lambda relocate: drive_to_object(arm, slot, relocate=relocate),
-        lambda: grasp(arm, slot, skip_kinds=kind),
+        lambda: arm.run_only_candidate("grasp", lambda: grasp(arm, slot, skip_kinds=kind)),
     )
 
 
@@ -160,8 +159,7 @@ def place_in_basket(arm: Arm, slot: int) -> None:
     """Carry a held object to the basket, with a drive if necessary, and release it there."""
     arm.start_subgoal("transfer object")
     drive_to_basket(arm, slot)
-    carry_to_basket(arm, slot)
-    release_into_basket(arm, slot)
+    arm.run_only_candidate("release", lambda: carry_and_release(arm, slot))
 
 
 def drive_to_basket(arm: Arm, slot: int) -> None:

@@ -6,7 +6,7 @@ withdraws straight back, so that neighbouring objects stay upright.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import islice
 
 import numpy as np
@@ -17,7 +17,7 @@ from robocas_ms3.core.poses import inverse
 from robocas_ms3.planning.grasp_choice import compute_grip_margins, filter_grasps, sample_grasp_order, score_grasps
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.scene import SPACING
-from robocas_ms3.planning.skills.arm import CLEARANCE, Arm, shift_back, shift_up
+from robocas_ms3.planning.skills.arm import CLEARANCE, Arm, PlannedPrimitive, shift_back, shift_up
 from robocas_ms3.scenes.grasp_checks import NEIGHBOURHOOD, PREGRASP_DISTANCE, is_gripper_clear
 
 GRASPS_CHECKED = 48  # grasps that are ordered by a collision check of the arm
@@ -34,7 +34,7 @@ WITHDRAWALS = (0.25, 0.18, 0.12)  # m straight back; the first reachable one is 
 ExitMotions = tuple[Trajectory, ...]
 
 
-def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, skip_kinds: int = 0) -> None:
+def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, skip_kinds: int = 0, grasps: Iterable[Array] = ()) -> None:
     """Grasp an object and move it out of its surroundings.
 
     After an approach from above the arm lifts the object. After an approach from the front it lifts the object slightly
@@ -45,12 +45,14 @@ def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, skip_kinds: int = 0
         slot: slot of the object.
         lift_height: lift after a grasp from above, m (RoboCAS-v0: 0.10 for pick, 0.15 for search).
         skip_kinds: number of kinds of similar grasps to skip, from the best kind on.
+        grasps: TCP poses (4x4) to try in this order, in the arm's base frame; empty: the annotated grasps.
 
     Raises:
         PlanningError: no grasp can be planned, the fingers miss the object, or the object slips out.
     """
     with arm.planning_time():
-        approach, out = plan_grasp(arm, slot, lift_height, skip_kinds)
+        approach, out = plan_grasp(arm, slot, lift_height, grasps or grasp_candidates(arm, slot, skip_kinds))
+        arm.planned = PlannedPrimitive("grasp", slot, arm.planner.tcp(approach.qpos[-1]))
     arm.follow(approach)
     arm.close_gripper()
     if not arm.is_holding(slot):
@@ -60,8 +62,8 @@ def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, skip_kinds: int = 0
         raise PlanningError("lift", "slipped")
 
 
-def plan_grasp(arm: Arm, slot: int, lift_height: float, skip_kinds: int = 0) -> tuple[Trajectory, ExitMotions]:
-    """Plan the approach to the best feasible grasp, and the exit with the object.
+def plan_grasp(arm: Arm, slot: int, lift_height: float, grasps: Iterable[Array]) -> tuple[Trajectory, ExitMotions]:
+    """Plan the approach to the first feasible grasp, and the exit with the object.
 
     The exit moves the object out of its surroundings.
 
@@ -69,7 +71,7 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, skip_kinds: int = 0) -> 
         arm: context of the attempt.
         slot: slot of the object.
         lift_height: lift after a grasp from above, m.
-        skip_kinds: number of kinds of similar grasps to skip, from the best kind on.
+        grasps: TCP poses (4x4) in the arm's base frame, in this order.
 
     Returns:
         Motion to the grasp; motions with the grasped object.
@@ -89,7 +91,7 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, skip_kinds: int = 0) -> 
         _, inward, out = min(ways, key=lambda way: float(np.abs(way[0] - reach.qpos[-1]).max()))
         return join_approach(reach, inward, out)
 
-    for tcp_in_base in grasp_candidates(arm, slot, skip_kinds):
+    for tcp_in_base in grasps:
         # the object is an obstacle on the way to the pre-grasp only
         planner.set_scene(others)
         starts = planner.ik(shift_back(tcp_in_base, PREGRASP_DISTANCE), arm.qpos)[:MAX_PREGRASPS]

@@ -5,7 +5,7 @@ Only contact forces between gripper and handle move the door.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from mani_skill.utils.structs import Articulation
@@ -19,7 +19,7 @@ from robocas_ms3.core.poses import inverse, transform_points
 from robocas_ms3.planning.protocol import Array, Obstacle, Shape, Trajectory
 from robocas_ms3.planning.pull_path import count_reached_poses, rotate_about_bar, track_handle
 from robocas_ms3.planning.scene import SPACING, get_body_shape
-from robocas_ms3.planning.skills.arm import Arm, plan_first_feasible, plan_retreat, shift_back
+from robocas_ms3.planning.skills.arm import Arm, PlannedPrimitive, plan_first_feasible, plan_retreat, shift_back
 from robocas_ms3.planning.time_parameterization import fit_spline, time_path
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.scenes.grasp_checks import HALF_TURN
@@ -55,11 +55,14 @@ class MovingPart:
         furniture: name of the piece of furniture.
         handle: handle of the door or drawer.
         joint: joint of the door or drawer.
+        grasp_offset: (4x4) pose of the planned grasp relative to the handle's own grasp pose; unless it is the
+            identity, the grasp may miss the handle.
     """
 
     furniture: str
     handle: Handle
     joint: Joint
+    grasp_offset: Array = field(default_factory=lambda: np.eye(4))
 
     @classmethod
     def from_task(cls, arm: Arm) -> MovingPart:
@@ -114,7 +117,7 @@ class MovingPart:
         w, x, y, z = self.handle.wxyz
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), self.handle.position
-        return pose
+        return pose @ self.grasp_offset
 
     def is_grasped(self, arm: Arm) -> bool:
         """Return whether both fingers press on the part."""
@@ -136,7 +139,7 @@ def open_furniture_part(arm: Arm) -> None:
     """
     part = MovingPart.from_task(arm)
     for _ in range(MAX_PULLS):
-        pull_handle(arm, part)
+        arm.run_only_candidate("pull", lambda: pull_handle(arm, part))
         if is_opened(arm):
             return
     raise PlanningError("pull", "not_far_enough")
@@ -153,6 +156,8 @@ def pull_handle(arm: Arm, part: MovingPart) -> None:
     """Grasp the handle, pull it as far as the arm reaches, release it and retreat."""
     with arm.planning_time():
         approach, opening = plan_pull(arm, part)
+        ends = (arm.planner.tcp(motion.qpos[-1]) for motion in (approach, opening))
+        arm.planned = PlannedPrimitive("pull", -1, *ends)
         before, least = part.joint_position(arm), 0.5 * part.min_pull(arm)
     arm.follow(approach)
     arm.close_gripper()
@@ -306,7 +311,10 @@ def _filter_grasps(
         between = np.abs(bar) < (PAD_HALF_EXTENT[0], width / 2, PAD_HALF_EXTENT[1])
         return bool(between.all(axis=1).any())
 
-    order = [i for i in order if has_handle_between_pads(starts[i])]
+    if np.array_equal(part.grasp_offset, np.eye(4)):
+        order = [i for i in order if has_handle_between_pads(starts[i])]
+    if not order:
+        return []
     return [i for i, free in zip(order, arm.planner.is_free(starts[order], width), strict=True) if free]
 
 

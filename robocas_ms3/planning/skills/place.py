@@ -15,6 +15,7 @@ from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.skills.arm import (
     CARRY_CLEARANCE,
     Arm,
+    PlannedPrimitive,
     plan_first_feasible,
     plan_retreat,
     shift_back,
@@ -46,14 +47,32 @@ class ContainerInterior:
     high: Array
 
 
-def carry_to_basket(arm: Arm, slot: int) -> None:
+def carry_and_release(arm: Arm, slot: int, *, drops: Array | None = None) -> None:
+    """Carry a held object to a pose above the basket, release it, and retreat.
+
+    Args:
+        arm: context of the attempt.
+        slot: slot of the held object.
+        drops: (N, 4, 4) TCP poses to try in this order, in the arm's base frame; None: sampled and ranked poses.
+    """
+    carry_to_basket(arm, slot, drops)
+    release_into_basket(arm, slot)
+
+
+def carry_to_basket(arm: Arm, slot: int, drops: Array | None = None) -> None:
     """Carry a held object to a pose above the basket.
+
+    Args:
+        arm: context of the attempt.
+        slot: slot of the held object.
+        drops: (N, 4, 4) TCP poses to try in this order, in the arm's base frame; None: sampled and ranked poses.
 
     Raises:
         PlanningError: no motion is found, or the gripper loses the object.
     """
     with arm.planning_time():
-        motion = plan_carry(arm, slot)
+        motion = plan_carry(arm, slot, drops)
+        arm.planned = PlannedPrimitive("release", slot, arm.planner.tcp(motion.qpos[-1]))
     arm.follow(motion)
     if not arm.is_holding(slot):
         raise PlanningError("transfer", "dropped")
@@ -78,17 +97,20 @@ def release_into_basket(arm: Arm, slot: int) -> None:
         raise PlanningError("release", _failure_reason(arm))
 
 
-def plan_carry(arm: Arm, slot: int) -> Trajectory:
+def plan_carry(arm: Arm, slot: int, drops: Array | None = None) -> Trajectory:
     """Plan a motion of a held object to a pose above the basket from which the arm can retreat.
 
     The motion keeps ``CARRY_CLEARANCE`` to basket and furniture if possible.
     """
-    drops = sample_drop_poses(arm, slot, arm.scene.arm_base_in_world)
+    is_ranked = drops is not None
+    drops = sample_drop_poses(arm, slot, arm.scene.arm_base_in_world) if drops is None else drops
     solved, qpos = arm.inverse_kinematics.nearest_solutions(drops, arm.qpos)
     if not solved.any():
         raise PlanningError("transfer", "unreachable")
-    order = _rank_drops(arm, slot, drops[solved], qpos[solved])
-    drops, qpos = drops[solved][order], qpos[solved][order]
+    drops, qpos = drops[solved], qpos[solved]
+    if not is_ranked:
+        order = _rank_drops(arm, slot, drops, qpos)
+        drops, qpos = drops[order], qpos[order]
     attach_held_object(arm, slot)
 
     def plan(clearance: float) -> Trajectory:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,7 @@ from robocas_ms3.core.poses import inverse
 from robocas_ms3.planning.executor import CLOSED
 from robocas_ms3.planning.protocol import Array, Obstacle, Trajectory
 from robocas_ms3.planning.pushes import STAND_OFF, YAWS, Push, generate_push_candidates
-from robocas_ms3.planning.skills.arm import Arm, shift_up
+from robocas_ms3.planning.skills.arm import Arm, PlannedPrimitive, shift_up
 
 APPROACH_HEIGHT = 0.08  # m above the start of the push; the tool moves straight down from there
 LIFT = 0.05  # m after the push (RoboCAS-v0)
@@ -55,9 +55,26 @@ def push_away(arm: Arm, slot: int, target: int, *, turn_deg: float = 0.0) -> Non
     Raises:
         PlanningError: no push can be planned.
     """
+    _push(arm, slot, lambda: plan_push(arm, slot, target, turn_deg))
+
+
+def push_along(arm: Arm, slot: int, pushes: Sequence[Push]) -> None:
+    """Push an object along the first feasible of some lines, and rise.
+
+    Furniture, basket and arm avoid each other; objects do not count as obstacles of the push itself.
+
+    Raises:
+        PlanningError: no push can be planned.
+    """
+    _push(arm, slot, lambda: plan_push_along(arm, pushes))
+
+
+def _push(arm: Arm, slot: int, make_plan: Callable[[], PushPlan]) -> None:
     arm.rise_until_free()
     with arm.planning_time():
-        plan = plan_push(arm, slot, target, turn_deg)
+        plan = make_plan()
+        ends = (arm.planner.tcp(motion.qpos[-1]) for motion in (plan.approach, plan.push))
+        arm.planned = PlannedPrimitive("push", slot, *ends)
     arm.executor.gripper = CLOSED  # closes during the approach
     arm.follow(plan.approach)
     lift = plan.lift if _execute_push(arm, plan.push, plan.direction) else _plan_lift(arm, plan.direction)
@@ -117,15 +134,31 @@ def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPl
         planner.finger_width = width
 
 
+def plan_push_along(arm: Arm, pushes: Sequence[Push]) -> PushPlan:
+    """Plan the first feasible of some pushes in the same direction."""
+    planner = arm.planner
+    width, planner.finger_width = planner.finger_width, 0.0
+    try:
+        starts = _plan_lines_down(arm, _filter_reachable(arm, pushes))
+        return _plan_push_and_lift(arm, starts, movable=set(range(len(arm.env.objects))))
+    finally:
+        planner.finger_width = width
+
+
 def _plan_starts(arm: Arm, slot: int, target: int, turn_deg: float) -> list[tuple[Push, Array, Trajectory]]:
     """Return pushes with a collision-free straight line down to their start.
 
     Returns:
         For each push: the push, the configuration (7,) above its start, and the line down.
     """
+    others = arm.scene.points_in_base(exclude=slot)
+    return _plan_lines_down(arm, find_reachable_pushes(arm, slot, target, others, turn_deg))
+
+
+def _plan_lines_down(arm: Arm, pushes: Iterable[tuple[Push, Array]]) -> list[tuple[Push, Array, Trajectory]]:
     arm.planner.set_scene(arm.scene.obstacles())
     failure, starts = PlanningError("push", "no_free_push"), []
-    for push, qpos in find_reachable_pushes(arm, slot, target, arm.scene.points_in_base(exclude=slot), turn_deg):
+    for push, qpos in pushes:
         try:
             starts.append((push, qpos, arm.planner.plan_straight(qpos, push.start, stage="push")))
         except PlanningError as error:
@@ -179,6 +212,10 @@ def find_reachable_pushes(
     points, middle = arm.scene.object_points(slot), arm.scene.object_points(target).mean(axis=0)
     fixed = arm.scene.points_in_base(exclude=range(len(arm.env.objects)))
     pushes = list(generate_push_candidates(arm.rng, points, middle, others, read_surface(arm), fixed, turn_deg))
+    yield from _filter_reachable(arm, pushes)
+
+
+def _filter_reachable(arm: Arm, pushes: Sequence[Push]) -> Iterator[tuple[Push, Array]]:
     if not pushes:
         return
     starts, ends = np.stack([push.start for push in pushes]), np.stack([push.end for push in pushes])

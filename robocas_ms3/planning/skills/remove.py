@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from scipy.spatial import ConvexHull, KDTree
@@ -13,11 +13,18 @@ from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import transform_points
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.shapes import convex_hull
-from robocas_ms3.planning.skills.arm import Arm, plan_first_feasible, plan_retreat, shift_back, shift_up
+from robocas_ms3.planning.skills.arm import (
+    Arm,
+    PlannedPrimitive,
+    plan_first_feasible,
+    plan_retreat,
+    shift_back,
+    shift_up,
+)
 from robocas_ms3.planning.skills.grasp import grasp
 from robocas_ms3.planning.skills.place import attach_held_object
 from robocas_ms3.planning.skills.push import read_surface
-from robocas_ms3.scenes.grasp_checks import MAX_WIDTH, grasp_direction_tests, is_gripper_clear
+from robocas_ms3.scenes.grasp_checks import MAX_WIDTH, NEIGHBOURHOOD, grasp_direction_tests, is_gripper_clear
 
 GRID = 0.04  # m between candidate positions
 TURNS = 8  # yaw angles of the object
@@ -33,16 +40,24 @@ OUTLINE_SPACING = 0.015  # m
 PLACES_SOLVED, PLACES_PLANNED = 96, 12
 
 
-def remove_object(arm: Arm, slot: int) -> None:
+def remove_object(arm: Arm, slot: int, *, grasps: Iterable[Array] = ()) -> None:
     """Grasp an object, place it at a free position on the surface, and retreat.
+
+    Args:
+        arm: context of the attempt.
+        slot: slot of the object.
+        grasps: TCP poses (4x4) of grasps to try, in the arm's base frame; empty: the annotated grasps.
 
     Raises:
         PlanningError: a motion cannot be planned, or the gripper loses the object.
     """
-    grasp(arm, slot, lift_height=compute_lift_height(arm, slot))
+    grasp(arm, slot, lift_height=compute_lift_height(arm, slot), grasps=grasps)
+    assert arm.planned is not None  # set by `grasp`
+    start = arm.planned.start_in_base
     raise_held_object(arm, slot)
     with arm.planning_time():
         way = plan_placement(arm, slot)
+        arm.planned = PlannedPrimitive("lift", slot, start, arm.planner.tcp(way.qpos[-1]))
     arm.follow(way)
     if not arm.is_holding(slot):
         raise PlanningError("remove", "dropped")
@@ -73,9 +88,10 @@ def compute_lift_height(arm: Arm, slot: int) -> float:
 
 
 def count_clear_grasps(arm: Arm, slot: int) -> int:
-    """Return the number of sampled grasps from above whose gripper touches no other body."""
-    grasps = _grasps_from_above(arm, slot)
-    near = arm.scene.points_in_base(exclude=slot)
+    """Return the number of sampled grasps of an object whose gripper touches no other body."""
+    grasps = sample_suitable_grasps(arm, slot)
+    around = arm.scene.object_in_base(slot)[:3, 3]
+    near = arm.scene.points_in_base(exclude=slot, radius=NEIGHBOURHOOD, around=around)
     return int(is_gripper_clear(grasps, near).sum())
 
 
@@ -84,7 +100,7 @@ def find_grasp_blockers(arm: Arm, slot: int) -> list[int]:
 
     Objects that alone block many grasps come first; a grasp that n objects block counts 1 / n^2 for each of them.
     """
-    grasps, blocked_by = _grasps_from_above(arm, slot), {}
+    grasps, blocked_by = sample_suitable_grasps(arm, slot), {}
     for other, used in enumerate(arm.env.present[0].tolist()):
         if used and other != slot:
             blocked_by[other] = ~is_gripper_clear(grasps, arm.scene.object_points(other))
@@ -93,10 +109,14 @@ def find_grasp_blockers(arm: Arm, slot: int) -> list[int]:
     return sorted((other for other in score if score[other] > 0), key=lambda other: -score[other])
 
 
-def _grasps_from_above(arm: Arm, slot: int) -> Array:
+def sample_suitable_grasps(arm: Arm, slot: int) -> Array:
+    """Return annotated grasps (G, 4, 4) of an object that are narrow enough and have a suitable direction.
+
+    The poses are TCP poses in the arm's base frame; G is at most ``GRASPS_TESTED``.
+    """
     notes, frame = arm.env.object_assets[0][slot].annotations, arm.scene.object_in_base(slot)
     grasps = frame @ notes.grasps_tcp_in_object
-    passed = np.logical_and.reduce(list(grasp_direction_tests(grasps, frame[:3, 3]).values()))
+    passed = np.logical_and.reduce(list(grasp_direction_tests(grasps, frame[:3, 3], arm.approach).values()))
     grasps = grasps[passed & (notes.grasp_widths <= MAX_WIDTH)]
     # evenly spaced instead of drawn, so that this query does not change the random state
     return grasps[np.linspace(0, len(grasps) - 1, min(len(grasps), GRASPS_TESTED)).astype(int)]

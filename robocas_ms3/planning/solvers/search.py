@@ -39,7 +39,7 @@ def attempt(arm: Arm) -> None:
         done = len(arm.executor.actions)
         try:
             limits = SearchLimits(MOVES_COMPARED, max_continued_moves(heap.moves_made), SUFFICIENT_SCORE)
-            arm.choose(heap.candidate_moves(), heap.execute, limits)
+            arm.choose(heap.candidate_moves(), heap.execute, limits, kind="move")
         except PlanningError:
             if len(arm.executor.actions) > done:
                 raise
@@ -53,9 +53,13 @@ def attempt(arm: Arm) -> None:
             look_at(arm, heap.centroid(slot), NEAR)
     arm.executor.check_open_loop()
     arm.start_subgoal("transfer object")
-    carry_to_basket(arm, slot)
+    arm.run_only_candidate("release", lambda: _carry_and_release(arm, heap))
+
+
+def _carry_and_release(arm: Arm, heap: Heap) -> None:
+    carry_to_basket(arm, heap.target)
     heap.check_objects_on_surface()
-    release_into_basket(arm, slot)
+    release_into_basket(arm, heap.target)
 
 
 def max_continued_moves(moves_made: int) -> int:
@@ -77,7 +81,7 @@ def _grasp(arm: Arm, slot: int) -> bool:
         return 0.0
 
     try:
-        arm.choose(range(GRASP_KINDS), execute_grasp)
+        arm.choose(range(GRASP_KINDS), execute_grasp, kind="grasp")
     except PlanningError:
         if len(arm.executor.actions) > done:
             raise

@@ -1,0 +1,188 @@
+"""Propose random candidates of a decision: grasps, pushes and lifts of any object, releases, and pulls.
+
+Random candidates represent failures, which the scripted policy avoids. *Near misses* are grasps, pushes, releases and
+pulls with a position error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.core.poses import inverse
+from robocas_ms3.demos.candidates.schema import DecisionKind, Primitive, Source
+from robocas_ms3.planning.executor import OPEN
+from robocas_ms3.planning.protocol import Array
+from robocas_ms3.planning.pushes import (
+    BELOW_TOP,
+    STAND_OFF,
+    TIP_BELOW_TCP,
+    TIP_CLEARANCE,
+    TOOL_RADIUS,
+    push_yaws,
+)
+from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.grasp import grasp
+from robocas_ms3.planning.skills.handles import MovingPart, pull_handle
+from robocas_ms3.planning.skills.place import carry_and_release, sample_drop_poses
+from robocas_ms3.planning.skills.push import push_along, read_surface
+from robocas_ms3.planning.skills.remove import remove_object, sample_suitable_grasps
+from robocas_ms3.scenes.grasp_checks import HALF_TURN, NEIGHBOURHOOD, is_gripper_clear
+
+# probability of each primitive, by kind of decision
+MIX: dict[DecisionKind, dict[Primitive, float]] = {
+    "move": {"push": 0.4, "lift": 0.25, "grasp": 0.35},
+    "grasp": {"grasp": 0.7, "push": 0.3},
+    "release": {"release": 1.0},
+    "pull": {"pull": 1.0},
+}
+NEAR_MISSES = 0.4  # fraction of near misses among random candidates
+TARGET_FRACTION = 0.5  # fraction of random grasps that are of the target
+NEIGHBOUR_DISTANCE = 0.15  # m from the target at which an object is chosen e times less often than the target
+CLEAR_FRACTION = 0.6  # fraction of random grasps that touch no other body, if there are any
+LIFT_GRASPS = 4  # grasps to try per random lift
+# errors of near misses: standard deviations across and along the approach in m, and in rad
+GRASP_SHIFT, GRASP_DEPTH, GRASP_TURN = 0.02, 0.012, np.deg2rad(15)
+PUSH_SHIFT = (0.02, 0.05)  # m across the direction of the push, minimum and maximum
+PUSH_LENGTHS = (0.04, 0.2)  # m, of a random push after the contact
+DROP_SHIFT = (0.06, 0.22)  # m, horizontally
+PULL_SHIFT, PULL_ERROR = 0.004, (0.012, 0.035)  # m: standard deviation of random pulls; length of the error of a miss
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Candidate of a decision.
+
+    Attributes:
+        source: origin of the candidate.
+        primitive: what the arm does.
+        slot: slot of the object; -1 for a pull.
+        run: function that plans and executes the candidate; it raises PlanningError if that fails.
+        start_in_base: (4x4) TCP pose at the start, as in `PlannedPrimitive`; None before it is planned.
+        end_in_base: (4x4) TCP pose at the end; None if there is none, or before it is planned.
+    """
+
+    source: Source
+    primitive: Primitive
+    slot: int
+    run: Callable[[], object]
+    start_in_base: Array | None = None
+    end_in_base: Array | None = None
+
+
+def propose(arm: Arm, kind: DecisionKind, count: int, rng: np.random.Generator) -> list[Candidate]:
+    """Return up to ``count`` random candidates for a decision of a kind, from the present state of the scene."""
+    mix = dict(MIX[kind])
+    if arm.approach == "front":  # the closed gripper cannot point down into a shelf
+        mix.pop("push", None)
+    weights = np.array(list(mix.values()))
+    primitives = rng.choice(list(mix), size=count, p=weights / weights.sum()).tolist()
+    makers = {"grasp": _grasp, "push": _push, "lift": _lift, "release": _release, "pull": _pull}
+    made = [makers[primitive](arm, rng, bool(rng.random() < NEAR_MISSES)) for primitive in primitives]
+    return [candidate for candidate in made if candidate is not None]
+
+
+def _draw_slot(arm: Arm, rng: np.random.Generator, *, with_target: bool) -> int | None:
+    """Draw an object near the target; None if there is no other object."""
+    present = np.flatnonzero(arm.env.present[0].cpu().numpy())
+    slots = present if with_target else present[present != arm.target]
+    if not len(slots):
+        return None
+    positions = np.stack([arm.scene.object_in_base(slot)[:3, 3] for slot in slots.tolist()])
+    distances = np.linalg.norm(positions - arm.scene.object_in_base(arm.target)[:3, 3], axis=1)
+    weights = np.exp(-distances / NEIGHBOUR_DISTANCE) + 1e-6
+    return int(rng.choice(slots, p=weights / weights.sum()))
+
+
+def _draw_grasps(arm: Arm, rng: np.random.Generator, slot: int, count: int) -> Array:
+    """Draw annotated grasps (G, 4, 4) of an object, in the arm's base frame; G is 0 if none is suitable."""
+    grasps = sample_suitable_grasps(arm, slot)
+    if not len(grasps):
+        return grasps
+    if rng.random() < CLEAR_FRACTION:
+        around = arm.scene.object_in_base(slot)[:3, 3]
+        near = arm.scene.points_in_base(exclude=slot, radius=NEIGHBOURHOOD, around=around)
+        clear = is_gripper_clear(grasps, near)
+        grasps = grasps[clear] if clear.any() else grasps
+    drawn = grasps[rng.choice(len(grasps), size=min(count, len(grasps)), replace=False)]
+    turned = rng.random(len(drawn)) < 0.5
+    return np.where(turned[:, None, None], drawn @ HALF_TURN, drawn)
+
+
+def _grasp(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate | None:
+    slot = arm.target if rng.random() < TARGET_FRACTION else _draw_slot(arm, rng, with_target=False)
+    if slot is None:
+        return None
+    grasps = _draw_grasps(arm, rng, slot, 1)
+    if not len(grasps):
+        return None
+    pose = grasps[0].copy()
+    if near_miss:
+        error = np.eye(4)
+        error[:3, :3] = Rotation.from_rotvec(rng.normal(scale=GRASP_TURN, size=3)).as_matrix()
+        error[:3, 3] = rng.normal(size=3) * (GRASP_SHIFT, GRASP_SHIFT, GRASP_DEPTH)
+        pose = pose @ error
+
+    def run() -> None:
+        arm.executor.gripper = OPEN
+        grasp(arm, slot, grasps=[pose])
+
+    return Candidate("near_miss" if near_miss else "random", "grasp", slot, run, pose)
+
+
+def _lift(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate | None:
+    slot = _draw_slot(arm, rng, with_target=False)
+    grasps = _draw_grasps(arm, rng, slot, LIFT_GRASPS) if slot is not None else ()
+    if slot is None or not len(grasps):
+        return None
+
+    def run() -> None:
+        arm.rise_until_free()
+        arm.executor.gripper = OPEN
+        remove_object(arm, slot, grasps=list(grasps))
+
+    return Candidate("random", "lift", slot, run, grasps[0])
+
+
+def _push(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate | None:
+    slot = _draw_slot(arm, rng, with_target=True)
+    assert slot is not None  # the target is present
+    points, (frame, _) = arm.scene.object_points(slot), read_surface(arm)
+    center, top = points.mean(axis=0), points[:, 2].max()
+    angle = rng.uniform(-np.pi, np.pi)
+    direction = np.array([np.cos(angle), np.sin(angle), 0.0])
+    lowest = frame[2, 3] + TIP_CLEARANCE + TIP_BELOW_TCP
+    height = rng.uniform(max(lowest, points[:, 2].min()), max(lowest, top - BELOW_TOP))
+    behind = -float(((points - center) @ direction).min())
+    aside = rng.choice((-1, 1)) * rng.uniform(*PUSH_SHIFT) if near_miss else 0.0
+    tool = np.array([*center[:2], height]) - (behind + STAND_OFF + TOOL_RADIUS) * direction
+    tool += aside * np.array([-direction[1], direction[0], 0.0])
+    pushes = push_yaws(tool, direction, STAND_OFF + rng.uniform(*PUSH_LENGTHS))
+    source: Source = "near_miss" if near_miss else "random"
+    return Candidate(source, "push", slot, lambda: push_along(arm, slot, pushes), pushes[0].start, pushes[0].end)
+
+
+def _release(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate:
+    drops = sample_drop_poses(arm, arm.target, arm.scene.arm_base_in_world)
+    pose = drops[rng.integers(len(drops))].copy()
+    if near_miss:
+        angle = rng.uniform(-np.pi, np.pi)
+        pose[:2, 3] += rng.uniform(*DROP_SHIFT) * np.array([np.cos(angle), np.sin(angle)])
+    source: Source = "near_miss" if near_miss else "random"
+    return Candidate(source, "release", arm.target, lambda: carry_and_release(arm, arm.target, drops=pose[None]), pose)
+
+
+def _pull(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate:
+    part, offset = MovingPart.from_task(arm), np.eye(4)
+    offset[:3, 3] = rng.normal(scale=PULL_SHIFT, size=3)
+    if near_miss:
+        error = rng.normal(size=3)
+        offset[:3, 3] = rng.uniform(*PULL_ERROR) * error / np.linalg.norm(error)
+    shifted = MovingPart(part.furniture, part.handle, part.joint, offset)
+    part_in_world = part.poses_in_world(arm, np.array([part.joint_position(arm)]))[0]
+    start = inverse(arm.scene.arm_base_in_world) @ part_in_world @ shifted.grasp_in_part
+    source: Source = "near_miss" if near_miss else "random"
+    return Candidate(source, "pull", -1, lambda: pull_handle(arm, shifted), start)
