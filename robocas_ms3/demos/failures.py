@@ -16,6 +16,7 @@ from pydantic import Field
 
 from robocas_ms3.core.checks import MAX_SEED
 from robocas_ms3.core.errors import PlanningError
+from robocas_ms3.demos.candidates.records import DecisionRecord
 from robocas_ms3.planning.decisions import CpuSeconds
 
 FAILURES_FILE = "failures.jsonl"
@@ -60,6 +61,7 @@ class EpisodeResult:
         seconds: CPU seconds by phase.
         failures: failed attempts, in order.
         max_attempts: number of failed attempts after which the seed is skipped.
+        decisions: decisions with their simulated candidates, of all attempts (``--record-candidates``).
         attempt_start: value of ``time.perf_counter()`` at the start of the present attempt, s.
     """
 
@@ -70,6 +72,7 @@ class EpisodeResult:
     seconds: CpuSeconds = field(default_factory=CpuSeconds)
     failures: list[FailedAttempt] = field(default_factory=list)
     max_attempts: int = 1
+    decisions: list[DecisionRecord] = field(default_factory=list)
     attempt_start: float = field(default_factory=time.perf_counter)
 
     @property

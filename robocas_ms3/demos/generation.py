@@ -21,6 +21,9 @@ from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
 from robocas_ms3.core.text import format_count, one_line
 from robocas_ms3.core.workers import Limits, Worker, WorkerPool, use_one_torch_thread
+from robocas_ms3.demos.candidates.candidates_file import FILE_NAME as CANDIDATES_FILE
+from robocas_ms3.demos.candidates.candidates_file import merge_candidates
+from robocas_ms3.demos.candidates.records import candidates_file_name
 from robocas_ms3.demos.failures import (
     FAILURES_FILE,
     EpisodeResult,
@@ -116,7 +119,7 @@ def generate(
         record[WEIGHTS] = weights
     with OutputFolder(settings.out, OUTPUT, record, overwrite=settings.overwrite) as output:
         output.start(record)
-        run = _Run(output.path)
+        run = _Run(output.path, has_candidates=settings.episode.record_candidates)
         on_start(sum(result.success for result in run.earlier.values()))
         results, successes = [], 0
         kept = next(n for n in count() if settings.seed + n not in run.earlier)  # seeds that a resumed run always keeps
@@ -232,7 +235,8 @@ class _Run:
         earlier: results of earlier calls by seed: recorded episodes, merged or not, and skipped seeds.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, has_candidates: bool = False) -> None:
+        self._has_candidates = has_candidates
         self._folder, self._trajectory = folder, folder / "trajectory.h5"
         self.episodes_folder = make_folder(folder / "episodes")
         self.failures: JsonLinesFile[FailedAttempt] = JsonLinesFile(folder / FAILURES_FILE, FailedAttempt)
@@ -299,6 +303,9 @@ class _Run:
             for result in successes
             if result.seed not in merged
         ]
+        if self._has_candidates and new:  # before the trajectories: a merge can be repeated
+            files = [path.with_name(candidates_file_name(path.stem)) for path in new]
+            merge_candidates(files, self._folder / CANDIDATES_FILE)
         if new:
             merge(([self._trajectory] if merged else []) + new, self._trajectory)
             flush_to_disk(self._folder)  # before its source files are deleted

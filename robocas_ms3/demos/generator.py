@@ -11,10 +11,12 @@ import gymnasium as gym
 import numpy as np
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
-from robocas_ms3.core.errors import LayoutError, PlanningError, UnrecoverableError
+from robocas_ms3.core.errors import LayoutError, PlanningError, RobocasError, UnrecoverableError
 from robocas_ms3.core.extensions import import_object
 from robocas_ms3.demos.backtracking import ResimulatedDecisions
 from robocas_ms3.demos.branches import ForkedDecisions, find_reason_not_to_fork, warn_cannot_fork
+from robocas_ms3.demos.candidates.probe import CandidateRecorder, CandidateSettings
+from robocas_ms3.demos.candidates.records import candidates_file_name
 from robocas_ms3.demos.failures import EpisodeResult, Intervention
 from robocas_ms3.demos.interventions import intervene
 from robocas_ms3.demos.open_loop import OpenLoopChecks, OpenLoopEnv
@@ -80,6 +82,14 @@ class EpisodeGenerator:
             self.open_loop_checks = OpenLoopChecks(self.open_loop_envs, settings)
         self._fork = fork and not settings.keep_recoveries
         reason = find_reason_not_to_fork(renders=base_env.scene.can_render())
+        if settings.record_candidates and (reason or not self._fork):
+            raise RobocasError(
+                "candidates can be recorded only with forked processes",
+                where="--record-candidates",
+                found=reason or "--no-fork",
+                fix="Use Linux and CPU physics, without --no-fork.",
+                usage=True,
+            )
         if self._fork and reason:
             warn_cannot_fork(reason)
             self._fork = False
@@ -91,14 +101,16 @@ class EpisodeGenerator:
 
         Args:
             seed: seed of the episode.
-            folder: folder of the files ``name.h5`` and ``name.json``.
+            folder: folder of the files ``name.h5`` and ``name.json``, and of the candidates' file.
             name: name of the files without suffix.
             intervention: state in which another policy left the scene; the episode starts in this state.
         """
         recorder = EpisodeRecorder(self.env, folder, name)
         executor = MotionExecutor(recorder, seed)
         result = EpisodeResult(seed, success=False, seconds=executor.seconds, max_attempts=self.settings.max_attempts)
-        attempts = _Attempts(self, recorder, executor, result, intervention)
+        settings = CandidateSettings(self.settings.candidates, self.settings.candidate_depth)
+        candidates = CandidateRecorder(settings, self.env, folder / candidates_file_name(name), result)
+        attempts = _Attempts(self, recorder, executor, result, intervention, candidates)
         executor.check_open_loop = attempts.check_open_loop
         try:
             if intervention is not None and intervention.skip_reason:
@@ -112,6 +124,7 @@ class EpisodeGenerator:
         except UnrecoverableError as error:  # of an intervention; those of attempts are handled there
             result.add_failure(error)
         result.attempts = len(result.failures) + result.success
+        result.decisions = []  # they are in their file
         return result
 
     def close(self) -> None:
@@ -127,6 +140,7 @@ class _Attempts:
     executor: MotionExecutor
     result: EpisodeResult
     intervention: Intervention | None
+    candidates: CandidateRecorder
 
     def run_from_resets(self, decisions: ForkedDecisions | ResimulatedDecisions) -> None:
         """Run attempts with backtracking, each from the reset, until one succeeds or none is left."""
@@ -171,7 +185,10 @@ class _Attempts:
                 self._reset()
 
     def _make_arm(self, decisions: Decisions, number: int) -> Arm:
-        return Arm(self.generator.planner, self.generator.inverse_kinematics, self.executor, decisions, (number,))
+        arm = Arm(self.generator.planner, self.generator.inverse_kinematics, self.executor, decisions, (number,))
+        if self.generator.settings.record_candidates:
+            self.candidates.observe(arm)
+        return arm
 
     def _run_policy(self, arm: Arm) -> None:
         if self.intervention is None:
@@ -208,6 +225,8 @@ class _Attempts:
             raise PlanningError("episode", "no_success")
         self.check_open_loop(finished=True)
         self.result.success, self.result.steps = True, len(self.executor.actions)
+        if self.generator.settings.record_candidates:  # first, since an episode with its trajectory is complete
+            self.candidates.write(self.recorder.env_info())
         self.recorder.finish(self._describe(recoveries))
 
     def _describe(self, recoveries: list[dict[str, Any]]) -> dict[str, Any]:

@@ -52,6 +52,15 @@ class EpisodeSettings:
     Such a recording has `check_trials: 0`."""
     check_noise_mm: Annotated[float, tyro.conf.Suppress] = 0.5
     check_noise_deg: Annotated[float, tyro.conf.Suppress] = 0.2
+    record_candidates: bool = False
+    """Also simulate the candidates of each decision, and record their outcomes in candidates.h5 (docs/candidates.md).
+    The demonstrations do not change."""
+    candidates: int = 16
+    """With --record-candidates: number of candidates per decision.
+    At least a third of them are random, the others are those of the scripted policy."""
+    candidate_depth: int = 0
+    """With --record-candidates: maximum number of further moves to simulate after each candidate of a search.
+    It gives the number of moves until the target can be grasped."""
     layouts: Annotated[str, tyro.conf.Suppress] = "auto"
     """Source of the layouts, see `RoboCASEnv`."""
     planner: Annotated[str, tyro.conf.arg(metavar="PLANNER")] = "rrt_connect"
@@ -98,6 +107,11 @@ class EpisodeSettings:
             )
         for name in ("check_trials", "check_failures", "check_noise_mm", "check_noise_deg"):
             check_number(f"--{name.replace('_', '-')}", getattr(self, name), 0)
+        check_number("--candidates", self.candidates, 1, 1000)
+        check_number("--candidate-depth", self.candidate_depth, 0, 20)
+        if self.record_candidates and self.keep_recoveries:
+            what, fix = "candidates cannot be recorded with recoveries", "Use --record-candidates without it."
+            raise RobocasError(what, where="--keep-recoveries", fix=fix, usage=True)
         check_number("--check-rate", replay, 0, control)
         if replay and (control % replay or SIM_FREQ % replay):
             raise RobocasError(

@@ -33,7 +33,7 @@ class SceneMeasures:
         hidden_fraction: (K,) fraction of each object that other objects hide, seen from above.
         obstacles: (K,) int, number of obstacles around each object.
         free_grasps: (K,) int, number of annotated grasps of each object whose gripper touches no other body.
-        fallen: (K,) bool, whether each object has fallen off the surface.
+        fallen: (K,) bool, whether each object has fallen off the surface, except into the basket.
         in_basket: (K,) bool, whether each object is in the basket.
         held_slot: slot of the object that both fingers hold; -1: none.
         opening: opening of the door or drawer as a fraction of its range; NaN without one.
@@ -63,14 +63,14 @@ def measure_scene(arm: Arm, before: SceneMeasures | None = None) -> SceneMeasure
     poses[slots] = [to_wxyz(arm.scene.object_in_base(slot)) for slot in slots.tolist()]
     hidden, obstacles = _measure_clutter(arm)
     held = np.flatnonzero(env.is_object_grasped()[0].cpu().numpy() & present)
-    height = to_native(env.object_states)[0, :, 2]
+    height, in_basket = to_native(env.object_states)[0, :, 2], _find_objects_in_basket(arm) & present
     return SceneMeasures(
         object_in_base=poses,
         hidden_fraction=np.where(present, hidden, np.nan),
         obstacles=np.where(present, obstacles, -1),
         free_grasps=_count_free_grasps(arm, poses, before),
-        fallen=np.asarray(height < env.success_check.fallen_below) & present,
-        in_basket=_find_objects_in_basket(arm) & present,
+        fallen=np.asarray(height < env.success_check.fallen_below) & present & ~in_basket,
+        in_basket=in_basket,
         held_slot=int(held[0]) if len(held) else -1,
         opening=measure_opening(arm),
     )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
@@ -13,10 +14,12 @@ from mani_skill.utils.common import to_numpy
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import to_wxyz
 from robocas_ms3.demos.branches import ForkedProcessError, run_in_forked_process
+from robocas_ms3.demos.candidates.candidates_file import write_candidates
 from robocas_ms3.demos.candidates.measure import DISTURBED, SceneMeasures, measure_scene
 from robocas_ms3.demos.candidates.proposals import Candidate, propose
 from robocas_ms3.demos.candidates.records import DecisionRecord
 from robocas_ms3.demos.candidates.schema import DecisionKind, Primitive
+from robocas_ms3.demos.failures import EpisodeResult
 from robocas_ms3.planning.decisions import IrreversibleDecisions
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.skills.arm import Arm
@@ -26,6 +29,7 @@ from robocas_ms3.tasks.search import RoboCASSearchEnv
 
 SETTLE_SECONDS = 0.25  # s after a candidate, until its objects are nearly at rest
 MIN_PUSH = 0.02  # m, least displacement of an object by a successful push
+MAX_DECISIONS = 30  # decisions that are recorded per seed, so that hard seeds do not dominate a dataset
 _STREAM = 412  # random stream of the proposals
 
 
@@ -44,50 +48,78 @@ class CandidateSettings:
 
 
 @dataclass
+class _PathDecision:
+    """Decision of the present attempt: its kind, its number in the result, and the number of the chosen candidate."""
+
+    kind: DecisionKind
+    number: int | None
+    chosen: int | None = None
+
+
+@dataclass
 class CandidateRecorder:
-    """Recorder of the decisions of an episode with the outcomes of their candidates.
+    """Recorder of the decisions of a seed with the outcomes of their candidates.
+
+    Decisions of undone attempts are recorded too, up to `MAX_DECISIONS` per seed.
 
     Attributes:
         settings: settings of the candidates.
         env: environment without a recorder, in which candidates are simulated.
-        records: decisions since the reset.
+        path: path of the file of the episode.
+        result: result of the seed, with the decisions of all attempts. Forked processes exchange it.
     """
 
     settings: CandidateSettings
     env: gym.Env
-    records: list[DecisionRecord] = field(default_factory=list)
+    path: Path
+    result: EpisodeResult
+    _decisions: list[_PathDecision] = field(default_factory=list)
 
     def observe(self, arm: Arm) -> None:
         """Record the decisions of an attempt from now on."""
-        self.records = []
+        self._decisions = []
 
         def on_decision(kind: str, candidates: Sequence[tuple[Any, Callable[[], object]]]) -> None:
             self._record(arm, cast("DecisionKind", kind), candidates)
 
         arm.on_decision, arm.on_choice = on_decision, self._mark_chosen
 
-    def finish(self) -> list[DecisionRecord]:
-        """Return the records of a successful episode, with the number of moves that followed each chosen move."""
+    def write(self, env_info: Mapping[str, Any]) -> None:
+        """Write the file of a successful episode, with the number of moves that followed each chosen move.
+
+        ``env_info`` is the value of this key in the JSON file of the trajectory.
+        """
         moves_left = 0
-        for record in reversed(self.records):
-            if record.values["kind"] == "move":
-                for candidate in record.candidates:
-                    if candidate["chosen"]:
+        for decision in reversed(self._decisions):
+            if decision.number is not None:
+                record = self.result.decisions[decision.number]
+                record.values["in_episode"] = True
+                if decision.chosen is not None:
+                    candidate = record.candidates[decision.chosen]
+                    candidate["chosen"] = True
+                    if decision.kind == "move":
                         candidate["moves_to_grasp"] = moves_left
-                moves_left += 1
-        return self.records
+            moves_left += decision.kind == "move"
+        write_candidates(self.path, self.result.decisions, env_info, asdict(self.settings))
 
     def _mark_chosen(self, index: int) -> None:
-        candidates = self.records[-1].candidates
-        if index < len(candidates) and candidates[index]["source"] == "expert":
-            candidates[index]["chosen"] = True
+        decision = self._decisions[-1]
+        if decision.number is not None:
+            candidates = self.result.decisions[decision.number].candidates
+            if index < len(candidates) and candidates[index]["source"] == "expert":
+                decision.chosen = index
 
     def _record(self, arm: Arm, kind: DecisionKind, options: Sequence[tuple[Any, Callable[[], object]]]) -> None:
+        number = len(self.result.decisions)
+        if number >= MAX_DECISIONS:
+            self._decisions.append(_PathDecision(kind, None))
+            return
+        self._decisions.append(_PathDecision(kind, number))
         before = measure_scene(arm)
         record = DecisionRecord(self._describe(arm, kind, before), _read_state(arm))
         count = self.settings.count
         candidates = [_make_expert_candidate(arm, kind, value, run) for value, run in options[:count]]
-        rng = np.random.default_rng([arm.executor.seed, *arm.decision_path, len(self.records), _STREAM])
+        rng = np.random.default_rng([arm.executor.seed, *arm.decision_path, len(self._decisions), _STREAM])
         # a third is random, even if the scripted policy has many candidates
         candidates = candidates[: max(1, count - count // 3)]
         candidates += propose(arm, kind, count - len(candidates), rng)
@@ -97,7 +129,7 @@ class CandidateRecorder:
             except ForkedProcessError as error:
                 outcome = _make_outcome(candidate, before, before, PlanningError("branch", str(error)))
             record.candidates.append(outcome)
-        self.records.append(record)
+        self.result.decisions.append(record)
 
     def _describe(self, arm: Arm, kind: DecisionKind, before: SceneMeasures) -> dict[str, Any]:
         env, scene = arm.env, arm.scene
@@ -105,8 +137,10 @@ class CandidateRecorder:
         assets = [asset.asset for asset in env.object_assets[0]]
         return {
             "seed": arm.executor.seed,
-            "decision": len(self.records),
+            "decision": len(self.result.decisions),
             "kind": kind,
+            "attempt": len(self.result.failures),
+            "in_episode": False,
             "step": len(arm.executor.actions),
             "instruction": env.instruction().text,
             "target_slot": arm.target,

@@ -24,13 +24,13 @@ from robocas_ms3.planning.pushes import (
     TOOL_RADIUS,
     push_yaws,
 )
-from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.arm import Arm, shift_back
 from robocas_ms3.planning.skills.grasp import grasp
 from robocas_ms3.planning.skills.handles import MovingPart, pull_handle
 from robocas_ms3.planning.skills.place import carry_and_release, sample_drop_poses
 from robocas_ms3.planning.skills.push import push_along, read_surface
 from robocas_ms3.planning.skills.remove import remove_object, sample_suitable_grasps
-from robocas_ms3.scenes.grasp_checks import HALF_TURN, NEIGHBOURHOOD, is_gripper_clear
+from robocas_ms3.scenes.grasp_checks import HALF_TURN, NEIGHBOURHOOD, PREGRASP_DISTANCE, is_gripper_clear
 
 # probability of each primitive, by kind of decision
 MIX: dict[DecisionKind, dict[Primitive, float]] = {
@@ -43,13 +43,14 @@ NEAR_MISSES = 0.4  # fraction of near misses among random candidates
 TARGET_FRACTION = 0.5  # fraction of random grasps that are of the target
 NEIGHBOUR_DISTANCE = 0.15  # m from the target at which an object is chosen e times less often than the target
 CLEAR_FRACTION = 0.6  # fraction of random grasps that touch no other body, if there are any
+REACHABLE_FRACTION = 0.9  # fraction of random grasps and releases that the arm reaches, if there are any
 LIFT_GRASPS = 4  # grasps to try per random lift
 # errors of near misses: standard deviations across and along the approach in m, and in rad
 GRASP_SHIFT, GRASP_DEPTH, GRASP_TURN = 0.02, 0.012, np.deg2rad(15)
 PUSH_SHIFT = (0.02, 0.05)  # m across the direction of the push, minimum and maximum
 PUSH_LENGTHS = (0.04, 0.2)  # m, of a random push after the contact
-DROP_SHIFT = (0.06, 0.22)  # m, horizontally
-PULL_SHIFT, PULL_ERROR = 0.004, (0.012, 0.035)  # m: standard deviation of random pulls; length of the error of a miss
+DROP_SHIFT = (0.06, 0.26)  # m, horizontally
+PULL_SHIFT, PULL_ERROR = 0.004, (0.015, 0.05)  # m: standard deviation of random pulls; length of the error of a miss
 
 
 @dataclass(frozen=True)
@@ -107,9 +108,23 @@ def _draw_grasps(arm: Arm, rng: np.random.Generator, slot: int, count: int) -> A
         near = arm.scene.points_in_base(exclude=slot, radius=NEIGHBOURHOOD, around=around)
         clear = is_gripper_clear(grasps, near)
         grasps = grasps[clear] if clear.any() else grasps
-    drawn = grasps[rng.choice(len(grasps), size=min(count, len(grasps)), replace=False)]
+    drawn = grasps[rng.permutation(len(grasps))[: 4 * count]]
     turned = rng.random(len(drawn)) < 0.5
-    return np.where(turned[:, None, None], drawn @ HALF_TURN, drawn)
+    drawn = np.where(turned[:, None, None], drawn @ HALF_TURN, drawn)
+    return _prefer_reachable(arm, rng, drawn, shift_back(drawn, PREGRASP_DISTANCE))[:count]
+
+
+def _prefer_reachable(arm: Arm, rng: np.random.Generator, poses: Array, starts: Array) -> Array:
+    """Return the reachable ones of TCP poses (N, 4, 4), or all of them with probability ``1 - REACHABLE_FRACTION``.
+
+    A pose is reachable if inverse kinematics has a solution for it and for its pose in ``starts`` (N, 4, 4).
+    """
+    if rng.random() > REACHABLE_FRACTION:
+        return poses
+    reachable = arm.inverse_kinematics.nearest_solutions(poses, arm.qpos)[0]
+    if starts is not poses:
+        reachable &= arm.inverse_kinematics.nearest_solutions(starts, arm.qpos)[0]
+    return poses[reachable] if reachable.any() else poses
 
 
 def _grasp(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate | None:
@@ -127,6 +142,8 @@ def _grasp(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate | N
         pose = pose @ error
 
     def run() -> None:
+        if arm.approach == "top":
+            arm.rise_until_free()
         arm.executor.gripper = OPEN
         grasp(arm, slot, grasps=[pose])
 
@@ -167,10 +184,11 @@ def _push(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate | No
 
 def _release(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate:
     drops = sample_drop_poses(arm, arm.target, arm.scene.arm_base_in_world)
-    pose = drops[rng.integers(len(drops))].copy()
     if near_miss:
-        angle = rng.uniform(-np.pi, np.pi)
-        pose[:2, 3] += rng.uniform(*DROP_SHIFT) * np.array([np.cos(angle), np.sin(angle)])
+        angles = rng.uniform(-np.pi, np.pi, len(drops))
+        shifts = rng.uniform(*DROP_SHIFT, len(drops))
+        drops[:, :2, 3] += shifts[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+    pose = _prefer_reachable(arm, rng, drops, drops)[0]
     source: Source = "near_miss" if near_miss else "random"
     return Candidate(source, "release", arm.target, lambda: carry_and_release(arm, arm.target, drops=pose[None]), pose)
 

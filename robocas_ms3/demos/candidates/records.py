@@ -9,6 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 
+def candidates_file_name(episode: str) -> str:
+    """Return the name of the file with the candidates of an episode whose trajectory file has the stem ``episode``."""
+    return f"candidates_{episode}.h5"
+
+
 @dataclass
 class DecisionRecord:
     """A decision with its candidates.

@@ -56,9 +56,12 @@ _POSE = "position in m and unit quaternion wxyz in the arm's base frame"
 
 DECISION_FIELDS = (
     Field("seed", "int64", (), "seed of the episode"),
-    Field("decision", "int32", (), "number of the decision in the episode, from 0"),
+    Field("decision", "int32", (), "number of the decision of the seed, from 0, in the order of simulation"),
     Field("kind", "str", (), "kind of the decision", DECISION_KINDS),
-    Field("step", "int32", (), "number of control steps before the decision, in the recorded episode"),
+    Field("attempt", "int16", (), "number of failed attempts of the seed before the decision"),
+    Field("in_episode", "bool", (), "whether the decision is part of the recorded episode; if not, its attempt failed "
+          "later and was undone"),
+    Field("step", "int32", (), "number of control steps before the decision, in its attempt"),
     Field("instruction", "str", (), "instruction of the episode"),
     Field("target_slot", "int16", (), "slot of the target"),
     Field("object_id", "str", (SLOTS,), "id of each object in its pack"),
@@ -95,7 +98,7 @@ CANDIDATE_FIELDS = (
     Field("seconds", "float32", (), "simulated duration, s"),
     Field("object_after_in_base", "float32", (SLOTS, 7), f"pose of each object at the end: {_POSE}"),
     Field("displacement", "float32", (SLOTS,), "distance between the positions of each object before and after, m"),
-    Field("fallen", "bool", (SLOTS,), "whether the object has fallen off the surface"),
+    Field("fallen", "bool", (SLOTS,), "whether the object has fallen off the surface, except into the basket"),
     Field("disturbed", "int16", (), "number of objects except the moved one that were displaced by more than 2 cm"),
     Field("in_basket", "bool", (SLOTS,), "whether the object is in the basket at the end"),
     Field("opening", "float32", (), "opening of the door or drawer at the end, as a fraction; NaN without one"),

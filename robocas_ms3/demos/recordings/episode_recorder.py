@@ -110,7 +110,7 @@ class EpisodeRecorder(gym.Wrapper):
             write_json(
                 self._trajectory.with_suffix(".json"),
                 {
-                    "env_info": self._env_info(),
+                    "env_info": self.env_info(),
                     "episodes": [
                         {
                             "episode_id": 0,
@@ -134,7 +134,8 @@ class EpisodeRecorder(gym.Wrapper):
                 sync=True,
             )
 
-    def _env_info(self) -> dict[str, Any]:
+    def env_info(self) -> dict[str, Any]:
+        """Return the value of ``env_info`` in the JSON file."""
         info = parse_env_info(self.env)
         assert info is not None, "the environment was not created by gym.make"
         kwargs = {key: value for key, value in info["env_kwargs"].items() if key not in _LOCAL_KWARGS}
