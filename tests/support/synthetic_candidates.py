@@ -103,6 +103,8 @@ def make_record(seed, number, slots=5, candidates=6):
         "seed": seed,
         "decision": number,
         "kind": "move",
+        "attempt": 0,
+        "in_episode": True,
         "step": 40 * number,
         "instruction": f"search the {names[TARGET]} and transfer it to the basket",
         "target_slot": TARGET,

@@ -101,8 +101,8 @@ def _check_decisions(tables: Tables) -> Iterator[_Rule]:
     yield "seed", "consecutive decisions per episode", repeated
     previous = np.append(-1, numbers[:-1])[: len(numbers)]
     yield "decision", "0, 1, 2, ... per episode", numbers != np.where(starts, 0, previous + 1)
-    earlier = np.where(starts, 0, np.append(0, steps[:-1])[: len(steps)])
-    yield "step", "at least 0, and at least that of the decision before", steps < earlier
+    yield "step", "at least 0", steps < 0
+    yield "attempt", "at least 0", values["attempt"] < 0
     yield "instruction", "a text", values["instruction"] == ""
     yield "target_slot", "slot of an object", ~_has_object(values["target_slot"], present)
     for name in ("object_id", "object_name"):
@@ -136,6 +136,7 @@ def _check_candidates(tables: Tables) -> Iterator[_Rule]:
     yield "end_in_base", "the end of a feasible push", pushed & _is_unknown(end)
     chosen = np.bincount(rows[values["chosen"]], minlength=len(decisions["seed"]))
     yield "chosen", "at most one candidate per decision", values["chosen"] & (chosen > 1)[rows]
+    yield "chosen", "false if in_episode is false", values["chosen"] & ~decisions["in_episode"][rows]
     yield "success", "feasible candidates only", values["success"] & ~feasible
     yield "failure", "a text if and only if the candidate failed", (values["failure"] == "") != values["success"]
     yield "held", "false for a pull", values["held"] & pulls

@@ -82,7 +82,11 @@ def propose(arm: Arm, kind: DecisionKind, count: int, rng: np.random.Generator) 
     weights = np.array(list(mix.values()))
     primitives = rng.choice(list(mix), size=count, p=weights / weights.sum()).tolist()
     makers = {"grasp": _grasp, "push": _push, "lift": _lift, "release": _release, "pull": _pull}
-    made = [makers[primitive](arm, rng, bool(rng.random() < NEAR_MISSES)) for primitive in primitives]
+    own, arm.rng = arm.rng, rng  # the episode must not depend on the proposals
+    try:
+        made = [makers[primitive](arm, rng, bool(rng.random() < NEAR_MISSES)) for primitive in primitives]
+    finally:
+        arm.rng = own
     return [candidate for candidate in made if candidate is not None]
 
 
