@@ -66,6 +66,8 @@ def make_records(recording, steps, target, names=None, kinds=tuple(KINDS)):
             "seed": recording.seed,
             "decision": number,
             "kind": kind,
+            "attempt": 0,
+            "in_episode": True,
             "step": step,
             "instruction": recording.instruction,
             "target_slot": target,

@@ -98,14 +98,19 @@ class DecisionContent(Content):
     def _collect_facts(self, decision: Decision) -> dict[str, Any]:
         """Return values of a decision that the page lists below the table, by title."""
         values, target = decision.values, int(decision.values["target_slot"])
-        name = self.source.name_object
-        facts = {"Target": name(decision, target), "Held object": name(decision, int(values["held_slot"]))}
+        held = int(values["held_slot"])
+        facts: dict[str, Any] = {
+            title: self.source.name_object(decision, slot, with_id=True)
+            for title, slot in (("Target", target), ("Held object", held))
+        }
         if 0 <= target < len(values["present"]):
             facts |= {
                 "Obstacles of the target": int(values["obstacles"][target]),
                 "Free grasps of the target": int(values["free_grasps"][target]),
                 "Hidden share of the target": f"{100 * values['hidden_fraction'][target]:.0f} %",
             }
+        if values["attempt"] or not values["in_episode"]:
+            facts["Attempt"] = f"{values['attempt'] + 1}{'' if values['in_episode'] else ', failed later and undone'}"
         if np.isfinite(values["opening"]):
             facts["Opening"] = f"{100 * values['opening']:.0f} %"
         facts["Gripper width"] = f"{1000 * values['gripper_width']:.0f} mm"

@@ -39,7 +39,7 @@ class ObjectOutline:
     """Object in a view.
 
     Attributes:
-        name: name of the object, with its id if the two differ.
+        name: name of the object.
         target: whether it is the instructed target.
         pixel: (2,) position; NaN: behind the camera.
         outline: (P, 2) outline; empty: unknown.
@@ -102,11 +102,12 @@ class DecisionSource:
             raise DatasetError("no such decision", where=self.file.path, expected=f"0 to {len(self) - 1}", found=row)
         return self.file.decision(row)
 
-    def name_object(self, decision: Decision, slot: int) -> str:
-        """Return the name of the object in a slot, "" if there is none."""
+    def name_object(self, decision: Decision, slot: int, *, with_id: bool = False) -> str:
+        """Return the name of the object in a slot, possibly with its id if the two differ; "" if there is none."""
         if not 0 <= slot < len(decision.values["present"]) or not decision.values["present"][slot]:
             return ""
-        return format_object_name(*(str(decision.values[key][slot]) for key in ("object_id", "object_name")))
+        asset, name = (str(decision.values[key][slot]) for key in ("object_id", "object_name"))
+        return format_object_name(asset, name) if with_id or not name else name
 
     def views(self, row: int) -> list[DecisionView]:
         """Return the views of a decision: those of the cameras, if there are images, and the plot from above."""

@@ -30,7 +30,7 @@ _BAND, _LEGEND, _GAP = 48, 60, 8  # px: text below an image, legend, space betwe
 _FINE = 2  # images are drawn this many times larger and then reduced, so that lines are smooth
 _PAPER, _INK, _FAINT, _EDGE, _WHITE = (24, 26, 30), (245, 245, 245), (170, 180, 190), (16, 20, 26), (255, 255, 255)
 _PLOT, _OBJECT, _TARGET = (238, 240, 243), (203, 209, 217), (170, 200, 250)  # of the plot from above
-_WIDTH, _CHOSEN_WIDTH = 1.8, 3.2  # px, of lines
+_WIDTH, _CHOSEN_WIDTH = 2.2, 3.4  # px, of lines
 _DASH = 6.0  # px
 
 
@@ -106,8 +106,7 @@ def draw_decision(source: DecisionSource, row: int, camera: str | None = None) -
         )
     for thing in shown.objects:
         if thing.target and np.isfinite(thing.pixel).all():
-            (spot,) = place(thing.pixel[None])
-            draw.text(spot, thing.name, _WHITE, _load_font(13 * _FINE), "mm", stroke_width=2 * _FINE, stroke_fill=_EDGE)
+            _draw_name(draw, thing.name, np.array(place(np.vstack([thing.pixel, *thing.outline]))), size)
     panel = Image.new("RGB", (_PANEL[0], _PANEL[1] + _BAND), _PAPER)
     panel.paste(background.resize(_PANEL, Image.Resampling.BOX), (0, 0))
     _draw_caption(panel, source, row, outcomes, shown.view.name)
@@ -144,9 +143,18 @@ def _draw_objects(draw: ImageDraw.ImageDraw, shown: DecisionView, place: Any, *,
             _draw_dashes(draw, outline, _WHITE, 1.4 * _FINE)
 
 
+def _draw_name(draw: ImageDraw.ImageDraw, name: str, pixels: Array, size: tuple[int, int]) -> None:
+    """Write the name of an object below its pixels (P, 2), the first of which is its position, inside the image."""
+    font = _load_font(13 * _FINE)
+    half = draw.textlength(name, font) / 2 + 4 * _FINE
+    x = float(np.clip(pixels[0, 0], half, max(half, size[0] - half)))
+    y = float(np.clip(pixels[:, 1].max() + 10 * _FINE, 8 * _FINE, size[1] - 8 * _FINE))
+    draw.text((x, y), name, _WHITE, font, "mm", stroke_width=2 * _FINE, stroke_fill=_EDGE)
+
+
 def _draw_candidate(draw: ImageDraw.ImageDraw, lines: list[tuple[Any, bool]], colour: Colour, chosen: bool) -> None:
     width = _FINE * (_CHOSEN_WIDTH if chosen else _WIDTH)
-    for ink, extra in ((_WHITE if chosen else _EDGE, _FINE * (3.5 if chosen else 1.4)), (colour, 0.0)):
+    for ink, extra in ((_WHITE if chosen else _EDGE, _FINE * (3.5 if chosen else 1.6)), (colour, 0.0)):
         for points, dashed in lines:
             if dashed:
                 _draw_dashes(draw, points, ink, width + extra)
@@ -184,24 +192,26 @@ def _draw_caption(panel: Image.Image, source: DecisionSource, row: int, outcomes
 
 
 def _draw_legend(sheet: Image.Image, title: str) -> None:
-    draw = ImageDraw.Draw(sheet)
-    _draw_text(draw, (_GAP, 6), title, 18, _INK, sheet.width - 2 * _GAP)
-    x, y = float(_GAP), 44.0
+    legend = Image.new("RGB", (_FINE * sheet.width, _FINE * _LEGEND), _PAPER)
+    draw = ImageDraw.Draw(legend)
+    _draw_text(draw, (_FINE * _GAP, _FINE * 6), title, 18 * _FINE, _INK, legend.width - 2 * _FINE * _GAP)
+    x, y = float(_FINE * _GAP), float(_FINE * 44)
     for name in reversed(OUTCOMES):
-        draw.rectangle((x, y - 6, x + 12, y + 6), COLOURS[name])
-        x = _label(draw, x + 18, y, name)
-    x += 10
+        half = 6 * _FINE
+        draw.rectangle((x, y - half, x + 2 * half, y + half), COLOURS[name])
+        x = _label(draw, x + 3 * half, y, name)
+    x += 10 * _FINE
     for text, lines, chosen in _LEGEND_SHAPES:
-        _draw_candidate(
-            draw, [([(x + px, y + py) for px, py in points], dashed) for points, dashed in lines], _FAINT, chosen
-        )
-        x = _label(draw, x + 40, y, text)
+        moved = [([(x + _FINE * px, y + _FINE * py) for px, py in points], dashed) for points, dashed in lines]
+        _draw_candidate(draw, moved, _FAINT, chosen)
+        x = _label(draw, max(px for points, _ in moved for px, _ in points) + 8 * _FINE, y, text)
+    sheet.paste(legend.resize((sheet.width, _LEGEND), Image.Resampling.BOX), (0, 0))
 
 
 def _label(draw: ImageDraw.ImageDraw, x: float, y: float, text: str) -> float:
     """Draw a text of the legend, vertically centred; return the x of the next entry."""
-    draw.text((x, y), text, _INK, _load_font(14), "lm")
-    return x + draw.textlength(text, _load_font(14)) + 22
+    draw.text((x, y), text, _INK, _load_font(14 * _FINE), "lm")
+    return x + draw.textlength(text, _load_font(14 * _FINE)) + 22 * _FINE
 
 
 _ARROW: list[tuple[list[tuple[float, float]], bool]] = [
@@ -211,7 +221,16 @@ _ARROW: list[tuple[list[tuple[float, float]], bool]] = [
 _LEGEND_SHAPES: list[tuple[str, list[tuple[list[tuple[float, float]], bool]], bool]] = [
     ("grasp", [([(2, 8), (2, -2), (26, -2), (26, 8)], False), ([(14, -2), (14, -10)], False)], False),
     ("push or pull", _ARROW, False),
-    ("lift: grasp, and placement", [(_ARROW[0][0], True), _ARROW[1]], False),
+    (
+        "lift",
+        [
+            ([(2, 8), (2, 0), (14, 0), (14, 8)], False),
+            ([(8, 0), (8, -8)], False),
+            ([(12, 0), (44, 0)], True),
+            ([(37, -6), (44, 0), (37, 6)], False),
+        ],
+        False,
+    ),
     ("release", [([(16 + 8 * np.cos(a), 8 * np.sin(a)) for a in np.linspace(0, 2 * np.pi, 17)], False)], False),
     ("chosen", _ARROW, True),
 ]

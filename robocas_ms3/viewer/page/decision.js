@@ -66,7 +66,7 @@ robocas.decision = (() => {
   function describe() {
     document.title = `Decision ${decision.n}: ${decision.instruction}`;
     byId("d-instruction").textContent = decision.instruction;
-    const parts = [`Decision ${decision.n}`, decision.kind, `seed ${decision.seed}`, `number ${decision.decision} of the episode, step ${decision.step}`, `${decision.candidates.length} candidates`];
+    const parts = [`Decision ${decision.n}`, decision.kind, `seed ${decision.seed}`, `number ${decision.decision} of the seed, step ${decision.step}`, `${decision.candidates.length} candidates`];
     byId("d-summary").textContent = parts.join(" \u00b7 ");
     byId("d-facts").replaceChildren(...pairs(Object.entries(decision.facts)));
   }
@@ -149,7 +149,8 @@ robocas.decision = (() => {
     const size = region[2] / 48;
     for (const thing of shown.objects) {
       if (!thing.pixel || (isCamera && !thing.target)) continue;
-      const label = svg("text", { x: thing.pixel[0], y: thing.pixel[1], "font-size": size, class: thing.target ? "target" : "" });
+      const below = isCamera ? Math.max(thing.pixel[1], ...thing.outline.map((point) => point[1])) + 1.2 * size : thing.pixel[1];
+      const label = svg("text", { x: thing.pixel[0], y: below, "font-size": size, class: thing.target ? "target" : "" });
       label.textContent = thing.name;
       parts.push(label);
     }
