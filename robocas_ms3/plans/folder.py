@@ -27,6 +27,7 @@ from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
 from robocas_ms3.core.strict_model import parse, validate_json
 from robocas_ms3.datasets.schema import episode_folder
+from robocas_ms3.demos.candidates.candidates_file import FILE_NAME as CANDIDATES_FILE
 from robocas_ms3.demos.recordings.trajectory_json import package_versions
 from robocas_ms3.plans.plan import Plan
 from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
@@ -75,6 +76,11 @@ class SeedFiles:
     def recording_path(self) -> Path:
         """Path of the HDF5 file of the recorded episode; its JSON file is next to it."""
         return self.folder / "recording.h5"
+
+    @property
+    def candidates_path(self) -> Path:
+        """Path of the file of the episode's candidates, with `record_candidates`."""
+        return self.folder / CANDIDATES_FILE
 
     @property
     def episode_path(self) -> Path:

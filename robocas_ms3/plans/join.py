@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, load_json, load_npy
-from robocas_ms3.core.errors import PlanError
+from robocas_ms3.core.errors import DatasetError, PlanError
 from robocas_ms3.core.files import atomic_file, encode_json, flush_to_disk, make_folder, write_json
 from robocas_ms3.core.output_folder import remove_temporary_files
 from robocas_ms3.core.text import format_count, one_line
@@ -25,6 +25,8 @@ from robocas_ms3.datasets.manage.split import SplitOptions, divide_episodes, gro
 from robocas_ms3.datasets.sources.provenance import make_recording_entry
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.split import SPLIT_RULE, split_by_seed
+from robocas_ms3.demos.candidates.candidates_file import FILE_NAME as CANDIDATES_FILE
+from robocas_ms3.demos.candidates.candidates_file import CandidateFile, merge_candidates
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.recordings.trajectory_hdf5 import find_violation, merge
 from robocas_ms3.plans.folder import (
@@ -110,6 +112,10 @@ def _join_files(folder: PlanFolder, files: EpisodeFiles, on_stage: OnStage) -> N
         _join_file(
             path, recordings, damage, write, partial(on_stage, f"joining demonstrations, {plan.part_name(part)}")
         )
+        if plan.recording.record_candidates:
+            target, sources = path.with_name(CANDIDATES_FILE), [each.candidates_path for each in episodes]
+            damage, write = partial(_find_candidates_damage, target, seeds[part]), partial(_merge, sources, target)
+            _join_file(target, sources, damage, write, partial(on_stage, f"joining candidates, {plan.part_name(part)}"))
 
 
 def _join_file(
@@ -141,6 +147,19 @@ def _join_file(
     if found := damage():
         fix = "Check the disk; then run the command again."
         raise PlanError("this file or folder is damaged after writing", where=path, found=found, fix=fix)
+
+
+def _merge(sources: Sequence[Path], target: Path) -> None:
+    target.unlink(missing_ok=True)  # damaged; otherwise its content would be kept
+    merge_candidates(sources, target)
+
+
+def _find_candidates_damage(path: Path, seeds: Sequence[int]) -> str:
+    try:
+        found = list(dict.fromkeys(CandidateFile(path).decisions["seed"].tolist()))
+    except (DatasetError, OSError) as error:
+        return _describe_error(error)
+    return "" if found == list(seeds) else f"candidates of {format_count(len(found), 'episode')} with other seeds"
 
 
 def _find_layouts_damage(path: Path, seeds: Sequence[int]) -> str:

@@ -53,6 +53,11 @@ class RecordingConfig(StrictModel):
     check_failures: Annotated[int, Field(ge=0, le=10_000)] | None = None
     check_noise_mm: Annotated[float, Field(ge=0, le=1000)] | None = None
     check_noise_deg: Annotated[float, Field(ge=0, le=180)] | None = None
+    record_candidates: bool | None = Field(
+        default=None, description="also write `candidates.h5` next to the demonstrations"
+    )
+    candidates: Annotated[int, Field(ge=1, le=1000)] | None = None
+    candidate_depth: Annotated[int, Field(ge=0, le=20)] | None = None
 
 
 class ImagesConfig(StrictModel):

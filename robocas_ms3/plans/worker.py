@@ -34,6 +34,7 @@ from robocas_ms3.datasets.conversion import rendered_source
 from robocas_ms3.datasets.conversion.conversion_input import ConversionInput
 from robocas_ms3.datasets.conversion.episode_folder import FolderWriter
 from robocas_ms3.datasets.images.image_files import ImageOptions
+from robocas_ms3.demos.candidates.records import candidates_file_name
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.trajectory_json import read_json
 from robocas_ms3.plans.folder import Outcome, PlanFolder, SeedFiles, WorkUnit
@@ -111,6 +112,8 @@ class Recorder:
                 episode["robocas"].pop("seconds", None)  # wall-clock times differ between machines
             write_json(files.recording_path.with_suffix(".json"), content)
             tmp.with_suffix(".json").unlink()
+            if generator.settings.record_candidates:
+                os.replace(files.folder / candidates_file_name(tmp.stem), files.candidates_path)
             os.replace(tmp, files.recording_path)
         episode = read_json(files.recording_path)["episodes"][0]
         return {

@@ -18,7 +18,12 @@ from branch_notes import Notes
 from robocas_ms3.core.errors import PlanningError, RobocasError
 from robocas_ms3.core.remote_errors import RemoteTraceback
 from robocas_ms3.demos import branches
-from robocas_ms3.demos.branches import ForkedDecisions, find_reason_not_to_fork
+from robocas_ms3.demos.branches import (
+    ForkedDecisions,
+    ForkedProcessCrashError,
+    find_reason_not_to_fork,
+    run_in_forked_process,
+)
 from robocas_ms3.planning.decisions import SearchLimits
 
 
@@ -302,3 +307,38 @@ def test_reasons_not_to_fork(monkeypatch):
     assert find_reason_not_to_fork(renders=False) == ("" if sys.platform == "linux" else "this is not Linux")
     monkeypatch.setattr(sys, "platform", "darwin")
     assert find_reason_not_to_fork(renders=False) == "this is not Linux"
+
+
+def test_function_in_a_forked_process_changes_only_the_child():
+    notes = ["before"]
+
+    def change():
+        notes.append("child")
+        return [*notes]
+
+    before = children()
+    assert run_in_forked_process(change) == ["before", "child"]
+    assert notes == ["before"]
+    assert children() == before
+
+
+def test_error_of_a_function_in_a_forked_process_reaches_the_parent():
+    with pytest.raises(ZeroDivisionError):
+        run_in_forked_process(lambda: 1 // 0)
+
+
+@pytest.mark.parametrize("crashes", [1, 2])
+def test_function_whose_process_crashes_is_called_once_more(crashes, tmp_path):
+    def crash():
+        with (tmp_path / "calls").open("a") as file:
+            file.write("x")
+        if (tmp_path / "calls").stat().st_size <= crashes:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return "result"
+
+    if crashes == 1:
+        assert run_in_forked_process(crash) == "result"
+    else:
+        with pytest.raises(ForkedProcessCrashError):
+            run_in_forked_process(crash)
+    assert (tmp_path / "calls").read_text() == "xx"

@@ -17,7 +17,7 @@ from robocas_ms3.demos.branches import ForkedProcessError, run_in_forked_process
 from robocas_ms3.demos.candidates.candidates_file import write_candidates
 from robocas_ms3.demos.candidates.measure import DISTURBED, SceneMeasures, measure_scene
 from robocas_ms3.demos.candidates.proposals import Candidate, propose
-from robocas_ms3.demos.candidates.records import DecisionRecord
+from robocas_ms3.demos.candidates.records import DecisionRecord, PathDecision, mark_episode
 from robocas_ms3.demos.candidates.schema import DecisionKind, Primitive
 from robocas_ms3.demos.failures import EpisodeResult
 from robocas_ms3.planning.decisions import IrreversibleDecisions
@@ -48,15 +48,6 @@ class CandidateSettings:
 
 
 @dataclass
-class _PathDecision:
-    """Decision of the present attempt: its kind, its number in the result, and the number of the chosen candidate."""
-
-    kind: DecisionKind
-    number: int | None
-    chosen: int | None = None
-
-
-@dataclass
 class CandidateRecorder:
     """Recorder of the decisions of a seed with the outcomes of their candidates.
 
@@ -73,7 +64,7 @@ class CandidateRecorder:
     env: gym.Env
     path: Path
     result: EpisodeResult
-    _decisions: list[_PathDecision] = field(default_factory=list)
+    _decisions: list[PathDecision] = field(default_factory=list)
 
     def observe(self, arm: Arm) -> None:
         """Record the decisions of an attempt from now on."""
@@ -85,21 +76,11 @@ class CandidateRecorder:
         arm.on_decision, arm.on_choice = on_decision, self._mark_chosen
 
     def write(self, env_info: Mapping[str, Any]) -> None:
-        """Write the file of a successful episode, with the number of moves that followed each chosen move.
+        """Write the file of a successful episode.
 
         ``env_info`` is the value of this key in the JSON file of the trajectory.
         """
-        moves_left = 0
-        for decision in reversed(self._decisions):
-            if decision.number is not None:
-                record = self.result.decisions[decision.number]
-                record.values["in_episode"] = True
-                if decision.chosen is not None:
-                    candidate = record.candidates[decision.chosen]
-                    candidate["chosen"] = True
-                    if decision.kind == "move":
-                        candidate["moves_to_grasp"] = moves_left
-            moves_left += decision.kind == "move"
+        mark_episode(self.result.decisions, self._decisions)
         write_candidates(self.path, self.result.decisions, env_info, asdict(self.settings))
 
     def _mark_chosen(self, index: int) -> None:
@@ -112,9 +93,9 @@ class CandidateRecorder:
     def _record(self, arm: Arm, kind: DecisionKind, options: Sequence[tuple[Any, Callable[[], object]]]) -> None:
         number = len(self.result.decisions)
         if number >= MAX_DECISIONS:
-            self._decisions.append(_PathDecision(kind, None))
+            self._decisions.append(PathDecision(kind, None))
             return
-        self._decisions.append(_PathDecision(kind, number))
+        self._decisions.append(PathDecision(kind, number))
         before = measure_scene(arm)
         record = DecisionRecord(self._describe(arm, kind, before), _read_state(arm))
         count = self.settings.count

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from robocas_ms3.demos.candidates.schema import DecisionKind
 
 
 def candidates_file_name(episode: str) -> str:
@@ -34,3 +37,40 @@ class DecisionRecord:
     def slots(self) -> int:
         """Number K of object slots."""
         return len(np.asarray(self.values["present"]))
+
+
+@dataclass
+class PathDecision:
+    """Decision of an attempt.
+
+    Attributes:
+        kind: kind of the decision.
+        number: index of its record; None if it is not recorded.
+        chosen: index of the candidate with which the attempt continued; None if it is not known.
+    """
+
+    kind: DecisionKind
+    number: int | None
+    chosen: int | None = None
+
+
+def mark_episode(records: Sequence[DecisionRecord], path: Sequence[PathDecision]) -> None:
+    """Mark the decisions of the recorded episode in the records of a seed.
+
+    The decisions get ``in_episode``, and their chosen candidates ``chosen``. A chosen move also gets the number of
+    moves that followed it as ``moves_to_grasp``.
+
+    Args:
+        records: decisions of all attempts.
+        path: decisions of the attempt that succeeded, in order.
+    """
+    moves_left = 0
+    for decision in reversed(path):
+        if decision.number is not None:
+            records[decision.number].values["in_episode"] = True
+            if decision.chosen is not None:
+                candidate = records[decision.number].candidates[decision.chosen]
+                candidate["chosen"] = True
+                if decision.kind == "move":
+                    candidate["moves_to_grasp"] = moves_left
+        moves_left += decision.kind == "move"
