@@ -40,9 +40,9 @@ import tyro
 
 from robocas_ms3.demos import EpisodeSettings
 from robocas_ms3.demos.generator import EpisodeGenerator
-from robocas_ms3.demos.open_loop import draw_noise
 from robocas_ms3.demos.recordings.motion import Motion, sample_states, sample_stride
 from robocas_ms3.demos.recordings.trajectory_hdf5 import open_trajectory
+from robocas_ms3.planning.action_noise import draw_noise
 from robocas_ms3.robots.description import MOBILE_PANDA
 from robocas_ms3.robots.registry import PANDA
 from robocas_ms3.scenes.config import load_task_config

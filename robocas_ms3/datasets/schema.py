@@ -72,6 +72,8 @@ EPISODE_INFO: tuple[ArraySpec, ...] = (
 
 RELATIVE_PAIRS = (("ee_pos", "ee_orn", "rel_pos", "rel_orn"), ("base_pos", "base_orn", "base_rel_pos", "base_rel_orn"))
 """Keys of absolute position and orientation, and of the corresponding relative motion."""
+INTENDED_POSE = ("intended_ee_pos", "intended_ee_orn")
+"""Keys of the EEF poses to which ``rel_pos`` and ``rel_orn`` lead, in episodes with action noise."""
 
 
 def check_version(found: object, where: Path, what: str = "a dataset") -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.core.errors import LayoutError, PlanningError, RobocasError, UnrecoverableError
@@ -23,7 +24,9 @@ from robocas_ms3.demos.open_loop import OpenLoopChecks, OpenLoopEnv
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.episode_recorder import EpisodeRecorder
 from robocas_ms3.demos.recordings.subgoals import SubGoal
+from robocas_ms3.demos.recordings.trajectory_hdf5 import INTENDED_ACTIONS, JOINT_DEVIATIONS
 from robocas_ms3.demos.settings import EpisodeSettings
+from robocas_ms3.planning.action_noise import ActionNoise
 from robocas_ms3.planning.decisions import Decisions, IrreversibleDecisions
 from robocas_ms3.planning.executor import MotionExecutor
 from robocas_ms3.planning.kinematics import ArmChain, InverseKinematics
@@ -106,7 +109,7 @@ class EpisodeGenerator:
             intervention: state in which another policy left the scene; the episode starts in this state.
         """
         recorder = EpisodeRecorder(self.env, folder, name)
-        executor = MotionExecutor(recorder, seed)
+        executor = MotionExecutor(recorder, seed, noise=self._make_noise())
         result = EpisodeResult(seed, success=False, seconds=executor.seconds, max_attempts=self.settings.max_attempts)
         settings = CandidateSettings(self.settings.candidates, self.settings.candidate_depth)
         candidates = CandidateRecorder(settings, self.env, folder / candidates_file_name(name), result)
@@ -126,6 +129,16 @@ class EpisodeGenerator:
         result.attempts = len(result.failures) + result.success
         result.decisions = []  # they are in their file
         return result
+
+    def _make_noise(self) -> ActionNoise | None:
+        settings, base_env = self.settings, self.env.unwrapped
+        assert isinstance(base_env, RoboCASEnv)
+        if not settings.has_action_noise:
+            return None
+        drive = base_env.agent.arm_drive
+        # within a simulation step, the target is that of the end of this step
+        lag = drive["damping"] / drive["stiffness"] - 0.5 / base_env.sim_freq
+        return ActionNoise(self.inverse_kinematics.chain, settings.action_noise, settings.control_freq, lag)
 
     def close(self) -> None:
         self.env.close()
@@ -227,7 +240,14 @@ class _Attempts:
         self.result.success, self.result.steps = True, len(self.executor.actions)
         if self.generator.settings.record_candidates:  # first, since an episode with its trajectory is complete
             self.candidates.write(self.recorder.env_info())
-        self.recorder.finish(self._describe(recoveries))
+        self.recorder.finish(self._describe(recoveries), self._noise_arrays())
+
+    def _noise_arrays(self) -> dict[str, NDArray[np.float32]]:
+        executor = self.executor
+        if executor.noise is None:
+            return {}
+        arrays = {INTENDED_ACTIONS: executor.actions, JOINT_DEVIATIONS: executor.deviations}
+        return {name: np.array(rows, np.float32) for name, rows in arrays.items()}
 
     def _describe(self, recoveries: list[dict[str, Any]]) -> dict[str, Any]:
         executor, settings, checked = (
@@ -265,4 +285,5 @@ class _Attempts:
                 if intervention
                 else {}
             ),
+            **({"action_noise": list(settings.action_noise)} if settings.has_action_noise else {}),
         }

@@ -20,6 +20,7 @@ from robocas_ms3.demos.failures import WITH_NOISE, Intervention
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.motion import Array, Motion, sample_states, sample_stride
 from robocas_ms3.demos.settings import EpisodeSettings
+from robocas_ms3.planning.action_noise import draw_noise
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 from robocas_ms3.scenes.layout import Layout
 from robocas_ms3.tasks.base import RoboCASEnv
@@ -132,23 +133,6 @@ class OpenLoopEnv:
 
     def close(self) -> None:
         self._env.close()
-
-
-def draw_noise(rng: np.random.Generator, count: int, std_mm: float, std_deg: float) -> Array:
-    """Draw normal actuation noise (count, 7) for dataset actions.
-
-    Args:
-        rng: random generator.
-        count: number of actions.
-        std_mm: standard deviation of each translation component, mm.
-        std_deg: standard deviation of each rotation component, deg.
-
-    Returns:
-        Translation in m, rotation in rad, and 0 for the gripper.
-    """
-    drawn = np.zeros((count, 7))
-    drawn[:, :6] = rng.normal(size=(count, 6)) * np.repeat([std_mm / 1000, np.deg2rad(std_deg)], 3)
-    return drawn
 
 
 class OpenLoopChecks:

@@ -43,7 +43,7 @@ class EpisodeSettings:
     check_rate: Annotated[int | None, _NO_HINT] = None
     """Rate in Hz of the open-loop check, which replays the 7-D actions of each attempt.
     An attempt that fails the check is undone. 0: no check.
-    Default: 5 Hz, or the control rate if 5 is not a divisor of it."""
+    Default: 5 Hz, or the control rate if 5 is not a divisor of it; with --action-noise no check."""
     check_trials: int = 1
     """Number of noise checks: open-loop checks with actuation noise (--check-noise), after the check without noise.
     0: none."""
@@ -73,15 +73,27 @@ class EpisodeSettings:
     Seeds in which the policy has succeeded or failed already are skipped."""
     after_steps: tuple[int, int] = (5, 60)
     """Minimum and maximum number of policy steps before the scripted policy continues; drawn uniformly per seed."""
+    action_noise: Annotated[tuple[float, float], tyro.conf.arg(metavar="MM DEG"), _NO_HINT] = (0.0, 0.0)
+    """Disturb the executed actions with noise, so that the demonstrations contain corrections (DART).
+    Standard deviation of each component of an action, in mm and degrees.
+    Datasets contain the intended actions, see docs/policies.md.
+    Default: 0 0, no noise."""
 
     def __post_init__(self) -> None:
         spec = TASKS.find(self.task, where="TASK")
         config = self.config or spec.default_config
         rate = self.check_rate
+        if rate is None and self.has_action_noise:
+            rate = 0
         if rate is None:
             rate = 5 if self.control_freq % 5 == 0 else self.control_freq
         object.__setattr__(self, "config", config)
         object.__setattr__(self, "check_rate", rate)
+
+    @property
+    def has_action_noise(self) -> bool:
+        """Whether noise disturbs the executed actions."""
+        return any(self.action_noise)
 
     def check(self) -> None:
         """Check the settings before anything is written.
@@ -122,6 +134,8 @@ class EpisodeSettings:
             )
         check_number("--after-steps", self.after_steps[0], 1)
         check_number("--after-steps", self.after_steps[1], self.after_steps[0])
+        for std in self.action_noise:
+            check_number("--action-noise", std, 0)
         PLANNERS.find(self.planner, where="planner")
         robot, config = find_robot(self.robot), load_config_for(TASKS[self.task], self.config, usage=True)
         SceneModel.load(config, load_pack(self.pack), load_pack("builtin"), robot=robot.description)

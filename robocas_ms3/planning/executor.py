@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from robocas_ms3.planning.action_noise import ActionNoise
 from robocas_ms3.planning.decisions import CpuSeconds
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.tasks.base import RoboCASEnv
@@ -39,8 +40,9 @@ class MotionExecutor:
         env: environment with ``num_envs`` = 1 and control mode ``pd_joint_pos`` or ``pd_joint_pos_base``, possibly
             wrapped by a recorder.
         seed: seed of the episode.
-        actions: actions since the reset, (8,) each: 7 arm joints in rad and the gripper command; with
-            ``pd_joint_pos_base`` (11,): also x in m, y in m and yaw in rad of the base.
+        actions: intended actions since the reset, (8,) each: 7 arm joints in rad and the gripper command; with
+            ``pd_joint_pos_base`` (11,): also x in m, y in m and yaw in rad of the base. Without ``noise`` they are
+            the executed actions.
         segments: segments since the reset, one per sub-goal.
         info: info of the last step or reset.
         gripper: last gripper command, 1 open or -1 closed.
@@ -49,6 +51,8 @@ class MotionExecutor:
         facts: counters that the policy sets and the recording stores, e.g. ``pushes``.
         check_open_loop: function that replays the actions since the reset open loop; it raises UnrecoverableError if
             the target deviates from the recording.
+        noise: noise that is added to the joint targets; None: no noise.
+        deviations: deviations of the arm joints (7,) that the noise has caused at the end of each action, rad.
     """
 
     env: gym.Env
@@ -61,6 +65,8 @@ class MotionExecutor:
     seconds: CpuSeconds = field(default_factory=CpuSeconds)
     facts: dict[str, Any] = field(default_factory=dict)
     check_open_loop: Callable[[], None] = lambda: None
+    noise: ActionNoise | None = None
+    deviations: list[Array] = field(default_factory=list)
 
     @property
     def base_env(self) -> RoboCASEnv:
@@ -78,7 +84,9 @@ class MotionExecutor:
         with self.seconds.measure("reset"):
             _, self.info = self.env.reset(seed=self.seed)
         self.actions, self.segments, self.gripper, self.base = [], [], OPEN, np.zeros(3)
-        self.facts = {}
+        self.facts, self.deviations = {}, []
+        if self.noise is not None:
+            self.noise.reset()
 
     def follow(self, trajectory: Trajectory, *, until: str | None = None) -> bool:
         """Send the rows of a trajectory to the arm, one per control step, with the last gripper command.
@@ -138,6 +146,11 @@ class MotionExecutor:
         return bool(self.info[name][0])
 
     def _step(self, action: np.ndarray) -> None:
+        executed = action
+        if self.noise is not None:
+            executed = action.copy()
+            executed[:7], deviation = self.noise.disturb(self.seed, len(self.actions), action[:7])
+            self.deviations.append(deviation)
         with self.seconds.measure("simulation"):
-            *_, self.info = self.env.step(action)
+            *_, self.info = self.env.step(executed)
         self.actions.append(action)

@@ -124,7 +124,9 @@ def recording_settings(plan: Plan, part: int) -> EpisodeSettings:
     config = plan.parts[part]
     assert config.config is not None  # set by `load_plan`
     rate = int(plan.rate) if plan.rate == int(plan.rate) else 5  # the open-loop check uses the rate of the dataset
-    chosen = {"control_freq": plan.control_freq, "check_rate": rate, **plan.recording.model_dump(exclude_none=True)}
+    chosen = {"control_freq": plan.control_freq, **plan.recording.model_dump(exclude_none=True)}
+    if not any(plan.recording.action_noise or ()):  # otherwise the default is no check
+        chosen = {"check_rate": rate, **chosen}
     return EpisodeSettings(config.task, config.config, config.pack, **chosen)
 
 

@@ -58,6 +58,9 @@ class RecordingConfig(StrictModel):
     )
     candidates: Annotated[int, Field(ge=1, le=1000)] | None = None
     candidate_depth: Annotated[int, Field(ge=0, le=20)] | None = None
+    action_noise: tuple[Annotated[float, Field(ge=0, le=1000)], Annotated[float, Field(ge=0, le=180)]] | None = Field(
+        default=None, description="standard deviations in mm and degrees; with noise the default of check_rate is 0"
+    )
 
 
 class ImagesConfig(StrictModel):

@@ -32,7 +32,7 @@ class ArraySpec:
         quaternion: whether rows are unit quaternions xyzw.
         embedding: whether rows are sentence embeddings, which a dataset may omit.
         limits: smallest and largest valid value; None: unlimited.
-        optional: whether a dataset of an older version, or of another format, may omit the array.
+        optional: whether an episode, or a dataset of an older version or of another format, may omit the array.
     """
 
     name: str
@@ -64,7 +64,7 @@ class Quantity(ArraySpec):
             observed.
         policy_key: name in the observations and remote messages of policies; empty: not available to policies.
         record: returns the quantity (T, ...) of a motion (`demos.recordings.motion.Motion`), for
-            ``episode_info.npz``; None: not recorded.
+            ``episode_info.npz``; None: not recorded. For an optional quantity the function may return None.
         lerobot_feature: LeRobot feature that contains the quantity, possibly with others; empty: none. An optional
             quantity must have none, since LeRobot datasets have every feature in every episode.
         components: names of the values in the LeRobot feature; default: the name, numbered if there are several.
@@ -273,6 +273,36 @@ QUANTITIES: tuple[Quantity, ...] = (
         "m, m, rad",
         "agv_pose[t+1] - agv_pose[t], in the world; the last row is 0",
         record=lambda motion: motion.agv_motion,
+    ),
+    Quantity(
+        "intended_ee_pos",
+        "float32",
+        ("T", 3),
+        "m",
+        f"position {_EE} without the action noise; only in episodes with noise",
+        record=lambda motion: None if motion.intended_joints is None else motion.intended_tcp_in_base[:, :3, 3],
+        optional=True,
+    ),
+    Quantity(
+        "intended_ee_orn",
+        "float32",
+        ("T", 4),
+        "xyzw",
+        f"orientation {_EE} without the action noise; only in episodes with noise",
+        quaternion=True,
+        record=lambda motion: (
+            None if motion.intended_joints is None else to_continuous_xyzw(motion.intended_tcp_in_base)
+        ),
+        optional=True,
+    ),
+    Quantity(
+        "intended_joints",
+        "float32",
+        ("T", 7),
+        "rad",
+        "positions of the arm joints without the action noise; only in episodes with noise",
+        record=lambda motion: motion.intended_joints,
+        optional=True,
     ),
 )
 

@@ -41,6 +41,7 @@ def recording(tmp_path):
             "generate --control-freq 7",
             "--control-freq: invalid control rate (expected one of 1, 2, 4, 5, 10, 20, 25, 50, 100 Hz",
         ),
+        ("generate --action-noise 1 -1", "--action-noise: "),
         ("generate -n 0", "--episodes: "),
         ("generate --jobs -1", "--jobs: "),
         ("generate --memory-gb nan", "--memory-gb: "),
@@ -76,6 +77,20 @@ def test_resolved_settings_do_not_change_again():
     assert settings.episode.config["objects"]["count"] == 6
     assert (settings.episode.check_noise_mm, settings.episode.check_noise_deg) == (1.0, 2.0)
     assert settings.out == Path("demos/pick_table_scattered-builtin")
+
+
+@pytest.mark.parametrize(
+    ("options", "check_rate"),
+    [
+        ({}, 5),
+        ({"action_noise": (3.0, 1.0)}, 0),
+        ({"action_noise": (0.0, 1.0)}, 0),
+        ({"action_noise": (3.0, 1.0), "check_rate": 5}, 5),
+    ],
+)
+def test_open_loop_check_is_off_by_default_with_action_noise(options, check_rate):
+    """The intended actions of such demonstrations do not succeed open loop."""
+    assert EpisodeSettings("pick", **options).check_rate == check_rate
 
 
 def killed_run(out, **record):
@@ -126,7 +141,7 @@ def test_replay_does_not_overwrite_its_recording(recording):
     assert notes.read_text() == "{}"
 
 
-DEFAULTS = ("planner", "check_failures", "after_policy", "after_steps")
+DEFAULTS = ("planner", "check_failures", "after_policy", "after_steps", "action_noise")
 
 
 @pytest.mark.parametrize(

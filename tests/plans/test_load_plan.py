@@ -185,6 +185,13 @@ def test_recording_settings_are_those_of_the_plan(written):
     )
 
 
+def test_demonstrations_with_action_noise_have_no_open_loop_check_by_default(written):
+    settings = recording_settings(load_plan(written(GOOD + "recording: {action_noise: [3, 1]}\n")), 0)
+    assert (settings.action_noise, settings.check_rate) == ((3.0, 1.0), 0)
+    checked = recording_settings(load_plan(written(GOOD + "recording: {action_noise: [3, 1], check_rate: 5}\n")), 0)
+    assert checked.check_rate == 5
+
+
 def test_recording_settings_are_checked_before_the_run(written):
     with pytest.raises(ExtensionError, match="no such planner"):
         check_plan(load_plan(written(GOOD + "recording: {planner: mplip}\nembeddings: false\n")))

@@ -193,10 +193,25 @@ def write_trajectory(path: Path, seeds=(3, 4, 5), failed=(), steps=STEPS):
     return path
 
 
+def add_action_noise(path: Path) -> Path:
+    """Add deviations of the joints by action noise to all episodes of a trajectory file, in place; return the path."""
+    rng = np.random.default_rng(7)
+    with h5py.File(path, "r+") as file:
+        for group in file.values():
+            deviations = rng.normal(scale=0.01, size=(len(group["actions"]), 7)).astype(np.float32)
+            group["joint_deviations"] = deviations
+            group["intended_actions"] = group["actions"] - np.pad(deviations, ((0, 0), (0, 1)))
+    metadata = json.loads(path.with_suffix(".json").read_text())
+    for episode in metadata["episodes"]:
+        episode["robocas"]["action_noise"] = [3.0, 1.0]
+    path.with_suffix(".json").write_text(json.dumps(metadata))
+    return path
+
+
 def stub_embeddings(source, entries):
     """Return unit vectors instead of sentence embeddings, whose model takes seconds to load."""
     texts = {text for entry in entries for text in source.list_texts(entry["source"])}
     return {text: np.eye(384, dtype=np.float32)[number] for number, text in enumerate(sorted(texts))}
 
 
-__all__ = ["RayCaster", "stub_embeddings", "make_states", "render_by", "write_trajectory"]
+__all__ = ["RayCaster", "add_action_noise", "stub_embeddings", "make_states", "render_by", "write_trajectory"]

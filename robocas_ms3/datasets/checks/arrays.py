@@ -88,7 +88,8 @@ def check_relative_poses(episode: EpisodeArrays, keys: tuple[str, str, str, str]
     position, orientation, rel_position, rel_orientation = keys
     if not set(keys) <= episode.arrays.keys():
         return
-    if any(np.linalg.norm(episode.arrays[key], axis=1).min() < 0.5 for key in (orientation, rel_orientation)):
+    turns = [episode.arrays.get(key) for key in (orientation, rel_orientation, schema.INTENDED_POSE[1])]
+    if any(turn is not None and np.linalg.norm(turn, axis=1).min() < 0.5 for turn in turns):
         return  # reported by `check_unit_length`
     shift, turn = compute_motion_errors(episode, keys)
     if (shift <= POSITION_TOLERANCE).all() and (turn <= ANGLE_TOLERANCE).all():
@@ -114,9 +115,14 @@ def compute_motion_errors(episode: EpisodeArrays, keys: tuple[str, ...], wxyz: b
 
     ``keys`` is one of ``schema.RELATIVE_PAIRS``. ``wxyz``: read the quaternions as wxyz instead of xyzw.
     """
-    arrays = [episode.arrays[key].astype(np.float64) for key in keys]
-    absolute, relative = (from_xyzw(arrays[i], np.roll(arrays[i + 1], -1 if wxyz else 0, axis=1)) for i in (0, 2))
-    motion = compute_relative_motion(absolute)
+
+    def read(position: str, orientation: str) -> NDArray[np.float64]:
+        shift, turn = (episode.arrays[key].astype(np.float64) for key in (position, orientation))
+        return from_xyzw(shift, np.roll(turn, -1 if wxyz else 0, axis=1))
+
+    absolute, relative = read(*keys[:2]), read(*keys[2:])
+    has_noise = keys == schema.RELATIVE_PAIRS[0] and set(schema.INTENDED_POSE) <= episode.arrays.keys()
+    motion = compute_relative_motion(absolute, read(*schema.INTENDED_POSE) if has_noise else None)
     turn = Rotation.from_matrix(np.swapaxes(motion[:, :3, :3], 1, 2) @ relative[:, :3, :3]).magnitude()
     return np.linalg.norm(motion[:, :3, 3] - relative[:, :3, 3], axis=1), turn
 

@@ -158,6 +158,8 @@ def _find_skip_reason(scene: SceneRecord, arrays: Mapping[str, NDArray]) -> str:
         return "the recording did not succeed"
     if scene.recorded and scene.recorded.intervention is not None:
         return "the episode starts where another policy stopped (expert intervention), so its seed can't reproduce it"
+    if scene.recorded and scene.recorded.action_noise is not None:
+        return "the actions are the intended actions of a demonstration with action noise, not the executed ones"
     if len(arrays["ee_pos"]) < 2:
         return "the episode has no actions"
     if not all(np.isfinite(arrays[key]).all() for key in ("rel_pos", "rel_orn", "ee_pos", "base_pos")):

@@ -23,6 +23,7 @@ from robocas_ms3.datasets.lerobot.language import EVENTS, PERSISTENT, Row, parse
 from robocas_ms3.datasets.lerobot.reader import LeRobotDataset
 from robocas_ms3.datasets.lerobot.tables import find_column_violations, open_table, read_episode_rows, to_array
 from robocas_ms3.datasets.sources.arrays import EpisodeArrays
+from robocas_ms3.datasets.sources.file_models import has_action_noise
 
 TOLERANCE = 1e-4
 """Tolerance of timestamps in s, as in LeRobot."""
@@ -61,7 +62,8 @@ def check_data(
                     break
                 numeric = [key for key, feature in features.items() if feature["dtype"] not in schema.NOT_NUMERIC]
                 columns = {key: to_array(table.column(key)) for key in numeric}
-                wrong = list(_check_episode(table, columns, row, dataset.info, texts))
+                has_noise = _has_action_noise(dataset, row["episode_index"])
+                wrong = list(_check_episode(table, columns, row, dataset.info, texts, has_noise))
                 if dataset.has_language:
                     wrong += check_language(table, name, dataset.info)
                 violations += [
@@ -111,9 +113,9 @@ def _find_number_violation(values: NDArray, feature: Mapping[str, Any]) -> tuple
 
 
 def _check_episode(
-    table: pa.Table, columns: Columns, row: Mapping[str, Any], info: Mapping[str, Any], texts: Texts
+    table: pa.Table, columns: Columns, row: Mapping[str, Any], info: Mapping[str, Any], texts: Texts, has_noise: bool
 ) -> Iterator[KeyViolation]:
-    """Check indices, timestamps, texts, outcome and values of an episode."""
+    """Check indices, timestamps, texts, outcome and values of an episode, with or without action noise."""
     length = row["length"]
     if len(table) != length:
         yield "", format_count(length, "frame"), str(len(table))
@@ -143,7 +145,14 @@ def _check_episode(
     if not wrong and not unknown:
         key = schema.SUBGOAL_TYPE.key
         types = table.column(key).to_pylist() if key in table.column_names else []
-        yield from _check_content(columns, types, next(iter(row["tasks"]), ""))
+        yield from _check_content(columns, types, next(iter(row["tasks"]), ""), has_noise)
+
+
+def _has_action_noise(dataset: LeRobotDataset, number: int) -> bool:
+    try:
+        return has_action_noise(dataset.episode(number).scene)
+    except DatasetError:  # reported by the check of the scenes
+        return False
 
 
 def _check_outcome(columns: Columns) -> Iterator[KeyViolation]:
@@ -168,12 +177,16 @@ def _check_texts(columns: Columns, tasks: list[str], texts: Texts) -> Iterator[K
             yield key, f"the tasks of meta/episodes, {tasks}", str([known[i] for i in used])
 
 
-def _check_content(columns: Columns, types: list[Any], instruction: str) -> Iterator[KeyViolation]:
-    """Check the values with the rules of RoboCAS folders, and that each action leads to the next state."""
+def _check_content(columns: Columns, types: list[Any], instruction: str, has_noise: bool) -> Iterator[KeyViolation]:
+    """Check the values with the rules of RoboCAS folders, and that each action leads to the next state.
+
+    In episodes with action noise, actions do not lead to the next state.
+    """
     arrays: dict[str, NDArray] = {"step_goal_type": np.array([str(kind) for kind in types], np.str_)}
     if set(schema.ROBOCAS_KEYS) <= set(columns):
         try:
-            arrays = to_robocas_arrays(dict(columns), instruction, [], arrays["step_goal_type"].tolist())
+            types = arrays["step_goal_type"].tolist()
+            arrays = to_robocas_arrays(dict(columns), instruction, [], types, has_action_noise=has_noise)
         except ValueError as error:  # a quaternion of length 0
             yield "observation.state, observation.arm_base", "unit quaternions", one_line(error)
             return

@@ -25,6 +25,7 @@ from robocas_ms3.datasets.lerobot.metadata import LeRobotMetadata
 from robocas_ms3.datasets.lerobot.tables import INTEGER, Column, check_columns, is_numeric, read_episode_rows, to_array
 from robocas_ms3.datasets.lerobot.video import read_frames, to_depth
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource, ImageKind, SourceEpisode, Split
+from robocas_ms3.datasets.sources.file_models import has_action_noise
 from robocas_ms3.datasets.sources.files import SEE_VALIDATE
 from robocas_ms3.datasets.sources.reader import check_rate
 from robocas_ms3.demos.recordings.subgoals import SubGoal, group_subgoals
@@ -139,7 +140,9 @@ class LeRobotEpisode(SourceEpisode):
                 where, expected = f"{self.where}, {feature.key}", f"{feature.width} finite numbers per step"
                 raise DatasetError("invalid values", where=where, expected=expected, fix=SEE_VALIDATE)
         try:
-            return to_robocas_arrays(self.columns, self.instruction, texts, types)
+            return to_robocas_arrays(
+                self.columns, self.instruction, texts, types, has_action_noise=has_action_noise(self.scene)
+            )
         except ValueError as error:  # a quaternion of length 0, or a text that is not ASCII
             what, found = "no arrays can be computed from these features", one_line(error)
             raise DatasetError(what, where=self.where, found=found, fix=SEE_VALIDATE) from error

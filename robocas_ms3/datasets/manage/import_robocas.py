@@ -133,7 +133,7 @@ def _make_scene(source: Episode, episode: ImportedEpisode, survey: Survey) -> di
     Without such a file in the input, most values are None (unknown).
     """
     previous = source.scene if source.scene.get("schema_version") == schema.SCHEMA_VERSION else {}
-    wanted = (spec.name for spec in schema.EPISODE_INFO if not spec.embedding)
+    wanted = (spec.name for spec in schema.EPISODE_INFO if not (spec.embedding or spec.optional))
     repaired = (found for found in episode.findings if found.outcome == "repaired")
     made = {
         "recording": None,

@@ -189,7 +189,8 @@ def compute_motion_arrays(arrays: Mapping[str, NDArray], keys: tuple[str, str, s
     """Compute both arrays of relative motion from poses; ``keys``: one of ``schema.RELATIVE_PAIRS``."""
     poses = _read_poses(arrays, keys[0], keys[1])
     assert poses is not None
-    return dict(zip(keys[2:], to_dataset_motion(poses), strict=True))
+    intended = _read_poses(arrays, *schema.INTENDED_POSE) if keys == schema.RELATIVE_PAIRS[0] else None
+    return dict(zip(keys[2:], to_dataset_motion(poses, intended), strict=True))
 
 
 def fingerprint_arrays(arrays: Mapping[str, NDArray]) -> str:
@@ -235,8 +236,9 @@ def _expand_goals(goals: Any, steps: int) -> list[tuple[str, str]]:
 def make_episode_arrays(motion: Motion, instruction: str, subgoals: Sequence[SubGoal]) -> dict[str, np.ndarray]:
     """Make the arrays of ``episode_info.npz`` without embeddings, from the motion at T sampled states."""
     of_steps = [goal for goal in subgoals for _ in range(goal.last - goal.first + 1)]
+    recorded = {quantity.name: quantity.record(motion) for quantity in QUANTITIES if quantity.record}
     values = {
-        **{quantity.name: quantity.record(motion) for quantity in QUANTITIES if quantity.record},
+        **{name: rows for name, rows in recorded.items() if rows is not None},
         "episode_length": len(motion.qpos),
         "language_goal": instruction,
         "step_lang_goals": [goal.goal_description for goal in of_steps],

@@ -107,6 +107,7 @@ class RecordedDetails(_JsonObject):
     attempts: NonNegativeInt | None = None
     recoveries: list[_Recovery] | None = None
     intervention: Any = None
+    action_noise: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
     seconds: dict[str, Any] | None = None
 
 
@@ -198,6 +199,12 @@ class SceneRecord(_JsonObject):
         "planning and simulation seconds, task-specific counts (`facts`, such as pushes)"
     )
     versions: dict[str, Any] | None = Field(description="{package: version} at the time of the recording")
+
+
+def has_action_noise(scene: Mapping[str, Any]) -> bool:
+    """Return whether noise disturbed the actions of an episode, from the content of its ``scene.json``."""
+    recorded = scene.get("recorded")
+    return isinstance(recorded, Mapping) and recorded.get("action_noise") is not None
 
 
 SCENE_KEYS = tuple(SceneRecord.model_fields)

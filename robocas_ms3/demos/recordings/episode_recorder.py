@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -86,11 +87,12 @@ class EpisodeRecorder(gym.Wrapper):
         """
         return self._base_env.bodies.to_state_dict(np.stack(self._steps.states))
 
-    def finish(self, episode: dict[str, Any]) -> None:
+    def finish(self, episode: dict[str, Any], arrays: Mapping[str, NDArray[np.float32]] | None = None) -> None:
         """Write the recorded episode to its files.
 
         Args:
             episode: value of the key ``robocas`` of the episode's entry: instruction, sub-goals, counters, ...
+            arrays: additional arrays of the episode by name.
         """
         steps, env = self._steps, self._base_env
         terminated, truncated, success, fail = np.array(steps.flags, bool).reshape(-1, 4).T
@@ -103,6 +105,8 @@ class EpisodeRecorder(gym.Wrapper):
             for name, values in flags.items():
                 group.create_dataset(name, data=values, dtype=bool)
             _write(group, "env_states", {**self.states, **_stack_steps(steps.extra_states)})
+            for name, values in (arrays or {}).items():
+                _write(group, name, values)
 
         with atomic_file(self._trajectory, sync=True) as tmp:
             write_hdf5(tmp, fill)

@@ -7,7 +7,7 @@ dataset step is shorter.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -84,21 +84,23 @@ def sample_gripper_commands(
     return widths[samples] > robot.open_width / 2 + 1e-6
 
 
-def compute_relative_motion(poses: Array) -> Array:
+def compute_relative_motion(poses: Array, intended: Array | None = None) -> Array:
     """Return the motions (T, 4, 4) between consecutive poses (T, 4, 4): ``inv(pose[t]) @ pose[t + 1]``.
 
-    The last motion is the identity.
+    With ``intended`` (T, 4, 4), a motion leads to the intended pose: ``inv(pose[t]) @ intended[t + 1]``. It corrects
+    the deviation of ``pose[t]`` and does not contain the noise of step t. The last motion is the identity.
     """
-    return np.concatenate([inverse(poses[:-1]) @ poses[1:], np.eye(4)[None]])
+    goals = poses if intended is None else intended
+    return np.concatenate([inverse(poses[:-1]) @ goals[1:], np.eye(4)[None]])
 
 
-def to_dataset_motion(poses: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the motions between consecutive poses (T, 4, 4) in the format of datasets.
+def to_dataset_motion(poses: Array, intended: Array | None = None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the result of `compute_relative_motion` in the format of datasets.
 
     Returns:
         Translations (T, 3), m; quaternions (T, 4), xyzw with w >= 0. The last row is no motion.
     """
-    motion = compute_relative_motion(poses)
+    motion = compute_relative_motion(poses, intended)
     turns = Rotation.from_matrix(motion[:, :3, :3]).as_quat(canonical=True)
     return motion[:, :3, 3].astype(np.float32), turns.astype(np.float32)
 
@@ -167,6 +169,9 @@ class Motion:
         tcp_in_world: (T, 4, 4) poses of the TCP, computed from ``qpos``.
         arm_base_in_world: (T, 4, 4) poses of the arm's base, computed from ``qpos``.
         gripper_open: (T,) whether the last gripper command opens the gripper (`sample_gripper_commands`).
+        intended_joints: (T, 7) positions of the arm joints without the deviation that action noise has caused; None:
+            no noise.
+        intended_tcp_in_base: (T, 4, 4) poses of the TCP in the arm's base frame at ``intended_joints``.
     """
 
     qpos: Array
@@ -175,6 +180,8 @@ class Motion:
     tcp_in_world: Array
     arm_base_in_world: Array
     gripper_open: NDArray[np.bool_]
+    intended_joints: Array | None = None
+    intended_tcp_in_base: Array | None = None
 
     @classmethod
     def from_states(
@@ -183,6 +190,7 @@ class Motion:
         robot_states: NDArray[np.floating],
         gripper: NDArray[np.floating],
         samples: NDArray[np.int64],
+        deviations: NDArray[np.floating] | None = None,
     ) -> Motion:
         """Compute the motion from recorded states.
 
@@ -191,11 +199,20 @@ class Motion:
             robot_states: (S + 1, 37) ManiSkill states of the robot, after the reset and after each control step.
             gripper: (S,) gripper commands in [-1, 1].
             samples: (T,) indices of states from `sample_states`, or a contiguous part of them.
+            deviations: (S, 7) deviations of the arm joints that action noise has caused at the end of each control
+                step, rad; None: no noise.
         """
         root_in_world, qpos, qvel = split_robot_states(robot_states[samples])
         width = float(split_robot_states(robot_states[:1])[1][0, robot.description.finger_slice].sum())
         gripper_open = sample_gripper_commands(robot.description, gripper, samples, initial_width=width)
-        return cls.from_joints(robot, root_in_world, qpos, qvel, gripper_open)
+        motion = cls.from_joints(robot, root_in_world, qpos, qvel, gripper_open)
+        if deviations is None:
+            return motion
+        intended = qpos.copy()
+        intended[:, robot.description.arm_slice] -= np.concatenate([np.zeros((1, 7)), deviations])[samples]
+        tcp, base = tcp_and_arm_base_poses(robot, root_in_world, intended)
+        joints = intended[:, robot.description.arm_slice]
+        return replace(motion, intended_joints=joints, intended_tcp_in_base=inverse(base) @ tcp)
 
     @classmethod
     def from_joints(
@@ -209,8 +226,11 @@ class Motion:
 
     @cached_property
     def tcp_motion(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Motions of the TCP in the arm's base frame: translations (T, 3) m, quaternions (T, 4) xyzw."""
-        return to_dataset_motion(self.tcp_in_base)
+        """Intended motions of the TCP in the TCP frame: translations (T, 3) m, quaternions (T, 4) xyzw.
+
+        Without noise they are the motions between the poses ``tcp_in_base``.
+        """
+        return to_dataset_motion(self.tcp_in_base, self.intended_tcp_in_base)
 
     @cached_property
     def base_motion(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -17,6 +17,7 @@ from robocas_ms3.demos.recordings.trajectory_hdf5 import (
     convert_read_errors,
     open_episode,
     open_trajectory,
+    read_joint_deviations,
     read_steps,
 )
 from robocas_ms3.demos.recordings.trajectory_json import EpisodeEntry, RunRecord, read_entry, read_json
@@ -31,22 +32,24 @@ class Recording(EpisodeEntry):
     """Recorded episode of S control steps: its JSON entry, actions and states.
 
     Attributes:
-        actions: (S, A) actions in the control mode of the recording.
+        actions: (S, A) executed actions in the control mode of the recording.
         states: states after the reset and after each control step, in ManiSkill's format:
             ``{"actors": {name: (S + 1, 13)}, "articulations": {name: (S + 1, 13 + 2 joints)}}``.
         robot: specification of the robot.
+        joint_deviations: (S, 7) deviations of the arm joints that action noise has caused at the end of each control
+            step, rad; None without noise.
     """
 
     actions: NDArray[np.float32]
     states: dict[str, dict[str, NDArray[np.float32]]]
     robot: RobotSpec
+    joint_deviations: NDArray[np.float32] | None = None
 
     def compute_motion(self, samples: NDArray[np.int64]) -> Motion:
         """Compute the motion of the robot at sampled states (T,), given by their indices."""
         commands = select_gripper_commands(self.actions, self.control_mode)
-        return Motion.from_states(
-            self.robot, self.states["articulations"][self.robot.description.uid], commands, samples
-        )
+        states = self.states["articulations"][self.robot.description.uid]
+        return Motion.from_states(self.robot, states, commands, samples, self.joint_deviations)
 
     def state(self, index: int) -> dict[str, dict[str, NDArray[np.float32]]]:
         """Return the state with an index, 0 to S, as an argument of ``set_state_dict``; each array is (1, D)."""
@@ -157,7 +160,8 @@ class TrajectoryFile:
                 expected=f"{uid} with {width} numbers per state",
                 found=sorted(states.get("articulations", {})) if robot is None else f"{robot.shape[1]} numbers",
             )
-        return Recording(**vars(entry), actions=actions, states=states, robot=self.robot)
+        deviations = read_joint_deviations(group, len(actions)) if entry.has_action_noise else None
+        return Recording(**vars(entry), actions=actions, states=states, robot=self.robot, joint_deviations=deviations)
 
     def _where(self, index: int) -> str:
         return f"{self.path}, traj_{self.episodes[index]['episode_id']}"

@@ -26,6 +26,9 @@ from robocas_ms3.core.files import atomic_file, write_json
 from robocas_ms3.core.text import one_line
 from robocas_ms3.demos.recordings.trajectory_json import parse_seed, read_json
 
+INTENDED_ACTIONS, JOINT_DEVIATIONS = "intended_actions", "joint_deviations"
+"""Arrays of an episode with action noise: actions without the noise (S, A), and deviations of the arm joints that the
+noise has caused at the end of each control step (S, 7), rad."""
 BODIES = ("actors", "articulations")
 """Kinds of states whose rows start with a position and a wxyz quaternion."""
 
@@ -141,13 +144,30 @@ def copy_episode(source: h5py.File, number: int, target: h5py.File, new_number: 
 def read_actions(episode: h5py.Group) -> NDArray[np.float32]:
     """Read the actions (S, A) of an episode, S > 0; check that they are finite."""
     where = _where(episode)
-    with convert_read_errors(where):
-        actions = np.asarray(_load_arrays(_collect_arrays(episode["actions"], 0)), np.float32)
+    actions = _read_rows(episode, "actions")
     if actions.ndim != 2 or len(actions) == 0:
         expected = "an array of shape (steps, A) with at least one step"
         raise DatasetError("episode without actions", where=where, expected=expected, found=f"shape {actions.shape}")
     _check_finite(actions, f"{where}, actions")
     return actions
+
+
+def read_joint_deviations(episode: h5py.Group, control_steps: int) -> NDArray[np.float32]:
+    """Read the deviations (S, 7) of the arm joints that action noise has caused, rad; check shape and values.
+
+    ``control_steps`` is S, the number of actions.
+    """
+    where, deviations = f"{_where(episode)}, {JOINT_DEVIATIONS}", _read_rows(episode, JOINT_DEVIATIONS)
+    if deviations.shape != (control_steps, 7):
+        expected = f"shape ({control_steps}, 7)"
+        raise DatasetError("damaged episode", where=where, expected=expected, found=f"shape {deviations.shape}")
+    _check_finite(deviations, where)
+    return deviations
+
+
+def _read_rows(episode: h5py.Group, name: str) -> NDArray[np.float32]:
+    with convert_read_errors(_where(episode)):
+        return np.asarray(_load_arrays(_collect_arrays(episode[name], 0)), np.float32)
 
 
 def read_steps(

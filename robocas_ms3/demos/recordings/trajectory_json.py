@@ -74,6 +74,7 @@ class TaskRecord(SubGoals):
     """Value of the key ``robocas`` of an episode entry, with the data of this package."""
 
     instruction: str
+    action_noise: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)] | None = None
 
 
 class EpisodeRecord(EpisodeHeader):
@@ -124,6 +125,7 @@ class EpisodeEntry:
         instruction: language instruction.
         subgoals: sub-goals with ranges of the actions 0..S-1.
         is_intervention: whether the episode starts in a state that another policy reached, not at the reset.
+        has_action_noise: whether noise disturbed the actions, so that the intended actions differ from them.
     """
 
     episode_id: int
@@ -134,6 +136,7 @@ class EpisodeEntry:
     instruction: str
     subgoals: list[SubGoal]
     is_intervention: bool
+    has_action_noise: bool
 
 
 def read_entry(episode: Mapping[str, Any], where: object) -> EpisodeEntry:
@@ -153,6 +156,7 @@ def read_entry(episode: Mapping[str, Any], where: object) -> EpisodeEntry:
         instruction=found.robocas.instruction,
         subgoals=goals,
         is_intervention=is_intervention(episode),
+        has_action_noise=found.robocas.action_noise is not None,
     )
 
 

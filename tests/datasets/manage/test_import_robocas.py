@@ -42,7 +42,7 @@ def test_v0_dataset_becomes_valid(dataset, made, tmp_path, pose_name):
     for number in (0, 1):
         name = f"episode_{number:07d}"
         old, now = arrays_of(made / name), arrays_of(out / name)
-        assert list(now) == [spec.name for spec in schema.EPISODE_INFO if not spec.embedding]
+        assert list(now) == [spec.name for spec in schema.EPISODE_INFO if not (spec.embedding or spec.optional)]
         for key, array in now.items():
             if array.dtype.kind == "f":
                 np.testing.assert_allclose(array, old[key], atol=1e-6)
