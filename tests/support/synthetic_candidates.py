@@ -23,7 +23,14 @@ ENV_INFO = {
 SETTINGS = {"candidates": 16, "candidate_depth": 0}
 DOWN = (0.0, 1.0, 0.0, 0.0)  # quaternion of a TCP that points down
 TARGET = 0
-NAMES = ("screwdriver", "mug", "peach", "plum", "soap", "lemon")
+NAMES = {
+    "flat_screwdriver": "screwdriver",
+    "mug": "mug",
+    "peach": "peach",
+    "plum": "plum",
+    "soap": "soap",
+    "lemon": "lemon",
+}
 NEAR = 0.1  # m; other objects within this distance of an object are its obstacles
 
 
@@ -98,7 +105,8 @@ def make_record(seed, number, slots=5, candidates=6):
         found.append(make_candidate(poses, primitive, slot, rng))
     if found:
         found[0]["chosen"] = True
-    names = [NAMES[slot % len(NAMES)] for slot in range(slots)]
+    ids = [list(NAMES)[slot % len(NAMES)] for slot in range(slots)]
+    names = [NAMES[name] for name in ids]
     values = {
         "seed": seed,
         "decision": number,
@@ -108,7 +116,7 @@ def make_record(seed, number, slots=5, candidates=6):
         "step": 40 * number,
         "instruction": f"search the {names[TARGET]} and transfer it to the basket",
         "target_slot": TARGET,
-        "object_id": [f"{name}_id" for name in names],
+        "object_id": ids,
         "object_name": names,
         "present": np.ones(slots, bool),
         "object_in_base": poses,

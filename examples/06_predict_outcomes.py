@@ -1,0 +1,202 @@
+"""Predict from geometry which grasps succeed and which pushes help, and test the predictions in held-out scenes.
+
+python examples/06_predict_outcomes.py CANDIDATES.h5 ...
+
+The features are computed from the poses and shapes of the objects before the candidate, and from its planned motion.
+"""
+
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from torch import nn
+
+from robocas_ms3.assets.pack import Pack, load_pack
+from robocas_ms3.demos import CandidateFile
+
+FOLDS, MODELS, STEPS = 5, 5, 250  # each fifth of the scenes is held out once; models per fold, training steps
+POINTS = 150  # per object
+FINGER, PALM = 0.04, 0.10  # m from the TCP: inner side of an open finger, and the palm
+NEAR = 0.015  # m around the target, horizontally
+# boxes in the TCP frame (x across the fingers, y closing direction, z approach), lower and upper corner, m
+BOXES = {
+    "between the fingers": ((-0.011, -FINGER, -0.02), (0.011, FINGER, 0.009)),
+    "left finger": ((-0.011, FINGER, -PALM), (0.011, FINGER + 0.02, 0.009)),
+    "right finger": ((-0.011, -FINGER - 0.02, -PALM), (0.011, -FINGER, 0.009)),
+    "palm": ((-0.03, -0.10, -PALM - 0.08), (0.03, 0.10, -PALM)),
+}
+
+
+def to_matrix(pose: np.ndarray) -> np.ndarray:
+    """Return the 4x4 matrix of a pose (7,): position, unit quaternion wxyz."""
+    w, x, y, z = pose[3:]
+    matrix = np.eye(4)
+    matrix[:3, 3] = pose[:3]
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return matrix
+
+
+def transform(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+class Scene:
+    """Objects before a decision: their surface points (P, 3) in the arm's base frame by slot."""
+
+    def __init__(self, values: dict, pack: Pack) -> None:
+        self.values = values
+        self.points = {}
+        for slot in np.flatnonzero(values["present"]).tolist():
+            points = pack.objects[values["object_id"][slot]].surface_points()
+            points = points[:: max(1, len(points) // POINTS)]
+            self.points[slot] = transform(to_matrix(values["object_in_base"][slot]), points)
+
+    def others(self, *slots: int) -> np.ndarray:
+        return np.concatenate(
+            [np.empty((0, 3)), *(points for slot, points in self.points.items() if slot not in slots)]
+        )
+
+    def clutter(self, slot: int) -> list[float]:
+        return [float(self.values[name][slot]) for name in ("hidden_fraction", "obstacles", "free_grasps")]
+
+
+def grasp_features(scene: Scene, slot: int, start: np.ndarray) -> list[float]:
+    """Describe a grasp: which points are between and at the fingers, its pose, and the clutter around the object."""
+    tcp, own = to_matrix(start), scene.points[slot]
+    features = []
+    in_tcp = [transform(np.linalg.inv(tcp), points) for points in (own, scene.others(slot))]
+    for low, high in BOXES.values():
+        for points in in_tcp:
+            inside = ((points >= low) & (points <= high)).all(axis=1)
+            features += [np.log1p(inside.sum())]
+    low, high = BOXES["between the fingers"]
+    gripped = in_tcp[0][((in_tcp[0] >= low) & (in_tcp[0] <= high))[:, [0, 2]].all(axis=1)]
+    gripped = gripped if len(gripped) else np.full((1, 3), 0.2)  # nothing between the fingers
+    features += [*gripped.min(axis=0), *gripped.max(axis=0), *in_tcp[0].min(axis=0), *in_tcp[0].max(axis=0)]
+    middle = own.mean(axis=0)
+    features += [*(tcp[:3, 3] - middle), *np.ptp(own, axis=0), *tcp[:3, 2], abs(tcp[2, 1]), tcp[2, 3]]
+    features += [np.linalg.norm(tcp[:2, 3]), np.arctan2(tcp[1, 3], tcp[0, 3]), own[:, 2].min(), own[:, 2].max()]
+    distance = np.linalg.norm(scene.others(slot) - tcp[:3, 3], axis=1)
+    features += [distance.min(initial=0.3), np.log1p((distance < 0.06).sum())]
+    return [*features, *scene.clutter(slot)]
+
+
+def push_features(scene: Scene, slot: int, target: int, start: np.ndarray, end: np.ndarray) -> list[float]:
+    """Describe a push: its length and direction relative to the target, and the points near the target after it."""
+    own, goal, others = scene.points[slot], scene.points[target], scene.others(slot, target)
+    push = end[:2] - start[:2]
+    length = float(np.linalg.norm(push))
+    ahead = push / max(length, 1e-6)
+    aside = np.array([-ahead[1], ahead[0]])
+    features = [length, start[2], start[0], start[1], *ahead, float(slot == target)]
+    for points in (own, goal):
+        along, across = (points[:, :2] - start[:2]) @ ahead, (points[:, :2] - start[:2]) @ aside
+        features += [along.min(), along.max(), across.min(), across.max(), points[:, 2].min(), points[:, 2].max()]
+    shift = max(0.0, length - max(0.0, float(((own[:, :2] - start[:2]) @ ahead).min())))
+    moved = own + [*(shift * ahead), 0.0]
+    offset, after = own.mean(axis=0) - goal.mean(axis=0), moved.mean(axis=0) - goal.mean(axis=0)
+    features += [shift, *offset, np.linalg.norm(offset[:2]), np.linalg.norm(after[:2])]
+    features += [float(ahead @ offset[:2]) / max(float(np.linalg.norm(offset[:2])), 1e-3)]
+    near = [count_above(goal, points) for points in (own, moved, others)]
+    features += [np.log1p(near[0]), np.log1p(near[1]), np.log1p(near[2]), near[0] / max(1.0, near[0] + near[2])]
+    along, across = (others[:, :2] - start[:2]) @ ahead, (others[:, :2] - start[:2]) @ aside
+    swept = (abs(across) < 0.03) & (along > 0) & (along < length + 0.05) & (others[:, 2] > start[2] - 0.02)
+    features += [np.log1p(swept.sum())]
+    return [*features, *scene.clutter(target), *scene.clutter(slot)]
+
+
+def count_above(target: np.ndarray, points: np.ndarray) -> float:
+    """Count points above the middle of the target and at most `NEAR` outside of its bounding box, seen from above."""
+    low, high = target[:, :2].min(axis=0) - NEAR, target[:, :2].max(axis=0) + NEAR
+    inside = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
+    return float((inside & (points[:, 2] > target[:, 2].mean())).sum())
+
+
+def read_samples(paths: list[str], primitive: str) -> Iterator[tuple[str, list[float], bool]]:
+    """Yield scene, features and label of each candidate of a primitive: grasps that succeed, pushes that help."""
+    for path in paths:
+        file = CandidateFile(path)
+        pack, helped = (
+            load_pack(file.recorded_env.kwargs.get("pack", "builtin")),
+            file.labels.for_target(file.labels.helped),
+        )
+        for row in range(len(file)):
+            decision, scene = file.decision(row), None
+            for number, values in enumerate(zip(*(decision.candidates[name] for name in
+                    ("primitive", "slot", "start_in_base", "end_in_base", "feasible", "success")), strict=True)):  # fmt: skip
+                name, slot, start, end, feasible, success = values
+                if name != primitive or np.isnan(start).any() or (primitive == "push" and not feasible):
+                    continue
+                scene = scene or Scene(decision.values, pack)
+                key = f"{file.recorded_env.env_id} {decision.values['seed']}"
+                if primitive == "grasp":
+                    yield key, grasp_features(scene, slot, start), bool(success)
+                else:
+                    target = int(decision.values["target_slot"])
+                    label = bool(helped[file.rows_of(row).start + number])
+                    yield key, push_features(scene, slot, target, start, end), label
+
+
+def predict(train: np.ndarray, labels: np.ndarray, test: np.ndarray) -> np.ndarray:
+    """Train small networks on features (N, F) and labels (N,); return the mean score (M,) of test samples (M, F)."""
+    mean, std = train.mean(axis=0), train.std(axis=0) + 1e-6
+    inputs, test_inputs = (torch.tensor(np.clip((x - mean) / std, -5, 5), dtype=torch.float32) for x in (train, test))
+    targets, scores = torch.tensor(labels, dtype=torch.float32), []
+    for seed in range(MODELS):
+        torch.manual_seed(seed)
+        widths = (inputs.shape[1], 64, 64)
+        layers = [
+            layer
+            for size in zip(widths[:-1], widths[1:], strict=True)
+            for layer in (nn.Linear(*size), nn.ReLU(), nn.Dropout(0.3))
+        ]
+        model = nn.Sequential(*layers, nn.Linear(widths[-1], 1))
+        optimizer = torch.optim.AdamW(model.parameters(), lr=3e-3, weight_decay=0.1)
+        for _ in range(STEPS):
+            batch = torch.randperm(len(inputs))[:512]
+            loss = nn.functional.binary_cross_entropy_with_logits(model(inputs[batch])[:, 0], targets[batch])
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        model.eval()
+        with torch.no_grad():
+            scores.append(model(test_inputs)[:, 0].sigmoid().numpy())
+    return np.mean(scores, axis=0)
+
+
+def compute_auc(labels: np.ndarray, scores: np.ndarray) -> float:
+    """Return the area under the ROC curve: the probability that a positive sample has a higher score."""
+    positive, negative = scores[labels], np.sort(scores[~labels])
+    if not len(positive) or not len(negative):
+        return np.nan
+    below, up_to = (np.searchsorted(negative, positive, side=side) for side in ("left", "right"))
+    return float((below + up_to).mean() / 2 / len(negative))
+
+
+def main(paths: list[str]) -> None:
+    torch.set_num_threads(1)  # faster for small networks
+    for primitive, label in (("grasp", "success"), ("push", "benefit")):
+        samples = list(read_samples(paths, primitive))
+        scenes, features, labels = (np.array(column) for column in zip(*samples, strict=True))
+        names, index = np.unique(scenes, return_inverse=True)
+        fold = np.random.default_rng(0).permutation(len(names))[index] % FOLDS
+        scores = np.zeros(len(labels))
+        for held_out in range(FOLDS):
+            test = fold == held_out
+            scores[test] = predict(features[~test], labels[~test], features[test])
+        rng, rows = np.random.default_rng(0), [np.flatnonzero(index == number) for number in range(len(names))]
+        drawn = [np.concatenate([rows[n] for n in rng.integers(len(rows), size=len(rows))]) for _ in range(500)]
+        low, high = np.nanpercentile([compute_auc(labels[draw], scores[draw]) for draw in drawn], [2.5, 97.5])
+        about = f"{len(labels)} candidates, {len(names)} scenes, {labels.mean():.0%} positive"
+        print(f"{primitive} {label}: AUC {compute_auc(labels, scores):.3f} [{low:.3f}, {high:.3f}] ({about})")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 2:
+        sys.exit("usage: python examples/06_predict_outcomes.py CANDIDATES.h5 ...")
+    main(sys.argv[1:])
