@@ -121,25 +121,20 @@ def read_samples(paths: list[str], primitive: str) -> Iterator[tuple[str, list[f
     """Yield scene, features and label of each candidate of a primitive: grasps that succeed, pushes that help."""
     for path in paths:
         file = CandidateFile(path)
-        pack, helped = (
-            load_pack(file.recorded_env.kwargs.get("pack", "builtin")),
-            file.labels.for_target(file.labels.helped),
-        )
+        pack = load_pack(file.recorded_env.kwargs.get("pack", "builtin"))
+        helped = file.labels.for_target(file.labels.helped)
         for row in range(len(file)):
-            decision, scene = file.decision(row), None
-            for number, values in enumerate(zip(*(decision.candidates[name] for name in
-                    ("primitive", "slot", "start_in_base", "end_in_base", "feasible", "success")), strict=True)):  # fmt: skip
-                name, slot, start, end, feasible, success = values
-                if name != primitive or np.isnan(start).any() or (primitive == "push" and not feasible):
-                    continue
-                scene = scene or Scene(decision.values, pack)
-                key = f"{file.recorded_env.env_id} {decision.values['seed']}"
+            decision = file.decision(row)
+            found, scene = decision.candidates, Scene(decision.values, pack)
+            target, key = int(decision.values["target_slot"]), f"{file.recorded_env.env_id} {decision.values['seed']}"
+            known = ~np.isnan(found["start_in_base"][:, 0]) & (found["primitive"] == primitive)
+            for number in np.flatnonzero(known if primitive == "grasp" else known & found["feasible"]).tolist():
+                slot, start, end = (found[name][number] for name in ("slot", "start_in_base", "end_in_base"))
                 if primitive == "grasp":
-                    yield key, grasp_features(scene, slot, start), bool(success)
+                    yield key, grasp_features(scene, int(slot), start), bool(found["success"][number])
                 else:
-                    target = int(decision.values["target_slot"])
-                    label = bool(helped[file.rows_of(row).start + number])
-                    yield key, push_features(scene, slot, target, start, end), label
+                    features = push_features(scene, int(slot), target, start, end)
+                    yield key, features, bool(helped[file.rows_of(row).start + number])
 
 
 def predict(train: np.ndarray, labels: np.ndarray, test: np.ndarray) -> np.ndarray:

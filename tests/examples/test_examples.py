@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import pytest
 from forkserver import ForkServer
+from synthetic_candidates import write_episodes
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / "examples"
@@ -77,6 +78,20 @@ def test_motion_planning_solves_pick_cube(needs_renderer, tmp_path):
 def test_motion_planning_solves_pick(tmp_path):
     lines = run("05_motion_planning.py", "--env", "RoboCASPick-v1", "--seed", 6, "--episodes", 4, cwd=tmp_path)
     assert lines[-1] == "4 of 4 episodes succeeded"
+
+
+def test_outcomes_are_predicted(tmp_path):
+    path = write_episodes(tmp_path / "candidates.h5", seeds=range(30))
+    lines = run("06_predict_outcomes.py", path, cwd=tmp_path)
+    scores = [float(re.fullmatch(r"(grasp success|push benefit): AUC (\S+) \[.*", line)[2]) for line in lines]
+    assert len(scores) == 2
+    assert scores[0] > 0.6  # synthetic grasps near the middle of an object succeed
+
+
+def test_program_of_candidates(tmp_path):
+    write_episodes(tmp_path / "demos/search/candidates.h5", seeds=range(20))
+    assert run(program_of("candidates.md", tmp_path), cwd=tmp_path)[0].startswith("search the screwdriver")
+    run(program_of("candidates.md", tmp_path, 1), cwd=tmp_path)
 
 
 def test_ppo_trains_for_a_few_steps(tmp_path):
