@@ -9,6 +9,7 @@ from synthetic import RayCaster, render_by
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core import files
+from robocas_ms3.datasets.candidate_images import render
 from robocas_ms3.datasets.conversion import convert, episode_folder
 from robocas_ms3.datasets.manage import copy_episodes, import_robocas
 
@@ -20,6 +21,9 @@ POINTS = {  # point -> (module, function, number of the call at which to kill)
     "convert overview": (convert, "write_data_info", 1),
     "merge overview": (copy_episodes, "write_data_info", 1),
     "import overview": (import_robocas, "write_data_info", 1),
+    "decisions": (render, "render_loaded", 2),  # of the second seed
+    "images": (render, "_merge_parts", 1),
+    "image parts": (render.shutil, "rmtree", 1),
     "rmtree": (os, "rmdir", 3),  # --overwrite, after two folders of the old dataset are removed
 }
 
@@ -56,4 +60,5 @@ if __name__ == "__main__":
         POINTS |= lerobot_points()
     kill_at(*POINTS[sys.argv[1]])
     convert.convert = render_by(RayCaster, convert.convert)
+    render.render_candidates = render_by(RayCaster, render.render_candidates)
     sys.exit(run(sys.argv[2:]))

@@ -31,6 +31,7 @@ from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.episode_source import ImageKind
 from robocas_ms3.demos.candidates.candidates_file import CandidateFile
+from robocas_ms3.demos.recordings.trajectory_hdf5 import check_links
 
 FORMAT, VERSION = "robocas-candidate-images", 1
 """Attributes ``format`` and ``version`` of the file."""
@@ -121,6 +122,7 @@ class CandidateImages:
     def __init__(self, path: Path | str, decisions: str | None = None) -> None:
         self.path = Path(path)
         with self._open() as file:
+            check_links(file, self.path)
             attributes: dict[str, Any] = dict(file.attrs)
             found = attributes.get("format"), attributes.get("version")
             if found != (FORMAT, VERSION):

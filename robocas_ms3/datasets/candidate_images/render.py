@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError, OutputExistsError
 from robocas_ms3.core.files import atomic_file
+from robocas_ms3.core.locks import lock_folder
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
 from robocas_ms3.core.poses import inverse
 from robocas_ms3.core.workers import WorkerPool, use_one_torch_thread
@@ -80,8 +81,12 @@ def render_candidates(
     decisions, total = hash_decisions(file), len(file)
     if not total:
         raise DatasetError("there are no decisions in this file", where=settings.candidates)
+    parts = out.with_name(f"{out.name}.parts")
     if out.exists() and not settings.overwrite:
         _check_existing(out, decisions, options)
+        if parts.exists():  # of a process that was killed after the merge
+            with lock_folder(parts):
+                shutil.rmtree(parts)
         return CandidateImageResult(total, 0, out.stat().st_size, time.perf_counter() - start)
     recorded = {
         "decisions": decisions,
@@ -90,7 +95,6 @@ def render_candidates(
         "depth": options.depth,
         "pack": settings.pack,
     }
-    parts = out.with_name(f"{out.name}.parts")
     with OutputFolder(parts, _FOLDER, recorded, overwrite=settings.overwrite) as output:
         if settings.open_renderer is None:
             from robocas_ms3.datasets.conversion.env_renderer import require_renderer
@@ -160,7 +164,9 @@ class _SeedWorker:
 
     def run(self, rows: Rows) -> int:
         first, last = rows
-        images = render_seed(self._renderer, make_recording(self._file, rows), self._options)
+        recording = make_recording(self._file, rows)
+        self._renderer.load_scene(recording)
+        images = render_loaded(self._renderer, recording, self._options)
 
         def fill(file: h5py.File) -> None:
             create_datasets(file, self._options, last - first)
@@ -196,9 +202,8 @@ def make_recording(file: CandidateFile, rows: Rows) -> Recording:
     )
 
 
-def render_seed(renderer: EnvRenderer, recording: Recording, options: ImageOptions) -> dict[str, CameraImages]:
-    """Render all states of a recording; return the images and the camera poses by camera."""
-    renderer.load_scene(recording)
+def render_loaded(renderer: EnvRenderer, recording: Recording, options: ImageOptions) -> dict[str, CameraImages]:
+    """Render all states of the recording that the renderer has loaded; return images and camera poses by camera."""
     samples = np.arange(recording.control_steps + 1)
     rgb: dict[str, list[bytes]] = {name: [] for name in options.cameras}
     depth: dict[str, list[bytes]] = {name: [] for name in options.cameras}

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import pickle
 import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -19,6 +23,7 @@ from robocas_ms3.datasets.candidate_images.settings import CandidateImageSetting
 from robocas_ms3.demos.candidates.candidates_file import CandidateFile
 
 STEPS = (0, 8, 16)
+KILL_DURING = Path(__file__).parents[2] / "support" / "kill_during.py"
 
 
 class Interrupted(RayCaster):
@@ -97,6 +102,18 @@ def test_interrupted_rendering_is_continued(candidates, images):
     assert done == [(3, 9), (6, 9), (9, 9)]
     assert sorted(path.name for path in candidates.parent.iterdir()) == ["candidates.h5", "candidates_images.h5"]
     assert images_path(candidates).read_bytes() == images.path.read_bytes()
+
+
+@pytest.mark.parametrize("moment", ["decisions", "images", "image parts"])
+def test_rendering_continued_after_kill_gives_the_same_file(candidates, images, moment):
+    words = ["render-candidates", str(candidates)]
+    done = subprocess.run(
+        [sys.executable, str(KILL_DURING), moment, *words], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    render_candidates(CandidateImageSettings(candidates, open_renderer=RayCaster))
+    assert images_path(candidates).read_bytes() == images.path.read_bytes()
+    assert sorted(path.name for path in candidates.parent.iterdir()) == ["candidates.h5", "candidates_images.h5"]
 
 
 def test_complete_file_is_left_as_it_is(candidates):
