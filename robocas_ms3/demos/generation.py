@@ -22,7 +22,7 @@ from robocas_ms3.core.output_folder import FolderKind, OutputFolder
 from robocas_ms3.core.text import format_count, one_line
 from robocas_ms3.core.workers import Limits, Worker, WorkerPool, use_one_torch_thread
 from robocas_ms3.demos.candidates.candidates_file import FILE_NAME as CANDIDATES_FILE
-from robocas_ms3.demos.candidates.candidates_file import merge_candidates
+from robocas_ms3.demos.candidates.candidates_file import CandidateFile, merge_candidates
 from robocas_ms3.demos.candidates.records import candidates_file_name
 from robocas_ms3.demos.failures import (
     FAILURES_FILE,
@@ -229,6 +229,8 @@ def _failure_lines(result: EpisodeResult) -> list[FailedAttempt]:
 class _Run:
     """Files of a run in its output folder.
 
+    An episode whose file, or whose file of candidates, is damaged is recorded again.
+
     Attributes:
         episodes_folder: folder with one trajectory file per episode that is not merged yet.
         failures: ``failures.jsonl``.
@@ -252,6 +254,8 @@ class _Run:
         for path in sorted(self.episodes_folder.glob("seed_*.h5")):
             try:
                 open_trajectory(path).close()
+                if has_candidates:
+                    CandidateFile(path.with_name(candidates_file_name(path.stem)))
                 self.earlier |= self._read_results(path)
             except RobocasError:
                 path.unlink()

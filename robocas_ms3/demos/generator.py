@@ -111,7 +111,7 @@ class EpisodeGenerator:
         recorder = EpisodeRecorder(self.env, folder, name)
         executor = MotionExecutor(recorder, seed, noise=self._make_noise())
         result = EpisodeResult(seed, success=False, seconds=executor.seconds, max_attempts=self.settings.max_attempts)
-        settings = CandidateSettings(self.settings.candidates, self.settings.candidate_depth)
+        settings = CandidateSettings.from_episode_settings(self.settings)
         candidates = CandidateRecorder(settings, self.env, folder / candidates_file_name(name), result)
         attempts = _Attempts(self, recorder, executor, result, intervention, candidates)
         executor.check_open_loop = attempts.check_open_loop

@@ -56,8 +56,12 @@ class EpisodeSettings:
     """Also simulate the candidates of each decision, and record their outcomes in candidates.h5 (docs/candidates.md).
     The demonstrations do not change."""
     candidates: int = 16
-    """With --record-candidates: number of candidates per decision.
-    At least a third of them are random, the others are those of the scripted policy."""
+    """With --record-candidates: number of candidates per decision, first those of the scripted policy, then random
+    ones."""
+    random_fraction: float = 0.33
+    """With --record-candidates: minimum fraction of random candidates, 0 to 1."""
+    near_miss_fraction: float = 0.4
+    """With --record-candidates: fraction of random candidates with a position error (near misses), 0 to 1."""
     candidate_depth: int = 0
     """With --record-candidates: maximum number of further moves to simulate after each candidate of a search.
     It gives the number of moves until the target can be grasped."""
@@ -120,6 +124,8 @@ class EpisodeSettings:
         for name in ("check_trials", "check_failures", "check_noise_mm", "check_noise_deg"):
             check_number(f"--{name.replace('_', '-')}", getattr(self, name), 0)
         check_number("--candidates", self.candidates, 1, 1000)
+        check_number("--random-fraction", self.random_fraction, 0, 1)
+        check_number("--near-miss-fraction", self.near_miss_fraction, 0, 1)
         check_number("--candidate-depth", self.candidate_depth, 0, 20)
         if self.record_candidates and self.keep_recoveries:
             what, fix = "candidates cannot be recorded with recoveries", "Use --record-candidates without it."

@@ -57,6 +57,8 @@ class RecordingConfig(StrictModel):
         default=None, description="also write `candidates.h5` next to the demonstrations"
     )
     candidates: Annotated[int, Field(ge=1, le=1000)] | None = None
+    random_fraction: Annotated[float, Field(ge=0, le=1)] | None = None
+    near_miss_fraction: Annotated[float, Field(ge=0, le=1)] | None = None
     candidate_depth: Annotated[int, Field(ge=0, le=20)] | None = None
     action_noise: tuple[Annotated[float, Field(ge=0, le=1000)], Annotated[float, Field(ge=0, le=180)]] | None = Field(
         default=None, description="standard deviations in mm and degrees; with noise the default of check_rate is 0"

@@ -54,7 +54,9 @@ def commands(tmp_path_factory):
     rules.write_text(rules.read_text().replace("max_steps: null", "max_steps: 60"))
     recorded = folder / "recorded"
     made = {
-        "generate": Command("generate", ("generate", "pick", "-n", str(EPISODES))),
+        "generate": Command(
+            "generate", ("generate", "pick", "-n", str(EPISODES), "--record-candidates", "--candidates", "2")
+        ),
         "convert": Command(
             "convert",
             ("convert", str(recorded / "trajectory.h5"), "--size", "64", "48", "--no-depth")
@@ -268,7 +270,7 @@ def kill_after_one_episode(command, out, log):
 
 
 TRUNCATED = {
-    "generate": ("episodes/seed_*.h5", "episodes/seed_*.json"),
+    "generate": ("episodes/seed_*.h5", "episodes/seed_*.json", "episodes/candidates_*.h5"),
     "convert": ("episode_*/episode_info.npz", "episode_*/base_camera/rgb/0001.png", "episode_*/scene.json"),
     "plan run": ("units/*/*/[0-9]*/outcome.json",),
     "eval": ("episodes.jsonl",),

@@ -22,6 +22,8 @@ from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.datasets.conversion.episode_folder import find_damaged_file
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.sources.reader import Dataset
+from robocas_ms3.demos.candidates.candidates_file import FILE_NAME as CANDIDATES_FILE
+from robocas_ms3.demos.candidates.candidates_file import CandidateFile
 from robocas_ms3.demos.failures import FAILURES_FILE, FailedAttempt
 from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.recordings.trajectory_hdf5 import open_trajectory
@@ -89,7 +91,14 @@ def content(command, out):
         assert list(failed) == sorted({line.seed for line in lines})
         with open_trajectory(out / "trajectory.h5") as file:
             found = [
-                (seed, (_of_recording(one, file[f"traj_{one['episode_id']}"]), _causes(failed.get(seed, []))))
+                (
+                    seed,
+                    (
+                        _of_recording(one, file[f"traj_{one['episode_id']}"]),
+                        _causes(failed.get(seed, [])),
+                        _of_candidates(out / CANDIDATES_FILE, seed),
+                    ),
+                )
                 for seed, one in ((one["episode_seed"], one) for one in episodes)
             ]
     elif command.name == "eval":
@@ -104,6 +113,17 @@ def content(command, out):
         assert len(folders) == len(data.numbers)
         found = [(seed, {k: v for k, v in files_of(one).items() if k != "scene.json"}) for seed, one in folders.items()]
     return found
+
+
+def _of_candidates(path, seed):
+    """Return the values of the decisions of a seed and of their candidates, as texts."""
+    file = CandidateFile(path)
+    rows = [row for row, of in enumerate(file.decisions["seed"].tolist()) if of == seed]
+    assert rows, f"no decisions of seed {seed}"
+    return [
+        (repr(sorted(one.values.items())), repr(sorted((k, v.tolist()) for k, v in one.candidates.items())))
+        for one in map(file.decision, rows)
+    ]
 
 
 def count_readable(command, out):

@@ -20,6 +20,7 @@ from robocas_ms3.demos.candidates.proposals import Candidate, propose
 from robocas_ms3.demos.candidates.records import DecisionRecord, PathDecision, mark_episode
 from robocas_ms3.demos.candidates.schema import DecisionKind, Primitive
 from robocas_ms3.demos.failures import EpisodeResult
+from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.planning.decisions import IrreversibleDecisions
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.skills.arm import Arm
@@ -39,12 +40,22 @@ class CandidateSettings:
 
     Attributes:
         count: number of candidates per decision.
+        random_fraction: minimum fraction of random candidates.
+        near_miss_fraction: fraction of random candidates with a position error.
         depth: maximum number of further moves that are simulated after a candidate of search, until the target can be
             grasped.
     """
 
     count: int
-    depth: int = 0
+    random_fraction: float
+    near_miss_fraction: float
+    depth: int
+
+    @classmethod
+    def from_episode_settings(cls, settings: EpisodeSettings) -> CandidateSettings:
+        """Return the settings of the candidates from the settings of an episode."""
+        fractions = settings.random_fraction, settings.near_miss_fraction
+        return cls(settings.candidates, *fractions, settings.candidate_depth)
 
 
 @dataclass
@@ -98,12 +109,11 @@ class CandidateRecorder:
         self._decisions.append(PathDecision(kind, number))
         before = measure_scene(arm)
         record = DecisionRecord(self._describe(arm, kind, before), _read_state(arm))
-        count = self.settings.count
-        candidates = [_make_expert_candidate(arm, kind, value, run) for value, run in options[:count]]
+        settings = self.settings
+        own = settings.count - round(settings.random_fraction * settings.count)
+        candidates = [_make_expert_candidate(arm, kind, value, run) for value, run in options[: max(1, own)]]
         rng = np.random.default_rng([arm.executor.seed, *arm.decision_path, len(self._decisions), _STREAM])
-        # a third is random, even if the scripted policy has many candidates
-        candidates = candidates[: max(1, count - count // 3)]
-        candidates += propose(arm, kind, count - len(candidates), rng)
+        candidates += propose(arm, kind, settings.count - len(candidates), rng, settings.near_miss_fraction)
         for candidate in candidates:
             try:
                 outcome = run_in_forked_process(lambda one=candidate: self._simulate(arm, one, before))

@@ -39,7 +39,6 @@ MIX: dict[DecisionKind, dict[Primitive, float]] = {
     "release": {"release": 1.0},
     "pull": {"pull": 1.0},
 }
-NEAR_MISSES = 0.4  # fraction of near misses among random candidates
 TARGET_FRACTION = 0.5  # fraction of random grasps that are of the target
 NEIGHBOUR_DISTANCE = 0.15  # m from the target at which an object is chosen e times less often than the target
 CLEAR_FRACTION = 0.6  # fraction of random grasps that touch no other body, if there are any
@@ -74,8 +73,18 @@ class Candidate:
     end_in_base: Array | None = None
 
 
-def propose(arm: Arm, kind: DecisionKind, count: int, rng: np.random.Generator) -> list[Candidate]:
-    """Return up to ``count`` random candidates for a decision of a kind, from the present state of the scene."""
+def propose(
+    arm: Arm, kind: DecisionKind, count: int, rng: np.random.Generator, near_miss_fraction: float
+) -> list[Candidate]:
+    """Return up to ``count`` random candidates for a decision, in the present state of the scene.
+
+    Args:
+        arm: context of the attempt, which does not change.
+        kind: kind of the decision.
+        count: number of candidates; a candidate is left out if its object has no annotated grasp.
+        rng: random generator.
+        near_miss_fraction: fraction of candidates with a position error.
+    """
     mix = dict(MIX[kind])
     if arm.approach == "front":  # the closed gripper cannot point down into a shelf
         mix.pop("push", None)
@@ -84,7 +93,7 @@ def propose(arm: Arm, kind: DecisionKind, count: int, rng: np.random.Generator) 
     makers = {"grasp": _grasp, "push": _push, "lift": _lift, "release": _release, "pull": _pull}
     own, arm.rng = arm.rng, rng  # the episode must not depend on the proposals
     try:
-        made = [makers[primitive](arm, rng, bool(rng.random() < NEAR_MISSES)) for primitive in primitives]
+        made = [makers[primitive](arm, rng, bool(rng.random() < near_miss_fraction)) for primitive in primitives]
     finally:
         arm.rng = own
     return [candidate for candidate in made if candidate is not None]
