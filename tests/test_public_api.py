@@ -48,6 +48,7 @@ PUBLIC = {
     "robocas_ms3.datasets": [
         "ActionScale",
         "CandidateDataset",
+        "CandidateImages",
         "CandidateOptions",
         "ConversionResult",
         "ConversionSettings",

@@ -10,6 +10,7 @@ from robocas_ms3.core.lazy import make_lazy_exports
 if TYPE_CHECKING:
     from robocas_ms3.datasets.actions import ActionScale as ActionScale
     from robocas_ms3.datasets.actions import to_joint_positions as to_joint_positions
+    from robocas_ms3.datasets.candidate_images.images_file import CandidateImages as CandidateImages
     from robocas_ms3.datasets.checks.dataset import ValidationReport as ValidationReport
     from robocas_ms3.datasets.checks.dataset import validate as validate
     from robocas_ms3.datasets.checks.violation import Violation as Violation
@@ -34,6 +35,7 @@ __getattr__, __dir__, __all__ = make_lazy_exports(
     __name__,
     {
         "robocas_ms3.datasets.actions": ["ActionScale", "to_joint_positions"],
+        "robocas_ms3.datasets.candidate_images.images_file": ["CandidateImages"],
         "robocas_ms3.datasets.checks.dataset": ["ValidationReport", "validate"],
         "robocas_ms3.datasets.checks.violation": ["Violation"],
         "robocas_ms3.datasets.conversion.convert": ["convert"],

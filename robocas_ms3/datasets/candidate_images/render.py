@@ -193,6 +193,7 @@ def make_recording(file: CandidateFile, rows: Rows) -> Recording:
         instruction=str(file.decisions["instruction"][first]),
         subgoals=[],
         is_intervention=True,  # the first state is not the one after the reset
+        has_action_noise=False,
         actions=np.zeros((last - first - 1, 8), np.float32),
         states={
             kind: {name: np.concatenate([state[kind][name] for state in states]) for name in of}

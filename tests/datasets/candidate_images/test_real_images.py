@@ -39,6 +39,7 @@ def candidates(tmp_path_factory, needs_renderer):
         instruction=base.get_language_instruction()[0],
         subgoals=[],
         is_intervention=False,
+        has_action_noise=False,
         actions=np.zeros((1, 8), np.float32),
         states={
             kind: {name: np.concatenate([state[kind][name].numpy() for state in states]) for name in states[0][kind]}
