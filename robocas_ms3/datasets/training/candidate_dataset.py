@@ -12,8 +12,10 @@ import torch
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError, EmptySplitError
+from robocas_ms3.datasets.candidate_images.images_file import CandidateImages, hash_decisions, images_path
 from robocas_ms3.datasets.sources.episode_source import Split
 from robocas_ms3.datasets.sources.split import split_by_seed
+from robocas_ms3.datasets.training.torch_dataset import resize_image
 from robocas_ms3.demos.candidates.candidates_file import CandidateFile
 from robocas_ms3.demos.candidates.labels import Labels
 from robocas_ms3.demos.candidates.schema import DECISION_KINDS, PRIMITIVES
@@ -36,12 +38,19 @@ class CandidateOptions:
             each other object whose name is unique in the scene, at decisions to move or grasp with an empty gripper.
         max_candidates: greatest number of candidates C of a sample; of more candidates, the chosen one and a random
             choice, the same at each access, are used. None: the greatest number of a decision.
+        cameras: names of the cameras, in the order of the stack; empty: no images. Images are read from the file of
+            ``robocas render-candidates`` next to each file.
+        depth: whether samples have depth images.
+        size: width and height to which images are scaled, pixels; None: no scaling.
     """
 
     split: Split = "train"
     kinds: Sequence[str] = DECISION_KINDS
     targets: Targets = "instructed"
     max_candidates: int | None = None
+    cameras: Sequence[str] = ()
+    depth: bool = False
+    size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         choices = [("split", self.split, get_args(Split)), ("targets", self.targets, get_args(Targets))]
@@ -72,6 +81,10 @@ class CandidateDataset(torch.utils.data.Dataset):
     ``gripper_width``      ()           distance between the finger pads, m
     ``opening``            ()           opening of the door or drawer, fraction of its range
     ``kind``               int          index in `schema.DECISION_KINDS`
+    ``rgb``                (M, 3, h, w) uint8, of M cameras in the given order
+    ``depth``              (M, h, w)    m along the optical axis, 0 = no depth
+    ``intrinsic``          (M, 4)       fx, fy, cx, cy in pixels of the scaled image
+    ``camera_pose``        (M, 4, 4)    pose of each OpenCV camera frame
     ``mask``               (C,)         bool, False = padding
     ``primitive``          (C,)         int64, index in `schema.PRIMITIVES`
     ``slot``               (C,)         int64, slot of the moved object; -1 also for a pull
@@ -94,7 +107,7 @@ class CandidateDataset(torch.utils.data.Dataset):
     ``file``               int          index of the file in ``paths``
     =====================  ===========  ======================================================================
 
-    Numbers without a type are float32.
+    Numbers without a type are float32. Images that are not requested are absent.
 
     Args:
         paths: files, or folders that contain ``candidates.h5``.
@@ -124,6 +137,7 @@ class CandidateDataset(torch.utils.data.Dataset):
         self.slots = max((file.tables.slots for file in self.files), default=0)
         counts = [int(file.decisions["candidate_count"].max(initial=0)) for file in self.files]
         self.max_candidates = options.max_candidates or max(counts, default=0)
+        self._images = [_open_images(file, options) for file in self.files] if options.cameras else []
         self._configs: list[TaskConfig] = [file.recorded_env.task_config() for file in self.files]
         rows = [
             (number, row)
@@ -171,6 +185,7 @@ class CandidateDataset(torch.utils.data.Dataset):
             **self._make_observation(values, target),
             **self._make_candidates({name: array[rows] for name, array in decision.candidates.items()}, is_instructed),
             **self._make_labels(file.labels, file.rows_of(row).start + rows, target),
+            **(_read_images(self._images[number], row, self.options) if self._images else {}),
             "instruction": str(values["instruction"]) if is_instructed else self._relabel(number, values, target, rng),
             "target_name": str(values["object_name"][target]),
             "seed": int(values["seed"]),
@@ -242,6 +257,34 @@ class CandidateDataset(torch.utils.data.Dataset):
         padded = np.full((self.max_candidates, *values.shape[1:]), padding, values.dtype)
         padded[: len(values)] = values
         return torch.from_numpy(padded)
+
+
+def _open_images(file: CandidateFile, options: CandidateOptions) -> CandidateImages:
+    images = CandidateImages(images_path(file.path), hash_decisions(file))
+    if unknown := set(options.cameras) - set(images.cameras):
+        expected, found = f"some of {', '.join(images.cameras)}", ", ".join(sorted(unknown))
+        raise DatasetError("unknown camera", where=images.path, expected=expected, found=found)
+    if options.depth and not images.has_depth:
+        fix = "Pass depth=False, or render the images again without --no-depth."
+        raise DatasetError("depth images are not available", where=images.path, fix=fix)
+    return images
+
+
+def _read_images(images: CandidateImages, row: int, options: CandidateOptions) -> dict[str, torch.Tensor]:
+    cameras, size = options.cameras, options.size
+    found = [images.rgb(row, camera) for camera in cameras]
+    # pixel centres are at + 0.5, so the principal point is scaled as the focal length
+    scales = [np.ones(4) if size is None else np.array([*size, *size]) / np.tile(x.shape[1::-1], 2) for x in found]
+    intrinsic = np.stack([images.intrinsic(row, camera) for camera in cameras]) * np.stack(scales)
+    arrays = {
+        "rgb": np.stack([resize_image(image, size).transpose(2, 0, 1) for image in found]),
+        "intrinsic": intrinsic.astype(np.float32),
+        "camera_pose": np.stack([images.camera_in_base(row, camera) for camera in cameras]).astype(np.float32),
+    }
+    if options.depth:
+        depth = np.stack([resize_image(images.depth(row, camera), size) for camera in cameras])
+        arrays["depth"] = depth.astype(np.float32) / 1000
+    return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
 
 def _to_known(values: Any) -> NDArray[np.float32]:

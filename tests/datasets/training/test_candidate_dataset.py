@@ -6,11 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from recorded_candidates import write_recorded_candidates
+from synthetic import SIZE, RayCaster, write_trajectory
 from synthetic_candidates import ENV_INFO, SETTINGS, make_record, write_episodes
 from torch.utils.data import DataLoader
 
 from robocas_ms3.core.errors import DatasetError, EmptySplitError
 from robocas_ms3.datasets import CandidateDataset, CandidateOptions
+from robocas_ms3.datasets.candidate_images.images_file import CandidateImages, images_path
+from robocas_ms3.datasets.candidate_images.render import render_candidates
+from robocas_ms3.datasets.candidate_images.settings import CandidateImageSettings
 from robocas_ms3.demos.candidates.candidates_file import CandidateFile, write_candidates
 from robocas_ms3.demos.candidates.schema import PRIMITIVES
 
@@ -134,3 +139,36 @@ def test_dataset_can_be_pickled_and_read_by_workers(tmp_path):
 def test_transform(tmp_path):
     dataset = CandidateDataset(write_episodes(tmp_path / "c.h5"), ALL, transform=count_candidates)
     assert dataset[0] == 6
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    """Return the path of a file with rendered decisions."""
+    folder = tmp_path_factory.mktemp("rendered")
+    trajectory = write_trajectory(folder / "trajectory.h5", seeds=(3, 4))
+    path = write_recorded_candidates(folder / "candidates.h5", trajectory, (0, 8))
+    render_candidates(CandidateImageSettings(path, open_renderer=RayCaster))
+    return path
+
+
+def test_images_of_decisions(rendered):
+    cameras = ("static_camera", "base_camera")
+    dataset = CandidateDataset(rendered, replace(ALL, cameras=cameras, depth=True))
+    images, sample = CandidateImages(images_path(rendered)), dataset[3]
+    for index, camera in enumerate(cameras):
+        np.testing.assert_array_equal(sample["rgb"][index].permute(1, 2, 0), images.rgb(3, camera))
+        np.testing.assert_allclose(sample["depth"][index], images.depth(3, camera) / 1000, rtol=1e-6)
+        np.testing.assert_allclose(sample["intrinsic"][index], images.intrinsic(3, camera), rtol=1e-6)
+        np.testing.assert_allclose(sample["camera_pose"][index], images.camera_in_base(3, camera), rtol=1e-6)
+    half = SIZE[0] // 2, SIZE[1] // 2
+    scaled = CandidateDataset(rendered, replace(ALL, cameras=cameras, size=half))[3]
+    assert scaled["rgb"].shape == (2, 3, half[1], half[0])
+    torch.testing.assert_close(scaled["intrinsic"], sample["intrinsic"] / 2)
+    assert "depth" not in scaled
+
+
+def test_images_that_are_not_available_are_errors(rendered, tmp_path):
+    with pytest.raises(DatasetError):
+        CandidateDataset(rendered, replace(ALL, cameras=("front_camera",)))
+    with pytest.raises(DatasetError):
+        CandidateDataset(write_episodes(tmp_path / "c.h5"), replace(ALL, cameras=("base_camera",)))
