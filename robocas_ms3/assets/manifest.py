@@ -247,7 +247,8 @@ class FurnitureAsset(AssetBase):
         named = {name: part.link for name, part in [*self.surfaces.items(), *self.handles.items()]}
         for name, link_name in named.items():
             if link_name not in known:
-                raise ValueError(f"unknown link {link_name!r} of {name!r}, expected one of {sorted(known - {''})}")
+                links = ", ".join(sorted(known - {""}))
+                raise ValueError(f"unknown link {link_name!r} of {name!r}, expected one of {links}")
         return self
 
 

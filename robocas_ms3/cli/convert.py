@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @resumable
 def main(settings: ConversionSettings) -> int:
-    from robocas_ms3.cli.progress import ProgressBar
+    from robocas_ms3.cli.progress import ProgressBar, format_duration
     from robocas_ms3.cli.terminal import print_line
 
     write: Callable[..., ConversionResult] = _find_format(settings).import_function("writer")
@@ -29,7 +29,7 @@ def main(settings: ConversionSettings) -> int:
     if count:
         megabytes = sum(episode.size for episode in done.episodes) / 1e6
         steps = format_count(sum(episode.steps for episode in done.episodes), "step")
-        words += [steps, f"{megabytes:.0f} MB", f"{done.seconds / count:.1f} s per episode"]
+        words += [steps, f"{megabytes:.0f} MB", format_duration(done.seconds)]
     print_line(", ".join(words))
     if count and settings.video and settings.to == "robocas" and not done.previews:
         print_line(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,7 +23,8 @@ class Stats:
     """
 
     path: Annotated[Path, tyro.conf.Positional]
-    """Folder of a dataset, a trajectory.h5, or a candidates.h5. Failed episodes of a trajectory.h5 are included."""
+    """Folder of a dataset or of robocas generate, a trajectory.h5, or a candidates.h5.
+    Failed episodes of a trajectory.h5 are included."""
     out: Maybe[Path] = None
     """Output folder. Default: DATASET/preview/stats, or NAME_stats next to a file NAME.h5."""
     json: bool = False
@@ -35,7 +36,9 @@ class Stats:
 def main(cfg: Stats) -> int:
     from robocas_ms3.cli.terminal import print_json, print_line
     from robocas_ms3.datasets.formats import CANDIDATES, detect_format
+    from robocas_ms3.demos.settings import find_trajectory
 
+    cfg = replace(cfg, path=find_trajectory(cfg.path))
     found = detect_format(cfg.path)
     out = cfg.out or (None if cfg.json else _default_folder(cfg.path))
     write_statistics = _write_candidate_statistics if found and found.name == CANDIDATES else _write_statistics

@@ -18,6 +18,7 @@ from robocas_ms3.core.extensions import Registry
 from robocas_ms3.core.signals import forbid_exit
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource
+from robocas_ms3.demos.settings import find_trajectory
 
 ENTRY_POINT_GROUP = "robocas_ms3.formats"
 CANDIDATES = "candidates"
@@ -127,13 +128,13 @@ def detect_format(path: Path) -> Format | None:
 
 
 def open_source(path: Path | str, *, rate_hz: float | None = None, include_failed: bool = False) -> EpisodeSource:
-    """Open a trajectory file or a dataset of any format.
+    """Open a trajectory file, an output folder of `robocas generate`, or a dataset of any format.
 
     ``rate_hz`` (default 5) and ``include_failed`` apply to trajectory files; a dataset has its own rate.
 
     Raises:
         DatasetError: the path can't be read, or the dataset has another rate.
     """
-    path = Path(path)
+    path = find_trajectory(Path(path))
     found = detect_format(path) or FORMATS["robocas"]  # its error suggests a nearby dataset
     return found.import_function("reader")(path, rate_hz=rate_hz, include_failed=include_failed)

@@ -16,6 +16,12 @@ from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ, TASKS
 _NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text describes the default
 
 
+def find_trajectory(path: Path) -> Path:
+    """Return the trajectory file in an output folder of `robocas generate`, or ``path`` if it is no such folder."""
+    file = path / "trajectory.h5"
+    return file if file.is_file() else path
+
+
 def _task_type() -> Any:
     """Return a type of text whose metavar is the names of all tasks, including tasks of other packages."""
     return Annotated[str, tyro.conf.arg(metavar=f"{{{','.join(TASKS)}}}")]
@@ -247,4 +253,4 @@ class ReplaySettings:
     @property
     def file(self) -> Path:
         """The .h5 file to replay."""
-        return self.trajectory / "trajectory.h5" if self.trajectory.is_dir() else self.trajectory
+        return find_trajectory(self.trajectory)

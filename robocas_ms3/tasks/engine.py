@@ -57,7 +57,7 @@ def check_engine_arguments(
         ConfigError: ``visual_level`` is unknown, or ``obs_mode`` has images and ``render_backend`` is ``none``.
     """
     if visual_level not in VISUALS:
-        expected = f"one of {list(VISUALS)}"
+        expected = f"one of {', '.join(VISUALS)}"
         raise ConfigError("no such visual_level", where="visual_level", expected=expected, found=visual_level)
     if num_envs > 1 and (sim_backend in CPU_SIM_BACKENDS or not torch.cuda.is_available()):
         found = f"sim_backend={sim_backend!r}" if sim_backend in CPU_SIM_BACKENDS else "no CUDA device"

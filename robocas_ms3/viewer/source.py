@@ -21,6 +21,7 @@ from robocas_ms3.datasets.sources.provenance import make_entry_without_fingerpri
 from robocas_ms3.datasets.sources.reader import DEFAULT_RATE, Dataset
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
 from robocas_ms3.demos.recordings.trajectory_file import Recording, TrajectoryFile
+from robocas_ms3.demos.settings import find_trajectory
 from robocas_ms3.viewer.content import Content, PageContent
 from robocas_ms3.viewer.damage import convert_damage_errors, read_object, read_or_default
 from robocas_ms3.viewer.decisions.content import DecisionContent
@@ -41,9 +42,7 @@ def open_content(path: Path | str, *, images: Path | None = None) -> Content:
 
     ``images`` is the file with the images of candidates.h5; None: the default file, if it exists.
     """
-    path = Path(path)
-    inside = path / "trajectory.h5"
-    path = inside if inside.is_file() else path
+    path = find_trajectory(Path(path))
     found = detect_format(path)
     if found is not None and found.name == CANDIDATES:
         return DecisionContent(DecisionSource(path, images))

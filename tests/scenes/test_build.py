@@ -61,7 +61,7 @@ def test_finishes_and_levels_of_detail_are_visible(needs_renderer):
 
 
 def test_an_unknown_level_of_detail_is_an_error():
-    with pytest.raises(ConfigError, match=r"no such visual_level \(expected one of \['fast', 'full'\], found fulll\)"):
+    with pytest.raises(ConfigError, match=r"no such visual_level \(expected one of fast, full, found fulll\)"):
         gym.make("RoboCASPick-v1", visual_level="fulll", render_backend="none")
 
 

@@ -11,6 +11,7 @@ import tyro
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.lerobot.variants import NEWEST, Version
+from robocas_ms3.demos.settings import find_trajectory
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,7 +28,8 @@ class ConversionOptions:
     """Input, output and episodes."""
 
     source: Annotated[Path, tyro.conf.Positional]
-    """Trajectory file F.h5 (with F.json next to it). With --to lerobot also the folder of a dataset with images."""
+    """Output folder of robocas generate, or its trajectory file F.h5 (with F.json next to it).
+    With --to lerobot also the folder of a dataset with images."""
     out: Path
     """Output folder of the dataset."""
     include_failed: bool = False
@@ -107,6 +109,7 @@ class ConversionSettings(ConversionOptions, FormatOptions, RenderOptions, Proces
     """
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "source", find_trajectory(self.source))
         for first, second, both in (
             ("--overwrite", "--append", self.overwrite and self.append),
             ("--no-video", "--all-videos", self.all_videos and not self.video),

@@ -165,7 +165,7 @@ def to_integer_rate(rate_hz: float) -> int:
     """Convert a rate in Hz to an integer; raise DatasetError if it is not a whole number."""
     if rate_hz < 1 or abs(rate_hz - round(rate_hz)) > 1e-9:
         what, expected = "invalid rate for LeRobot", "a whole number of frames per second"
-        raise DatasetError(what, where="rate", expected=expected, found=rate_hz)
+        raise DatasetError(what, where="rate", expected=expected, found=rate_hz, usage=True)
     return round(rate_hz)
 
 

@@ -102,7 +102,9 @@ class RecordedEnv:
     def _task(self) -> TaskSpec:
         known, config = {spec.env_id: spec for spec in TASKS.values()}, self.kwargs.get("config")
         if self.env_id not in known:
-            raise DatasetError("unknown task", where="env_id", expected=f"one of {sorted(known)}", found=self.env_id)
+            raise DatasetError(
+                "unknown task", where="env_id", expected=f"one of {', '.join(sorted(known))}", found=self.env_id
+            )
         if isinstance(config, str) and config not in bundled_configs():
             expected = "a bundled configuration (robocas list)"
             raise DatasetError("unknown configuration", where="config", expected=expected, found=config)

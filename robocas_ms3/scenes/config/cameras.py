@@ -93,7 +93,7 @@ def apply_camera_changes(
             raise ConfigError(
                 "unknown camera",
                 where=f"cameras.{name}",
-                expected=f"one of {list(specs)}, or for an additional camera the key `position` or `overview`",
+                expected=f"one of {', '.join(specs)}, or for an additional camera the key `position` or `overview`",
                 fix=did_you_mean(name, specs),
             )
         specs[name] = change.apply_to(specs.get(name, CameraSpec(name)))

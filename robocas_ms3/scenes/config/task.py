@@ -292,9 +292,8 @@ class TaskConfig(StrictModel):
     def _check_references(self) -> TaskConfig:
         for name, part in (("surface", self.surface), ("opening", self.opening)):
             if part is not None and part.furniture not in self.furniture:
-                raise ValueError(
-                    f"{name}.furniture: expected one of {sorted(self.furniture)}, found {part.furniture!r}"
-                )
+                known = ", ".join(sorted(self.furniture))
+                raise ValueError(f"{name}.furniture: expected one of {known}, found {part.furniture!r}")
         try:
             spec = TASKS.find(self.task)
         except ExtensionError as error:

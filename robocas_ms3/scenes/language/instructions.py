@@ -130,7 +130,7 @@ def draw_instruction(
     if not templates:
         known = [name for name in SPLITS if _templates(slots.task, name)]
         what = f"no instruction templates in the split {split!r}"
-        raise RobocasError(what, where=f"task {slots.task}", expected=f"one of {known}")
+        raise RobocasError(what, where=f"task {slots.task}", expected=f"one of {', '.join(known)}")
     objects, supports, phrases = [slots.object], [slots.support], [relation.plain if relation else ""]
     if synonyms:
         known = words.objects[slots.object].for_split(split) if slots.object in words.objects else ()

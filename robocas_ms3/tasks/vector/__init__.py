@@ -85,7 +85,7 @@ def choose_backend(backend: str, sim_backend: str = "auto") -> Literal["processe
         VectorEnvError: the backend is unknown or contradicts ``sim_backend``, or there is no GPU for it.
     """
     if backend not in get_args(Backend):
-        expected = f"one of {list(get_args(Backend))}"
+        expected = f"one of {', '.join(get_args(Backend))}"
         raise VectorEnvError("no such backend", where="make_vec", expected=expected, found=repr(backend))
     on_cpu = sim_backend in CPU_SIM_BACKENDS
     if (backend == "gpu" and on_cpu) or (backend == "processes" and sim_backend != "auto" and not on_cpu):

@@ -10,6 +10,7 @@ from synthetic import RayCaster, render_by, write_trajectory
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.conversion import convert as conversion
+from robocas_ms3.datasets.formats import open_source
 
 
 @pytest.fixture
@@ -25,6 +26,28 @@ def test_a_conversion_and_its_repetition(trajectory, stub_images, tmp_path, caps
     assert "episodes written: 2/2" in printed.err
     assert run(command) == 0
     assert capsys.readouterr().out.endswith(": 0 episodes, 2 already there\n")
+
+
+def test_the_folder_of_generate_is_a_source(trajectory, stub_images, tmp_path, capsys):
+    demos = tmp_path / "demos"
+    demos.mkdir()
+    for suffix in (".h5", ".json"):
+        shutil.copy(trajectory.with_suffix(suffix), demos / f"trajectory{suffix}")
+    out = str(tmp_path / "out")
+    assert run(["convert", str(demos), "--out", out, "--no-embeddings", "--no-video"]) == 0
+    assert validate(tmp_path / "out").episodes == 2
+    assert len(open_source(demos, include_failed=True).numbers) == 3
+    capsys.readouterr()
+    assert run(["stats", str(demos), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["episodes"] == 3
+
+
+@pytest.mark.parametrize("rate", ["2.5", "3"])
+def test_invalid_rate_of_a_lerobot_dataset_is_wrong_usage(trajectory, tmp_path, capsys, rate):
+    pytest.importorskip("av", reason="needs the extra 'lerobot'")
+    out = tmp_path / "out"
+    assert run(["convert", str(trajectory), "--to", "lerobot", "--rate", rate, "--out", str(out)]) == 2
+    assert not out.exists()
 
 
 def tried(path, *rates):

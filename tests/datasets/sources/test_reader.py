@@ -31,7 +31,6 @@ def test_missing_key_of_data_info_is_an_error(tmp_path, key):
     [
         ("part_0/conversion.json", "part_0"),
         ("datasets/part_0/conversion.json", "datasets/part_0"),
-        ("trajectory.h5", "trajectory.h5"),
         ("meta/info.json", ""),
     ],
 )

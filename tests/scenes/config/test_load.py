@@ -39,7 +39,7 @@ def test_bundled_configurations_load_repeatedly(name):
         ("objects.count", "ten", ["'objects.count'", "a whole number", "'ten'"]),
         ("objects.count", 0, ["'objects.count'", "greater than or equal to 1", "0"]),
         ("robot.yaw_deg", "90", ["'robot.yaw_deg'", "a number", "'90'"]),
-        ("surface.furniture", "desk", ["surface.furniture", "['table']", "'desk'"]),
+        ("surface.furniture", "desk", ["surface.furniture", "expected one of table", "'desk'"]),
         ("surface.min_xy", [0.4, 0.0], ["min_xy", "max_xy"]),
         ("layout.kind", "stackd", ["'layout.kind'", "orderly, scattered, stacked", "Did you mean stacked?"]),
         ("randomisation", {"object_sets": []}, ["'randomisation.object_sets'", "at least 1 item", "[]"]),
