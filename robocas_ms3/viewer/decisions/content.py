@@ -21,7 +21,6 @@ from robocas_ms3.viewer.episode import round_values
 from robocas_ms3.viewer.episode_table import Row
 from robocas_ms3.viewer.images import EncodedImage, encode_jpeg
 
-_NO_IMAGES = "There are no images. Render them with `robocas render-candidates {name}`."
 _PIXEL_DECIMALS = 1
 _TARGET_FIELDS = ("obstacles", "free_grasps", "hidden_fraction")
 
@@ -42,7 +41,7 @@ class DecisionContent(Content):
             "kind": f"candidates of {(parse_task_name(env) or env).replace('_', ' ')}",
             "cameras": [name for name in images.cameras if CAMERA_NAME.fullmatch(name)] if images else [],
             "depth": bool(images and images.has_depth),
-            "note": "" if images else _NO_IMAGES.format(name=path.name),
+            "note": self.source.note,
             "decisions": True,
             "outcomes": {name: "#{:02x}{:02x}{:02x}".format(*COLOURS[name]) for name in OUTCOMES},
             "episodes": [asdict(self._make_row(row)) for row in range(len(self.source))],
@@ -80,14 +79,15 @@ class DecisionContent(Content):
 
     def _make_row(self, number: int) -> Row:
         file, rows = self.source.file, self.source.file.rows_of(number)
-        values = {name: file.decisions[name][number] for name in ("seed", "kind")}
+        values = {name: file.decisions[name][number] for name in ("seed", "kind", "in_episode")}
+        undone = "" if values["in_episode"] else ", undone attempt"
         counts = Counter(self.source.outcomes[rows].tolist())
         found = ", ".join(f"{counts[name]} {name}" for name in reversed(OUTCOMES) if counts[name])
         chosen = np.flatnonzero(file.candidates["chosen"][rows])
         return Row(
             number,
             steps=rows.stop - rows.start,
-            instruction=f"seed {values['seed']}: {found or 'no candidates'}",
+            instruction=f"seed {values['seed']}{undone}: {found or 'no candidates'}",
             task=str(values["kind"]),
             object=self.source.name_object(file.decision(number), int(file.decisions["target_slot"][number])),
             seed=int(values["seed"]),

@@ -80,18 +80,27 @@ class DecisionSource:
     Attributes:
         file: the candidates file.
         images: the images; None: there are none.
+        note: sentences for the top of the page about missing images.
         outcomes: outcome class (N,) of each candidate.
 
     Raises:
-        DatasetError: a file is damaged, or the images show other decisions.
+        DatasetError: the candidates file is damaged; or ``images`` is missing, damaged, or shows other decisions.
     """
 
     def __init__(self, path: Path, images: Path | None = None) -> None:
         self.file = CandidateFile(path)
         self.outcomes = classify_outcomes(self.file)
-        if images is None and images_path(self.file.path).is_file():
-            images = images_path(self.file.path)
-        self.images = CandidateImages(images, hash_decisions(self.file)) if images else None
+        self.images, self.note = None, ""
+        images_file = images or images_path(self.file.path)
+        if images is None and not images_file.is_file():
+            self.note = f"There are no images. Render them with `robocas render-candidates {self.file.path.name}`."
+            return
+        try:
+            self.images = CandidateImages(images_file, hash_decisions(self.file))
+        except DatasetError as error:
+            if images is not None:
+                raise
+            self.note = f"The images are not shown. `{images_file.name}`: {error.what}. {error.fix}"
 
     def __len__(self) -> int:
         return len(self.file)

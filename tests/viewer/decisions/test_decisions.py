@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import cv2
 import numpy as np
 import pytest
-from recorded_candidates import PER_DECISION
+from recorded_candidates import PER_DECISION, write_recorded_candidates
+from synthetic import write_trajectory
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.datasets.candidate_images.images_file import images_path
 from robocas_ms3.viewer.decisions.content import DecisionContent
 from robocas_ms3.viewer.decisions.decision_source import choose_view
 from robocas_ms3.viewer.decisions.outcomes import COLOURS
@@ -65,6 +68,17 @@ def test_without_images_there_is_a_plot_from_above(plain):
     assert all(view["candidates"])
     with pytest.raises(DatasetError):
         content.rgb(0, "base_camera", 0)
+
+
+def test_images_of_other_decisions_are_not_shown(file_with_images, tmp_path):
+    trajectory = write_trajectory(tmp_path / "trajectory.h5", seeds=(7,))
+    other = write_recorded_candidates(tmp_path / "candidates.h5", trajectory, steps=(0,))
+    images = shutil.copy(images_path(file_with_images), images_path(other))
+    index = open_content(other).index()
+    assert index["cameras"] == []
+    assert "render-candidates --overwrite" in index["note"]
+    with pytest.raises(DatasetError):
+        open_content(other, images=images)
 
 
 def test_images_of_a_decision(source):
