@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -97,16 +97,24 @@ class EpisodeGenerator:
             warn_cannot_fork(reason)
             self._fork = False
 
-    def generate(self, seed: int, folder: Path, name: str, intervention: Intervention | None = None) -> EpisodeResult:
+    def generate(
+        self,
+        seed: int,
+        folder: Path,
+        name: str,
+        intervention: Intervention | None = None,
+        horizon: int | None = None,
+    ) -> EpisodeResult:
         """Generate the episode of a seed, and write it if an attempt succeeds.
 
-        The episode depends only on the seed, the intervention, the settings and the package versions.
+        The episode depends only on the arguments, the settings and the package versions.
 
         Args:
             seed: seed of the episode.
             folder: folder of the files ``name.h5`` and ``name.json``, and of the candidates' file.
             name: name of the files without suffix.
             intervention: state in which another policy left the scene; the episode starts in this state.
+            horizon: maximum length of the episode in control steps; None: the horizon of the task.
         """
         recorder = EpisodeRecorder(self.env, folder, name)
         executor = MotionExecutor(recorder, seed, noise=self._make_noise())
@@ -114,6 +122,7 @@ class EpisodeGenerator:
         settings = CandidateSettings.from_episode_settings(self.settings)
         candidates = CandidateRecorder(settings, self.env, folder / candidates_file_name(name), result)
         attempts = _Attempts(self, recorder, executor, result, intervention, candidates)
+        attempts.horizon = min(horizon or self.horizon, self.horizon)
         executor.check_open_loop = attempts.check_open_loop
         try:
             if intervention is not None and intervention.skip_reason:
@@ -154,6 +163,7 @@ class _Attempts:
     result: EpisodeResult
     intervention: Intervention | None
     candidates: CandidateRecorder
+    horizon: int = field(init=False)  # maximum length of the episode, control steps
 
     def run_from_resets(self, decisions: ForkedDecisions | ResimulatedDecisions) -> None:
         """Run attempts with backtracking, each from the reset, until one succeeds or none is left."""
@@ -188,7 +198,7 @@ class _Attempts:
                 result.add_failure(error)
                 last = error
             try:
-                if not first < len(executor.actions) < self.generator.horizon or isinstance(last, UnrecoverableError):
+                if not first < len(executor.actions) < self.horizon or isinstance(last, UnrecoverableError):
                     raise last
                 recover(arm)
                 span = [first, len(executor.actions) - 1]
@@ -232,7 +242,7 @@ class _Attempts:
                 )
 
     def _finish(self, recoveries: list[dict[str, Any]]) -> None:
-        if len(self.executor.actions) > self.generator.horizon:
+        if len(self.executor.actions) > self.horizon:
             raise UnrecoverableError("episode", "too_long")
         if not self.executor.is_flag_set("success"):
             raise PlanningError("episode", "no_success")

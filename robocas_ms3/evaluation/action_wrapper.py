@@ -12,6 +12,7 @@ from mani_skill.utils.structs import Pose
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.demos.open_loop import draw_noise
 from robocas_ms3.evaluation.metrics import EpisodeMetrics
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec, TcpMotion
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
@@ -30,6 +31,7 @@ RAISED_HEIGHT = 0.03  # m above the initial height
 # The drive that holds the rotation, in acceleration units (1/s^2, 1/s): equally stiff for light and heavy objects.
 # Limits of zero width lock the translation; SAPIEN 3.0.3 does not enforce angular limits.
 _STIFFNESS, _DAMPING = 1e8, 1e5
+_NOISE_STREAM = 412  # random stream of the action noise
 
 
 class PolicyActionWrapper(gym.Wrapper):
@@ -43,10 +45,21 @@ class PolicyActionWrapper(gym.Wrapper):
             the gripper until its width is constant, at most 1 s, then the TCP until it arrives, at most 0.4 s. In a
             batch, each env waits until all envs have finished.
         weld: whether lifted objects are fixed to the hand (`Weld`); only for one env on the CPU.
+        action_noise: standard deviations of normal noise that is added to each component of each motion of the TCP, in
+            mm and degrees; None: no noise. The noise of an episode depends on its seed only.
     """
 
-    def __init__(self, env: gym.Env, spec: PolicySpec, stepping: Stepping, *, weld: bool = False) -> None:
+    def __init__(
+        self,
+        env: gym.Env,
+        spec: PolicySpec,
+        stepping: Stepping,
+        *,
+        weld: bool = False,
+        action_noise: tuple[float, float] | None = None,
+    ) -> None:
         super().__init__(env)
+        self._observes_simulation, self._noise = spec.simulation_state, action_noise
         self._convention, self._reference, self._stepping = CONVENTIONS[spec.convention], spec.reference, stepping
         self._base: Any = env.unwrapped
         count = self._base.num_envs
@@ -60,6 +73,7 @@ class PolicyActionWrapper(gym.Wrapper):
         self._open = np.ones(count, dtype=bool)  # whether the last command to each gripper was to open
         self._width_change = np.zeros(count)  # change of the gripper width in the last control step, m
         self._image_period, self._steps = spec.observe_every, np.zeros(count, dtype=np.int64)  # steps by env
+        self._rngs: list[np.random.Generator] = [np.random.default_rng()] * count  # of the noise, by env
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         if self._weld:
@@ -69,7 +83,9 @@ class PolicyActionWrapper(gym.Wrapper):
         self._metrics.reset(envs)
         rows = envs if isinstance(envs, slice) else np.asarray(torch.as_tensor(envs).cpu())
         self._open[rows], self._width_change[rows], self._steps[rows] = True, 0.0, 0
-        return obs, {**info, **self._compute_metrics(info)}
+        for env in np.arange(len(self._rngs))[rows]:
+            self._rngs[env] = np.random.default_rng([int(self._base._episode_seed[env]), _NOISE_STREAM])
+        return self._add_simulation_state(obs), {**info, **self._compute_metrics(info)}
 
     @property
     def is_gripper_commanded_open(self) -> bool:
@@ -98,14 +114,29 @@ class PolicyActionWrapper(gym.Wrapper):
         if self._weld and not self._open[0]:
             self._weld.weld_touched_object()
         self._metrics.end_step()
-        return (obs, *others, {**info, **self._compute_metrics(info)})
+        return (self._add_simulation_state(obs), *others, {**info, **self._compute_metrics(info)})
 
     def _execute(self, actions: np.ndarray) -> tuple:
         if self._convention.decode is None:
             self._open = actions[:, 7] > 0
             return self._step_control(actions)
         motion = self._convention.decode(actions)
+        if self._noise is not None:
+            motion = self._add_noise(motion, self._noise)
         return self._timed_step(motion) if self._stepping == "timed" else self._v0_step(motion)
+
+    def _add_noise(self, motion: TcpMotion, std: tuple[float, float]) -> TcpMotion:
+        noise = np.concatenate([draw_noise(rng, 1, *std) for rng in self._rngs])
+        angles = motion.rotation.as_euler("xyz") + noise[:, 3:6]
+        return TcpMotion(motion.translation + noise[:, :3], Rotation.from_euler("xyz", angles), motion.open)
+
+    def _add_simulation_state(self, obs: Any) -> Any:
+        """Add the entry ``simulation`` to an observation if the policy observes it (`policy.SimulationState`)."""
+        if not self._observes_simulation:
+            return obs
+        values = {kind: of for kind, of in self._base.get_state_dict().items() if kind != "controller"}
+        gripper = torch.from_numpy(np.where(self._open, 1.0, -1.0))
+        return {**obs, "simulation": {"values": values, "gripper": gripper}}
 
     def _compute_metrics(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
         return {**self._metrics.compute_info(), **(self._weld.compute_info(info) if self._weld else {})}
@@ -238,6 +269,15 @@ def check_weld_available(stepping: str, backend: str) -> None:
     if backend == "gpu":  # a running GPU batch accepts no new components
         what, fix = "the weld is not available on a GPU", "Pass --backend processes."
         raise EvaluationError(what, where="--weld", expected="backend processes", found=backend, fix=fix)
+
+
+def check_action_noise_available(spec: PolicySpec) -> None:
+    """Raise `EvaluationError` if no noise can be added to actions of a policy, because they are joint targets."""
+    if CONVENTIONS[spec.convention].decode is None:
+        what, fix = "action noise needs motions of the TCP", "Omit --action-noise, or choose another policy."
+        raise EvaluationError(
+            what, where="--action-noise", expected="another convention", found=spec.convention, fix=fix
+        )
 
 
 def choose_control_mode(convention: str) -> str:

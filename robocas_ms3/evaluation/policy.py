@@ -101,6 +101,7 @@ class PolicySpec:
         language: form of the instruction: ``text``, ``embedding`` (text and its sentence embedding) or ``none``.
         observe_every: number n of policy steps between rendered images: steps 0, n, 2 n, ... are rendered. The images
             of other steps are black, which saves rendering time. Chunk lengths must be multiples of n.
+        simulation_state: whether the policy observes the state of the simulation (`SimulationState`).
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")  # for specifications in messages and addresses
@@ -113,6 +114,7 @@ class PolicySpec:
     state: bool = False
     language: Language = "text"
     observe_every: int = 1
+    simulation_state: bool = False
 
     def __post_init__(self) -> None:
         wrong_cameras = [name for name in self.cameras if not re.fullmatch(CAMERA_NAME, name)]
@@ -142,6 +144,7 @@ class EpisodeSpec:
         seed: seed of the scene.
         instruction: text of the instruction; may be empty.
         robot: name of the robot.
+        max_steps: maximum number of policy steps of the episode; None: unknown.
     """
 
     env: int
@@ -153,6 +156,25 @@ class EpisodeSpec:
     seed: int
     instruction: str
     robot: str = DEFAULT_ROBOT
+    max_steps: int | None = None
+
+
+@dataclass(frozen=True)
+class SimulationState:
+    """State of the simulation of one env, from which another environment can continue the episode.
+
+    Attributes:
+        values: argument of ``set_state_dict``: positions and velocities of all bodies and the reached stages, arrays
+            (1, D); without targets of the controllers.
+        gripper: last gripper command, 1 open or -1 closed.
+        steps: policy steps since the reset.
+        succeeded: whether the task has succeeded at some step.
+    """
+
+    values: dict[str, dict[str, NDArray[Any]]]
+    gripper: float
+    steps: int
+    succeeded: bool
 
 
 @dataclass(frozen=True)
@@ -167,6 +189,7 @@ class Observations:
         depths: by camera name, (E, H, W, 1) int16 in mm, 0: no measurement; empty without depth.
         robot: by name in `ROBOT_QUANTITIES`, (E, D) float32. Each quantity is also an attribute, such as ``qpos``.
         state: (E, D) float32 privileged state; None unless the policy observes it.
+        simulation: state of the simulation of each env; None unless the policy observes it.
     """
 
     envs: NDArray[np.int64]
@@ -176,6 +199,7 @@ class Observations:
     depths: dict[str, NDArray[Any]]
     robot: dict[str, NDArray[np.float32]]
     state: NDArray[np.float32] | None
+    simulation: list[SimulationState] | None = None
 
     def __getattr__(self, name: str) -> NDArray[np.float32]:
         if name not in ROBOT_QUANTITIES:
@@ -256,9 +280,10 @@ class ExternalPolicy:
 
 
 def policy_spec_to_dict(spec: PolicySpec) -> dict[str, Any]:
-    """Return a specification as a dict of JSON values; ``observe_every`` is left out if it is 1."""
+    """Return a specification as a dict of JSON values, without ``observe_every`` 1 and ``simulation_state`` false."""
     values = {**vars(spec), "cameras": {name: list(size) for name, size in spec.cameras.items()}}
-    return {key: value for key, value in values.items() if key != "observe_every" or value != 1}
+    left_out = {"observe_every": 1, "simulation_state": False}
+    return {key: value for key, value in values.items() if key not in left_out or value != left_out[key]}
 
 
 def describe_policy(policy: Policy) -> dict[str, Any]:

@@ -15,9 +15,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
@@ -72,6 +72,7 @@ class RunRecord(BaseModel):
         protocol, protocol_hash: name and hash of the protocol.
         policy: name, specification and description of the policy.
         weld: whether lifted objects were fixed to the hand (--weld).
+        action_noise: standard deviations of the noise on actions, in mm and degrees (--action-noise); None: no noise.
         played_as: tasks that were evaluated in the episodes of another task (`LoadedProtocol.find_task_aliases`).
         backend: ``processes`` or ``gpu``.
         versions: package versions by name.
@@ -86,6 +87,7 @@ class RunRecord(BaseModel):
     protocol_hash: str
     policy: PolicyRecord
     weld: bool = False
+    action_noise: Annotated[tuple[float, float] | None, Field(strict=False)] = None
     played_as: dict[str, str] = {}
     backend: str
     versions: dict[str, str]
@@ -110,7 +112,7 @@ class RunRecord(BaseModel):
         policy = self.policy.model_dump(exclude_unset=True)
         if self.policy.server and self.policy.name.startswith(("ws://", "wss://")):
             del policy["name"]
-        names = ("protocol", "protocol_hash", "weld", "played_as", "backend", "versions", "pack_hashes")
+        names = ("protocol", "protocol_hash", "weld", "action_noise", "played_as", "backend", "versions", "pack_hashes")
         return {"policy": policy, **{name: getattr(self, name) for name in names}}
 
     def resume_settings(self) -> dict[str, Any]:

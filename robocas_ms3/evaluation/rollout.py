@@ -21,6 +21,7 @@ from robocas_ms3.evaluation.policy import (
     Observations,
     Policy,
     PolicySpec,
+    SimulationState,
     as_action_chunks,
     concatenate_privileged_state,
     forbid_policy_exit,
@@ -164,6 +165,7 @@ class EpisodeBatch:
             depths={name: cameras[name]["depth"][index] for name in spec.cameras} if spec.depth else {},
             robot={name: agent[quantity.name][index] for name, quantity in ROBOT_QUANTITIES.items()},
             state=concatenate_privileged_state(obs["extra"])[index] if spec.state else None,
+            simulation=[self._read_simulation_state(env) for env in envs] if spec.simulation_state else None,
         )
 
     def step(self, actions: NDArray[np.float32]) -> Iterator[Rollout]:
@@ -211,6 +213,15 @@ class EpisodeBatch:
             if env in self.running:
                 episode, name = self.running[env], self._flags[flag]
                 episode.flags[name], episode.flag_seconds[name] = episode.steps, round(self._elapsed_seconds(env), 4)
+
+    def _read_simulation_state(self, env: int) -> SimulationState:
+        found, episode = self.obs["simulation"], self.running[env]
+        values = {
+            kind: {name: rows[env : env + 1].copy() for name, rows in of.items()}
+            for kind, of in found["values"].items()
+        }
+        succeeded = episode.flags.get("success") is not None
+        return SimulationState(values, float(found["gripper"][env]), episode.steps, succeeded)
 
     def _elapsed_seconds(self, env: int) -> float:
         return float(self._info["elapsed_steps"][env]) * self._dt

@@ -23,6 +23,7 @@ from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.action_wrapper import (
     V0_CONTROL_HZ,
     PolicyActionWrapper,
+    check_action_noise_available,
     check_weld_available,
     make_env_kwargs,
 )
@@ -88,6 +89,8 @@ class EvaluationSession:
         backend = choose_backend(settings.backend)
         if settings.weld:
             check_weld_available(rules.stepping, backend)
+        if settings.action_noise is not None:
+            check_action_noise_available(self.spec)
         self.played_as = self.protocol.find_task_aliases(settings.tasks)
         self.episodes = self.protocol.select_episodes(settings)
         if self.spec.cameras:
@@ -144,6 +147,7 @@ class EvaluationSession:
             seed=episode.seed,
             instruction=episode.instruction,
             robot=self.protocol.rules.robot,
+            max_steps=self.max_steps(episode.task),
         )
 
     def run_episodes(self, episodes: Sequence[ProtocolEpisode], max_steps: int | None = None) -> Iterator[Outcome]:
@@ -314,7 +318,8 @@ class EvaluationSession:
 
     def _make_env(self, episode: ProtocolEpisode, num_envs: int) -> Any:
         rules, settings = self.protocol.rules, self.settings
-        stepping = partial(PolicyActionWrapper, spec=self.spec, stepping=rules.stepping, weld=settings.weld)
+        changes = {"weld": settings.weld, "action_noise": settings.action_noise}
+        stepping = partial(PolicyActionWrapper, spec=self.spec, stepping=rules.stepping, **changes)
         render: dict[str, Any] = {}
         if settings.render_size is not None:
             width, height = settings.render_size
@@ -354,6 +359,7 @@ class EvaluationSession:
             "protocol_hash": self.protocol.hash,
             "policy": {"name": name} | describe_policy(self.policy) | {"name": name},  # a description may not rename it
             "weld": self.settings.weld,
+            **({} if self.settings.action_noise is None else {"action_noise": self.settings.action_noise}),
             **({"played_as": self.played_as} if self.played_as else {}),
             "backend": backend,
             "versions": results.get_package_versions(),

@@ -87,6 +87,41 @@ def test_joint_targets_are_executed_unchanged():
     np.testing.assert_allclose(base.agent.robot.get_qpos()[0, 3:10].numpy(), wanted, atol=0.01)
 
 
+def test_action_noise_depends_on_the_seed_only_and_has_the_given_size():
+    def moved(seed: int, noise: tuple[float, float] | None) -> np.ndarray:
+        env = PolicyActionWrapper(pick("robocas", 5), PolicySpec("robocas", "target"), "timed", action_noise=noise)
+        env.reset(seed=seed)
+        before = tcp(env)
+        for _ in range(40):
+            env.step(along(0.0))
+        return tcp(env) - before
+
+    assert np.linalg.norm(moved(3, (0.0, 0.0))) < 1e-4
+    first, again, other = moved(3, (2.0, 0.0)), moved(3, (2.0, 0.0)), moved(4, (2.0, 0.0))
+    assert np.array_equal(first, again) and not np.allclose(first, other, atol=1e-3)
+    # 40 motions with 2 mm per component add up to 2 mm * sqrt(40) = 12.6 mm per component
+    assert 0.004 < np.linalg.norm([first, other]) / np.sqrt(6) < 0.035
+
+
+def test_simulation_state_continues_in_another_env():
+    env = PolicyActionWrapper(pick("robocas", 5), PolicySpec("robocas", "tcp", simulation_state=True), "timed")
+    env.reset(seed=3)
+    for _ in range(3):
+        obs, *_ = env.step(along(0.02, gripper=0.0))
+    assert obs["simulation"]["gripper"].tolist() == [-1.0]
+    values, base = obs["simulation"]["values"], env.unwrapped
+    stages = values["task"]["stages"].clone()
+    stages[0, 0] = True
+    wanted = {kind: {name: rows.clone() for name, rows in of.items()} for kind, of in values.items()}
+    env.reset(seed=3)
+    base.set_state_dict({**wanted, "task": {"stages": stages}})
+    found = base.get_state_dict()
+    for kind in ("actors", "articulations"):
+        for name, rows in wanted[kind].items():
+            np.testing.assert_allclose(found[kind][name], rows, atol=1e-5)
+    assert found["task"]["stages"].tolist() == stages.tolist()
+
+
 def test_v0_step_waits_for_gripper_and_motion():
     env = made(stepping="upstream")
     base: Any = env.unwrapped

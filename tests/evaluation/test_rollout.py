@@ -9,6 +9,7 @@ from counting_env import CountingEnv, run_policy
 from robocas_ms3.core.errors import EvaluationError, PolicyError
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, run_rollouts
 
 
 class CountingPolicy:
@@ -91,6 +92,35 @@ def test_policy_error_or_nan_action_ends_only_its_episode(fails):
     assert [(one.error, one.steps) for one in ended] == [("", 3), (error, 0), ("", 5)]
     outcome = ended[1].make_outcome(load_protocol("smoke").episodes[0], ())
     assert (outcome.success, outcome.failure_stage, outcome.error) == (False, "error", error)
+
+
+class SimulationEnv(CountingEnv):
+    """Envs whose observations have a state of the simulation: the elapsed steps, and the number of the env."""
+
+    def _observation(self):
+        envs = np.arange(self.num_envs)
+        values = {"actors": {"apple": np.stack([self.elapsed, envs], axis=1)}}
+        return {**super()._observation(), "simulation": {"values": values, "gripper": 1.0 - 2.0 * envs}}
+
+
+def test_each_env_observes_its_own_simulation_state():
+    """Env 0 counts to 3, env 1 to 1, after which it has succeeded but continues."""
+    env, seen = SimulationEnv(2, None), []
+
+    class Watching(CountingPolicy):
+        spec = PolicySpec(state=True, simulation_state=True)
+
+        def act(self, observations: Observations) -> np.ndarray:
+            seen.append(dict(zip(observations.envs.tolist(), observations.simulation, strict=True)))
+            return super().act(observations)
+
+    batch = EpisodeBatch(env, Watching.spec, EndConditions(3, ends_on=()), 0.05, refill=True)
+    list(run_rollouts(batch, Watching(), starts(1, 3)))
+    last = seen[2]
+    assert [last[env].values["actors"]["apple"].tolist() for env in (0, 1)] == [[[2, 0]], [[2, 1]]]
+    assert [last[env].gripper for env in (0, 1)] == [1, -1]
+    assert [last[env].steps for env in (0, 1)] == [2, 2]
+    assert sorted(last[env].succeeded for env in (0, 1)) == [False, True]
 
 
 def test_actions_of_another_shape_are_refused():

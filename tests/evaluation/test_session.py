@@ -128,6 +128,7 @@ def no_renderer() -> None:
         ({}, PolicySpec(cameras={"side_camera": (8, 8)}), "unknown camera"),
         ({}, PolicySpec(cameras={"base_camera": (8, 8)}), "no render device"),
         ({"backend": "threads"}, AT_5_HZ, "no such backend"),
+        ({"action_noise": (0.5, 0.2)}, PolicySpec("joint_positions"), "action noise needs motions of the TCP"),
         ({"weld": True}, AT_5_HZ, "the weld needs a protocol with RoboCAS-v0's steps"),
         (
             {"protocol": "paper-v1", "weld": True, "backend": "gpu"},

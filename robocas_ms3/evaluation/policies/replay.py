@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.demos.recordings.environment import read_recorded_env
-from robocas_ms3.demos.recordings.motion import Motion, sample_states
+from robocas_ms3.demos.recordings.motion import Motion
 from robocas_ms3.demos.recordings.trajectory_hdf5 import open_episode, open_trajectory, read_actions
 from robocas_ms3.demos.recordings.trajectory_json import is_intervention, read_json, read_reset
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
@@ -50,8 +49,7 @@ class PoseTrack:
     """Sequence of TCP poses for one episode, one per policy step; an action moves from the present to the next pose.
 
     Attributes:
-        poses: (S, 4, 4) in the frame of the arm's base. After the last pose, the last pose is held. With S = 0 the arm
-            does not move and the gripper is open.
+        poses: (S, 4, 4) in the frame of the arm's base. After the last pose, the last pose is held.
         open: (S,) bool gripper commands, True: open.
         step: index of the next pose.
     """
@@ -61,26 +59,24 @@ class PoseTrack:
     step: int = 0
 
     @classmethod
-    def from_recording(cls, robot: RobotSpec, robot_states: Array, gripper_commands: Array, stride: int) -> PoseTrack:
-        """Return the TCP poses of a recording, one pose per ``stride`` control steps.
+    def from_recording(
+        cls, robot: RobotSpec, robot_states: Array, gripper_commands: Array, samples: NDArray[np.int64]
+    ) -> PoseTrack:
+        """Return the TCP poses of a recording in some of its states.
 
         Args:
             robot: specification of the recorded robot.
             robot_states: (S + 1, 37) ManiSkill states of the robot after the reset and after each of S control steps.
             gripper_commands: (S,) gripper commands, -1 closed to 1 open.
-            stride: control steps per pose.
+            samples: (T + 1,) indices of states in ascending order; the first is the present state.
         """
-        if not len(gripper_commands):
-            return cls(np.zeros((0, 4, 4)), np.zeros(0, dtype=bool))
-        motion = Motion.from_states(robot, robot_states, gripper_commands, sample_states(len(gripper_commands), stride))
+        motion = Motion.from_states(robot, robot_states, gripper_commands, samples)
         return cls(motion.tcp_in_base[1:], motion.gripper_open[1:])
 
     def next_action(self, observations: Observations, row: int) -> Array:
         """Return the next action (7,), in the convention ``robocas``; ``row``: row of the env."""
         index = min(self.step, len(self.poses) - 1)
         self.step += 1
-        if index < 0:
-            return np.array([0, 0, 0, 0, 0, 0, 1.0])
         tcp = observations.tcp_in_base[row].astype(np.float64)
         turn = Rotation.from_quat(tcp[[4, 5, 6, 3]]).inv()
         motion = turn.apply(self.poses[index, :3, 3] - tcp[:3])
@@ -88,26 +84,7 @@ class PoseTrack:
         return np.array([*motion, *angles, float(self.open[index])])
 
 
-class TrackPolicy(ABC):
-    """Base class of policies that compute a track of targets per episode and then follow it."""
-
-    def __init__(self) -> None:
-        self._tracks: dict[int, JointTrack | PoseTrack] = {}  # by env
-
-    @abstractmethod
-    def make_track(self, episode: EpisodeSpec) -> JointTrack | PoseTrack:
-        """Compute the track of targets for an episode that starts."""
-
-    def reset(self, episodes: list[EpisodeSpec]) -> None:
-        self._tracks |= {episode.env: self.make_track(episode) for episode in episodes}
-
-    def act(self, observations: Observations) -> Array:
-        """Return the next action (A,) of each env, (E, A)."""
-        envs = observations.envs.tolist()
-        return np.stack([self._tracks[env].next_action(observations, row) for row, env in enumerate(envs)])
-
-
-class ReplayPolicy(TrackPolicy):
+class ReplayPolicy:
     """Policy that replays recorded joint targets, at the control rate of the recording.
 
     An episode replays the recording with the same seed. If there is none, the arm does not move.
@@ -117,7 +94,7 @@ class ReplayPolicy(TrackPolicy):
     """
 
     def __init__(self, trajectory: Path) -> None:
-        super().__init__()
+        self._tracks: dict[int, JointTrack] = {}  # by env
         self._trajectory = trajectory = trajectory.absolute()
         data = read_json(trajectory)
         env = read_recorded_env(data["env_info"], trajectory.with_suffix(".json"))
@@ -139,7 +116,16 @@ class ReplayPolicy(TrackPolicy):
     def describe(self) -> dict[str, Any]:
         return {"trajectory": self._trajectory.name, "episodes": len(self._episodes)}
 
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
+        self._tracks |= {episode.env: self.make_track(episode) for episode in episodes}
+
+    def act(self, observations: Observations) -> Array:
+        """Return the next action (8,) of each env, (E, 8)."""
+        envs = observations.envs.tolist()
+        return np.stack([self._tracks[env].next_action(observations, row) for row, env in enumerate(envs)])
+
     def make_track(self, episode: EpisodeSpec) -> JointTrack:
+        """Return the recorded targets for an episode."""
         if episode.seed not in self._episodes:
             return JointTrack(np.zeros((0, 8)))
         number = self._episodes[episode.seed]

@@ -1,8 +1,11 @@
-"""Scripted policy of the demonstrations, as a policy for evaluations."""
+"""Scripted policy of the demonstrations, as a policy for evaluations: it observes, plans, and plans again."""
 
 from __future__ import annotations
 
+import logging
+import math
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -10,62 +13,170 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.demos.failures import Intervention
 from robocas_ms3.demos.generator import EpisodeGenerator
-from robocas_ms3.demos.recordings.motion import sample_stride
 from robocas_ms3.demos.recordings.trajectory_hdf5 import open_episode, open_trajectory, read_steps
 from robocas_ms3.demos.settings import EpisodeSettings
-from robocas_ms3.evaluation.policies.replay import JointTrack, PoseTrack, TrackPolicy
-from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec
-from robocas_ms3.robots.registry import find_robot
+from robocas_ms3.evaluation.policies.planned_scene import PlannedScene, SceneState, measure_speeds
+from robocas_ms3.evaluation.policies.replay import JointTrack, PoseTrack
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec, SimulationState
+from robocas_ms3.robots.description import RobotDescription
+from robocas_ms3.robots.registry import RobotSpec, find_robot
 from robocas_ms3.scenes.task_specs import TASKS
 
 OFFSETS = (0.01, 0.05)  # smallest and largest offset in m: a finger lands on the target or on a neighbouring object
+MAX_PLANS = 6  # plans per episode
+MAX_HURRY = 2.5  # largest ratio of the speed of the policy to the speed of the plan
+MIN_STEPS = 15  # policy steps below which no plan helps
+WAIT_SECONDS = 1.0  # s to wait for bodies to come to rest, and for success after the end of a plan
+RETRY_SECONDS = 2.0  # s to wait after a failed plan
+_END_STEPS = 6  # policy steps that a plan should leave at the end of the episode
+_REST = 0.05  # m/s below which a body is at rest
 _FREQ = 20  # Hz, control rate of the plans
 _MAX_GENERATORS = 4  # maximum number of open environments
 _OFFSET_STREAM = 411  # random stream of the offset
+_log = logging.getLogger(__name__)
 
 
-class ScriptedPolicy(TrackPolicy):
-    """Policy that plans a whole episode from privileged state, and then executes the plan open loop.
+@dataclass(frozen=True)
+class _Plan:
+    """A planned episode.
 
-    The scripted policy of `robocas generate` makes the plan in a separate environment. If it finds no successful plan,
-    the arm does not move. The base of the robot never moves.
+    Attributes:
+        track: targets, one per policy step.
+        scene: expected scene.
+        samples: (T + 1,) states of the plan before each of T policy steps and after the last.
+    """
+
+    track: JointTrack | PoseTrack
+    scene: PlannedScene
+    samples: NDArray[np.int64]
+
+    @property
+    def is_over(self) -> bool:
+        return self.track.step >= len(self.samples) - 1
+
+    def find_deviations(self, robot: RobotSpec, state: SimulationState) -> list[int] | None:
+        """Return the deviating bodies; None: none, an empty list: the arm or the gripper command deviates."""
+        now, step = SceneState.from_states(robot, state.values), min(self.track.step, len(self.samples) - 1)
+        index = int(self.samples[step])
+        window = max(_FREQ // 5, int(np.diff(self.samples).max()))
+        if (step > 0 and self.scene.closed[index] == (state.gripper > 0)) or self.scene.is_tcp_away(now, index, window):
+            return []
+        return self.scene.find_deviations(now, index, window) or None
+
+
+@dataclass
+class _Run:
+    """Running episode of an env.
+
+    Attributes:
+        plan: present plan; None before the first plan and after a failed one.
+        plans: number of plans, also of failed ones.
+        waited: policy steps for which the policy has waited to plan again.
+    """
+
+    episode: EpisodeSpec
+    plan: _Plan | None = None
+    plans: int = 0
+    waited: int = 0
+
+
+class ScriptedPolicy:
+    """Policy that plans from privileged state, follows the plan closed loop, and plans again when the scene deviates.
+
+    The scripted policy of `robocas generate` makes the plan in a separate environment. The first plan of an episode
+    starts at the reset. A later plan starts from the present state like an expert intervention (`demos.interventions`).
+    The policy plans again when the scene is not as the plan expects it (`PlannedScene`), when the plan has ended
+    without success, and some time after a failed plan. Without a plan the arm does not move. If a plan has more steps
+    than the episode has left, the policy moves faster than the plan. The base of the robot never moves.
 
     Args:
         convention: ``joint_positions``: joint targets at 20 Hz; ``robocas``: 7-D actions at 5 Hz, relative to the TCP.
         perturbed: whether to shift all TCP poses of an episode by one horizontal offset (`sample_offset`), like a
-            policy that misjudges positions; only with the convention ``robocas``.
+            policy that misjudges positions, and never to plan again; only with the convention ``robocas``.
     """
 
     def __init__(
         self, convention: Literal["joint_positions", "robocas"] = "joint_positions", *, perturbed: bool = False
     ) -> None:
-        super().__init__()
-        self._perturbed = perturbed
-        rate = _FREQ if convention == "joint_positions" else 5
-        self.spec = PolicySpec(convention, reference="tcp", rate_hz=rate, language="none")
+        self._perturbed, self._rate = perturbed, _FREQ if convention == "joint_positions" else 5
+        self.spec = PolicySpec(convention, reference="tcp", rate_hz=self._rate, language="none", simulation_state=True)
+        self._runs: dict[int, _Run] = {}  # by env
         self._generators: dict[EpisodeSettings, EpisodeGenerator] = {}  # most recently used last
 
-    def make_track(self, episode: EpisodeSpec) -> JointTrack | PoseTrack:
-        """Plan an episode with the scripted policy and return the planned targets; takes several seconds."""
-        actions, states = np.zeros((0, 8)), np.zeros((1, 37))
-        generator = self._open_generator(episode)
-        with tempfile.TemporaryDirectory() as folder:
-            if generator.generate(episode.seed, Path(folder), "episode").success:
-                with open_trajectory(Path(folder) / "episode.h5") as file:
-                    actions, found = read_steps(open_episode(file, 0), body=episode.robot)
-                actions, states = actions[:, :8], found["articulations"][episode.robot]
-        if self.spec.convention == "joint_positions":
-            return JointTrack(actions)
-        track = PoseTrack.from_recording(find_robot(episode.robot), states, actions[:, 7], sample_stride(_FREQ, 5))
-        if self._perturbed:
-            track.poses[:, :2, 3] += sample_offset(episode.seed)
-        return track
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
+        for episode in episodes:
+            self._open_generator(episode)
+        self._runs |= {episode.env: _Run(episode) for episode in episodes}
+
+    def act(self, observations: Observations) -> NDArray[np.floating]:
+        """Return the next action (A,) of each env, (E, A); planning takes several seconds."""
+        return np.stack([self._act(observations, row) for row in range(len(observations.envs))])
 
     def close(self) -> None:
         """Close the environments in which the episodes were planned."""
         for generator in self._generators.values():
             generator.close()
+
+    def _act(self, observations: Observations, row: int) -> NDArray[np.floating]:
+        assert observations.simulation is not None
+        run, state = self._runs[int(observations.envs[row])], observations.simulation[row]
+        decision = self._decide(run, state)
+        if decision == "plan":
+            run.plans, run.waited = run.plans + 1, 0
+            run.plan = self._make_plan(run, state) or run.plan
+        if decision == "wait" or run.plan is None:
+            return self._hold(observations, row, state.gripper)
+        return run.plan.track.next_action(observations, row)
+
+    def _decide(self, run: _Run, state: SimulationState) -> Literal["follow", "wait", "plan"]:
+        """Return whether to follow the plan, to wait until the scene is at rest, or to plan again."""
+        left = math.inf if run.episode.max_steps is None else run.episode.max_steps - state.steps
+        if run.plans == 0:
+            return "plan"
+        if self._perturbed or state.succeeded or run.plans == MAX_PLANS or left < MIN_STEPS:
+            return "follow"
+        run.waited += 1
+        if run.plan is None or run.plan.is_over:
+            return "plan" if run.waited > WAIT_SECONDS * self._rate else "follow"
+        deviations = run.plan.find_deviations(find_robot(run.episode.robot), state)
+        if deviations is None:
+            run.waited = 0
+            return "follow"
+        moving = [body for body in deviations if measure_speeds(state.values)[body : body + 1].max(initial=0.0) > _REST]
+        return "wait" if moving and run.waited <= WAIT_SECONDS * self._rate else "plan"
+
+    def _hold(self, observations: Observations, row: int, gripper: float) -> NDArray[np.floating]:
+        """Return the action (A,) that moves nothing."""
+        if self.spec.convention == "joint_positions":
+            return np.append(observations.qpos[row, RobotDescription.arm_slice], gripper)
+        return np.append(np.zeros(6), float(gripper > 0))
+
+    def _make_plan(self, run: _Run, state: SimulationState) -> _Plan | None:
+        """Plan from the reset, or from the present state; return None if there is no plan."""
+        episode, stride = run.episode, _FREQ // self._rate
+        left = None if episode.max_steps is None else max(MIN_STEPS, episode.max_steps - state.steps - _END_STEPS)
+        horizon = None if left is None else round(left * stride * MAX_HURRY)
+        after = (
+            Intervention(episode.seed, "scripted", state.steps, state.values, state.gripper) if state.steps else None
+        )
+        with tempfile.TemporaryDirectory() as folder:
+            generator = self._open_generator(episode)
+            result = generator.generate(episode.seed, Path(folder), "episode", after, horizon)
+            if not result.success:
+                return None
+            with open_trajectory(Path(folder) / "episode.h5") as file:
+                actions, states = read_steps(open_episode(file, 0))
+        robot, gripper = find_robot(episode.robot), actions[:, 7]
+        samples = sample_plan(gripper, stride, left)
+        scene = PlannedScene(SceneState.from_states(robot, states), np.append(state.gripper, gripper) < 0)
+        if self.spec.convention == "joint_positions":
+            return _Plan(JointTrack(actions[samples[1:] - 1, :8]), scene, samples)
+        track = PoseTrack.from_recording(robot, states["articulations"][robot.description.uid], gripper, samples)
+        if self._perturbed:
+            track.poses[:, :2, 3] += sample_offset(episode.seed)
+        return _Plan(track, scene, samples)
 
     def _open_generator(self, episode: EpisodeSpec) -> EpisodeGenerator:
         """Return the generator for the configuration of an episode; open it if needed.
@@ -96,6 +207,24 @@ class ScriptedPolicy(TrackPolicy):
         if len(self._generators) > _MAX_GENERATORS:
             self._generators.pop(next(iter(self._generators))).close()
         return generator
+
+
+def sample_plan(gripper: NDArray[np.floating], stride: int, max_steps: int | None) -> NDArray[np.int64]:
+    """Return the states (T + 1,) of a plan before and after each of T policy steps, in ascending order.
+
+    They are evenly spaced, with the last states before a change of the gripper command in addition: the arm must have
+    arrived before the gripper closes.
+
+    Args:
+        gripper: (S,) gripper commands of the plan.
+        stride: control steps of the plan per policy step.
+        max_steps: number of policy steps that should suffice; the policy then moves up to `MAX_HURRY` times faster.
+    """
+    steps, changes = len(gripper), np.flatnonzero(np.diff(gripper)) + 1
+    count = math.ceil(steps / stride)
+    if max_steps is not None:
+        count = min(count, max(max_steps - len(changes), math.ceil(count / MAX_HURRY)))
+    return np.union1d(np.linspace(0, steps, count + 1).round().astype(np.int64), changes)
 
 
 def sample_offset(seed: int) -> NDArray[np.floating]:

@@ -31,6 +31,7 @@ from robocas_ms3.evaluation.remote.messages import (
     LARGEST_BATCH,
     PREFIX,
     ServerMetadata,
+    check_observations_can_be_sent,
     make_observation_message,
     parse_actions,
     parse_batch,
@@ -281,16 +282,20 @@ class RemotePolicy:
         """Return the specification of the policy: from the server, else from the address, else the default.
 
         Raises:
-            EvaluationError: both the server and the address have one.
+            EvaluationError: both the server and the address have one, or the policy observes the state of the
+                simulation.
         """
         url, given = self._address.url, self._address.spec
         if metadata.spec is None:
+            check_observations_can_be_sent(given or PolicySpec(), url)
             return given or PolicySpec()
         if given is not None:
             what = "both the server and the address specify the policy"
             fix = "Remove the options of the address that are fields of PolicySpec, such as cameras."
             raise EvaluationError(what, where=url, fix=fix)
-        return parse_policy_spec(metadata.spec, url)
+        spec = parse_policy_spec(metadata.spec, url)
+        check_observations_can_be_sent(spec, url)
+        return spec
 
 
 def _actions_or_error(answer: dict[str, Any]) -> Any:

@@ -74,6 +74,7 @@ class _EpisodeFields(BaseModel):
     seed: _Number = 0
     instruction: _Text | None = None
     robot: _Text = DEFAULT_ROBOT
+    max_steps: _Number | None = None
 
 
 class Request(BaseModel):
@@ -129,6 +130,14 @@ def parse_policy_spec(message: Any, where: object) -> PolicySpec:
         raise EvaluationError(what, where=where, found=one_line(error, 200)) from error
 
 
+def check_observations_can_be_sent(spec: PolicySpec, where: object) -> None:
+    """Raise `EvaluationError` if a policy observes the state of the simulation, which no message contains."""
+    if spec.simulation_state:
+        what = "a policy that observes the state of the simulation cannot run behind a policy server"
+        fix = "Pass its name to robocas eval --policy."
+        raise EvaluationError(what, where=where, expected="simulation_state=False", fix=fix, usage=True)
+
+
 def make_observation_message(
     observations: Observations, row: int, start: EpisodeSpec | None, *, reset: bool
 ) -> dict[str, Any]:
@@ -151,8 +160,8 @@ def make_observation_message(
     if start is not None:
         values = {name: value for name, value in vars(start).items() if name != "env"}
         values |= {name: message_file_name(values[name]) for name in ("config_file", "layouts_file")}
-        if start.robot == DEFAULT_ROBOT:  # the default robot is left out
-            del values["robot"]
+        defaults = {"robot": DEFAULT_ROBOT, "max_steps": None}  # left out
+        values = {name: value for name, value in values.items() if name not in defaults or value != defaults[name]}
         message[START] = values
     return message
 

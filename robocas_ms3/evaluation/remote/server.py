@@ -31,6 +31,7 @@ from robocas_ms3.evaluation.policy import (
     as_action_chunks,
     describe_policy,
     forbid_policy_exit,
+    get_class_name,
     policy_spec_to_dict,
 )
 from robocas_ms3.evaluation.remote import connection
@@ -43,6 +44,7 @@ from robocas_ms3.evaluation.remote.messages import (
     FILE_NAME_PARTS,
     RESET,
     ServerMetadata,
+    check_observations_can_be_sent,
     max_envs_per_request,
     parse_batch,
     parse_observations,
@@ -114,6 +116,9 @@ class PolicyServer:
         port: port to listen on; 0: a free port.
         files: files and packs that clients may select; None: those of the bundled protocols.
         max_batch: maximum number of envs per request; reduced if the images would exceed the limit of a message.
+
+    Raises:
+        EvaluationError: the policy observes the state of the simulation.
     """
 
     def __init__(
@@ -127,6 +132,7 @@ class PolicyServer:
         self._host, self._port = strip_brackets(host), port
         with forbid_policy_exit(policy):
             spec = policy.spec
+        check_observations_can_be_sent(spec, f"policy {get_class_name(policy)}")
         max_batch = max_envs_per_request(spec, max_batch)
         self._max_bytes = request_size_limit(spec, max_batch)
         metadata = ServerMetadata(

@@ -9,6 +9,7 @@ from itertools import combinations
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.text import escape_markdown, format_count
 from robocas_ms3.evaluation.protocol import LoadedProtocol
+from robocas_ms3.evaluation.report.tables import describe_action_noise, name_measurement
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import Comparison, adjust_p_values, compare_successes, make_power_warning
 
@@ -35,7 +36,8 @@ def compare_results(results: Sequence[Result]) -> str:
     """Compare two or more results over their common episodes; return a Markdown table.
 
     Raises:
-        EvaluationError: the results have different protocols, only some have the weld, or no episode is in all results.
+        EvaluationError: the results have different protocols or different action noise, only some have the weld, or no
+            episode is in all results.
     """
     first = results[0]
     for other in results[1:]:
@@ -51,12 +53,16 @@ def compare_results(results: Sequence[Result]) -> str:
                 where=welded,
                 fix="Evaluate all policies with the same weld setting.",
             )
+        if first.run.action_noise != other.run.action_noise:
+            expected, found = (describe_action_noise(run.run) or "no action noise" for run in (first, other))
+            what, fix = "cannot compare results with different action noise", "Use the same --action-noise."
+            raise EvaluationError(what, where=other.folder, expected=expected, found=found, fix=fix)
     shared = sorted(set.intersection(*(set(result.outcomes) for result in results)))
     if not shared:
         what, fix = "the results have no common episodes", "Compare results of the same episodes, or of all episodes."
         raise EvaluationError(what, where=results[-1].folder, fix=fix)
     names = [chr(ord("A") + number) for number in range(len(results))]
-    measured = first.run.protocol + (" with RoboCAS-v0's weld" if first.run.weld else "")
+    measured = name_measurement(first.run)
     runs = [f"{name}: {_name_policy(one, results)} ({one.folder})" for name, one in zip(names, results, strict=True)]
     both = "both" if len(results) == 2 else "all"
     head = escape_markdown(

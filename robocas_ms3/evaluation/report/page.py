@@ -22,6 +22,7 @@ from robocas_ms3.evaluation.report.tables import (
     FailureCount,
     Table,
     count_episodes,
+    describe_action_noise,
     get_failure_name,
     get_stage_names,
     list_notes,
@@ -159,6 +160,7 @@ def _render_settings(result: Result, protocol: LoadedProtocol | None) -> str:
     entries = policy.model_dump(exclude_unset=True, exclude={"name"})
     pairs += [("policy", policy.name), *((f"policy, {name}", _to_text(value)) for name, value in entries.items())]
     pairs += [("RoboCAS-v0's weld", "yes" if run.weld else "no")]
+    pairs += [("action noise", describe_action_noise(run) or "none")]
     pairs += [("played_as", _to_text(run.played_as))] if run.played_as else []
     pairs += [("backend", run.backend)]
     pairs += [

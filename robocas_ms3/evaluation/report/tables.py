@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from robocas_ms3.core.text import escape_markdown, format_count
 from robocas_ms3.evaluation.outcomes import PAPER_STAGES, Outcome
 from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.results import Result, RunRecord
 from robocas_ms3.evaluation.statistics import SuccessRate, bin_success_rates
 from robocas_ms3.scenes.task_specs import STAGES as DEFAULT_STAGES
 from robocas_ms3.scenes.task_specs import TASKS
@@ -19,6 +19,7 @@ WELD_NOTE = (
     "With RoboCAS-v0's weld: a lifted object was fixed to the hand until the gripper was commanded to open. "
     "Do not compare with results without the weld."
 )
+NOISE_NOTE = "Measured with {}. Do not compare with results without this noise."
 PAPER_NOTE = (
     "Comparison with the RoboCAS paper: the object meshes are replacements made by this project, success is stricter "
     "than the paper's rule, and a policy trained on pick_upstream_eval or search_upstream_eval is evaluated in its "
@@ -121,19 +122,30 @@ def count_episodes(result: Result, protocol: LoadedProtocol | None) -> str:
 
 
 def make_title(result: Result) -> str:
-    """Return the title of the report: names of policy and protocol, and the weld."""
-    weld = " with RoboCAS-v0's weld" if result.run.weld else ""
-    return f"{result.run.policy.name} on {result.run.protocol}{weld}"
+    """Return the title of the report: names of policy and protocol, weld and action noise."""
+    return f"{result.run.policy.name} on {name_measurement(result.run)}"
+
+
+def name_measurement(run: RunRecord) -> str:
+    """Return the name of the protocol with the deviations from it: weld and action noise."""
+    changes = [*(["RoboCAS-v0's weld"] if run.weld else []), *filter(None, [describe_action_noise(run)])]
+    return f"{run.protocol} with {' and '.join(changes)}" if changes else run.protocol
+
+
+def describe_action_noise(run: RunRecord) -> str:
+    """Return the action noise, such as ``action noise of 0.5 mm and 0.2 degrees``; empty without noise."""
+    return "action noise of {:g} mm and {:g} degrees".format(*run.action_noise) if run.action_noise else ""
 
 
 def list_notes(result: Result) -> list[str]:
-    """Return the notes under the title of a report: weld, task aliases, and differences from the paper."""
+    """Return the notes under the title of a report: weld, noise, task aliases, and differences from the paper."""
     played_as = [
         f"{task} was evaluated in the episodes of {other}, as RoboCAS-v0's evaluator does."
         for task, other in result.run.played_as.items()
     ]
     paper = [PAPER_NOTE] if result.run.protocol.startswith("paper-") else []
-    return [*([WELD_NOTE] if result.run.weld else []), *played_as, *paper]
+    noise = [NOISE_NOTE.format(describe_action_noise(result.run))] if result.run.action_noise else []
+    return [*([WELD_NOTE] if result.run.weld else []), *noise, *played_as, *paper]
 
 
 def get_stage_names(task: str) -> dict[str, str]:

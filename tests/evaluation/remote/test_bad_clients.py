@@ -18,7 +18,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.remote.messages import make_observation_message, message_file_name
-from robocas_ms3.evaluation.remote.server import ServedFiles
+from robocas_ms3.evaluation.remote.server import PolicyServer, ServedFiles
 from robocas_ms3.evaluation.remote.wire import encode_message
 
 GARBAGE, TOO_LARGE = 1008, 1009
@@ -114,6 +114,12 @@ def test_policy_error_is_one_line_for_the_client_and_other_clients_are_served(er
         assert isinstance(answer, str) and len(answer) < 1000
         assert answer.isprintable() and code
         assert isinstance(ask(url, message())[0], str)
+
+
+def test_policies_that_observe_the_simulation_state_are_not_served():
+    policy = RecordingPolicy(PolicySpec(simulation_state=True))
+    with pytest.raises(EvaluationError, match="cannot run behind a policy server"):
+        PolicyServer(policy)
 
 
 def test_message_limit_depends_on_the_images_of_the_policy():

@@ -92,6 +92,17 @@ def test_results_that_cannot_be_compared_are_refused(tmp_path):
             compare_results(pair)
 
 
+def test_action_noise_is_named_and_never_compared_with_other_noise(tmp_path):
+    plain, weak, strong = (
+        write(tmp_path / name, [outcome(0)], **noise)
+        for name, noise in (("a", {}), ("b", {"action_noise": [0.5, 0.2]}), ("c", {"action_noise": [1.0, 0.2]}))
+    )
+    assert "made_up with action noise of 0.5 mm and 0.2 degrees in both results" in compare_results([weak, weak])
+    for pair in ([plain, weak], [weak, plain], [weak, strong]):
+        with pytest.raises(EvaluationError, match="different action noise"):
+            compare_results(pair)
+
+
 def of_suite(folder, name, succeeds):
     """A result of a protocol; ``succeeds`` chooses the outcome of each episode."""
     protocol = load_protocol(name)

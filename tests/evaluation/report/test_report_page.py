@@ -83,6 +83,13 @@ def test_page_names_the_weld(result, tmp_path):
     assert Reader(render_page(result)).after("RoboCAS-v0's weld", 1) == ["no"]
 
 
+def test_page_names_the_action_noise(result, tmp_path):
+    reader = Reader(render_page(write(tmp_path / "noisy", result.outcomes.values(), action_noise=[0.5, 0.2])))
+    assert any(text.startswith("Measured with action noise of 0.5 mm and 0.2 degrees") for text in reader.texts)
+    assert reader.after("action noise", 1) == ["action noise of 0.5 mm and 0.2 degrees"]
+    assert Reader(render_page(result)).after("action noise", 1) == ["none"]
+
+
 def test_page_links_only_its_own_videos(result):
     text = render_page(result, result.folder)
     assert Reader(text).links == []
