@@ -12,9 +12,9 @@ from mani_skill.utils.structs import Pose
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.demos.open_loop import draw_noise
 from robocas_ms3.evaluation.metrics import EpisodeMetrics
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec, TcpMotion
+from robocas_ms3.planning.action_noise import draw_noise
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 from robocas_ms3.tasks import terms
 
@@ -31,7 +31,7 @@ RAISED_HEIGHT = 0.03  # m above the initial height
 # The drive that holds the rotation, in acceleration units (1/s^2, 1/s): equally stiff for light and heavy objects.
 # Limits of zero width lock the translation; SAPIEN 3.0.3 does not enforce angular limits.
 _STIFFNESS, _DAMPING = 1e8, 1e5
-_NOISE_STREAM = 412  # random stream of the action noise
+_NOISE_STREAM = 413  # random stream of the action noise
 
 
 class PolicyActionWrapper(gym.Wrapper):
@@ -46,7 +46,7 @@ class PolicyActionWrapper(gym.Wrapper):
             batch, each env waits until all envs have finished.
         weld: whether lifted objects are fixed to the hand (`Weld`); only for one env on the CPU.
         action_noise: standard deviations of normal noise that is added to each component of each motion of the TCP, in
-            mm and degrees; None: no noise. The noise of an episode depends on its seed only.
+            mm and degrees. The noise of an episode depends on its seed only.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class PolicyActionWrapper(gym.Wrapper):
         stepping: Stepping,
         *,
         weld: bool = False,
-        action_noise: tuple[float, float] | None = None,
+        action_noise: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         super().__init__(env)
         self._observes_simulation, self._noise = spec.simulation_state, action_noise
@@ -121,12 +121,12 @@ class PolicyActionWrapper(gym.Wrapper):
             self._open = actions[:, 7] > 0
             return self._step_control(actions)
         motion = self._convention.decode(actions)
-        if self._noise is not None:
-            motion = self._add_noise(motion, self._noise)
+        if any(self._noise):
+            motion = self._add_noise(motion)
         return self._timed_step(motion) if self._stepping == "timed" else self._v0_step(motion)
 
-    def _add_noise(self, motion: TcpMotion, std: tuple[float, float]) -> TcpMotion:
-        noise = np.concatenate([draw_noise(rng, 1, *std) for rng in self._rngs])
+    def _add_noise(self, motion: TcpMotion) -> TcpMotion:
+        noise = np.concatenate([draw_noise(rng, 1, *self._noise) for rng in self._rngs])
         angles = motion.rotation.as_euler("xyz") + noise[:, 3:6]
         return TcpMotion(motion.translation + noise[:, :3], Rotation.from_euler("xyz", angles), motion.open)
 

@@ -89,7 +89,7 @@ class EvaluationSession:
         backend = choose_backend(settings.backend)
         if settings.weld:
             check_weld_available(rules.stepping, backend)
-        if settings.action_noise is not None:
+        if any(settings.action_noise):
             check_action_noise_available(self.spec)
         self.played_as = self.protocol.find_task_aliases(settings.tasks)
         self.episodes = self.protocol.select_episodes(settings)
@@ -359,7 +359,7 @@ class EvaluationSession:
             "protocol_hash": self.protocol.hash,
             "policy": {"name": name} | describe_policy(self.policy) | {"name": name},  # a description may not rename it
             "weld": self.settings.weld,
-            **({} if self.settings.action_noise is None else {"action_noise": self.settings.action_noise}),
+            **({"action_noise": self.settings.action_noise} if any(self.settings.action_noise) else {}),
             **({"played_as": self.played_as} if self.played_as else {}),
             "backend": backend,
             "versions": results.get_package_versions(),

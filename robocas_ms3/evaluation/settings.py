@@ -39,10 +39,10 @@ class EvaluationOptions:
     """Fix lifted objects to the hand until the gripper is commanded to open, as RoboCAS-v0 does.
     Only for protocols with RoboCAS-v0's steps (paper-v1), in worker processes.
     Results with and without the weld are not comparable."""
-    action_noise: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG"), _NO_HINT] = None
+    action_noise: Annotated[tuple[float, float], tyro.conf.arg(metavar="MM DEG"), _NO_HINT] = (0.0, 0.0)
     """Add normal noise to each component of each motion of the TCP that the policy commands.
     Standard deviations in mm and degrees, such as 0.5 0.2.
-    Results with and without noise are not comparable. Default: no noise."""
+    Results with and without noise are not comparable. Default: 0 0, no noise."""
     render_size: Annotated[tuple[int, int] | None, tyro.conf.Suppress] = None
     """Width and height in pixels of the images of ``env.render``; None: no images."""
 
@@ -89,8 +89,8 @@ class EvaluationSettings(EvaluationOptions, SelectionOptions, SimulationOptions)
         for name in ("envs", "episodes", "workers"):
             if (number := getattr(self, name)) is not None:
                 check_number(f"--{name}", number, 1)
-        for number in self.action_noise or ():
-            check_number("--action-noise", number, 0, 100)
+        for number in self.action_noise:
+            check_number("--action-noise", number, 0)
         check_number("--step-seconds", self.step_seconds, 1)
         check_number("--memory-gb", self.memory_gb, 0.1)
         parse_shard(self.shard, EvaluationError)
@@ -100,6 +100,6 @@ class EvaluationSettings(EvaluationOptions, SelectionOptions, SimulationOptions)
 
         The default folder has the suffixes ``_TASK``, for each task in ``played_as``, ``_weld`` and ``_noise``.
         """
-        suffixes = [*played_as, *(["weld"] if self.weld else []), *(["noise"] if self.action_noise else [])]
+        suffixes = [*played_as, *(["weld"] if self.weld else []), *(["noise"] if any(self.action_noise) else [])]
         name = "_".join([re.sub(r"[^\w.-]+", "_", self.policy), *suffixes])
         return self.out or (Path("eval") / protocol / name).absolute()

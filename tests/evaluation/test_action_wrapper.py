@@ -88,7 +88,7 @@ def test_joint_targets_are_executed_unchanged():
 
 
 def test_action_noise_depends_on_the_seed_only_and_has_the_given_size():
-    def moved(seed: int, noise: tuple[float, float] | None) -> np.ndarray:
+    def moved(seed: int, noise: tuple[float, float]) -> np.ndarray:
         env = PolicyActionWrapper(pick("robocas", 5), PolicySpec("robocas", "target"), "timed", action_noise=noise)
         env.reset(seed=seed)
         before = tcp(env)

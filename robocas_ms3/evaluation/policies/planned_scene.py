@@ -13,8 +13,8 @@ from robocas_ms3.demos.recordings.motion import split_robot_states
 from robocas_ms3.robots.description_file import tcp_and_arm_base_poses
 from robocas_ms3.robots.registry import RobotSpec
 
-Array = NDArray[np.floating]
-States = Mapping[str, Mapping[str, Array]]
+Array = NDArray[np.float64]
+States = Mapping[str, Mapping[str, NDArray[np.floating]]]
 
 MAX_OFFSET = 0.02  # m between a body that the plan will move and its expected position in the world
 MAX_BYSTANDER_OFFSET = 0.06  # m, the same for a body that the plan will not move; it can only be in the way

@@ -25,7 +25,7 @@ from robocas_ms3.robots.registry import RobotSpec, find_robot
 from robocas_ms3.scenes.task_specs import TASKS
 
 OFFSETS = (0.01, 0.05)  # smallest and largest offset in m: a finger lands on the target or on a neighbouring object
-MAX_PLANS = 6  # plans per episode
+MAX_PLANS, MAX_FAILED_PLANS = 6, 2  # per episode
 MAX_HURRY = 2.5  # largest ratio of the speed of the policy to the speed of the plan
 MIN_STEPS = 15  # policy steps below which no plan helps
 WAIT_SECONDS = 1.0  # s to wait for bodies to come to rest, and for success after the end of a plan
@@ -71,15 +71,19 @@ class _Run:
     """Running episode of an env.
 
     Attributes:
-        plan: present plan; None before the first plan and after a failed one.
+        plan: present plan; None without one.
         plans: number of plans, also of failed ones.
+        failed: number of failed plans.
         waited: policy steps for which the policy has waited to plan again.
+        retry_at: policy step before which the policy does not plan again after a failed plan.
     """
 
     episode: EpisodeSpec
     plan: _Plan | None = None
     plans: int = 0
+    failed: int = 0
     waited: int = 0
+    retry_at: int = 0
 
 
 class ScriptedPolicy:
@@ -124,22 +128,31 @@ class ScriptedPolicy:
         run, state = self._runs[int(observations.envs[row])], observations.simulation[row]
         decision = self._decide(run, state)
         if decision == "plan":
-            run.plans, run.waited = run.plans + 1, 0
-            run.plan = self._make_plan(run, state) or run.plan
+            self._plan_again(run, state)
         if decision == "wait" or run.plan is None:
             return self._hold(observations, row, state.gripper)
         return run.plan.track.next_action(observations, row)
+
+    def _plan_again(self, run: _Run, state: SimulationState) -> None:
+        """Replace the plan; without a new plan keep the old one, since the deviation may not matter."""
+        plan = self._make_plan(run, state)
+        run.plans, run.waited = run.plans + 1, 0
+        if plan is None:
+            run.failed, run.retry_at = run.failed + 1, state.steps + round(RETRY_SECONDS * self._rate)
+        else:
+            run.plan = plan
 
     def _decide(self, run: _Run, state: SimulationState) -> Literal["follow", "wait", "plan"]:
         """Return whether to follow the plan, to wait until the scene is at rest, or to plan again."""
         left = math.inf if run.episode.max_steps is None else run.episode.max_steps - state.steps
         if run.plans == 0:
             return "plan"
-        if self._perturbed or state.succeeded or run.plans == MAX_PLANS or left < MIN_STEPS:
+        may_plan = run.plans < MAX_PLANS and run.failed < MAX_FAILED_PLANS and left >= MIN_STEPS
+        if self._perturbed or state.succeeded or not may_plan or state.steps < run.retry_at:
             return "follow"
         run.waited += 1
         if run.plan is None or run.plan.is_over:
-            return "plan" if run.waited > WAIT_SECONDS * self._rate else "follow"
+            return "plan" if run.plan is None or run.waited > WAIT_SECONDS * self._rate else "follow"
         deviations = run.plan.find_deviations(find_robot(run.episode.robot), state)
         if deviations is None:
             run.waited = 0

@@ -64,7 +64,7 @@ def record_videos(
         envs=1,
         backend="processes",
         weld=result.run.weld,
-        action_noise=result.run.action_noise,
+        action_noise=result.run.action_noise or (0.0, 0.0),
         render_size=SIZE,
     )
     session = EvaluationSession(policy, settings, recorder.wrap)
