@@ -39,6 +39,19 @@ from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.base import RoboCASEnv
 
 
+@dataclass(frozen=True)
+class EpisodeLimits:
+    """Limits of an episode.
+
+    Attributes:
+        horizon: maximum length of the episode in control steps.
+        max_attempts: maximum number of attempts of the scripted policy.
+    """
+
+    horizon: int
+    max_attempts: int
+
+
 class EpisodeGenerator:
     """Generator of the episodes of one task in one process.
 
@@ -103,7 +116,7 @@ class EpisodeGenerator:
         folder: Path,
         name: str,
         intervention: Intervention | None = None,
-        horizon: int | None = None,
+        limits: EpisodeLimits | None = None,
     ) -> EpisodeResult:
         """Generate the episode of a seed, and write it if an attempt succeeds.
 
@@ -114,15 +127,16 @@ class EpisodeGenerator:
             folder: folder of the files ``name.h5`` and ``name.json``, and of the candidates' file.
             name: name of the files without suffix.
             intervention: state in which another policy left the scene; the episode starts in this state.
-            horizon: maximum length of the episode in control steps; None: the horizon of the task.
+            limits: limits of this episode; None: the horizon of the task and the attempts of the settings.
         """
+        limits = limits or EpisodeLimits(self.horizon, self.settings.max_attempts)
         recorder = EpisodeRecorder(self.env, folder, name)
         executor = MotionExecutor(recorder, seed, noise=self._make_noise())
-        result = EpisodeResult(seed, success=False, seconds=executor.seconds, max_attempts=self.settings.max_attempts)
+        result = EpisodeResult(seed, success=False, seconds=executor.seconds, max_attempts=limits.max_attempts)
         settings = CandidateSettings.from_episode_settings(self.settings)
         candidates = CandidateRecorder(settings, self.env, folder / candidates_file_name(name), result)
         attempts = _Attempts(self, recorder, executor, result, intervention, candidates)
-        attempts.horizon = min(horizon or self.horizon, self.horizon)
+        attempts.horizon = limits.horizon
         executor.check_open_loop = attempts.check_open_loop
         try:
             if intervention is not None and intervention.skip_reason:

@@ -18,7 +18,7 @@ States = Mapping[str, Mapping[str, NDArray[np.floating]]]
 
 MAX_OFFSET = 0.02  # m between a body that the plan will move and its expected position in the world
 MAX_BYSTANDER_OFFSET = 0.06  # m, the same for a body that the plan will not move; it can only be in the way
-MOVED_LATER = 0.03  # m by which a body moves in the rest of the plan if the plan moves it on purpose
+MOVED_LATER = 0.10  # m by which a body moves in the rest of the plan if the plan moves it on purpose
 MAX_HELD_OFFSET = 0.04  # m between a body and its expected position relative to the TCP: grasps vary
 MAX_JOINT_OFFSET = 0.05  # m or rad between a furniture joint and its expected position
 MAX_TCP_OFFSET = 0.15  # m between the TCP and its expected position; more than the lag of the arm
@@ -94,7 +94,7 @@ class PlannedScene:
         near = slice(max(0, index - window), index + window + 1)
         planned, moves = self.states, self._find_moving(index)
         later = np.linalg.norm(planned.bodies[index:] - planned.bodies[index], axis=-1).max(axis=0) > MOVED_LATER
-        tolerance = np.where(later, MAX_OFFSET, MAX_BYSTANDER_OFFSET)
+        tolerance = np.where(later | moves[: len(later)], MAX_OFFSET, MAX_BYSTANDER_OFFSET)
         away = np.linalg.norm(now.bodies[0] - planned.bodies[near], axis=-1).min(axis=0) > tolerance
         joints = np.abs(now.joints[0] - planned.joints[near]).min(axis=0) > MAX_JOINT_OFFSET
         if self.holding[index]:

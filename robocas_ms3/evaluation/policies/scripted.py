@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.demos.failures import Intervention
-from robocas_ms3.demos.generator import EpisodeGenerator
+from robocas_ms3.demos.generator import EpisodeGenerator, EpisodeLimits
 from robocas_ms3.demos.recordings.trajectory_hdf5 import open_episode, open_trajectory, read_steps
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.evaluation.policies.planned_scene import PlannedScene, SceneState, measure_speeds
@@ -26,6 +26,7 @@ from robocas_ms3.scenes.task_specs import TASKS
 
 OFFSETS = (0.01, 0.05)  # smallest and largest offset in m: a finger lands on the target or on a neighbouring object
 MAX_PLANS, MAX_FAILED_PLANS = 6, 2  # per episode
+MAX_LATER_ATTEMPTS = 4  # attempts of each plan after the first one, since the old plan may still succeed
 MAX_HURRY = 2.5  # largest ratio of the speed of the policy to the speed of the plan
 MIN_STEPS = 15  # policy steps below which no plan helps
 WAIT_SECONDS = 1.0  # s to wait for bodies to come to rest, and for success after the end of a plan
@@ -170,13 +171,14 @@ class ScriptedPolicy:
         """Plan from the reset, or from the present state; return None if there is no plan."""
         episode, stride = run.episode, _FREQ // self._rate
         left = None if episode.max_steps is None else max(MIN_STEPS, episode.max_steps - state.steps - _END_STEPS)
-        horizon = None if left is None else round(left * stride * MAX_HURRY)
         after = (
             Intervention(episode.seed, "scripted", state.steps, state.values, state.gripper) if state.steps else None
         )
         with tempfile.TemporaryDirectory() as folder:
             generator = self._open_generator(episode)
-            result = generator.generate(episode.seed, Path(folder), "episode", after, horizon)
+            horizon = generator.horizon if left is None else min(generator.horizon, round(left * stride * MAX_HURRY))
+            limits = EpisodeLimits(horizon, MAX_LATER_ATTEMPTS if run.plans else generator.settings.max_attempts)
+            result = generator.generate(episode.seed, Path(folder), "episode", after, limits)
             if not result.success:
                 return None
             with open_trajectory(Path(folder) / "episode.h5") as file:
