@@ -137,4 +137,7 @@ def open_source(path: Path | str, *, rate_hz: float | None = None, include_faile
     """
     path = find_trajectory(Path(path))
     found = detect_format(path) or FORMATS["robocas"]  # its error suggests a nearby dataset
+    if not found.reader:
+        expected, found_format = "a trajectory file or a dataset", f"a {found.title}"
+        raise DatasetError("this file has no episodes", where=path, expected=expected, found=found_format)
     return found.import_function("reader")(path, rate_hz=rate_hz, include_failed=include_failed)

@@ -11,6 +11,7 @@ import pytest
 import synthetic_results
 from fuzzing import damage, flip_bits
 from synthetic import RayCaster, write_trajectory
+from synthetic_candidates import write_episodes
 
 from robocas_ms3.assets.annotations import Annotations
 from robocas_ms3.assets.hulls import read_hulls
@@ -22,6 +23,8 @@ from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import OutputFolder
 from robocas_ms3.core.paths import builtin_packs_dir
 from robocas_ms3.core.poses import from_xyz_yaw
+from robocas_ms3.datasets import CandidateDataset, CandidateOptions
+from robocas_ms3.datasets.checks.candidates import validate_candidates
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.conversion.convert import convert
 from robocas_ms3.datasets.conversion.episode_plan import DATASET, make_settings, plan_episodes
@@ -32,6 +35,7 @@ from robocas_ms3.datasets.lerobot.convert import convert_lerobot
 from robocas_ms3.datasets.sources.provenance import make_recorded_scene, make_recording_entry
 from robocas_ms3.datasets.sources.reader import Dataset
 from robocas_ms3.datasets.sources.trajectory import TrajectorySource
+from robocas_ms3.datasets.statistics.candidates import compute_candidate_statistics
 from robocas_ms3.datasets.statistics.collect import collect_statistics
 from robocas_ms3.demos.failures import FailedAttempt, count_by_reason
 from robocas_ms3.demos.generation import OUTPUT
@@ -86,6 +90,11 @@ def write_lerobot(root):
 def write_recording(root):
     root.mkdir()
     write_trajectory(root / "trajectory.h5", seeds=(3, 4))
+
+
+def write_candidates(root):
+    root.mkdir()
+    write_episodes(root / "candidates.h5", seeds=(3,), decisions=1)
 
 
 def write_pack(root):
@@ -184,6 +193,18 @@ def read_recording(root):
         _ = episode.goals, episode.scene, episode.layout, source.conversion_entry(number)
 
 
+def read_candidates(root):
+    """Read candidates as the validator, statistics and training do."""
+    validate_candidates(root / "candidates.h5")
+    dataset = CandidateDataset(root, CandidateOptions(split="all"))
+    assert dataset.files[0].labels.benefit.shape == dataset.files[0].candidates["displacement"].shape
+    for index in range(len(dataset)):
+        assert dataset[index]["mask"].any()
+        assert dataset.files[0].state(index)["actors"]
+    with np.errstate(all="ignore"):
+        compute_candidate_statistics(root / "candidates.h5")
+
+
 def show_page(root):
     """Request all answers of the viewer except images."""
     routes = Routes(open_page(root))
@@ -256,6 +277,7 @@ CASES = [  # writer, file, reader, number of changed files, least number of erro
     (write_recording, "trajectory.json", show_page, 40, 0),
     (write_recording, "trajectory.h5", read_recording, 80, 20),
     (write_recording, "trajectory.json", read_recording, 120, 30),
+    (write_candidates, "candidates.h5", read_candidates, 80, 20),
     (write_recording, "trajectory.json", lambda root: collect_statistics(root / "trajectory.h5"), 20, 0),
     (write_pack, "manifest.json", load_pack, 150, 120),
     (write_pack, "hulls.obj", read_hull_file, 40, 10),

@@ -61,13 +61,22 @@ def validate_candidates(path: str | Path, *, on_episode: Callable[[int, int], No
         on_episode: called once with (episodes, episodes).
     """
     try:
-        file = CandidateFile(path)
+        file = CandidateFile(path, strict=False)
     except DatasetError as error:
         key = str(error.where).removeprefix(f"{path}, ")
         found = " ".join(filter(None, (error.what, str(error.found))))
         return CandidatesReport(0, 0, 0, [Violation(Path(path).name, key, str(error.expected) or "valid data", found)])
-    tables, episodes = file.tables, len(np.unique(file.decisions["seed"]))
-    violations = [
+    episodes = len(np.unique(file.decisions["seed"]))
+    with np.errstate(invalid="ignore"):  # NaN and infinite values are violations
+        violations = _find_violations(file)
+    if on_episode:
+        on_episode(episodes, episodes)
+    return CandidatesReport(episodes, len(file), len(file.candidates["slot"]), violations)
+
+
+def _find_violations(file: CandidateFile) -> list[Violation]:
+    tables = file.tables
+    return [
         _make_violation(file.path.name, table, rule, values.get(rule[0]))
         for table, rules, values in (
             (DECISIONS, _check_decisions(tables), tables.decisions),
@@ -77,9 +86,6 @@ def validate_candidates(path: str | Path, *, on_episode: Callable[[int, int], No
         for rule in rules
         if rule[2].any()
     ]
-    if on_episode:
-        on_episode(episodes, episodes)
-    return CandidatesReport(episodes, len(file), len(file.candidates["slot"]), violations)
 
 
 def _make_violation(file: str, table: str, rule: _Rule, values: NDArray[Any] | None) -> Violation:

@@ -37,13 +37,13 @@ from robocas_ms3.demos.recordings.trajectory_json import package_versions
 
 FILE_NAME = "candidates.h5"
 """Name of the file in the output folder of ``robocas generate``."""
-JSON_ATTRIBUTES = ("env_info", "settings", "versions")
-"""Attributes with JSON texts: environment as in the JSON file of a trajectory, settings, and package versions."""
+METADATA = ("env_info", "settings", "versions")
+"""JSON texts of the file: environment as in the JSON file of a trajectory, settings, and package versions."""
 _FIX = "Record it again with robocas generate --record-candidates."
 _CHUNK_BYTES = 2**17  # before compression
 _COMPRESSION = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 _MAX_BYTES = 2**32  # of all arrays: a small compressed file can declare terabytes
-_MAX_TEXT = 4096  # bytes
+_TEXT = Field("", "str", (), "")
 
 
 def is_candidates_file(path: Path) -> bool:
@@ -51,7 +51,7 @@ def is_candidates_file(path: Path) -> bool:
     try:
         check_regular_file(path)
         with h5py.File(path, "r") as file:
-            return file.attrs.get("format") == FORMAT
+            return _read_format(file)[0] == FORMAT
     except (OSError, DocumentError, RuntimeError, ValueError, TypeError):
         return False
 
@@ -104,7 +104,10 @@ def merge_candidates(sources: Sequence[Path], target: Path) -> None:
 
 def _write(path: Path, tables: Tables, texts: Mapping[str, str]) -> None:
     def fill(file: h5py.File) -> None:
-        file.attrs.update({"format": FORMAT, "version": VERSION, **texts})
+        file.attrs.create("format", FORMAT.encode(), dtype=h5py.string_dtype("ascii", len(FORMAT)))
+        file.attrs["version"] = VERSION
+        for name, text in texts.items():  # not as attributes, which are limited to 64 kB
+            _write_array(file, name, np.array(text))
         for table, values in ((DECISIONS, tables.decisions), (CANDIDATES, tables.candidates)):
             group = file.create_group(table)
             for field in FIELDS[table]:
@@ -124,8 +127,8 @@ def _write_array(group: h5py.Group, name: str, values: NDArray[Any]) -> None:
         values = np.char.encode(values, "utf-8")
         dtype = h5py.string_dtype("utf-8", max(values.dtype.itemsize, 1))
     row_bytes = dtype.itemsize * math.prod(values.shape[1:])
-    if not values.size:
-        group.create_dataset(name, shape=values.shape, dtype=dtype)
+    if not values.size or not values.shape:
+        group.create_dataset(name, shape=values.shape, dtype=dtype, data=values.astype(dtype))
         return
     chunks = (min(len(values), max(1, _CHUNK_BYTES // row_bytes)), *values.shape[1:])
     group.create_dataset(name, data=values.astype(dtype), dtype=dtype, chunks=chunks, **_COMPRESSION)
@@ -154,24 +157,26 @@ class CandidateFile:
     Args:
         path: the file, or a folder that contains ``candidates.h5``.
         pack: object pack to use instead of the recorded pack, by name or folder.
+        strict: whether unknown words and slots without an object are errors.
 
     Attributes:
         path: path of the file.
         tables: all arrays.
-        texts: JSON texts of the attributes by name in `JSON_ATTRIBUTES`.
+        texts: JSON texts by name in `METADATA`.
         recorded_env: specification of the recorded environment.
 
     Raises:
         DatasetError: the file is missing or damaged, refers to other files, or an array has a wrong type or shape.
     """
 
-    def __init__(self, path: Path | str, *, pack: str | Path | None = None) -> None:
+    def __init__(self, path: Path | str, *, pack: str | Path | None = None, strict: bool = True) -> None:
         self.path = Path(path) / FILE_NAME if Path(path).is_dir() else Path(path)
         with _open(self.path) as file, convert_read_errors(self.path, "damaged file"):
-            self.texts = _read_attributes(file, self.path)
-            self.tables = _read_tables(file, self.path)
+            self.texts, self.tables = _read_content(file, self.path)
         _check_rows(self.tables, self.path)
-        self.env_info, self.settings, self.versions = (self._decode(name) for name in JSON_ATTRIBUTES)
+        if strict:
+            _check_words(self.tables, self.path)
+        self.env_info, self.settings, self.versions = (self._decode(name) for name in METADATA)
         self.recorded_env: RecordedEnv = read_recorded_env(self.env_info, f"{self.path}, env_info", pack=pack)
 
     def __len__(self) -> int:
@@ -222,7 +227,7 @@ class CandidateFile:
             where = f"{self.path}, {name}"
             raise DatasetError("invalid JSON", where=where, found=one_line(error), fix=_FIX) from error
         if not isinstance(content, dict):
-            raise DatasetError("invalid attribute", where=f"{self.path}, {name}", expected="a JSON object", fix=_FIX)
+            raise DatasetError("invalid JSON", where=f"{self.path}, {name}", expected="an object", fix=_FIX)
         return content
 
 
@@ -236,22 +241,22 @@ def _open(path: Path) -> h5py.File:
         raise DatasetError("not a readable HDF5 file", where=path, found=one_line(error), fix=_FIX) from error
 
 
-def _read_attributes(file: h5py.File, path: Path) -> dict[str, str]:
-    found = file.attrs.get("format"), file.attrs.get("version")
-    if found[0] != FORMAT or found[1] != VERSION:
+def _read_format(file: h5py.File) -> tuple[str, int]:
+    """Return the attributes ``format`` and ``version``; an empty text or -1 if they have another type."""
+    found: list[Any] = []
+    for name, kind in (("format", "S"), ("version", "i")):
+        # HDF5 may crash if it reads damaged texts of variable length
+        fits = name in file.attrs and file.attrs.get_id(name).dtype.kind == kind and file.attrs.get_id(name).shape == ()
+        found.append(file.attrs[name] if fits else None)
+    return "" if found[0] is None else found[0].decode("ascii", "replace"), -1 if found[1] is None else int(found[1])
+
+
+def _read_content(file: h5py.File, path: Path) -> tuple[dict[str, str], Tables]:
+    name, version = _read_format(file)
+    if (name, version) != (FORMAT, VERSION):
         expected = f"format {FORMAT!r}, version {VERSION}"
-        raise DatasetError("not a file of candidates", where=path, expected=expected, found=f"{found[0]!r}, {found[1]}")
-    texts: dict[str, Any] = {name: file.attrs.get(name) for name in JSON_ATTRIBUTES}
-    for name, text in texts.items():
-        if not isinstance(text, str):
-            raise DatasetError(
-                "missing or invalid attribute", where=f"{path}, {name}", expected="a JSON text", fix=_FIX
-            )
-    return texts
-
-
-def _read_tables(file: h5py.File, path: Path) -> Tables:
-    check_links(file, path)  # type: ignore[arg-type]
+        raise DatasetError("not a file of candidates", where=path, expected=expected, found=f"{name!r}, {version}")
+    check_links(file, path)
     found: dict[str, h5py.Dataset] = {}
     file.visititems(lambda name, item: found.update({name: item}) if isinstance(item, h5py.Dataset) else None)
     for array in found.values():
@@ -260,6 +265,11 @@ def _read_tables(file: h5py.File, path: Path) -> Tables:
     if size > _MAX_BYTES:
         expected, size_mb = f"at most {_MAX_BYTES >> 20} MB", f"{size >> 20} MB"
         raise DatasetError("arrays too large", where=path, expected=expected, found=size_mb)
+    texts = {name: str(_read_field(_take(found, name, path), _TEXT, (), path)) for name in METADATA}
+    return texts, _read_tables({name: array for name, array in found.items() if name not in METADATA}, path)
+
+
+def _read_tables(found: dict[str, h5py.Dataset], path: Path) -> Tables:
     present = _take(found, f"{DECISIONS}/present", path)
     slots = present.shape[1] if present.ndim == 2 else 0
     tables: dict[str, Arrays] = {}
@@ -292,8 +302,7 @@ def _take(found: Mapping[str, h5py.Dataset], name: str, path: Path) -> h5py.Data
 def _read_field(array: h5py.Dataset, field: Field, shape: tuple[int, ...], path: Path) -> NDArray[Any]:
     text = h5py.check_string_dtype(array.dtype)
     if field.dtype == "str":
-        fits = text is not None and text.encoding == "utf-8" and text.length is not None and text.length <= _MAX_TEXT
-        expected = f"UTF-8 texts of at most {_MAX_TEXT} bytes"
+        fits, expected = text is not None and text.encoding == "utf-8" and text.length is not None, "UTF-8 texts"
     else:
         fits, expected = array.dtype == np.dtype(field.dtype), field.dtype
     if not fits or array.shape != shape:
@@ -320,3 +329,20 @@ def _check_rows(tables: Tables, path: Path) -> None:
         fields = "first_candidate, candidate_count and decision_row"
         expected = "consecutive rows of candidates per decision"
         raise DatasetError("inconsistent rows", where=f"{path}, {fields}", expected=expected, fix=_FIX)
+
+
+def _check_words(tables: Tables, path: Path) -> None:
+    """Check the values on which readers rely: words of a fixed list, and slots."""
+    for table, values in ((DECISIONS, tables.decisions), (CANDIDATES, tables.candidates)):
+        for field in FIELDS[table]:
+            low = {"target_slot": 0, "held_slot": -1, "slot": -1}.get(field.name)
+            wrong = np.zeros(len(values[field.name]), bool)
+            if field.values:
+                wrong, expected = ~np.isin(values[field.name], field.values), f"one of {', '.join(field.values)}"
+            elif low is not None:
+                expected = f"{low} to {tables.slots - 1}"
+                wrong = (values[field.name] < low) | (values[field.name] >= tables.slots)
+            if wrong.any():
+                row = int(np.flatnonzero(wrong)[0])
+                where, found = f"{path}, {table}/{field.name}, row {row}", values[field.name][row]
+                raise DatasetError("invalid value", where=where, expected=expected, found=found, fix=_FIX)

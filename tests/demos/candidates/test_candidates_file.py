@@ -9,7 +9,12 @@ import pytest
 from synthetic_candidates import ENV_INFO, SETTINGS, make_record, write_episodes
 
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.demos.candidates.candidates_file import CandidateFile, merge_candidates, write_candidates
+from robocas_ms3.demos.candidates.candidates_file import (
+    CandidateFile,
+    is_candidates_file,
+    merge_candidates,
+    write_candidates,
+)
 from robocas_ms3.demos.candidates.schema import CANDIDATE_FIELDS, DECISION_FIELDS
 
 SECRET = np.arange(12, dtype=np.float32).reshape(2, 6)
@@ -198,6 +203,20 @@ def test_rows_of_candidates_must_be_consecutive(tmp_path, field):
         CandidateFile(path)
 
 
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("decisions/kind", b"x"), ("decisions/target_slot", -1), ("decisions/held_slot", 5), ("candidates/slot", 5)],
+)
+def test_words_and_slots_are_checked(tmp_path, field, value):
+    path = write_episodes(tmp_path / "c.h5")
+    with h5py.File(path, "r+") as file:
+        file[field][1] = value
+    with pytest.raises(DatasetError) as error:
+        CandidateFile(path)
+    assert str(error.value.where) == f"{path}, {field}, row 1"
+    assert len(CandidateFile(path, strict=False)) == 4
+
+
 @pytest.mark.parametrize("content", [None, b"", b"not HDF5"])
 def test_file_must_be_hdf5(tmp_path, content):
     path = tmp_path / "c.h5"
@@ -208,13 +227,32 @@ def test_file_must_be_hdf5(tmp_path, content):
     assert error.value.where == path
 
 
-@pytest.mark.parametrize(("name", "value"), [("format", "x"), ("version", 2), ("env_info", "{"), ("settings", 3)])
-def test_attributes_are_checked(tmp_path, name, value):
+@pytest.mark.parametrize(("name", "value"), [("format", "x"), ("format", b"x"), ("version", 2), ("version", "x")])
+def test_format_and_version_are_checked(tmp_path, name, value):
     path = write_episodes(tmp_path / "c.h5")
+    assert is_candidates_file(path)
     with h5py.File(path, "r+") as file:
         file.attrs[name] = value
     with pytest.raises(DatasetError):
         CandidateFile(path)
+    assert is_candidates_file(path) == (name != "format")
+
+
+@pytest.mark.parametrize("value", [b"{", b"3", "{}", np.zeros(3)])
+@pytest.mark.parametrize("name", ["env_info", "settings"])
+def test_metadata_is_checked(tmp_path, name, value):
+    path = write_episodes(tmp_path / "c.h5")
+    with h5py.File(path, "r+") as file:
+        del file[name]
+        file[name] = value
+    with pytest.raises(DatasetError):
+        CandidateFile(path)
+
+
+def test_long_metadata(tmp_path):
+    settings = {"text": "x" * 100_000}  # HDF5 attributes are limited to 64 kB
+    write_candidates(tmp_path / "c.h5", [make_record(3, 0)], ENV_INFO, settings)
+    assert CandidateFile(tmp_path / "c.h5").settings == settings
 
 
 def test_truncated_file_is_rejected(tmp_path):
