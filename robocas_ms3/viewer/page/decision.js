@@ -4,7 +4,7 @@
 robocas.decision = (() => {
   const { byId, element, imageUrl, table } = robocas;
   const SVG = "http://www.w3.org/2000/svg";
-  const COLUMNS = [["n", "#"], ["what", "Candidate"], ["outcome", "Outcome"], ["benefit", "Benefit s"], ["seconds", "s"]];
+  const COLUMNS = [["n", "#"], ["what", "Candidate"], ["outcome", "Outcome"], ["benefit", "Benefit s"], ["seconds", "Time s"]];
   const VALUES = [
     ["obstacles", "Obstacles of the target", change], ["free_grasps", "Free grasps of the target", change],
     ["hidden_fraction", "Hidden share of the target", (v) => change(v.map((share) => `${Math.round(100 * share)} %`))],
