@@ -2,6 +2,7 @@
 
 # pyright: reportAttributeAccessIssue=false, reportIndexIssue=false
 import os
+import signal
 
 import h5py
 import numpy as np
@@ -121,6 +122,28 @@ def test_merge_takes_each_seed_once_and_can_be_repeated(tmp_path):
     merge_candidates([write_episodes(tmp_path / "3.h5", seeds=(9,))], tmp_path / "c.h5")
     assert CandidateFile(tmp_path / "c.h5").decisions["seed"].tolist() == [3, 3, 4, 4, 5, 9, 9]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1.h5", "2.h5", "3.h5", "c.h5"]
+
+
+@pytest.mark.parametrize("moment", ["before the rename", "after the rename"])
+def test_merge_after_a_kill_gives_the_same_file(tmp_path, moment):
+    parts = [write_episodes(tmp_path / f"{seed}.h5", seeds=(seed,)) for seed in (7, 3)]
+    merge_candidates(parts, tmp_path / "whole.h5")
+    child = os.fork()
+    if child == 0:
+        replace = os.replace
+
+        def replace_and_die(source, target):
+            if moment == "after the rename":
+                replace(source, target)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        os.replace = replace_and_die
+        merge_candidates(parts, tmp_path / "c.h5")
+        os._exit(0)
+    assert os.WTERMSIG(os.waitpid(child, 0)[1]) == signal.SIGKILL
+    assert (tmp_path / "c.h5").exists() == (moment == "after the rename")
+    merge_candidates(parts, tmp_path / "c.h5")
+    assert (tmp_path / "c.h5").read_bytes() == (tmp_path / "whole.h5").read_bytes()
 
 
 def test_different_environments_are_not_merged(tmp_path):
