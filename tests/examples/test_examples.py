@@ -91,7 +91,7 @@ def test_outcomes_are_predicted(tmp_path):
 def test_program_of_candidates(tmp_path):
     write_episodes(tmp_path / "demos/search/candidates.h5", seeds=range(20))
     assert run(program_of("candidates.md", tmp_path), cwd=tmp_path)[0].startswith("search the screwdriver")
-    run(program_of("candidates.md", tmp_path, 1), cwd=tmp_path)
+    run(program_of("candidates.md", tmp_path, 2), cwd=tmp_path)
 
 
 def test_ppo_trains_for_a_few_steps(tmp_path):
