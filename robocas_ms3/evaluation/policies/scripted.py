@@ -12,7 +12,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.demos.failures import Intervention
 from robocas_ms3.demos.generator import EpisodeGenerator, EpisodeLimits
 from robocas_ms3.demos.recordings.trajectory_hdf5 import open_episode, open_trajectory, read_steps
@@ -22,7 +21,6 @@ from robocas_ms3.evaluation.policies.replay import JointTrack, PoseTrack
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec, SimulationState
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.registry import RobotSpec, find_robot
-from robocas_ms3.scenes.task_specs import TASKS
 
 OFFSETS = (0.01, 0.05)  # smallest and largest offset in m: a finger lands on the target or on a neighbouring object
 MAX_PLANS, MAX_FAILED_PLANS = 6, 2  # per episode
@@ -198,16 +196,6 @@ class ScriptedPolicy:
 
         If more than `_MAX_GENERATORS` generators are open, the least recently used one is closed.
         """
-        for name in ("config_file", "layouts_file", "pack"):
-            if not getattr(episode, name):
-                what, fix = (
-                    "the policy server does not have this file or pack",
-                    "Start the server with --protocol FOLDER.",
-                )
-                expected = "a file of a bundled protocol or of a protocol that was passed to robocas serve-policy"
-                raise EvaluationError(what, where=f"start.{name}", expected=expected, fix=fix)
-        TASKS.find(episode.task, where="start.task")
-        find_robot(episode.robot, where="start.robot")
         settings = EpisodeSettings(
             episode.task,
             episode.config_file,

@@ -15,11 +15,12 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.remote.messages import make_observation_message, message_file_name
 from robocas_ms3.evaluation.remote.server import PolicyServer, ServedFiles
 from robocas_ms3.evaluation.remote.wire import encode_message
+from robocas_ms3.robots.registry import find_robot
+from robocas_ms3.scenes.task_specs import TASKS
 
 GARBAGE, TOO_LARGE = 1008, 1009
 
@@ -36,11 +37,16 @@ class Failing(RecordingPolicy):
 
 
 class Reading(RecordingPolicy):
-    """Policy that reads the task configuration, like the scripted policies."""
+    """Policy that reads the files, the task and the robot of an episode."""
 
     def reset(self, episodes):
         super().reset(episodes)
-        ScriptedPolicy().reset(episodes)
+        for episode in episodes:
+            for name in ("config_file", "layouts_file", "pack"):
+                if not getattr(episode, name):
+                    raise EvaluationError("no such file or pack", where=f"start.{name}")
+            TASKS.find(episode.task, where="start.task")
+            find_robot(episode.robot, where="start.robot")
 
 
 def message(env=0, start=None, **more):
