@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import synthetic_results
 from fuzzing import damage, flip_bits
+from recorded_candidates import write_recorded_candidates
 from synthetic import RayCaster, write_trajectory
 from synthetic_candidates import write_episodes
 
@@ -24,6 +25,9 @@ from robocas_ms3.core.output_folder import OutputFolder
 from robocas_ms3.core.paths import builtin_packs_dir
 from robocas_ms3.core.poses import from_xyz_yaw
 from robocas_ms3.datasets import CandidateDataset, CandidateOptions
+from robocas_ms3.datasets.candidate_images.images_file import CandidateImages
+from robocas_ms3.datasets.candidate_images.render import render_candidates
+from robocas_ms3.datasets.candidate_images.settings import CandidateImageSettings
 from robocas_ms3.datasets.checks.candidates import validate_candidates
 from robocas_ms3.datasets.checks.dataset import validate
 from robocas_ms3.datasets.conversion.convert import convert
@@ -95,6 +99,13 @@ def write_recording(root):
 def write_candidates(root):
     root.mkdir()
     write_episodes(root / "candidates.h5", seeds=(3,), decisions=1)
+
+
+def write_candidate_images(root):
+    root.mkdir()
+    trajectory = write_trajectory(root / "trajectory.h5", seeds=(3,))
+    candidates = write_recorded_candidates(root / "candidates.h5", trajectory, steps=(0, 8))
+    render_candidates(CandidateImageSettings(candidates, open_renderer=RayCaster))
 
 
 def write_pack(root):
@@ -205,6 +216,22 @@ def read_candidates(root):
         compute_candidate_statistics(root / "candidates.h5")
 
 
+def read_candidate_images(root):
+    images = CandidateImages(root / "candidates_images.h5")
+    for camera in images.cameras:
+        for row in (0, 1):
+            _ = images.rgb(row, camera), images.depth(row, camera), images.intrinsic(row, camera)
+            _ = images.camera_in_base(row, camera)
+
+
+def show_decisions(root):
+    """Request all answers of the viewer for decisions except images."""
+    content = open_page(root / "candidates.h5")
+    with np.errstate(all="ignore"):
+        for entry in content.index()["episodes"]:
+            content.episode(entry["n"])
+
+
 def show_page(root):
     """Request all answers of the viewer except images."""
     routes = Routes(open_page(root))
@@ -278,6 +305,9 @@ CASES = [  # writer, file, reader, number of changed files, least number of erro
     (write_recording, "trajectory.h5", read_recording, 80, 20),
     (write_recording, "trajectory.json", read_recording, 120, 30),
     (write_candidates, "candidates.h5", read_candidates, 80, 20),
+    (write_candidate_images, "candidates_images.h5", read_candidate_images, 120, 10),
+    (write_candidate_images, "candidates.h5", show_decisions, 80, 20),
+    (write_candidate_images, "candidates_images.h5", show_decisions, 40, 0),
     (write_recording, "trajectory.json", lambda root: collect_statistics(root / "trajectory.h5"), 20, 0),
     (write_pack, "manifest.json", load_pack, 150, 120),
     (write_pack, "hulls.obj", read_hull_file, 40, 10),

@@ -2,17 +2,21 @@
 
 The file ``candidates_images.h5`` has a group per camera with D rows, one per decision, in the order of ``decisions``::
 
-    base_camera/rgb             PNG, 8 bit RGB
-    base_camera/depth           PNG, 16 bit, mm, 0 = no depth
+    base_camera/rgb             (B,) uint8, the PNG files of all rows, 8 bit RGB
+    base_camera/rgb_ends        (D,) int64, end of each PNG file in `rgb`; it starts at the end of the one before
+    base_camera/depth           (B,) as `rgb`, 16 bit, mm, 0 = no depth
+    base_camera/depth_ends      (D,) as `rgb_ends`
     base_camera/intrinsic       (D, 4) fx, fy, cx, cy in pixels
     base_camera/camera_in_base  (D, 4, 4) pose of the OpenCV camera frame in the arm's base frame
 
-The attribute ``decisions`` identifies the decisions that are shown; see `hash_decisions`.
+The attribute ``decisions`` identifies the decisions that are shown; see `hash_decisions`. Arrays of variable length
+would be shorter to read, but HDF5 may crash when it reads damaged ones.
 """
 
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,14 +28,14 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.documents import DocumentError, check_regular_file
+from robocas_ms3.core.documents import check_regular_file
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import one_line
-from robocas_ms3.datasets import schema
-from robocas_ms3.datasets.images.image_files import ImageOptions
+from robocas_ms3.datasets.schema import IMAGE_KINDS
 from robocas_ms3.datasets.sources.episode_source import ImageKind
 from robocas_ms3.demos.candidates.candidates_file import CandidateFile
 from robocas_ms3.demos.recordings.trajectory_hdf5 import check_links
+from robocas_ms3.robots.cameras import CAMERA_NAME
 
 FORMAT, VERSION = "robocas-candidate-images", 1
 """Attributes ``format`` and ``version`` of the file."""
@@ -69,37 +73,78 @@ def hash_decisions(file: CandidateFile) -> str:
     return digest.hexdigest()
 
 
-def create_datasets(file: h5py.File, options: ImageOptions, rows: int) -> None:
-    """Create the datasets of an images file for ``rows`` decisions, with the cameras and kinds of the options."""
-    png = h5py.vlen_dtype(np.uint8)
-    for camera in options.cameras:
-        group = file.create_group(camera)
-        for kind in options.kinds:
-            group.create_dataset(kind, (rows,), png)
-        group.create_dataset("intrinsic", (rows, 4), np.float32)
-        group.create_dataset("camera_in_base", (rows, 4, 4), np.float32)
+def count_bytes(images: Mapping[str, CameraImages]) -> dict[str, int]:
+    """Return the number of bytes of all PNG files by dataset, such as ``base_camera/rgb``."""
+    kinds = {f"{camera}/{kind}": getattr(found, kind) for camera, found in images.items() for kind in IMAGE_KINDS}
+    return {name: sum(map(len, files)) for name, files in kinds.items() if files}
+
+
+def create_datasets(file: h5py.File, rows: int, sizes: Mapping[str, int]) -> None:
+    """Create the datasets of an images file.
+
+    Args:
+        file: the open file.
+        rows: number of decisions D.
+        sizes: number of bytes of all PNG files by dataset, see `count_bytes`.
+    """
+    for name, size in sizes.items():
+        file.create_dataset(name, (size,), np.uint8)
+        file.create_dataset(f"{name}_ends", (rows,), np.int64)
+    for camera in dict.fromkeys(name.split("/")[0] for name in sizes):
+        file.create_dataset(f"{camera}/intrinsic", (rows, 4), np.float32)
+        file.create_dataset(f"{camera}/camera_in_base", (rows, 4, 4), np.float32)
 
 
 def write_images(file: h5py.File, first: int, images: Mapping[str, CameraImages]) -> None:
-    """Write the images of consecutive decisions by camera, the first one to the row ``first``."""
+    """Write the images of consecutive decisions by camera from the row ``first`` on; write earlier rows before."""
     for camera, found in images.items():
         group: Any = file[camera]
         rows = slice(first, first + len(found.rgb))
         group["intrinsic"][rows], group["camera_in_base"][rows] = found.intrinsic, found.camera_in_base
-        for kind in schema.IMAGE_KINDS:
-            for row, data in enumerate(getattr(found, kind), first):
-                group[kind][row] = np.frombuffer(data, np.uint8)
+        for kind in IMAGE_KINDS:
+            if files := getattr(found, kind):
+                start = int(group[f"{kind}_ends"][first - 1]) if first else 0
+                ends = start + np.cumsum([len(data) for data in files])
+                group[f"{kind}_ends"][rows] = ends
+                group[kind][start : ends[-1]] = np.frombuffer(b"".join(files), np.uint8)
 
 
 def read_images(file: h5py.File) -> dict[str, CameraImages]:
     """Read all images of an open images file, by camera."""
-    found = {}
+    images = {}
     for camera, group in file.items():
-        kinds = {kind: [row.tobytes() for row in group[kind]] if kind in group else [] for kind in schema.IMAGE_KINDS}
-        found[camera] = CameraImages(
-            **kinds, intrinsic=group["intrinsic"][:], camera_in_base=group["camera_in_base"][:]
+        rows = range(len(group["intrinsic"]))
+        rgb, depth = (
+            [_read_png(group, kind, row).tobytes() for row in rows] if kind in group else [] for kind in IMAGE_KINDS
         )
-    return found
+        images[camera] = CameraImages(rgb, depth, group["intrinsic"][:], group["camera_in_base"][:])
+    return images
+
+
+def write_attributes(file: h5py.File, decisions: str) -> None:
+    """Write the attributes of an images file; ``decisions`` is the result of `hash_decisions`."""
+    for name, text in (("format", FORMAT), ("decisions", decisions)):
+        file.attrs.create(name, text.encode(), dtype=h5py.string_dtype("ascii", len(text)))
+    file.attrs["version"] = VERSION
+
+
+def _read_attribute(file: h5py.File, name: str, kind: str) -> Any:
+    """Return an attribute, None if it is missing or has another kind of type; HDF5 may crash on damaged texts."""
+    if name not in file.attrs:
+        return None
+    attribute = file.attrs.get_id(name)
+    return file.attrs[name] if attribute.dtype.kind == kind and attribute.shape == () else None
+
+
+def _read_png(group: Any, kind: str, row: int) -> NDArray[np.uint8]:
+    """Read the PNG file of a row; raise ValueError if its position is invalid."""
+    files, ends = group[kind], group[f"{kind}_ends"]
+    if files.dtype != np.uint8 or files.ndim != 1 or ends.dtype != np.int64 or ends.ndim != 1:
+        raise ValueError(f"{kind} has another type or shape")
+    start, end = (0 if row == 0 else int(ends[row - 1])), int(ends[row])
+    if not 0 <= start <= end <= len(files):
+        raise ValueError(f"{kind} of row {row} ends at byte {end} of {len(files)}")
+    return files[start:end]
 
 
 class CandidateImages:
@@ -122,18 +167,19 @@ class CandidateImages:
     def __init__(self, path: Path | str, decisions: str | None = None) -> None:
         self.path = Path(path)
         with self._open() as file:
-            check_links(file, self.path)
-            attributes: dict[str, Any] = dict(file.attrs)
-            found = attributes.get("format"), attributes.get("version")
-            if found != (FORMAT, VERSION):
+            name, version = (_read_attribute(file, name, kind) for name, kind in (("format", "S"), ("version", "i")))
+            if (name, version) != (FORMAT.encode(), VERSION):
                 what, expected = "not a file with images of decisions", f"format {FORMAT!r}, version {VERSION}"
-                raise DatasetError(what, where=self.path, expected=expected, found=f"{found[0]!r}, {found[1]}")
-            if decisions is not None and attributes["decisions"] != decisions:
+                raise DatasetError(what, where=self.path, expected=expected, found=f"{name}, {version}", fix=_RENDER)
+            if decisions is not None and _read_attribute(file, "decisions", "S") != decisions.encode():
                 what = "these images show other decisions than the candidates file"
                 raise DatasetError(what, where=self.path, fix=_RENDER_AGAIN)
-            self.cameras = tuple(str(name) for name in attributes["cameras"])
-            groups: list[Any] = [file[camera] for camera in self.cameras]
-            self.has_depth = all("depth" in group for group in groups)
+            check_links(file, self.path)
+            groups: dict[str, Any] = dict(file.items())
+            self.cameras = tuple(name for name in sorted(groups) if re.fullmatch(CAMERA_NAME, name))
+            self.has_depth = all("depth" in groups[camera] for camera in self.cameras)
+        if not self.cameras:
+            raise DatasetError("this file has no images", where=self.path, fix=_RENDER_AGAIN)
         height, width = self.rgb(0, self.cameras[0]).shape[:2]
         self.size = width, height
 
@@ -147,26 +193,32 @@ class CandidateImages:
 
     def intrinsic(self, row: int, camera: str) -> NDArray[np.float64]:
         """Return fx, fy, cx, cy (4,) of a camera in pixels."""
-        return np.asarray(self._read(row, camera, "intrinsic"), np.float64)
+        return self._read(row, camera, "intrinsic")
 
     def camera_in_base(self, row: int, camera: str) -> NDArray[np.float64]:
         """Return the pose (4, 4) of the OpenCV camera frame in the arm's base frame."""
-        return np.asarray(self._read(row, camera, "camera_in_base"), np.float64)
+        return self._read(row, camera, "camera_in_base")
 
     def _decode(self, row: int, camera: str, kind: ImageKind) -> NDArray[Any]:
-        data = self._read(row, camera, kind)
+        with self._open() as file:
+            group: Any = file[camera]
+            self._check_row(row, len(group["intrinsic"]))
+            data = _read_png(group, kind, row)
         image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-        if image is None:
+        if image is None or (image.dtype, image.ndim) != {"rgb": (np.uint8, 3), "depth": (np.uint16, 2)}[kind]:
             where = f"{self.path}, {camera}/{kind}, row {row}"
             raise DatasetError("this image is damaged", where=where, fix=_RENDER_AGAIN)
         return image
 
-    def _read(self, row: int, camera: str, name: str) -> NDArray[Any]:
+    def _read(self, row: int, camera: str, name: str) -> NDArray[np.float64]:
         with self._open() as file:
             dataset: Any = file[f"{camera}/{name}"]
-            if not 0 <= row < len(dataset):
-                raise DatasetError("no such decision", where=self.path, expected=f"0 to {len(dataset) - 1}", found=row)
-            return np.asarray(dataset[row])
+            self._check_row(row, len(dataset))
+            return np.asarray(dataset[row], np.float64)
+
+    def _check_row(self, row: int, rows: int) -> None:
+        if not 0 <= row < rows:
+            raise DatasetError("no such decision", where=self.path, expected=f"0 to {rows - 1}", found=row)
 
     @contextmanager
     def _open(self) -> Iterator[h5py.File]:
@@ -176,7 +228,7 @@ class CandidateImages:
                 yield file
         except FileNotFoundError as error:
             raise DatasetError("no such images file", where=self.path, fix=_RENDER) from error
-        except (OSError, KeyError, ValueError, TypeError, RuntimeError, DocumentError) as error:
+        except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError, MemoryError) as error:
             raise DatasetError(
                 "damaged images file", where=self.path, found=one_line(error), fix=_RENDER_AGAIN
             ) from error

@@ -9,12 +9,12 @@ from __future__ import annotations
 import os
 import shutil
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -27,19 +27,20 @@ from robocas_ms3.core.output_folder import FolderKind, OutputFolder
 from robocas_ms3.core.poses import inverse
 from robocas_ms3.core.workers import WorkerPool, use_one_torch_thread
 from robocas_ms3.datasets.candidate_images.images_file import (
-    FORMAT,
-    VERSION,
     CameraImages,
     CandidateImages,
+    count_bytes,
     create_datasets,
     hash_decisions,
     read_images,
+    write_attributes,
     write_images,
 )
 from robocas_ms3.datasets.candidate_images.settings import CandidateImageResult, CandidateImageSettings
 from robocas_ms3.datasets.conversion.rendered_source import open_env_renderer
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.images.png import encode_png
+from robocas_ms3.datasets.schema import IMAGE_KINDS
 from robocas_ms3.demos.candidates.candidates_file import CandidateFile
 from robocas_ms3.demos.recordings.motion import Motion
 from robocas_ms3.demos.recordings.trajectory_file import Recording
@@ -50,7 +51,7 @@ if TYPE_CHECKING:
 
 _FOLDER = FolderKind("robocas render-candidates", ("settings.json",), "decisions")
 _CONTROL_MODE = "pd_joint_pos"  # of recordings; the images do not depend on it
-_MARGIN_BYTES = 2**13  # per decision, that the merged file may need in addition
+_ROW_BYTES, _MARGIN_BYTES = 128, 2**13  # for positions and poses per row, and for the structure of the merged file
 
 Rows = tuple[int, int]
 """First row of the decisions of a seed, and the row after the last one."""
@@ -109,7 +110,7 @@ def render_candidates(
         for count in _render_parts(settings, options, missing):
             done += count
             on_decisions(done, total)
-        _merge_parts({rows: _part_path(parts, rows) for rows in seeds}, out, options, decisions)
+        _merge_parts({rows: _part_path(parts, rows) for rows in seeds}, out, decisions)
         shutil.rmtree(parts)
     rendered = sum(last - first for first, last in missing)
     return CandidateImageResult(total, rendered, out.stat().st_size, time.perf_counter() - start)
@@ -125,13 +126,12 @@ def iter_seeds(file: CandidateFile) -> Iterator[Rows]:
 def _check_existing(out: Path, decisions: str, options: ImageOptions) -> None:
     """Raise OutputExistsError unless a file has the requested images of these decisions."""
     found = CandidateImages(out, decisions)
-    stored = replace(options, cameras=found.cameras, size=options.size and found.size, depth=found.has_depth)
-    if stored != options:
-        what = "the images were rendered with other cameras, another size or depth option"
+    has_size = options.size in (None, found.size)
+    if set(found.cameras) != set(options.cameras) or found.has_depth != options.depth or not has_size:
+        what, (width, height) = "the images were rendered with other options", found.size
+        shown = f"{', '.join(found.cameras)}, {width} x {height}, {'with' if found.has_depth else 'without'} depth"
         fix = "Pass --overwrite to replace them, or choose another file with --out."
-        raise OutputExistsError(
-            what, where=out, found=f"{', '.join(found.cameras)}, {found.size[0]} x {found.size[1]}", fix=fix
-        )
+        raise OutputExistsError(what, where=out, found=shown, fix=fix)
 
 
 def _part_path(folder: Path, rows: Rows) -> Path:
@@ -169,7 +169,7 @@ class _SeedWorker:
         images = render_loaded(self._renderer, recording, self._options)
 
         def fill(file: h5py.File) -> None:
-            create_datasets(file, self._options, last - first)
+            create_datasets(file, last - first, count_bytes(images))
             write_images(file, 0, images)
 
         with atomic_file(_part_path(self._folder, rows), sync=True) as path:
@@ -232,13 +232,19 @@ def _find_parent_in_base(parent: str, motion: Motion) -> NDArray[np.float64]:
     return np.broadcast_to(np.eye(4), world_in_base.shape) if parent == "arm_base" else world_in_base
 
 
-def _merge_parts(parts: Mapping[Rows, Path], out: Path, options: ImageOptions, decisions: str) -> None:
+def _merge_parts(parts: Mapping[Rows, Path], out: Path, decisions: str) -> None:
     """Merge the files of the seeds to one file, atomically."""
+    sizes: Counter[str] = Counter()
+    for part in parts.values():
+        with h5py.File(part, "r") as source:
+            cameras: dict[str, Any] = dict(source.items())
+            for camera, group in cameras.items():
+                sizes.update({f"{camera}/{kind}": len(group[kind]) for kind in IMAGE_KINDS if kind in group})
     rows = max(last for _, last in parts)
-    size = sum(path.stat().st_size for path in parts.values()) + rows * _MARGIN_BYTES
-    with atomic_file(out, sync=True) as path, open_reserved(path, size) as file:
-        create_datasets(file, options, rows)
+    reserved = sum(sizes.values()) + len(sizes) * (rows * _ROW_BYTES + _MARGIN_BYTES)
+    with atomic_file(out, sync=True) as path, open_reserved(path, reserved) as file:
+        create_datasets(file, rows, sizes)
         for (first, _), part in parts.items():
             with h5py.File(part, "r") as source:
                 write_images(file, first, read_images(source))
-        file.attrs.update({"format": FORMAT, "version": VERSION, "decisions": decisions, "cameras": options.cameras})
+        write_attributes(file, decisions)

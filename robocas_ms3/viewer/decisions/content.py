@@ -48,6 +48,10 @@ class DecisionContent(Content):
         }
 
     def episode(self, number: int) -> dict[str, Any]:
+        with convert_damage_errors(f"{self.root.name}, decision {number}"):
+            return self._make_content(number)
+
+    def _make_content(self, number: int) -> dict[str, Any]:
         decision, views = self.source.decision(number), self.source.views(number)
         values = decision.values
         return {

@@ -145,7 +145,7 @@ def test_reader_is_picklable(images):
     np.testing.assert_array_equal(copy.depth(1, "static_camera"), images.depth(1, "static_camera"))
 
 
-@pytest.mark.parametrize("damage", ["truncated", "camera", "format", "empty"])
+@pytest.mark.parametrize("damage", ["truncated", "ends", "format", "empty"])
 def test_damaged_files_are_dataset_errors(images, tmp_path, damage):
     path = tmp_path / "images.h5"
     shutil.copy(images.path, path)
@@ -155,8 +155,8 @@ def test_damaged_files_are_dataset_errors(images, tmp_path, damage):
         path.write_bytes(b"")
     else:
         with h5py.File(path, "r+") as file:
-            if damage == "camera":
-                del file["static_camera"]
+            if damage == "ends":
+                file["base_camera/rgb_ends"][0] = -1
             else:
                 file.attrs["format"] = "other"
     with pytest.raises(DatasetError):
