@@ -91,7 +91,7 @@ def generate_push_candidates(
             if extent is None:
                 continue
             tool = np.array([*center[:2], height]) - (extent + STAND_OFF + TOOL_RADIUS) * direction
-            if not _tool_fits(tool, near):
+            if not does_tool_fit(tool, near):
                 continue
             length = STAND_OFF + extent + PUSH_BEYOND_CENTER
             shift = (length - STAND_OFF) * direction
@@ -171,6 +171,10 @@ def _hits(tree: KDTree | None, points: Array, shift: Array) -> bool:
     return bool(tree.query(np.concatenate(ways))[0].min() < WALL_MARGIN)
 
 
-def _tool_fits(tool: Array, points: Array) -> bool:
+def does_tool_fit(tool: Array, points: Array) -> bool:
+    """Return whether the closed fingers touch none of some points (P, 3) while they move straight down to ``tool``.
+
+    ``tool`` (3,) is the position of the TCP, m.
+    """
     above = points[points[:, 2] > tool[2] - TIP_BELOW_TCP - 0.002]
     return not np.any(np.linalg.norm(above[:, :2] - tool[:2], axis=1) < TOOL_RADIUS + 0.003)

@@ -22,6 +22,7 @@ from robocas_ms3.planning.pushes import (
     TIP_BELOW_TCP,
     TIP_CLEARANCE,
     TOOL_RADIUS,
+    does_tool_fit,
     push_yaws,
 )
 from robocas_ms3.planning.skills.arm import Arm, shift_back
@@ -42,11 +43,12 @@ MIX: dict[DecisionKind, dict[Primitive, float]] = {
 TARGET_FRACTION = 0.5  # fraction of random grasps that are of the target
 NEIGHBOUR_DISTANCE = 0.15  # m from the target at which an object is chosen e times less often than the target
 CLEAR_FRACTION = 0.6  # fraction of random grasps that touch no other body, if there are any
-REACHABLE_FRACTION = 0.9  # fraction of random grasps and releases that the arm reaches, if there are any
+REACHABLE_FRACTION = 0.9  # fraction of random candidates whose start is reachable or free, if there is one
 LIFT_GRASPS = 4  # grasps to try per random lift
 # errors of near misses: standard deviations across and along the approach in m, and in rad
 GRASP_SHIFT, GRASP_DEPTH, GRASP_TURN = 0.02, 0.012, np.deg2rad(15)
 PUSH_SHIFT = (0.02, 0.05)  # m across the direction of the push, minimum and maximum
+PUSH_STARTS = 8  # starts to draw until the tool is free at the start
 PUSH_LENGTHS = (0.04, 0.2)  # m, of a random push after the contact
 DROP_SHIFT = (0.06, 0.26)  # m, horizontally
 PULL_SHIFT, PULL_ERROR = 0.004, (0.015, 0.05)  # m: standard deviation of random pulls; length of the error of a miss
@@ -180,19 +182,35 @@ def _lift(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate | No
 def _push(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate | None:
     slot = _draw_slot(arm, rng, with_target=True)
     assert slot is not None  # the target is present
-    points, (frame, _) = arm.scene.object_points(slot), read_surface(arm)
-    center, top = points.mean(axis=0), points[:, 2].max()
-    angle = rng.uniform(-np.pi, np.pi)
-    direction = np.array([np.cos(angle), np.sin(angle), 0.0])
-    lowest = frame[2, 3] + TIP_CLEARANCE + TIP_BELOW_TCP
-    height = rng.uniform(max(lowest, points[:, 2].min()), max(lowest, top - BELOW_TOP))
-    behind = -float(((points - center) @ direction).min())
-    aside = rng.choice((-1, 1)) * rng.uniform(*PUSH_SHIFT) if near_miss else 0.0
-    tool = np.array([*center[:2], height]) - (behind + STAND_OFF + TOOL_RADIUS) * direction
-    tool += aside * np.array([-direction[1], direction[0], 0.0])
+    points, others = arm.scene.object_points(slot), arm.scene.points_in_base(exclude=slot)
+    lowest = read_surface(arm)[0][2, 3] + TIP_CLEARANCE + TIP_BELOW_TCP
+    tool, direction = draw_push_start(rng, points, lowest, near_miss)
+    for _ in range(PUSH_STARTS if rng.random() < REACHABLE_FRACTION else 0):  # prefer a free start
+        if does_tool_fit(tool, others):
+            break
+        tool, direction = draw_push_start(rng, points, lowest, near_miss)
     pushes = push_yaws(tool, direction, STAND_OFF + rng.uniform(*PUSH_LENGTHS))
     source: Source = "near_miss" if near_miss else "random"
     return Candidate(source, "push", slot, lambda: push_along(arm, slot, pushes), pushes[0].start, pushes[0].end)
+
+
+def draw_push_start(rng: np.random.Generator, points: Array, lowest: float, near_miss: bool) -> tuple[Array, Array]:
+    """Draw the TCP position (3,) at the start of a push of an object, and the direction (3,) of the push.
+
+    Args:
+        rng: random generator.
+        points: (P, 3) surface points of the object, m.
+        lowest: lowest height of the TCP, m.
+        near_miss: whether the tool passes the middle of the object at a distance.
+    """
+    center, angle = points.mean(axis=0), rng.uniform(-np.pi, np.pi)
+    direction = np.array([np.cos(angle), np.sin(angle), 0.0])
+    height = rng.uniform(max(lowest, points[:, 2].min()), max(lowest, points[:, 2].max() - BELOW_TOP))
+    behind = -float(((points - center) @ direction).min())
+    tool = np.array([*center[:2], height]) - (behind + STAND_OFF + TOOL_RADIUS) * direction
+    if near_miss:
+        tool += rng.choice((-1, 1)) * rng.uniform(*PUSH_SHIFT) * np.array([-direction[1], direction[0], 0.0])
+    return tool, direction
 
 
 def _release(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate:
