@@ -19,7 +19,7 @@ from robocas_ms3.planning.pushes import compute_push_direction
 from robocas_ms3.planning.skills import heap as heap_skill
 from robocas_ms3.planning.skills import push
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.heap import Heap, Move
+from robocas_ms3.planning.skills.heap import Heap, Move, find_fallen_objects
 from robocas_ms3.planning.skills.push import push_away
 from robocas_ms3.planning.skills.remove import count_clear_grasps, find_grasp_blockers, remove_object
 from robocas_ms3.planning.solvers import search
@@ -184,3 +184,5 @@ def test_object_on_the_floor_ends_the_attempt(generator, which):
     fallen.set_pose(Pose.create_from_pq(torch.tensor([[-1.0, -1.0, 0.1]]), fallen.pose.q))
     with pytest.raises(UnrecoverableError, match="fell_off_table"):
         Heap(arm, target).check_objects_on_surface()
+    assert find_fallen_objects(arm) == {target if which == "target" else slots[0]}
+    Heap(arm, target, find_fallen_objects(arm)).check_objects_on_surface()  # as after another policy

@@ -53,10 +53,12 @@ class Heap:
     Attributes:
         arm: context of the attempt.
         target: slot of the target.
+        fallen: slots of objects that fell off the surface earlier, as before an intervention, and are ignored.
     """
 
     arm: Arm
     target: int
+    fallen: frozenset[int] = frozenset()
 
     @property
     def env(self) -> RoboCASSearchEnv:
@@ -156,11 +158,12 @@ class Heap:
 
         Raises PlanningError if an object is at the edge, and UnrecoverableError if an object has fallen off.
         """
+        if not self.fallen.issuperset(find_fallen_objects(self.arm)):
+            raise UnrecoverableError("clear", "fell_off_table")
         frame, half = read_surface(self.arm)
         present = np.flatnonzero(self.env.present[0].cpu().numpy()).tolist()
-        positions = np.stack([self.arm.scene.object_in_base(slot)[:3, 3] for slot in present])
-        if (positions[:, 2] < frame[2, 3] - FALLEN).any():
-            raise UnrecoverableError("clear", "fell_off_table")
+        remaining = [slot for slot in present if slot not in self.fallen]
+        positions = np.stack([self.arm.scene.object_in_base(slot)[:3, 3] for slot in remaining])
         local = (positions - frame[:3, 3]) @ frame[:3, :3]
         if (np.abs(local[:, :2]) > half - EDGE_MARGIN).any():
             raise PlanningError("clear", "object_at_edge")
@@ -168,3 +171,10 @@ class Heap:
     def centroid(self, slot: int) -> Array:
         """Return the mean (3,) of the surface points of an object in the arm's base frame, m."""
         return self.arm.scene.object_points(slot).mean(axis=0)
+
+
+def find_fallen_objects(arm: Arm) -> frozenset[int]:
+    """Return the slots of the objects that have fallen off the surface."""
+    height = read_surface(arm)[0][2, 3] - FALLEN
+    present = np.flatnonzero(arm.env.present[0].cpu().numpy()).tolist()
+    return frozenset(slot for slot in present if arm.scene.object_in_base(slot)[2, 3] < height)

@@ -10,7 +10,7 @@ from robocas_ms3.planning.decisions import SearchLimits
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.grasp import grasp
-from robocas_ms3.planning.skills.heap import COUNTERS, Heap
+from robocas_ms3.planning.skills.heap import COUNTERS, Heap, find_fallen_objects
 from robocas_ms3.planning.skills.look import FAR, NEAR, load_object_meshes, look_at
 from robocas_ms3.planning.skills.place import carry_to_basket, release_into_basket
 from robocas_ms3.planning.skills.remove import raise_held_object
@@ -23,7 +23,7 @@ GRASP_KINDS = 3  # kinds of grasps of the target to try
 
 def attempt(arm: Arm) -> None:
     """Make one attempt at search from the present state; raise PlanningError if it fails."""
-    slot, heap = arm.target, Heap(arm, arm.target)
+    slot, heap = arm.target, Heap(arm, arm.target, find_fallen_objects(arm) - {arm.target})
     for fact in COUNTERS:
         arm.executor.facts.setdefault(fact, 0)
     with arm.planning_time():
