@@ -15,11 +15,14 @@ from robocas_ms3.demos.failures import FAILURES_FILE, FailedAttempt
 
 @dataclass(frozen=True)
 class Row:
-    """Row of the table: an episode, or a skipped seed.
+    """Row of the table: an episode, a skipped seed, or a decision with candidates.
 
     Attributes:
-        n: episode number; None: a skipped seed.
-        stages: stages at which attempts failed.
+        n: episode number, or row of a decision; None: a skipped seed.
+        steps: number of steps, or of the candidates of a decision.
+        task: task, or kind of a decision.
+        success: outcome of the episode, or of the chosen candidate; None: unknown.
+        stages: stages at which attempts failed, or primitives of the candidates.
         damage: text on damaged values, which the page does not show.
     """
 

@@ -96,7 +96,7 @@ robocas.decision = (() => {
         return button;
       })
     );
-    picture();
+    drawImage();
     rows();
     highlight(chosen);
   }
@@ -114,7 +114,7 @@ robocas.decision = (() => {
     return made;
   }
 
-  function picture() {
+  function drawImage() {
     const shown = decision.views.find((v) => v.name === view);
     const isCamera = index.cameras.includes(view);
     const [width, height] = shown.size;
