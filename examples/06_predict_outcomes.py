@@ -6,7 +6,7 @@ The features are computed from the poses and shapes of the objects before the ca
 """
 
 import sys
-from collections.abc import Iterator
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -14,11 +14,13 @@ from torch import nn
 
 from robocas_ms3.assets.pack import Pack, load_pack
 from robocas_ms3.demos import CandidateFile
+from robocas_ms3.demos.candidates.labels import MIN_BENEFIT
+from robocas_ms3.planning.clearing_cost import compute_clearing_cost
 
-FOLDS, MODELS, STEPS = 5, 5, 250  # each fifth of the scenes is held out once; models per fold, training steps
-POINTS = 150  # per object
+FOLDS, MODELS, STEPS = 5, 8, 400  # each fifth of the scenes is held out once; models per fold, training steps
+POINTS = 400  # per object
+CELL, CELLS, NOTHING = 0.01, 40, -1.0  # m, edge of the cells of a height map; cells per side; height of an empty cell
 FINGER, PALM = 0.04, 0.10  # m from the TCP: inner side of an open finger, and the palm
-NEAR = 0.015  # m around the target, horizontally
 # boxes in the TCP frame (x across the fingers, y closing direction, z approach), lower and upper corner, m
 BOXES = {
     "between the fingers": ((-0.011, -FINGER, -0.02), (0.011, FINGER, 0.009)),
@@ -87,80 +89,134 @@ def grasp_features(scene: Scene, slot: int, start: np.ndarray) -> list[float]:
 
 
 def push_features(scene: Scene, slot: int, target: int, start: np.ndarray, end: np.ndarray) -> list[float]:
-    """Describe a push: its length and direction relative to the target, and the points near the target after it."""
+    """Describe a push: its path relative to object and target, and the clutter if only the pushed object moved."""
     own, goal, others = scene.points[slot], scene.points[target], scene.others(slot, target)
     push = end[:2] - start[:2]
     length = float(np.linalg.norm(push))
     ahead = push / max(length, 1e-6)
     aside = np.array([-ahead[1], ahead[0]])
-    features = [length, start[2], start[0], start[1], *ahead, float(slot == target)]
+    features = [length, start[2], start[0], start[1], float(slot == target)]
     for points in (own, goal):
         along, across = (points[:, :2] - start[:2]) @ ahead, (points[:, :2] - start[:2]) @ aside
         features += [along.min(), along.max(), across.min(), across.max(), points[:, 2].min(), points[:, 2].max()]
     shift = max(0.0, length - max(0.0, float(((own[:, :2] - start[:2]) @ ahead).min())))
     moved = own + [*(shift * ahead), 0.0]
     offset, after = own.mean(axis=0) - goal.mean(axis=0), moved.mean(axis=0) - goal.mean(axis=0)
-    features += [shift, *offset, np.linalg.norm(offset[:2]), np.linalg.norm(after[:2])]
+    features += [shift, offset[2], np.linalg.norm(offset[:2]), np.linalg.norm(after[:2])]
     features += [float(ahead @ offset[:2]) / max(float(np.linalg.norm(offset[:2])), 1e-3)]
-    near = [count_above(goal, points) for points in (own, moved, others)]
-    features += [np.log1p(near[0]), np.log1p(near[1]), np.log1p(near[2]), near[0] / max(1.0, near[0] + near[2])]
+    # the clutter now, without the object, and after the push
+    middle, hidden, is_obstacle = goal.mean(axis=0), [], []
+    maps = [height_map(points, middle) for points in (goal, others, own, moved)]
+    for pushed in (maps[2], None, maps[3]):
+        top = maps[1] if pushed is None else np.maximum(maps[1], pushed)
+        seen = maps[0] > NOTHING
+        hidden.append(float((seen & (top > maps[0])).sum() / max(1, seen.sum())))
+        high = np.full_like(top, NOTHING) if pushed is None else pushed
+        is_obstacle.append(float((dilate(seen) & (high > np.maximum(maps[0], middle[2]))).any()))
+    around = scene.clutter(target)[1]
+    costs = [
+        compute_clearing_cost(around - is_obstacle[0] + one, part, 1)
+        for one, part in zip(is_obstacle, hidden, strict=True)
+    ]
+    features += [*hidden, *is_obstacle, *costs, costs[0] - costs[1], costs[0] - costs[2]]
     along, across = (others[:, :2] - start[:2]) @ ahead, (others[:, :2] - start[:2]) @ aside
     swept = (abs(across) < 0.03) & (along > 0) & (along < length + 0.05) & (others[:, 2] > start[2] - 0.02)
     features += [np.log1p(swept.sum())]
     return [*features, *scene.clutter(target), *scene.clutter(slot)]
 
 
-def count_above(target: np.ndarray, points: np.ndarray) -> float:
-    """Count points above the middle of the target and at most `NEAR` outside of its bounding box, seen from above."""
-    low, high = target[:, :2].min(axis=0) - NEAR, target[:, :2].max(axis=0) + NEAR
-    inside = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
-    return float((inside & (points[:, 2] > target[:, 2].mean())).sum())
+def height_map(points: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """Return the greatest height of the points in each cell of a grid around ``middle``, seen from above."""
+    heights = np.full((CELLS, CELLS), NOTHING)
+    cells = np.floor((points[:, :2] - middle[:2]) / CELL).astype(int) + CELLS // 2
+    inside = ((cells >= 0) & (cells < CELLS)).all(axis=1)
+    np.maximum.at(heights, tuple(cells[inside].T), points[inside, 2])
+    return heights
 
 
-def read_samples(paths: list[str], primitive: str) -> Iterator[tuple[str, list[float], bool]]:
-    """Yield scene, features and label of each candidate of a primitive: grasps that succeed, pushes that help."""
+def dilate(mask: np.ndarray) -> np.ndarray:
+    """Return a mask with the cells next to the cells of a mask."""
+    padded = np.pad(mask, 1)
+    shifts = [padded[1 + x : CELLS + 1 + x, 1 + y : CELLS + 1 + y] for x in (-1, 0, 1) for y in (-1, 0, 1)]
+    return np.any(shifts, axis=0)
+
+
+@dataclass
+class Samples:
+    """Samples of a primitive: scene, features and label of each one, and whether its target is that of the episode."""
+
+    scenes: list[str] = field(default_factory=list)
+    features: list[list[float]] = field(default_factory=list)
+    labels: list[bool] = field(default_factory=list)
+    instructed: list[bool] = field(default_factory=list)
+    sources: list[str] = field(default_factory=list)
+
+
+def read_samples(paths: list[str], primitive: str) -> Samples:
+    """Read the grasps, labelled by their success, or the pushes, labelled by whether they helped a target.
+
+    A push is a sample for each target that it could help: one simulation serves several instructions. Candidates whose
+    start is unknown are left out.
+    """
+    samples = Samples()
     for path in paths:
         file = CandidateFile(path)
-        pack = load_pack(file.recorded_env.kwargs.get("pack", "builtin"))
-        helped = file.labels.for_target(file.labels.helped)
+        pack, labels = load_pack(file.recorded_env.kwargs.get("pack", "builtin")), file.labels
         for row in range(len(file)):
-            decision = file.decision(row)
+            decision, first = file.decision(row), file.rows_of(row).start
             found, scene = decision.candidates, Scene(decision.values, pack)
-            target, key = int(decision.values["target_slot"]), f"{file.recorded_env.env_id} {decision.values['seed']}"
             known = ~np.isnan(found["start_in_base"][:, 0]) & (found["primitive"] == primitive)
-            for number in np.flatnonzero(known if primitive == "grasp" else known & found["feasible"]).tolist():
+            for number in np.flatnonzero(known).tolist():
                 slot, start, end = (found[name][number] for name in ("slot", "start_in_base", "end_in_base"))
+                target, added = int(decision.values["target_slot"]), []
                 if primitive == "grasp":
-                    yield key, grasp_features(scene, int(slot), start), bool(found["success"][number])
+                    added = [(target, grasp_features(scene, int(slot), start), found["success"][number])]
                 else:
-                    features = push_features(scene, int(slot), target, start, end)
-                    yield key, features, bool(helped[file.rows_of(row).start + number])
+                    for other in np.flatnonzero(labels.cost_before[first + number] >= MIN_BENEFIT).tolist():
+                        features = push_features(scene, int(slot), other, start, end)
+                        added.append((other, features, labels.helped[first + number, other]))
+                for other, features, label in added:
+                    samples.scenes.append(f"{file.recorded_env.env_id} {decision.values['seed']}")
+                    samples.features.append(features)
+                    samples.labels.append(bool(label))
+                    samples.instructed.append(other == target)
+                    samples.sources.append(str(found["source"][number]))
+    return samples
 
 
-def predict(train: np.ndarray, labels: np.ndarray, test: np.ndarray) -> np.ndarray:
-    """Train small networks on features (N, F) and labels (N,); return the mean score (M,) of test samples (M, F)."""
+def predict(train: np.ndarray, labels: np.ndarray, scenes: np.ndarray, test: np.ndarray) -> np.ndarray:
+    """Train small networks on features (N, F) and labels (N,); return the mean score (M,) of test samples (M, F).
+
+    Each network stops at its lowest loss in a fifth of the training scenes (N,), which it does not train on.
+    """
     mean, std = train.mean(axis=0), train.std(axis=0) + 1e-6
     inputs, test_inputs = (torch.tensor(np.clip((x - mean) / std, -5, 5), dtype=torch.float32) for x in (train, test))
     targets, scores = torch.tensor(labels, dtype=torch.float32), []
+    compute_loss = nn.functional.binary_cross_entropy_with_logits
     for seed in range(MODELS):
         torch.manual_seed(seed)
-        widths = (inputs.shape[1], 64, 64)
-        layers = [
-            layer
-            for size in zip(widths[:-1], widths[1:], strict=True)
-            for layer in (nn.Linear(*size), nn.ReLU(), nn.Dropout(0.3))
-        ]
-        model = nn.Sequential(*layers, nn.Linear(widths[-1], 1))
-        optimizer = torch.optim.AdamW(model.parameters(), lr=3e-3, weight_decay=0.1)
-        for _ in range(STEPS):
-            batch = torch.randperm(len(inputs))[:512]
-            loss = nn.functional.binary_cross_entropy_with_logits(model(inputs[batch])[:, 0], targets[batch])
+        names = np.random.default_rng(seed).permutation(np.unique(scenes))
+        kept = torch.tensor(np.isin(scenes, names[: max(1, len(names) // 5)]))
+        rows = torch.nonzero(~kept)[:, 0]
+        sizes = ((inputs.shape[1], 32), (32, 32))
+        layers = [layer for size in sizes for layer in (nn.Linear(*size), nn.ReLU(), nn.Dropout(0.3))]
+        model = nn.Sequential(*layers, nn.Linear(32, 1))
+        optimizer = torch.optim.AdamW(model.parameters(), lr=2e-3, weight_decay=0.3)
+        lowest, best = np.inf, np.zeros(len(test))
+        for step in range(STEPS):
+            model.train()
+            batch = rows[torch.randperm(len(rows))[:512]]
+            loss = compute_loss(model(inputs[batch])[:, 0], targets[batch])
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
-        model.eval()
-        with torch.no_grad():
-            scores.append(model(test_inputs)[:, 0].sigmoid().numpy())
+            if step % 10 == 9:
+                model.eval()
+                with torch.no_grad():
+                    found = float(compute_loss(model(inputs[kept])[:, 0], targets[kept]))
+                    if found < lowest:
+                        lowest, best = found, model(test_inputs)[:, 0].sigmoid().numpy()
+        scores.append(best)
     return np.mean(scores, axis=0)
 
 
@@ -173,22 +229,35 @@ def compute_auc(labels: np.ndarray, scores: np.ndarray) -> float:
     return float((below + up_to).mean() / 2 / len(negative))
 
 
+def describe_auc(scenes: np.ndarray, labels: np.ndarray, scores: np.ndarray) -> str:
+    """Return the AUC with its 95 % bootstrap interval; scenes are drawn, since their candidates are not independent."""
+    names, index = np.unique(scenes, return_inverse=True)
+    rng, rows = np.random.default_rng(0), [np.flatnonzero(index == number) for number in range(len(names))]
+    drawn = [np.concatenate([rows[n] for n in rng.integers(len(rows), size=len(rows))]) for _ in range(500)]
+    low, high = np.nanpercentile([compute_auc(labels[draw], scores[draw]) for draw in drawn], [2.5, 97.5])
+    about = f"{len(labels)} candidates, {len(names)} scenes, {labels.mean():.0%} positive"
+    return f"AUC {compute_auc(labels, scores):.3f} [{low:.3f}, {high:.3f}] ({about})"
+
+
 def main(paths: list[str]) -> None:
     torch.set_num_threads(1)  # faster for small networks
     for primitive, label in (("grasp", "success"), ("push", "benefit")):
-        samples = list(read_samples(paths, primitive))
-        scenes, features, labels = (np.array(column) for column in zip(*samples, strict=True))
+        samples = read_samples(paths, primitive)
+        scenes, labels = np.array(samples.scenes), np.array(samples.labels)
+        features, sources = np.array(samples.features), np.array(samples.sources)
         names, index = np.unique(scenes, return_inverse=True)
         fold = np.random.default_rng(0).permutation(len(names))[index] % FOLDS
         scores = np.zeros(len(labels))
         for held_out in range(FOLDS):
             test = fold == held_out
-            scores[test] = predict(features[~test], labels[~test], features[test])
-        rng, rows = np.random.default_rng(0), [np.flatnonzero(index == number) for number in range(len(names))]
-        drawn = [np.concatenate([rows[n] for n in rng.integers(len(rows), size=len(rows))]) for _ in range(500)]
-        low, high = np.nanpercentile([compute_auc(labels[draw], scores[draw]) for draw in drawn], [2.5, 97.5])
-        about = f"{len(labels)} candidates, {len(names)} scenes, {labels.mean():.0%} positive"
-        print(f"{primitive} {label}: AUC {compute_auc(labels, scores):.3f} [{low:.3f}, {high:.3f}] ({about})")
+            scores[test] = predict(features[~test], labels[~test], scenes[~test], features[test])
+        tested = np.array(samples.instructed)  # other targets are only used for training
+        by_source = {"expert": tested & (sources == "expert"), "random": tested & (sources != "expert")}
+        for name, rows in {"all": tested, **by_source}.items():
+            if len(set(labels[rows])) == 2:
+                print(
+                    f"{primitive} {label}, {name} candidates: {describe_auc(scenes[rows], labels[rows], scores[rows])}"
+                )
 
 
 if __name__ == "__main__":
