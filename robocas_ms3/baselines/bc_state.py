@@ -49,7 +49,7 @@ from robocas_ms3.evaluation.policy import Observations, PolicySpec, concatenate_
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 
-_CACHE_VERSION = 3
+_CACHE_VERSION = 4
 _PACKAGES = ("robocas-ms3", "mani_skill", "sapien")
 _MIN_DEVIATION = 1e-2  # smallest deviation of an input: nearly constant inputs must not be scaled up
 
@@ -105,9 +105,11 @@ class StateSamples:
             self.scenes = read_training_scenes(source, source.numbers)
         ends = np.cumsum(arrays["lengths"])
         rows = [slice(int(ends[number] - arrays["lengths"][number]), int(ends[number])) for number in numbers]
-        poses, opened = arrays["poses"], arrays["opened"]
-        self._chunks = _concatenate([encode_chunks(poses[row], opened[row], config.chunk) for row in rows])
-        self._keys = _concatenate([encode_next_key_poses(poses[row], opened[row]) for row in rows])
+        poses, opened, intended = arrays["poses"], arrays["opened"], arrays["intended_poses"]
+        self._chunks = _concatenate(
+            [encode_chunks(poses[row], opened[row], config.chunk, intended[row]) for row in rows]
+        )
+        self._keys = _concatenate([encode_next_key_poses(poses[row], opened[row], intended[row]) for row in rows])
         self._inputs = _concatenate(
             [make_inputs(arrays["state"][row], poses[row], arrays["widths"][row]) for row in rows]
         )
@@ -176,11 +178,12 @@ def read_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArra
     The recorded state of a step is set in the environment of the recording, which computes the privileged state.
 
     Returns:
-        Per policy step: ``state`` (N, D), ``poses`` (N, 4, 4) of the TCP in the arm's base frame, ``opened`` (N,)
-        gripper commands (1 = open), ``widths`` (N,) of the gripper in m. Per episode: ``lengths`` in policy steps,
-        ``seeds``.
+        Per policy step: ``state`` (N, D), ``poses`` (N, 4, 4) of the TCP in the arm's base frame, ``intended_poses``
+        (N, 4, 4) without action noise, ``opened`` (N,) gripper commands (1 = open), ``widths`` (N,) of the gripper in
+        m. Per episode: ``lengths`` in policy steps, ``seeds``.
     """
-    parts: dict[str, list[NDArray[Any]]] = {name: [] for name in ("state", "poses", "opened", "widths")}
+    names = ("state", "poses", "intended_poses", "opened", "widths")
+    parts: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
     lengths, seeds, env = [], [], None
     with TrajectoryFile(path) as file:
         stride = sample_stride(file.control_freq, rate_hz)
@@ -206,7 +209,9 @@ def read_states(path: Path, rate_hz: float, on_read: OnRead) -> dict[str, NDArra
                     )
                     raise DatasetError(what, where=where, expected=expected, found=found, fix=fix)
                 parts["state"].append(np.stack(rows))
+                intended = motion.intended_tcp_in_base
                 parts["poses"].append(motion.tcp_in_base)
+                parts["intended_poses"].append(motion.tcp_in_base if intended is None else intended)
                 parts["opened"].append(motion.gripper_open)
                 parts["widths"].append(motion.qpos[:, -2:].sum(1))
                 lengths.append(len(samples))

@@ -39,23 +39,29 @@ def encode_proprioception(poses: NDArray[np.floating], widths: NDArray[np.floati
     return _encode_rows(poses, widths / 0.08)
 
 
-def encode_chunks(poses: Array, gripper_commands: NDArray[Any], steps: int) -> NDArray[np.float32]:
+def encode_chunks(
+    poses: Array, gripper_commands: NDArray[Any], steps: int, intended: Array | None = None
+) -> NDArray[np.float32]:
     """Encode a chunk for each of the T steps of an episode.
 
     Args:
         poses: (T, 4, 4) TCP poses in the arm's base frame.
         gripper_commands: (T,) as in ``gripper_status``: 1 = open; row t is the command that led to step t.
         steps: number of steps per chunk, K.
+        intended: (T, 4, 4) intended TCP poses of an episode with action noise, to which chunks lead; None: ``poses``.
 
     Returns:
         Chunks (T, K, 10). Rows after the end of the episode repeat the last pose and gripper command.
     """
     length = len(poses)
     ahead = np.minimum(np.arange(length)[:, None] + np.arange(1, steps + 1), length - 1)  # (T, K)
-    return _encode_rows(inverse(poses)[:, None] @ poses[ahead], np.asarray(gripper_commands, np.float64)[ahead])
+    goals = poses if intended is None else intended
+    return _encode_rows(inverse(poses)[:, None] @ goals[ahead], np.asarray(gripper_commands, np.float64)[ahead])
 
 
-def encode_next_key_poses(poses: Array, gripper_commands: NDArray[Any]) -> NDArray[np.float32]:
+def encode_next_key_poses(
+    poses: Array, gripper_commands: NDArray[Any], intended: Array | None = None
+) -> NDArray[np.float32]:
     """Encode the next key pose of each step of an episode, (T, 9).
 
     The encoding is that of a row of a chunk, without the gripper command.
@@ -66,7 +72,8 @@ def encode_next_key_poses(poses: Array, gripper_commands: NDArray[Any]) -> NDArr
     length = len(poses)
     changes = np.flatnonzero(np.diff(np.asarray(gripper_commands, np.int8))).tolist()  # last steps before a change
     key_steps = np.array([next((change for change in changes if change >= t), length - 1) for t in range(length)])
-    return _encode_rows(inverse(poses) @ poses[key_steps], np.zeros(length))[:, :9]
+    goals = poses if intended is None else intended
+    return _encode_rows(inverse(poses) @ goals[key_steps], np.zeros(length))[:, :9]
 
 
 def decode_chunk(rows: NDArray[np.floating], tcp: NDArray[np.floating]) -> tuple[Array, NDArray[np.float64]]:

@@ -35,6 +35,15 @@ def test_encoding_of_a_chunk():
     assert np.allclose(rows[2], [0, 0, 0, 1, 0, 0, 0, 1, 0, 0])
 
 
+def test_labels_lead_to_the_intended_poses():
+    poses, intended = (np.tile(np.eye(4), (3, 1, 1)) for _ in range(2))
+    intended[:, 0, 3] = [0, 1, 2]
+    poses[:, 0, 3] = [0, 1.25, 1.5]  # deviations 0.25 and -0.5
+    chunks = encode_chunks(poses, [1, 1, 1], 2, intended)
+    assert chunks[:2, :, 0].tolist() == [[1, 2], [0.75, 0.75]]
+    assert encode_next_key_poses(poses, [1, 1, 1], intended)[:, 0].tolist() == [2, 0.75, 0.5]
+
+
 @given(st.integers(0, 10_000), st.integers(1, 6), st.integers(1, 5))
 def test_decoding_inverts_encoding(seed, length, steps):
     rng = np.random.default_rng(seed)

@@ -38,6 +38,7 @@ from robocas_ms3.baselines.small.objects import (
 from robocas_ms3.baselines.training.scenes import read_training_scenes
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import Array, from_xyzw
+from robocas_ms3.datasets.schema import INTENDED_POSE
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 
 _log = logging.getLogger(__name__)
@@ -157,7 +158,8 @@ class SmallSamples:
             Objects of the episode.
         """
         config, episode = self._config, self._source.episode(number)
-        arrays = episode.read([*_KEYS, *(["language_embedding"] if config.language else [])])
+        optional = [key for key in INTENDED_POSE if key in episode.arrays]
+        arrays = episode.read([*_KEYS, *optional, *(["language_embedding"] if config.language else [])])
         length = self._source.lengths[number]
         for key, array in arrays.items():
             if array.dtype.kind == "f" and not np.isfinite(array).all():
@@ -166,8 +168,9 @@ class SmallSamples:
         poses = from_xyzw(arrays["ee_pos"].astype(np.float64), arrays["ee_orn"].astype(np.float64))
         opened, rows = arrays["gripper_status"].reshape(-1), slice(start, start + length)
         self._state[rows] = torch.from_numpy(encode_proprioception(poses, arrays[GRIPPER_WIDTH].reshape(-1)))
-        self._chunks[rows] = torch.from_numpy(encode_chunks(poses, opened, config.chunk))
-        keys = encode_next_key_poses(poses, opened)
+        intended = from_xyzw(*(arrays[key].astype(np.float64) for key in INTENDED_POSE)) if optional else None
+        self._chunks[rows] = torch.from_numpy(encode_chunks(poses, opened, config.chunk, intended))
+        keys = encode_next_key_poses(poses, opened, intended)
         key_points = (poses[:, :3, :3] @ keys[:, :3, None])[..., 0] + poses[:, :3, 3]  # in the arm's base frame
         self._keys[rows] = torch.from_numpy(keys)
         if config.language:

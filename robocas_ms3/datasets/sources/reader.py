@@ -55,7 +55,8 @@ class Episode(SourceEpisode):
     def arrays(self) -> dict[str, NDArray]:
         path = self.folder / schema.EPISODE_FILE
         loaded = load_arrays(path)
-        if any(spec.name not in loaded.arrays for spec in schema.EPISODE_INFO if not spec.embedding):
+        required = (spec.name for spec in schema.EPISODE_INFO if not (spec.embedding or spec.optional))
+        if any(name not in loaded.arrays for name in required):
             loaded = derive_missing_arrays(loaded, self._read_data_info(), self.dataset.rate_hz)
         for key in set(loaded.unreadable) - set(loaded.derived):
             where, found = f"{path}, {key}", loaded.describe_error(key)
