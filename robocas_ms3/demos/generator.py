@@ -46,10 +46,12 @@ class EpisodeLimits:
     Attributes:
         horizon: maximum length of the episode in control steps.
         max_attempts: maximum number of attempts of the scripted policy.
+        first_attempt: number of the first attempt; other numbers give other random numbers.
     """
 
     horizon: int
     max_attempts: int
+    first_attempt: int = 0
 
 
 class EpisodeGenerator:
@@ -136,7 +138,7 @@ class EpisodeGenerator:
         settings = CandidateSettings.from_episode_settings(self.settings)
         candidates = CandidateRecorder(settings, self.env, folder / candidates_file_name(name), result)
         attempts = _Attempts(self, recorder, executor, result, intervention, candidates)
-        attempts.horizon = limits.horizon
+        attempts.horizon, attempts.first_attempt = limits.horizon, limits.first_attempt
         executor.check_open_loop = attempts.check_open_loop
         try:
             if intervention is not None and intervention.skip_reason:
@@ -178,6 +180,7 @@ class _Attempts:
     intervention: Intervention | None
     candidates: CandidateRecorder
     horizon: int = field(init=False)  # maximum length of the episode, control steps
+    first_attempt: int = field(init=False)
 
     def run_from_resets(self, decisions: ForkedDecisions | ResimulatedDecisions) -> None:
         """Run attempts with backtracking, each from the reset, until one succeeds or none is left."""
@@ -222,7 +225,8 @@ class _Attempts:
                 self._reset()
 
     def _make_arm(self, decisions: Decisions, number: int) -> Arm:
-        arm = Arm(self.generator.planner, self.generator.inverse_kinematics, self.executor, decisions, (number,))
+        path = (self.first_attempt + number,)
+        arm = Arm(self.generator.planner, self.generator.inverse_kinematics, self.executor, decisions, path)
         if self.generator.settings.record_candidates:
             self.candidates.observe(arm)
         return arm

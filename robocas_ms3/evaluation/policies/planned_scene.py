@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.poses import inverse
+from robocas_ms3.core.poses import inverse, transform_points
 from robocas_ms3.demos.recordings.motion import split_robot_states
 from robocas_ms3.robots.description_file import tcp_and_arm_base_poses
 from robocas_ms3.robots.registry import RobotSpec
@@ -50,7 +50,9 @@ class SceneState:
         uid, furniture = robot.description.uid, {**states["articulations"]}
         root, qpos, _ = split_robot_states(furniture.pop(uid))
         count = len(qpos)
-        joints = [of[:, _BODY : _BODY + (of.shape[1] - _BODY) // 2] for _, of in sorted(furniture.items())]
+        joints = [
+            of[:, _BODY : _BODY + (of.shape[1] - _BODY) // 2].astype(np.float64) for _, of in sorted(furniture.items())
+        ]
         return cls(
             tcp_and_arm_base_poses(robot, root, qpos)[0],
             np.stack([states["actors"][name][:, :3] for name in sorted(states["actors"])], axis=1).astype(np.float64),
@@ -117,8 +119,7 @@ class PlannedScene:
 
 def _positions_in_tcp(states: SceneState, near: slice = slice(None)) -> Array:
     """Return the positions (T, B, 3) of the bodies in the frame of the TCP."""
-    frames = inverse(states.tcp[near])
-    return np.einsum("tij,tbj->tbi", frames[:, :3, :3], states.bodies[near]) + frames[:, None, :3, 3]
+    return np.asarray(transform_points(inverse(states.tcp[near]), states.bodies[near]), np.float64)
 
 
 def measure_speeds(values: States) -> Array:

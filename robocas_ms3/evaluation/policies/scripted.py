@@ -23,8 +23,8 @@ from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.registry import RobotSpec, find_robot
 
 OFFSETS = (0.01, 0.05)  # smallest and largest offset in m: a finger lands on the target or on a neighbouring object
-MAX_PLANS, MAX_FAILED_PLANS = 6, 2  # per episode
-MAX_LATER_ATTEMPTS = 4  # attempts of each plan after the first one, since the old plan may still succeed
+MAX_PLANS, MAX_FAILED_PLANS = 8, 3  # per episode
+MAX_LATER_ATTEMPTS = 6  # attempts of each plan after the first one
 MAX_HURRY = 2.5  # largest ratio of the speed of the policy to the speed of the plan
 MIN_STEPS = 15  # policy steps below which no plan helps
 WAIT_SECONDS = 1.0  # s to wait for bodies to come to rest, and for success after the end of a plan
@@ -73,6 +73,7 @@ class _Run:
         plan: present plan; None without one.
         plans: number of plans, also of failed ones.
         failed: number of failed plans.
+        attempts: number of attempts of all plans.
         waited: policy steps for which the policy has waited to plan again.
         retry_at: policy step before which the policy does not plan again after a failed plan.
     """
@@ -81,6 +82,7 @@ class _Run:
     plan: _Plan | None = None
     plans: int = 0
     failed: int = 0
+    attempts: int = 0
     waited: int = 0
     retry_at: int = 0
 
@@ -133,13 +135,13 @@ class ScriptedPolicy:
         return run.plan.track.next_action(observations, row)
 
     def _plan_again(self, run: _Run, state: SimulationState) -> None:
-        """Replace the plan; without a new plan keep the old one, since the deviation may not matter."""
+        """Replace the plan. If only the time is too short for a new plan, keep the old one, which may still succeed."""
         plan = self._make_plan(run, state)
         run.plans, run.waited = run.plans + 1, 0
-        if plan is None:
+        if not isinstance(plan, _Plan):
             run.failed, run.retry_at = run.failed + 1, state.steps + round(RETRY_SECONDS * self._rate)
-        else:
-            run.plan = plan
+        if plan != "too_long":
+            run.plan = plan if isinstance(plan, _Plan) else None
 
     def _decide(self, run: _Run, state: SimulationState) -> Literal["follow", "wait", "plan"]:
         """Return whether to follow the plan, to wait until the scene is at rest, or to plan again."""
@@ -165,8 +167,8 @@ class ScriptedPolicy:
             return np.append(observations.qpos[row, RobotDescription.arm_slice], gripper)
         return np.append(np.zeros(6), float(gripper > 0))
 
-    def _make_plan(self, run: _Run, state: SimulationState) -> _Plan | None:
-        """Plan from the reset, or from the present state; return None if there is no plan."""
+    def _make_plan(self, run: _Run, state: SimulationState) -> _Plan | str:
+        """Plan from the reset, or from the present state; return the reason of the last failure if there is no plan."""
         episode, stride = run.episode, _FREQ // self._rate
         left = None if episode.max_steps is None else max(MIN_STEPS, episode.max_steps - state.steps - _END_STEPS)
         after = (
@@ -175,10 +177,12 @@ class ScriptedPolicy:
         with tempfile.TemporaryDirectory() as folder:
             generator = self._open_generator(episode)
             horizon = generator.horizon if left is None else min(generator.horizon, round(left * stride * MAX_HURRY))
-            limits = EpisodeLimits(horizon, MAX_LATER_ATTEMPTS if run.plans else generator.settings.max_attempts)
+            attempts = MAX_LATER_ATTEMPTS if run.plans else generator.settings.max_attempts
+            limits = EpisodeLimits(horizon, attempts, run.attempts)
             result = generator.generate(episode.seed, Path(folder), "episode", after, limits)
+            run.attempts += attempts
             if not result.success:
-                return None
+                return result.failures[-1].reason
             with open_trajectory(Path(folder) / "episode.h5") as file:
                 actions, states = read_steps(open_episode(file, 0))
         robot, gripper = find_robot(episode.robot), actions[:, 7]
