@@ -8,7 +8,7 @@ episodes; the second is slower.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.demos.failures import EpisodeResult
@@ -79,15 +79,19 @@ class _Decision:
     """State of a decision, which is kept while the attempt is simulated again.
 
     Args:
-        order: generator `order_candidates` over the indices of the candidates.
+        items: candidates. They are kept, since their order may depend on earlier failures of the seed.
+        limits: numbers of candidates to compare and to continue from.
+        result: result of the episode.
 
     Attributes:
+        items: candidates.
         next: index of the next candidate and flag of `order_candidates`, or the error that ends the decision.
         chosen: index of the candidate from which the episode continues; None while no candidate is chosen.
     """
 
-    def __init__(self, order: Generator[tuple[int, bool], float | PlanningError | None, None]) -> None:
-        self._order = order
+    def __init__(self, items: list[Any], limits: SearchLimits, result: EpisodeResult) -> None:
+        self.items = items
+        self._order = order_candidates(range(len(items)), limits, result)
         self.advance()
 
     def advance(self, outcome: float | PlanningError | None = None) -> None:
@@ -137,10 +141,10 @@ class ResimulatedDecisions:
     def choose(
         self, candidates: Iterable[T], run_candidate: Callable[[T], float], limits: SearchLimits = FIRST_FEASIBLE
     ) -> T:
-        items = list(candidates)
         if self._depth == len(self._decisions):
-            self._decisions.append(_Decision(order_candidates(range(len(items)), limits, self._result)))
+            self._decisions.append(_Decision(list(candidates), limits, self._result))
         decision = self._decisions[self._depth]
+        items = decision.items
         self._depth += 1
         if decision.chosen is None:
             if isinstance(decision.next, Exception):

@@ -134,7 +134,13 @@ class EpisodeGenerator:
         limits = limits or EpisodeLimits(self.horizon, self.settings.max_attempts)
         recorder = EpisodeRecorder(self.env, folder, name)
         executor = MotionExecutor(recorder, seed, noise=self._make_noise())
-        result = EpisodeResult(seed, success=False, seconds=executor.seconds, max_attempts=limits.max_attempts)
+        result = EpisodeResult(
+            seed,
+            success=False,
+            seconds=executor.seconds,
+            failed_moves=executor.failed_moves,
+            max_attempts=limits.max_attempts,
+        )
         settings = CandidateSettings.from_episode_settings(self.settings)
         candidates = CandidateRecorder(settings, self.env, folder / candidates_file_name(name), result)
         attempts = _Attempts(self, recorder, executor, result, intervention, candidates)

@@ -18,6 +18,7 @@ from robocas_ms3.core.errors import PlanningError
 
 T = TypeVar("T")
 MAX_CONTINUED_CANDIDATES = 3
+WITH_NOISE = "_with_noise"  # suffix of the reasons of open-loop checks that failed only with noise
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ WALL_MARGIN = 0.02  # m from a pushed object to furniture and basket
 PUSHED_THINNED = 5  # stride over surface points, which are 5 mm apart
 COINCIDENT_DISTANCE = 0.01  # m between centres below which the push direction is random (RoboCAS-v0)
 TURNS_DEG = (0.0, 20.0, -20.0, 40.0, -40.0, 65.0, -65.0, 90.0, -90.0)  # offsets from the paper's direction
-YAWS = 4  # yaw angles of the tool, over half a turn
+YAWS = 8  # yaw angles of the tool, over half a turn
 
 
 @dataclass(frozen=True)

@@ -75,6 +75,28 @@ def test_candidates_are_tried_in_order_until_the_attempt_succeeds(good, limits, 
     assert found == (bool(outcome), outcome, [f"end: {end}" for end in failures.split()])
 
 
+def test_order_may_depend_on_earlier_failures():
+    """A letter that failed is the last in later decisions, whichever class undoes the motions."""
+    runs = []
+    for make in RUNNERS:
+        notes, world = Notes(), World()
+        runner = make(notes)
+
+        def attempt(world=world, runner=runner, notes=notes):
+            world.done = ""
+            for _ in range(2):
+                letters = sorted("abc", key=lambda letter: notes.failed_moves[letter])
+                letter = runner.choose(letters, lambda letter: world.act(letter) or 0.0)
+            notes.failed_moves[letter] += 1
+            raise PlanningError("end", world.done)
+
+        runner.run(attempt)
+        runs.append((notes.texts, dict(notes.failed_moves)))
+    assert runs[0] == runs[1]
+    assert runs[0][0] == [f"end: {first}{second}" for first in "abc" for second in "abc"]
+    assert runs[0][1] == {"a": 3, "b": 3, "c": 3}
+
+
 def test_sufficient_score_ends_the_comparison():
     scores = {"a": 1.0, "b": 5.0, "c": 9.0}
 

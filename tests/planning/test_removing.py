@@ -19,6 +19,7 @@ from robocas_ms3.planning.pushes import compute_push_direction
 from robocas_ms3.planning.skills import heap as heap_skill
 from robocas_ms3.planning.skills import push
 from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.grasp import retract_from_contact
 from robocas_ms3.planning.skills.heap import Heap, Move, find_fallen_objects
 from robocas_ms3.planning.skills.push import push_away
 from robocas_ms3.planning.skills.remove import count_clear_grasps, find_grasp_blockers, remove_object
@@ -119,7 +120,7 @@ def test_push_without_displacement_fails(generator, monkeypatch):
     assert facts == {"pushes": 1, "removals": 0}
     facts["removals"] = heap_skill.MAX_MOVES - 1
     with pytest.raises(UnrecoverableError, match="too_many_obstacles"):
-        next(heap.candidate_moves())
+        heap.candidate_moves()
 
 
 def test_candidate_moves_start_with_pushes_of_the_highest_and_queries_have_no_side_effect(generator):
@@ -129,12 +130,26 @@ def test_candidate_moves_start_with_pushes_of_the_highest_and_queries_have_no_si
     assert seen[0] == seen[1]
     assert arm.rng.bit_generator.state == state
     heap = Heap(arm, target)
-    moves = list(heap.candidate_moves())
+    moves = heap.candidate_moves()
     assert target not in {move.slot for move in moves}
     assert len(set(moves)) == len(moves)
     in_the_way = np.flatnonzero(heap.env.measure_clutter().obstacles[0].numpy()).tolist()
     if in_the_way:
         assert moves[0] == Move("push", max(in_the_way, key=lambda slot: surface(arm, slot)[:, 2].max()))
+    arm.executor.failed_moves["push", moves[0].slot] = 1  # an open-loop check after such a push failed earlier
+    failed = [move for move in moves if (move.skill, move.slot) == ("push", moves[0].slot)]
+    assert heap.candidate_moves() == [move for move in moves if move not in failed] + failed
+
+
+def test_grasps_that_touch_the_table_are_shifted_back(generator):
+    arm, target, _ = start_episode(generator, 3)
+    table, middle = push.read_surface(arm)[0][2, 3], surface(arm, target).mean(axis=0)
+    grasps = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (3, 1, 1))  # straight down
+    grasps[:, :2, 3] = middle[:2] - [0.2, 0.0]  # next to the heap
+    grasps[:, 2, 3] = table + np.array([0.03, 0.006, -0.02])
+    free, shifted = retract_from_contact(arm, target, grasps)  # no shift frees the third one
+    assert free == pytest.approx(grasps[0])
+    assert shifted[2, 3] - grasps[1, 2, 3] == pytest.approx(0.008)
 
 
 def test_target_is_grasped_if_no_move_is_feasible(generator, monkeypatch):
@@ -146,6 +161,7 @@ def test_target_is_grasped_if_no_move_is_feasible(generator, monkeypatch):
 
     monkeypatch.setattr(Heap, "execute", refuse)
     monkeypatch.setattr(Heap, "target_visible", True)
+    monkeypatch.setattr(search, "retract_from_contact", lambda *_: [np.eye(4)])
     for name in ("grasp", "raise_held_object", "carry_to_basket", "release_into_basket"):
         monkeypatch.setattr(search, name, lambda *_, name=name, **how: skills.append(name))
     search.attempt(arm)

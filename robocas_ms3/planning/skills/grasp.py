@@ -30,6 +30,8 @@ GRASPS_PLANNED = 12  # maximum number of grasps to plan motions for
 # m; the first height with a free exit path is used. The smallest one completes the lift stage (3 cm)
 FRONT_LIFTS = (0.04, 0.08, 0.14, 0.2)
 WITHDRAWALS = (0.25, 0.18, 0.12)  # m straight back; the first reachable one is used
+# m against the approach axis; an annotated grasp of a flat object that lies on a surface may touch the surface
+RETRACTIONS = (0.0, 0.004, 0.008)
 
 ExitMotions = tuple[Trajectory, ...]
 
@@ -165,6 +167,21 @@ def grasp_candidates(arm: Arm, slot: int, skip_kinds: int) -> Iterator[Array]:
         yield tcp_in_base[index]
     if not found:
         raise PlanningError("grasp_sampling", "no_clear_grasp")
+
+
+def retract_from_contact(arm: Arm, slot: int, tcp_in_base: Iterable[Array]) -> list[Array]:
+    """Shift grasps back by the smallest of `RETRACTIONS` at which the arm touches nothing but the object.
+
+    Grasps for which no shift suffices are omitted. The order is that of ``tcp_in_base``, TCP poses (4x4) in the arm's
+    base frame.
+    """
+    poses = np.array(list(tcp_in_base)).reshape(-1, 4, 4)
+    shifted = np.stack([shift_back(poses, distance) for distance in RETRACTIONS], axis=1)  # (N, R, 4, 4)
+    solved, qpos = arm.inverse_kinematics.nearest_solutions(shifted, arm.qpos)
+    arm.planner.set_scene(arm.scene.obstacles(exclude=slot))
+    solved[solved] = arm.planner.is_free(qpos[solved], arm.planner.finger_width)
+    free = solved.reshape(-1, len(RETRACTIONS))
+    return [row[int(np.argmax(ok))] for row, ok in zip(shifted, free, strict=True) if ok.any()]
 
 
 def _skip_kinds(tcp: Array, count: int) -> list[int]:

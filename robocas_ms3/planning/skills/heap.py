@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,7 +14,7 @@ from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.planning.skills.look import measure_hidden_fraction
 from robocas_ms3.planning.skills.push import push_away, read_surface
-from robocas_ms3.planning.skills.remove import count_clear_grasps, find_grasp_blockers, remove_object
+from robocas_ms3.planning.skills.remove import count_feasible_grasps, find_grasp_blockers, remove_object
 from robocas_ms3.scenes.task_specs import MAX_HIDDEN_FRACTION
 from robocas_ms3.tasks.search import RoboCASSearchEnv
 from robocas_ms3.tasks.terms import FALLEN
@@ -28,7 +27,9 @@ TURNS_DEG = (30.0, -30.0)  # offsets from the paper's push direction
 EDGE_MARGIN = 0.01  # m from every object to the edge of the surface
 
 COST_PER_METRE_OF_TARGET = 400.0  # s per metre that a move displaces the target
-COST_PER_PUSH = 8.0  # s; the result of a push is less repeatable than that of a removal
+COST_PER_PUSH = 2.0  # s; the result of a push is less repeatable than that of a removal
+MAX_TARGET_DISPLACEMENT = 0.03  # m by a move; beyond it, 17 of 20 open-loop checks fail
+COST_OF_FAILED_CHECK = 15.0  # s, for a greater displacement, and per failed check after an earlier move of this kind
 
 
 @dataclass(frozen=True)
@@ -87,10 +88,10 @@ class Heap:
         """Whether the target is cleared and visible to the gripper camera."""
         return self.target_uncovered and self.target_visible
 
-    def candidate_moves(self) -> Iterator[Move]:
-        """Yield candidate moves of the obstacles, the most promising first.
+    def candidate_moves(self) -> list[Move]:
+        """Return candidate moves of the obstacles, the most promising first.
 
-        docs/policies.md describes the order.
+        docs/policies.md describes the order. Moves after which open-loop checks failed earlier are the last.
 
         Raises:
             UnrecoverableError: reason ``too_many_obstacles``: ``MAX_MOVES`` moves have been made.
@@ -99,12 +100,16 @@ class Heap:
             raise UnrecoverableError("episode", "too_many_obstacles")
         with self.arm.planning_time():
             slots = self._find_obstacles()
-        yield from (Move(skill, slot) for slot in slots[:2] for skill in ("push", "lift"))
-        yield from (Move("push", slot) for slot in slots[2:])
-        yield from (Move("push", slot, turn) for slot in slots[:2] for turn in TURNS_DEG)
-        yield from (Move("lift", slot) for slot in slots[2:])
+        moves = [Move(skill, slot) for slot in slots[:2] for skill in ("push", "lift")]
+        moves += [Move("push", slot) for slot in slots[2:]]
+        moves += [Move("push", slot, turn) for slot in slots[:2] for turn in TURNS_DEG]
+        moves += [Move("lift", slot) for slot in slots[2:]]
         if not slots:  # no grasp from above is possible: change the pose of the target
-            yield from (Move("push", self.target, turn) for turn in (0.0, 90.0, -90.0, 180.0))
+            moves = [Move("push", self.target, turn) for turn in (0.0, 90.0, -90.0, 180.0)]
+        return sorted(moves, key=self._count_failed_checks)
+
+    def _count_failed_checks(self, move: Move) -> int:
+        return self.arm.executor.failed_moves[move.skill, move.slot]
 
     def _find_obstacles(self) -> list[int]:
         """Return slots of at most ``MAX_OBSTACLES`` obstacles, the first to move first.
@@ -138,19 +143,18 @@ class Heap:
             remove_object(arm, move.slot)
             facts["removals"] += 1
         self.check_objects_on_surface()
-        seconds = COST_PER_PUSH * (move.skill == "push") + (len(arm.executor.actions) - start) * arm.executor.dt
-        return (
-            -seconds
-            - self.remaining_cost()
-            - COST_PER_METRE_OF_TARGET * float(np.linalg.norm(self.centroid(self.target) - target))
-        )
+        displacement = float(np.linalg.norm(self.centroid(self.target) - target))
+        cost = (len(arm.executor.actions) - start) * arm.executor.dt + COST_PER_PUSH * (move.skill == "push")
+        cost += self.remaining_cost() + COST_PER_METRE_OF_TARGET * displacement
+        expected_failures = self._count_failed_checks(move) + (displacement > MAX_TARGET_DISPLACEMENT)
+        return -cost - COST_OF_FAILED_CHECK * expected_failures
 
     def remaining_cost(self) -> float:
         """Estimate the cost of the moves that are still necessary, s."""
         with self.arm.planning_time():
             clutter = self.env.measure_clutter()
             hidden, obstacles = float(clutter.hidden_fraction[0]), int(clutter.obstacles[0].sum())
-            grasps = count_clear_grasps(self.arm, self.target)
+            grasps = count_feasible_grasps(self.arm, self.target)
             return float(compute_clearing_cost(obstacles, hidden, grasps))
 
     def check_objects_on_surface(self) -> None:

@@ -16,7 +16,7 @@ from robocas_ms3.scenes.visibility import MeshScene, PinholeCamera, load_visual_
 
 FAR, NEAR = (0.4, 0.5), (0.2, 0.3)  # m from camera to target: first view, later views (RoboCAS-v0)
 ELEVATION_DEG = (60.0, 90.0)  # elevation of the camera above the target (RoboCAS-v0)
-VIEWS_SAMPLED, VIEWS_PLANNED = 96, 6
+VIEWS_SAMPLED, VIEWS_PLANNED = 384, 6
 
 
 def look_at(arm: Arm, point_in_base: Array, distance: tuple[float, float]) -> None:

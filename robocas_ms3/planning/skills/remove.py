@@ -21,10 +21,17 @@ from robocas_ms3.planning.skills.arm import (
     shift_back,
     shift_up,
 )
-from robocas_ms3.planning.skills.grasp import grasp
+from robocas_ms3.planning.skills.grasp import grasp, retract_from_contact
 from robocas_ms3.planning.skills.place import attach_held_object
 from robocas_ms3.planning.skills.push import read_surface
-from robocas_ms3.scenes.grasp_checks import MAX_WIDTH, NEIGHBOURHOOD, grasp_direction_tests, is_gripper_clear
+from robocas_ms3.scenes.grasp_checks import (
+    HALF_TURN,
+    MAX_WIDTH,
+    NEIGHBOURHOOD,
+    PREGRASP_DISTANCE,
+    grasp_direction_tests,
+    is_gripper_clear,
+)
 
 GRID = 0.04  # m between candidate positions
 TURNS = 8  # yaw angles of the object
@@ -36,8 +43,9 @@ RETREAT = 0.08  # m
 ARM_REACH = 0.8  # m from its base
 LIFT_RANGE = (0.08, 0.2)  # m, minimum and maximum lift
 GRASPS_TESTED = 150  # grasps whose gripper is tested for collisions
+GRASPS_SOLVED = 16  # grasps whose arm configuration is tested for collisions
 OUTLINE_SPACING = 0.015  # m
-PLACES_SOLVED, PLACES_PLANNED = 96, 12
+PLACES_SOLVED, PLACES_PLANNED = 256, 12
 
 
 def remove_object(arm: Arm, slot: int, *, grasps: Iterable[Array] = ()) -> None:
@@ -93,6 +101,21 @@ def count_clear_grasps(arm: Arm, slot: int) -> int:
     around = arm.scene.object_in_base(slot)[:3, 3]
     near = arm.scene.points_in_base(exclude=slot, radius=NEIGHBOURHOOD, around=around)
     return int(is_gripper_clear(grasps, near).sum())
+
+
+def count_feasible_grasps(arm: Arm, slot: int) -> int:
+    """Return the number of sampled grasps of an object that the arm reaches without touching other bodies.
+
+    At most ``GRASPS_SOLVED`` clear grasps are tested.
+    """
+    grasps = sample_suitable_grasps(arm, slot)
+    around = arm.scene.object_in_base(slot)[:3, 3]
+    near = arm.scene.points_in_base(exclude=slot, radius=NEIGHBOURHOOD, around=around)
+    grasps = grasps[is_gripper_clear(grasps, near)]
+    grasps = grasps[np.linspace(0, len(grasps) - 1, min(len(grasps), GRASPS_SOLVED)).astype(int)]
+    both = np.concatenate([grasps, grasps @ HALF_TURN])
+    reachable, _ = arm.inverse_kinematics.nearest_solutions(shift_back(both, PREGRASP_DISTANCE), arm.qpos)
+    return len(retract_from_contact(arm, slot, both[reachable]))
 
 
 def find_grasp_blockers(arm: Arm, slot: int) -> list[int]:

@@ -6,11 +6,11 @@ The policy runs several candidate moves and continues from the move with the low
 from __future__ import annotations
 
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.planning.decisions import SearchLimits
+from robocas_ms3.planning.decisions import WITH_NOISE, SearchLimits
 from robocas_ms3.planning.executor import OPEN
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.grasp import grasp
-from robocas_ms3.planning.skills.heap import COUNTERS, Heap, find_fallen_objects
+from robocas_ms3.planning.skills.grasp import grasp, grasp_candidates, retract_from_contact
+from robocas_ms3.planning.skills.heap import COUNTERS, Heap, Move, find_fallen_objects
 from robocas_ms3.planning.skills.look import FAR, NEAR, load_object_meshes, look_at
 from robocas_ms3.planning.skills.place import carry_to_basket, release_into_basket
 from robocas_ms3.planning.skills.remove import raise_held_object
@@ -39,7 +39,7 @@ def attempt(arm: Arm) -> None:
         done = len(arm.executor.actions)
         try:
             limits = SearchLimits(MOVES_COMPARED, max_continued_moves(heap.moves_made), SUFFICIENT_SCORE)
-            arm.choose(heap.candidate_moves(), heap.execute, limits, kind="move")
+            move = arm.choose(heap.candidate_moves(), heap.execute, limits, kind="move")
         except PlanningError:
             if len(arm.executor.actions) > done:
                 raise
@@ -48,7 +48,7 @@ def attempt(arm: Arm) -> None:
             if not heap.target_visible or not _grasp(arm, slot):
                 raise
             break
-        arm.executor.check_open_loop()
+        _check_move(arm, move)
         if heap.target_uncovered and not heap.target_visible:
             look_at(arm, heap.centroid(slot), NEAR)
     arm.executor.check_open_loop()
@@ -70,13 +70,26 @@ def max_continued_moves(moves_made: int) -> int:
     return max(1, 3 - moves_made // 2)
 
 
+def _check_move(arm: Arm, move: Move) -> None:
+    """Check the actions open loop; if the check fails without noise, later decisions of the seed avoid such moves."""
+    try:
+        arm.executor.check_open_loop()
+    except PlanningError as error:
+        arm.executor.failed_moves[move.skill, move.slot] += not error.reason.endswith(WITH_NOISE)
+        raise
+
+
 def _grasp(arm: Arm, slot: int) -> bool:
     """Grasp the target and lift it; return False if no grasp is feasible and the arm has not moved."""
     done = len(arm.executor.actions)
 
     def execute_grasp(kind: int) -> float:
         arm.executor.gripper = OPEN  # opens during the approach
-        grasp(arm, slot, lift_height=LIFT_HEIGHT, skip_kinds=kind)
+        with arm.planning_time():
+            grasps = retract_from_contact(arm, slot, grasp_candidates(arm, slot, kind))
+        if not grasps:
+            raise PlanningError("grasp_sampling", "no_clear_grasp")
+        grasp(arm, slot, lift_height=LIFT_HEIGHT, grasps=grasps)
         raise_held_object(arm, slot)
         return 0.0
 
