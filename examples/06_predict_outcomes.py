@@ -17,7 +17,7 @@ from robocas_ms3.demos import CandidateFile
 from robocas_ms3.demos.candidates.labels import MIN_BENEFIT
 from robocas_ms3.planning.clearing_cost import compute_clearing_cost
 
-FOLDS, MODELS, STEPS = 5, 8, 400  # each fifth of the scenes is held out once; models per fold, training steps
+FOLDS, MODELS, STEPS = 5, 5, 300  # each fifth of the scenes is held out once; models per fold, training steps
 POINTS = 400  # per object
 CELL, CELLS, NOTHING = 0.01, 40, -1.0  # m, edge of the cells of a height map; cells per side; height of an empty cell
 FINGER, PALM = 0.04, 0.10  # m from the TCP: inner side of an open finger, and the palm

@@ -15,13 +15,14 @@ from robocas_ms3.core.errors import DatasetError, EmptySplitError
 from robocas_ms3.datasets.candidate_images.images_file import CandidateImages, hash_decisions, images_path
 from robocas_ms3.datasets.sources.episode_source import Split
 from robocas_ms3.datasets.sources.split import split_by_seed
+from robocas_ms3.datasets.training.target_instructions import draw_target_instruction, find_relations
 from robocas_ms3.datasets.training.torch_dataset import resize_image
 from robocas_ms3.demos.candidates.candidates_file import CandidateFile
 from robocas_ms3.demos.candidates.labels import Labels
 from robocas_ms3.demos.candidates.schema import DECISION_KINDS, PRIMITIVES
 from robocas_ms3.demos.candidates.tables import Arrays
 from robocas_ms3.scenes.config.task import TaskConfig
-from robocas_ms3.scenes.language.instructions import InstructionSlots, draw_instruction, part_name
+from robocas_ms3.scenes.relations import Relation
 
 Targets = Literal["instructed", "all"]
 _STREAM = 413  # random stream of the instructions of other targets, and of the choice of candidates
@@ -34,8 +35,9 @@ class CandidateOptions:
     Attributes:
         split: ``train`` or ``val`` by seed (a tenth of the seeds is for validation), or ``all``.
         kinds: kinds of decisions.
-        targets: ``instructed``: one sample per decision, with the target of the episode; ``all``: also one sample for
-            each other object whose name is unique in the scene, at decisions to move or grasp with an empty gripper.
+        targets: ``instructed``: one sample per decision, with the target of the episode; ``all``: at decisions to move
+            or grasp with an empty gripper, also one sample for each other object that an instruction can name. Its name
+            is unique, or (select) a relation distinguishes it from those of the same name.
         max_candidates: greatest number of candidates C of a sample; of more candidates, the chosen one and a random
             choice, the same at each access, are used. None: the greatest number of a decision.
         cameras: names of the cameras, in the order of the stack; empty: no images. Images are read from the file of
@@ -101,7 +103,7 @@ class CandidateDataset(torch.utils.data.Dataset):
     ``disturbed``          (C,)         int64, number of other objects that were displaced by more than 2 cm
     ``moves_to_grasp``     (C,)         int64, number of further moves; -1 if unknown, and for other targets
     ``object_pose_after``  (C, K, 7)    pose of each object at the end
-    ``instruction``        str          instruction; for other targets, one of the task's templates with the name
+    ``instruction``        str          instruction; for other targets, from the templates of the task
     ``target_name``        str          name of the target in instructions
     ``seed``, ``row``      int          seed of the episode, and row of the decision in its file
     ``file``               int          index of the file in ``paths``
@@ -162,9 +164,16 @@ class CandidateDataset(torch.utils.data.Dataset):
         moves = decisions["kind"][row] in ("move", "grasp") and decisions["held_slot"][row] < 0
         if self.options.targets == "instructed" or not moves:
             return [target]
-        names = decisions["object_name"][row]
-        unique = [slot for slot in np.flatnonzero(present).tolist() if (names[present] == names[slot]).sum() == 1]
-        return [target, *(slot for slot in unique if slot != target)]
+        others = [slot for slot in np.flatnonzero(present).tolist() if slot != target]
+        return [target, *(slot for slot in others if self._find_relations(number, row, slot))]
+
+    def _find_relations(self, number: int, row: int, slot: int) -> list[Relation | None]:
+        xy = self.files[number].decisions["object_in_base"][row][:, :2]
+        return find_relations(self._configs[number], self._find_names(number, row), xy, slot)
+
+    def _find_names(self, number: int, row: int) -> NDArray[np.str_]:
+        decisions = self.files[number].decisions
+        return np.where(decisions["present"][row], decisions["object_name"][row], "")
 
     def __len__(self) -> int:
         return len(self._samples)
@@ -186,7 +195,7 @@ class CandidateDataset(torch.utils.data.Dataset):
             **self._make_candidates({name: array[rows] for name, array in decision.candidates.items()}, is_instructed),
             **self._make_labels(file.labels, file.rows_of(row).start + rows, target),
             **(_read_images(self._images[number], row, self.options) if self._images else {}),
-            "instruction": str(values["instruction"]) if is_instructed else self._relabel(number, values, target, rng),
+            "instruction": self._make_instruction(number, row, target, rng),
             "target_name": str(values["object_name"][target]),
             "seed": int(values["seed"]),
             "row": row,
@@ -241,14 +250,13 @@ class CandidateDataset(torch.utils.data.Dataset):
             "benefit": self._pad_candidates(benefit),
         }
 
-    def _relabel(self, number: int, values: dict[str, Any], target: int, rng: np.random.Generator) -> str:
-        """Return an instruction for another object, from the templates of the task's configuration."""
-        config, names = self._configs[number], values["object_name"]
-        part = (config.opening.part or part_name(config.opening.handle)) if config.opening else ""
-        slots = InstructionSlots(config.task, object=str(names[target]), support=config.support, part=part)
-        others = [str(name) for name in names[values["present"]] if name != names[target]]
-        language = config.language
-        return draw_instruction(rng, slots, language.split, others=others, synonyms=language.synonyms).text
+    def _make_instruction(self, number: int, row: int, target: int, rng: np.random.Generator) -> str:
+        decisions = self.files[number].decisions
+        if target == decisions["target_slot"][row]:
+            return str(decisions["instruction"][row])
+        relations = self._find_relations(number, row, target)
+        relation = relations[rng.integers(len(relations))]
+        return draw_target_instruction(self._configs[number], self._find_names(number, row), target, relation, rng)
 
     def _pad_slots(self, values: NDArray[Any]) -> NDArray[Any]:
         return np.pad(values, ((0, self.slots - len(values)), *[(0, 0)] * (values.ndim - 1)))
