@@ -22,6 +22,8 @@ MOVED_LATER = 0.10  # m by which a body moves in the rest of the plan if the pla
 MAX_HELD_OFFSET = 0.04  # m between a body and its expected position relative to the TCP: grasps vary
 MAX_JOINT_OFFSET = 0.05  # m or rad between a furniture joint and its expected position
 MAX_TCP_OFFSET = 0.15  # m between the TCP and its expected position; more than the lag of the arm
+FADE, LIFT = 20, 10  # states of a plan: to shift a grasp to a displaced body or back to the plan; from grasp to lift
+CARRIED = 0.05  # m by which a held body moves at least
 MOTION = 0.01  # m or rad by which a body or joint moves in the plan to count as moving
 MOTION_SAMPLES = 10  # states before and after the present one in which it moves
 HELD_WIDTH = 0.004  # m, least width of a closed gripper that holds a body
@@ -62,6 +64,29 @@ class SceneState:
 
 
 @dataclass(frozen=True)
+class PlannedGrasp:
+    """Grasp of a body in a plan.
+
+    Attributes:
+        body: index of the body.
+        closes: index of the last state before the gripper closes.
+        holds: index of the first state in which the gripper holds the body.
+    """
+
+    body: int
+    closes: int
+    holds: int
+
+    def shift_weight(self, index: int) -> float:
+        """Return the fraction of the body's displacement by which the TCP pose of a state is shifted, 0 to 1.
+
+        It grows in the `FADE` states before the gripper closes, and falls in `FADE` states after the lift.
+        """
+        rise, fall = (index - self.closes) / FADE + 1, (self.holds + LIFT + FADE - index) / FADE
+        return float(np.clip(min(rise, fall), 0.0, 1.0))
+
+
+@dataclass(frozen=True)
 class PlannedScene:
     """Scene that a plan expects after the reset and after each of S control steps.
 
@@ -77,6 +102,19 @@ class PlannedScene:
     def holding(self) -> NDArray[np.bool_]:
         """Whether the gripper holds a body in each state, (S + 1,) bool."""
         return self.closed & (self.states.width > HELD_WIDTH)
+
+    def list_grasps(self) -> list[PlannedGrasp]:
+        """Return the grasps of the plan in their order, without one that started before the plan."""
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], self.holding, [False]]).astype(int)))
+        in_tcp, found = _positions_in_tcp(self.states), []
+        for first, after in edges.reshape(-1, 2).tolist():
+            moved = np.linalg.norm(self.states.bodies[after - 1] - self.states.bodies[first], axis=-1)
+            slipped = np.linalg.norm(in_tcp[after - 1] - in_tcp[first], axis=-1)
+            held = np.flatnonzero((moved > CARRIED) & (slipped < MAX_HELD_OFFSET))
+            opened = np.flatnonzero(~self.closed[:first])
+            if len(held) and len(opened):  # else the body was held at the start of the plan
+                found.append(PlannedGrasp(int(held[np.argmin(slipped[held])]), int(opened[-1]), first))
+        return found
 
     def find_deviations(self, now: SceneState, index: int, window: int) -> list[int]:
         """Return the indices of the bodies that are not where the plan expects them, B + j for furniture joint j.
@@ -119,9 +157,10 @@ class PlannedScene:
 
 def _positions_in_tcp(states: SceneState, near: slice = slice(None)) -> Array:
     """Return the positions (T, B, 3) of the bodies in the frame of the TCP."""
-    return np.asarray(transform_points(inverse(states.tcp[near]), states.bodies[near]), np.float64)
+    return transform_points(inverse(states.tcp[near]), states.bodies[near]).astype(np.float64)
 
 
 def measure_speeds(values: States) -> Array:
     """Return the speed of each movable body in a state, (B,) m/s, in the order of `SceneState.bodies`."""
-    return np.array([np.linalg.norm(values["actors"][name][0, _LINEAR]) for name in sorted(values["actors"])])
+    speeds = [float(np.linalg.norm(values["actors"][name][0, _LINEAR])) for name in sorted(values["actors"])]
+    return np.array(speeds)

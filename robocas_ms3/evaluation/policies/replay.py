@@ -73,13 +73,20 @@ class PoseTrack:
         motion = Motion.from_states(robot, robot_states, gripper_commands, samples)
         return cls(motion.tcp_in_base[1:], motion.gripper_open[1:])
 
-    def next_action(self, observations: Observations, row: int) -> Array:
-        """Return the next action (7,), in the convention ``robocas``; ``row``: row of the env."""
+    def next_action(self, observations: Observations, row: int, shift: Array | None = None) -> Array:
+        """Return the next action (7,), in the convention ``robocas``.
+
+        Args:
+            observations: observations of several envs.
+            row: row of the env.
+            shift: (3,) translation of the next pose, in m in the frame of the arm's base; None: no translation.
+        """
         index = min(self.step, len(self.poses) - 1)
         self.step += 1
         tcp = observations.tcp_in_base[row].astype(np.float64)
         turn = Rotation.from_quat(tcp[[4, 5, 6, 3]]).inv()
-        motion = turn.apply(self.poses[index, :3, 3] - tcp[:3])
+        goal = self.poses[index, :3, 3] + (0.0 if shift is None else shift)
+        motion = turn.apply(goal - tcp[:3])
         angles = (turn * Rotation.from_matrix(self.poses[index, :3, :3])).as_euler("xyz")
         return np.array([*motion, *angles, float(self.open[index])])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +16,7 @@ from robocas_ms3.demos.failures import Intervention
 from robocas_ms3.demos.generator import EpisodeGenerator, EpisodeLimits
 from robocas_ms3.demos.recordings.trajectory_hdf5 import open_episode, open_trajectory, read_steps
 from robocas_ms3.demos.settings import EpisodeSettings
-from robocas_ms3.evaluation.policies.planned_scene import PlannedScene, SceneState, measure_speeds
+from robocas_ms3.evaluation.policies.planned_scene import FADE, LIFT, PlannedScene, SceneState, measure_speeds
 from robocas_ms3.evaluation.policies.replay import JointTrack, PoseTrack
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec, SimulationState
 from robocas_ms3.robots.description import RobotDescription
@@ -30,6 +30,7 @@ MIN_STEPS = 15  # policy steps below which no plan helps
 WAIT_SECONDS = 1.0  # s to wait for bodies to come to rest, and for success after the end of a plan
 RETRY_SECONDS = 2.0  # s to wait after a failed plan
 _END_STEPS = 6  # policy steps that a plan should leave at the end of the episode
+MAX_SHIFT = 0.03  # m by which a grasp follows a displaced body
 _REST = 0.05  # m/s below which a body is at rest
 _FREQ = 20  # Hz, control rate of the plans
 _MAX_GENERATORS = 4  # maximum number of open environments
@@ -37,7 +38,7 @@ _OFFSET_STREAM = 411  # random stream of the offset
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Plan:
     """A planned episode.
 
@@ -45,11 +46,16 @@ class _Plan:
         track: targets, one per policy step.
         scene: expected scene.
         samples: (T + 1,) states of the plan before each of T policy steps and after the last.
+        offset: (3,) horizontal displacement of the body that is grasped next or is held, before its grasp, m, world.
     """
 
     track: JointTrack | PoseTrack
     scene: PlannedScene
     samples: NDArray[np.int64]
+    offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        self._grasps = self.scene.list_grasps()
 
     @property
     def is_over(self) -> bool:
@@ -63,6 +69,27 @@ class _Plan:
         if (step > 0 and self.scene.closed[index] == (state.gripper > 0)) or self.scene.is_tcp_away(now, index, window):
             return []
         return self.scene.find_deviations(now, index, window) or None
+
+    def next_action(self, observations: Observations, row: int, robot: RobotSpec) -> NDArray[np.floating]:
+        """Return the next action (A,); a grasp follows a body that is up to `MAX_SHIFT` away from its planned position.
+
+        The TCP poses are shifted with the body during the approach and the lift.
+        """
+        track = self.track
+        if isinstance(track, JointTrack) or self.is_over or observations.simulation is None:
+            return track.next_action(observations, row)
+        index = int(self.samples[track.step + 1])
+        grasp = next((one for one in self._grasps if index < one.holds + LIFT + FADE), None)
+        if grasp is None or (weight := grasp.shift_weight(index)) == 0:
+            return track.next_action(observations, row)
+        if index <= grasp.closes:
+            now = SceneState.from_states(robot, observations.simulation[row].values)
+            self.offset = now.bodies[0, grasp.body] - self.scene.states.bodies[index, grasp.body]
+            self.offset[2] = 0
+        if np.linalg.norm(self.offset) > MAX_SHIFT:
+            return track.next_action(observations, row)
+        base_to_world = self.scene.states.tcp[index, :3, :3] @ track.poses[track.step, :3, :3].T
+        return track.next_action(observations, row, weight * self.offset @ base_to_world)
 
 
 @dataclass
@@ -132,7 +159,7 @@ class ScriptedPolicy:
             self._plan_again(run, state)
         if decision == "wait" or run.plan is None:
             return self._hold(observations, row, state.gripper)
-        return run.plan.track.next_action(observations, row)
+        return run.plan.next_action(observations, row, find_robot(run.episode.robot))
 
     def _plan_again(self, run: _Run, state: SimulationState) -> None:
         """Replace the plan. If only the time is too short for a new plan, keep the old one, which may still succeed."""

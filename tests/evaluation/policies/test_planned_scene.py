@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robocas_ms3.evaluation.policies.planned_scene import PlannedScene, SceneState, measure_speeds
+from robocas_ms3.evaluation.policies.planned_scene import PlannedGrasp, PlannedScene, SceneState, measure_speeds
 from robocas_ms3.robots.registry import find_robot
 
 STATES, GRASPED, RELEASED = 61, 20, 40
@@ -87,6 +87,22 @@ def test_nothing_is_compared_after_the_last_release():
     now = at(plan, 41)
     now.bodies[:] += 1.0
     assert plan.find_deviations(now, 41, WINDOW) == []
+
+
+def test_grasps_are_found_by_the_body_that_moves_with_the_gripper():
+    plan = make_plan(pushed_between=(22, 38))
+    assert plan.list_grasps() == [PlannedGrasp(body=0, closes=GRASPED, holds=GRASPED + 1)]
+    assert PlannedScene(plan.states, np.ones(STATES, bool)).list_grasps() == []  # closed from the start on
+    plan.states.bodies[GRASPED:, 0] = plan.states.bodies[GRASPED, 0]  # the gripper closes on nothing
+    assert plan.list_grasps() == []
+
+
+@pytest.mark.parametrize(
+    ("index", "weight"), [(79, 0), (80, 0), (85, 0.25), (100, 1), (103, 1), (113, 1), (123, 0.5), (133, 0), (140, 0)]
+)
+def test_shift_of_a_grasp_grows_in_1_s_and_fades_in_1_s_after_the_lift(index, weight):
+    """1 s is 20 states; the body is held from state 103 on, and lifted until state 113."""
+    assert PlannedGrasp(body=0, closes=100, holds=103).shift_weight(index) == pytest.approx(weight)
 
 
 def test_furniture_joints_follow_the_bodies():
