@@ -124,6 +124,14 @@ def test_merge_takes_each_seed_once_and_can_be_repeated(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1.h5", "2.h5", "3.h5", "c.h5"]
 
 
+def test_file_does_not_depend_on_the_number_of_merges(tmp_path):
+    parts = [write_episodes(tmp_path / f"{seed}.h5", seeds=(seed,), slots=12) for seed in (7, 3, 5)]
+    merge_candidates(parts, tmp_path / "once.h5")
+    merge_candidates(parts[:2], tmp_path / "twice.h5")
+    merge_candidates(parts[2:], tmp_path / "twice.h5")
+    assert (tmp_path / "once.h5").read_bytes() == (tmp_path / "twice.h5").read_bytes()
+
+
 @pytest.mark.parametrize("moment", ["before the rename", "after the rename"])
 def test_merge_after_a_kill_gives_the_same_file(tmp_path, moment):
     parts = [write_episodes(tmp_path / f"{seed}.h5", seeds=(seed,)) for seed in (7, 3)]
