@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections import defaultdict
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, fields
 from functools import partial
@@ -259,8 +259,18 @@ class _Run:
                 self.earlier |= self._read_results(path)
             except RobocasError:
                 path.unlink()
-        self.earlier |= self._read_merged()
+        merged = self._read_merged()
+        if has_candidates and merged:
+            self._check_candidates(merged)
+        self.earlier |= merged
         self._rewrite_failures([self.earlier[seed] for seed in sorted(self.earlier)])
+
+    def _check_candidates(self, seeds: Iterable[int]) -> None:
+        path = self._folder / CANDIDATES_FILE
+        if missing := sorted(set(seeds) - set(CandidateFile(path).decisions["seed"].tolist())):
+            what, expected = "seeds of the trajectory file are missing", "decisions of all seeds in trajectory.h5"
+            fix = "Restore the file from a copy, or record again with --overwrite."
+            raise DatasetError(what, where=path, expected=expected, found=f"none of seed {missing[0]}", fix=fix)
 
     def _rewrite_failures(self, results: list[EpisodeResult]) -> None:
         """Rewrite ``failures.jsonl`` if its lines differ from the failures of ``results``, e.g. after a kill."""
@@ -307,9 +317,11 @@ class _Run:
             for result in successes
             if result.seed not in merged
         ]
-        if self._has_candidates and new:  # before the trajectories: a merge can be repeated
-            files = [path.with_name(candidates_file_name(path.stem)) for path in new]
-            merge_candidates(files, self._folder / CANDIDATES_FILE)
+        if self._has_candidates:  # before the trajectories: a merge can be repeated
+            names = [candidates_file_name(seed_file_stem(result.seed)) for result in results]
+            files = [path for path in (self.episodes_folder / name for name in names) if path.exists()]
+            if files:
+                merge_candidates(files, self._folder / CANDIDATES_FILE)
         if new:
             merge(([self._trajectory] if merged else []) + new, self._trajectory)
             flush_to_disk(self._folder)  # before its source files are deleted

@@ -16,7 +16,7 @@ from robocas_ms3.core.errors import LayoutError, PlanningError, RobocasError, Un
 from robocas_ms3.core.extensions import import_object
 from robocas_ms3.demos.backtracking import ResimulatedDecisions
 from robocas_ms3.demos.branches import ForkedDecisions, find_reason_not_to_fork, warn_cannot_fork
-from robocas_ms3.demos.candidates.probe import CandidateRecorder, CandidateSettings
+from robocas_ms3.demos.candidates.probe import CandidateRecorder
 from robocas_ms3.demos.candidates.records import candidates_file_name
 from robocas_ms3.demos.failures import EpisodeResult, Intervention
 from robocas_ms3.demos.interventions import intervene
@@ -141,8 +141,7 @@ class EpisodeGenerator:
             failed_moves=executor.failed_moves,
             max_attempts=limits.max_attempts,
         )
-        settings = CandidateSettings.from_episode_settings(self.settings)
-        candidates = CandidateRecorder(settings, self.env, folder / candidates_file_name(name), result)
+        candidates = CandidateRecorder(self.settings, self.env, folder / candidates_file_name(name), result)
         attempts = _Attempts(self, recorder, executor, result, intervention, candidates)
         attempts.horizon, attempts.first_attempt = limits.horizon, limits.first_attempt
         executor.check_open_loop = attempts.check_open_loop
@@ -158,6 +157,8 @@ class EpisodeGenerator:
         except UnrecoverableError as error:  # of an intervention; those of attempts are handled there
             result.add_failure(error)
         result.attempts = len(result.failures) + result.success
+        if result.decisions and not result.success:
+            candidates.write(recorder.env_info())
         result.decisions = []  # they are in their file
         return result
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -64,6 +64,8 @@ class EpisodeSettings:
     candidates: int = 16
     """With --record-candidates: number of candidates per decision, first those of the scripted policy, then random
     ones."""
+    candidate_decisions: tuple[Literal["move", "grasp", "release", "pull"], ...] = ("move", "grasp", "release", "pull")
+    """With --record-candidates: kinds of decisions to record (docs/candidates.md)."""
     random_fraction: float = 0.33
     """With --record-candidates: minimum fraction of random candidates, 0 to 1."""
     near_miss_fraction: float = 0.4

@@ -109,6 +109,13 @@ def _check_decisions(tables: Tables) -> Iterator[_Rule]:
     yield "decision", "0, 1, 2, ... per episode", numbers != np.where(starts, 0, previous + 1)
     yield "step", "at least 0", steps < 0
     yield "attempt", "at least 0", values["attempt"] < 0
+    moves = values["moves_left"]
+    yield (
+        "moves_left",
+        "at least 0, or -1 if in_episode is false",
+        np.where(values["in_episode"], moves < 0, moves != -1),
+    )
+    yield "fallen", "false in slots without an object", (values["fallen"] & ~present).any(axis=1)
     yield "instruction", "a text", values["instruction"] == ""
     yield "target_slot", "slot of an object", ~_has_object(values["target_slot"], present)
     for name in ("object_id", "object_name"):
@@ -135,11 +142,11 @@ def _check_candidates(tables: Tables) -> Iterator[_Rule]:
     yield from _check_texts(CANDIDATES, values)
     slot, pulls = values["slot"], values["primitive"] == "pull"
     yield "slot", "slot of an object; -1 for a pull", np.where(pulls, slot != -1, ~_has_object(slot, present))
-    feasible, start, end = values["feasible"], values["start_in_base"], values["end_in_base"]
-    yield "start_in_base", "a pose; NaN only if it is infeasible", ~(_is_pose(start) | (_is_unknown(start) & ~feasible))
-    yield "end_in_base", "a pose, or NaN", ~(_is_pose(end) | _is_unknown(end))
-    pushed = feasible & (values["primitive"] == "push")
-    yield "end_in_base", "the end of a feasible push", pushed & _is_unknown(end)
+    feasible, end, final = values["feasible"], values["end_in_base"], values["final_in_base"]
+    yield "start_in_base", "a pose", ~_is_pose(values["start_in_base"])
+    is_push = values["primitive"] == "push"
+    yield "end_in_base", "a pose for a push, else NaN", np.where(is_push, ~_is_pose(end), ~_is_unknown(end))
+    yield "final_in_base", "a pose, or NaN", ~(_is_pose(final) | _is_unknown(final))
     chosen = np.bincount(rows[values["chosen"]], minlength=len(decisions["seed"]))
     yield "chosen", "at most one candidate per decision", values["chosen"] & (chosen > 1)[rows]
     yield "chosen", "false if in_episode is false", values["chosen"] & ~decisions["in_episode"][rows]

@@ -215,7 +215,7 @@ def compute_candidate_statistics(path: Path) -> CandidateStatistics:
 
 def _compare_choices(file: CandidateFile, value: NDArray[np.float64]) -> dict[str, ChoiceStatistics]:
     """Compare the value (N,) of the chosen candidate with the greatest value of its decision; NaN: no value."""
-    regrets: Mapping[str, list[float]] = {kind: [] for kind in DECISION_KINDS}
+    regrets: Mapping[str, list[float]] = {"move": []}  # the values of other kinds differ only in durations
     for row, kind in enumerate(file.decisions["kind"].tolist()):
         rows = file.rows_of(row)
         values = value[rows]

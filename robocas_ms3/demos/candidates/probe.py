@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -29,33 +30,12 @@ from robocas_ms3.tasks.occlusion import MAX_HIDDEN_FRACTION, MAX_OBSTACLES
 from robocas_ms3.tasks.search import RoboCASSearchEnv
 
 SETTLE_SECONDS = 0.25  # s after a candidate, until its objects are nearly at rest
+SETTINGS = ("candidates", "candidate_decisions", "random_fraction", "near_miss_fraction", "candidate_depth")
+"""Names of the settings of the candidates in `EpisodeSettings`."""
 MIN_PUSH = 0.02  # m, least displacement of an object by a successful push
 MAX_DECISIONS = 30  # decisions that are recorded per seed, so that hard seeds do not dominate a dataset
 _STREAM = 412  # random stream of the proposals
-
-
-@dataclass(frozen=True)
-class CandidateSettings:
-    """Settings of the candidates of each decision.
-
-    Attributes:
-        count: number of candidates per decision.
-        random_fraction: minimum fraction of random candidates.
-        near_miss_fraction: fraction of random candidates with a position error.
-        depth: maximum number of further moves that are simulated after a candidate of search, until the target can be
-            grasped.
-    """
-
-    count: int
-    random_fraction: float
-    near_miss_fraction: float
-    depth: int
-
-    @classmethod
-    def from_episode_settings(cls, settings: EpisodeSettings) -> CandidateSettings:
-        """Return the settings of the candidates from the settings of an episode."""
-        fractions = settings.random_fraction, settings.near_miss_fraction
-        return cls(settings.candidates, *fractions, settings.candidate_depth)
+_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -65,13 +45,13 @@ class CandidateRecorder:
     Decisions of undone attempts are recorded too, up to `MAX_DECISIONS` per seed.
 
     Attributes:
-        settings: settings of the candidates.
+        settings: settings of the episode, with those of the candidates.
         env: environment without a recorder, in which candidates are simulated.
         path: path of the file of the episode.
         result: result of the seed, with the decisions of all attempts. Forked processes exchange it.
     """
 
-    settings: CandidateSettings
+    settings: EpisodeSettings
     env: gym.Env
     path: Path
     result: EpisodeResult
@@ -87,40 +67,49 @@ class CandidateRecorder:
         arm.on_decision, arm.on_choice = on_decision, self._mark_chosen
 
     def write(self, env_info: Mapping[str, Any]) -> None:
-        """Write the file of a successful episode.
+        """Write the decisions of the seed to its file.
 
         ``env_info`` is the value of this key in the JSON file of the trajectory.
         """
-        mark_episode(self.result.decisions, self._decisions)
-        write_candidates(self.path, self.result.decisions, env_info, asdict(self.settings))
+        if self.result.success:
+            mark_episode(self.result.decisions, self._decisions)
+        settings = {name: getattr(self.settings, name) for name in SETTINGS}
+        write_candidates(self.path, self.result.decisions, env_info, settings)
 
-    def _mark_chosen(self, index: int) -> None:
-        decision = self._decisions[-1]
-        if decision.number is not None:
-            candidates = self.result.decisions[decision.number].candidates
-            if index < len(candidates) and candidates[index]["source"] == "expert":
-                decision.chosen = index
+    def _mark_chosen(self, option: int) -> None:
+        self._decisions[-1].chosen = self._decisions[-1].options.get(option)
 
     def _record(self, arm: Arm, kind: DecisionKind, options: Sequence[tuple[Any, Callable[[], object]]]) -> None:
-        number = len(self.result.decisions)
-        if number >= MAX_DECISIONS:
+        number, settings = len(self.result.decisions), self.settings
+        if number >= MAX_DECISIONS or kind not in settings.candidate_decisions:
             self._decisions.append(PathDecision(kind, None))
             return
-        self._decisions.append(PathDecision(kind, number))
+        path = PathDecision(kind, number)
+        self._decisions.append(path)
         before = measure_scene(arm)
         record = DecisionRecord(self._describe(arm, kind, before), _read_state(arm))
-        settings = self.settings
-        own = settings.count - round(settings.random_fraction * settings.count)
-        candidates = [_make_expert_candidate(arm, kind, value, run) for value, run in options[: max(1, own)]]
+        own = max(1, settings.candidates - round(settings.random_fraction * settings.candidates))
+        for option, (value, run) in enumerate(options[:own]):
+            outcome = self._simulate_forked(arm, _make_expert_candidate(arm, kind, option, value, run), before)
+            # a candidate that could not be planned has no parameters
+            if outcome is not None and np.isfinite(outcome["start_in_base"]).all():
+                path.options[option] = len(record.candidates)
+                record.candidates.append(outcome)
         rng = np.random.default_rng([arm.executor.seed, *arm.decision_path, len(self._decisions), _STREAM])
-        candidates += propose(arm, kind, settings.count - len(candidates), rng, settings.near_miss_fraction)
-        for candidate in candidates:
-            try:
-                outcome = run_in_forked_process(lambda one=candidate: self._simulate(arm, one, before))
-            except ForkedProcessError as error:
-                outcome = _make_outcome(candidate, before, before, PlanningError("branch", str(error)))
-            record.candidates.append(outcome)
+        count = settings.candidates - len(record.candidates)
+        for candidate in propose(arm, kind, count, rng, settings.near_miss_fraction):
+            outcome = self._simulate_forked(arm, candidate, before)
+            if outcome is not None:
+                record.candidates.append(outcome)
         self.result.decisions.append(record)
+
+    def _simulate_forked(self, arm: Arm, candidate: Candidate, before: SceneMeasures) -> dict[str, Any] | None:
+        """Return the outcome of a candidate; None if its process crashed twice or exceeded its time limit."""
+        try:
+            return run_in_forked_process(lambda: self._simulate(arm, candidate, before))
+        except ForkedProcessError as error:
+            _log.warning("seed %d: a %s is left out: its process %s", self.result.seed, candidate.primitive, error)
+            return None
 
     def _describe(self, arm: Arm, kind: DecisionKind, before: SceneMeasures) -> dict[str, Any]:
         env, scene = arm.env, arm.scene
@@ -132,6 +121,7 @@ class CandidateRecorder:
             "kind": kind,
             "attempt": len(self.result.failures),
             "in_episode": False,
+            "moves_left": -1,
             "step": len(arm.executor.actions),
             "instruction": env.instruction().text,
             "target_slot": arm.target,
@@ -144,6 +134,7 @@ class CandidateRecorder:
             "qpos": scene.arm_qpos,
             "gripper_width": float(env.agent.gripper_width[0]),
             "held_slot": before.held_slot,
+            "fallen": before.fallen,
             "opening": before.opening,
             "hidden_fraction": before.hidden_fraction,
             "obstacles": before.obstacles,
@@ -164,26 +155,31 @@ class CandidateRecorder:
         steps = len(executor.actions) - first
         if steps:
             executor.move_gripper(executor.gripper, arm.qpos, seconds=SETTLE_SECONDS)
-        planned = arm.planned
-        if planned is not None and planned.primitive == candidate.primitive:
-            candidate = replace(candidate, start_in_base=planned.start_in_base, end_in_base=planned.end_in_base)
-        else:
-            failure = failure or PlanningError("decision", "no_candidate")
         after = measure_scene(arm, before) if steps else before
-        outcome = _make_outcome(candidate, before, after, failure)
-        outcome["feasible"] = planned is not None and planned.primitive == candidate.primitive
-        outcome["seconds"] = steps * executor.dt
-        outcome["moves_to_grasp"] = self._count_moves(arm, after) if steps else -1
-        return outcome
+        planned = arm.planned
+        if planned is not None and candidate.source == "expert":
+            end = planned.end_in_base if candidate.primitive == "push" else None
+            candidate = replace(candidate, start_in_base=planned.start_in_base, end_in_base=end)
+        complete = planned is not None and planned.primitive == candidate.primitive
+        return {
+            **_make_outcome(candidate, before, after, failure),
+            "feasible": planned is not None,
+            "final_in_base": _to_pose(planned.end_in_base if planned is not None and complete else None),
+            "seconds": steps * executor.dt,
+            "moves_to_grasp": self._count_moves(arm, after) if steps and candidate.primitive != "release" else -1,
+        }
 
     def _count_moves(self, arm: Arm, after: SceneMeasures) -> int:
-        """Return the number of moves, up to ``settings.depth``, until the target can be grasped; -1 if unknown."""
+        """Return the number of moves until the target can be grasped; -1 if it is unknown.
+
+        At most ``settings.candidate_depth`` further moves are simulated.
+        """
         if after.held_slot == arm.target:
             return 0
-        for number in range(self.settings.depth + 1):
+        for number in range(self.settings.candidate_depth + 1):
             if _can_be_grasped(arm.target, after):
                 return number
-            if number == self.settings.depth or not isinstance(arm.env, RoboCASSearchEnv):
+            if number == self.settings.candidate_depth or not isinstance(arm.env, RoboCASSearchEnv):
                 break
             try:
                 heap = Heap(arm, arm.target)
@@ -199,11 +195,13 @@ def _can_be_grasped(target: int, measures: SceneMeasures) -> bool:
     return bool(cleared and measures.free_grasps[target] > 0)
 
 
-def _make_expert_candidate(arm: Arm, kind: DecisionKind, value: Any, run: Callable[[], object]) -> Candidate:
+def _make_expert_candidate(
+    arm: Arm, kind: DecisionKind, option: int, value: Any, run: Callable[[], object]
+) -> Candidate:
     if isinstance(value, Move):
-        return Candidate("expert", value.skill, value.slot, run)
+        return Candidate("expert", value.skill, value.slot, run, option=option)
     primitive = cast("Primitive", kind)  # every other kind of decision has one primitive
-    return Candidate("expert", primitive, -1 if primitive == "pull" else arm.target, run)
+    return Candidate("expert", primitive, -1 if primitive == "pull" else arm.target, run, option=option)
 
 
 def _make_outcome(
@@ -211,10 +209,7 @@ def _make_outcome(
 ) -> dict[str, Any]:
     displacement = np.linalg.norm(after.object_in_base[:, :3] - before.object_in_base[:, :3], axis=1)
     others = np.arange(len(displacement)) != candidate.slot
-    if failure is None and candidate.primitive == "push" and displacement[candidate.slot] <= MIN_PUSH:
-        failure = PlanningError("push", "not_moved")
-    if failure is None and (after.fallen & ~before.fallen).any():
-        failure = PlanningError("clear", "fell_off_table")
+    failure = _find_failure(candidate, before, after, failure)
     return {
         "primitive": candidate.primitive,
         "source": candidate.source,
@@ -222,11 +217,9 @@ def _make_outcome(
         "start_in_base": _to_pose(candidate.start_in_base),
         "end_in_base": _to_pose(candidate.end_in_base),
         "chosen": False,
-        "feasible": False,
         "failure": "" if failure is None else str(failure),
         "success": failure is None,
         "held": candidate.slot >= 0 and after.held_slot == candidate.slot,
-        "seconds": 0.0,
         "object_after_in_base": after.object_in_base,
         "displacement": displacement,
         "fallen": after.fallen,
@@ -236,8 +229,27 @@ def _make_outcome(
         "hidden_fraction": after.hidden_fraction,
         "obstacles": after.obstacles,
         "free_grasps": after.free_grasps,
-        "moves_to_grasp": -1,
     }
+
+
+def _find_failure(
+    candidate: Candidate, before: SceneMeasures, after: SceneMeasures, failure: PlanningError | None
+) -> PlanningError | None:
+    """Return the failure of a candidate by its measured outcome; None if it reached the goal of its primitive.
+
+    ``failure`` is the error of the skill, which may be stricter: the same rule holds for all sources.
+    """
+    slot = candidate.slot
+    if (after.fallen & ~before.fallen).any():
+        return PlanningError("clear", "fell_off_table")
+    if candidate.primitive == "grasp":
+        return None if after.held_slot == slot else failure or PlanningError("grasp", "missed")
+    if candidate.primitive == "push":
+        moved = np.linalg.norm(after.object_in_base[slot, :3] - before.object_in_base[slot, :3]) > MIN_PUSH
+        return None if moved else failure or PlanningError("push", "not_moved")
+    if candidate.primitive == "lift" and failure is not None and failure.stage == "clear":
+        return None  # it was placed, at the edge of the surface
+    return failure
 
 
 def _to_pose(pose: Array | None) -> Array:

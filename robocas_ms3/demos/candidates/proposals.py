@@ -1,7 +1,7 @@
 """Propose random candidates of a decision: grasps, pushes and lifts of any object, releases, and pulls.
 
-Random candidates represent failures, which the scripted policy avoids. *Near misses* are grasps, pushes, releases and
-pulls with a position error.
+Random candidates represent failures, which the scripted policy avoids. *Near misses* have an error of position or
+angle.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from robocas_ms3.planning.pushes import (
     TIP_BELOW_TCP,
     TIP_CLEARANCE,
     TOOL_RADIUS,
+    YAWS,
     does_tool_fit,
     push_yaws,
 )
@@ -44,7 +45,7 @@ TARGET_FRACTION = 0.5  # fraction of random grasps that are of the target
 NEIGHBOUR_DISTANCE = 0.15  # m from the target at which an object is chosen e times less often than the target
 CLEAR_FRACTION = 0.6  # fraction of random grasps that touch no other body, if there are any
 REACHABLE_FRACTION = 0.9  # fraction of random candidates whose start is reachable or free, if there is one
-LIFT_GRASPS = 4  # grasps to try per random lift
+GRASPS_DRAWN = 8  # grasps to draw until one is reachable and, for a near miss, touches no other body
 # errors of near misses: standard deviations across and along the approach in m, and in rad
 GRASP_SHIFT, GRASP_DEPTH, GRASP_TURN = 0.02, 0.012, np.deg2rad(15)
 PUSH_SHIFT = (0.02, 0.05)  # m across the direction of the push, minimum and maximum
@@ -64,7 +65,8 @@ class Candidate:
         slot: slot of the object; -1 for a pull.
         run: function that plans and executes the candidate; it raises PlanningError if that fails.
         start_in_base: (4x4) TCP pose at the start, as in `PlannedPrimitive`; None before it is planned.
-        end_in_base: (4x4) TCP pose at the end; None if there is none, or before it is planned.
+        end_in_base: (4x4) TCP pose at the end of a push; None for other primitives, or before it is planned.
+        option: number of the scripted policy's candidate in its decision; None for random candidates.
     """
 
     source: Source
@@ -73,6 +75,7 @@ class Candidate:
     run: Callable[[], object]
     start_in_base: Array | None = None
     end_in_base: Array | None = None
+    option: int | None = None
 
 
 def propose(
@@ -113,20 +116,32 @@ def _draw_slot(arm: Arm, rng: np.random.Generator, *, with_target: bool) -> int 
     return int(rng.choice(slots, p=weights / weights.sum()))
 
 
-def _draw_grasps(arm: Arm, rng: np.random.Generator, slot: int, count: int) -> Array:
-    """Draw annotated grasps (G, 4, 4) of an object, in the arm's base frame; G is 0 if none is suitable."""
+def _draw_grasp(arm: Arm, rng: np.random.Generator, slot: int, near_miss: bool) -> Array | None:
+    """Draw an annotated grasp (4x4) of an object, in the arm's base frame; None if none is suitable."""
     grasps = sample_suitable_grasps(arm, slot)
     if not len(grasps):
-        return grasps
+        return None
+    around = arm.scene.object_in_base(slot)[:3, 3]
+    near = arm.scene.points_in_base(exclude=slot, radius=NEIGHBOURHOOD, around=around)
     if rng.random() < CLEAR_FRACTION:
-        around = arm.scene.object_in_base(slot)[:3, 3]
-        near = arm.scene.points_in_base(exclude=slot, radius=NEIGHBOURHOOD, around=around)
         clear = is_gripper_clear(grasps, near)
         grasps = grasps[clear] if clear.any() else grasps
-    drawn = grasps[rng.permutation(len(grasps))[: 4 * count]]
+    drawn = grasps[rng.permutation(len(grasps))[:GRASPS_DRAWN]]
     turned = rng.random(len(drawn)) < 0.5
     drawn = np.where(turned[:, None, None], drawn @ HALF_TURN, drawn)
-    return _prefer_reachable(arm, rng, drawn, shift_back(drawn, PREGRASP_DISTANCE))[:count]
+    if near_miss:
+        drawn = drawn @ _draw_errors(rng, len(drawn))
+        clear = is_gripper_clear(drawn, near)
+        drawn = drawn[clear] if clear.any() else drawn
+    return _prefer_reachable(arm, rng, drawn, shift_back(drawn, PREGRASP_DISTANCE))[0]
+
+
+def _draw_errors(rng: np.random.Generator, count: int) -> Array:
+    """Draw errors (count, 4, 4) of near misses, in the TCP frame."""
+    errors = np.tile(np.eye(4), (count, 1, 1))
+    errors[:, :3, :3] = Rotation.from_rotvec(rng.normal(scale=GRASP_TURN, size=(count, 3))).as_matrix()
+    errors[:, :3, 3] = rng.normal(size=(count, 3)) * (GRASP_SHIFT, GRASP_SHIFT, GRASP_DEPTH)
+    return errors
 
 
 def _prefer_reachable(arm: Arm, rng: np.random.Generator, poses: Array, starts: Array) -> Array:
@@ -146,15 +161,9 @@ def _grasp(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate | N
     slot = arm.target if rng.random() < TARGET_FRACTION else _draw_slot(arm, rng, with_target=False)
     if slot is None:
         return None
-    grasps = _draw_grasps(arm, rng, slot, 1)
-    if not len(grasps):
+    pose = _draw_grasp(arm, rng, slot, near_miss)
+    if pose is None:
         return None
-    pose = grasps[0].copy()
-    if near_miss:
-        error = np.eye(4)
-        error[:3, :3] = Rotation.from_rotvec(rng.normal(scale=GRASP_TURN, size=3)).as_matrix()
-        error[:3, 3] = rng.normal(size=3) * (GRASP_SHIFT, GRASP_SHIFT, GRASP_DEPTH)
-        pose = pose @ error
 
     def run() -> None:
         if arm.approach == "top":
@@ -167,16 +176,16 @@ def _grasp(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate | N
 
 def _lift(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate | None:
     slot = _draw_slot(arm, rng, with_target=False)
-    grasps = _draw_grasps(arm, rng, slot, LIFT_GRASPS) if slot is not None else ()
-    if slot is None or not len(grasps):
+    pose = None if slot is None else _draw_grasp(arm, rng, slot, near_miss)
+    if slot is None or pose is None:
         return None
 
     def run() -> None:
         arm.rise_until_free()
         arm.executor.gripper = OPEN
-        remove_object(arm, slot, grasps=list(grasps))
+        remove_object(arm, slot, grasps=[pose])
 
-    return Candidate("random", "lift", slot, run, grasps[0])
+    return Candidate("near_miss" if near_miss else "random", "lift", slot, run, pose)
 
 
 def _push(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate | None:
@@ -189,9 +198,9 @@ def _push(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate | No
         if does_tool_fit(tool, others):
             break
         tool, direction = draw_push_start(rng, points, lowest, near_miss)
-    pushes = push_yaws(tool, direction, STAND_OFF + rng.uniform(*PUSH_LENGTHS))
+    push = push_yaws(tool, direction, STAND_OFF + rng.uniform(*PUSH_LENGTHS))[int(rng.integers(YAWS))]
     source: Source = "near_miss" if near_miss else "random"
-    return Candidate(source, "push", slot, lambda: push_along(arm, slot, pushes), pushes[0].start, pushes[0].end)
+    return Candidate(source, "push", slot, lambda: push_along(arm, slot, push), push.start, push.end)
 
 
 def draw_push_start(rng: np.random.Generator, points: Array, lowest: float, near_miss: bool) -> tuple[Array, Array]:

@@ -46,19 +46,20 @@ class PathDecision:
     Attributes:
         kind: kind of the decision.
         number: index of its record; None if it is not recorded.
-        chosen: index of the candidate with which the attempt continued; None if it is not known.
+        options: index of the scripted policy's candidate in its record, by its number in the decision.
+        chosen: index of the candidate with which the attempt continued; None if it is not in the record.
     """
 
     kind: DecisionKind
     number: int | None
+    options: dict[int, int] = field(default_factory=dict)
     chosen: int | None = None
 
 
 def mark_episode(records: Sequence[DecisionRecord], path: Sequence[PathDecision]) -> None:
     """Mark the decisions of the recorded episode in the records of a seed.
 
-    The decisions get ``in_episode``, and their chosen candidates ``chosen``. A chosen move also gets the number of
-    moves that followed it as ``moves_to_grasp``.
+    The decisions get ``in_episode`` and ``moves_left``, and their chosen candidates get ``chosen``.
 
     Args:
         records: decisions of all attempts.
@@ -67,10 +68,8 @@ def mark_episode(records: Sequence[DecisionRecord], path: Sequence[PathDecision]
     moves_left = 0
     for decision in reversed(path):
         if decision.number is not None:
-            records[decision.number].values["in_episode"] = True
+            record = records[decision.number]
+            record.values |= {"in_episode": True, "moves_left": moves_left}
             if decision.chosen is not None:
-                candidate = records[decision.number].candidates[decision.chosen]
-                candidate["chosen"] = True
-                if decision.kind == "move":
-                    candidate["moves_to_grasp"] = moves_left
+                record.candidates[decision.chosen]["chosen"] = True
         moves_left += decision.kind == "move"

@@ -58,15 +58,15 @@ def push_away(arm: Arm, slot: int, target: int, *, turn_deg: float = 0.0) -> Non
     _push(arm, slot, lambda: plan_push(arm, slot, target, turn_deg))
 
 
-def push_along(arm: Arm, slot: int, pushes: Sequence[Push]) -> None:
-    """Push an object along the first feasible of some lines, and rise.
+def push_along(arm: Arm, slot: int, push: Push) -> None:
+    """Push an object along a given line, and rise.
 
     Furniture, basket and arm avoid each other; objects do not count as obstacles of the push itself.
 
     Raises:
         PlanningError: no push can be planned.
     """
-    _push(arm, slot, lambda: plan_push_along(arm, pushes))
+    _push(arm, slot, lambda: plan_push_along(arm, push))
 
 
 def _push(arm: Arm, slot: int, make_plan: Callable[[], PushPlan]) -> None:
@@ -134,12 +134,12 @@ def plan_push(arm: Arm, slot: int, target: int, turn_deg: float = 0.0) -> PushPl
         planner.finger_width = width
 
 
-def plan_push_along(arm: Arm, pushes: Sequence[Push]) -> PushPlan:
-    """Plan the first feasible of some pushes in the same direction."""
+def plan_push_along(arm: Arm, push: Push) -> PushPlan:
+    """Plan a given push, whose motion along the line may touch all objects."""
     planner = arm.planner
     width, planner.finger_width = planner.finger_width, 0.0
     try:
-        starts = _plan_lines_down(arm, _filter_reachable(arm, pushes))
+        starts = _plan_lines_down(arm, _filter_reachable(arm, [push]))
         return _plan_push_and_lift(arm, starts, movable=set(range(len(arm.env.objects))))
     finally:
         planner.finger_width = width
@@ -222,7 +222,7 @@ def _filter_reachable(arm: Arm, pushes: Sequence[Push]) -> Iterator[tuple[Push, 
     reachable, qpos = arm.inverse_kinematics.nearest_solutions(shift_up(starts, APPROACH_HEIGHT), arm.qpos)
     for poses in (starts, ends):
         reachable[reachable] = arm.inverse_kinematics.nearest_solutions(poses[reachable], arm.qpos)[0]
-    turn = np.repeat(np.arange(len(pushes) // YAWS), YAWS)
+    turn = np.arange(len(pushes)) // YAWS
     order = np.lexsort((np.abs(qpos - arm.qpos).max(axis=1), turn))
     yield from [(pushes[i], qpos[i]) for i in order if reachable[i]][:PUSHES_TRIED]
 

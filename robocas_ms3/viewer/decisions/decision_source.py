@@ -121,11 +121,11 @@ class DecisionSource:
     def views(self, row: int) -> list[DecisionView]:
         """Return the views of a decision: those of the cameras, if there are images, and the plot from above."""
         decision = self.decision(row)
+        candidates = decision.candidates
+        ends = np.where(np.isnan(candidates["end_in_base"]), candidates["final_in_base"], candidates["end_in_base"])
         strokes = [
             make_strokes(str(primitive), start, end)
-            for primitive, start, end in zip(
-                *(decision.candidates[key] for key in ("primitive", "start_in_base", "end_in_base")), strict=True
-            )
+            for primitive, start, end in zip(candidates["primitive"], candidates["start_in_base"], ends, strict=True)
         ]
         found = []
         if images := self.images:

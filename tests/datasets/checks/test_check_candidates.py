@@ -82,11 +82,10 @@ def test_success_agrees_with_feasibility_and_failure(tmp_path, success):
     assert ("candidates/success, row 0" in found) == success
 
 
-def test_unknown_start_is_valid_only_if_infeasible(tmp_path):
+def test_unknown_start_is_a_violation(tmp_path):
     records = [make_record(seed, 0, candidates=1) for seed in (3, 4)]
-    for record, feasible in zip(records, (True, False), strict=True):
-        failure = {"success": False, "failure": "grasp: missed"}
-        record.candidates[0] |= {"start_in_base": np.full(7, np.nan), "feasible": feasible, **failure}
+    failure = {"success": False, "failure": "grasp: unreachable", "feasible": False}
+    records[0].candidates[0] |= {"start_in_base": np.full(7, np.nan), **failure}
     write_candidates(tmp_path / "c.h5", records, ENV_INFO, SETTINGS)
     (found,) = validate_candidates(tmp_path / "c.h5").violations
     assert found.key == "candidates/start_in_base, row 0"

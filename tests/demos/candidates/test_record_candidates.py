@@ -47,13 +47,12 @@ def test_file_has_no_violation(folders):
     assert validate_candidates(folders[0] / FILE_NAME).violations == []
 
 
-def test_every_decision_has_scripted_and_random_candidates(file):
+def test_every_decision_has_random_candidates(file):
     assert set(file.decisions["seed"]) == {SEED}
     assert {decision.values["kind"] for decision in in_episode(file)} >= {"grasp", "release"}
     for row in range(len(file)):
         sources = file.decision(row).candidates["source"]
         assert len(sources) == COUNT
-        assert sources[0] == "expert"
         assert set(sources) & {"random", "near_miss"}
 
 
@@ -63,6 +62,9 @@ def test_episode_continues_with_one_scripted_candidate(file):
         assert chosen.sum() == 1
         assert decision.candidates["source"][chosen] == ["expert"]
         assert decision.candidates["success"][chosen] == [True]
+    left = [decision.values["moves_left"] for decision in in_episode(file)]
+    kinds = [decision.values["kind"] for decision in in_episode(file)]
+    assert left == [kinds[number + 1 :].count("move") for number in range(len(kinds))]
 
 
 def test_outcome_of_the_chosen_candidate_is_the_next_state_of_the_episode(file):
@@ -82,9 +84,16 @@ def test_outcome_of_the_chosen_candidate_is_the_next_state_of_the_episode(file):
 
 def test_infeasible_candidates_leave_the_scene_unchanged(file):
     moved = np.nanmax(file.candidates["displacement"], axis=1)
-    still = file.candidates["seconds"] == 0
-    assert not file.candidates["success"][still].any()
-    assert (moved[still] == 0).all()
+    untried = ~file.candidates["feasible"] & (file.candidates["seconds"] == 0)
+    assert untried.any()
+    assert not file.candidates["success"][untried].any()
+    assert (moved[untried] == 0).all()
+    assert np.isfinite(file.candidates["start_in_base"]).all()
+
+
+def test_parameters_do_not_tell_whether_a_candidate_was_feasible(file):
+    is_push = file.candidates["primitive"] == "push"
+    assert (np.isfinite(file.candidates["end_in_base"]).all(axis=1) == is_push).all()
 
 
 def test_candidates_need_forked_processes():
