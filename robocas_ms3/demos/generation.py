@@ -61,7 +61,7 @@ class Summary:
         trajectory: path of ``trajectory.h5``.
         episodes: number of recorded episodes.
         seeds: number of seeds tried, recorded or skipped.
-        mean_seconds: mean CPU seconds per seed by phase: reset, planning, simulation, check (open-loop checks).
+        mean_seconds: mean CPU seconds per seed by phase (`CpuSeconds`).
         mean_steps: mean number of control steps per episode.
         failures: number of failed attempts by stage and reason: ``{"stage: reason": count}``.
         skipped: skipped seeds.
@@ -328,11 +328,12 @@ class _Run:
         shutil.rmtree(self.episodes_folder)
         self._rewrite_failures(results)
         seconds = {part.name: [getattr(result.seconds, part.name) for result in results] for part in fields(CpuSeconds)}
+        phases = [name for name in seconds if self._has_candidates or name != "candidates"]
         summary = Summary(
             self._trajectory,
             len(successes),
             len(results),
-            {name: round(float(np.mean(values)), 3) for name, values in seconds.items()},
+            {name: round(float(np.mean(values)), 3) for name, values in seconds.items() if name in phases},
             round(float(np.mean([result.steps for result in successes])), 1),
             count_by_reason(self.failures.read()),
             [result.seed for result in results if not result.success],

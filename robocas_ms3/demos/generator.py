@@ -310,7 +310,11 @@ class _Attempts:
             ],
             "check_rate": settings.check_rate if checked else None,
             "facts": {"disturbed": int(executor.info["disturbed"][0]), **executor.facts},
-            "seconds": {phase: round(value, 3) for phase, value in asdict(executor.seconds).items()},
+            "seconds": {
+                phase: round(value, 3)
+                for phase, value in asdict(executor.seconds).items()
+                if phase != "candidates" or settings.record_candidates
+            },
             "attempts": len(self.result.failures) + 1,
             "failed_attempts": [f"{failure.stage}: {failure.reason}" for failure in self.result.failures],
             "check_trials": None if not checked else settings.check_trials if self._is_noise_checked else 0,

@@ -103,12 +103,14 @@ class CpuSeconds:
         planning: motion planning.
         simulation: steps of the recorded environment.
         check: open-loop checks.
+        candidates: candidates that are simulated for candidates.h5, including their processes.
     """
 
     reset: float = 0.0
     planning: float = 0.0
     simulation: float = 0.0
     check: float = 0.0
+    candidates: float = 0.0
 
     @contextmanager
     def measure(self, phase: str) -> Iterator[None]:

@@ -57,6 +57,7 @@ class RecordingConfig(StrictModel):
         default=None, description="also write `candidates.h5` next to the demonstrations"
     )
     candidates: Annotated[int, Field(ge=1, le=1000)] | None = None
+    candidate_decisions: list[Literal["move", "grasp", "release", "pull"]] | None = None
     random_fraction: Annotated[float, Field(ge=0, le=1)] | None = None
     near_miss_fraction: Annotated[float, Field(ge=0, le=1)] | None = None
     candidate_depth: Annotated[int, Field(ge=0, le=20)] | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -62,7 +63,9 @@ class CandidateRecorder:
         self._decisions = []
 
         def on_decision(kind: str, candidates: Sequence[tuple[Any, Callable[[], object]]]) -> None:
+            start = sum(os.times()[:4])  # with forked processes
             self._record(arm, cast("DecisionKind", kind), candidates)
+            arm.executor.seconds.candidates += sum(os.times()[:4]) - start
 
         arm.on_decision, arm.on_choice = on_decision, self._mark_chosen
 

@@ -44,6 +44,7 @@ MIX: dict[DecisionKind, dict[Primitive, float]] = {
 TARGET_FRACTION = 0.5  # fraction of random grasps that are of the target
 NEIGHBOUR_DISTANCE = 0.15  # m from the target at which an object is chosen e times less often than the target
 CLEAR_FRACTION = 0.6  # fraction of random grasps that touch no other body, if there are any
+LIFT_OBJECTS = 4  # objects to draw until one can be lifted without contact between the gripper and another body
 REACHABLE_FRACTION = 0.9  # fraction of random candidates whose start is reachable or free, if there is one
 GRASPS_DRAWN = 8  # grasps to draw until one is reachable and, for a near miss, touches no other body
 # errors of near misses: standard deviations across and along the approach in m, and in rad
@@ -116,16 +117,26 @@ def _draw_slot(arm: Arm, rng: np.random.Generator, *, with_target: bool) -> int 
     return int(rng.choice(slots, p=weights / weights.sum()))
 
 
-def _draw_grasp(arm: Arm, rng: np.random.Generator, slot: int, near_miss: bool) -> Array | None:
-    """Draw an annotated grasp (4x4) of an object, in the arm's base frame; None if none is suitable."""
+def _draw_grasp(arm: Arm, rng: np.random.Generator, slot: int, near_miss: bool, *, clear_only: bool) -> Array | None:
+    """Draw an annotated grasp (4x4) of an object, in the arm's base frame.
+
+    Args:
+        arm: context of the attempt.
+        rng: random generator.
+        slot: slot of the object.
+        near_miss: whether the grasp has an error.
+        clear_only: whether the gripper must touch no other body.
+
+    Returns:
+        The grasp; None if there is none.
+    """
     grasps = sample_suitable_grasps(arm, slot)
-    if not len(grasps):
-        return None
     around = arm.scene.object_in_base(slot)[:3, 3]
     near = arm.scene.points_in_base(exclude=slot, radius=NEIGHBOURHOOD, around=around)
-    if rng.random() < CLEAR_FRACTION:
-        clear = is_gripper_clear(grasps, near)
-        grasps = grasps[clear] if clear.any() else grasps
+    if clear_only:
+        grasps = grasps[is_gripper_clear(grasps, near)]
+    if not len(grasps):
+        return None
     drawn = grasps[rng.permutation(len(grasps))[:GRASPS_DRAWN]]
     turned = rng.random(len(drawn)) < 0.5
     drawn = np.where(turned[:, None, None], drawn @ HALF_TURN, drawn)
@@ -161,7 +172,9 @@ def _grasp(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate | N
     slot = arm.target if rng.random() < TARGET_FRACTION else _draw_slot(arm, rng, with_target=False)
     if slot is None:
         return None
-    pose = _draw_grasp(arm, rng, slot, near_miss)
+    pose = _draw_grasp(arm, rng, slot, near_miss, clear_only=rng.random() < CLEAR_FRACTION)
+    if pose is None:
+        pose = _draw_grasp(arm, rng, slot, near_miss, clear_only=False)
     if pose is None:
         return None
 
@@ -175,8 +188,12 @@ def _grasp(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate | N
 
 
 def _lift(arm: Arm, rng: np.random.Generator, near_miss: bool) -> Candidate | None:
-    slot = _draw_slot(arm, rng, with_target=False)
-    pose = None if slot is None else _draw_grasp(arm, rng, slot, near_miss)
+    slot = pose = None
+    for _ in range(LIFT_OBJECTS):
+        slot = _draw_slot(arm, rng, with_target=False)
+        pose = None if slot is None else _draw_grasp(arm, rng, slot, near_miss, clear_only=True)
+        if pose is not None:
+            break
     if slot is None or pose is None:
         return None
 

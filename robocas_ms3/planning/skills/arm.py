@@ -127,9 +127,9 @@ class Arm:
         self.on_choice(index)
         return chosen
 
-    def run_only_candidate(self, kind: str, run: Callable[[], T]) -> T:
-        """Call ``run``, as the only candidate of a decision of a kind."""
-        self.on_decision(kind, [(None, run)])
+    def run_first_candidate(self, kind: str, run: Callable[[], T], *others: Callable[[], object]) -> T:
+        """Call ``run``, the first candidate of a decision of a kind; ``others`` are not called."""
+        self.on_decision(kind, [(None, one) for one in (run, *others)])
         result = run()
         self.on_choice(0)
         return result

@@ -6,6 +6,7 @@ The base drives only in configurations with ``base_motion: true``.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -56,11 +57,12 @@ def drive_and_grasp(arm: Arm, slot: int) -> None:
 
     If no grasp can be planned, the robot drives to another base pose, up to ``MAX_BASE_POSES`` times.
     """
-    kind = arm.decision_path[-1] % GRASP_KINDS  # skip the kinds of earlier attempts
+    first = arm.decision_path[-1] % GRASP_KINDS  # skip the kinds of earlier attempts
+    kinds = [first, *(kind for kind in range(GRASP_KINDS) if kind != first)]
     _try_base_poses(
         arm,
         lambda relocate: drive_to_object(arm, slot, relocate=relocate),
-        lambda: arm.run_only_candidate("grasp", lambda: grasp(arm, slot, skip_kinds=kind)),
+        lambda: arm.run_first_candidate("grasp", *(partial(grasp, arm, slot, skip_kinds=one) for one in kinds)),
     )
 
 
@@ -159,7 +161,7 @@ def place_in_basket(arm: Arm, slot: int) -> None:
     """Carry a held object to the basket, with a drive if necessary, and release it there."""
     arm.start_subgoal("transfer object")
     drive_to_basket(arm, slot)
-    arm.run_only_candidate("release", lambda: carry_and_release(arm, slot))
+    arm.run_first_candidate("release", lambda: carry_and_release(arm, slot))
 
 
 def drive_to_basket(arm: Arm, slot: int) -> None:

@@ -139,7 +139,7 @@ def open_furniture_part(arm: Arm) -> None:
     """
     part = MovingPart.from_task(arm)
     for _ in range(MAX_PULLS):
-        arm.run_only_candidate("pull", lambda: pull_handle(arm, part))
+        arm.run_first_candidate("pull", lambda: pull_handle(arm, part))
         if is_opened(arm):
             return
     raise PlanningError("pull", "not_far_enough")

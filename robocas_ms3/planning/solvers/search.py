@@ -53,7 +53,7 @@ def attempt(arm: Arm) -> None:
             look_at(arm, heap.centroid(slot), NEAR)
     arm.executor.check_open_loop()
     arm.start_subgoal("transfer object")
-    arm.run_only_candidate("release", lambda: _carry_and_release(arm, heap))
+    arm.run_first_candidate("release", lambda: _carry_and_release(arm, heap))
 
 
 def _carry_and_release(arm: Arm, heap: Heap) -> None:
