@@ -84,6 +84,7 @@ def _grasp(arm: Arm, slot: int) -> bool:
     done = len(arm.executor.actions)
 
     def execute_grasp(kind: int) -> float:
+        arm.rise_until_free()  # an object may lean on the tool after a push
         arm.executor.gripper = OPEN  # opens during the approach
         with arm.planning_time():
             grasps = retract_from_contact(arm, slot, grasp_candidates(arm, slot, kind))
