@@ -27,7 +27,8 @@ TURNS_DEG = (30.0, -30.0)  # offsets from the paper's push direction
 EDGE_MARGIN = 0.01  # m from every object to the edge of the surface
 
 COST_PER_METRE_OF_TARGET = 400.0  # s per metre that a move displaces the target
-COST_PER_PUSH = 2.0  # s; the result of a push is less repeatable than that of a removal
+COST_PER_PUSH = 4.0  # s; the result of a push is less repeatable than that of a removal
+COST_WITHOUT_PROGRESS = 10.0  # s; a move after which as much work is left as before
 MAX_TARGET_DISPLACEMENT = 0.03  # m by a move; beyond it, 17 of 20 open-loop checks fail
 COST_OF_FAILED_CHECK = 15.0  # s, for a greater displacement, and per failed check after an earlier move of this kind
 
@@ -132,6 +133,7 @@ class Heap:
         """
         arm, facts = self.arm, self.arm.executor.facts
         before, target, start = self.centroid(move.slot), self.centroid(self.target), len(arm.executor.actions)
+        work = self.remaining_cost()
         arm.rise_until_free()
         if move.skill == "push":
             push_away(arm, move.slot, self.target, turn_deg=move.turn_deg)
@@ -145,7 +147,8 @@ class Heap:
         self.check_objects_on_surface()
         displacement = float(np.linalg.norm(self.centroid(self.target) - target))
         cost = (len(arm.executor.actions) - start) * arm.executor.dt + COST_PER_PUSH * (move.skill == "push")
-        cost += self.remaining_cost() + COST_PER_METRE_OF_TARGET * displacement
+        work_left = self.remaining_cost()
+        cost += work_left + COST_WITHOUT_PROGRESS * (work_left >= work) + COST_PER_METRE_OF_TARGET * displacement
         expected_failures = self._count_failed_checks(move) + (displacement > MAX_TARGET_DISPLACEMENT)
         return -cost - COST_OF_FAILED_CHECK * expected_failures
 

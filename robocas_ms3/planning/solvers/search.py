@@ -17,7 +17,7 @@ from robocas_ms3.planning.skills.remove import raise_held_object
 
 LIFT_HEIGHT = 0.15  # m (RoboCAS-v0)
 MOVES_COMPARED = 3  # candidate moves that are compared
-SUFFICIENT_SCORE = -18.0  # s; a move with this score is not compared with others: no work left and at most 18 s
+SUFFICIENT_SCORE = -15.0  # s; a move with this score is not compared with others: no work left and at most 15 s
 GRASP_KINDS = 3  # kinds of grasps of the target to try
 
 
