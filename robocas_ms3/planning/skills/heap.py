@@ -28,7 +28,6 @@ EDGE_MARGIN = 0.01  # m from every object to the edge of the surface
 
 COST_PER_METRE_OF_TARGET = 400.0  # s per metre that a move displaces the target
 COST_PER_PUSH = 4.0  # s; the result of a push is less repeatable than that of a removal
-COST_WITHOUT_PROGRESS = 10.0  # s; a move after which as much work is left as before
 MAX_TARGET_DISPLACEMENT = 0.03  # m by a move; beyond it, 17 of 20 open-loop checks fail
 COST_OF_FAILED_CHECK = 15.0  # s, for a greater displacement, and per failed check after an earlier move of this kind
 
@@ -85,6 +84,11 @@ class Heap:
         return bool(self.env.measure_clutter().is_target_cleared[0])
 
     @property
+    def target_exposed(self) -> bool:
+        """Whether at most a fifth of the target is hidden, seen from the camera above."""
+        return float(self.env.measure_clutter().hidden_fraction[0]) <= MAX_HIDDEN_FRACTION
+
+    @property
     def target_cleared(self) -> bool:
         """Whether the target is cleared and visible to the gripper camera."""
         return self.target_uncovered and self.target_visible
@@ -129,7 +133,8 @@ class Heap:
         """Run the motions of a move and return its score, minus the cost in s.
 
         Raises:
-            PlanningError: a motion cannot be planned or has no effect, or an object is at the edge of the surface.
+            PlanningError: a motion cannot be planned or has no effect, an object is at the edge of the surface, or as
+                much work is left as before, although the target is exposed.
         """
         arm, facts = self.arm, self.arm.executor.facts
         before, target, start = self.centroid(move.slot), self.centroid(self.target), len(arm.executor.actions)
@@ -148,7 +153,9 @@ class Heap:
         displacement = float(np.linalg.norm(self.centroid(self.target) - target))
         cost = (len(arm.executor.actions) - start) * arm.executor.dt + COST_PER_PUSH * (move.skill == "push")
         work_left = self.remaining_cost()
-        cost += work_left + COST_WITHOUT_PROGRESS * (work_left >= work) + COST_PER_METRE_OF_TARGET * displacement
+        if self.target_exposed and work_left >= work:
+            raise PlanningError("clear", "no_progress")
+        cost += work_left + COST_PER_METRE_OF_TARGET * displacement
         expected_failures = self._count_failed_checks(move) + (displacement > MAX_TARGET_DISPLACEMENT)
         return -cost - COST_OF_FAILED_CHECK * expected_failures
 

@@ -44,6 +44,8 @@ def attempt(arm: Arm) -> None:
             if len(arm.executor.actions) > done:
                 raise
             # no move is feasible: try to grasp the target now
+            if heap.target_exposed and not heap.target_visible:
+                look_at(arm, heap.centroid(slot), NEAR)
             arm.start_subgoal("move and grasp")
             if not heap.target_visible or not _grasp(arm, slot):
                 raise
