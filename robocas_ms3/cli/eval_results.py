@@ -124,6 +124,7 @@ def compare(cfg: Compare) -> int:
 
 def verify(cfg: Verify) -> int:
     from robocas_ms3.cli.terminal import print_line
+    from robocas_ms3.evaluation.report.tables import name_measurement
     from robocas_ms3.evaluation.verify import find_violations
 
     result = _read(cfg.folders)
@@ -132,7 +133,7 @@ def verify(cfg: Verify) -> int:
         print_line(violation)
     if broken := result.count_errors():
         print_line(f"note: {format_count(broken, 'episode')} ended with an error and counted as failed")
-    valid = f"{format_count(len(result.outcomes), 'episode')} of {result.run.protocol}, no violations"
+    valid = f"{format_count(len(result.outcomes), 'episode')} of {name_measurement(result.run)}, no violations"
     print_line(f"{', '.join(map(str, cfg.folders))}: {format_count(len(found), 'violation') if found else valid}")
     return 1 if found else 0
 

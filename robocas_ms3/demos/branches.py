@@ -337,7 +337,11 @@ def _run_once(function: Callable[[], T]) -> T:
             try:
                 set_up_forked_process(parent)
                 signal.pthread_sigmask(signal.SIG_SETMASK, before)
-                forked.send(_call(function))
+                answer = _call(function)
+                try:
+                    forked.send(answer)
+                except Exception as error:  # noqa: BLE001  (the answer cannot be pickled)
+                    forked.send(RemoteError.from_error(error, "a candidate"))
             finally:  # even an interrupt must not return to the code that the parent runs too
                 os._exit(0)
     finally:

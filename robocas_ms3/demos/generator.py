@@ -16,7 +16,7 @@ from robocas_ms3.core.errors import LayoutError, PlanningError, RobocasError, Un
 from robocas_ms3.core.extensions import import_object
 from robocas_ms3.demos.backtracking import ResimulatedDecisions
 from robocas_ms3.demos.branches import ForkedDecisions, find_reason_not_to_fork, warn_cannot_fork
-from robocas_ms3.demos.candidates.probe import CandidateRecorder
+from robocas_ms3.demos.candidates.recorder import CandidateRecorder
 from robocas_ms3.demos.candidates.records import candidates_file_name
 from robocas_ms3.demos.failures import EpisodeResult, Intervention
 from robocas_ms3.demos.interventions import intervene

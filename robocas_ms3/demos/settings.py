@@ -62,8 +62,8 @@ class EpisodeSettings:
     """Also simulate the candidates of each decision, and record their outcomes in candidates.h5 (docs/candidates.md).
     The demonstrations do not change."""
     candidates: int = 16
-    """With --record-candidates: number of candidates per decision, first those of the scripted policy, then random
-    ones."""
+    """With --record-candidates: number of candidates per decision.
+    First come those of the scripted policy, then random ones."""
     candidate_decisions: tuple[Literal["move", "grasp", "release", "pull"], ...] = ("move", "grasp", "release", "pull")
     """With --record-candidates: kinds of decisions to record (docs/candidates.md)."""
     random_fraction: float = 0.33

@@ -30,7 +30,7 @@ class EvaluationOptions:
     protocol: Annotated[str, tyro.conf.arg(metavar="PROTOCOL")] = "ms3-v1"
     """Name of a bundled protocol (`robocas eval protocols`), or a protocol folder."""
     out: Annotated[Path | None, _NO_HINT] = None
-    """Output folder. Default: eval/PROTOCOL/POLICY, with the suffix _weld or _noise for these options."""
+    """Output folder. Default: eval/PROTOCOL/POLICY, with a suffix for --weld and --action-noise."""
     overwrite: bool = False
     """Delete an existing result and start again. Default: continue a result that has the same settings."""
     retry_errors: bool = False
@@ -98,8 +98,12 @@ class EvaluationSettings(EvaluationOptions, SelectionOptions, SimulationOptions)
     def choose_folder(self, protocol: str, played_as: Iterable[str] = ()) -> Path:
         """Return ``out``, or the default folder eval/PROTOCOL/POLICY of the working directory.
 
-        The default folder has the suffixes ``_TASK``, for each task in ``played_as``, ``_weld`` and ``_noise``.
+        The default folder has the suffixes ``_TASK``, for each task in ``played_as``, ``_weld`` and ``_noiseMM_DEG``.
         """
-        suffixes = [*played_as, *(["weld"] if self.weld else []), *(["noise"] if any(self.action_noise) else [])]
+        suffixes = [
+            *played_as,
+            *(["weld"] if self.weld else []),
+            *(["noise{:g}_{:g}".format(*self.action_noise)] if any(self.action_noise) else []),
+        ]
         name = "_".join([re.sub(r"[^\w.-]+", "_", self.policy), *suffixes])
         return self.out or (Path("eval") / protocol / name).absolute()

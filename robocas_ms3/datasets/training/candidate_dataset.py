@@ -25,7 +25,7 @@ from robocas_ms3.scenes.config.task import TaskConfig
 from robocas_ms3.scenes.relations import Relation
 
 Targets = Literal["instructed", "all"]
-_STREAM = 413  # random stream of the instructions of other targets, and of the choice of candidates
+_STREAM = 416  # random stream of the instructions of other targets, and of the choice of candidates
 
 
 @dataclass(frozen=True)

@@ -50,8 +50,7 @@ def compute_labels(tables: Tables) -> Labels:
     before = np.where(held_before, 0.0, _clearing_cost(tables.decisions))[rows]
     after = np.where(own & delivered, 0.0, _clearing_cost(tables.candidates))
     benefit = before - after
-    fell = tables.candidates["fallen"] & ~tables.decisions["fallen"][rows]
-    helped = (benefit >= MIN_BENEFIT) & ~fell.any(axis=1, keepdims=True)
+    helped = (benefit >= MIN_BENEFIT) & ~tables.candidates["fallen"].any(axis=1, keepdims=True)
     return Labels(before, after, benefit, helped, tables.decisions["target_slot"][rows].astype(np.int64))
 
 

@@ -35,7 +35,7 @@ class SceneMeasures:
         free_grasps: (K,) int, number of annotated grasps of each object whose gripper touches no other body.
         fallen: (K,) bool, whether each object has fallen off the surface, except into the basket.
         in_basket: (K,) bool, whether each object is in the basket.
-        held_slot: slot of the object that both fingers hold; -1: none.
+        held: (K,) bool, whether both fingers hold each object.
         opening: opening of the door or drawer as a fraction of its range; NaN without one.
     """
 
@@ -45,7 +45,7 @@ class SceneMeasures:
     free_grasps: Array
     fallen: Array
     in_basket: Array
-    held_slot: int
+    held: Array
     opening: float
 
 
@@ -62,7 +62,6 @@ def measure_scene(arm: Arm, before: SceneMeasures | None = None) -> SceneMeasure
     poses = np.full((len(present), 7), np.nan)
     poses[slots] = [to_wxyz(arm.scene.object_in_base(slot)) for slot in slots.tolist()]
     hidden, obstacles = _measure_clutter(arm)
-    held = np.flatnonzero(env.is_object_grasped()[0].cpu().numpy() & present)
     height, in_basket = to_native(env.object_states)[0, :, 2], _find_objects_in_basket(arm) & present
     return SceneMeasures(
         object_in_base=poses,
@@ -71,7 +70,7 @@ def measure_scene(arm: Arm, before: SceneMeasures | None = None) -> SceneMeasure
         free_grasps=_count_free_grasps(arm, poses, before),
         fallen=np.asarray(height < env.success_check.fallen_below) & present & ~in_basket,
         in_basket=in_basket,
-        held_slot=int(held[0]) if len(held) else -1,
+        held=env.is_object_grasped()[0].cpu().numpy() & present,
         opening=measure_opening(arm),
     )
 

@@ -87,7 +87,7 @@ DECISION_FIELDS = (
 CANDIDATE_FIELDS = (
     Field("decision_row", "int64", (), "row of the decision"),
     Field("primitive", "str", (), "what the arm does", PRIMITIVES),
-    Field("source", "str", (), "origin: the scripted policy, random, or a perturbed grasp or push", SOURCES),
+    Field("source", "str", (), "origin: the scripted policy, random, or random with an error", SOURCES),
     Field("slot", "int16", (), "slot of the object to grasp, push, lift or release; -1 for a pull"),
     Field("start_in_base", "float32", (7,), f"TCP pose of the grasp or release, or at the start of the push: {_POSE}"),
     Field("end_in_base", "float32", (7,), f"TCP pose at the end of the push: {_POSE}; NaN for other primitives"),
@@ -101,7 +101,7 @@ CANDIDATE_FIELDS = (
     Field("seconds", "float32", (), "simulated duration, s"),
     Field("object_after_in_base", "float32", (SLOTS, 7), f"pose of each object at the end: {_POSE}"),
     Field("displacement", "float32", (SLOTS,), "distance between the positions of each object before and after, m"),
-    Field("fallen", "bool", (SLOTS,), "whether the object has fallen off the surface, except into the basket"),
+    Field("fallen", "bool", (SLOTS,), "whether the object fell off the surface, except into the basket"),
     Field("disturbed", "int16", (), "number of objects except the moved one that were displaced by more than 2 cm"),
     Field("in_basket", "bool", (SLOTS,), "whether the object is in the basket at the end"),
     Field("opening", "float32", (), "opening of the door or drawer at the end, as a fraction; NaN without one"),

@@ -26,7 +26,7 @@ from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.planning.decisions import IrreversibleDecisions
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.heap import Heap, Move
+from robocas_ms3.planning.skills.heap import Heap, Move, find_fallen_objects
 from robocas_ms3.tasks.occlusion import MAX_HIDDEN_FRACTION, MAX_OBSTACLES
 from robocas_ms3.tasks.search import RoboCASSearchEnv
 
@@ -35,7 +35,7 @@ SETTINGS = ("candidates", "candidate_decisions", "random_fraction", "near_miss_f
 """Names of the settings of the candidates in `EpisodeSettings`."""
 MIN_PUSH = 0.02  # m, least displacement of an object by a successful push
 MAX_DECISIONS = 30  # decisions that are recorded per seed, so that hard seeds do not dominate a dataset
-_STREAM = 412  # random stream of the proposals
+_STREAM = 415  # random stream of the proposals
 _log = logging.getLogger(__name__)
 
 
@@ -136,7 +136,7 @@ class CandidateRecorder:
             "tcp_in_base": to_wxyz(scene.tcp_in_base),
             "qpos": scene.arm_qpos,
             "gripper_width": float(env.agent.gripper_width[0]),
-            "held_slot": before.held_slot,
+            "held_slot": int(np.flatnonzero(before.held)[0]) if before.held.any() else -1,
             "fallen": before.fallen,
             "opening": before.opening,
             "hidden_fraction": before.hidden_fraction,
@@ -177,7 +177,7 @@ class CandidateRecorder:
 
         At most ``settings.candidate_depth`` further moves are simulated.
         """
-        if after.held_slot == arm.target:
+        if after.held[arm.target]:
             return 0
         for number in range(self.settings.candidate_depth + 1):
             if _can_be_grasped(arm.target, after):
@@ -185,7 +185,7 @@ class CandidateRecorder:
             if number == self.settings.candidate_depth or not isinstance(arm.env, RoboCASSearchEnv):
                 break
             try:
-                heap = Heap(arm, arm.target)
+                heap = Heap(arm, arm.target, find_fallen_objects(arm) - {arm.target})
                 arm.choose(heap.candidate_moves(), heap.execute)
             except PlanningError:
                 break
@@ -222,10 +222,10 @@ def _make_outcome(
         "chosen": False,
         "failure": "" if failure is None else str(failure),
         "success": failure is None,
-        "held": candidate.slot >= 0 and after.held_slot == candidate.slot,
+        "held": candidate.slot >= 0 and bool(after.held[candidate.slot]),
         "object_after_in_base": after.object_in_base,
         "displacement": displacement,
-        "fallen": after.fallen,
+        "fallen": after.fallen & ~before.fallen,
         "disturbed": int((displacement[others] > DISTURBED).sum()),
         "in_basket": after.in_basket,
         "opening": after.opening,
@@ -246,7 +246,7 @@ def _find_failure(
     if (after.fallen & ~before.fallen).any():
         return PlanningError("clear", "fell_off_table")
     if candidate.primitive == "grasp":
-        return None if after.held_slot == slot else failure or PlanningError("grasp", "missed")
+        return None if after.held[slot] else failure or PlanningError("grasp", "missed")
     if candidate.primitive == "push":
         moved = np.linalg.norm(after.object_in_base[slot, :3] - before.object_in_base[slot, :3]) > MIN_PUSH
         return None if moved else failure or PlanningError("push", "not_moved")
