@@ -147,7 +147,8 @@ class SuccessCheck:
         finger = read_link_poses(self._env.scene, [self._env.agent.finger1_link])[:, 0]
         # the left finger opens along its own +y
         opening = rotations.rotate(finger[:, 3:], self._sideways)
-        return terms.is_grasped(forces[:, 0], forces[:, 1], opening)
+        apart = to_native(self._env.agent.gripper_width) >= terms.MIN_GRASP_WIDTH
+        return terms.is_grasped(forces[:, 0], forces[:, 1], opening) & apart[:, None]
 
     def success_conditions(self) -> dict[str, torch.Tensor]:
         """Return the success conditions by name, (N,) bool each.

@@ -13,6 +13,7 @@ from robocas_ms3.core.rotations import rotate_inverse, to_matrix, vertical_axis
 
 MIN_GRASP_FORCE = 0.5  # N, on each finger
 MAX_GRASP_ANGLE = 85.0  # deg, between the force on a finger and the finger's opening direction
+MIN_GRASP_WIDTH = 0.002  # m between the finger pads; closed fingers that press on an object do not hold it
 MIN_CONTACT_FORCE = 1e-3  # N; smaller forces are noise
 LIFT = 0.03  # m above the object's resting height, as in RoboCAS-v0
 REST_SPEED, REST_TURN = 0.03, 0.5  # m/s and rad/s, greatest velocities of a body at rest

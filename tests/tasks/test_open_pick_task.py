@@ -21,7 +21,7 @@ from robocas_ms3.demos.trajectory_replay import replay
 from robocas_ms3.planning.executor import MotionExecutor
 from robocas_ms3.planning.skills.base_placement import drive_to_handle
 from robocas_ms3.planning.skills.drive import current_base_pose, drive
-from robocas_ms3.planning.skills.grasp import plan_grasp
+from robocas_ms3.planning.skills.grasp import grasp_candidates, plan_grasp
 from robocas_ms3.planning.skills.handles import MovingPart, estimate_pull_fraction, open_furniture_part
 from robocas_ms3.scenes.config import bundled_configs, load_task_config
 from robocas_ms3.scenes.language.templates import make_subgoal
@@ -204,7 +204,7 @@ def test_robot_drives_to_a_target_out_of_reach(tmp_path):
 
     def policy(arm) -> None:
         with pytest.raises(PlanningError):
-            plan_grasp(arm, int(arm.env.target_slot[0]), 0.1)
+            plan_grasp(arm, arm.target, 0.1, grasp_candidates(arm, arm.target, 0))
         pick(arm)
 
     generator.policy = policy
