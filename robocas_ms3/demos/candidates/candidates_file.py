@@ -124,7 +124,7 @@ def _write(path: Path, tables: Tables, texts: Mapping[str, str]) -> None:
 def _write_array(group: h5py.Group, name: str, values: NDArray[Any]) -> None:
     dtype: Any = values.dtype
     if dtype.kind == "U":
-        values = np.char.encode(values, "utf-8")
+        values = np.char.encode(values, "utf-8").reshape(values.shape)  # NumPy 1 drops axes of empty arrays
         dtype = h5py.string_dtype("utf-8", max(values.dtype.itemsize, 1))
     row_bytes = dtype.itemsize * math.prod(values.shape[1:])
     if not values.size or not values.shape:
@@ -308,7 +308,7 @@ def _read_field(array: h5py.Dataset, field: Field, shape: tuple[int, ...], path:
     if not fits or array.shape != shape:
         raise _wrong_array(path, str(array.name).strip("/"), f"{expected} of shape {shape}", array)
     values = array[()]
-    return np.char.decode(values, "utf-8") if field.dtype == "str" else values
+    return np.char.decode(values, "utf-8").reshape(values.shape) if field.dtype == "str" else values
 
 
 def _wrong_array(path: Path, name: str, expected: str, array: h5py.Dataset) -> DatasetError:
