@@ -48,5 +48,5 @@ def main(settings: GenerateSettings) -> int:
     print_line(f"mean seconds per seed: {seconds}; mean length: {summary.mean_steps:.0f} steps")
     if summary.failures:
         print_line("failed attempts: " + ", ".join(f"{reason} x{n}" for reason, n in summary.failures.items()))
-    print_line(f"wrote {summary.trajectory}")
+    print_line(f"wrote {summary.trajectory}{' and candidates.h5' if settings.episode.record_candidates else ''}")
     return 0

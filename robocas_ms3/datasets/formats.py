@@ -73,9 +73,9 @@ def _is_robocas(path: Path) -> bool:
 def _has_candidates(path: Path) -> bool:
     if not path.is_file() or path.suffix not in {".h5", ".hdf5"}:
         return False
-    from robocas_ms3.demos.candidates.candidates_file import is_candidates_file  # imports h5py
+    from robocas_ms3.demos.candidates.candidates_file import FILE_NAME, is_candidates_file  # imports h5py
 
-    return is_candidates_file(path)
+    return path.name == FILE_NAME or is_candidates_file(path)  # a damaged file is known by its name
 
 
 _PACKAGE = "robocas_ms3.datasets"

@@ -15,10 +15,11 @@ import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.core.errors import LayoutError, PlanningError, RobocasError, UnrecoverableError
 from robocas_ms3.core.extensions import import_object
 from robocas_ms3.demos.backtracking import ResimulatedDecisions
-from robocas_ms3.demos.branches import ForkedDecisions, find_reason_not_to_fork, warn_cannot_fork
+from robocas_ms3.demos.branches import ForkedDecisions
 from robocas_ms3.demos.candidates.recorder import CandidateRecorder
 from robocas_ms3.demos.candidates.records import candidates_file_name
 from robocas_ms3.demos.failures import EpisodeResult, Intervention
+from robocas_ms3.demos.forked_processes import find_reason_not_to_fork, warn_cannot_fork
 from robocas_ms3.demos.interventions import intervene
 from robocas_ms3.demos.open_loop import OpenLoopChecks, OpenLoopEnv
 from robocas_ms3.demos.recordings.environment import RecordedEnv

@@ -18,12 +18,8 @@ from branch_notes import Notes
 from robocas_ms3.core.errors import PlanningError, RobocasError
 from robocas_ms3.core.remote_errors import RemoteTraceback
 from robocas_ms3.demos import branches
-from robocas_ms3.demos.branches import (
-    ForkedDecisions,
-    ForkedProcessCrashError,
-    find_reason_not_to_fork,
-    run_in_forked_process,
-)
+from robocas_ms3.demos.branches import ForkedDecisions
+from robocas_ms3.demos.forked_processes import ForkedProcessCrashError, find_reason_not_to_fork, run_in_forked_process
 from robocas_ms3.planning.decisions import SearchLimits
 
 

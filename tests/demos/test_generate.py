@@ -14,7 +14,7 @@ from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.structs import Pose
 
 from robocas_ms3.core.errors import PlanningError, UnrecoverableError
-from robocas_ms3.demos.branches import ForkedProcess
+from robocas_ms3.demos.forked_processes import ForkedProcess
 from robocas_ms3.demos.generation import generate
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.demos.open_loop import OpenLoopChecks

@@ -15,13 +15,13 @@ from mani_skill.utils.common import to_numpy
 
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import to_wxyz
-from robocas_ms3.demos.branches import ForkedProcessError, run_in_forked_process
 from robocas_ms3.demos.candidates.candidates_file import write_candidates
 from robocas_ms3.demos.candidates.measure import DISTURBED, SceneMeasures, measure_scene
 from robocas_ms3.demos.candidates.proposals import Candidate, propose
 from robocas_ms3.demos.candidates.records import DecisionRecord, PathDecision, mark_episode
 from robocas_ms3.demos.candidates.schema import DecisionKind, Primitive
 from robocas_ms3.demos.failures import EpisodeResult
+from robocas_ms3.demos.forked_processes import ForkedProcessError, run_in_forked_process
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.planning.decisions import IrreversibleDecisions
 from robocas_ms3.planning.protocol import Array

@@ -10,6 +10,7 @@ from synthetic_candidates import ENV_INFO, SETTINGS, make_record, write_episodes
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.datasets.checks.candidates import validate_candidates
+from robocas_ms3.datasets.formats import CANDIDATES, detect_format
 from robocas_ms3.demos.candidates.candidates_file import merge_candidates, write_candidates
 
 
@@ -104,3 +105,12 @@ def test_wrong_shape_is_one_violation(tmp_path):
         del file["candidates/slot"]
     (found,) = validate_candidates(path).violations
     assert found.key == "candidates/slot"
+
+
+def test_truncated_file_is_known_by_its_name(tmp_path):
+    path = write_episodes(tmp_path / "candidates.h5")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    found = detect_format(path)
+    assert found is not None
+    assert found.name == CANDIDATES
+    assert len(validate_candidates(path).violations) == 1
