@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -17,7 +17,7 @@ from pydantic import Field
 from robocas_ms3.core.checks import MAX_SEED
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.demos.candidates.records import DecisionRecord
-from robocas_ms3.planning.decisions import WITH_NOISE, CpuSeconds
+from robocas_ms3.planning.decisions import WITH_NOISE, CpuSeconds, MoveExperience
 
 FAILURES_FILE = "failures.jsonl"
 
@@ -59,8 +59,9 @@ class EpisodeResult:
         attempts: number of attempts, with the successful attempt.
         seconds: CPU seconds by phase.
         failures: failed attempts, in order.
-        failed_moves: number of open-loop checks that failed without noise after each kind of move (`MotionExecutor`).
+        experience: results of the moves in all attempts (`MotionExecutor`).
         max_attempts: number of failed attempts after which the seed is skipped.
+        noise_checked: whether attempts are still checked with noise (``--check-failures``).
         decisions: decisions with their simulated candidates, of all attempts (``--record-candidates``).
         attempt_start: value of ``time.perf_counter()`` at the start of the present attempt, s.
     """
@@ -71,8 +72,9 @@ class EpisodeResult:
     attempts: int = 0
     seconds: CpuSeconds = field(default_factory=CpuSeconds)
     failures: list[FailedAttempt] = field(default_factory=list)
-    failed_moves: Counter[Hashable] = field(default_factory=Counter)
+    experience: MoveExperience = field(default_factory=MoveExperience)
     max_attempts: int = 1
+    noise_checked: bool = True
     decisions: list[DecisionRecord] = field(default_factory=list)
     attempt_start: float = field(default_factory=time.perf_counter)
 
@@ -97,8 +99,8 @@ class EpisodeResult:
         """Replace all values by those of another result, e.g. of a forked process."""
         # in place, since the executor refers to these two objects
         vars(self.seconds).update(vars(other.seconds))
-        self.failed_moves.update(other.failed_moves - self.failed_moves)
-        shared = ("seconds", "failed_moves")
+        self.experience.merge(other.experience)
+        shared = ("seconds", "experience")
         vars(self).update({key: value for key, value in vars(other).items() if key not in shared})
 
 

@@ -139,7 +139,7 @@ class EpisodeGenerator:
             seed,
             success=False,
             seconds=executor.seconds,
-            failed_moves=executor.failed_moves,
+            experience=executor.experience,
             max_attempts=limits.max_attempts,
         )
         candidates = CandidateRecorder(self.settings, self.env, folder / candidates_file_name(name), result)
@@ -255,17 +255,20 @@ class _Attempts:
             if self.generator.open_loop_checks is not None:
                 self.generator.open_loop_checks.reset(self.executor.seed, self.intervention)
 
-    @property
-    def _is_noise_checked(self) -> bool:
-        return self.result.noise_failure_count < self.generator.settings.check_failures
-
     def check_open_loop(self, *, finished: bool = False) -> None:
+        result = self.result
         if self.generator.open_loop_checks is not None:
             gripper = np.array([action[7] for action in self.executor.actions])
             with self.executor.seconds.measure("check"):
-                self.generator.open_loop_checks.check(
-                    self.recorder.states, gripper, finished=finished, noise=self._is_noise_checked
+                noise_failure = self.generator.open_loop_checks.check(
+                    self.recorder.states, gripper, finished=finished, noise=result.noise_checked
                 )
+            if noise_failure:
+                allowed = self.generator.settings.check_failures
+                assert allowed is not None  # set by the settings
+                if result.noise_failure_count < allowed:
+                    raise UnrecoverableError("open_loop_check", noise_failure)
+                result.noise_checked = False
 
     def _finish(self, recoveries: list[dict[str, Any]]) -> None:
         if len(self.executor.actions) > self.horizon:
@@ -318,7 +321,7 @@ class _Attempts:
             },
             "attempts": len(self.result.failures) + 1,
             "failed_attempts": [f"{failure.stage}: {failure.reason}" for failure in self.result.failures],
-            "check_trials": None if not checked else settings.check_trials if self._is_noise_checked else 0,
+            "check_trials": None if not checked else settings.check_trials if self.result.noise_checked else 0,
             "recoveries": recoveries,
             **(
                 {"intervention": {"policy": intervention.policy, "policy_steps": intervention.policy_steps}}

@@ -158,7 +158,7 @@ class OpenLoopChecks:
 
     def check(
         self, states: States, gripper: NDArray[np.floating], *, finished: bool = False, noise: bool = True
-    ) -> None:
+    ) -> str:
         """Replay the actions recorded since the last call and compare the result with the recording.
 
         Args:
@@ -167,8 +167,12 @@ class OpenLoopChecks:
             finished: whether the recording is complete; then the last action may be shorter, and the task must succeed.
             noise: whether to replay with noise too.
 
+        Returns:
+            Empty text, or the reason why a replay with noise fails, with the suffix ``WITH_NOISE``. The replays with
+            noise then do not continue: pass ``noise=False`` from now on.
+
         Raises:
-            UnrecoverableError: one of these reasons, with the suffix ``WITH_NOISE`` if only a replay with noise fails.
+            UnrecoverableError: the replay without noise fails, for one of these reasons.
                 ``clipped``: an action exceeds the range of one controller step.
                 ``target_displaced``: the target is more than ``MAX_TARGET_OFFSET`` from its recorded position.
                 ``no_success``: the task does not succeed at the end.
@@ -179,13 +183,18 @@ class OpenLoopChecks:
         new = samples[self._replayed :]
         recorded = states["articulations"][self._robot.description.uid]
         actions = Motion.from_states(self._robot, recorded, gripper, new).actions[:-1].astype(np.float64)
+        failure = ""
         for number, env in enumerate(self._envs if noise else self._envs[:1]):
             for action in self._add_noise(actions, number) if number else actions:
                 env.step(action)
             reason = _find_deviation(env, states, int(new[-1]), finished)
+            if reason and not number:
+                raise UnrecoverableError("open_loop_check", reason)
             if reason:
-                raise UnrecoverableError("open_loop_check", f"{reason}{WITH_NOISE}" if number else reason)
+                failure = f"{reason}{WITH_NOISE}"
+                break
         self._replayed += len(actions)
+        return failure
 
     def _add_noise(self, actions: NDArray[np.float64], number: int) -> NDArray[np.float64]:
         # drawn from the first action on, so that the noise of an action does not depend on the number of checks

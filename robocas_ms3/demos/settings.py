@@ -53,9 +53,9 @@ class EpisodeSettings:
     check_trials: int = 1
     """Number of noise checks: open-loop checks with actuation noise (--check-noise), after the check without noise.
     0: none."""
-    check_failures: int = 1
-    """Number of failed noise checks per seed after which the noise check is switched off for that seed.
-    Such a recording has `check_trials: 0`."""
+    check_failures: Annotated[int | None, _NO_HINT] = None
+    """Number of failed noise checks per seed that undo an attempt.
+    After one more, the seed has no noise checks any more; then `check_trials` is 0. Default: 1; search: 0."""
     check_noise_mm: Annotated[float, tyro.conf.Suppress] = 0.5
     check_noise_deg: Annotated[float, tyro.conf.Suppress] = 0.2
     record_candidates: bool = False
@@ -101,6 +101,8 @@ class EpisodeSettings:
             rate = 5 if self.control_freq % 5 == 0 else self.control_freq
         object.__setattr__(self, "config", config)
         object.__setattr__(self, "check_rate", rate)
+        if self.check_failures is None:
+            object.__setattr__(self, "check_failures", spec.check_failures)
 
     @property
     def has_action_noise(self) -> bool:

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
 from robocas_ms3.core.errors import PlanningError
@@ -92,6 +93,27 @@ class IrreversibleDecisions:
                 if self.count_actions() > before:
                     raise
         raise failure
+
+
+@dataclass
+class MoveExperience:
+    """Results of the moves that were simulated at a seed, in all attempts; later decisions use them.
+
+    Attributes:
+        failed_checks: number of open-loop checks that failed without noise after each kind of move.
+        gains: cost that each move saved when it was last simulated, s; -inf if it was not feasible.
+        dead_ends: number of states in which no move was feasible.
+    """
+
+    failed_checks: Counter[Hashable] = field(default_factory=Counter)
+    gains: dict[Hashable, float] = field(default_factory=dict)
+    dead_ends: int = 0
+
+    def merge(self, other: MoveExperience) -> None:
+        """Add the experience of a forked process."""
+        self.failed_checks |= other.failed_checks
+        self.gains.update(other.gains)
+        self.dead_ends = max(self.dead_ends, other.dead_ends)
 
 
 @dataclass

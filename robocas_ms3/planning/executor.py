@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from robocas_ms3.planning.action_noise import ActionNoise
-from robocas_ms3.planning.decisions import CpuSeconds
+from robocas_ms3.planning.decisions import CpuSeconds, MoveExperience
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.tasks.base import RoboCASEnv
 
@@ -50,8 +49,7 @@ class MotionExecutor:
         base: (3,) last command of the base joints: x m, y m, yaw rad.
         seconds: CPU seconds of the episode.
         facts: counters that the policy sets and the recording stores, e.g. ``pushes``.
-        failed_moves: number of open-loop checks that failed without noise after each kind of move, in all attempts of
-            the seed; `reset` keeps it.
+        experience: results of the moves in all attempts at the seed; `reset` keeps them.
         check_open_loop: function that replays the actions since the reset open loop; it raises UnrecoverableError if
             the target deviates from the recording.
         noise: noise that is added to the joint targets; None: no noise.
@@ -67,7 +65,7 @@ class MotionExecutor:
     base: Array = field(default_factory=lambda: np.zeros(3))
     seconds: CpuSeconds = field(default_factory=CpuSeconds)
     facts: dict[str, Any] = field(default_factory=dict)
-    failed_moves: Counter[Hashable] = field(default_factory=Counter)
+    experience: MoveExperience = field(default_factory=MoveExperience)
     check_open_loop: Callable[[], None] = lambda: None
     noise: ActionNoise | None = None
     deviations: list[Array] = field(default_factory=list)

@@ -85,13 +85,13 @@ def test_order_may_depend_on_earlier_failures():
         def attempt(world=world, runner=runner, notes=notes):
             world.done = ""
             for _ in range(2):
-                letters = sorted("abc", key=lambda letter: notes.failed_moves[letter])
+                letters = sorted("abc", key=lambda letter: notes.experience.failed_checks[letter])
                 letter = runner.choose(letters, lambda letter: world.act(letter) or 0.0)
-            notes.failed_moves[letter] += 1
+            notes.experience.failed_checks[letter] += 1
             raise PlanningError("end", world.done)
 
         runner.run(attempt)
-        runs.append((notes.texts, dict(notes.failed_moves)))
+        runs.append((notes.texts, dict(notes.experience.failed_checks)))
     assert runs[0] == runs[1]
     assert runs[0][0] == [f"end: {first}{second}" for first in "abc" for second in "abc"]
     assert runs[0][1] == {"a": 3, "b": 3, "c": 3}

@@ -325,3 +325,25 @@ def test_after_failures_with_noise_an_episode_is_checked_without_noise(tmp_path,
     assert result.success
     assert [failure.reason for failure in result.failures].count("no_success_with_noise") == 2
     assert read_json(tmp_path / "modified.h5")["episodes"][0]["robocas"]["check_trials"] == 0
+
+
+def test_attempt_that_fails_only_with_noise_is_kept_if_no_failure_is_allowed(tmp_path, monkeypatch, pick_generator):
+    change(monkeypatch, pick_generator, check_failures=0)
+    monkeypatch.setattr(pick_generator.open_loop_envs[1], "settle", lambda: False)
+    result = pick_generator.generate(1, tmp_path, "kept")
+    assert (result.success, result.attempts) == (True, 1)
+    assert read_json(tmp_path / "kept.h5")["episodes"][0]["robocas"]["check_trials"] == 0
+
+
+def test_blocked_fruit_is_picked_after_another_object_was_moved(tmp_path):
+    """In this scene of RoboCAS-v0's evaluation, the gripper touches another fruit in every grasp."""
+    generator = EpisodeGenerator(EpisodeSettings("pick", "pick_upstream_eval", check_rate=0))
+    try:
+        result = generator.generate(960206, tmp_path, "blocked")
+    finally:
+        generator.close()
+    assert (result.success, result.attempts) == (True, 1)
+    with h5py.File(tmp_path / "blocked.h5") as file:
+        positions = {name: body[:, :3] for name, body in file["traj_0/env_states/actors"].items()}
+    shifts = {name: np.linalg.norm(rows[-1, :2] - rows[0, :2]) for name, rows in positions.items()}
+    assert sum(shift > 0.02 for shift in shifts.values()) == 2  # the target, and the object that was in the way

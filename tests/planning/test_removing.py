@@ -16,10 +16,11 @@ from robocas_ms3.planning.decisions import IrreversibleDecisions
 from robocas_ms3.planning.executor import MotionExecutor
 from robocas_ms3.planning.protocol import Obstacle, Shape
 from robocas_ms3.planning.pushes import compute_push_direction
+from robocas_ms3.planning.skills import grasp as grasp_skill
 from robocas_ms3.planning.skills import heap as heap_skill
 from robocas_ms3.planning.skills import push
 from robocas_ms3.planning.skills.arm import Arm
-from robocas_ms3.planning.skills.grasp import retract_from_contact
+from robocas_ms3.planning.skills.grasp import grasp_candidates, retract_from_contact
 from robocas_ms3.planning.skills.heap import Heap, Move, find_fallen_objects
 from robocas_ms3.planning.skills.push import push_away
 from robocas_ms3.planning.skills.remove import count_clear_grasps, find_grasp_blockers, remove_object
@@ -136,9 +137,14 @@ def test_candidate_moves_start_with_pushes_of_the_highest_and_queries_have_no_si
     in_the_way = np.flatnonzero(heap.env.measure_clutter().obstacles[0].numpy()).tolist()
     if in_the_way:
         assert moves[0] == Move("push", max(in_the_way, key=lambda slot: surface(arm, slot)[:, 2].max()))
-    arm.executor.failed_moves["push", moves[0].slot] = 1  # an open-loop check after such a push failed earlier
+    arm.executor.experience.failed_checks["push", moves[0].slot] = 1
     failed = [move for move in moves if (move.skill, move.slot) == ("push", moves[0].slot)]
-    assert heap.candidate_moves() == [move for move in moves if move not in failed] + failed
+    moves = [move for move in moves if move not in failed] + failed
+    assert heap.candidate_moves() == moves
+    infeasible, useless, useful = moves[:3]
+    arm.executor.experience.gains = {infeasible: -np.inf, useless: -10.0, useful: 5.0}
+    rest = [move for move in moves if move not in {infeasible, useless, *failed}]
+    assert heap.candidate_moves() == [*rest, infeasible, *failed]
 
 
 def test_grasps_that_touch_the_table_are_shifted_back(generator):
@@ -150,6 +156,45 @@ def test_grasps_that_touch_the_table_are_shifted_back(generator):
     free, shifted = retract_from_contact(arm, target, grasps)  # no shift frees the third one
     assert free == pytest.approx(grasps[0])
     assert shifted[2, 3] - grasps[1, 2, 3] == pytest.approx(0.008)
+
+
+def test_move_without_progress_fails_until_the_first_dead_end(generator, monkeypatch):
+    arm, target, slots = start_episode(generator, 3)
+    heap = Heap(arm, target)
+    monkeypatch.setattr(heap_skill, "execute_move", lambda *_: None)
+    monkeypatch.setattr(Heap, "target_exposed", True)
+    monkeypatch.setattr(Heap, "remaining_cost", lambda _: 18.0)
+    with pytest.raises(PlanningError, match="no_progress"):
+        heap.execute(Move("lift", slots[0]))
+    arm.executor.experience.dead_ends = 1
+    assert heap.execute(Move("lift", slots[0])) == pytest.approx(-18.0)  # only the remaining work counts
+
+
+def test_grasps_may_touch_movable_objects(generator):
+    arm, target, slots = start_episode(generator, 3)
+    before = len(list(grasp_candidates(arm, target, 0)))
+    box, center = arm.env.objects[slots[0]], arm.env.objects[target].pose.p
+    box.set_pose(Pose.create_from_pq(center + torch.tensor([[0.0, 0.0, 0.05]]), box.pose.q))  # in the way
+    with pytest.raises(PlanningError, match="no_clear_grasp"):
+        list(grasp_candidates(arm, target, 0))
+    free = list(grasp_candidates(arm, target, 0, {slots[0]}))
+    assert len(free) == before > 0
+
+
+def test_grasps_without_space_are_shifted_back(generator, monkeypatch):
+    arm, target, _ = start_episode(generator, 3)
+    found = {tuple(pose[:3, 3].round(6)) for pose in grasp_candidates(arm, target, 0)}
+    tried = []
+
+    def clear_on_the_second_call(tcp, order, points):
+        tried.append(tcp)
+        return iter(order.tolist() if len(tried) == 2 else [])
+
+    monkeypatch.setattr(grasp_skill, "_filter_clear", clear_on_the_second_call)
+    shifted = next(grasp_candidates(arm, target, 0))
+    assert len(tried) == 2
+    assert np.linalg.norm(tried[1] - tried[0], axis=(1, 2)) == pytest.approx(0.004)  # the smallest shift
+    assert tuple(shifted[:3, 3].round(6)) not in found
 
 
 def test_target_is_grasped_if_no_move_is_feasible(generator, monkeypatch):

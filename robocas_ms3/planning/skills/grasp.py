@@ -6,7 +6,7 @@ withdraws straight back, so that neighbouring objects stay upright.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from itertools import islice
 
 import numpy as np
@@ -36,7 +36,15 @@ RETRACTIONS = (0.0, 0.004, 0.008)
 ExitMotions = tuple[Trajectory, ...]
 
 
-def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, skip_kinds: int = 0, grasps: Iterable[Array] = ()) -> None:
+def grasp(
+    arm: Arm,
+    slot: int,
+    *,
+    lift_height: float = 0.10,
+    skip_kinds: int = 0,
+    grasps: Iterable[Array] = (),
+    movable: Collection[int] = (),
+) -> None:
     """Grasp an object and move it out of its surroundings.
 
     After an approach from above the arm lifts the object. After an approach from the front it lifts the object slightly
@@ -48,12 +56,14 @@ def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, skip_kinds: int = 0
         lift_height: lift after a grasp from above, m (RoboCAS-v0: 0.10 for pick, 0.15 for search).
         skip_kinds: number of kinds of similar grasps to skip, from the best kind on.
         grasps: TCP poses (4x4) to try in this order, in the arm's base frame; empty: the annotated grasps.
+        movable: slots of other objects that the gripper may touch and move.
 
     Raises:
         PlanningError: no grasp can be planned, the fingers miss the object, or the object slips out.
     """
     with arm.planning_time():
-        approach, out = plan_grasp(arm, slot, lift_height, grasps or grasp_candidates(arm, slot, skip_kinds))
+        grasps = grasps or grasp_candidates(arm, slot, skip_kinds, movable)
+        approach, out = plan_grasp(arm, slot, lift_height, grasps, movable)
         arm.planned = PlannedPrimitive("grasp", slot, arm.planner.tcp(approach.qpos[-1]))
     arm.follow(approach)
     arm.close_gripper()
@@ -64,7 +74,9 @@ def grasp(arm: Arm, slot: int, *, lift_height: float = 0.10, skip_kinds: int = 0
         raise PlanningError("lift", "slipped")
 
 
-def plan_grasp(arm: Arm, slot: int, lift_height: float, grasps: Iterable[Array]) -> tuple[Trajectory, ExitMotions]:
+def plan_grasp(
+    arm: Arm, slot: int, lift_height: float, grasps: Iterable[Array], movable: Collection[int] = ()
+) -> tuple[Trajectory, ExitMotions]:
     """Plan the approach to the first feasible grasp, and the exit with the object.
 
     The exit moves the object out of its surroundings.
@@ -74,12 +86,13 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, grasps: Iterable[Array])
         slot: slot of the object.
         lift_height: lift after a grasp from above, m.
         grasps: TCP poses (4x4) in the arm's base frame, in this order.
+        movable: slots of other objects that are no obstacles from the pre-grasp on.
 
     Returns:
         Motion to the grasp; motions with the grasped object.
     """
     planner, failure = arm.planner, PlanningError("grasp_sampling", "no_feasible_grasp")
-    everything, others = arm.scene.obstacles(), arm.scene.obstacles(exclude=slot)
+    everything, others = arm.scene.obstacles(), arm.scene.obstacles(exclude={slot, *movable})
     with_room = arm.scene.obstacles(clearance=CLEARANCE)
     ways: list[tuple[Array, Trajectory, ExitMotions]] = []  # pre-grasp configuration, approach, exit
 
@@ -124,61 +137,70 @@ def plan_grasp(arm: Arm, slot: int, lift_height: float, grasps: Iterable[Array])
     raise failure
 
 
-def grasp_candidates(arm: Arm, slot: int, skip_kinds: int) -> Iterator[Array]:
+def grasp_candidates(arm: Arm, slot: int, skip_kinds: int, movable: Collection[int] = ()) -> Iterator[Array]:
     """Yield TCP poses (4x4) of reachable grasps whose gripper touches nothing, the best first.
 
-    The best ``skip_kinds`` kinds of similar grasps are omitted. Each pose is in the arm's base frame.
+    The best ``skip_kinds`` kinds of similar grasps are omitted. If there is no such grasp, all grasps are shifted back
+    by the next distance of `RETRACTIONS`. Each pose is in the arm's base frame. The gripper may touch the objects in
+    the slots ``movable``.
     """
     notes = arm.env.object_assets[0][slot].annotations
     base, object_in_base = arm.scene.arm_base_in_world, arm.scene.object_in_base(slot)
     kept = filter_grasps(notes, base @ object_in_base, base, arm.approach)
-    tcp_in_base = inverse(base) @ kept.tcp_in_world
-    solved, qpos = arm.inverse_kinematics.nearest_solutions(tcp_in_base, arm.qpos)
-    solved_before, qpos_before = arm.inverse_kinematics.nearest_solutions(
-        shift_back(tcp_in_base, PREGRASP_DISTANCE), arm.qpos
-    )
-    reachable = np.flatnonzero(solved & solved_before)
-    if not len(reachable):
-        raise PlanningError("grasp_sampling", "unreachable" if len(kept) else "no_suitable_grasp")
     surface = arm.env.object_assets[0][slot].surface_points(SPACING)
-    scores = score_grasps(
-        tcp_in_base[reachable],
-        kept.qualities[reachable],
-        compute_grip_margins(notes.grasps_tcp_in_object[kept.index[reachable]], kept.widths[reachable], surface),
-        np.abs(qpos[reachable] - arm.qpos).max(axis=1),
-        object_in_base[:3, 3],
-        arm.approach,
-    )
-    ranks = sample_grasp_order(arm.rng, scores)
-    near = arm.scene.points_in_base(exclude=slot, radius=NEIGHBOURHOOD, around=object_in_base[:3, 3])
-    clear = _filter_clear(tcp_in_base, reachable[ranks], near)
-    if arm.approach == "front":  # first grasps whose arm configurations are collision-free
-        first_grasps = list(islice(clear, GRASPS_CHECKED))
-        arm.planner.set_scene(arm.scene.obstacles(exclude=slot))
-        ways = np.stack([qpos_before[first_grasps], qpos[first_grasps]], axis=1)
-        free = arm.planner.is_free(ways.reshape(-1, 7)).reshape(-1, 2).all(axis=1)
-        clear = iter([first_grasps[i] for i in np.argsort(~free, kind="stable")])
-    if skip_kinds:
-        first_grasps = list(islice(clear, GRASPS_COMPARED))
-        clear = (first_grasps[i] for i in _skip_kinds(tcp_in_base[first_grasps], skip_kinds))
-    found = False
-    for index in islice(clear, GRASPS_PLANNED):
-        found = True
-        yield tcp_in_base[index]
-    if not found:
-        raise PlanningError("grasp_sampling", "no_clear_grasp")
+    near = arm.scene.points_in_base(exclude={slot, *movable}, radius=NEIGHBOURHOOD, around=object_in_base[:3, 3])
+    any_reachable = False
+    for distance in RETRACTIONS:
+        tcp_in_base = shift_back(inverse(base) @ kept.tcp_in_world, distance)
+        solved, qpos = arm.inverse_kinematics.nearest_solutions(tcp_in_base, arm.qpos)
+        solved_before, qpos_before = arm.inverse_kinematics.nearest_solutions(
+            shift_back(tcp_in_base, PREGRASP_DISTANCE), arm.qpos
+        )
+        reachable = np.flatnonzero(solved & solved_before)
+        if not len(reachable):
+            continue
+        any_reachable = True
+        scores = score_grasps(
+            tcp_in_base[reachable],
+            kept.qualities[reachable],
+            compute_grip_margins(notes.grasps_tcp_in_object[kept.index[reachable]], kept.widths[reachable], surface),
+            np.abs(qpos[reachable] - arm.qpos).max(axis=1),
+            object_in_base[:3, 3],
+            arm.approach,
+        )
+        ranks = sample_grasp_order(arm.rng, scores)
+        clear = _filter_clear(tcp_in_base, reachable[ranks], near)
+        if arm.approach == "front":  # first grasps whose arm configurations are collision-free
+            first_grasps = list(islice(clear, GRASPS_CHECKED))
+            arm.planner.set_scene(arm.scene.obstacles(exclude={slot, *movable}))
+            ways = np.stack([qpos_before[first_grasps], qpos[first_grasps]], axis=1)
+            free = arm.planner.is_free(ways.reshape(-1, 7)).reshape(-1, 2).all(axis=1)
+            clear = iter([first_grasps[i] for i in np.argsort(~free, kind="stable")])
+        if skip_kinds:
+            first_grasps = list(islice(clear, GRASPS_COMPARED))
+            clear = (first_grasps[i] for i in _skip_kinds(tcp_in_base[first_grasps], skip_kinds))
+        found = False
+        for index in islice(clear, GRASPS_PLANNED):
+            found = True
+            yield tcp_in_base[index]
+        if found:
+            return
+    reason = "no_clear_grasp" if any_reachable else "unreachable" if len(kept) else "no_suitable_grasp"
+    raise PlanningError("grasp_sampling", reason)
 
 
-def retract_from_contact(arm: Arm, slot: int, tcp_in_base: Iterable[Array]) -> list[Array]:
+def retract_from_contact(
+    arm: Arm, slot: int, tcp_in_base: Iterable[Array], movable: Collection[int] = ()
+) -> list[Array]:
     """Shift grasps back by the smallest of `RETRACTIONS` at which the arm touches nothing but the object.
 
-    Grasps for which no shift suffices are omitted. The order is that of ``tcp_in_base``, TCP poses (4x4) in the arm's
-    base frame.
+    The arm may also touch the objects in the slots ``movable``. Grasps for which no shift suffices are omitted. The
+    order is that of ``tcp_in_base``, TCP poses (4x4) in the arm's base frame.
     """
     poses = np.array(list(tcp_in_base)).reshape(-1, 4, 4)
     shifted = np.stack([shift_back(poses, distance) for distance in RETRACTIONS], axis=1)  # (N, R, 4, 4)
     solved, qpos = arm.inverse_kinematics.nearest_solutions(shifted, arm.qpos)
-    arm.planner.set_scene(arm.scene.obstacles(exclude=slot))
+    arm.planner.set_scene(arm.scene.obstacles(exclude={slot, *movable}))
     solved[solved] = arm.planner.is_free(qpos[solved], arm.planner.finger_width)
     free = solved.reshape(-1, len(RETRACTIONS))
     return [row[int(np.argmax(ok))] for row, ok in zip(shifted, free, strict=True) if ok.any()]

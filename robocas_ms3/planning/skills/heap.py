@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,6 +25,7 @@ MAX_MOVES = 8  # maximum number of pushes and removals per demonstration
 MIN_DISPLACEMENT = 0.02  # m, minimum displacement of a pushed object
 MAX_OBSTACLES = 4  # obstacles that are considered, the highest first
 TURNS_DEG = (30.0, -30.0)  # offsets from the paper's push direction
+MIN_GAIN = -3.0  # s; moves that saved less when they were last simulated are omitted
 EDGE_MARGIN = 0.01  # m from every object to the edge of the surface
 
 COST_PER_METRE_OF_TARGET = 400.0  # s per metre that a move displaces the target
@@ -96,7 +98,8 @@ class Heap:
     def candidate_moves(self) -> list[Move]:
         """Return candidate moves of the obstacles, the most promising first.
 
-        docs/policies.md describes the order. Moves after which open-loop checks failed earlier are the last.
+        docs/policies.md describes the order. Moves after which open-loop checks failed earlier are the last, and before
+        them those that were not feasible when they were last simulated. Moves that were useless then are omitted.
 
         Raises:
             UnrecoverableError: reason ``too_many_obstacles``: ``MAX_MOVES`` moves have been made.
@@ -111,10 +114,13 @@ class Heap:
         moves += [Move("lift", slot) for slot in slots[2:]]
         if not slots:  # no grasp from above is possible: change the pose of the target
             moves = [Move("push", self.target, turn) for turn in (0.0, 90.0, -90.0, 180.0)]
-        return sorted(moves, key=self._count_failed_checks)
+        gains = {move: self.arm.executor.experience.gains.get(move, math.inf) for move in moves}
+        useful = [move for move in moves if gains[move] >= MIN_GAIN or gains[move] == -math.inf]
+        moves = useful or moves
+        return sorted(moves, key=lambda move: (self._count_failed_checks(move), gains[move] == -math.inf))
 
     def _count_failed_checks(self, move: Move) -> int:
-        return self.arm.executor.failed_moves[move.skill, move.slot]
+        return self.arm.executor.experience.failed_checks[move.skill, move.slot]
 
     def _find_obstacles(self) -> list[int]:
         """Return slots of at most ``MAX_OBSTACLES`` obstacles, the first to move first.
@@ -134,30 +140,25 @@ class Heap:
 
         Raises:
             PlanningError: a motion cannot be planned or has no effect, an object is at the edge of the surface, or as
-                much work is left as before, although the target is exposed.
+                much work is left as before, although the target is exposed (until the first dead end of the seed).
         """
-        arm, facts = self.arm, self.arm.executor.facts
-        before, target, start = self.centroid(move.slot), self.centroid(self.target), len(arm.executor.actions)
+        arm, facts, experience = self.arm, self.arm.executor.facts, self.arm.executor.experience
+        experience.gains[move] = -math.inf  # until it turns out to be feasible
+        target, start = self.centroid(self.target), len(arm.executor.actions)
         work = self.remaining_cost()
-        arm.rise_until_free()
-        if move.skill == "push":
-            push_away(arm, move.slot, self.target, turn_deg=move.turn_deg)
-            if np.linalg.norm(self.centroid(move.slot) - before) <= MIN_DISPLACEMENT:
-                raise PlanningError("push", "not_moved")
-            facts["pushes"] += 1
-        else:
-            arm.executor.gripper = OPEN  # opens during the motion
-            remove_object(arm, move.slot)
-            facts["removals"] += 1
+        execute_move(arm, move, self.target)
+        facts["pushes" if move.skill == "push" else "removals"] += 1
         self.check_objects_on_surface()
         displacement = float(np.linalg.norm(self.centroid(self.target) - target))
         cost = (len(arm.executor.actions) - start) * arm.executor.dt + COST_PER_PUSH * (move.skill == "push")
         work_left = self.remaining_cost()
-        if self.target_exposed and work_left >= work:
+        if self.target_exposed and work_left >= work and not experience.dead_ends:
             raise PlanningError("clear", "no_progress")
         cost += work_left + COST_PER_METRE_OF_TARGET * displacement
         expected_failures = self._count_failed_checks(move) + (displacement > MAX_TARGET_DISPLACEMENT)
-        return -cost - COST_OF_FAILED_CHECK * expected_failures
+        score = -cost - COST_OF_FAILED_CHECK * expected_failures
+        experience.gains[move] = work + score
+        return score
 
     def remaining_cost(self) -> float:
         """Estimate the cost of the moves that are still necessary, s."""
@@ -185,6 +186,24 @@ class Heap:
     def centroid(self, slot: int) -> Array:
         """Return the mean (3,) of the surface points of an object in the arm's base frame, m."""
         return self.arm.scene.object_points(slot).mean(axis=0)
+
+
+def execute_move(arm: Arm, move: Move, target: int) -> None:
+    """Run the motions of a move; a push is directed away from the object in the slot ``target``.
+
+    Raises:
+        PlanningError: a motion cannot be planned, the gripper loses the object, or a push displaces it too little
+            (reason ``not_moved``).
+    """
+    arm.rise_until_free()
+    if move.skill == "lift":
+        arm.executor.gripper = OPEN  # opens during the motion
+        remove_object(arm, move.slot)
+        return
+    before = arm.scene.object_points(move.slot).mean(axis=0)
+    push_away(arm, move.slot, target, turn_deg=move.turn_deg)
+    if np.linalg.norm(arm.scene.object_points(move.slot).mean(axis=0) - before) <= MIN_DISPLACEMENT:
+        raise PlanningError("push", "not_moved")
 
 
 def find_fallen_objects(arm: Arm) -> frozenset[int]:

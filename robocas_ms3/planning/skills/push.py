@@ -18,7 +18,7 @@ from robocas_ms3.planning.skills.arm import Arm, PlannedPrimitive, shift_up
 APPROACH_HEIGHT = 0.08  # m above the start of the push; the tool moves straight down from there
 LIFT = 0.05  # m after the push (RoboCAS-v0)
 SPEED = 0.6  # fraction of the arm's limits during a push, so that objects neither roll far nor jump
-PUSHES_TRIED, PUSHES_PLANNED = 24, 6
+PUSHES_TRIED, PUSHES_PLANNED = 24, 3
 MAX_FORCE = 30.0  # N; a greater force ejects wedged objects from the heap
 RESISTED_SECONDS = 0.1  # s above MAX_FORCE after which a push is stopped
 SETTLE_SECONDS = 0.3

@@ -13,12 +13,14 @@ from robocas_ms3.planning.skills.grasp import grasp, grasp_candidates, retract_f
 from robocas_ms3.planning.skills.heap import COUNTERS, Heap, Move, find_fallen_objects
 from robocas_ms3.planning.skills.look import FAR, NEAR, load_object_meshes, look_at
 from robocas_ms3.planning.skills.place import carry_to_basket, release_into_basket
-from robocas_ms3.planning.skills.remove import raise_held_object
+from robocas_ms3.planning.skills.remove import find_grasp_blockers, raise_held_object
 
 LIFT_HEIGHT = 0.15  # m (RoboCAS-v0)
 MOVES_COMPARED = 3  # candidate moves that are compared
 SUFFICIENT_SCORE = -15.0  # s; a move with this score is not compared with others: no work left and at most 15 s
+SUFFICIENT_GAIN = 8.0  # s; neither is a move that saves this much
 GRASP_KINDS = 3  # kinds of grasps of the target to try
+MAX_TOUCHED_OBJECTS = 3  # objects for which a grasp is tried that may touch this object
 
 
 def attempt(arm: Arm) -> None:
@@ -38,7 +40,8 @@ def attempt(arm: Arm) -> None:
             arm.start_subgoal("find the object")
         done = len(arm.executor.actions)
         try:
-            limits = SearchLimits(MOVES_COMPARED, max_continued_moves(heap.moves_made), SUFFICIENT_SCORE)
+            sufficient = min(SUFFICIENT_SCORE, SUFFICIENT_GAIN - heap.remaining_cost())
+            limits = SearchLimits(MOVES_COMPARED, max_continued_moves(heap.moves_made), sufficient)
             move = arm.choose(heap.candidate_moves(), heap.execute, limits, kind="move")
         except PlanningError:
             if len(arm.executor.actions) > done:
@@ -48,6 +51,7 @@ def attempt(arm: Arm) -> None:
                 look_at(arm, heap.centroid(slot), NEAR)
             arm.start_subgoal("move and grasp")
             if not heap.target_visible or not _grasp(arm, slot):
+                arm.executor.experience.dead_ends += 1
                 raise
             break
         _check_move(arm, move)
@@ -77,27 +81,35 @@ def _check_move(arm: Arm, move: Move) -> None:
     try:
         arm.executor.check_open_loop()
     except PlanningError as error:
-        arm.executor.failed_moves[move.skill, move.slot] += not error.reason.endswith(WITH_NOISE)
+        arm.executor.experience.failed_checks[move.skill, move.slot] += not error.reason.endswith(WITH_NOISE)
         raise
 
 
 def _grasp(arm: Arm, slot: int) -> bool:
-    """Grasp the target and lift it; return False if no grasp is feasible and the arm has not moved."""
+    """Grasp the target and lift it; return False if no grasp is feasible and the arm has not moved.
+
+    The last grasps are those in which the gripper touches and moves one of the other objects.
+    """
     done = len(arm.executor.actions)
 
-    def execute_grasp(kind: int) -> float:
+    def execute_grasp(option: tuple[int, tuple[int, ...]]) -> float:
+        kind, movable = option
         arm.rise_until_free()  # an object may lean on the tool after a push
         arm.executor.gripper = OPEN  # opens during the approach
         with arm.planning_time():
-            grasps = retract_from_contact(arm, slot, grasp_candidates(arm, slot, kind))
+            candidates = grasp_candidates(arm, slot, kind, movable)
+            grasps = retract_from_contact(arm, slot, candidates, movable)
         if not grasps:
             raise PlanningError("grasp_sampling", "no_clear_grasp")
-        grasp(arm, slot, lift_height=LIFT_HEIGHT, grasps=grasps)
+        grasp(arm, slot, lift_height=LIFT_HEIGHT, grasps=grasps, movable=movable)
         raise_held_object(arm, slot)
         return 0.0
 
+    with arm.planning_time():
+        blockers = find_grasp_blockers(arm, slot)[:MAX_TOUCHED_OBJECTS]
+    options = [(kind, ()) for kind in range(GRASP_KINDS)] + [(0, (blocker,)) for blocker in blockers]
     try:
-        arm.choose(range(GRASP_KINDS), execute_grasp, kind="grasp")
+        arm.choose(options, execute_grasp, kind="grasp")
     except PlanningError:
         if len(arm.executor.actions) > done:
             raise
