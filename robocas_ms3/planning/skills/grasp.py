@@ -185,8 +185,9 @@ def grasp_candidates(arm: Arm, slot: int, skip_kinds: int, movable: Collection[i
             yield tcp_in_base[index]
         if found:
             return
-    reason = "no_clear_grasp" if any_reachable else "unreachable" if len(kept) else "no_suitable_grasp"
-    raise PlanningError("grasp_sampling", reason)
+    if any_reachable:
+        raise PlanningError("grasp_sampling", "no_clear_grasp")
+    raise PlanningError("grasp_sampling", "unreachable" if len(kept) else "no_suitable_grasp")
 
 
 def retract_from_contact(
