@@ -25,6 +25,7 @@ from robocas_ms3.planning.skills.heap import Heap, Move, find_fallen_objects
 from robocas_ms3.planning.skills.push import push_away
 from robocas_ms3.planning.skills.remove import count_clear_grasps, find_grasp_blockers, remove_object
 from robocas_ms3.planning.solvers import search
+from robocas_ms3.scenes.grasp_checks import NEIGHBOURHOOD
 
 pytestmark = pytest.mark.slow
 
@@ -170,15 +171,22 @@ def test_move_without_progress_fails_until_the_first_dead_end(generator, monkeyp
     assert heap.execute(Move("lift", slots[0])) == pytest.approx(-18.0)  # only the remaining work counts
 
 
-def test_grasps_may_touch_movable_objects(generator):
+def test_grasps_may_touch_movable_objects(generator, monkeypatch):
     arm, target, slots = start_episode(generator, 3)
-    before = len(list(grasp_candidates(arm, target, 0)))
-    box, center = arm.env.objects[slots[0]], arm.env.objects[target].pose.p
-    box.set_pose(Pose.create_from_pq(center + torch.tensor([[0.0, 0.0, 0.05]]), box.pose.q))  # in the way
-    with pytest.raises(PlanningError, match="no_clear_grasp"):
-        list(grasp_candidates(arm, target, 0))
-    free = list(grasp_candidates(arm, target, 0, {slots[0]}))
-    assert len(free) == before > 0
+    obstacles = []
+
+    def record(tcp, order, points):
+        obstacles.append(points)
+        return iter(order.tolist())
+
+    monkeypatch.setattr(grasp_skill, "_filter_clear", record)
+    for movable in ((), slots[:1], slots):
+        assert list(grasp_candidates(arm, target, 0, movable))
+    around = arm.scene.object_in_base(target)[:3, 3]
+    for points, excluded in zip(obstacles, ([target], [target, slots[0]], [target, *slots]), strict=True):
+        expected = arm.scene.points_in_base(exclude=excluded, radius=NEIGHBOURHOOD, around=around)
+        assert points == pytest.approx(expected)
+    assert len(obstacles[0]) > len(obstacles[1]) > len(obstacles[2]) > 0  # the table remains
 
 
 def test_grasps_without_space_are_shifted_back(generator, monkeypatch):
