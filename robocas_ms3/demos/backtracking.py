@@ -8,6 +8,7 @@ episodes; the second is slower.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable
+from copy import deepcopy
 from typing import Any, TypeVar
 
 from robocas_ms3.core.errors import PlanningError
@@ -161,5 +162,7 @@ class ResimulatedDecisions:
                 decision.chosen = index  # the candidate that has just run is the best one: keep its motions
                 return items[index]
             decision.chosen = index
+        experience = deepcopy(self._result.experience)
         run_candidate(items[decision.chosen])
+        self._result.experience.restore(experience)  # later results of the same move are the ones that count
         return items[decision.chosen]

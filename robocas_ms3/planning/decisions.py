@@ -102,7 +102,7 @@ class MoveExperience:
     Attributes:
         failed_checks: number of open-loop checks that failed without noise after each kind of move.
         gains: cost that each move saved when it was last simulated, s; -inf if it was not feasible.
-        dead_ends: number of states in which no move was feasible.
+        dead_ends: number of states in which neither a move nor a grasp of the target was feasible.
     """
 
     failed_checks: Counter[Hashable] = field(default_factory=Counter)
@@ -114,6 +114,10 @@ class MoveExperience:
         self.failed_checks |= other.failed_checks
         self.gains.update(other.gains)
         self.dead_ends = max(self.dead_ends, other.dead_ends)
+
+    def restore(self, earlier: MoveExperience) -> None:
+        """Return to an earlier state, in place."""
+        vars(self).update(vars(earlier))
 
 
 @dataclass

@@ -97,6 +97,29 @@ def test_order_may_depend_on_earlier_failures():
     assert runs[0][1] == {"a": 3, "b": 3, "c": 3}
 
 
+def test_repeated_moves_do_not_change_the_experience():
+    """The gain of a letter is that of its last simulation, whichever class undoes the motions."""
+    runs = []
+    for make in RUNNERS:
+        notes, world = Notes(), World()
+        runner = make(notes)
+
+        def act(letter, world=world, notes=notes):
+            notes.experience.gains[letter] = len(world.done)  # other gains at other depths
+            return world.act(letter) or 0.0
+
+        def attempt(world=world, runner=runner, notes=notes, act=act):
+            world.done = ""
+            for _ in range(3):
+                runner.choose(sorted("abc", key=lambda letter: (notes.experience.gains.get(letter, 9), letter)), act)
+            raise PlanningError("end", f"{world.done} {sorted(notes.experience.gains.items())}")
+
+        runner.run(attempt)
+        runs.append(notes.texts)
+    assert runs[0] == runs[1]
+    assert len(runs[0]) == 27
+
+
 def test_sufficient_score_ends_the_comparison():
     scores = {"a": 1.0, "b": 5.0, "c": 9.0}
 
