@@ -335,11 +335,12 @@ def test_attempt_that_fails_only_with_noise_is_kept_if_no_failure_is_allowed(tmp
     assert read_json(tmp_path / "kept.h5")["episodes"][0]["robocas"]["check_trials"] == 0
 
 
-def test_blocked_fruit_is_picked_after_another_object_was_moved(tmp_path):
-    """In this scene of RoboCAS-v0's evaluation, the gripper touches another fruit in every grasp."""
+@pytest.mark.parametrize("seed", [960206, 960276])  # a push, a lift
+def test_blocked_fruit_is_picked_after_another_object_was_moved(tmp_path, seed):
+    """In these scenes of RoboCAS-v0's evaluation, the gripper touches another fruit in every grasp."""
     generator = EpisodeGenerator(EpisodeSettings("pick", "pick_upstream_eval", check_rate=0))
     try:
-        result = generator.generate(960206, tmp_path, "blocked")
+        result = generator.generate(seed, tmp_path, "blocked")
     finally:
         generator.close()
     assert (result.success, result.attempts) == (True, 1)

@@ -18,6 +18,8 @@ def attempt(arm: Arm) -> None:
         if len(arm.executor.actions) > done or error.reason == "unreachable" or not can_make_room(arm):
             raise
         make_room(arm, arm.target)
+        arm.executor.check_open_loop()
+        arm.add_backtracking_point()
         drive_and_grasp(arm, arm.target)
     arm.executor.check_open_loop()
     place_in_basket(arm, arm.target)
