@@ -55,7 +55,7 @@ echo "gpu_checks: PhysX does not start on the GPU. Without internet, copy ~/.sap
 echo "The tests use CUDA tensors with physics on the CPU, and the steps per second of one env are measured. Not tested:"
 echo "physics and contact buffers on the GPU, 256 envs, steps per second of several envs."
 export PYTHONPATH="$PYTHONPATH:$PWD/tests/support"
-check tests.txt -m gpu tests/gpu/test_baselines.py
+check tests.txt -m gpu tests/gpu/test_baselines.py tests/gpu/test_generate_on_gpu.py
 check tests_on_cpu_physics.txt -p gpu_emulation.plugin -m "gpu or emulated_gpu_full" tests/gpu
 for size in "128 128" "640 480"; do
     measure "fps_rgb_${size/ /x}" --envs 1 --modes rgb --size $size

@@ -239,6 +239,16 @@ def use_one_torch_thread() -> None:
     torch.set_num_threads(1)
 
 
+def hide_cuda() -> None:
+    """Hide CUDA devices from this process, so that it can be forked; call it before torch uses CUDA.
+
+    A reset of a ManiSkill environment initializes CUDA if there is a device, even if the environment does not use it,
+    because it saves the random state of all devices (`torch.random.fork_rng`). A process that uses CUDA cannot be
+    forked.
+    """
+    os.environ["CUDA_VISIBLE_DEVICES"] = ""
+
+
 def _raise_crash(task: Any, reason: str) -> Any:
     what, fix = "the worker process of this task crashed", "Use fewer --jobs if the memory is short."
     raise WorkerCrashError(what, where=f"{task}"[:80], found=reason, fix=fix)

@@ -20,7 +20,7 @@ from robocas_ms3.core.files import flush_to_disk, make_folder, write_json
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
 from robocas_ms3.core.text import format_count, one_line
-from robocas_ms3.core.workers import Limits, Worker, WorkerPool, use_one_torch_thread
+from robocas_ms3.core.workers import Limits, Worker, WorkerPool, hide_cuda, use_one_torch_thread
 from robocas_ms3.demos.candidates.candidates_file import FILE_NAME as CANDIDATES_FILE
 from robocas_ms3.demos.candidates.candidates_file import CandidateFile, merge_candidates
 from robocas_ms3.demos.candidates.records import candidates_file_name
@@ -187,10 +187,11 @@ def generate_seeds(
 
 class _EpisodeWorker:
     def __init__(self, settings: GenerateSettings, folder: Path) -> None:
+        if settings.jobs:  # jobs=0: this process keeps its threads and CUDA
+            use_one_torch_thread()
+            hide_cuda()
         from robocas_ms3.demos.generator import EpisodeGenerator  # its import takes seconds
 
-        if settings.jobs:  # jobs=0: this process keeps its threads
-            use_one_torch_thread()
         self._generator, self._folder = EpisodeGenerator(settings.episode, fork=settings.fork), folder
 
     def run(self, task: int | Intervention) -> EpisodeResult:

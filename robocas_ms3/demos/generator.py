@@ -106,7 +106,7 @@ class EpisodeGenerator:
                 "candidates can be recorded only with forked processes",
                 where="--record-candidates",
                 found=reason or "--no-fork",
-                fix="Use Linux and CPU physics, without --no-fork.",
+                fix="Use Linux and CPU physics, without --no-fork, and at least one of --jobs.",
                 usage=True,
             )
         if self._fork and reason:

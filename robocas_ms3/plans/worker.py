@@ -29,7 +29,7 @@ from robocas_ms3.core.errors import (
 from robocas_ms3.core.files import delete_path, write_json
 from robocas_ms3.core.output_folder import remove_temporary_files
 from robocas_ms3.core.text import format_error
-from robocas_ms3.core.workers import Limits, WorkerPool, use_one_torch_thread
+from robocas_ms3.core.workers import Limits, WorkerPool, hide_cuda, use_one_torch_thread
 from robocas_ms3.datasets.conversion import rendered_source
 from robocas_ms3.datasets.conversion.conversion_input import ConversionInput
 from robocas_ms3.datasets.conversion.episode_folder import FolderWriter
@@ -60,6 +60,7 @@ class Recorder:
 
     def __init__(self, plan: Plan) -> None:
         use_one_torch_thread()
+        hide_cuda()
         self._plan = plan
         self._part: int | None = None
         self._generator: EpisodeGenerator | None = None

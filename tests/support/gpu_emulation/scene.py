@@ -64,7 +64,7 @@ class EmulatedCameraGroup:
         for camera in self._cameras:
             camera.take_picture()
 
-    def get_image_cuda(self, name: str) -> Buffer:
+    def get_picture_cuda(self, name: str) -> Buffer:
         return Buffer(np.stack([camera.get_picture(name) for camera in self._cameras]))
 
 
