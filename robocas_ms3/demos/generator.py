@@ -106,7 +106,7 @@ class EpisodeGenerator:
                 "candidates can be recorded only with forked processes",
                 where="--record-candidates",
                 found=reason or "--no-fork",
-                fix="Use Linux and CPU physics, without --no-fork, and at least one of --jobs.",
+                fix="Use Linux and CPU physics, and --jobs 1 or more, without --no-fork.",
                 usage=True,
             )
         if self._fork and reason:
