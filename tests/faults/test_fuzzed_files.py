@@ -213,7 +213,7 @@ def read_candidates(root):
         assert dataset[index]["mask"].any()
         assert dataset.files[0].state(index)["actors"]
     with np.errstate(all="ignore"):
-        compute_candidate_statistics(root / "candidates.h5")
+        compute_candidate_statistics([root / "candidates.h5"])
 
 
 def read_candidate_images(root):

@@ -55,7 +55,7 @@ def draw_outcomes(stats: CandidateStatistics) -> Any:
     axes.set_yticks(places, [f"{name}  {of.success}" for name, of in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     use_integer_ticks(axes.xaxis)
-    axes.set(xlabel="candidates", title=f"{stats.task}: outcomes; rate of success with its 95 % interval")
+    axes.set(xlabel="candidates", title=f"{stats.title}: outcomes; rate of success with its 95 % interval")
     axes.legend(frameon=False, loc="lower right")
     return figure
 
@@ -91,5 +91,5 @@ def draw_failures(stats: CandidateStatistics) -> Any:
     axes.set_yticks(places, [shorten_label(name) for name, _ in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     use_integer_ticks(axes.xaxis)
-    axes.set(xlabel="candidates", title=f"{stats.task}: failures")
+    axes.set(xlabel="candidates", title=f"{stats.title}: failures")
     return figure

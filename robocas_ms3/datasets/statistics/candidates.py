@@ -1,4 +1,4 @@
-"""Statistics of ``candidates.h5``: counts, rates of success and benefit per primitive, and the choices."""
+"""Statistics of files ``candidates.h5``: counts, rates of success and benefit per primitive, and the choices."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ ALL_SOURCES = "all"
 MOVES = ("push", "lift")
 """Primitives that clear the target."""
 COLUMNS = ("primitive", "source", "candidates", "feasible", "success", "helped", "mean s")
+_CANDIDATE_FIELDS = ("primitive", "source", "feasible", "success", "seconds", "failure")
 _TOLERANCE = 0.1  # s, difference of values that counts as equal
 
 
@@ -104,11 +105,11 @@ class ChoiceStatistics:
 
 @dataclass(frozen=True)
 class CandidateStatistics:
-    """Statistics of a file of candidates.
+    """Statistics of files of candidates.
 
     Attributes:
-        path: path of the file.
-        task: name of the task.
+        paths: paths of the files.
+        tasks: names of the tasks of the files, each once.
         episodes: number of episodes.
         kinds: number of decisions by kind.
         primitives: statistics by primitive and source; `ALL_SOURCES` for all candidates of a primitive.
@@ -117,14 +118,19 @@ class CandidateStatistics:
         benefits: benefits for the target of feasible pushes and lifts, s.
     """
 
-    path: Path
-    task: str
+    paths: tuple[Path, ...]
+    tasks: tuple[str, ...]
     episodes: int
     kinds: dict[str, int]
     primitives: dict[str, dict[str, PrimitiveStatistics]]
     choices: dict[str, ChoiceStatistics]
     failures: dict[str, int]
     benefits: dict[str, NDArray[np.float64]] = field(repr=False)
+
+    @property
+    def title(self) -> str:
+        """Names of the tasks as one text."""
+        return ", ".join(self.tasks)
 
     @property
     def decisions(self) -> int:
@@ -137,7 +143,7 @@ class CandidateStatistics:
     def summary(self) -> str:
         """Return the numbers of rows as one line of text."""
         counts = ((self.episodes, "episode"), (self.decisions, "decision"), (self.candidates, "candidate"))
-        return f"{self.task}: " + ", ".join(format_count(count, noun) for count, noun in counts)
+        return f"{self.title}: " + ", ".join(format_count(count, noun) for count, noun in counts)
 
     def rows(self) -> list[Sequence[str]]:
         """Return the rows of a table with the columns `COLUMNS`."""
@@ -154,8 +160,8 @@ class CandidateStatistics:
 
     def as_json(self) -> dict[str, Any]:
         return {
-            "path": str(self.path),
-            "task": self.task,
+            "paths": [str(path) for path in self.paths],
+            "tasks": list(self.tasks),
             "episodes": self.episodes,
             "decisions": self.decisions,
             "candidates": self.candidates,
@@ -169,13 +175,19 @@ class CandidateStatistics:
         }
 
 
-def compute_candidate_statistics(path: Path) -> CandidateStatistics:
-    """Compute the statistics of a file of candidates; raise ``DatasetError`` if it is invalid."""
-    file = CandidateFile(path)
-    decisions, candidates, labels = file.decisions, file.candidates, file.labels
-    tasks = {spec.env_id: name for name, spec in TASKS.items()}
-    benefit, helped = labels.for_target(labels.benefit), labels.for_target(labels.helped)
-    fell, feasible = np.asarray(candidates["fallen"].any(axis=1)), candidates["feasible"]
+def compute_candidate_statistics(paths: Sequence[Path]) -> CandidateStatistics:
+    """Compute the statistics of one or several files of candidates; raise ``DatasetError`` if one is invalid.
+
+    The candidates of several files count as those of one file.
+    """
+    files = [CandidateFile(path) for path in paths]
+    candidates = {name: np.concatenate([file.candidates[name] for file in files]) for name in _CANDIDATE_FIELDS}
+    labels = [file.labels for file in files]
+    benefit, helped = (
+        np.concatenate([of.for_target(getattr(of, name)) for of in labels]) for name in ("benefit", "helped")
+    )
+    fell = np.concatenate([file.candidates["fallen"].any(axis=1) for file in files])
+    feasible, kinds = candidates["feasible"], np.concatenate([file.decisions["kind"] for file in files])
     moves = np.isin(candidates["primitive"], MOVES)
 
     def describe(rows: NDArray[np.bool_]) -> PrimitiveStatistics:
@@ -197,13 +209,14 @@ def compute_candidate_statistics(path: Path) -> CandidateStatistics:
             found = {source: describe(of_source) for source, of_source in sources.items() if of_source.any()}
             primitives[primitive] = {ALL_SOURCES: describe(rows), **found}
     value = np.where(candidates["success"] & ~fell, benefit - candidates["seconds"], np.nan)
+    ends = np.cumsum([len(file.candidates["success"]) for file in files])
     return CandidateStatistics(
-        file.path,
-        tasks.get(file.recorded_env.env_id, file.recorded_env.env_id),
-        len(np.unique(decisions["seed"])),
-        {kind: count for kind in DECISION_KINDS if (count := int(np.sum(decisions["kind"] == kind)))},
+        tuple(file.path for file in files),
+        tuple(dict.fromkeys(_find_task(file) for file in files)),
+        sum(len(np.unique(file.decisions["seed"])) for file in files),
+        {kind: count for kind in DECISION_KINDS if (count := int(np.sum(kinds == kind)))},
         primitives,
-        _compare_choices(file, value),
+        _compare_choices(files, np.split(value, ends[:-1])),
         dict(sort_counts(Counter(name for name in candidates["failure"].tolist() if name))),
         {
             name: benefit[np.asarray(feasible & (candidates["primitive"] == name))]
@@ -213,15 +226,28 @@ def compute_candidate_statistics(path: Path) -> CandidateStatistics:
     )
 
 
-def _compare_choices(file: CandidateFile, value: NDArray[np.float64]) -> dict[str, ChoiceStatistics]:
-    """Compare the value (N,) of the chosen candidate with the greatest value of its decision; NaN: no value."""
+def _find_task(file: CandidateFile) -> str:
+    env_id = file.recorded_env.env_id
+    return next((name for name, spec in TASKS.items() if spec.env_id == env_id), env_id)
+
+
+def _compare_choices(
+    files: Sequence[CandidateFile], values: Sequence[NDArray[np.float64]]
+) -> dict[str, ChoiceStatistics]:
+    """Compare the value of the chosen candidate with the greatest value of its decision.
+
+    Args:
+        files: files of candidates.
+        values: (N,) values of the candidates of each file; NaN: no value.
+    """
     regrets: Mapping[str, list[float]] = {"move": []}  # the values of other kinds differ only in durations
-    for row, kind in enumerate(file.decisions["kind"].tolist()):
-        rows = file.rows_of(row)
-        values = value[rows]
-        chosen = values[file.candidates["chosen"][rows]]
-        if len(chosen) == 1 and np.isfinite(chosen[0]) and np.isfinite(values).sum() > 1 and kind in regrets:
-            regrets[kind].append(float(np.nanmax(values) - chosen[0]))
+    for file, of_file in zip(files, values, strict=True):
+        for row, kind in enumerate(file.decisions["kind"].tolist()):
+            rows = file.rows_of(row)
+            of_decision = of_file[rows]
+            chosen = of_decision[file.candidates["chosen"][rows]]
+            if len(chosen) == 1 and np.isfinite(chosen[0]) and np.isfinite(of_decision).sum() > 1 and kind in regrets:
+                regrets[kind].append(float(np.nanmax(of_decision) - chosen[0]))
     return {
         kind: ChoiceStatistics(Rate.of(np.asarray(np.array(found) <= _TOLERANCE)), round(float(np.mean(found)), 3))
         for kind, found in regrets.items()

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
+from synthetic import write_trajectory
 from synthetic_candidates import ENV_INFO, SETTINGS, make_record, write_episodes
 
 from robocas_ms3.cli.main import run
@@ -40,8 +41,8 @@ def path(tmp_path):
 
 
 def test_rates_and_choices(path):
-    stats = compute_candidate_statistics(path)
-    assert (stats.task, stats.episodes, stats.decisions, stats.candidates) == ("search", 1, 2, 6)
+    stats = compute_candidate_statistics([path])
+    assert (stats.tasks, stats.episodes, stats.decisions, stats.candidates) == (("search",), 1, 2, 6)
     assert stats.kinds == {"move": 2}
     assert stats.primitives.keys() == {"push"}
     pushes = stats.primitives["push"]
@@ -80,11 +81,33 @@ def test_command_writes_json_and_plots_and_prints_a_table(path, capsys):
 
 def test_empty_file(tmp_path):
     write_candidates(tmp_path / "c.h5", [], ENV_INFO, SETTINGS)
-    assert compute_candidate_statistics(tmp_path / "c.h5").summary() == "search: 0 episodes, 0 decisions, 0 candidates"
+    assert (
+        compute_candidate_statistics([tmp_path / "c.h5"]).summary() == "search: 0 episodes, 0 decisions, 0 candidates"
+    )
     assert run(["stats", str(tmp_path / "c.h5")]) == 0
 
 
 def test_all_primitives_of_an_episode(tmp_path):
-    stats = compute_candidate_statistics(write_episodes(tmp_path / "c.h5", seeds=range(5)))
+    stats = compute_candidate_statistics([write_episodes(tmp_path / "c.h5", seeds=range(5))])
     assert list(stats.primitives) == ["grasp", "push", "lift"]
     assert stats.candidates == 5 * 2 * 6
+
+
+def test_several_files_count_as_one(path, tmp_path, capsys):
+    other = write_episodes(tmp_path / "other.h5", seeds=range(5))
+    alone, both = compute_candidate_statistics([path]), compute_candidate_statistics([path, other])
+    assert (both.tasks, both.episodes, both.candidates) == (("search",), 6, 6 + 5 * 2 * 6)
+    pushes = compute_candidate_statistics([other]).primitives["push"][ALL_SOURCES].success
+    assert both.primitives["push"][ALL_SOURCES].success == Rate(4 + pushes.k, 6 + pushes.n)
+    assert len(both.benefits["push"]) > len(alone.benefits["push"])
+    assert run(["stats", str(path), str(other)]) == 0
+    assert "2 files: search: 6 episodes" in capsys.readouterr().out
+    assert not list(tmp_path.glob("*_stats"))
+    assert run(["stats", str(path), str(other), "--out", str(tmp_path / "plots")]) == 0
+    assert (tmp_path / "plots" / "stats.json").exists()
+
+
+def test_recordings_are_not_counted_together(path, tmp_path):
+    trajectory = write_trajectory(tmp_path / "trajectory.h5", seeds=(3,))
+    assert run(["stats", str(trajectory)]) == 0
+    assert run(["stats", str(trajectory), str(path)]) == 2
