@@ -241,9 +241,12 @@ def describe_auc(scenes: np.ndarray, labels: np.ndarray, scores: np.ndarray) -> 
 
 def main(paths: list[str]) -> None:
     torch.set_num_threads(1)  # faster for small networks
-    for primitive, label in (("grasp", "success"), ("push", "benefit")):
+    for primitive, label in (("grasp", "success"), ("push", "helped")):
         samples = read_samples(paths, primitive)
         scenes, labels = np.array(samples.scenes), np.array(samples.labels)
+        if len(set(samples.scenes)) < FOLDS or len(set(samples.labels)) < 2:
+            print(f"{primitive}: not evaluated; expected {FOLDS} scenes or more, with successes and failures")
+            continue
         features, sources = np.array(samples.features), np.array(samples.sources)
         names, index = np.unique(scenes, return_inverse=True)
         fold = np.random.default_rng(0).permutation(len(names))[index] % FOLDS
@@ -252,9 +255,9 @@ def main(paths: list[str]) -> None:
             test = fold == held_out
             scores[test] = predict(features[~test], labels[~test], scenes[~test], features[test])
         tested = np.array(samples.instructed)  # other targets are only used for training
-        by_source = {"expert": tested & (sources == "expert"), "random": tested & (sources != "expert")}
+        by_source = {"expert": tested & (sources == "expert"), "other": tested & (sources != "expert")}
         for name, rows in {"all": tested, **by_source}.items():
-            if len(set(labels[rows])) == 2:
+            if len(set(labels[rows])) == 2 and len(set(scenes[rows])) >= FOLDS:
                 print(
                     f"{primitive} {label}, {name} candidates: {describe_auc(scenes[rows], labels[rows], scores[rows])}"
                 )

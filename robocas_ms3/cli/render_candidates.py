@@ -15,10 +15,10 @@ def main(settings: CandidateImageSettings) -> int:
 
     with ProgressBar("decisions rendered") as bar:
         done = render_candidates(settings, on_decisions=bar.update)
-    words = [f"{settings.output}: {format_count(done.decisions, 'decision')}", f"{done.size / 1e6:.0f} MB"]
+    words = [f"{settings.output}: {format_count(done.decisions, 'decision')}", f"{done.size / 1e6:.1f} MB"]
     if done.rendered < done.decisions:
         words.append(f"{done.decisions - done.rendered} already there")
     if done.rendered:
-        words.append(f"{done.seconds / done.rendered:.1f} s per decision")
+        words.append(f"{done.rendered} rendered in {done.seconds:.1f} s")
     print_line(", ".join(words))
     return 0

@@ -50,9 +50,12 @@ class View:
 
 def main(cfg: View) -> int:
     from robocas_ms3.cli.terminal import print_line
+    from robocas_ms3.viewer.decisions.content import DecisionContent
     from robocas_ms3.viewer.source import open_content
 
     source = open_content(cfg.path, images=cfg.images)
+    if isinstance(source, DecisionContent) and source.source.note:
+        print_line(source.source.note.replace("`", ""))
     if cfg.sheet is not None:
         return _write_sheet(cfg, cfg.sheet, source)
     if cfg.static is not None:

@@ -9,6 +9,7 @@ from robocas_ms3.core.lazy import make_lazy_exports
 
 if TYPE_CHECKING:
     from robocas_ms3.demos.candidates.candidates_file import CandidateFile as CandidateFile
+    from robocas_ms3.demos.candidates.candidates_file import merge_candidates as merge_candidates
     from robocas_ms3.demos.generation import Summary as Summary
     from robocas_ms3.demos.generation import generate as generate
     from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile as TrajectoryFile
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = make_lazy_exports(
     __name__,
     {
-        "robocas_ms3.demos.candidates.candidates_file": ["CandidateFile"],
+        "robocas_ms3.demos.candidates.candidates_file": ["CandidateFile", "merge_candidates"],
         "robocas_ms3.demos.generation": ["Summary", "generate"],
         "robocas_ms3.demos.recordings.trajectory_file": ["TrajectoryFile"],
         "robocas_ms3.demos.settings": ["EpisodeSettings", "GenerateSettings", "ReplaySettings"],

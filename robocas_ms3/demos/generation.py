@@ -140,7 +140,8 @@ def generate(
                             where=output.path,
                             expected=f"at most {limit} for {format_count(successes, 'episode')}",
                             found=f"{skipped} skipped seeds",
-                            fix=f"See {FAILURES_FILE} for the reasons; fewer objects (--set objects.count=N) may help.",
+                            fix=f"See {FAILURES_FILE} for the reasons; fewer objects (--set objects.count=N) "
+                            "or less --action-noise may help.",
                         )
         except BaseException:
             if not (results or run.earlier):

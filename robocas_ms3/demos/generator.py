@@ -106,7 +106,7 @@ class EpisodeGenerator:
                 "candidates can be recorded only with forked processes",
                 where="--record-candidates",
                 found=reason or "--no-fork",
-                fix="Use Linux and CPU physics, and --jobs 1 or more, without --no-fork.",
+                fix="Use Linux and CPU physics, without --no-fork. If CUDA is in use, pass --jobs 1 or more.",
                 usage=True,
             )
         if self._fork and reason:

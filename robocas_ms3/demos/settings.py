@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,6 +14,8 @@ from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
 from robocas_ms3.scenes.task_specs import SIM_FREQ, STANDARD_FREQ, TASKS
 
 _NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text describes the default
+CANDIDATE_OPTIONS = ("candidates", "candidate_decisions", "random_fraction", "near_miss_fraction", "candidate_depth")
+"""Names of the `EpisodeSettings` that need ``record_candidates``."""
 
 
 def find_trajectory(path: Path) -> Path:
@@ -69,7 +71,8 @@ class EpisodeSettings:
     random_fraction: float = 0.33
     """With --record-candidates: minimum fraction of random candidates, 0 to 1."""
     near_miss_fraction: float = 0.4
-    """With --record-candidates: fraction of random candidates with a position error (near misses), 0 to 1."""
+    """With --record-candidates: fraction of random candidates with an error of position or angle (near misses).
+    0 to 1."""
     candidate_depth: int = 0
     """With --record-candidates: maximum number of further moves to simulate after each candidate of a search.
     It gives the number of moves until the target can be grasped."""
@@ -137,6 +140,14 @@ class EpisodeSettings:
         check_number("--random-fraction", self.random_fraction, 0, 1)
         check_number("--near-miss-fraction", self.near_miss_fraction, 0, 1)
         check_number("--candidate-depth", self.candidate_depth, 0, 20)
+        if not self.record_candidates:
+            for option in fields(self):
+                if option.name in CANDIDATE_OPTIONS and getattr(self, option.name) != option.default:
+                    what, where = "this option needs --record-candidates", f"--{option.name.replace('_', '-')}"
+                    raise RobocasError(what, where=where, fix="Add --record-candidates.", usage=True)
+        if not self.candidate_decisions:
+            what, expected = "no kind of decision", "one or more of move, grasp, release, pull"
+            raise RobocasError(what, where="--candidate-decisions", expected=expected, usage=True)
         if self.record_candidates and self.keep_recoveries:
             what, fix = "candidates cannot be recorded with recoveries", "Use --record-candidates without it."
             raise RobocasError(what, where="--keep-recoveries", fix=fix, usage=True)
@@ -223,6 +234,9 @@ class GenerateSettings:
         check_number("--jobs", self.jobs, 0)
         check_number("--episode-seconds", self.episode_seconds, 1)
         check_number("--memory-gb", self.memory_gb, 0.1)
+        if self.episode.record_candidates and not self.fork:
+            what, fix = "candidates can be recorded only with forked processes", "Omit --no-fork."
+            raise RobocasError(what, where="--record-candidates", found="--no-fork", fix=fix, usage=True)
         self.episode.check()
 
 

@@ -276,7 +276,7 @@ def check_action_noise_available(spec: PolicySpec) -> None:
     if CONVENTIONS[spec.convention].decode is None:
         what, fix = "action noise needs motions of the TCP", "Omit --action-noise, or choose another policy."
         raise EvaluationError(
-            what, where="--action-noise", expected="another convention", found=spec.convention, fix=fix
+            what, where="--action-noise", expected="actions that are motions", found=spec.convention, fix=fix
         )
 
 

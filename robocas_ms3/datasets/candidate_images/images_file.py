@@ -33,7 +33,7 @@ from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets.schema import IMAGE_KINDS
 from robocas_ms3.datasets.sources.episode_source import ImageKind
-from robocas_ms3.demos.candidates.candidates_file import CandidateFile
+from robocas_ms3.demos.candidates.candidates_file import FILE_NAME, CandidateFile
 from robocas_ms3.demos.recordings.trajectory_hdf5 import check_links
 from robocas_ms3.robots.cameras import CAMERA_NAME
 
@@ -61,7 +61,9 @@ class CameraImages:
 
 
 def images_path(candidates: Path) -> Path:
-    """Return the default path of the images of a candidates file: ``candidates_images.h5`` next to it."""
+    """Return the default path of the images: ``candidates_images.h5`` next to a file or in a folder of candidates."""
+    if candidates.is_dir():
+        candidates = candidates / FILE_NAME
     return candidates.with_name(f"{candidates.stem}_images.h5")
 
 
@@ -200,6 +202,7 @@ class CandidateImages:
         return self._read(row, camera, "camera_in_base")
 
     def _decode(self, row: int, camera: str, kind: ImageKind) -> NDArray[Any]:
+        self._check_camera(camera)
         with self._open() as file:
             group: Any = file[camera]
             self._check_row(row, len(group["intrinsic"]))
@@ -211,10 +214,15 @@ class CandidateImages:
         return image
 
     def _read(self, row: int, camera: str, name: str) -> NDArray[np.float64]:
+        self._check_camera(camera)
         with self._open() as file:
             dataset: Any = file[f"{camera}/{name}"]
             self._check_row(row, len(dataset))
             return np.asarray(dataset[row], np.float64)
+
+    def _check_camera(self, camera: str) -> None:
+        if camera not in self.cameras:
+            raise DatasetError("unknown camera", where=self.path, expected=", ".join(self.cameras), found=camera)
 
     def _check_row(self, row: int, rows: int) -> None:
         if not 0 <= row < rows:

@@ -24,7 +24,7 @@ class CandidateImageSettings:
     """
 
     candidates: Annotated[Path, tyro.conf.Positional]
-    """File candidates.h5 of robocas generate --record-candidates."""
+    """File candidates.h5 of robocas generate --record-candidates, or its folder."""
     out: Annotated[Path | None, _NO_HINT] = None
     """Output file. Default: candidates_images.h5 next to candidates.h5."""
     cameras: Annotated[tuple[str, ...], tyro.conf.arg(metavar="CAMERA [CAMERA ...]"), _NO_HINT] = ()
@@ -38,7 +38,7 @@ class CandidateImageSettings:
     jobs: int = 1
     """Number of processes that render."""
     overwrite: bool = False
-    """Start again. Default: continue an interrupted rendering with the same settings."""
+    """Delete the images and start again. Default: continue an interrupted rendering with the same settings."""
     open_renderer: Annotated[Any, tyro.conf.Suppress, tyro.conf.Fixed] = None
     """Function that opens a renderer, see `rendered_source.OpenRenderer`. Default: `env_renderer.EnvRenderer`."""
 

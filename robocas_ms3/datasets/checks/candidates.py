@@ -64,7 +64,7 @@ def validate_candidates(path: str | Path, *, on_episode: Callable[[int, int], No
         file = CandidateFile(path, strict=False)
     except DatasetError as error:
         key = str(error.where).removeprefix(f"{path}, ")
-        found = " ".join(filter(None, (error.what, str(error.found))))
+        found = ": ".join(filter(None, (error.what, str(error.found))))
         return CandidatesReport(0, 0, 0, [Violation(Path(path).name, key, str(error.expected) or "valid data", found)])
     episodes = len(np.unique(file.decisions["seed"]))
     with np.errstate(invalid="ignore"):  # NaN and infinite values are violations

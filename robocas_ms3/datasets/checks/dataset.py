@@ -61,7 +61,8 @@ def validate(root: str | Path, *, on_episode: Callable[[int, int], None] | None 
     """
     root = Path(root)
     if root.is_file():
-        expected, fix = "a folder of robocas convert", "Check a recording with robocas replay."
+        expected = "a folder of robocas convert, or a candidates.h5"
+        fix = "Check a recording with robocas replay."
         raise DatasetError("not a dataset", where=root, expected=expected, found="a file", fix=fix, usage=True)
     if not root.is_dir():
         raise DatasetError("no such folder", where=root)

@@ -55,7 +55,8 @@ def draw_outcomes(stats: CandidateStatistics) -> Any:
     axes.set_yticks(places, [f"{name}  {of.success}" for name, of in rows])
     axes.set_ylim(len(rows) - 0.4, -0.6)
     use_integer_ticks(axes.xaxis)
-    axes.set(xlabel="candidates", title=f"{stats.title}: outcomes; rate of success with its 95 % interval")
+    axes.set(xlabel="candidates")
+    figure.suptitle(f"{stats.title}: outcomes; rate of success with its 95 % interval", fontsize=9)
     axes.legend(frameon=False, loc="lower right")
     return figure
 

@@ -149,7 +149,7 @@ class CandidateStatistics:
         """Return the rows of a table with the columns `COLUMNS`."""
         return [
             (primitive, source, str(of.candidates), f"{of.feasible.k / of.feasible.n:.0%}", str(of.success),
-             str(of.helped), f"{of.mean_seconds:.1f}")
+             str(of.helped), f"{of.mean_seconds:.1f}" if of.feasible.k else "-")
             for primitive, sources in self.primitives.items()
             for source, of in sources.items()
         ]  # fmt: skip

@@ -82,18 +82,18 @@ class CandidateDataset(torch.utils.data.Dataset):
     ``qpos``               (7,)         joint angles of the arm, rad
     ``gripper_width``      ()           distance between the finger pads, m
     ``opening``            ()           opening of the door or drawer, fraction of its range
-    ``kind``               int          index in `schema.DECISION_KINDS`
+    ``kind``               int          index in `demos.candidates.schema.DECISION_KINDS`
     ``rgb``                (M, 3, h, w) uint8, of M cameras in the given order
     ``depth``              (M, h, w)    m along the optical axis, 0 = no depth
     ``intrinsic``          (M, 4)       fx, fy, cx, cy in pixels of the scaled image
     ``camera_pose``        (M, 4, 4)    pose of each OpenCV camera frame
     ``mask``               (C,)         bool, False = padding
-    ``primitive``          (C,)         int64, index in `schema.PRIMITIVES`
+    ``primitive``          (C,)         int64, index in `demos.candidates.schema.PRIMITIVES`
     ``slot``               (C,)         int64, slot of the moved object; -1 also for a pull
-    ``start_pose``         (C, 7)       TCP pose of the grasp, or at the start of the push
-    ``end_pose``           (C, 7)       TCP pose at the end of the push or pull, or of the placement
+    ``start_pose``         (C, 7)       TCP pose of the grasp or release, or at the start of the push
+    ``end_pose``           (C, 7)       TCP pose at the end of the push; zeros for other primitives
     ``chosen``             (C,)         bool, whether the episode continued with it; False for other targets
-    ``feasible``           (C,)         bool, whether its motions could be planned
+    ``feasible``           (C,)         bool, whether a motion to the start pose could be planned
     ``success``            (C,)         bool, whether the primitive reached its own goal
     ``held``               (C,)         bool, whether the moved object is in the gripper at the end
     ``helped``             (C,)         bool, see `labels.Labels`, for the target of the sample

@@ -75,7 +75,7 @@ def write_candidates(
     _write(path, build_tables(records), texts)
 
 
-def merge_candidates(sources: Sequence[Path], target: Path) -> None:
+def merge_candidates(sources: Sequence[Path | str], target: Path | str) -> None:
     """Merge files to one file, atomically, in the order of the sources; the file is synced to the disk.
 
     An existing target is the first source. A seed that an earlier source contains is not taken again, so that an
@@ -84,10 +84,11 @@ def merge_candidates(sources: Sequence[Path], target: Path) -> None:
     Raises:
         DatasetError: a source is invalid, or has another environment or other settings than the first one.
     """
+    target, paths = Path(target), [Path(source) for source in sources]
     parts: list[Tables] = []
     seeds: NDArray[np.int64] = np.empty(0, np.int64)
     texts: dict[str, str] = {}
-    for path in [*([target] if target.exists() else []), *(source for source in sources if source != target)]:
+    for path in [*([target] if target.exists() else []), *(path for path in paths if path != target)]:
         file = CandidateFile(path)
         texts = texts or file.texts
         for name in ("env_info", "settings"):
@@ -204,7 +205,9 @@ class CandidateFile:
         return slice(first, first + int(self.decisions["candidate_count"][row]))
 
     def decision(self, row: int) -> Decision:
-        """Return the decision in a row with its candidates."""
+        """Return the decision in a row with its candidates; raise ``DatasetError`` if there is no such row."""
+        if not 0 <= row < len(self):
+            raise DatasetError("no such decision", where=self.path, expected=f"0 to {len(self) - 1}", found=row)
         rows = self.rows_of(row)
         values = {name: array[row] for name, array in self.decisions.items()}
         return Decision(row, values, {name: array[rows] for name, array in self.candidates.items()})
@@ -253,9 +256,12 @@ def _read_format(file: h5py.File) -> tuple[str, int]:
 
 def _read_content(file: h5py.File, path: Path) -> tuple[dict[str, str], Tables]:
     name, version = _read_format(file)
-    if (name, version) != (FORMAT, VERSION):
-        expected = f"format {FORMAT!r}, version {VERSION}"
-        raise DatasetError("not a file of candidates", where=path, expected=expected, found=f"{name!r}, {version}")
+    if name != FORMAT:
+        what, found_name = "not a file of candidates", repr(name) if name else "no attribute format"
+        raise DatasetError(what, where=path, expected=f"format {FORMAT!r}", found=found_name, fix=_FIX)
+    if version != VERSION:
+        what = "unsupported version of the format of candidates"
+        raise DatasetError(what, where=path, expected=f"version {VERSION}", found=f"version {version}", fix=_FIX)
     check_links(file, path)
     found: dict[str, h5py.Dataset] = {}
     file.visititems(lambda name, item: found.update({name: item}) if isinstance(item, h5py.Dataset) else None)

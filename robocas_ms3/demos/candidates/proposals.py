@@ -231,7 +231,8 @@ def draw_push_start(rng: np.random.Generator, points: Array, lowest: float, near
     """
     center, angle = points.mean(axis=0), rng.uniform(-np.pi, np.pi)
     direction = np.array([np.cos(angle), np.sin(angle), 0.0])
-    height = rng.uniform(max(lowest, points[:, 2].min()), max(lowest, points[:, 2].max() - BELOW_TOP))
+    low = max(lowest, points[:, 2].min())
+    height = rng.uniform(low, max(low, points[:, 2].max() - BELOW_TOP))
     behind = -float(((points - center) @ direction).min())
     tool = np.array([*center[:2], height]) - (behind + STAND_OFF + TOOL_RADIUS) * direction
     if near_miss:

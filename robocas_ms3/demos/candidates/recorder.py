@@ -22,7 +22,7 @@ from robocas_ms3.demos.candidates.records import DecisionRecord, PathDecision, m
 from robocas_ms3.demos.candidates.schema import DecisionKind, Primitive
 from robocas_ms3.demos.failures import EpisodeResult
 from robocas_ms3.demos.forked_processes import ForkedProcessError, run_in_forked_process
-from robocas_ms3.demos.settings import EpisodeSettings
+from robocas_ms3.demos.settings import CANDIDATE_OPTIONS, EpisodeSettings
 from robocas_ms3.planning.decisions import IrreversibleDecisions
 from robocas_ms3.planning.protocol import Array
 from robocas_ms3.planning.skills.arm import Arm
@@ -31,8 +31,8 @@ from robocas_ms3.tasks.occlusion import MAX_HIDDEN_FRACTION, MAX_OBSTACLES
 from robocas_ms3.tasks.search import RoboCASSearchEnv
 
 SETTLE_SECONDS = 0.25  # s after a candidate, until its objects are nearly at rest
-SETTINGS = ("candidates", "candidate_decisions", "random_fraction", "near_miss_fraction", "candidate_depth")
-"""Names of the settings of the candidates in `EpisodeSettings`."""
+SETTINGS = (*CANDIDATE_OPTIONS, "action_noise", "after_policy", "after_steps")
+"""Names of the settings in `EpisodeSettings` on which candidates and their outcomes depend."""
 MIN_PUSH = 0.02  # m, least displacement of an object by a successful push
 MAX_DECISIONS = 30  # decisions that are recorded per seed, so that hard seeds do not dominate a dataset
 _STREAM = 415  # random stream of the proposals

@@ -84,6 +84,8 @@ class TrajectoryFile:
             raise DatasetError("not a file", where=self.path, expected="an .h5 file", found="a folder", fix=fix)
         if not self.path.is_file():
             raise DatasetError("no such trajectory file", where=self.path, fix="Record one with robocas generate.")
+        with open_trajectory(self.path):  # a damaged file is reported before a missing JSON file
+            pass
         metadata = read_json(self.path)
         self.env_info: dict[str, Any] = metadata["env_info"]
         self.episodes: list[dict[str, Any]] = metadata["episodes"]

@@ -11,18 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.core.errors import AssetError, DatasetError
+from robocas_ms3.assets.pack import BodyFiles, load_pack
+from robocas_ms3.core.errors import AssetError, DatasetError, RobocasError
 from robocas_ms3.core.poses import from_wxyz, transform_points
 from robocas_ms3.core.text import format_object_name
 from robocas_ms3.datasets.candidate_images.images_file import CandidateImages, hash_decisions, images_path
 from robocas_ms3.demos.candidates.candidates_file import CandidateFile, Decision
+from robocas_ms3.scenes.lookup import find_container
 from robocas_ms3.viewer.decisions.outcomes import classify_outcomes
 from robocas_ms3.viewer.decisions.strokes import Stroke, make_strokes
 from robocas_ms3.viewer.decisions.views import CameraView, Region, View, find_region, make_top_view, project_stroke
 
 Array = NDArray[np.float64]
 _NEARLY_ALL = 0.8  # of the candidates that the best camera shows
+_NO_CORNERS: Array = np.empty((0, 3))
 _IN_FRONT = 0.08  # m; a surface that is nearer by this distance hides a candidate
 
 
@@ -107,8 +109,6 @@ class DecisionSource:
 
     def decision(self, row: int) -> Decision:
         """Return the decision in a row; raise DatasetError if there is none."""
-        if not 0 <= row < len(self):
-            raise DatasetError("no such decision", where=self.file.path, expected=f"0 to {len(self) - 1}", found=row)
         return self.file.decision(row)
 
     def name_object(self, decision: Decision, slot: int, *, with_id: bool = False) -> str:
@@ -150,9 +150,14 @@ class DecisionSource:
         poses = decision.values["object_in_base"]
         objects = []
         present = np.flatnonzero(decision.values["present"])
+        basket = decision.values["basket_in_base"]
+        if np.isfinite(basket).all():
+            pixel = view.project(basket[None, :3].astype(np.float64))[0][0]
+            objects.append(ObjectOutline("basket", False, pixel, _project_outline(view, self._basket_corners, basket)))
         for slot in present[np.argsort(poses[present, 2])]:
             pixel = view.project(poses[slot : slot + 1, :3].astype(np.float64))[0][0]
-            outline = self._find_outline(view, str(decision.values["object_id"][slot]), poses[slot])
+            corners = self._corners.get(str(decision.values["object_id"][slot]), _NO_CORNERS)
+            outline = _project_outline(view, corners, poses[slot])
             target = slot == decision.values["target_slot"]
             objects.append(ObjectOutline(self.name_object(decision, slot), bool(target), pixel, outline))
         shown = [line.pixels for of in lines for line in of if not line.dashed]
@@ -160,14 +165,6 @@ class DecisionSource:
         hidden = _find_hidden(view, decision.candidates["start_in_base"][:, :3], depth)
         visible = sum(_is_inside(of, view.size) and not behind for of, behind in zip(lines, hidden, strict=True))
         return DecisionView(view, lines, objects, find_region(view, shown), visible)
-
-    def _find_outline(self, view: View, asset: str, pose: NDArray) -> Array:
-        """Return the convex outline (P, 2) of an object in a view; empty if it is unknown or behind the camera."""
-        corners = self._corners.get(asset)
-        if corners is None or not np.isfinite(pose).all():
-            return np.empty((0, 2))
-        pixels, _ = view.project(transform_points(from_wxyz(pose.astype(np.float64)), corners))
-        return pixels[ConvexHull(pixels).vertices] if np.isfinite(pixels).all() else np.empty((0, 2))
 
     @cached_property
     def _corners(self) -> dict[str, Array]:
@@ -179,9 +176,17 @@ class DecisionSource:
         found = {}
         for asset in np.unique(self.file.decisions["object_id"][self.file.decisions["present"]]):
             if str(asset) in pack.objects:
-                points = np.concatenate(pack.objects[str(asset)].hulls)
-                found[str(asset)] = points[ConvexHull(points).vertices]
+                found[str(asset)] = _find_corners(pack.objects[str(asset)])
         return found
+
+    @cached_property
+    def _basket_corners(self) -> Array:
+        """Corners (P, 3) of the convex hull of the basket; empty if it is unknown."""
+        try:
+            config = self.file.recorded_env.task_config()
+            return _find_corners(find_container(load_pack("builtin"), config.basket)) if config.basket else _NO_CORNERS
+        except RobocasError:
+            return _NO_CORNERS
 
 
 def choose_view(views: Sequence[DecisionView]) -> DecisionView:
@@ -214,10 +219,26 @@ def _find_hidden(view: View, points: NDArray, depth: NDArray[np.uint16] | None) 
     return hidden
 
 
+def _find_corners(asset: BodyFiles) -> Array:
+    """Return the corners (P, 3) of the convex hull of an asset, in its frame."""
+    points = np.concatenate(asset.hulls)
+    return points[ConvexHull(points).vertices]
+
+
+def _project_outline(view: View, corners: Array, pose: NDArray) -> Array:
+    """Return the convex outline (P, 2) of corners (P, 3) at a pose in a view; empty if it is unknown or not visible."""
+    if not len(corners) or not np.isfinite(pose).all():
+        return np.empty((0, 2))
+    pixels, _ = view.project(transform_points(from_wxyz(pose.astype(np.float64)), corners))
+    return pixels[ConvexHull(pixels).vertices] if np.isfinite(pixels).all() else np.empty((0, 2))
+
+
 def _list_points(decision: Decision, strokes: Sequence[list[Stroke]]) -> Array:
-    """Return all finite points (P, 3) of objects and candidates, and of the TCP."""
+    """Return all finite points (P, 3) of objects and candidates, of the TCP, and in release decisions of the basket."""
     values = decision.values
     points = [values["object_in_base"][values["present"], :3], values["tcp_in_base"][None, :3]]
+    if values["kind"] == "release":
+        points.append(values["basket_in_base"][None, :3])
     points += [stroke.points for of in strokes for stroke in of]
     found = np.concatenate(points).astype(np.float64)
     return found[np.isfinite(found).all(axis=1)]

@@ -39,3 +39,9 @@ def test_push_of_a_flat_object_keeps_above_the_surface(cylinder):
     flat = cylinder * [1, 1, 0] + [0, 0, LOWEST - 0.01]
     tool, _ = draw_push_start(np.random.default_rng(0), flat, LOWEST, False)
     assert tool[2] == pytest.approx(LOWEST)
+
+
+def test_push_of_a_flat_object_on_a_heap_is_not_below_it(cylinder):
+    bottom, flat = LOWEST + 0.1, cylinder * [1, 1, 0.05] + [0, 0, LOWEST + 0.1 - 0.05 * 0.15]  # 5 mm high
+    tool, _ = draw_push_start(np.random.default_rng(0), flat, LOWEST, False)
+    assert tool[2] == pytest.approx(bottom, abs=1e-6)

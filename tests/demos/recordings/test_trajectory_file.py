@@ -62,6 +62,9 @@ def test_missing_or_truncated_files_are_errors(tmp_path, own):
     for share, found in ((0.5, f"{len(data) // 2} of {len(data)} bytes"), (0, "F.h5")):
         own.write_bytes(data[: int(len(data) * share)])
         fails(own, "F.h5", found, "again")
+    (tmp_path / "alone.h5").write_bytes(data[: len(data) // 2])
+    fails(tmp_path / "alone.h5", "alone.h5", "not a readable HDF5 file")
+    own.write_bytes(data)
     for text, word in (('{"env_info": ', "again"), ("[]", "")):
         json_file.write_text(text)
         fails(own, "F.json", word)
