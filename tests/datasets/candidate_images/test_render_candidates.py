@@ -140,6 +140,18 @@ def test_images_of_other_decisions_are_an_error(images, tmp_path):
         render_candidates(CandidateImageSettings(other, open_renderer=RayCaster))
 
 
+def test_folder_of_candidates_gets_images(candidates, images):
+    assert images_path(candidates.parent) == images_path(candidates)
+    render_candidates(CandidateImageSettings(candidates.parent, open_renderer=RayCaster))
+    assert images_path(candidates).read_bytes() == images.path.read_bytes()
+
+
+def test_unknown_camera_is_an_error(images):
+    for read in (images.rgb, images.depth, images.intrinsic, images.camera_in_base):
+        with pytest.raises(DatasetError):
+            read(0, "wrist")
+
+
 def test_reader_is_picklable(images):
     copy = pickle.loads(pickle.dumps(images))
     np.testing.assert_array_equal(copy.depth(1, "static_camera"), images.depth(1, "static_camera"))

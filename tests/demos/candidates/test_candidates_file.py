@@ -47,6 +47,9 @@ def test_values_of_records_are_read_back(tmp_path):
     assert (file.env_info, file.settings) == (ENV_INFO, SETTINGS)
     assert file.recorded_env.kwargs["config"] == "search_table_stacked"
     assert "robocas-ms3" in file.versions
+    for row in (-1, 3):
+        with pytest.raises(DatasetError):
+            file.decision(row)
 
 
 def test_episode_without_decisions(tmp_path):
@@ -162,6 +165,13 @@ def test_different_environments_are_not_merged(tmp_path):
         merge_candidates([first, tmp_path / "2.h5"], tmp_path / "c.h5")
     assert error.value.where == tmp_path / "2.h5"
     assert not (tmp_path / "c.h5").exists()
+
+
+def test_candidates_with_other_noise_are_not_merged(tmp_path):
+    first = write_episodes(tmp_path / "1.h5")
+    write_candidates(tmp_path / "2.h5", [make_record(9, 0)], ENV_INFO, {**SETTINGS, "action_noise": [3.0, 1.0]})
+    with pytest.raises(DatasetError):
+        merge_candidates([str(first), str(tmp_path / "2.h5")], str(tmp_path / "c.h5"))
 
 
 def replaced(path, name, fill):

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 from recorded_candidates import PER_DECISION, write_recorded_candidates
 from synthetic import write_trajectory
+from synthetic_candidates import write_episodes
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.candidate_images.images_file import images_path
 from robocas_ms3.viewer.decisions.content import DecisionContent
-from robocas_ms3.viewer.decisions.decision_source import choose_view
+from robocas_ms3.viewer.decisions.decision_source import DecisionSource, choose_view
 from robocas_ms3.viewer.decisions.outcomes import COLOURS
 from robocas_ms3.viewer.decisions.sheet import draw_decision, select_rows, write_sheet
 from robocas_ms3.viewer.source import open_content
@@ -68,6 +69,19 @@ def test_without_images_there_is_a_plot_from_above(plain):
     assert all(view["candidates"])
     with pytest.raises(DatasetError):
         content.rgb(0, "base_camera", 0)
+
+
+def test_plot_from_above_has_the_basket(tmp_path):
+    source = DecisionSource(write_episodes(tmp_path / "candidates.h5", seeds=(3,)))
+    row = int(np.flatnonzero(np.isfinite(source.file.decisions["basket_in_base"]).all(axis=1))[0])
+    (basket,) = [thing for thing in source.views(row)[-1].objects if thing.name == "basket"]
+    width, height = np.ptp(basket.outline, axis=0)
+    assert min(width, height) > 20  # pixels
+
+
+def test_command_tells_that_images_are_missing(plain_file, tmp_path, capsys):
+    assert run(["view", str(plain_file), "--sheet", str(tmp_path / "sheet.png"), "--decisions", "1"]) == 0
+    assert "robocas render-candidates" in capsys.readouterr().out
 
 
 def test_images_of_other_decisions_are_not_shown(file_with_images, tmp_path):
