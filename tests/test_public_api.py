@@ -78,6 +78,7 @@ PUBLIC = {
         "Summary",
         "TrajectoryFile",
         "generate",
+        "merge_candidates",
         "replay",
     ],
     "robocas_ms3.evaluation": [

@@ -84,8 +84,14 @@ def test_outcomes_are_predicted(tmp_path):
     path = write_episodes(tmp_path / "candidates.h5", seeds=range(30))
     lines = run("06_predict_outcomes.py", path, cwd=tmp_path)
     found = dict(re.fullmatch(r"(.+) candidates: AUC (\S+) \[.*", line).groups() for line in lines)
-    assert {"grasp success, all", "push benefit, all"} <= found.keys()
+    assert {"grasp success, all", "push helped, all"} <= found.keys()
     assert float(found["grasp success, all"]) > 0.6  # synthetic grasps near the middle of an object succeed
+
+
+def test_outcomes_of_few_scenes_are_not_predicted(tmp_path):
+    path = write_episodes(tmp_path / "candidates.h5", seeds=range(2))
+    lines = run("06_predict_outcomes.py", path, cwd=tmp_path)
+    assert [line.partition(":")[2].startswith(" not evaluated") for line in lines] == [True, True]
 
 
 def test_program_of_candidates(tmp_path):
