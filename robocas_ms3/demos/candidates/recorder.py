@@ -31,7 +31,7 @@ from robocas_ms3.tasks.occlusion import MAX_HIDDEN_FRACTION, MAX_OBSTACLES
 from robocas_ms3.tasks.search import RoboCASSearchEnv
 
 SETTLE_SECONDS = 0.25  # s after a candidate, until its objects are nearly at rest
-SETTINGS = (*CANDIDATE_OPTIONS, "action_noise", "after_policy", "after_steps")
+SETTINGS = (*CANDIDATE_OPTIONS, "planner", "action_noise", "after_policy", "after_steps")
 """Names of the settings in `EpisodeSettings` on which candidates and their outcomes depend."""
 MIN_PUSH = 0.02  # m, least displacement of an object by a successful push
 MAX_DECISIONS = 30  # decisions that are recorded per seed, so that hard seeds do not dominate a dataset

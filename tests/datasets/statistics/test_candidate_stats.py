@@ -81,9 +81,8 @@ def test_command_writes_json_and_plots_and_prints_a_table(path, capsys):
 
 def test_empty_file(tmp_path):
     write_candidates(tmp_path / "c.h5", [], ENV_INFO, SETTINGS)
-    assert (
-        compute_candidate_statistics([tmp_path / "c.h5"]).summary() == "search: 0 episodes, 0 decisions, 0 candidates"
-    )
+    stats = compute_candidate_statistics([tmp_path / "c.h5"])
+    assert stats.summary() == "search: 0 episodes, 0 decisions, 0 candidates"
     assert run(["stats", str(tmp_path / "c.h5")]) == 0
 
 
