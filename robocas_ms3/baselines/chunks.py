@@ -202,7 +202,7 @@ class ChunkPolicy:
     a failed grasp looks like pushing with a closed gripper, and the network would wait forever.
 
     Args:
-        spec: specification of the policy; ``observe_every`` becomes ``n_action_steps``.
+        spec: specification of the policy.
         predict: function that predicts the chunk (K, 10) of one env, from the observations and the row of the env. The
             last column is the probability of the command to open the gripper.
         n_action_steps: policy steps of a chunk that are executed before the next prediction, at most K.
@@ -221,7 +221,7 @@ class ChunkPolicy:
         reopen: float = 0.0,
         description: dict[str, Any] | None = None,
     ) -> None:
-        self.spec, self._predict = replace(spec, observe_every=n_action_steps), predict
+        self.spec, self._predict = spec, predict
         self._description = description or {}
         self._n_action_steps, self._ensemble_coeff, self._reopen = n_action_steps, temporal_ensemble_coeff, reopen
         self._chunks: dict[int, list[_Chunk]] = {}  # by env, newest first
@@ -236,13 +236,18 @@ class ChunkPolicy:
             self._chunks[episode.env] = []
             self._chunk_start.pop(episode.env, None)
 
+    def requests_images(self, envs: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return (E,) bool, whether each env needs a prediction at its next step."""
+        return np.array([self._needs_prediction(env) for env in envs.tolist()], dtype=bool)
+
     def act(self, observations: Observations) -> NDArray[np.floating]:
         """Return one action per env (E, 7)."""
         tcp = from_wxyz(observations.tcp_in_base)
         envs = observations.envs.tolist()
         for row, env in enumerate(envs):
+            needs_prediction = self._needs_prediction(env)
             chunks = [replace(one, age=one.age + 1) for one in self._chunks[env] if one.age + 1 < len(one.poses)]
-            if not chunks or chunks[0].age >= self._n_action_steps:
+            if needs_prediction:
                 rows = self._predict(
                     observations, row
                 )  # one env at a time: in a batch, rounding depends on the other rows
@@ -253,6 +258,10 @@ class ChunkPolicy:
                     ]  # otherwise older predictions outvote it
             self._chunks[env] = chunks
         return np.stack([self._make_action(self._chunks[env], here) for env, here in zip(envs, tcp, strict=True)])
+
+    def _needs_prediction(self, env: int) -> bool:
+        chunks = self._chunks[env]
+        return not chunks or chunks[0].age + 1 >= min(self._n_action_steps, len(chunks[0].poses))
 
     def _update_stuck(self, env: int, position: Array, width: float) -> bool:
         """Return whether the gripper is empty and has not moved since the last prediction; store its position.

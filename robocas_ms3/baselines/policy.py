@@ -7,12 +7,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from robocas_ms3.baselines.registry import find_baseline
 from robocas_ms3.baselines.training.record import BUNDLED, RUN, WEIGHTS, hash_weights, read_run
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.core.text import format_error
-from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, PolicySpec
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, PolicySpec, find_image_requests
 from robocas_ms3.scenes.config import TaskConfig
 
 
@@ -87,6 +90,10 @@ class RunPolicy:
     def reset(self, episodes: list[EpisodeSpec]) -> None:
         """Start new episodes in some of the envs."""
         self._policy.reset(episodes)
+
+    def requests_images(self, envs: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return (E,) bool, whether the next call of `act` needs images of each env."""
+        return find_image_requests(self._policy, envs)
 
     def protocol_warnings(self, configs: dict[str, TaskConfig]) -> list[str]:
         """Warn if the training stopped early, or if its data lacks tasks, scenes, objects or cameras of configurations.

@@ -37,10 +37,11 @@ _NOISE_STREAM = 413  # random stream of the action noise
 class PolicyActionWrapper(gym.Wrapper):
     """Environment wrapper whose step is a policy step; it adds metrics to ``info``. For one env or a batch.
 
+    Observations have no images; `SceneEnv.render_images` renders them on request.
+
     Args:
         env: a RoboCAS environment made with `make_env_kwargs`.
-        spec: specification of the policy. Its ``observe_every`` is the number of steps between images; the images of
-            other steps are black.
+        spec: specification of the policy.
         stepping: ``timed``: a policy step is one control step. ``upstream``: the policy step of RoboCAS-v0. It moves
             the gripper until its width is constant, at most 1 s, then the TCP until it arrives, at most 0.4 s. In a
             batch, each env waits until all envs have finished.
@@ -62,6 +63,7 @@ class PolicyActionWrapper(gym.Wrapper):
         self._observes_simulation, self._noise = spec.simulation_state, action_noise
         self._convention, self._reference, self._stepping = CONVENTIONS[spec.convention], spec.reference, stepping
         self._base: Any = env.unwrapped
+        self._base.observes_images = False
         count = self._base.num_envs
         bound = np.full(self._convention.size, np.inf, np.float32)
         self.single_action_space = gym.spaces.Box(-bound, bound)
@@ -72,7 +74,6 @@ class PolicyActionWrapper(gym.Wrapper):
         self._weld = Weld(self._base) if weld else None
         self._open = np.ones(count, dtype=bool)  # whether the last command to each gripper was to open
         self._width_change = np.zeros(count)  # change of the gripper width in the last control step, m
-        self._image_period, self._steps = spec.observe_every, np.zeros(count, dtype=np.int64)  # steps by env
         self._rngs: list[np.random.Generator] = [np.random.default_rng()] * count  # of the noise, by env
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
@@ -82,7 +83,7 @@ class PolicyActionWrapper(gym.Wrapper):
         envs = (kwargs.get("options") or {}).get("env_idx", slice(None))
         self._metrics.reset(envs)
         rows = envs if isinstance(envs, slice) else np.asarray(torch.as_tensor(envs).cpu())
-        self._open[rows], self._width_change[rows], self._steps[rows] = True, 0.0, 0
+        self._open[rows], self._width_change[rows] = True, 0.0
         for env in np.arange(len(self._rngs))[rows]:
             self._rngs[env] = np.random.default_rng([int(self._base._episode_seed[env]), _NOISE_STREAM])
         return self._add_simulation_state(obs), {**info, **self._compute_metrics(info)}
@@ -103,14 +104,7 @@ class PolicyActionWrapper(gym.Wrapper):
         actions = actions.reshape(self._base.num_envs, self._convention.size)
         if not np.isfinite(actions).all():
             raise EvaluationError("NaN or infinite action", where="action", found=actions.tolist())
-        self._base.renders_images = False  # cameras render only at the end of the policy step
-        try:
-            obs, *others, info = self._execute(actions)
-        finally:
-            self._base.renders_images = True
-        self._steps += 1
-        if (self._steps % self._image_period == 0).any() and isinstance(obs, dict) and "sensor_data" in obs:
-            obs = self._base.get_obs(info)
+        obs, *others, info = self._execute(actions)
         if self._weld and not self._open[0]:
             self._weld.weld_touched_object()
         self._metrics.end_step()

@@ -99,8 +99,6 @@ class PolicySpec:
         depth: whether the policy observes a depth image per camera.
         state: whether the policy observes privileged state (docs/rl.md).
         language: form of the instruction: ``text``, ``embedding`` (text and its sentence embedding) or ``none``.
-        observe_every: number n of policy steps between rendered images: steps 0, n, 2 n, ... are rendered. The images
-            of other steps are black, which saves rendering time. Chunk lengths must be multiples of n.
         simulation_state: whether the policy observes the state of the simulation (`SimulationState`).
     """
 
@@ -113,7 +111,6 @@ class PolicySpec:
     depth: bool = False
     state: bool = False
     language: Language = "text"
-    observe_every: int = 1
     simulation_state: bool = False
 
     def __post_init__(self) -> None:
@@ -123,7 +120,6 @@ class PolicySpec:
             ("reference", self.reference in get_args(Reference), f"one of {list(get_args(Reference))}"),
             ("language", self.language in get_args(Language), f"one of {list(get_args(Language))}"),
             ("cameras", not wrong_cameras, "camera names that end in _camera, such as side_camera"),
-            ("observe_every", self.observe_every >= 1, "at least 1"),
         ):
             if not fits:
                 found = repr(wrong_cameras[0] if name == "cameras" else getattr(self, name))
@@ -185,8 +181,8 @@ class Observations:
         envs: (E,) int64 indices of the envs.
         instructions: E texts; empty texts with language ``none``.
         embeddings: (E, 384) float32 sentence embeddings; None unless language is ``embedding``.
-        images: by camera name, (E, H, W, 3) uint8.
-        depths: by camera name, (E, H, W, 1) int16 in mm, 0: no measurement; empty without depth.
+        images: by camera name, (E, H, W, 3) uint8; black where `Policy` did not request images.
+        depths: by camera name, (E, H, W, 1) int16 in mm, 0: no measurement, or not requested; empty without depth.
         robot: by name in `ROBOT_QUANTITIES`, (E, D) float32. Each quantity is also an attribute, such as ``qpos``.
         state: (E, D) float32 privileged state; None unless the policy observes it.
         simulation: state of the simulation of each env; None unless the policy observes it.
@@ -217,6 +213,9 @@ class Policy(Protocol):
 
     Optional methods:
 
+    - ``requests_images(envs)`` gets the indices (E,) int64 of the envs of the next call of ``act``. It returns (E,)
+      bool, whether ``act`` needs images of each env. Other images are not rendered. Without this method, ``act`` gets
+      all images. The method must not change the state of the policy, because it may be called more than once.
     - ``describe()`` returns a dict that ``run.json`` of a result records.
     - ``protocol_warnings(configs)`` gets the task configurations of an evaluation by name. It returns a list of
       warnings, such as scenes that are not in the training data.
@@ -236,6 +235,25 @@ class Policy(Protocol):
         All H actions of a chunk are executed before the next call for this env.
         """
         ...
+
+
+def find_image_requests(policy: Policy, envs: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return (E,) bool, whether a policy requests images of each env for the next call of ``act``.
+
+    Raises:
+        EvaluationError: the result of ``requests_images`` has another shape or type.
+    """
+    request = getattr(policy, "requests_images", None)
+    if request is None:
+        return np.ones(len(envs), dtype=bool)
+    with forbid_policy_exit(policy):
+        found = np.asarray(request(envs))
+    if found.dtype != bool or found.shape != envs.shape:
+        where, what = f"policy {get_class_name(policy)}, requests_images()", f"{found.shape} {found.dtype}"
+        raise EvaluationError(
+            "the image requests have an invalid shape or type", where=where, expected=f"{envs.shape} bool", found=what
+        )
+    return found
 
 
 def as_action_chunks(
@@ -280,9 +298,9 @@ class ExternalPolicy:
 
 
 def policy_spec_to_dict(spec: PolicySpec) -> dict[str, Any]:
-    """Return a specification as a dict of JSON values, without ``observe_every`` 1 and ``simulation_state`` false."""
+    """Return a specification as a dict of JSON values, without ``simulation_state`` false."""
     values = {**vars(spec), "cameras": {name: list(size) for name, size in spec.cameras.items()}}
-    left_out = {"observe_every": 1, "simulation_state": False}
+    left_out = {"simulation_state": False}
     return {key: value for key, value in values.items() if key not in left_out or value != left_out[key]}
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.errors import EvaluationError, PolicyError
+from robocas_ms3.core.errors import PolicyError
 from robocas_ms3.core.text import escape_controls
 from robocas_ms3.evaluation.metrics import MEASURES, read_metric
 from robocas_ms3.evaluation.outcomes import Outcome, Retrieval, find_failure_stage
@@ -24,6 +24,7 @@ from robocas_ms3.evaluation.policy import (
     SimulationState,
     as_action_chunks,
     concatenate_privileged_state,
+    find_image_requests,
     forbid_policy_exit,
     get_class_name,
 )
@@ -151,22 +152,47 @@ class EpisodeBatch:
         self._record_flags()
         return starts
 
-    def observe(self, envs: list[int]) -> Observations:
-        """Return the last observations of the envs with these indices, one row per env."""
+    def observe(self, envs: list[int], image_requests: NDArray[np.bool_] | None = None) -> Observations:
+        """Return the last observations of E envs, one row per env.
+
+        Args:
+            envs: indices of the envs.
+            image_requests: (E,) bool, whether images of each env are rendered; other images are black. None: all.
+        """
         obs, spec, index = self.obs, self._spec, np.array(envs)
-        agent, cameras = obs["agent"], obs.get("sensor_data", {})
+        agent = obs["agent"]
+        images, depths = self.render_images(index, image_requests)
         starts = [self.running[env].spec for env in envs]
         texts = [start.instruction if spec.language != "none" else "" for start in starts]
         return Observations(
             envs=index,
             instructions=texts,
             embeddings=self._embed(texts) if self._embed else None,
-            images={name: cameras[name]["rgb"][index] for name in spec.cameras},
-            depths={name: cameras[name]["depth"][index] for name in spec.cameras} if spec.depth else {},
+            images=images,
+            depths=depths,
             robot={name: agent[quantity.name][index] for name, quantity in ROBOT_QUANTITIES.items()},
             state=concatenate_privileged_state(obs["extra"])[index] if spec.state else None,
             simulation=[self._read_simulation_state(env) for env in envs] if spec.simulation_state else None,
         )
+
+    def render_images(
+        self, envs: NDArray[np.int64], image_requests: NDArray[np.bool_] | None = None
+    ) -> tuple[dict[str, NDArray[np.uint8]], dict[str, NDArray[np.int16]]]:
+        """Render the cameras of the policy in E envs; return the images and depths as in `Observations`."""
+        spec, requested = self._spec, envs if image_requests is None else envs[image_requests]
+        rendered = self.env.render_images(requested) if spec.cameras and len(requested) else {}
+
+        def collect(kind: str, channels: int, dtype: type) -> dict[str, NDArray[Any]]:
+            if len(requested) == len(envs):
+                return {name: rendered[name][kind] for name in spec.cameras}
+            found = {}
+            for name, (width, height) in spec.cameras.items():
+                found[name] = np.zeros((len(envs), height, width, channels), dtype)
+                if len(requested):
+                    found[name][image_requests] = rendered[name][kind]
+            return found
+
+        return collect("rgb", 3, np.uint8), collect("depth", 1, np.int16) if spec.depth else {}
 
     def step(self, actions: NDArray[np.float32]) -> Iterator[Rollout]:
         """Step all N envs once with actions (N, A) and yield the episodes that end."""
@@ -263,7 +289,7 @@ def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list
     envs = [env for env in running if not chunks[env]]
     if not envs:
         return
-    observations = batch.observe(envs)
+    observations = batch.observe(envs, find_image_requests(policy, np.array(envs)))
     started = time.perf_counter()
     try:
         with forbid_policy_exit(policy):
@@ -277,14 +303,6 @@ def _request_actions(batch: EpisodeBatch, policy: Policy, chunks: dict[int, list
     seconds = (time.perf_counter() - started) / len(envs)
     where, fix = get_class_name(policy), "Return one row per env: len(observations.envs)."
     new = as_action_chunks(actions, len(envs), batch.action_size, where=where, fix=fix)
-    period = policy.spec.observe_every
-    if new.shape[1] > 1 and new.shape[1] % period:
-        raise EvaluationError(
-            "the chunk length of the policy does not fit its observe_every",
-            where=where,
-            expected=f"a multiple of {period} actions, so that each chunk starts with images",
-            found=f"{new.shape[1]} actions",
-        )
     for env, chunk in zip(envs, new, strict=True):
         if not np.isfinite(chunk).all():
             running[env].error = running[env].error or NOT_FINITE

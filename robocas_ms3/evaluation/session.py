@@ -13,7 +13,7 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.core.errors import EvaluationError, VectorEnvCrashError
@@ -230,9 +230,14 @@ class EvaluationSession:
 
     @property
     def observation(self) -> dict[str, Any]:
-        """Return the last observation of the vector environment: a nested dict of arrays (N, ...)."""
+        """Return the last observation of the vector environment: a nested dict of arrays (N, ...), without images."""
         assert self._batch is not None
         return self._batch.obs
+
+    def render_images(self, envs: Sequence[int]) -> tuple[dict[str, NDArray[np.uint8]], dict[str, NDArray[np.int16]]]:
+        """Render the cameras of the policy in E envs; return the images and depths as in `Observations`."""
+        assert self._batch is not None
+        return self._batch.render_images(np.array(envs))
 
     def open_batch(self, episode: ProtocolEpisode, num_envs: int, max_steps: int | None = None) -> EpisodeBatch:
         """Return the open batch of envs if it fits, or open one.

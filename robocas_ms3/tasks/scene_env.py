@@ -68,13 +68,13 @@ class SceneEnv(BaseEnv):
         is_target: (N, K) bool, whether each object is the target.
         start_poses: (N, K, 7) world poses of the objects at the start of the episode.
         basket_start_poses: (N, 7) world poses of the basket at the start of the episode.
-        renders_images: whether images are rendered; if False, the images of later observations are zero.
+        observes_images: whether observations have images and camera parameters; `render_images` works without.
     """
 
     SPEC: ClassVar[TaskSpec]
 
     agent: MobileManipulator
-    renders_images = True
+    observes_images = True
 
     def __init__(
         self,
@@ -274,8 +274,11 @@ class SceneEnv(BaseEnv):
         present = self.layout(env).present
         return {asset.asset.name for asset, used in zip(self.object_assets[env], present, strict=True) if used}
 
-    def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
-        last = self._last_obs.get("sensor_data") if isinstance(self._last_obs, dict) else None
-        if self.renders_images or last is None:  # None with point clouds, which need rendered images
-            return super()._get_obs_sensor_data(apply_texture_transforms)
-        return {camera: {kind: torch.zeros_like(of) for kind, of in kinds.items()} for camera, kinds in last.items()}
+    def render_images(self) -> dict[str, dict[str, torch.Tensor]]:
+        """Render the present state of all envs; return camera -> kind, such as ``rgb`` -> (N, H, W, C)."""
+        return self._get_obs_sensor_data()
+
+    def _get_obs_with_sensor_data(self, info: dict, apply_texture_transforms: bool = True) -> dict:
+        if not self.observes_images:
+            return self._get_obs_state_dict(info)
+        return super()._get_obs_with_sensor_data(info, apply_texture_transforms)

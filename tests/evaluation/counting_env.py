@@ -27,7 +27,7 @@ class CountingEnv:
 
     def __init__(self, num_envs: int = 1, goal: Any = 5.0, *, steps: bool = False, config: str = "") -> None:
         self.num_envs, self.config, self._goal, self._count_steps = num_envs, config, goal, steps
-        self.resets, self.seeds, self.actions, self.closed = [], [], [], False
+        self.resets, self.seeds, self.actions, self.rendered, self.closed = [], [], [], [], False
         self.sums, self.elapsed, self.seed_of = np.zeros(num_envs), np.zeros(num_envs, int), np.zeros(num_envs, int)
 
     def reset(self, *, seed: list[int], options: dict[str, Any]) -> tuple[Any, dict]:
@@ -47,6 +47,12 @@ class CountingEnv:
         self.elapsed += 1
         return self._observation(), None, None, None, self._info()
 
+    def render_images(self, envs: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
+        """Return images whose pixels are the elapsed steps plus 1."""
+        self.rendered.append(envs.tolist())
+        pixels = np.tile(self.elapsed[envs, None, None, None] + 1, (1, 4, 6, 3)).astype(np.uint8)
+        return {"base_camera": {"rgb": pixels, "depth": pixels[..., :1].astype(np.int16) * 100}}
+
     def close(self) -> None:
         self.closed = True
 
@@ -54,12 +60,10 @@ class CountingEnv:
         count = self.num_envs
         qpos = np.tile(np.arange(12, dtype=np.float32) + 10, (count, 1))
         tcp = np.tile(np.array(_POSE, np.float32), (count, 1))
-        pixels = np.tile(self.elapsed[:, None, None, None], (1, 4, 6, 3)).astype(np.uint8)
         width = np.full((count, 1), 0.05, np.float32)
         return {
             "agent": {"qpos": qpos, "qvel": qpos, "tcp_in_arm_base": tcp, "gripper_width": width},
             "extra": {"seed": self.seed_of[:, None].astype(np.float32), "tcp_pose": tcp},
-            "sensor_data": {"base_camera": {"rgb": pixels, "depth": pixels[..., :1].astype(np.int16) * 100}},
         }
 
     def _info(self) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import torch
 from mani_skill.utils.structs import Pose
 
 import robocas_ms3  # noqa: F401
-from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError, VectorEnvError
 from robocas_ms3.evaluation.action_wrapper import PolicyActionWrapper, make_env_kwargs
 from robocas_ms3.evaluation.metrics import read_metric
 from robocas_ms3.evaluation.policy import PolicySpec
@@ -173,55 +173,62 @@ def test_metrics_count_from_the_reset():
     assert read_metric(info, "path_length") < 0.002
 
 
-def test_images_are_rendered_only_when_the_policy_observes_them(monkeypatch):
-    """Images are rendered once per action, and with ``observe_every=2`` after every other action; others are black."""
+def test_images_are_rendered_only_on_request(monkeypatch):
     env = gym.make("RoboCASPick-v1", **IMAGES)
     base: Any = env.unwrapped
     rendered, capture = [], base.capture_sensor_data
     monkeypatch.setattr(base, "capture_sensor_data", lambda: (rendered.append(1), capture()))
-    for every, rendered_steps in ((1, [1, 1, 1]), (2, [0, 1, 0])):
-        stepped = PolicyActionWrapper(env, PolicySpec("robocas", "tcp", observe_every=every), "upstream")
-        for _ in range(2):  # a reset restarts the count
-            obs, _ = stepped.reset(seed=3)
-            assert obs["sensor_data"]["base_camera"]["rgb"].any()
-            for expected in rendered_steps:
-                rendered.clear()
-                obs, *_, info = stepped.step(along(0.08))
-                assert len(rendered) == expected
-                seen = {name: images["rgb"] for name, images in obs["sensor_data"].items()}
-                assert {tuple(rgb.shape) for rgb in seen.values()} == {(1, 24, 32, 3)}
-                assert [bool(rgb.any()) for rgb in seen.values()] == [bool(expected)] * len(seen)
-                now = base.get_obs()["sensor_data"]["base_camera"]["rgb"]
-                assert not expected or torch.equal(seen["base_camera"], now)
-            assert int(info["elapsed_steps"]) > len(rendered_steps)
+    stepped = PolicyActionWrapper(env, PolicySpec("robocas", "tcp"), "upstream")
+    obs, _ = stepped.reset(seed=3)
+    first = base.render_images()
+    for _ in range(3):
+        obs, *_, info = stepped.step(along(0.08))
+    assert len(rendered) == 1 and not {"sensor_data", "sensor_param"} & obs.keys()
+    images = base.render_images()
+    assert {name: tuple(one["rgb"].shape) for name, one in images.items()} == dict.fromkeys(
+        base._sensors, (1, 24, 32, 3)
+    )
+    assert not torch.equal(images["gripper_camera"]["rgb"], first["gripper_camera"]["rgb"])
+    base.observes_images = True
+    now = base.get_obs()["sensor_data"]
+    assert all(torch.equal(images[name]["rgb"], now[name]["rgb"]) for name in images)
     env.close()
+
+
+def check_rendered_envs(backend: str) -> None:
+    """Images of chosen envs, in their order, equal the images of all envs."""
+    envs = make_vec(
+        "RoboCASPick-v1",
+        4,
+        backend=backend,
+        arrays="numpy",
+        workers=2,
+        auto_reset=False,
+        ignore_terminations=True,
+        record_metrics=False,
+        wrappers=[partial(PolicyActionWrapper, spec=PolicySpec("robocas", "tcp"), stepping="upstream")],
+        **IMAGES,
+    )
+    obs, _ = envs.reset(seed=[3, 4, 5, 6])
+    assert "sensor_data" not in obs
+    envs.step(np.tile(along(0.02), (4, 1)))
+    every, chosen = envs.render_images(np.arange(4)), envs.render_images(np.array([3, 0]))
+    for camera, images in every.items():
+        assert images["rgb"].shape == (4, 24, 32, 3)
+        np.testing.assert_array_equal(chosen[camera]["rgb"], images["rgb"][[3, 0]])
+    rgb = every["base_camera"]["rgb"]
+    assert all((rgb[i] != rgb[j]).any() for i in range(4) for j in range(i))
+    if backend == "processes":
+        with pytest.raises(VectorEnvError, match="invalid env_idx"):
+            envs.render_images(np.array([4]))
+    envs.close()
+
+
+def test_chosen_envs_are_rendered_in_their_processes():
+    check_rendered_envs("processes")
 
 
 @pytest.mark.gpu
 @needs_cuda
-def test_each_env_of_a_batch_renders_at_its_own_steps():
-    """The last is reset after a step, and is one behind from there on."""
-    num_envs = 4
-    envs = make_vec(
-        "RoboCASPick-v1",
-        num_envs,
-        auto_reset=False,
-        ignore_terminations=True,
-        record_metrics=False,
-        wrappers=[
-            partial(PolicyActionWrapper, spec=PolicySpec("robocas", "tcp", observe_every=3), stepping="upstream")
-        ],
-        **IMAGES,
-    )
-
-    def shows(obs: Any) -> list[bool]:
-        return obs["sensor_data"]["base_camera"]["rgb"].flatten(1).any(dim=1).tolist()
-
-    actions = torch.tensor(along(0.02), dtype=torch.float32).repeat(num_envs, 1)
-    assert all(shows(envs.reset(seed=3)[0]))
-    envs.step(actions)
-    envs.reset(options={"env_idx": torch.tensor([num_envs - 1])})
-    found = [shows(envs.step(actions)[0]) for _ in range(4)]
-    assert [one[0] for one in found] == [False, True, False, False]
-    assert [one[-1] for one in found][2:] == [True, False]
-    envs.close()
+def test_chosen_envs_of_a_batch_are_rendered():
+    check_rendered_envs("gpu")

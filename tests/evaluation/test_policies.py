@@ -59,10 +59,8 @@ def here(tmp_path, monkeypatch):
 
 
 def test_invalid_specifications_name_the_field():
-    assert "observe_every" not in policy_spec_to_dict(PolicySpec())  # the default is left out
-    assert policy_spec_to_dict(PolicySpec(observe_every=7))["observe_every"] == 7
     assert policy_spec_to_dict(PolicySpec(simulation_state=True))["simulation_state"] is True
-    for wrong in ({"convention": "words"}, {"language": "loud"}, {"reference": "me"}, {"observe_every": 0}):
+    for wrong in ({"convention": "words"}, {"language": "loud"}, {"reference": "me"}):
         with pytest.raises(EvaluationError) as error:
             PolicySpec(**wrong)
         assert error.value.where == next(iter(wrong))

@@ -62,16 +62,58 @@ def test_all_actions_of_a_chunk_are_executed_before_the_next_call_of_the_policy(
     assert policy.asked == [[0, 1], [0, 1], [1]]
 
 
-@pytest.mark.parametrize(("chunk", "observe_every", "fits"), [(6, 3, True), (1, 3, True), (3, 6, False), (6, 4, False)])
-def test_chunk_lengths_must_be_multiples_of_observe_every(chunk, observe_every, fits):
-    """A policy without chunks may have any length."""
-    policy = CountingPolicy(chunk)
-    policy.spec = PolicySpec(state=True, observe_every=observe_every)
-    if fits:
-        assert [one.steps for one in run_policy(CountingEnv(1, None), policy, starts(4), 7)] == [4]
-    else:
-        with pytest.raises(EvaluationError, match=f"a multiple of {observe_every} actions"):
-            run_policy(CountingEnv(1, None), policy, starts(4), 7)
+class LookingPolicy(CountingPolicy):
+    """Policy with a camera that requests images of env 1 only; it records the mean pixel and depth of each env."""
+
+    spec = PolicySpec(state=True, cameras={"base_camera": (6, 4)}, depth=True)
+
+    def __init__(self, chunk: int = 1) -> None:
+        super().__init__(chunk)
+        self.pixels, self.depths = [], []
+
+    def requests_images(self, envs: np.ndarray) -> np.ndarray:
+        return envs == 1
+
+    def act(self, observations: Observations) -> np.ndarray:
+        self.pixels.append(observations.images["base_camera"].mean((1, 2, 3)).tolist())
+        self.depths.append(observations.depths["base_camera"].mean((1, 2, 3)).tolist())
+        assert observations.images["base_camera"].shape[1:] == (4, 6, 3)
+        return super().act(observations)
+
+
+def test_only_requested_images_are_rendered():
+    env, policy = CountingEnv(2, None), LookingPolicy()
+    run_policy(env, policy, starts(2, 3), 7)
+    # episodes are assigned to envs in order: env 0 counts to 2, env 1 to 3
+    assert env.rendered == [[1], [1], [1]]
+    assert policy.pixels == [[0, 1], [0, 2], [3]]
+    assert policy.depths == [[0, 100], [0, 200], [300]]
+
+
+def test_nothing_is_rendered_between_the_starts_of_chunks():
+    env, policy = CountingEnv(2, None), LookingPolicy(chunk=3)
+    policy.requests_images = lambda envs: np.ones(len(envs), bool)
+    run_policy(env, policy, starts(4, 4), 7)
+    assert env.rendered == [[0, 1], [0, 1]]
+    assert policy.pixels == [[1, 1], [4, 4]]
+
+
+def test_without_requests_images_each_observation_has_images():
+    class AlwaysLookingPolicy(LookingPolicy):
+        requests_images = None
+
+    env, policy = CountingEnv(1, None), AlwaysLookingPolicy()
+    run_policy(env, policy, starts(2), 7)
+    assert (env.rendered, policy.pixels) == ([[0], [0]], [[1], [2]])
+
+
+@pytest.mark.parametrize("found", [[True], [1, 0], "yes"])
+def test_image_requests_of_another_shape_or_type_are_refused(found):
+    policy = LookingPolicy()
+    policy.requests_images = lambda envs: found
+    with pytest.raises(EvaluationError) as error:
+        run_policy(CountingEnv(2, None), policy, starts(4, 4), 7)
+    assert (error.value.expected, "LookingPolicy, requests_images()" in error.value.where) == ("(2,) bool", True)
 
 
 @pytest.mark.parametrize("fails", [True, False])

@@ -52,6 +52,10 @@ class RT1Policy:
             self._frames.pop(episode.env, None)
             self._final.pop(episode.env, None)
 
+    def requests_images(self, envs: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return (E,) bool, whether each env has no terminate token yet."""
+        return np.array([env not in self._final for env in envs.tolist()], dtype=bool)
+
     def act(self, observations: Observations) -> NDArray[np.floating]:
         """Return one action per env (E, 7).
 

@@ -17,7 +17,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.harness.proprioception import WIDTHS, Proprioception, depth_key
 from robocas_ms3.evaluation.outcomes import Outcome
-from robocas_ms3.evaluation.policy import CONVENTIONS, ExternalPolicy, PolicySpec
+from robocas_ms3.evaluation.policy import CONVENTIONS, ExternalPolicy, Observations, PolicySpec
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
@@ -91,13 +91,13 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         indices = [int(one) % len(self._episodes) for one in seeds]
         self._next = indices[-1] + 1
         episodes = [self._episodes[index] for index in indices]
-        self._session.reset([episode.episode for episode in episodes])
+        observations = self._session.reset([episode.episode for episode in episodes])
         self.episodes = np.array([episode.episode for episode in episodes], np.int64)
         self._instructions = [episode.instruction for episode in episodes]
         self._grippers = [None] * self.num_envs
         self._proprioception.reset(self._session.observation)
         self._obs = cast(dict[str, Any], create_empty_array(self.single_observation_space, self.num_envs))
-        self._update_observations(list(range(self.num_envs)))
+        self._update_observations(list(range(self.num_envs)), observations)
         return deepcopy(self._obs), self._make_info(np.zeros(self.num_envs, bool))  # a copy: the caller may keep it
 
     def step(
@@ -111,10 +111,10 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
             raise EvaluationError("no episode is running", fix="Call reset before step.")
         before = self._has_ended(lambda outcome: True)
         if running := np.flatnonzero(~before).tolist():
-            self._session.step(acts)
+            observations = self._session.step(acts)
             for env, command in zip(running, self._gripper_commands(acts[running]), strict=True):
                 self._grippers[env] = command
-            self._update_observations(running)
+            self._update_observations(running, observations)
         ended = self._has_ended(lambda outcome: True)
         self._write_outcomes(np.flatnonzero(ended & ~before).tolist())
         truncated = self._has_ended(lambda outcome: not outcome.success and outcome.steps >= self._max_steps)
@@ -160,16 +160,24 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
                 results.append_outcome(self._folder, outcome)
                 self._recorded.add(outcome.episode)
 
-    def _update_observations(self, envs: list[int]) -> None:
+    def _update_observations(self, envs: list[int], observations: Observations | None) -> None:
+        """Update the observations of some envs; ``observations``: those of the envs whose episode is running."""
         obs = self._session.observation
         for env in envs:
             for name, values in self._proprioception.compute_columns(env, obs, self._grippers[env]).items():
                 self._obs[name][env] = values
-        for camera, pixels in self._obs["pixels"].items():
-            images = obs["sensor_data"][camera]
-            pixels[envs] = images["rgb"][envs]
-            if self._spec.depth:
-                self._obs[depth_key(camera)][envs] = images["depth"][envs].transpose(0, 3, 1, 2)
+        if observations is not None:
+            self._store_images(observations.envs.tolist(), observations.images, observations.depths)
+        if ended := [env for env in envs if observations is None or env not in observations.envs]:
+            self._store_images(ended, *self._session.render_images(ended))
+
+    def _store_images(
+        self, envs: list[int], images: Mapping[str, NDArray[np.uint8]], depths: Mapping[str, NDArray[np.int16]]
+    ) -> None:
+        for camera, rows in images.items():
+            self._obs["pixels"][camera][envs] = rows
+        for camera, rows in depths.items():
+            self._obs[depth_key(camera)][envs] = rows.transpose(0, 3, 1, 2)
 
     def _make_info(self, just_ended: NDArray[np.bool_]) -> dict[str, Any]:
         success = self._has_ended(lambda outcome: outcome.success)

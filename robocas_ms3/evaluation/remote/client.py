@@ -7,7 +7,7 @@ import logging
 import threading
 import time
 from collections.abc import Coroutine, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -35,6 +35,7 @@ from robocas_ms3.evaluation.remote.messages import (
     make_observation_message,
     parse_actions,
     parse_batch,
+    parse_image_request,
     parse_policy_spec,
 )
 from robocas_ms3.evaluation.remote.wire import encode_message
@@ -82,17 +83,16 @@ class RemotePolicy:
         self._thread.start()
         self._connections: dict[int, _Connection] = {}
         self._starts: dict[int, EpisodeSpec] = {}  # episodes that were not sent to the server yet
+        self._image_requests: dict[int, bool] = {}  # by env, of the last answer of its episode
         self._chunk_length: int | None = None
         self._last_answer = 0.0  # clock time, s
         self._metadata = ServerMetadata()
         try:
             self._metadata = self._run_on_network_thread(self._fetch_metadata())
-            spec = self._choose_spec(self._metadata)
+            self.spec: PolicySpec = self._choose_spec(self._metadata)
         except BaseException:
             self.close()
             raise
-        # With `n_action_steps` a request may follow any step, so each observation needs images.
-        self.spec: PolicySpec = replace(spec, observe_every=1) if self._address.n_action_steps else spec
 
     def describe(self) -> dict[str, Any]:
         """Return the description that the server announces, and the options ``n_action_steps`` and ``rename``."""
@@ -102,6 +102,12 @@ class RemotePolicy:
     def reset(self, episodes: list[EpisodeSpec]) -> None:
         """Start episodes. The server gets an episode together with its first observation."""
         self._starts |= {episode.env: episode for episode in episodes}
+        for episode in episodes:
+            self._image_requests.pop(episode.env, None)
+
+    def requests_images(self, envs: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return (E,) bool, whether the server requests images of each env; True for the first observation."""
+        return np.array([self._image_requests.get(env, True) for env in envs.tolist()], dtype=bool)
 
     def act(self, observations: Observations) -> NDArray[np.floating]:
         """Return action chunks (E, H, A).
@@ -119,6 +125,7 @@ class RemotePolicy:
         for row, env in enumerate(envs):
             try:
                 chunks[row] = self._parse_chunk(answers[row])
+                self._image_requests[env] = parse_image_request(answers[row])
             except EvaluationError as error:
                 reasons[env] = str(error)
                 _log.warning("the episode in env %d ends: %s", env, error)
@@ -150,7 +157,8 @@ class RemotePolicy:
 
     def _make_message(self, observations: Observations, row: int, start: EpisodeSpec | None) -> dict[str, Any]:
         known = start if self._metadata.spec is not None else None  # a plain openpi server does not expect the key
-        message = make_observation_message(observations, row, known, reset=start is not None)
+        images = self._image_requests.get(int(observations.envs[row]), True)
+        message = make_observation_message(observations, row, known, reset=start is not None, images=images)
         rename = self._address.rename
         return {rename.get(key.removeprefix(PREFIX), key): value for key, value in message.items()}
 

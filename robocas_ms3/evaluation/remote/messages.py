@@ -1,9 +1,9 @@
 """Messages between policy clients and servers: maps that `wire` encodes (docs/remote_policies.md).
 
 The first message of a server is its `ServerMetadata`. A request is the observation of one env, without an axis for
-envs. The answer is ``{"actions": (H, A)}``, or a text with the error, after which the server closes the connection. A
-batched request is ``{"batch": [observation, ...]}``; the answer is ``{"batch": [answer, ...]}`` in the same order,
-where each answer is ``{"actions": (H, A)}`` or ``{"error": text}``.
+envs. The answer is ``{"actions": (H, A), "requests_images": bool}``, or a text with the error, after which the server
+closes the connection. A batched request is ``{"batch": [observation, ...]}``; the answer is ``{"batch": [answer,
+...]}`` in the same order, where each answer is as above or ``{"error": text}``.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from robocas_ms3.evaluation.remote.wire import MAX_BYTES
 from robocas_ms3.robots.registry import DEFAULT_ROBOT
 
 ENV, RESET, START, PROMPT, ACTIONS, BATCH, ERROR = "env_id", "reset", "start", "prompt", "actions", "batch", "error"
+REQUESTS_IMAGES = "requests_images"
 PREFIX = "observation/"
 DEFAULT_BATCH, LARGEST_BATCH = 64, 256  # envs
 FILE_NAME_PARTS = 3  # path components of a file name in messages: protocol folder, subfolder, file
@@ -139,7 +140,7 @@ def check_observations_can_be_sent(spec: PolicySpec, where: object) -> None:
 
 
 def make_observation_message(
-    observations: Observations, row: int, start: EpisodeSpec | None, *, reset: bool
+    observations: Observations, row: int, start: EpisodeSpec | None, *, reset: bool, images: bool = True
 ) -> dict[str, Any]:
     """Return the request for one env: a row of the observations, as a dict of values and arrays.
 
@@ -148,10 +149,12 @@ def make_observation_message(
         row: row of the env in the observations.
         start: episode that starts, sent under the key ``start``; None: no such key.
         reset: whether an episode starts; sent under the key ``reset``.
+        images: whether images and depths are sent.
     """
     arrays: dict[str, Any] = {name: values[row] for name, values in observations.robot.items()}
-    arrays |= {name: images[row] for name, images in observations.images.items()}
-    arrays |= {f"{name}_depth": depths[row] for name, depths in observations.depths.items()}
+    if images:
+        arrays |= {name: values[row] for name, values in observations.images.items()}
+        arrays |= {f"{name}_depth": values[row] for name, values in observations.depths.items()}
     for name, values in (("embedding", observations.embeddings), ("simulator_state", observations.state)):
         if values is not None:
             arrays[name] = values[row]
@@ -166,14 +169,29 @@ def make_observation_message(
     return message
 
 
-def parse_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int], spec: PolicySpec) -> Observations:
+def parse_observations(
+    messages: Sequence[Mapping[str, Any]], envs: Sequence[int], spec: PolicySpec, *, images_optional: bool = False
+) -> Observations:
     """Parse requests for one env each to the observations of a policy with one row per request.
 
-    ``envs``: indices of the envs on the server, in the order of the requests.
+    Args:
+        messages: the requests.
+        envs: indices of the envs on the server, in the order of the requests.
+        spec: specification of the policy.
+        images_optional: whether requests without images are valid; their images are black.
     """
 
     def stack_rows(name: str, dtype: str, *shape: int | None) -> NDArray[Any]:
         arrays: list[Any] = [message.get(PREFIX + name) for message in messages]
+        return stack_arrays(name, arrays, dtype, *shape)
+
+    def stack_images(name: str, dtype: str, *shape: int) -> NDArray[Any]:
+        black = np.zeros(shape, dtype)
+        is_black = [images_optional and not has_images(message, spec) for message in messages]
+        arrays = [black if skip else one.get(PREFIX + name) for one, skip in zip(messages, is_black, strict=True)]
+        return stack_arrays(name, arrays, dtype, *shape)
+
+    def stack_arrays(name: str, arrays: list[Any], dtype: str, *shape: int | None) -> NDArray[Any]:
         for found in arrays:
             if not (
                 isinstance(found, np.ndarray)
@@ -197,13 +215,18 @@ def parse_observations(messages: Sequence[Mapping[str, Any]], envs: Sequence[int
         envs=np.array(envs),
         instructions=["" if spec.language == "none" else message.get(PROMPT, "") for message in messages],
         embeddings=stack_rows("embedding", "float32", None) if spec.language == "embedding" else None,
-        images={name: stack_rows(name, "uint8", *size, 3) for name, size in sizes.items()},
-        depths={name: stack_rows(f"{name}_depth", "int16", *size, 1) for name, size in sizes.items()}
+        images={name: stack_images(name, "uint8", *size, 3) for name, size in sizes.items()},
+        depths={name: stack_images(f"{name}_depth", "int16", *size, 1) for name, size in sizes.items()}
         if spec.depth
         else {},
         robot={name: stack_rows(name, "float32", quantity.width) for name, quantity in ROBOT_QUANTITIES.items()},
         state=stack_rows("simulator_state", "float32", None) if spec.state else None,
     )
+
+
+def has_images(message: Mapping[str, Any], spec: PolicySpec) -> bool:
+    """Return whether a request contains an image of a camera of the policy."""
+    return any(PREFIX + name in message or f"{PREFIX}{name}_depth" in message for name in spec.cameras)
 
 
 def message_file_name(path: str) -> str:
@@ -238,6 +261,18 @@ def parse_actions(answer: Any, convention: str) -> NDArray[np.float32]:
         expected, found = f"absolute values of at most {_LARGEST_ACTION:g}", one_line(actions.tolist(), 200)
         raise WireError("action value out of range, NaN or infinite", expected=expected, found=found)
     return actions.reshape(-1, size).astype(np.float32)
+
+
+def parse_image_request(answer: Mapping[str, Any]) -> bool:
+    """Return whether the policy requests images of the next observation of an env; True if the answer lacks the key.
+
+    Raises:
+        WireError: the value is not a bool.
+    """
+    found = answer.get(REQUESTS_IMAGES, True)
+    if not isinstance(found, bool):
+        raise WireError("invalid image request", where=REQUESTS_IMAGES, expected="a bool", found=one_line(found, 200))
+    return found
 
 
 def parse_batch(message: Any, min_size: int, max_size: int) -> list[dict[str, Any]]:

@@ -15,6 +15,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
@@ -30,6 +31,7 @@ from robocas_ms3.evaluation.policy import (
     Policy,
     as_action_chunks,
     describe_policy,
+    find_image_requests,
     forbid_policy_exit,
     get_class_name,
     policy_spec_to_dict,
@@ -42,9 +44,11 @@ from robocas_ms3.evaluation.remote.messages import (
     ENV,
     ERROR,
     FILE_NAME_PARTS,
+    REQUESTS_IMAGES,
     RESET,
     ServerMetadata,
     check_observations_can_be_sent,
+    has_images,
     max_envs_per_request,
     parse_batch,
     parse_observations,
@@ -250,6 +254,21 @@ class PolicyServer:
             return _log_failure(error), _FAILED
 
 
+@dataclass(frozen=True)
+class _ParsedRequest:
+    """Request of a client.
+
+    Attributes:
+        observations: observations of the E envs of the request.
+        starts: episodes that start.
+        has_images: (E,) bool, whether the request contains images of each env.
+    """
+
+    observations: Observations
+    starts: list[EpisodeSpec]
+    has_images: NDArray[np.bool_]
+
+
 class _RequestHandler:
     """Handler that converts requests to calls of a policy, and actions to answers.
 
@@ -274,19 +293,21 @@ class _RequestHandler:
         if not isinstance(message, dict):
             raise WireError("invalid request", expected="a msgpack map", found=type(message).__name__)
         if BATCH not in message:
-            return {ACTIONS: self._call_policy(*self._parse_messages([message], envs))[0]}
-        observations, starts = self._parse_messages(parse_batch(message, 1, self._max_batch), envs)
-        actions, reasons = self._call_policy_safely(observations, starts)
-        rows = enumerate(observations.envs.tolist())
-        return {BATCH: [{ERROR: reasons[env]} if env in reasons else {ACTIONS: actions[row]} for row, env in rows]}
+            request = self._parse_messages([message], envs)
+            return self._make_answer(self._call_policy(request)[0], request.observations.envs[0])
+        request = self._parse_messages(parse_batch(message, 1, self._max_batch), envs)
+        actions, reasons = self._call_policy_safely(request)
+        answers = [
+            {ERROR: reasons[env]} if env in reasons else self._make_answer(actions[row], env)
+            for row, env in enumerate(request.observations.envs.tolist())
+        ]
+        return {BATCH: answers}
 
     def release_envs(self, envs: dict[int, int]) -> None:
         """Free the indices of the envs of a closed connection, so that other clients can use them."""
         self._used -= set(envs.values())
 
-    def _parse_messages(
-        self, messages: Sequence[dict[str, Any]], envs: dict[int, int]
-    ) -> tuple[Observations, list[EpisodeSpec]]:
+    def _parse_messages(self, messages: Sequence[dict[str, Any]], envs: dict[int, int]) -> _ParsedRequest:
         numbers, starts = [], []
         for message in messages:
             request = parse_request(message)
@@ -296,7 +317,9 @@ class _RequestHandler:
                 starts.append(self._files.resolve_episode(request.make_episode_spec(number)))
         if len(set(numbers)) < len(numbers):
             raise WireError("an env is twice in a batch", where=ENV, expected="different envs", found=sorted(numbers))
-        return parse_observations(messages, numbers, self._spec), starts
+        optional = hasattr(self._policy, "requests_images")
+        observations = parse_observations(messages, numbers, self._spec, images_optional=optional)
+        return _ParsedRequest(observations, starts, np.array([has_images(one, self._spec) for one in messages]))
 
     def _assign_env(self, env: int, reset: bool | None, envs: dict[int, int]) -> tuple[int, bool]:
         """Return the env index of the policy for an env index of the client, and whether the env is new."""
@@ -313,21 +336,38 @@ class _RequestHandler:
         self._used.add(envs[env])
         return envs[env], True
 
-    def _call_policy(self, observations: Observations, starts: list[EpisodeSpec]) -> NDArray[Any]:
-        """Start the given episodes and return the actions (E, H, A) of the policy for the observations."""
+    def _call_policy(self, request: _ParsedRequest) -> NDArray[Any]:
+        """Start the episodes of a request and return the actions (E, H, A) of the policy for its observations."""
+        observations = request.observations
         with forbid_policy_exit(self._policy):
-            if starts:
-                self._policy.reset(starts)
+            if request.starts:
+                self._policy.reset(request.starts)
+            self._check_images(request)
             return as_action_chunks(self._policy.act(observations), len(observations.envs), None)
 
-    def _call_policy_safely(self, observations: Observations, starts: list[EpisodeSpec]) -> tuple[Any, dict[int, str]]:
+    def _check_images(self, request: _ParsedRequest) -> None:
+        """Make images that the policy does not request black; raise `WireError` if a requested image is missing."""
+        observations = request.observations
+        requested = find_image_requests(self._policy, observations.envs)
+        if self._spec.cameras and (missing := observations.envs[requested & ~request.has_images]).size:
+            fix = f"Send images with the first observation, and if the last answer has {REQUESTS_IMAGES}: true."
+            raise WireError("the policy requests images", where=f"{ENV} {missing.tolist()}", found="no images", fix=fix)
+        for images in (*observations.images.values(), *observations.depths.values()):
+            images[~requested] = 0
+
+    def _make_answer(self, actions: NDArray[Any], env: int) -> dict[str, Any]:
+        """Return the answer for one env; ``env``: index of the policy."""
+        requested = find_image_requests(self._policy, np.array([env]))
+        return {ACTIONS: actions, REQUESTS_IMAGES: bool(requested[0])}
+
+    def _call_policy_safely(self, request: _ParsedRequest) -> tuple[Any, dict[int, str]]:
         """Return the actions (E, H, A) of the policy, or None, and the errors by index of the env.
 
         If the policy raises an exception, its text is the error of all envs.
         """
-        reasons: dict[int, str] = {}
+        observations, reasons = request.observations, dict[int, str]()
         try:
-            return self._call_policy(observations, starts), {}
+            return self._call_policy(request), {}
         except PolicyError as failed:
             text = _log_failure(failed)
             reasons = {env: one_line(reason, 300) for env, reason in failed.reasons.items()}

@@ -108,6 +108,9 @@ class _VideoRecorder:
             self._add_image()
         return result
 
+    def render_images(self, envs: Any) -> Any:
+        return self._env.render_images(envs)
+
     def close(self) -> None:
         self._env.close()
 

@@ -7,11 +7,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal, get_args
 
 import gymnasium as gym
+import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
 from mani_skill.envs.utils.system.backend import CPU_SIM_BACKENDS
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import VectorEnvError
 from robocas_ms3.core.workers import NO_LIMITS, Limits
@@ -137,6 +139,19 @@ class RoboCASVectorEnv(ManiSkillVectorEnv):
         if self.record_metrics and "success" in at_end:  # ManiSkill adds it with ``ignore_terminations`` only
             at_end["episode"]["success_at_end"] = at_end["success"].clone()
         found: Any = obs, reward, terminated, truncated, info
+        return _as_numpy(found) if self._in_numpy else found
+
+    def render_images(self, envs: NDArray[np.integer]) -> dict[str, dict[str, Any]]:
+        """Render the present state of E envs; return camera -> kind, such as ``rgb`` -> (E, H, W, C).
+
+        The envs need an ``obs_mode`` with images. A batch on a GPU renders all envs.
+        """
+        if isinstance(self._env, ProcessEnv):
+            found = self._env.render_images(envs)
+        else:
+            index = torch.as_tensor(envs, device=self.device)
+            rendered = self._env.get_wrapper_attr("render_images")()
+            found = {camera: {kind: of[index] for kind, of in kinds.items()} for camera, kinds in rendered.items()}
         return _as_numpy(found) if self._in_numpy else found
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> Any:

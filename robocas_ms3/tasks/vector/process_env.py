@@ -143,10 +143,7 @@ class ProcessEnv(gym.Env):
         Raises:
             VectorEnvError: the action has an invalid shape, or some envs must be reset after a failed call.
         """
-        if self._must_reset:
-            envs = format_envs(sorted(self._must_reset))
-            what = "the state is unknown, because an earlier call was interrupted or failed"
-            raise VectorEnvError(what, where=envs, fix="Reset these environments before the next step.")
+        self._check_states_known(set(range(self.num_envs)))
         action = action.cpu().numpy() if isinstance(action, torch.Tensor) else np.asarray(action)
         expected = self.action_space.shape
         if action.shape not in (expected, expected[1:] if self.num_envs == 1 else expected):  # pyright: ignore[reportOptionalSubscript]
@@ -160,6 +157,26 @@ class ProcessEnv(gym.Env):
         self._last_results = [*zip(map(len, self._env_ranges), answers, strict=True)]
         found = self._batch_last_results()
         return found.get("obs", {}), found["reward"], found["terminated"], found["truncated"], found["info"]
+
+    def render_images(self, envs: Any) -> dict[str, dict[str, torch.Tensor]]:
+        """Render the present state of the E envs ``envs`` (`SceneEnv.render_images`).
+
+        Returns camera -> kind, such as ``rgb`` -> (E, H, W, C), in the order of ``envs``.
+
+        Raises:
+            VectorEnvError: ``envs`` is invalid, or one of the envs must be reset after a failed call.
+        """
+        numbers = self._parse_env_indices(envs)
+        self._check_states_known(set(numbers))
+        envs_of_workers = [[env for env in numbers if env in env_range] for env_range in self._env_ranges]
+        answers = self._run_commands([("render_images", envs_of_worker) for envs_of_worker in envs_of_workers])
+        rendered = [env for envs_of_worker in envs_of_workers for env in envs_of_worker]
+        order = [rendered.index(env) for env in numbers]
+        rows = join_rows([(len(part), found) for part, found in zip(envs_of_workers, answers, strict=True) if part])
+        images: dict[str, dict[str, torch.Tensor]] = {}
+        for (camera, kind), value in rows.items():
+            images.setdefault(camera, {})[kind] = torch.from_numpy(value[order])
+        return images
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method or read an attribute of each env; return a tuple of N picklable results."""
@@ -213,6 +230,13 @@ class ProcessEnv(gym.Env):
             if failed is not None:
                 failed.reraise()
         return [found for found, _ in answers]
+
+    def _check_states_known(self, envs: set[int]) -> None:
+        if unknown := self._must_reset & envs:
+            what = "the state is unknown, because an earlier call was interrupted or failed"
+            raise VectorEnvError(
+                what, where=format_envs(sorted(unknown)), fix="Reset these environments before the next step."
+            )
 
     def _batch_last_results(self) -> dict[str, Any]:
         """Return the last results of all envs as a nested dictionary of tensors (N, ...) or lists."""

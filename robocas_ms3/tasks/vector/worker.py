@@ -42,8 +42,8 @@ class EnvSettings:
 class EnvWorker:
     """Worker that runs commands in some environments, and returns the results and the first error.
 
-    A command is a tuple of a method name (``step``, ``reset`` or ``call``) and its arguments. After an error in one
-    env, the command still runs in the other envs, so that an env does not depend on its process.
+    A command is a tuple of a method name (``step``, ``reset``, ``render_images`` or ``call``) and its arguments. After
+    an error in one env, the command still runs in the other envs, so that an env does not depend on its process.
 
     Args:
         settings: pickled `EnvSettings`.
@@ -84,6 +84,15 @@ class EnvWorker:
             options: options of ``BaseEnv.reset``.
         """
         return self._run_each(seeds, lambda env: self._reset_env(env, *seeds[env], dict(options)))
+
+    def render_images(self, envs: Sequence[int]) -> tuple[Rows, RemoteError | None]:
+        """Render the present state of some environments."""
+
+        def render(env: int) -> Rows:
+            return flatten_to_rows(self._envs[env].get_wrapper_attr("render_images")())
+
+        rows, failed = self._run_each(envs, render)
+        return join_rows([(1, row) for row in rows]), failed
 
     def call(self, name: str, args: tuple, kwargs: dict[str, Any]) -> tuple[list[bytes], RemoteError | None]:
         """Call a method or read an attribute of each environment; return pickled results."""

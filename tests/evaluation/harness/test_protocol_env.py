@@ -55,7 +55,7 @@ def test_observations_are_in_the_declared_space_and_have_the_datasets_names(make
     assert env.step(act(0, 0, gripper=1.0))[0]["gripper_open"].tolist() == [[1.0], [1.0]]
     obs = env.step(act(1, 1))[0]
     assert obs["gripper_open"].tolist() == [[0.0], [0.0]]
-    assert (obs["pixels"]["base_camera"] == 2).all() and (obs["images.base_camera_depth"] == 200).all()
+    assert (obs["pixels"]["base_camera"] == 3).all() and (obs["images.base_camera_depth"] == 300).all()
     assert env.render()[0].shape == (4, 6, 3)
     assert info["is_success"].tolist() == [False, False] and "final_info" not in info
 
@@ -69,7 +69,7 @@ def test_env_returns_its_last_observation_after_the_end_of_its_episode(make):
     assert [result[2].tolist() for result in results][1:4] == [[True, False]] * 3
     assert not any(result[3].any() for result in results)
     pixels = [result[0]["pixels"]["base_camera"][:, 0, 0, 0].tolist() for result in results]
-    assert pixels == [[1, 1], [2, 2], [2, 3], [2, 4], [2, 5]]
+    assert pixels == [[2, 2], [3, 3], [3, 4], [3, 5], [3, 6]]
     infos = [result[4] for result in results]
     assert [info["is_success"].tolist() for info in infos] == [[False] * 2, *[[True, False]] * 3, [True, True]]
     assert [step for step, info in enumerate(infos) if "final_info" in info] == [1, 4]

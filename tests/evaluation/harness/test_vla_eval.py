@@ -75,7 +75,7 @@ def test_observations_and_result_of_an_episode(benchmark):
     task = {**benchmark.get_tasks()[0], "episode_idx": 0}
     played = asyncio.run(play(benchmark, task, recorder=recorder))
     seen, metrics = played["seen"], played["metrics"]
-    assert [one["images"]["base_camera"].max() for one in seen] == [0, 1, 2, 3, 4]
+    assert [one["images"]["base_camera"].max() for one in seen] == [1, 2, 3, 4, 5]
     assert seen[0]["images"]["base_camera"].shape == (4, 6, 3)
     state = seen[0]["state"]
     assert state.dtype == np.float32
@@ -92,7 +92,7 @@ def test_observations_and_result_of_an_episode(benchmark):
     averaged = {name for name in benchmark.get_metric_keys() if name in metrics}
     assert averaged >= {"success", "success_at_end", "success_v0", "reached_any", "seconds", "contact_impulse"}
     assert all(isinstance(metrics[name], bool | int | float) for name in averaged)
-    assert [frame is None or int(frame.max()) for frame in recorder.frames] == [0, 1, 2, 3, 4, True]
+    assert [frame is None or int(frame.max()) for frame in recorder.frames] == [1, 2, 3, 4, 5, True]
 
 
 def test_shortened_or_missing_episodes_and_mode_live_are_refused(benchmark):

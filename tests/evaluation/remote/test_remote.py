@@ -16,10 +16,11 @@ pytest.importorskip("msgpack")
 
 from counting_env import CountingEnv, run_policy
 from remote_ends import CAMERA, SHORT_TIMEOUTS, RecordingPolicy, make_episode, make_observations, serve_answer, serving
+from websockets.sync.client import connect
 
 from robocas_ms3.core.errors import EvaluationError, PolicyError
 from robocas_ms3.evaluation.policies import make_policy
-from robocas_ms3.evaluation.policy import PolicySpec
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.remote.client import RemotePolicy
 from robocas_ms3.evaluation.remote.connection import PolicyAddress, parse_address
 from robocas_ms3.evaluation.remote.messages import (
@@ -29,7 +30,7 @@ from robocas_ms3.evaluation.remote.messages import (
     request_size_limit,
 )
 from robocas_ms3.evaluation.remote.server import PolicyServer, ServedFiles
-from robocas_ms3.evaluation.remote.wire import MAX_BYTES
+from robocas_ms3.evaluation.remote.wire import MAX_BYTES, encode_message
 
 ALL = PolicySpec(cameras={"base_camera": CAMERA}, depth=True, state=True, rate_hz=10, reference="tcp")
 PAGE = Path(__file__).resolve().parents[3] / "docs/remote_policies.md"
@@ -139,12 +140,55 @@ def test_batches_are_split_and_failures_end_only_their_episodes():
     assert policy.episodes[6:] == [make_episode(1, episode=9)]
 
 
-def test_with_n_action_steps_each_observation_has_images():
-    with serving(RecordingPolicy(PolicySpec(observe_every=3))) as url:
-        for address, period in ((url, 3), (f"{url}?n_action_steps=2", 1)):
-            remote = RemotePolicy(address)
-            assert remote.spec.observe_every == period
-            remote.close()
+class LookingPolicy(RecordingPolicy):
+    """Policy that requests images at every other step of an env; ``first``: whether at the first step."""
+
+    def __init__(self, first: bool) -> None:
+        super().__init__(PolicySpec(cameras={"base_camera": CAMERA}, depth=True))
+        self.first, self.looks = first, {}
+
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
+        super().reset(episodes)
+        self.looks |= {episode.env: self.first for episode in episodes}
+
+    def requests_images(self, envs: np.ndarray) -> np.ndarray:
+        return np.array([self.looks[env] for env in envs.tolist()])
+
+    def act(self, observations: Observations) -> np.ndarray:
+        for env in observations.envs.tolist():
+            self.looks[env] = not self.looks[env]
+        return super().act(observations)
+
+
+@pytest.mark.parametrize("max_batch", [1, 8])
+@pytest.mark.parametrize("first", [True, False])
+def test_server_requests_images_per_env(max_batch, first):
+    """The client sends the images of the first observation in any case; the policy gets only images it requests."""
+    policy, full = LookingPolicy(first), make_observations(0, 1, cameras=True)
+    with serving(policy, max_batch=max_batch) as url:
+        remote = RemotePolicy(url)
+        remote.reset([make_episode(0), make_episode(1)])
+        requests = []
+        for _ in range(3):
+            requests.append(remote.requests_images(full.envs).tolist())
+            remote.act(full)
+        remote.reset([make_episode(1, episode=4)])
+        requests.append(remote.requests_images(full.envs).tolist())
+        remote.close()
+    assert requests == [[True] * 2, [not first] * 2, [first] * 2, [not first, True]]
+    for name in ("images", "depths"):
+        sent = getattr(full, name)["base_camera"]
+        found = np.concatenate([getattr(one, name)["base_camera"] for one in policy.seen])
+        wanted = np.concatenate([sent if look else 0 * sent for look in (first, not first, first)])
+        np.testing.assert_array_equal(found, wanted)
+
+
+def test_missing_requested_images_are_an_error():
+    request = make_observation_message(make_observations(0), 0, make_episode(), reset=True, images=False)
+    with serving(LookingPolicy(True)) as url, connect(url) as client:
+        client.recv()
+        client.send(encode_message(request))
+        assert "the policy requests images" in client.recv()
 
 
 def test_two_clients_have_separate_envs():
