@@ -77,9 +77,9 @@ class StandIn:
 
     def cameras(self) -> dict[str, Any]:
         """Return cameras at one pose."""
-        from robocas_ms3.datasets.sources.episode_source import CameraModel
+        from robocas_ms3.robots.camera_models import CameraModel
 
-        model = CameraModel(np.array([24.0, 24.0, 32.0, 24.0]), np.eye(4), "world")
+        model = CameraModel(np.array([24.0, 24.0, 32.0, 24.0]), np.eye(4), "world", np.eye(4))
         return dict.fromkeys(self.image_options.cameras, model)
 
     def scene(self) -> dict[str, Any]:

@@ -8,8 +8,9 @@
       scene.json                      how the episode was recorded, see `SceneRecord`; not read by the RoboCAS-v0 loader
       episode_info.npz                arrays over T steps, see EPISODE_INFO; no pickles
       <camera>/                       one folder per camera, see `robots.cameras`
-        cam_pos_wrt_<parent>.npy      4x4 OpenCV camera frame (x right, y down, z forward) in its parent; name of
-        cam_pose_wrt_<parent>.npy     the paper, and of RoboCAS-v0 (same content)
+        cam_pos_wrt_<parent>.npy      4x4 nominal pose of the OpenCV camera frame (x right, y down, z forward) in its
+        cam_pose_wrt_<parent>.npy     parent; name of the paper, and of RoboCAS-v0 (same content)
+        true_cam_pose_wrt_<parent>.npy  the pose with the random motion of the camera; as above if missing
         intrinsic.npy                 (4,) fx, fy, cx, cy in pixels
         rgb/0000.png ...              8-bit RGB, one per step; .jpg or .webp with --image-format
         depth/0000.png ...            16-bit grey, millimetres along the optical axis, 0 = no depth; optional
@@ -92,6 +93,11 @@ def check_version(found: object, where: Path, what: str = "a dataset") -> None:
 def pose_files(parent: Parent) -> tuple[str, str]:
     """Return the names of the two pose files of a camera whose pose is in the frame ``parent``."""
     return f"cam_pos_wrt_{parent}.npy", f"cam_pose_wrt_{parent}.npy"
+
+
+def true_pose_file(parent: Parent) -> str:
+    """Return the name of the file with the true pose of a camera whose pose is in the frame ``parent``."""
+    return f"true_cam_pose_wrt_{parent}.npy"
 
 
 def camera_parent(folder: Path) -> Parent:

@@ -26,6 +26,7 @@ ROBOT_QUANTITIES = {quantity.policy_key: quantity for quantity in QUANTITIES if 
 """Quantities of the robot that policies observe, by their names in `Observations.robot`."""
 Language = Literal["none", "text", "embedding"]
 Reference = Literal["tcp", "target"]
+Calibration = Literal["nominal", "true"]
 Pixels = Annotated[int, Field(ge=1, le=4096)]
 """Width or height of an image."""
 Array = NDArray[np.float64]
@@ -99,6 +100,8 @@ class PolicySpec:
         depth: whether the policy observes a depth image per camera.
         state: whether the policy observes privileged state (docs/rl.md).
         language: form of the instruction: ``text``, ``embedding`` (text and its sentence embedding) or ``none``.
+        calibration: camera poses in the observations: ``nominal``, as configured, or ``true``, with the random motion
+            of the cameras (``randomisation.cameras``).
         simulation_state: whether the policy observes the state of the simulation (`SimulationState`).
     """
 
@@ -111,6 +114,7 @@ class PolicySpec:
     depth: bool = False
     state: bool = False
     language: Language = "text"
+    calibration: Calibration = "nominal"
     simulation_state: bool = False
 
     def __post_init__(self) -> None:
@@ -119,6 +123,8 @@ class PolicySpec:
             ("convention", self.convention in CONVENTIONS, f"one of {sorted(CONVENTIONS)}"),
             ("reference", self.reference in get_args(Reference), f"one of {list(get_args(Reference))}"),
             ("language", self.language in get_args(Language), f"one of {list(get_args(Language))}"),
+            ("calibration", self.calibration in get_args(Calibration), f"one of {list(get_args(Calibration))}"),
+            ("depth", not self.depth or bool(self.cameras), "a policy with cameras, or depth=False"),
             ("cameras", not wrong_cameras, "camera names that end in _camera, such as side_camera"),
         ):
             if not fits:
@@ -186,6 +192,9 @@ class Observations:
         robot: by name in `ROBOT_QUANTITIES`, (E, D) float32. Each quantity is also an attribute, such as ``qpos``.
         state: (E, D) float32 privileged state; None unless the policy observes it.
         simulation: state of the simulation of each env; None unless the policy observes it.
+        intrinsics: by camera name, (E, 3, 3) float32 intrinsic matrices of the images, in pixels.
+        camera_in_base: by camera name, (E, 4, 4) float32 poses of the OpenCV camera frame (x right, y down, z forward)
+            in the arm's base frame, from the measured robot state and the calibration (`PolicySpec.calibration`).
     """
 
     envs: NDArray[np.int64]
@@ -196,6 +205,8 @@ class Observations:
     robot: dict[str, NDArray[np.float32]]
     state: NDArray[np.float32] | None
     simulation: list[SimulationState] | None = None
+    intrinsics: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    camera_in_base: dict[str, NDArray[np.float32]] = field(default_factory=dict)
 
     def __getattr__(self, name: str) -> NDArray[np.float32]:
         if name not in ROBOT_QUANTITIES:
@@ -298,9 +309,9 @@ class ExternalPolicy:
 
 
 def policy_spec_to_dict(spec: PolicySpec) -> dict[str, Any]:
-    """Return a specification as a dict of JSON values, without ``simulation_state`` false."""
+    """Return a specification as a dict of JSON values, without defaults of ``calibration`` and ``simulation_state``."""
     values = {**vars(spec), "cameras": {name: list(size) for name, size in spec.cameras.items()}}
-    left_out = {"simulation_state": False}
+    left_out = {"calibration": "nominal", "simulation_state": False}
     return {key: value for key, value in values.items() if key not in left_out or value != left_out[key]}
 
 

@@ -23,8 +23,9 @@ from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.evaluation.action_wrapper import V0_CONTROL_HZ, PolicyActionWrapper, make_env_kwargs
 from robocas_ms3.evaluation.policies import open_policy
 from robocas_ms3.evaluation.policy import EpisodeSpec, Policy
-from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.protocol import check_cameras, load_protocol
 from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, run_rollouts
+from robocas_ms3.robots.registry import find_robot
 from robocas_ms3.scenes.config import load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.vector import RoboCASVectorEnv
@@ -44,6 +45,8 @@ def check_roll_in_policy(settings: EpisodeSettings) -> str:
     with open_policy(settings.after_policy) as policy:
         load_protocol(PROTOCOL).rules.check_policy(policy.spec)
         if policy.spec.cameras:
+            robot = find_robot(settings.robot).description
+            check_cameras(policy.spec, load_task_config(settings.config), robot, settings.config)
             require_renderer()
         return str(getattr(policy, "describe", dict)().get("weights", ""))
 

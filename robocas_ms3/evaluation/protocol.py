@@ -30,7 +30,9 @@ from robocas_ms3.core.strict_model import MAX_NAME_BYTES, FileName, StrictModel,
 from robocas_ms3.evaluation.bundled_protocols import DESCRIPTIONS, RULES, bundled_protocols
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec
 from robocas_ms3.evaluation.settings import EvaluationSettings
+from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
+from robocas_ms3.scenes.config import TaskConfig
 from robocas_ms3.scenes.config.load import check_no_extends, load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 
@@ -232,14 +234,7 @@ class LoadedProtocol:
         """Raise `EvaluationError` if the configuration of an episode lacks a camera that a policy observes."""
         robot = find_robot(self.rules.robot, usage=False).description
         for config in dict.fromkeys(episode.config for episode in episodes):
-            known = [camera.name for camera in load_task_config(self.config_file(config)).cameras_of(robot)]
-            for name in spec.cameras:
-                if name not in known:
-                    where, expected = f"{self.rules.name}, {config}", f"one of {', '.join(known)}"
-                    fix = did_you_mean(name, known)
-                    raise EvaluationError(
-                        "the policy observes an unknown camera", where=where, expected=expected, found=name, fix=fix
-                    )
+            check_cameras(spec, load_task_config(self.config_file(config)), robot, f"{self.rules.name}, {config}")
 
     def check_same_configuration(self, episodes: Sequence[ProtocolEpisode], fix: str = "") -> None:
         """Raise `EvaluationError` if the episodes have different configurations, so that one batch cannot run them."""
@@ -259,6 +254,15 @@ class LoadedProtocol:
     def training_configs(self) -> list[Path]:
         """Return the paths of the configurations for training; empty if the protocol has none."""
         return sorted(self.folder.glob(f"{TRAIN}/*.yaml"))
+
+
+def check_cameras(spec: PolicySpec, config: TaskConfig, robot: RobotDescription, where: object) -> None:
+    """Raise `EvaluationError` if a configuration lacks a camera that a policy observes."""
+    known = [camera.name for camera in config.cameras_of(robot)]
+    for name in spec.cameras:
+        if name not in known:
+            what, expected = "the policy observes an unknown camera", f"one of {', '.join(known)}"
+            raise EvaluationError(what, where=where, expected=expected, found=name, fix=did_you_mean(name, known))
 
 
 def list_protocol_files(folder: Path) -> list[Path]:

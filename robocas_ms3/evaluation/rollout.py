@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import PolicyError
 from robocas_ms3.core.text import escape_controls
+from robocas_ms3.evaluation.calibration import CameraCalibration
 from robocas_ms3.evaluation.metrics import MEASURES, read_metric
 from robocas_ms3.evaluation.outcomes import Outcome, Retrieval, find_failure_stage
 from robocas_ms3.evaluation.policy import (
@@ -87,6 +88,15 @@ class Rollout:
         )
 
 
+class CameraObservations(NamedTuple):
+    """Observations of the cameras: fields of `Observations` with the same names."""
+
+    images: dict[str, NDArray[np.uint8]]
+    depths: dict[str, NDArray[Any]]
+    intrinsics: dict[str, NDArray[np.float32]]
+    camera_in_base: dict[str, NDArray[np.float32]]
+
+
 @dataclass(frozen=True)
 class EndConditions:
     """Conditions that end an episode.
@@ -129,6 +139,7 @@ class EpisodeBatch:
         self._flags: list[str] = []  # names of the flags in ``info``
         self._held = np.zeros((0, self.num_envs), dtype=bool)  # (flags, N) whether a flag has held
         self._embed = TextEmbedder() if spec.language == "embedding" else None
+        self._calibration: CameraCalibration | None = None  # None before the first reset, or without cameras
 
     def start_episodes(self, pairs: list[tuple[int, EpisodeSpec]]) -> list[EpisodeSpec]:
         """Reset envs to the initial states of episodes, given as (index of the env, episode).
@@ -145,6 +156,8 @@ class EpisodeBatch:
             rest = [seeds[0]] * (self.num_envs - len(seeds))
             self.obs, info = self.env.reset(seed=seeds + rest, options={"reconfigure": True})
         self._info = info
+        if self._spec.cameras and (self._calibration is None or self._spec.calibration == "true"):
+            self._calibration = CameraCalibration(self._spec, self.env.camera_models())
         if not self._flags:
             self._flags = [name for name, value in info.items() if _is_flag(value)]
             self._held = np.zeros((len(self._flags), self.num_envs), dtype=bool)
@@ -161,24 +174,22 @@ class EpisodeBatch:
         """
         obs, spec, index = self.obs, self._spec, np.array(envs)
         agent = obs["agent"]
-        images, depths = self.render_images(index, image_requests)
         starts = [self.running[env].spec for env in envs]
         texts = [start.instruction if spec.language != "none" else "" for start in starts]
         return Observations(
             envs=index,
             instructions=texts,
             embeddings=self._embed(texts) if self._embed else None,
-            images=images,
-            depths=depths,
             robot={name: agent[quantity.name][index] for name, quantity in ROBOT_QUANTITIES.items()},
             state=concatenate_privileged_state(obs["extra"])[index] if spec.state else None,
             simulation=[self._read_simulation_state(env) for env in envs] if spec.simulation_state else None,
+            **self.observe_cameras(index, image_requests)._asdict(),
         )
 
-    def render_images(
+    def observe_cameras(
         self, envs: NDArray[np.int64], image_requests: NDArray[np.bool_] | None = None
-    ) -> tuple[dict[str, NDArray[np.uint8]], dict[str, NDArray[np.int16]]]:
-        """Render the cameras of the policy in E envs; return the images and depths as in `Observations`."""
+    ) -> CameraObservations:
+        """Return the present observations of the cameras of the policy in E envs; arguments as in `observe`."""
         spec, requested = self._spec, envs if image_requests is None else envs[image_requests]
         rendered = self.env.render_images(requested) if spec.cameras and len(requested) else {}
 
@@ -192,7 +203,13 @@ class EpisodeBatch:
                     found[name][image_requests] = rendered[name][kind]
             return found
 
-        return collect("rgb", 3, np.uint8), collect("depth", 1, np.int16) if spec.depth else {}
+        calibration = self._calibration
+        return CameraObservations(
+            images=collect("rgb", 3, np.uint8),
+            depths=collect("depth", 1, np.int16) if spec.depth else {},
+            intrinsics=calibration.select_intrinsics(envs) if calibration else {},
+            camera_in_base=calibration.compute_camera_in_base(envs, self.obs) if calibration else {},
+        )
 
     def step(self, actions: NDArray[np.float32]) -> Iterator[Rollout]:
         """Step all N envs once with actions (N, A) and yield the episodes that end."""

@@ -13,7 +13,7 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.core.errors import EvaluationError, VectorEnvCrashError
@@ -37,7 +37,14 @@ from robocas_ms3.evaluation.policy import (
     forbid_policy_exit,
 )
 from robocas_ms3.evaluation.protocol import ProtocolEpisode, load_protocol
-from robocas_ms3.evaluation.rollout import NOT_FINITE, EndConditions, EpisodeBatch, Rollout, run_rollouts
+from robocas_ms3.evaluation.rollout import (
+    NOT_FINITE,
+    CameraObservations,
+    EndConditions,
+    EpisodeBatch,
+    Rollout,
+    run_rollouts,
+)
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.scenes.config import TaskConfig, load_task_config
 from robocas_ms3.scenes.layout_table import FrozenLayouts
@@ -234,10 +241,10 @@ class EvaluationSession:
         assert self._batch is not None
         return self._batch.obs
 
-    def render_images(self, envs: Sequence[int]) -> tuple[dict[str, NDArray[np.uint8]], dict[str, NDArray[np.int16]]]:
-        """Render the cameras of the policy in E envs; return the images and depths as in `Observations`."""
+    def observe_cameras(self, envs: Sequence[int]) -> CameraObservations:
+        """Return the present observations of the cameras of the policy in E envs, whose episodes may have ended."""
         assert self._batch is not None
-        return self._batch.render_images(np.array(envs))
+        return self._batch.observe_cameras(np.array(envs))
 
     def open_batch(self, episode: ProtocolEpisode, num_envs: int, max_steps: int | None = None) -> EpisodeBatch:
         """Return the open batch of envs if it fits, or open one.

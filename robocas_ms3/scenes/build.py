@@ -16,7 +16,8 @@ from robocas_ms3.assets.spawn import spawn, spawn_articulation
 from robocas_ms3.scenes.config import TaskConfig
 from robocas_ms3.scenes.layout import PARKING_HEIGHT
 from robocas_ms3.scenes.model import SceneModel
-from robocas_ms3.scenes.randomise import draw_camera_shift, draw_finishes, draw_lights
+from robocas_ms3.scenes.placement import Array
+from robocas_ms3.scenes.randomise import draw_finishes, draw_lights
 
 _SHADOW_NEAR = -2.0  # m along the light from the origin; with less, ceiling and walls shade the whole room
 
@@ -89,20 +90,11 @@ def build_lights(scene: ManiSkillScene, config: TaskConfig, seeds: Sequence[int]
         scene.add_directional_light([0, 0, -1], bright, scene_idxs=[i])
 
 
-def shift_cameras(cameras: Sequence[RenderCamera], config: TaskConfig, seeds: Sequence[int]) -> None:
-    """Move and turn the cameras at random, by ``randomisation.cameras`` of the configuration.
-
-    Args:
-        cameras: cameras of the scene. Their order matters, because each index has its own random stream.
-        config: the task configuration.
-        seeds: seed of each sub-scene.
-    """
-    limits = config.randomisation.cameras
-    if limits is None:
-        return
+def shift_cameras(cameras: Sequence[RenderCamera], shifts: Array) -> None:
+    """Move and turn C cameras in N sub-scenes by motions (N, C, 4, 4) in the frames of the cameras."""
     for number, camera in enumerate(cameras):
-        for part, seed in zip(camera._render_cameras, seeds, strict=True):
-            part.local_pose = part.local_pose * sapien.Pose(draw_camera_shift(limits, number, seed))
+        for part, shift in zip(camera._render_cameras, shifts[:, number], strict=True):
+            part.local_pose = part.local_pose * sapien.Pose(shift)
 
 
 def build_objects(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,6 +50,17 @@ def draw_lights(config: TaskConfig, seed: int) -> Lights:
     vector = rng.normal(size=3)
     turn = Rotation.from_rotvec(vector / np.linalg.norm(vector) * rng.uniform() * np.deg2rad(limits.direction_deg))
     return Lights(float(ambient), float(directional), turn.apply(direction))
+
+
+def draw_camera_shifts(config: TaskConfig, cameras: int, seeds: Sequence[int]) -> Array:
+    """Draw the random motions (N, C, 4, 4) of C cameras in their frames, in N sub-scenes with these seeds.
+
+    They are the identity without ``randomisation.cameras``.
+    """
+    limits = config.randomisation.cameras
+    if limits is None:
+        return np.tile(np.eye(4), (len(seeds), cameras, 1, 1))
+    return np.array([[draw_camera_shift(limits, camera, seed) for camera in range(cameras)] for seed in seeds])
 
 
 def draw_camera_shift(limits: CameraRandomisation, camera: int, seed: int) -> Array:

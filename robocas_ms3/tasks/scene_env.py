@@ -19,13 +19,16 @@ from robocas_ms3.assets.pack import LoadedObject, VisualLevel, load_pack
 from robocas_ms3.core.arrays import Array
 from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.core.extensions import import_object
+from robocas_ms3.core.poses import from_wxyz
 from robocas_ms3.robots.agent import MobileManipulator
+from robocas_ms3.robots.camera_models import OPENCV_IN_SAPIEN, CameraModel, find_mount_in_parent
 from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
 from robocas_ms3.scenes import build
 from robocas_ms3.scenes.cache import make_layout_source
 from robocas_ms3.scenes.config import TaskConfig, load_config_for
 from robocas_ms3.scenes.layout import Layout, LayoutSource
 from robocas_ms3.scenes.model import SceneModel
+from robocas_ms3.scenes.randomise import draw_camera_shifts
 from robocas_ms3.scenes.task_specs import TaskSpec
 from robocas_ms3.tasks import engine
 from robocas_ms3.tasks.bodies import BodyStateReader, read_link_poses
@@ -68,6 +71,7 @@ class SceneEnv(BaseEnv):
         is_target: (N, K) bool, whether each object is the target.
         start_poses: (N, K, 7) world poses of the objects at the start of the episode.
         basket_start_poses: (N, 7) world poses of the basket at the start of the episode.
+        camera_shifts: (N, C, 4, 4) random motions of the cameras in their frames (SAPIEN: x forward, y left, z up).
         observes_images: whether observations have images and camera parameters; `render_images` works without.
     """
 
@@ -120,9 +124,9 @@ class SceneEnv(BaseEnv):
     def _setup_sensors(self, options: dict) -> None:
         super()._setup_sensors(options)
         sensors = cast("dict[str, Any]", self._sensors)
-        build.shift_cameras(
-            [sensors[spec.name].camera for spec in self.cameras], self.task_config, self.appearance_seeds
-        )
+        self.camera_shifts = draw_camera_shifts(self.task_config, len(self.cameras), self.appearance_seeds)
+        if self.task_config.randomisation.cameras is not None:
+            build.shift_cameras([sensors[spec.name].camera for spec in self.cameras], self.camera_shifts)
 
     @property
     def appearance_seeds(self) -> list[int]:
@@ -273,6 +277,26 @@ class SceneEnv(BaseEnv):
         """Return the names of all objects in env number ``env``."""
         present = self.layout(env).present
         return {asset.asset.name for asset, used in zip(self.object_assets[env], present, strict=True) if used}
+
+    def camera_models(self) -> list[dict[str, CameraModel]]:
+        """Return the intrinsics and poses of the cameras of each env, by name."""
+        sensors = cast("dict[str, Any]", self._sensors)
+        found: list[dict[str, CameraModel]] = [{} for _ in range(self.num_envs)]
+        for number, spec in enumerate(self.agent.cameras):
+            if spec.name not in sensors:
+                continue
+            sensor = sensors[spec.name]
+            mount = find_mount_in_parent(self.robot_spec, spec.mount)
+            in_parent = mount @ from_wxyz(sensor.config.pose.raw_pose[0])
+            matrices = sensor.camera.get_intrinsic_matrix().cpu().numpy().astype(np.float64)
+            for env, models in enumerate(found):
+                models[spec.name] = CameraModel(
+                    intrinsic=matrices[env][[0, 1, 0, 1], [0, 1, 2, 2]],
+                    camera_in_parent=in_parent @ OPENCV_IN_SAPIEN,
+                    parent=spec.parent,
+                    true_camera_in_parent=in_parent @ self.camera_shifts[env, number] @ OPENCV_IN_SAPIEN,
+                )
+        return found
 
     def render_images(self) -> dict[str, dict[str, torch.Tensor]]:
         """Render the present state of all envs; return camera -> kind, such as ``rgb`` -> (N, H, W, C)."""

@@ -93,6 +93,8 @@ def as_v0(root, pose_name="cam_pos_wrt"):
         path.unlink()
     for path in root.glob("episode_*"):
         change(path, **dict.fromkeys(("agv_pose", "rel_agv_pose", "language_embedding", "step_goal_embs")))
+    for path in root.glob("*/*/true_cam_pose*"):
+        path.unlink()
     for path in root.glob("*/*/cam_pos*"):
         if not path.name.startswith(pose_name):
             path.unlink()

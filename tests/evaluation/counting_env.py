@@ -10,9 +10,10 @@ from robocas_ms3.core.errors import VectorEnvCrashError
 from robocas_ms3.evaluation.metrics import SUMS
 from robocas_ms3.evaluation.policy import EpisodeSpec, Policy
 from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, Rollout, run_rollouts
+from robocas_ms3.robots.camera_models import CameraModel
 
 BREAKS = 13.0  # an action with this number raises
-_POSE = [1, 2, 3, 0.4, 0.1, 0.2, 0.3]  # m; quaternion wxyz
+POSE = [1, 2, 3, 0.4, 0.1, 0.2, 0.3]  # m; quaternion wxyz
 
 
 class CountingEnv:
@@ -53,13 +54,23 @@ class CountingEnv:
         pixels = np.tile(self.elapsed[envs, None, None, None] + 1, (1, 4, 6, 3)).astype(np.uint8)
         return {"base_camera": {"rgb": pixels, "depth": pixels[..., :1].astype(np.int16) * 100}}
 
+    def camera_models(self) -> list[dict[str, CameraModel]]:
+        """Return a gripper camera 10 cm above the TCP; the true pose is shifted by the index of the env along x."""
+        found = []
+        for env in range(self.num_envs):
+            nominal, true = np.eye(4), np.eye(4)
+            nominal[2, 3] = true[2, 3] = -0.1
+            true[0, 3] = env
+            found.append({"base_camera": CameraModel(np.array([2.0, 2.0, 3.0, 2.0]), nominal, "ee", true)})
+        return found
+
     def close(self) -> None:
         self.closed = True
 
     def _observation(self) -> dict[str, Any]:
         count = self.num_envs
         qpos = np.tile(np.arange(12, dtype=np.float32) + 10, (count, 1))
-        tcp = np.tile(np.array(_POSE, np.float32), (count, 1))
+        tcp = np.tile(np.array(POSE, np.float32), (count, 1))
         width = np.full((count, 1), 0.05, np.float32)
         return {
             "agent": {"qpos": qpos, "qvel": qpos, "tcp_in_arm_base": tcp, "gripper_width": width},

@@ -60,7 +60,9 @@ def here(tmp_path, monkeypatch):
 
 def test_invalid_specifications_name_the_field():
     assert policy_spec_to_dict(PolicySpec(simulation_state=True))["simulation_state"] is True
-    for wrong in ({"convention": "words"}, {"language": "loud"}, {"reference": "me"}):
+    assert policy_spec_to_dict(PolicySpec(calibration="true"))["calibration"] == "true"
+    assert not {"calibration", "simulation_state"} & policy_spec_to_dict(PolicySpec()).keys()  # defaults
+    for wrong in ({"convention": "words"}, {"language": "loud"}, {"reference": "me"}, {"calibration": "exact"}):
         with pytest.raises(EvaluationError) as error:
             PolicySpec(**wrong)
         assert error.value.where == next(iter(wrong))

@@ -20,10 +20,18 @@ from robocas_ms3.demos.recordings.trajectory_file import TrajectoryFile
 from robocas_ms3.demos.recordings.trajectory_json import read_json
 from robocas_ms3.demos.settings import EpisodeSettings, ReplaySettings
 from robocas_ms3.demos.trajectory_replay import replay
+from robocas_ms3.evaluation.policies.plain import NoopPolicy
 from robocas_ms3.evaluation.policies.replay import ReplayPolicy
+from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.policy_rollin import PolicyRollIn, check_roll_in_policy, sample_roll_in_steps
 
 CONFIG = "pick_upstream_eval"
+
+
+class SidePolicy(NoopPolicy):
+    """Policy that observes a camera that the configuration lacks."""
+
+    spec = PolicySpec(reference="tcp", cameras={"side_camera": (64, 48)})
 
 
 def settings(policy: str, steps: tuple[int, int]) -> EpisodeSettings:
@@ -71,6 +79,8 @@ def test_number_of_steps_is_drawn_from_the_seed_with_both_ends():
 def test_weights_have_a_hash_and_unsupported_actions_are_an_error():
     with pytest.raises(EvaluationError, match="joint_positions"):
         check_roll_in_policy(settings("scripted", (5, 60)))
+    with pytest.raises(EvaluationError, match="unknown camera.*side_camera"):
+        check_roll_in_policy(settings(f"{__name__}:SidePolicy", (5, 60)))
     assert check_roll_in_policy(settings("random", (5, 60))) == ""
     assert check_roll_in_policy(settings("small", (5, 60))) == hash_weights(BUNDLED / "small")
 

@@ -10,7 +10,8 @@ import h5py
 import numpy as np
 
 from robocas_ms3.datasets.images.image_files import ImageOptions, compute_bounding_box
-from robocas_ms3.datasets.sources.episode_source import CameraModel, StepImages
+from robocas_ms3.datasets.sources.episode_source import StepImages
+from robocas_ms3.robots.camera_models import CameraModel
 from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES, standard_camera_parent
 from robocas_ms3.robots.description import MOBILE_PANDA
 
@@ -68,7 +69,9 @@ class RayCaster:
 
     def cameras(self):
         return {
-            name: CameraModel(self.intrinsic(), CAMERA_IN_PARENT[name], standard_camera_parent(name))
+            name: CameraModel(
+                self.intrinsic(), CAMERA_IN_PARENT[name], standard_camera_parent(name), CAMERA_IN_PARENT[name]
+            )
             for name in self.image_options.cameras
         }
 

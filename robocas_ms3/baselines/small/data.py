@@ -181,7 +181,7 @@ class SmallSamples:
             self._check_calibration(camera, found, episode.where)
             projections[camera] = partial(
                 project_points_to_view,
-                camera_in_parent=episode.camera_in_parent(camera),
+                camera_in_parent=episode.true_camera_in_parent(camera),
                 intrinsic=episode.intrinsic(camera),
                 stored_size=sizes[camera],
                 view=view,

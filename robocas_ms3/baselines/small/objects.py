@@ -108,7 +108,7 @@ def read_calibration(
         stored_size: width and height of the images in the dataset, pixels.
         view: view of the camera.
     """
-    mount, parent = episode.camera_in_parent(camera), episode.camera_parent(camera)
+    mount, parent = episode.true_camera_in_parent(camera), episode.camera_parent(camera)
     if parent == "world":
         mount = inverse(_base_poses(arrays))[0] @ mount
     left, top, right, bottom = np.array(view.crop_box()) / np.tile(view.image_size, 2)

@@ -7,7 +7,8 @@ The file ``candidates_images.h5`` has a group per camera with D rows, one per de
     base_camera/depth           (B,) as `rgb`, 16 bit, mm, 0 = no depth
     base_camera/depth_ends      (D,) as `rgb_ends`
     base_camera/intrinsic       (D, 4) fx, fy, cx, cy in pixels
-    base_camera/camera_in_base  (D, 4, 4) pose of the OpenCV camera frame in the arm's base frame
+    base_camera/camera_in_base  (D, 4, 4) nominal pose of the OpenCV camera frame in the arm's base frame
+    base_camera/true_camera_in_base  (D, 4, 4) the same with the random motion of the camera
 
 The attribute ``decisions`` identifies the decisions that are shown; see `hash_decisions`. Arrays of variable length
 would be shorter to read, but HDF5 may crash when it reads damaged ones.
@@ -37,8 +38,9 @@ from robocas_ms3.demos.candidates.candidates_file import FILE_NAME, CandidateFil
 from robocas_ms3.demos.recordings.trajectory_hdf5 import check_links
 from robocas_ms3.robots.cameras import CAMERA_NAME
 
-FORMAT, VERSION = "robocas-candidate-images", 1
+FORMAT, VERSION = "robocas-candidate-images", 2
 """Attributes ``format`` and ``version`` of the file."""
+_POSES = ("camera_in_base", "true_camera_in_base")
 _RENDER = "Render the images with robocas render-candidates."
 _RENDER_AGAIN = "Render the images again: robocas render-candidates --overwrite."
 
@@ -51,13 +53,15 @@ class CameraImages:
         rgb: PNG of the RGB image per decision.
         depth: PNG of the depth image per decision; empty without depth.
         intrinsic: (N, 4) fx, fy, cx, cy in pixels.
-        camera_in_base: (N, 4, 4) pose of the OpenCV camera frame in the arm's base frame.
+        camera_in_base: (N, 4, 4) nominal pose of the OpenCV camera frame in the arm's base frame, as configured.
+        true_camera_in_base: (N, 4, 4) the same with the random motion of the camera.
     """
 
     rgb: list[bytes]
     depth: list[bytes]
     intrinsic: NDArray[np.float32]
     camera_in_base: NDArray[np.float32]
+    true_camera_in_base: NDArray[np.float32]
 
 
 def images_path(candidates: Path) -> Path:
@@ -94,7 +98,8 @@ def create_datasets(file: h5py.File, rows: int, sizes: Mapping[str, int]) -> Non
         file.create_dataset(f"{name}_ends", (rows,), np.int64)
     for camera in dict.fromkeys(name.split("/")[0] for name in sizes):
         file.create_dataset(f"{camera}/intrinsic", (rows, 4), np.float32)
-        file.create_dataset(f"{camera}/camera_in_base", (rows, 4, 4), np.float32)
+        for name in _POSES:
+            file.create_dataset(f"{camera}/{name}", (rows, 4, 4), np.float32)
 
 
 def write_images(file: h5py.File, first: int, images: Mapping[str, CameraImages]) -> None:
@@ -102,7 +107,8 @@ def write_images(file: h5py.File, first: int, images: Mapping[str, CameraImages]
     for camera, found in images.items():
         group: Any = file[camera]
         rows = slice(first, first + len(found.rgb))
-        group["intrinsic"][rows], group["camera_in_base"][rows] = found.intrinsic, found.camera_in_base
+        for name in ("intrinsic", *_POSES):
+            group[name][rows] = getattr(found, name)
         for kind in IMAGE_KINDS:
             if files := getattr(found, kind):
                 start = int(group[f"{kind}_ends"][first - 1]) if first else 0
@@ -119,7 +125,7 @@ def read_images(file: h5py.File) -> dict[str, CameraImages]:
         rgb, depth = (
             [_read_png(group, kind, row).tobytes() for row in rows] if kind in group else [] for kind in IMAGE_KINDS
         )
-        images[camera] = CameraImages(rgb, depth, group["intrinsic"][:], group["camera_in_base"][:])
+        images[camera] = CameraImages(rgb, depth, group["intrinsic"][:], *(group[name][:] for name in _POSES))
     return images
 
 
@@ -198,8 +204,12 @@ class CandidateImages:
         return self._read(row, camera, "intrinsic")
 
     def camera_in_base(self, row: int, camera: str) -> NDArray[np.float64]:
-        """Return the pose (4, 4) of the OpenCV camera frame in the arm's base frame."""
+        """Return the nominal pose (4, 4) of the OpenCV camera frame in the arm's base frame, as configured."""
         return self._read(row, camera, "camera_in_base")
+
+    def true_camera_in_base(self, row: int, camera: str) -> NDArray[np.float64]:
+        """Return the pose (4, 4) of the OpenCV camera frame with its random motion in the arm's base frame."""
+        return self._read(row, camera, "true_camera_in_base")
 
     def _decode(self, row: int, camera: str, kind: ImageKind) -> NDArray[Any]:
         self._check_camera(camera)

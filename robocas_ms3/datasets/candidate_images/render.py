@@ -18,13 +18,11 @@ from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError, OutputExistsError
 from robocas_ms3.core.files import atomic_file
 from robocas_ms3.core.locks import lock_folder
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
-from robocas_ms3.core.poses import inverse
 from robocas_ms3.core.workers import WorkerPool, use_one_torch_thread
 from robocas_ms3.datasets.candidate_images.images_file import (
     CameraImages,
@@ -42,16 +40,16 @@ from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.images.png import encode_png
 from robocas_ms3.datasets.schema import IMAGE_KINDS
 from robocas_ms3.demos.candidates.candidates_file import CandidateFile
-from robocas_ms3.demos.recordings.motion import Motion
 from robocas_ms3.demos.recordings.trajectory_file import Recording
 from robocas_ms3.demos.recordings.trajectory_hdf5 import open_reserved, write_hdf5
+from robocas_ms3.robots.camera_models import find_parent_in_base
 
 if TYPE_CHECKING:
     from robocas_ms3.datasets.conversion.env_renderer import EnvRenderer
 
 _FOLDER = FolderKind("robocas render-candidates", ("settings.json",), "decisions")
 _CONTROL_MODE = "pd_joint_pos"  # of recordings; the images do not depend on it
-_ROW_BYTES, _MARGIN_BYTES = 128, 2**13  # for positions and poses per row, and for the structure of the merged file
+_ROW_BYTES, _MARGIN_BYTES = 192, 2**13  # for positions and poses per row, and for the structure of the merged file
 
 Rows = tuple[int, int]
 """First row of the decisions of a seed, and the row after the last one."""
@@ -212,24 +210,21 @@ def render_loaded(renderer: EnvRenderer, recording: Recording, options: ImageOpt
         for images, encoded in ((step.rgb, rgb), (step.depth, depth)):
             for name, image in images.items():
                 encoded[name].append(encode_png(image))
-    motion = recording.compute_motion(samples)
+    motion, models = recording.compute_motion(samples), renderer.cameras()
+    parents = {
+        name: find_parent_in_base(model.parent, motion.tcp_in_base, motion.arm_base_in_world)
+        for name, model in models.items()
+    }
     return {
         name: CameraImages(
             rgb=rgb[name],
             depth=depth[name],
             intrinsic=np.tile(model.intrinsic, (len(samples), 1)).astype(np.float32),
-            camera_in_base=(_find_parent_in_base(model.parent, motion) @ model.camera_in_parent).astype(np.float32),
+            camera_in_base=(parents[name] @ model.camera_in_parent).astype(np.float32),
+            true_camera_in_base=(parents[name] @ model.true_camera_in_parent).astype(np.float32),
         )
-        for name, model in renderer.cameras().items()
+        for name, model in models.items()
     }
-
-
-def _find_parent_in_base(parent: str, motion: Motion) -> NDArray[np.float64]:
-    """Return the pose (T, 4, 4) of the parent frame of a camera in the arm's base frame."""
-    if parent == "ee":
-        return motion.tcp_in_base
-    world_in_base = inverse(motion.arm_base_in_world)
-    return np.broadcast_to(np.eye(4), world_in_base.shape) if parent == "arm_base" else world_in_base
 
 
 def _merge_parts(parts: Mapping[Rows, Path], out: Path, decisions: str) -> None:

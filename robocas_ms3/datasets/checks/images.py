@@ -35,7 +35,10 @@ ReadHeader = Callable[[Path], ImageHeader | None]
 
 
 def check_cameras(folder: Path, image_options: ImageOptions) -> Iterator[Violation]:
-    """Check that each camera has valid intrinsics and pose files, and that there are no other cameras."""
+    """Check that each camera has valid intrinsics and poses, and that there are no other cameras.
+
+    The file of the true pose may be missing.
+    """
     for camera in schema.camera_names(folder):
         if camera not in image_options.cameras:
             expected = f"the cameras listed in {schema.CONVERSION_FILE}"
@@ -43,7 +46,9 @@ def check_cameras(folder: Path, image_options: ImageOptions) -> Iterator[Violati
     for camera in image_options.cameras:
         poses: list[NDArray] = []
         pose_files = schema.pose_files(schema.camera_parent(folder / camera))
-        for name in (schema.INTRINSIC_FILE, *pose_files):
+        true_pose = schema.true_pose_file(schema.camera_parent(folder / camera))
+        optional = [true_pose] if (folder / camera / true_pose).exists() else []
+        for name in (schema.INTRINSIC_FILE, *pose_files, *optional):
             file = f"{folder.name}/{camera}/{name}"
             try:
                 found = load_npy(folder / camera / name, CAMERA_LIMIT)
@@ -53,7 +58,7 @@ def check_cameras(folder: Path, image_options: ImageOptions) -> Iterator[Violati
             except DAMAGED_FILE_ERRORS as error:
                 yield Violation(file, "", "a numpy array", one_line(error))
                 continue
-            wrong = list(check_camera_array(file, found, pose=name in pose_files))
+            wrong = list(check_camera_array(file, found, pose=name != schema.INTRINSIC_FILE))
             yield from wrong
             poses += [found] if name in pose_files and not wrong else []
         if len(poses) == 2 and not np.allclose(poses[0], poses[1], atol=1e-6):
@@ -130,13 +135,14 @@ def check_depth(folder: Path, stored: EpisodeArrays, image_options: ImageOptions
     base = from_xyzw(arrays["base_pos"], arrays["base_orn"])
     ee = base @ from_xyzw(arrays["ee_pos"], arrays["ee_orn"])
     parent_of: dict[str, Parent] = {camera: schema.camera_parent(folder / camera) for camera in image_options.cameras}
-    cameras = {
-        camera: [
+    cameras = {}
+    for camera, parent in parent_of.items():
+        true_pose = schema.true_pose_file(parent)
+        pose_file = true_pose if (folder / camera / true_pose).exists() else schema.pose_files(parent)[0]
+        cameras[camera] = [
             np.asarray(load_npy(folder / camera / name, CAMERA_LIMIT), np.float64)
-            for name in (schema.INTRINSIC_FILE, schema.pose_files(parent)[0])
+            for name in (schema.INTRINSIC_FILE, pose_file)
         ]
-        for camera, parent in parent_of.items()
-    }
     steps = sorted({round(step) for step in np.linspace(0, stored.steps - 1, _DEPTH_STEPS)})
     views: list[list[geometry.DepthView]] = []
     for step in steps:

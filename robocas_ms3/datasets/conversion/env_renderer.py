@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.poses import inverse
 from robocas_ms3.datasets.images.image_files import Box, ImageOptions, compute_bounding_box
-from robocas_ms3.datasets.sources.episode_source import CameraModel, StepImages
+from robocas_ms3.datasets.sources.episode_source import StepImages
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.trajectory_file import Recording
+from robocas_ms3.robots.camera_models import CameraModel
 
 _SAME_PLACE = 1e-3  # m
 
@@ -101,23 +101,8 @@ class EnvRenderer:
         return {name: box for name, mask in masks.items() if (box := compute_bounding_box(mask)) is not None}
 
     def cameras(self) -> dict[str, CameraModel]:
-        """Return intrinsics and pose of each rendered camera at the last rendered state, by name."""
-        agent = self._base.agent
-        parents = {"ee": agent.tcp.pose, "arm_base": agent.arm_base_link.pose}
-        models = {}
-        for spec in self._base.cameras:
-            if spec.name not in self._image_options.cameras:
-                continue
-            camera = self._base.scene.sensors[spec.name].camera
-            world_in_camera = np.vstack([camera.get_extrinsic_matrix()[0].cpu().numpy(), [0, 0, 0, 1]])
-            parent_in_world = _pose_matrix(parents[spec.parent]) if spec.parent in parents else np.eye(4)
-            k = camera.get_intrinsic_matrix()[0].cpu().numpy().astype(np.float64)
-            models[spec.name] = CameraModel(
-                intrinsic=np.array([k[0, 0], k[1, 1], k[0, 2], k[1, 2]]),
-                camera_in_parent=inverse(parent_in_world) @ inverse(world_in_camera.astype(np.float64)),
-                parent=spec.parent,
-            )
-        return models
+        """Return intrinsics and poses of each rendered camera in the loaded scene, by name."""
+        return self._base.camera_models()[0]
 
     def scene(self) -> dict[str, Any]:
         """Return task, configuration, layout and objects of the scene, as in ``scene.json``."""
@@ -178,7 +163,3 @@ def _convert_segmentation(textures: dict[str, torch.Tensor], shader: ShaderConfi
     """Convert the textures of a camera to the id of the actor or link per pixel (H, W), 0 = none."""
     name = next(name for name, kinds in shader.texture_names.items() if "segmentation" in kinds)
     return shader.texture_transforms[name](textures[name])["segmentation"][0, ..., 0].cpu().numpy()
-
-
-def _pose_matrix(pose: Any) -> NDArray[np.float64]:
-    return pose.to_transformation_matrix()[0].cpu().numpy().astype(np.float64)

@@ -24,7 +24,8 @@ from robocas_ms3.datasets.images.image_headers import check_file_ends
 from robocas_ms3.datasets.images.preview_frames import EpisodeDrawer
 from robocas_ms3.datasets.images.video import open_preview
 from robocas_ms3.datasets.sources.arrays import add_embeddings, read_arrays
-from robocas_ms3.datasets.sources.episode_source import CameraModel, StepImages
+from robocas_ms3.datasets.sources.episode_source import StepImages
+from robocas_ms3.robots.camera_models import CameraModel
 
 ENCODERS = 2  # threads; libdeflate and OpenCV release the GIL
 _MAX_WAITING = 24  # images, to bound memory
@@ -82,6 +83,7 @@ def write_episode_files(
         np.save(folder / camera / schema.INTRINSIC_FILE, model.intrinsic)
         for name in schema.pose_files(model.parent):
             np.save(folder / camera / name, model.camera_in_parent)
+        np.save(folder / camera / schema.true_pose_file(model.parent), model.true_camera_in_parent)
     np.savez(folder / schema.EPISODE_FILE, **arrays)  # pyright: ignore[reportArgumentType]
     text = encode_json(dict(scene), folder, indent=1, error=DatasetError)
     (folder / schema.SCENE_FILE).write_text(text + "\n", encoding="utf-8")

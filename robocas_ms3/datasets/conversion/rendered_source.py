@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.images.image_files import ImageOptions
-from robocas_ms3.datasets.sources.episode_source import CameraModel, StepImages
+from robocas_ms3.datasets.sources.episode_source import StepImages
 from robocas_ms3.datasets.sources.provenance import make_entry_without_fingerprint, make_recording_entry, make_scene
 from robocas_ms3.datasets.sources.trajectory import RecordedEpisode, TrajectorySource
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.motion import sample_states
 from robocas_ms3.demos.recordings.trajectory_file import Recording, TrajectoryFile
+from robocas_ms3.robots.camera_models import CameraModel
 
 if TYPE_CHECKING:
     from robocas_ms3.datasets.conversion.env_renderer import EnvRenderer

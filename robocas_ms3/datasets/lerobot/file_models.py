@@ -25,8 +25,8 @@ from robocas_ms3.core.text import one_line
 from robocas_ms3.datasets.lerobot import schema
 from robocas_ms3.datasets.lerobot.tables import INTEGER, INTEGERS, NUMBER, NUMBERS, TEXT, TEXTS, Column
 from robocas_ms3.datasets.lerobot.variants import CHUNK_FILES, LAYOUTS
-from robocas_ms3.datasets.sources.episode_source import CameraModel
 from robocas_ms3.datasets.sources.file_models import EntryRecord
+from robocas_ms3.robots.camera_models import CameraModel
 from robocas_ms3.robots.cameras import Parent, standard_camera_parent
 
 MAX_EPISODES = 10**6
@@ -163,12 +163,22 @@ class CameraRecord(_Record):
     intrinsic: _Four
     camera_in_parent: Annotated[list[_Four], Field(min_length=4, max_length=4)]
     parent: Parent | None = Field(default=None, description="None: parent frame of the standard camera with this name")
+    true_camera_in_parent: Annotated[list[_Four], Field(min_length=4, max_length=4)] | None = Field(
+        default=None, description="None: as camera_in_parent"
+    )
 
     @classmethod
     def from_model(cls, name: str, model: CameraModel) -> CameraRecord:
-        intrinsic, pose = (np.asarray(array).tolist() for array in (model.intrinsic, model.camera_in_parent))
-        parent = None if model.parent == standard_camera_parent(name) else model.parent
-        return cls(intrinsic=intrinsic, camera_in_parent=pose, parent=parent)
+        intrinsic, pose, true_pose = (
+            np.asarray(array).tolist()
+            for array in (model.intrinsic, model.camera_in_parent, model.true_camera_in_parent)
+        )
+        return cls(
+            intrinsic=intrinsic,
+            camera_in_parent=pose,
+            parent=None if model.parent == standard_camera_parent(name) else model.parent,
+            true_camera_in_parent=None if true_pose == pose else true_pose,
+        )
 
 
 class CamerasRecord(RootModel[dict[Name, CameraRecord]]):

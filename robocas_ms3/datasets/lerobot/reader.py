@@ -194,6 +194,10 @@ class LeRobotEpisode(SourceEpisode):
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
         return np.array(self._camera(camera).camera_in_parent)
 
+    def true_camera_in_parent(self, camera: str) -> NDArray[np.float64]:
+        record = self._camera(camera)
+        return np.array(record.true_camera_in_parent or record.camera_in_parent)
+
     def camera_parent(self, camera: str) -> Parent:
         return self._camera(camera).parent or standard_camera_parent(camera)
 

@@ -30,9 +30,9 @@ from robocas_ms3.datasets.manage.copy_episodes import (
 from robocas_ms3.datasets.manage.repairs import EMBEDDINGS, ImportedEpisode
 from robocas_ms3.datasets.manage.survey import Survey, read_data_info, read_imported_episode
 from robocas_ms3.datasets.sources.arrays import SPECS, EpisodeArrays, add_embeddings
-from robocas_ms3.datasets.sources.episode_source import CameraModel
 from robocas_ms3.datasets.sources.file_models import SCENE_KEYS, EpisodesRecord
 from robocas_ms3.datasets.sources.reader import Dataset, Episode
+from robocas_ms3.robots.camera_models import CameraModel
 
 Embed = Callable[[list[str]], NDArray[np.float32]]
 REPORT_FILE = "import_report.json"
@@ -113,11 +113,15 @@ def _write_episode(folder: Path, source: Episode, episode: ImportedEpisode, surv
     cameras: dict[str, CameraModel] = {}
     for camera in image_options.cameras:
         model = source.camera(camera)
-        pose = np.asarray(model.camera_in_parent, dtype=np.float64)
-        if model.parent == "ee" and episode.eef_rotation_deg:
-            back = Rotation.from_euler("z", -episode.eef_rotation_deg, degrees=True).as_matrix()
-            pose = np.vstack([back @ pose[:3], pose[3]])
-        cameras[camera] = CameraModel(np.asarray(model.intrinsic, dtype=np.float64), pose, model.parent)
+        back = np.eye(4)
+        if model.parent == "ee":
+            back[:3, :3] = Rotation.from_euler("z", -episode.eef_rotation_deg, degrees=True).as_matrix()
+        cameras[camera] = CameraModel(
+            np.asarray(model.intrinsic, dtype=np.float64),
+            back @ np.asarray(model.camera_in_parent, dtype=np.float64),
+            model.parent,
+            back @ np.asarray(model.true_camera_in_parent, dtype=np.float64),
+        )
         for kind in image_options.kinds:
             (folder / camera / kind).mkdir(parents=True)
             for step in range(stored.steps):

@@ -206,9 +206,16 @@ def _check_files(episode: ImportedEpisode, source: Episode) -> None:
             episode.add_finding(_make_read_violation(f"{name}/{camera}", "intrinsics and a pose", error), "skipped")
             continue
         intrinsic = f"{name}/{camera}/{schema.INTRINSIC_FILE}"
+        poses = {f"{name}/{camera}": model.camera_in_parent}
+        if (source.folder / camera / schema.true_pose_file(model.parent)).is_file():
+            poses[f"{name}/{camera}/{schema.true_pose_file(model.parent)}"] = model.true_camera_in_parent
         for wrong in (
             *check_camera_array(intrinsic, model.intrinsic.astype(np.float64), pose=False),
-            *check_camera_array(f"{name}/{camera}", model.camera_in_parent.astype(np.float64), pose=True),
+            *(
+                wrong
+                for file, pose in poses.items()
+                for wrong in check_camera_array(file, pose.astype(np.float64), pose=True)
+            ),
         ):
             episode.add_finding(wrong, "skipped")
         files = schema.pose_files(model.parent)

@@ -18,31 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.poses import from_xyzw
 from robocas_ms3.datasets.actions import compute_action_space
 from robocas_ms3.datasets.images.image_files import Box, ImageOptions
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.demos.recordings.subgoals import SubGoal, group_subgoals
+from robocas_ms3.robots.camera_models import CameraModel, find_parent_in_base
 from robocas_ms3.robots.cameras import Parent, standard_camera_parent
 
 Split = Literal["train", "val", "all"]
 """Name of a split: training or validation episodes, or all."""
 ImageKind = Literal["rgb", "depth"]
 """Kind of image."""
-
-
-@dataclass(frozen=True)
-class CameraModel:
-    """Intrinsics and pose of a camera.
-
-    Attributes:
-        intrinsic: (4,) fx, fy, cx, cy in pixels.
-        camera_in_parent: (4, 4) pose of the OpenCV camera frame in the parent frame.
-        parent: parent frame: the EEF, the arm base or the world.
-    """
-
-    intrinsic: NDArray[np.float64]
-    camera_in_parent: NDArray[np.float64]
-    parent: Parent
 
 
 @dataclass(frozen=True)
@@ -152,16 +139,35 @@ class SourceEpisode(ABC):
         raise _make_no_images_error(self)
 
     def camera_in_parent(self, camera: str) -> NDArray[np.float64]:
-        """Return the pose (4, 4) of the OpenCV camera frame in its parent frame."""
+        """Return the nominal pose (4, 4) of the OpenCV camera frame in its parent frame, as configured."""
         raise _make_no_images_error(self)
+
+    def true_camera_in_parent(self, camera: str) -> NDArray[np.float64]:
+        """Return the pose (4, 4) of the camera with its random motion; default: the nominal pose."""
+        return self.camera_in_parent(camera)
+
+    def camera_in_base(self, camera: str) -> NDArray[np.float64]:
+        """Return the nominal poses (T, 4, 4) of the OpenCV camera frame in the arm's base frame."""
+        arrays = self.read(("ee_pos", "ee_orn", "base_pos", "base_orn"))
+        ee, base = (
+            from_xyzw(arrays[f"{name}_pos"].astype(np.float64), arrays[f"{name}_orn"].astype(np.float64))
+            for name in ("ee", "base")
+        )
+        model = self.camera(camera)
+        return find_parent_in_base(model.parent, ee, base) @ model.camera_in_parent
 
     def camera_parent(self, camera: str) -> Parent:
         """Return the parent frame of the camera pose; default: as for the standard camera with this name."""
         return standard_camera_parent(camera)
 
     def camera(self, name: str) -> CameraModel:
-        """Return the intrinsics and the pose of a camera."""
-        return CameraModel(self.intrinsic(name), self.camera_in_parent(name), self.camera_parent(name))
+        """Return the intrinsics and the poses of a camera."""
+        return CameraModel(
+            self.intrinsic(name),
+            self.camera_in_parent(name),
+            self.camera_parent(name),
+            self.true_camera_in_parent(name),
+        )
 
 
 def _make_no_images_error(episode: SourceEpisode) -> DatasetError:

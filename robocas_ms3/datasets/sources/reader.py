@@ -139,6 +139,10 @@ class Episode(SourceEpisode):
                 return read_array(self.folder / camera / name)
         raise DatasetError("missing pose of a camera", where=self.folder / camera, expected=" or ".join(names))
 
+    def true_camera_in_parent(self, camera: str) -> NDArray[np.float64]:
+        path = self.folder / camera / schema.true_pose_file(self.camera_parent(camera))
+        return read_array(path) if path.is_file() else self.camera_in_parent(camera)
+
     def camera_parent(self, camera: str) -> Parent:
         return schema.camera_parent(self.folder / camera)
 

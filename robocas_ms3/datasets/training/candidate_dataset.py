@@ -86,7 +86,7 @@ class CandidateDataset(torch.utils.data.Dataset):
     ``rgb``                (M, 3, h, w) uint8, of M cameras in the given order
     ``depth``              (M, h, w)    m along the optical axis, 0 = no depth
     ``intrinsic``          (M, 4)       fx, fy, cx, cy in pixels of the scaled image
-    ``camera_pose``        (M, 4, 4)    pose of each OpenCV camera frame
+    ``camera_in_base``     (M, 4, 4)    nominal pose of each OpenCV camera frame
     ``mask``               (C,)         bool, False = padding
     ``primitive``          (C,)         int64, index in `demos.candidates.schema.PRIMITIVES`
     ``slot``               (C,)         int64, slot of the moved object; -1 also for a pull
@@ -287,7 +287,7 @@ def _read_images(images: CandidateImages, row: int, options: CandidateOptions) -
     arrays = {
         "rgb": np.stack([resize_image(image, size).transpose(2, 0, 1) for image in found]),
         "intrinsic": intrinsic.astype(np.float32),
-        "camera_pose": np.stack([images.camera_in_base(row, camera) for camera in cameras]).astype(np.float32),
+        "camera_in_base": np.stack([images.camera_in_base(row, camera) for camera in cameras]).astype(np.float32),
     }
     if options.depth:
         depth = np.stack([resize_image(images.depth(row, camera), size) for camera in cameras])

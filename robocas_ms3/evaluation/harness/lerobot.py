@@ -11,8 +11,8 @@ from lerobot.configs import FeatureType, PolicyFeature  # pyright: ignore[report
 from lerobot.envs import EnvConfig  # pyright: ignore[reportMissingImports]
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.harness.proprioception import KEYS, WIDTHS, depth_key
-from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec, Reference
+from robocas_ms3.evaluation.harness.proprioception import CALIBRATION_SHAPES, KEYS, WIDTHS, depth_key
+from robocas_ms3.evaluation.policy import CONVENTIONS, Calibration, PolicySpec, Reference
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES
 
@@ -30,7 +30,7 @@ class RoboCASEnvConfig(EnvConfig):
         cameras: names separated by commas. LeRobot records videos of the first camera.
         observation_width, observation_height: size of the images of each camera, pixels.
         depth: add the depth of each camera as ``observation.images.CAMERA_depth``, (1, H, W) float32 in mm.
-        convention, reference: as in `PolicySpec` (docs/evaluation.md).
+        convention, reference, calibration: as in `PolicySpec` (docs/evaluation.md).
         backend: where the simulation runs: ``processes``, ``gpu`` or ``auto`` (a GPU if there is one).
         results: folder for results that `robocas eval report` reads, one subfolder per task; None: no results.
         policy_name: name of the policy in these results.
@@ -46,6 +46,7 @@ class RoboCASEnvConfig(EnvConfig):
     depth: bool = False
     convention: str = "robocas"
     reference: str = "tcp"
+    calibration: str = "nominal"
     backend: str = "auto"
     results: str | None = None
     policy_name: str = "lerobot"
@@ -58,16 +59,18 @@ class RoboCASEnvConfig(EnvConfig):
         visual, state = FeatureType.VISUAL, FeatureType.STATE
         images = [f"observation.images.{camera}" for camera in spec.cameras]
         depths = [depth_key(camera) for camera in spec.cameras] if self.depth else []
+        calibration = {key(camera): shape for key, shape in CALIBRATION_SHAPES.items() for camera in spec.cameras}
         self.features = {
             "action": PolicyFeature(FeatureType.ACTION, (CONVENTIONS[self.convention].size,)),
             **{name: PolicyFeature(state, (size,)) for name, size in WIDTHS.items()},
+            **{name: PolicyFeature(state, shape) for name, shape in calibration.items()},
             **{name: PolicyFeature(visual, (height, width, 3)) for name in images},
             **{name: PolicyFeature(visual, (height, width, 1)) for name in depths},
         }
         self.features_map = {
             **{name: name for name in ("action", *images)},
             **KEYS,
-            **{name: f"observation.{name}" for name in depths},
+            **{name: f"observation.{name}" for name in (*calibration, *depths)},
         }
 
     @property
@@ -75,7 +78,15 @@ class RoboCASEnvConfig(EnvConfig):
         """Return the policy specification of these settings."""
         size = (self.observation_width, self.observation_height)
         cameras = dict.fromkeys(_split_names(self.cameras, "env.cameras"), size)
-        return PolicySpec(self.convention, cast(Reference, self.reference), self.fps, cameras, depth=self.depth)
+        calibration = cast(Calibration, self.calibration)
+        return PolicySpec(
+            self.convention,
+            cast(Reference, self.reference),
+            self.fps,
+            cameras,
+            depth=self.depth,
+            calibration=calibration,
+        )
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Robot state in observations of LeRobot environments, with the columns of our LeRobot datasets."""
+"""Robot state in observations of LeRobot environments, with the columns of our LeRobot datasets; keys of cameras."""
 
 from __future__ import annotations
 
@@ -26,6 +26,20 @@ _YAW = feature_columns(STATE)["agv_pose"].stop - 1  # in agent_pos
 def depth_key(camera: str) -> str:
     """Return the key of the depth image of a camera in observations, to which LeRobot adds ``observation.``."""
     return schema.depth_key(camera).removeprefix("observation.")
+
+
+def intrinsics_key(camera: str) -> str:
+    """Return the key of the intrinsic matrix of a camera in observations."""
+    return f"intrinsics.{camera}"
+
+
+def camera_pose_key(camera: str) -> str:
+    """Return the key of the pose of a camera in the arm's base frame in observations."""
+    return f"camera_in_base.{camera}"
+
+
+CALIBRATION_SHAPES = {intrinsics_key: (3, 3), camera_pose_key: (4, 4)}
+"""Shape of the values of a camera by function of their key."""
 
 
 class Proprioception:

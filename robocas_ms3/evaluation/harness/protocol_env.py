@@ -15,9 +15,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import results
-from robocas_ms3.evaluation.harness.proprioception import WIDTHS, Proprioception, depth_key
+from robocas_ms3.evaluation.harness.proprioception import (
+    CALIBRATION_SHAPES,
+    WIDTHS,
+    Proprioception,
+    camera_pose_key,
+    depth_key,
+    intrinsics_key,
+)
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import CONVENTIONS, ExternalPolicy, Observations, PolicySpec
+from robocas_ms3.evaluation.rollout import CameraObservations
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
@@ -29,7 +37,8 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
     - No automatic reset: an env whose episode has ended returns its last observation until the next reset.
     - Observations: ``pixels`` by camera, (N, H, W, 3) uint8. State columns of LeRobot datasets, float32: ``agent_pos``
       (N, 18), ``joint_velocity`` (N, 7), ``arm_base`` (N, 7) and ``gripper_open`` (N, 1). With depth also
-      ``images.CAMERA_depth`` (N, 1, H, W) float32 in mm, 0: no measurement.
+      ``images.CAMERA_depth`` (N, 1, H, W) float32 in mm, 0: no measurement. ``intrinsics.CAMERA`` (N, 3, 3) and
+      ``camera_in_base.CAMERA`` (N, 4, 4), as in `Observations`.
     - Reward: 1 at the step at which an episode ends with success, else 0.
     - ``info["is_success"]`` (N,) bool: whether the episode has succeeded; at the end of an episode also in
       ``info["final_info"]``.
@@ -167,17 +176,17 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
             for name, values in self._proprioception.compute_columns(env, obs, self._grippers[env]).items():
                 self._obs[name][env] = values
         if observations is not None:
-            self._store_images(observations.envs.tolist(), observations.images, observations.depths)
+            self._store_cameras(observations.envs.tolist(), observations)
         if ended := [env for env in envs if observations is None or env not in observations.envs]:
-            self._store_images(ended, *self._session.render_images(ended))
+            self._store_cameras(ended, self._session.observe_cameras(ended))
 
-    def _store_images(
-        self, envs: list[int], images: Mapping[str, NDArray[np.uint8]], depths: Mapping[str, NDArray[np.int16]]
-    ) -> None:
-        for camera, rows in images.items():
-            self._obs["pixels"][camera][envs] = rows
-        for camera, rows in depths.items():
-            self._obs[depth_key(camera)][envs] = rows.transpose(0, 3, 1, 2)
+    def _store_cameras(self, envs: list[int], cameras: Observations | CameraObservations) -> None:
+        for camera in self._spec.cameras:
+            self._obs["pixels"][camera][envs] = cameras.images[camera]
+            self._obs[intrinsics_key(camera)][envs] = cameras.intrinsics[camera]
+            self._obs[camera_pose_key(camera)][envs] = cameras.camera_in_base[camera]
+            if self._spec.depth:
+                self._obs[depth_key(camera)][envs] = cameras.depths[camera].transpose(0, 3, 1, 2)
 
     def _make_info(self, just_ended: NDArray[np.bool_]) -> dict[str, Any]:
         success = self._has_ended(lambda outcome: outcome.success)
@@ -190,7 +199,8 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
 
 def _make_observation_space(spec: PolicySpec) -> gym.spaces.Dict:
     depths = [(depth_key(name), (1, h, w)) for name, (w, h) in spec.cameras.items()] if spec.depth else []
-    shapes = [*((name, (width,)) for name, width in WIDTHS.items()), *depths]
+    calibration = [(key(name), shape) for key, shape in CALIBRATION_SHAPES.items() for name in spec.cameras]
+    shapes = [*((name, (width,)) for name, width in WIDTHS.items()), *depths, *calibration]
     numbers: dict[str, gym.Space[Any]] = {name: gym.spaces.Box(-np.inf, np.inf, shape) for name, shape in shapes}
     pixels: dict[str, gym.Space[Any]] = {
         name: gym.spaces.Box(0, 255, (h, w, 3), np.uint8) for name, (w, h) in spec.cameras.items()

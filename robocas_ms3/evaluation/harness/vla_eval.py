@@ -44,6 +44,7 @@ class RoboCAS:
         cameras: (width, height) in pixels by camera, in the order of the images that a model server receives.
         convention, reference: as in `PolicySpec`.
         rate_hz: actions per second; None: the rate of the protocol, or 20 if it has none.
+        calibration: as in `PolicySpec`.
     """
 
     def __init__(
@@ -53,9 +54,10 @@ class RoboCAS:
         convention: str = "robocas",
         reference: str = "target",
         rate_hz: float | None = None,
+        calibration: str = "nominal",
     ) -> None:
-        values = {"cameras": dict(cameras or {}), "convention": convention, "reference": reference, "rate_hz": rate_hz}
-        self._spec = parse_policy_spec(values, "params")
+        values = {"convention": convention, "reference": reference, "rate_hz": rate_hz, "calibration": calibration}
+        self._spec = parse_policy_spec({"cameras": dict(cameras or {}), **values}, "params")
         settings = EvaluationSettings(protocol=protocol, envs=1, backend="processes")
         self._session = EvaluationSession(ExternalPolicy(self._spec), settings)
         self._episodes_by_config: dict[str, list[ProtocolEpisode]] = {}
@@ -137,14 +139,17 @@ class RoboCAS:
         self._record_frame()
 
     async def get_observation(self) -> dict[str, Any]:
-        """Return ``images`` (H, W, 3) uint8 by camera, ``state`` and ``task_description``.
+        """Return ``images``, ``intrinsics`` and ``camera_in_base`` by camera, ``state`` and ``task_description``.
 
-        ``state`` (18,) float32 has the values of ``observation.state`` in our LeRobot datasets.
+        Images (H, W, 3) uint8, intrinsic matrices (3, 3) and camera poses (4, 4) are those of `Observations`. ``state``
+        (18,) float32 has the values of ``observation.state`` in our LeRobot datasets.
         """
         observations = self._observations
         assert observations is not None  # vla-eval requests no observation after the end of an episode
         return {
             "images": {name: images[0] for name, images in observations.images.items()},
+            "intrinsics": {name: matrices[0] for name, matrices in observations.intrinsics.items()},
+            "camera_in_base": {name: poses[0] for name, poses in observations.camera_in_base.items()},
             "state": self._proprioception.compute_columns(0, self._session.observation, None)["agent_pos"],
             "task_description": observations.instructions[0],
         }

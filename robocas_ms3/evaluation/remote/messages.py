@@ -152,6 +152,8 @@ def make_observation_message(
         images: whether images and depths are sent.
     """
     arrays: dict[str, Any] = {name: values[row] for name, values in observations.robot.items()}
+    arrays |= {f"{name}_intrinsics": values[row] for name, values in observations.intrinsics.items()}
+    arrays |= {f"{name}_in_base": values[row] for name, values in observations.camera_in_base.items()}
     if images:
         arrays |= {name: values[row] for name, values in observations.images.items()}
         arrays |= {f"{name}_depth": values[row] for name, values in observations.depths.items()}
@@ -221,6 +223,8 @@ def parse_observations(
         else {},
         robot={name: stack_rows(name, "float32", quantity.width) for name, quantity in ROBOT_QUANTITIES.items()},
         state=stack_rows("simulator_state", "float32", None) if spec.state else None,
+        intrinsics={name: stack_rows(f"{name}_intrinsics", "float32", 3, 3) for name in spec.cameras},
+        camera_in_base={name: stack_rows(f"{name}_in_base", "float32", 4, 4) for name in spec.cameras},
     )
 
 

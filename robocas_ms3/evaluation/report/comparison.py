@@ -9,7 +9,7 @@ from itertools import combinations
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.text import escape_markdown, format_count
 from robocas_ms3.evaluation.protocol import LoadedProtocol
-from robocas_ms3.evaluation.report.tables import describe_action_noise, name_measurement
+from robocas_ms3.evaluation.report.tables import describe_action_noise, name_measurement, name_policy
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.statistics import Comparison, adjust_p_values, compare_successes, make_power_warning
 
@@ -87,7 +87,7 @@ def compare_results(results: Sequence[Result]) -> str:
 
 def _name_policy(result: Result, results: Sequence[Result]) -> str:
     """Return the policy of a result; also its tasks, if the results have other tasks in the same episodes."""
-    name, played_as = result.run.policy.name, result.run.played_as
+    name, played_as = name_policy(result.run), result.run.played_as
     if all(one.run.played_as == played_as for one in results):
         return name
     tasks = dict.fromkeys(one.task for one in result.outcomes.values())
@@ -131,7 +131,7 @@ def compare_splits(result: Result, protocol: LoadedProtocol) -> str:
     if not rows:
         fix = "Pass a second result folder to compare with."
         raise EvaluationError("no two splits of the result have the same scenes", where=result.folder, fix=fix)
-    head = f"{result.run.policy.name} ({result.folder}), splits of {result.run.protocol} over the same scenes."
+    head = f"{name_policy(result.run)} ({result.folder}), splits of {result.run.protocol} over the same scenes."
     return _render_table(escape_markdown(head), "task", rows)
 
 

@@ -19,6 +19,10 @@ WELD_NOTE = (
     "With RoboCAS-v0's weld: a lifted object was fixed to the hand until the gripper was commanded to open. "
     "Do not compare with results without the weld."
 )
+CALIBRATION_NOTE = (
+    "The policy observes the true poses of the cameras, with their random motion. A robot has only the nominal poses, "
+    "which other policies observe."
+)
 NOISE_NOTE = "Measured with {}. Do not compare with results without this noise."
 PAPER_NOTE = (
     "Comparison with the RoboCAS paper: the object meshes are replacements made by this project, success is stricter "
@@ -123,7 +127,18 @@ def count_episodes(result: Result, protocol: LoadedProtocol | None) -> str:
 
 def make_title(result: Result) -> str:
     """Return the title of the report: names of policy and protocol, weld and action noise."""
-    return f"{result.run.policy.name} on {name_measurement(result.run)}"
+    return f"{name_policy(result.run)} on {name_measurement(result.run)}"
+
+
+def name_policy(run: RunRecord) -> str:
+    """Return the name of the policy; also if it observes the true camera calibration."""
+    is_true = has_true_calibration(run)
+    return f"{run.policy.name} with true camera calibration" if is_true else run.policy.name
+
+
+def has_true_calibration(run: RunRecord) -> bool:
+    """Return whether the policy observes the true camera calibration (`PolicySpec.calibration`)."""
+    return run.policy.spec.get("calibration") == "true"
 
 
 def name_measurement(run: RunRecord) -> str:
@@ -145,7 +160,8 @@ def list_notes(result: Result) -> list[str]:
     ]
     paper = [PAPER_NOTE] if result.run.protocol.startswith("paper-") else []
     noise = [NOISE_NOTE.format(describe_action_noise(result.run))] if result.run.action_noise else []
-    return [*([WELD_NOTE] if result.run.weld else []), *noise, *played_as, *paper]
+    calibration = [CALIBRATION_NOTE] if has_true_calibration(result.run) else []
+    return [*([WELD_NOTE] if result.run.weld else []), *noise, *calibration, *played_as, *paper]
 
 
 def get_stage_names(task: str) -> dict[str, str]:

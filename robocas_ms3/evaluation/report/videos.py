@@ -111,6 +111,9 @@ class _VideoRecorder:
     def render_images(self, envs: Any) -> Any:
         return self._env.render_images(envs)
 
+    def camera_models(self) -> Any:
+        return self._env.camera_models()
+
     def close(self) -> None:
         self._env.close()
 

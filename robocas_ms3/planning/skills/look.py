@@ -11,7 +11,6 @@ from robocas_ms3.core.poses import from_wxyz, inverse
 from robocas_ms3.planning.protocol import Array, Trajectory
 from robocas_ms3.planning.skills.arm import Arm
 from robocas_ms3.robots.cameras import CameraSpec
-from robocas_ms3.scenes.randomise import draw_camera_shift
 from robocas_ms3.scenes.visibility import MeshScene, PinholeCamera, load_visual_mesh, make_ray_scene
 
 FAR, NEAR = (0.4, 0.5), (0.2, 0.3)  # m from camera to target: first view, later views (RoboCAS-v0)
@@ -98,10 +97,7 @@ def camera_in_base(arm: Arm) -> Array:
 
 
 def _camera_shift(arm: Arm) -> Array:
-    randomisation = arm.env.task_config.randomisation.cameras
-    if randomisation is None:
-        return np.eye(4)
-    return draw_camera_shift(randomisation, arm.env.agent.cameras.index(_hand_camera(arm)), arm.env.appearance_seeds[0])
+    return arm.env.camera_shifts[0, arm.env.agent.cameras.index(_hand_camera(arm))]
 
 
 def _hand_camera(arm: Arm) -> CameraSpec:

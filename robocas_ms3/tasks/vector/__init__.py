@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import VectorEnvError
 from robocas_ms3.core.workers import NO_LIMITS, Limits
+from robocas_ms3.robots.camera_models import CameraModel
 from robocas_ms3.scenes.task_specs import TASKS
 from robocas_ms3.tasks.vector.process_env import ProcessEnv
 
@@ -153,6 +154,11 @@ class RoboCASVectorEnv(ManiSkillVectorEnv):
             rendered = self._env.get_wrapper_attr("render_images")()
             found = {camera: {kind: of[index] for kind, of in kinds.items()} for camera, kinds in rendered.items()}
         return _as_numpy(found) if self._in_numpy else found
+
+    def camera_models(self) -> list[dict[str, CameraModel]]:
+        """Return the intrinsics and poses of the cameras of each env, by name (`SceneEnv.camera_models`)."""
+        found = self.call("camera_models")
+        return [models for of in found for models in of] if isinstance(self._env, ProcessEnv) else found
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
         """Call a method or read an attribute of each env (processes) or of the batch (GPU).

@@ -130,7 +130,7 @@ class DecisionSource:
         found = []
         if images := self.images:
             for name in images.cameras:
-                view = CameraView(name, images.size, images.intrinsic(row, name), images.camera_in_base(row, name))
+                view = CameraView(name, images.size, images.intrinsic(row, name), images.true_camera_in_base(row, name))
                 depth = images.depth(row, name) if images.has_depth else None
                 found.append(self._make_view(view, decision, strokes, depth))
         top = make_top_view(_list_points(decision, strokes))

@@ -31,7 +31,8 @@ def test_folder_matches_the_schema(made):
     for camera, parent in (("base", "arm_base"), ("gripper", "ee"), ("static", "world")):
         folder = episode / f"{camera}_camera"
         assert {path.name for path in folder.iterdir()} == {
-            f"cam_pos_wrt_{parent}.npy", f"cam_pose_wrt_{parent}.npy", "intrinsic.npy", "rgb", "depth",
+            f"cam_pos_wrt_{parent}.npy", f"cam_pose_wrt_{parent}.npy", f"true_cam_pose_wrt_{parent}.npy",
+            "intrinsic.npy", "rgb", "depth",
         }  # fmt: skip
         # 22 control steps with a stride of 4: states 0, 4, ..., 20 and 22.
         for kind in ("rgb", "depth"):

@@ -223,7 +223,7 @@ def test_command(parts, tmp_path, capsys):
     assert run(words) == 1
     assert capsys.readouterr().err.startswith("error: ")
     assert run([*words, "--skip-duplicates", "--copy"]) == 0
-    assert "4 episodes, 0 files linked, 212 copied, 2 duplicates skipped" in capsys.readouterr().out
+    assert "4 episodes, 0 files linked, 224 copied, 2 duplicates skipped" in capsys.readouterr().out
 
 
 def test_command_without_datasets(tmp_path, capsys):

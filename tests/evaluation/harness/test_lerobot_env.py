@@ -77,7 +77,8 @@ def test_observations_have_the_names_and_shapes_of_the_policys_features(made, de
     states = {one.key: (one.width,) for one in schema.FEATURES if one.key.startswith("observation.")}
     images = {schema.image_key("base_camera"): (3, 4, 6)}
     depths = {schema.depth_key("base_camera"): (1, 4, 6)} if depth else {}
-    assert inputs == {**states, **images, **depths}
+    calibration = {"observation.intrinsics.base_camera": (3, 3), "observation.camera_in_base.base_camera": (4, 4)}
+    assert inputs == {**states, **images, **depths, **calibration}
     assert features["action"].shape == (7,)
 
 
@@ -107,6 +108,7 @@ def test_all_tasks_of_a_protocol_or_of_a_split(made):
     ("settings", "error"),
     [
         (dict(convention="euler"), EvaluationError),
+        (dict(calibration="exact"), EvaluationError),
         (dict(cameras=","), EvaluationError),
         (dict(task=" "), EvaluationError),
         (dict(protocol="smok"), EvaluationError),

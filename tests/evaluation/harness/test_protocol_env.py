@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from counting_env import POSE
 from short_protocols import shorten
 
 from robocas_ms3.core.errors import EvaluationError, RobocasError
 from robocas_ms3.core.locks import lock_folder
+from robocas_ms3.core.poses import from_wxyz
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.harness.protocol_env import ProtocolVectorEnv
 from robocas_ms3.evaluation.policy import PolicySpec
@@ -50,7 +52,13 @@ def test_observations_are_in_the_declared_space_and_have_the_datasets_names(make
         env.step(act(0, 0))
     obs, info = env.reset(seed=0)
     assert env.observation_space.contains(obs)
-    assert set(obs) == {"pixels", "agent_pos", "joint_velocity", "arm_base", "gripper_open", "images.base_camera_depth"}
+    state = {"agent_pos", "joint_velocity", "arm_base", "gripper_open"}
+    calibration = {"intrinsics.base_camera", "camera_in_base.base_camera"}
+    assert set(obs) == {"pixels", "images.base_camera_depth", *state, *calibration}
+    assert obs["intrinsics.base_camera"][1].tolist() == [[2, 0, 3], [0, 2, 2], [0, 0, 1]]
+    # the camera is 10 cm behind the TCP at (1, 2, 3) along its approach direction, column z of its rotation matrix
+    approach = from_wxyz(np.array(POSE, np.float64))[:3, 2]
+    np.testing.assert_allclose(obs["camera_in_base.base_camera"][1, :3, 3], [1, 2, 3] - 0.1 * approach, atol=1e-6)
     assert obs["images.base_camera_depth"].shape == (2, 1, 4, 6)
     assert env.step(act(0, 0, gripper=1.0))[0]["gripper_open"].tolist() == [[1.0], [1.0]]
     obs = env.step(act(1, 1))[0]

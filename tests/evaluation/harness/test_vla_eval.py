@@ -77,6 +77,8 @@ def test_observations_and_result_of_an_episode(benchmark):
     seen, metrics = played["seen"], played["metrics"]
     assert [one["images"]["base_camera"].max() for one in seen] == [1, 2, 3, 4, 5]
     assert seen[0]["images"]["base_camera"].shape == (4, 6, 3)
+    assert seen[0]["intrinsics"]["base_camera"].tolist() == [[2, 0, 3], [0, 2, 2], [0, 0, 1]]
+    assert seen[0]["camera_in_base"]["base_camera"].shape == (4, 4)
     state = seen[0]["state"]
     assert state.dtype == np.float32
     np.testing.assert_allclose(state[7:14], [13, 14, 15, 16, 17, 18, 19])  # arm joints 3 to 9

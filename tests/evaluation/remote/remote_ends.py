@@ -38,6 +38,8 @@ def make_observations(*envs: int, cameras: bool = False) -> Observations:
             "gripper_width": rng.normal(size=(count, 1)).astype(np.float32),
         },
         state=rng.normal(size=(count, 9)).astype(np.float32) if cameras else None,
+        intrinsics={"base_camera": rng.normal(size=(count, 3, 3)).astype(np.float32)} if cameras else {},
+        camera_in_base={"base_camera": rng.normal(size=(count, 4, 4)).astype(np.float32)} if cameras else {},
     )
 
 

@@ -184,7 +184,7 @@ def test_server_requests_images_per_env(max_batch, first):
 
 
 def test_missing_requested_images_are_an_error():
-    request = make_observation_message(make_observations(0), 0, make_episode(), reset=True, images=False)
+    request = make_observation_message(make_observations(0, cameras=True), 0, make_episode(), reset=True, images=False)
     with serving(LookingPolicy(True)) as url, connect(url) as client:
         client.recv()
         client.send(encode_message(request))

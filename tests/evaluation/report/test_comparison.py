@@ -9,6 +9,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
 from robocas_ms3.evaluation.protocol import EPISODES, load_protocol
 from robocas_ms3.evaluation.report.comparison import compare_results, compare_splits
+from robocas_ms3.evaluation.report.tables import render_markdown
 from robocas_ms3.evaluation.statistics import adjust_p_values, mcnemar_p_value
 
 
@@ -90,6 +91,17 @@ def test_results_that_cannot_be_compared_are_refused(tmp_path):
     for pair in ([one, welded], [welded, one]):
         with pytest.raises(EvaluationError, match=r"/d: cannot compare results with and without RoboCAS-v0's weld"):
             compare_results(pair)
+
+
+def test_true_camera_calibration_is_named(tmp_path):
+    spec = {"rate_hz": None, "calibration": "true"}
+    policy = {"name": "mine", "class": "mine:Policy", "spec": spec}
+    results = [write(tmp_path / "a", [outcome(0)]), write(tmp_path / "b", [outcome(0)], policy=policy)]
+    table = compare_results(results)
+    assert "A: mine (" in table and "B: mine with true camera calibration (" in table
+    assert render_markdown(results[1]).startswith("# mine with true camera calibration on made_up")
+    assert "true poses of the cameras" in render_markdown(results[1])
+    assert "true poses" not in render_markdown(results[0])
 
 
 def test_action_noise_is_named_and_never_compared_with_other_noise(tmp_path):
