@@ -96,7 +96,9 @@ def test_no_motion_after_termination(policy, model, seen):
     assert np.allclose(policy.act(shown), [moving, gripper])
     assert np.allclose(policy.act(shown), [moving, gripper])  # the second env terminates
     assert np.allclose(policy.act(shown), [moving, nothing])
+    assert policy.requests_images(np.array([4, 7])).tolist() == [True, False]
     policy.reset(start_episodes(7))
+    assert policy.requests_images(np.array([4, 7])).tolist() == [True, True]
     assert np.allclose(policy.act(shown), [moving, gripper])
     assert predicted == []
     assert np.allclose(
