@@ -45,6 +45,9 @@ BASELINES: Registry[Callable[[], Baseline]] = Registry(
         "small": BuiltinBaseline(
             "small", "base and gripper camera, language; action chunks by a small transformer; bundled weights for pick"
         ),
+        "keyframe": BuiltinBaseline(
+            "keyframe", "RGB-D images of three cameras, language; next keyframe by segmentation and ranked grasps"
+        ),
         "bc-state": BuiltinBaseline("bc_state", "privileged state of the simulator; action chunks by a residual MLP"),
         "rt1": BuiltinBaseline(
             "rt1", "RT-1 of the RoboCAS paper: base and gripper camera, language; action tokens by a transformer"

@@ -62,6 +62,20 @@ class Small(DatasetBaseline):
 
 
 @dataclass(kw_only=True)
+class Keyframe(Training):
+    """Train `keyframe`: segmentation of RGB-D images, and the success of grasps, from decisions with candidates.
+
+    Two CPU cores suffice for training.
+
+    Example: robocas train keyframe --data demos --out runs/keyframe
+    """
+
+    data: Path
+    """A candidates.h5 of `robocas generate --record-candidates`, or a folder that contains such files. Each file has
+    images of `robocas render-candidates --looks 3 --segmentation` next to it."""
+
+
+@dataclass(kw_only=True)
 class BCState(Training):
     """Train `bc-state`: a residual MLP that predicts action chunks from the privileged state of the simulator.
 
@@ -115,6 +129,7 @@ def command(baseline: str, settings: type[Training]) -> Callable[[Any], int]:
 
 COMMANDS = {
     "small": command("small", Small),
+    "keyframe": command("keyframe", Keyframe),
     "bc-state": command("bc-state", BCState),
     "rt1": command("rt1", RT1),
     "ppo": command("ppo", PPO),

@@ -6,6 +6,8 @@ The file ``candidates_images.h5`` has a group per camera with D rows, one per de
     base_camera/rgb_ends        (D,) int64, end of each PNG file in `rgb`; it starts at the end of the one before
     base_camera/depth           (B,) as `rgb`, 16 bit, mm, 0 = no depth
     base_camera/depth_ends      (D,) as `rgb_ends`
+    base_camera/segmentation    (B,) as `rgb`, 8 bit, values of `episode_source.StepImages`; with `--segmentation`
+    base_camera/segmentation_ends  (D,) as `rgb_ends`
     base_camera/intrinsic       (D, 4) fx, fy, cx, cy in pixels
     base_camera/camera_in_base  (D, 4, 4) nominal pose of the OpenCV camera frame in the arm's base frame
     base_camera/true_camera_in_base  (D, 4, 4) the same with the random motion of the camera
@@ -22,7 +24,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import h5py
@@ -32,14 +34,19 @@ from numpy.typing import NDArray
 from robocas_ms3.core.documents import check_regular_file
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.text import one_line
-from robocas_ms3.datasets.schema import IMAGE_KINDS
-from robocas_ms3.datasets.sources.episode_source import ImageKind
 from robocas_ms3.demos.candidates.candidates_file import FILE_NAME, CandidateFile
 from robocas_ms3.demos.recordings.trajectory_hdf5 import check_links
 from robocas_ms3.robots.cameras import CAMERA_NAME
 
-FORMAT, VERSION = "robocas-candidate-images", 2
+FORMAT, VERSION = "robocas-candidate-images", 3
 """Attributes ``format`` and ``version`` of the file."""
+ImageKind = Literal["rgb", "depth", "segmentation"]
+KINDS: dict[ImageKind, tuple[type, int]] = {
+    "rgb": (np.uint8, 3),
+    "depth": (np.uint16, 2),
+    "segmentation": (np.uint8, 2),
+}
+"""Type and number of dimensions of the images, by kind."""
 _POSES = ("camera_in_base", "true_camera_in_base")
 _RENDER = "Render the images with robocas render-candidates."
 _RENDER_AGAIN = "Render the images again: robocas render-candidates --overwrite."
@@ -52,6 +59,7 @@ class CameraImages:
     Attributes:
         rgb: PNG of the RGB image per decision.
         depth: PNG of the depth image per decision; empty without depth.
+        segmentation: PNG of the segmentation image per decision; empty without segmentation.
         intrinsic: (N, 4) fx, fy, cx, cy in pixels.
         camera_in_base: (N, 4, 4) nominal pose of the OpenCV camera frame in the arm's base frame, as configured.
         true_camera_in_base: (N, 4, 4) the same with the random motion of the camera.
@@ -59,6 +67,7 @@ class CameraImages:
 
     rgb: list[bytes]
     depth: list[bytes]
+    segmentation: list[bytes]
     intrinsic: NDArray[np.float32]
     camera_in_base: NDArray[np.float32]
     true_camera_in_base: NDArray[np.float32]
@@ -81,7 +90,7 @@ def hash_decisions(file: CandidateFile) -> str:
 
 def count_bytes(images: Mapping[str, CameraImages]) -> dict[str, int]:
     """Return the number of bytes of all PNG files by dataset, such as ``base_camera/rgb``."""
-    kinds = {f"{camera}/{kind}": getattr(found, kind) for camera, found in images.items() for kind in IMAGE_KINDS}
+    kinds = {f"{camera}/{kind}": getattr(found, kind) for camera, found in images.items() for kind in KINDS}
     return {name: sum(map(len, files)) for name, files in kinds.items() if files}
 
 
@@ -109,7 +118,7 @@ def write_images(file: h5py.File, first: int, images: Mapping[str, CameraImages]
         rows = slice(first, first + len(found.rgb))
         for name in ("intrinsic", *_POSES):
             group[name][rows] = getattr(found, name)
-        for kind in IMAGE_KINDS:
+        for kind in KINDS:
             if files := getattr(found, kind):
                 start = int(group[f"{kind}_ends"][first - 1]) if first else 0
                 ends = start + np.cumsum([len(data) for data in files])
@@ -122,10 +131,8 @@ def read_images(file: h5py.File) -> dict[str, CameraImages]:
     images = {}
     for camera, group in file.items():
         rows = range(len(group["intrinsic"]))
-        rgb, depth = (
-            [_read_png(group, kind, row).tobytes() for row in rows] if kind in group else [] for kind in IMAGE_KINDS
-        )
-        images[camera] = CameraImages(rgb, depth, group["intrinsic"][:], *(group[name][:] for name in _POSES))
+        files = [[_read_png(group, kind, row).tobytes() for row in rows] if kind in group else [] for kind in KINDS]
+        images[camera] = CameraImages(*files, group["intrinsic"][:], *(group[name][:] for name in _POSES))
     return images
 
 
@@ -166,6 +173,7 @@ class CandidateImages:
         path: of the images file.
         cameras: names of the cameras.
         has_depth: whether there are depth images.
+        has_segmentation: whether there are segmentation images.
         size: width and height of the images in pixels.
 
     Raises:
@@ -186,6 +194,7 @@ class CandidateImages:
             groups: dict[str, Any] = dict(file.items())
             self.cameras = tuple(name for name in sorted(groups) if re.fullmatch(CAMERA_NAME, name))
             self.has_depth = all("depth" in groups[camera] for camera in self.cameras)
+            self.has_segmentation = all("segmentation" in groups[camera] for camera in self.cameras)
         if not self.cameras:
             raise DatasetError("this file has no images", where=self.path, fix=_RENDER_AGAIN)
         height, width = self.rgb(0, self.cameras[0]).shape[:2]
@@ -198,6 +207,10 @@ class CandidateImages:
     def depth(self, row: int, camera: str) -> NDArray[np.uint16]:
         """Return the depth image (H, W) of a camera at the decision of a row, mm, 0 = no depth."""
         return self._decode(row, camera, "depth")
+
+    def segmentation(self, row: int, camera: str) -> NDArray[np.uint8]:
+        """Return the segmentation image (H, W) of a camera at the decision of a row, see `StepImages`."""
+        return self._decode(row, camera, "segmentation")
 
     def intrinsic(self, row: int, camera: str) -> NDArray[np.float64]:
         """Return fx, fy, cx, cy (4,) of a camera in pixels."""
@@ -218,7 +231,7 @@ class CandidateImages:
             self._check_row(row, len(group["intrinsic"]))
             data = _read_png(group, kind, row)
         image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-        if image is None or (image.dtype, image.ndim) != {"rgb": (np.uint8, 3), "depth": (np.uint16, 2)}[kind]:
+        if image is None or (image.dtype, image.ndim) != KINDS[kind]:
             where = f"{self.path}, {camera}/{kind}, row {row}"
             raise DatasetError("this image is damaged", where=where, fix=_RENDER_AGAIN)
         return image

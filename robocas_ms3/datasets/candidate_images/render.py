@@ -25,6 +25,7 @@ from robocas_ms3.core.locks import lock_folder
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
 from robocas_ms3.core.workers import WorkerPool, use_one_torch_thread
 from robocas_ms3.datasets.candidate_images.images_file import (
+    KINDS,
     CameraImages,
     CandidateImages,
     count_bytes,
@@ -34,11 +35,11 @@ from robocas_ms3.datasets.candidate_images.images_file import (
     write_attributes,
     write_images,
 )
+from robocas_ms3.datasets.candidate_images.looks import Looks, name_look
 from robocas_ms3.datasets.candidate_images.settings import CandidateImageResult, CandidateImageSettings
 from robocas_ms3.datasets.conversion.rendered_source import open_env_renderer
 from robocas_ms3.datasets.images.image_files import ImageOptions
 from robocas_ms3.datasets.images.png import encode_png
-from robocas_ms3.datasets.schema import IMAGE_KINDS
 from robocas_ms3.demos.candidates.candidates_file import CandidateFile
 from robocas_ms3.demos.recordings.trajectory_file import Recording
 from robocas_ms3.demos.recordings.trajectory_hdf5 import open_reserved, write_hdf5
@@ -82,7 +83,7 @@ def render_candidates(
         raise DatasetError("there are no decisions in this file", where=settings.candidates)
     parts = out.with_name(f"{out.name}.parts")
     if out.exists() and not settings.overwrite:
-        _check_existing(out, decisions, options)
+        _check_existing(out, decisions, options, settings.looks)
         if parts.exists():  # of a process that was killed after the merge
             with lock_folder(parts):
                 shutil.rmtree(parts)
@@ -92,6 +93,8 @@ def render_candidates(
         "cameras": options.cameras,
         "size": options.size,
         "depth": options.depth,
+        "segmentation": options.segmentation,
+        "looks": settings.looks,
         "pack": settings.pack,
     }
     with OutputFolder(parts, _FOLDER, recorded, overwrite=settings.overwrite) as output:
@@ -121,13 +124,17 @@ def iter_seeds(file: CandidateFile) -> Iterator[Rows]:
     yield from zip(bounds, bounds[1:], strict=False)
 
 
-def _check_existing(out: Path, decisions: str, options: ImageOptions) -> None:
+def _check_existing(out: Path, decisions: str, options: ImageOptions, looks: int) -> None:
     """Raise OutputExistsError unless a file has the requested images of these decisions."""
     found = CandidateImages(out, decisions)
     has_size = options.size in (None, found.size)
-    if set(found.cameras) != set(options.cameras) or found.has_depth != options.depth or not has_size:
+    cameras = {*options.cameras, *(name_look(number) for number in range(looks))}
+    has_kinds = (found.has_depth, found.has_segmentation) == (options.depth, options.segmentation)
+    if set(found.cameras) != cameras or not has_kinds or not has_size:
         what, (width, height) = "the images were rendered with other options", found.size
-        shown = f"{', '.join(found.cameras)}, {width} x {height}, {'with' if found.has_depth else 'without'} depth"
+        kinds = {"depth": found.has_depth, "segmentation": found.has_segmentation}
+        words = [f"{'with' if has else 'without'} {kind}" for kind, has in kinds.items()]
+        shown = f"{', '.join(found.cameras)}, {width} x {height}, {', '.join(words)}"
         fix = "Pass --overwrite to replace them, or choose another file with --out."
         raise OutputExistsError(what, where=out, found=shown, fix=fix)
 
@@ -159,12 +166,16 @@ class _SeedWorker:
         self._file = CandidateFile(settings.candidates, pack=settings.pack)
         open_renderer = settings.open_renderer or open_env_renderer
         self._renderer: EnvRenderer = open_renderer(self._file.recorded_env, _CONTROL_MODE, options)
+        self._count = settings.looks
+        self._looks = Looks(self._file.recorded_env) if settings.looks else None
 
     def run(self, rows: Rows) -> int:
         first, last = rows
         recording = make_recording(self._file, rows)
         self._renderer.load_scene(recording)
-        images = render_loaded(self._renderer, recording, self._options)
+        images = render_loaded(self._renderer, recording)
+        if self._looks is not None:
+            images |= self._render_looks(recording, rows)
 
         def fill(file: h5py.File) -> None:
             create_datasets(file, last - first, count_bytes(images))
@@ -173,6 +184,15 @@ class _SeedWorker:
         with atomic_file(_part_path(self._folder, rows), sync=True) as path:
             write_hdf5(path, fill)
         return last - first
+
+    def _render_looks(self, recording: Recording, rows: Rows) -> dict[str, CameraImages]:
+        assert self._looks is not None
+        model, images = self._renderer.cameras()[self._looks.camera], {}
+        for number in range(self._count):
+            moved = self._looks.move_arm(self._file, rows, recording, model, number)
+            with self._renderer.select_cameras([self._looks.camera]):
+                images[name_look(number)] = render_loaded(self._renderer, moved)[self._looks.camera]
+        return images
 
     def close(self) -> None:
         self._renderer.close()
@@ -201,24 +221,22 @@ def make_recording(file: CandidateFile, rows: Rows) -> Recording:
     )
 
 
-def render_loaded(renderer: EnvRenderer, recording: Recording, options: ImageOptions) -> dict[str, CameraImages]:
+def render_loaded(renderer: EnvRenderer, recording: Recording) -> dict[str, CameraImages]:
     """Render all states of the recording that the renderer has loaded; return images and camera poses by camera."""
-    samples = np.arange(recording.control_steps + 1)
-    rgb: dict[str, list[bytes]] = {name: [] for name in options.cameras}
-    depth: dict[str, list[bytes]] = {name: [] for name in options.cameras}
+    samples, models = np.arange(recording.control_steps + 1), renderer.cameras()
+    files = {name: {kind: list[bytes]() for kind in KINDS} for name in models}
     for step in renderer.frames(recording, samples):
-        for images, encoded in ((step.rgb, rgb), (step.depth, depth)):
-            for name, image in images.items():
-                encoded[name].append(encode_png(image))
-    motion, models = recording.compute_motion(samples), renderer.cameras()
+        for kind in KINDS:
+            for name, image in getattr(step, kind).items():
+                files[name][kind].append(encode_png(image))
+    motion = recording.compute_motion(samples)
     parents = {
         name: find_parent_in_base(model.parent, motion.tcp_in_base, motion.arm_base_in_world)
         for name, model in models.items()
     }
     return {
         name: CameraImages(
-            rgb=rgb[name],
-            depth=depth[name],
+            **files[name],
             intrinsic=np.tile(model.intrinsic, (len(samples), 1)).astype(np.float32),
             camera_in_base=(parents[name] @ model.camera_in_parent).astype(np.float32),
             true_camera_in_base=(parents[name] @ model.true_camera_in_parent).astype(np.float32),
@@ -234,7 +252,7 @@ def _merge_parts(parts: Mapping[Rows, Path], out: Path, decisions: str) -> None:
         with h5py.File(part, "r") as source:
             cameras: dict[str, Any] = dict(source.items())
             for camera, group in cameras.items():
-                sizes.update({f"{camera}/{kind}": len(group[kind]) for kind in IMAGE_KINDS if kind in group})
+                sizes.update({f"{camera}/{kind}": len(group[kind]) for kind in KINDS if kind in group})
     rows = max(last for _, last in parts)
     reserved = sum(sizes.values()) + len(sizes) * (rows * _ROW_BYTES + _MARGIN_BYTES)
     with atomic_file(out, sync=True) as path, open_reserved(path, reserved) as file:

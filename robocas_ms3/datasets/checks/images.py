@@ -10,9 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.documents import DAMAGED_FILE_ERRORS, load_npy
-from robocas_ms3.core.poses import from_xyzw
+from robocas_ms3.core.poses import from_xyzw, inverse
 from robocas_ms3.core.text import format_count, one_line
 from robocas_ms3.datasets import schema
 from robocas_ms3.datasets.checks import depth as geometry
@@ -27,6 +28,7 @@ _UNEXPECTED = "an additional file"
 _INTACT = "an intact image"
 _DEPTH_STEPS = 3  # steps whose depth is decoded
 _READERS = 4  # threads; reading and checksums release the GIL
+_MAX_SHIFT, _MAX_TURN_DEG = 0.35, 60  # more than the greatest random motion: 0.2 m and 20 degrees per axis
 _HEADERS = {"rgb": (8, 3), "depth": (16, 1)}
 Sizes = dict[str, tuple[int, int]]
 """Camera -> width and height of its images."""
@@ -44,7 +46,7 @@ def check_cameras(folder: Path, image_options: ImageOptions) -> Iterator[Violati
             expected = f"the cameras listed in {schema.CONVERSION_FILE}"
             yield Violation(f"{folder.name}/{camera}", "", expected, "another camera")
     for camera in image_options.cameras:
-        poses: list[NDArray] = []
+        poses: dict[str, NDArray] = {}
         pose_files = schema.pose_files(schema.camera_parent(folder / camera))
         true_pose = schema.true_pose_file(schema.camera_parent(folder / camera))
         optional = [true_pose] if (folder / camera / true_pose).exists() else []
@@ -60,10 +62,19 @@ def check_cameras(folder: Path, image_options: ImageOptions) -> Iterator[Violati
                 continue
             wrong = list(check_camera_array(file, found, pose=name != schema.INTRINSIC_FILE))
             yield from wrong
-            poses += [found] if name in pose_files and not wrong else []
-        if len(poses) == 2 and not np.allclose(poses[0], poses[1], atol=1e-6):
-            file = f"{folder.name}/{camera}/{pose_files[1]}"
-            yield Violation(file, "", f"the pose of {pose_files[0]}", "another pose")
+            if not wrong:
+                poses[name] = found
+        first, second = pose_files
+        if first in poses and second in poses and not np.allclose(poses[first], poses[second], atol=1e-6):
+            yield Violation(f"{folder.name}/{camera}/{second}", "", f"the pose of {first}", "another pose")
+        if first in poses and true_pose in poses:
+            shift = inverse(poses[first]) @ poses[true_pose]
+            distance = float(np.linalg.norm(shift[:3, 3]))
+            angle = float(np.rad2deg(Rotation.from_matrix(shift[:3, :3]).magnitude()))
+            if distance > _MAX_SHIFT or angle > _MAX_TURN_DEG:
+                expected = f"at most {_MAX_SHIFT} m and {_MAX_TURN_DEG} degrees from the pose of {first}"
+                found = f"{distance:.2f} m, {angle:.0f} degrees"
+                yield Violation(f"{folder.name}/{camera}/{true_pose}", "", expected, found)
 
 
 def check_camera_array(file: str, array: NDArray, *, pose: bool) -> Iterator[Violation]:

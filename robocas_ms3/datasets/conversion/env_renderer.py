@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import cv2
@@ -15,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.images.image_files import Box, ImageOptions, compute_bounding_box
-from robocas_ms3.datasets.sources.episode_source import StepImages
+from robocas_ms3.datasets.sources.episode_source import BASKET, FIRST_SLOT, ROBOT, StepImages
 from robocas_ms3.demos.recordings.environment import RecordedEnv
 from robocas_ms3.demos.recordings.trajectory_file import Recording
 from robocas_ms3.robots.camera_models import CameraModel
@@ -34,8 +35,11 @@ class EnvRenderer:
         if self._image_options.size is not None:
             sensors["width"], sensors["height"] = self._image_options.size
         require_renderer()
+        options = self._image_options
         self.env = env.make(
-            obs_mode="+".join([*self._image_options.kinds, *(["segmentation"] if self._image_options.boxes else [])]),
+            obs_mode="+".join(
+                [*self._image_options.kinds, *(["segmentation"] if options.boxes or options.segmentation else [])]
+            ),
             control_mode=control_mode,
             num_envs=1,
             sim_backend="physx_cpu",
@@ -78,27 +82,52 @@ class EnvRenderer:
         for index in samples:
             yield self._render_state(recording.state(int(index)))
 
+    @contextmanager
+    def select_cameras(self, names: Collection[str]) -> Iterator[None]:
+        """Open a context in which only some of the cameras are rendered."""
+        base, sensors = self._base, self._base._sensors
+        base._sensors = base.scene.sensors = {name: sensor for name, sensor in sensors.items() if name in names}
+        try:
+            yield
+        finally:
+            base._sensors = base.scene.sensors = sensors
+
     def _render_state(self, state: dict[str, dict[str, NDArray[np.float32]]]) -> StepImages:
         tensors = {kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()}
         self._base.set_state_dict(tensors)
-        textures = self._base._get_obs_sensor_data(apply_texture_transforms=False)
-        shaders = {name: self._base._sensors[name].config.shader_config for name in self._image_options.cameras}
+        textures, options = self._base._get_obs_sensor_data(apply_texture_transforms=False), self._image_options
+        shaders = {name: sensor.config.shader_config for name, sensor in self._base._sensors.items()}
+        ids = {}
+        if options.boxes or options.segmentation:
+            ids = {name: _convert_segmentation(textures[name], shader) for name, shader in shaders.items()}
+        values = self._find_segmentation_values() if options.segmentation else None
         return StepImages(
             rgb={name: _convert_rgb(textures[name], shader) for name, shader in shaders.items()},
-            depth={
-                name: _convert_depth(textures[name], shader)
-                for name, shader in shaders.items()
-                if self._image_options.depth
-            },
-            boxes=self._find_boxes(textures, shaders) if self._image_options.boxes else {},
+            depth={name: _convert_depth(textures[name], shader) for name, shader in shaders.items() if options.depth},
+            boxes=self._find_boxes(ids) if options.boxes else {},
+            segmentation={} if values is None else {name: values[of] for name, of in ids.items()},
         )
 
-    def _find_boxes(self, textures: dict[str, Any], shaders: dict[str, ShaderConfig]) -> dict[str, Box]:
-        """Return the bounding box of the target's visible pixels, by camera; only cameras that see it."""
+    def _find_segmentation_values(self) -> NDArray[np.uint8]:
+        """Return the value of a segmentation image by the id of an actor or link."""
+        base = self._base
+        bodies = {FIRST_SLOT + slot: actor for slot, actor in enumerate(base.objects)}
+        if base.fixtures.basket is not None:
+            bodies[BASKET] = base.fixtures.basket
+        links = [int(link.per_scene_id[0]) for link in base.agent.robot.links]
+        numbers = {int(body.per_scene_id[0]): value for value, body in bodies.items()} | dict.fromkeys(links, ROBOT)
+        values = np.zeros(max(np.iinfo(np.int16).max + 1, *numbers), np.uint8)
+        values[list(numbers)] = list(numbers.values())
+        return values
+
+    def _find_boxes(self, ids: dict[str, NDArray[np.int16]]) -> dict[str, Box]:
+        """Return the bounding box of the target's visible pixels, by camera; only cameras that see it.
+
+        ids: (H, W) id of the actor or link per pixel, by camera.
+        """
         slot = int(self._base.target_slot[0])
         number = int(self._base.scene.actors[f"object_{slot}"].per_scene_id[0])
-        masks = {name: _convert_segmentation(textures[name], shader) == number for name, shader in shaders.items()}
-        return {name: box for name, mask in masks.items() if (box := compute_bounding_box(mask)) is not None}
+        return {name: box for name, of in ids.items() if (box := compute_bounding_box(of == number)) is not None}
 
     def cameras(self) -> dict[str, CameraModel]:
         """Return intrinsics and poses of each rendered camera in the loaded scene, by name."""

@@ -46,6 +46,7 @@ class ImageOptions:
         depth: whether there are depth images in addition to RGB.
         image_format: format of RGB images.
         boxes: whether the bounding box of the target in each image is computed.
+        segmentation: whether there are segmentation images (`StepImages`).
     """
 
     cameras: tuple[str, ...] = ()
@@ -53,6 +54,7 @@ class ImageOptions:
     depth: bool = True
     image_format: schema.ImageFormat = "png"
     boxes: bool = False
+    segmentation: bool = False
 
     def __post_init__(self) -> None:
         if self.size is not None:

@@ -30,6 +30,8 @@ Split = Literal["train", "val", "all"]
 """Name of a split: training or validation episodes, or all."""
 ImageKind = Literal["rgb", "depth"]
 """Kind of image."""
+NOTHING, BASKET, ROBOT, FIRST_SLOT = range(4)
+"""Values of a segmentation image: other surfaces, the basket, the robot, and the object in the first slot."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +42,14 @@ class StepImages:
         rgb: RGB image (H, W, 3) by camera.
         depth: depth image (H, W) in mm by camera, 0 = no depth; empty without depth.
         boxes: bounding box of the target by camera that sees it; empty unless requested.
+        segmentation: segmentation image (H, W) by camera: `NOTHING`, `BASKET`, `ROBOT`, or `FIRST_SLOT` + slot of an
+            object; empty unless requested.
     """
 
     rgb: dict[str, NDArray[np.uint8]]
     depth: dict[str, NDArray[np.uint16]]
     boxes: dict[str, Box] = field(default_factory=dict)
+    segmentation: dict[str, NDArray[np.uint8]] = field(default_factory=dict)
 
 
 class SourceEpisode(ABC):

@@ -1,0 +1,200 @@
+"""Paths of the arm: inverse kinematics, straight lines and joint motions, without a planner."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.core.errors import PlanningError
+from robocas_ms3.core.poses import Array, from_rotation, inverse
+from robocas_ms3.planning.kinematics import ArmChain, InverseKinematics, joint_distance, solve_straight_line
+from robocas_ms3.robots.registry import RobotSpec
+
+PREGRASP = 0.1
+"""m between pre-grasp and grasp."""
+LIFT = 0.12
+"""m that an object is lifted after a grasp."""
+_JOINT_STEP = 0.05  # rad between the configurations of a joint motion
+_MAX_TRANSLATION, _MAX_ROTATION = 0.095, 0.45  # m along an axis and rad per control step of 0.2 s; 5 % below the limits
+_MAX_JOINT_STEP = 0.4  # rad per control step
+_LOWER, _NEARER = (
+    (0.0, 0.05, 0.1),
+    (1.0, 0.93, 0.86, 0.78),
+)  # alternative ends of a rise, m and fraction of the distance
+
+
+@dataclass(frozen=True)
+class Approach:
+    """Motion to a grasp.
+
+    Attributes:
+        grasp: (4, 4) TCP pose of the grasp in the arm's base frame.
+        start: (7,) configuration at the pre-grasp, rad.
+        path: (n, 7) straight path from the pre-grasp to the grasp, rad.
+    """
+
+    grasp: Array
+    start: Array
+    path: Array
+
+
+class ArmPaths:
+    """Paths of an arm, computed from its kinematics.
+
+    Args:
+        robot: specification of the robot.
+
+    Raises:
+        RobotDescriptionError, RobocasError: the robot has no inverse kinematics for this arm.
+    """
+
+    def __init__(self, robot: RobotSpec) -> None:
+        self.chain = ArmChain(robot.files().arm_urdf, robot.description)
+        self.kinematics = InverseKinematics(self.chain)
+
+    def straight(self, qpos: Array, tcp_in_base: Array) -> Array | None:
+        """Return a straight path (n, 7) from a configuration (7,) to a TCP pose (4, 4), or None."""
+        try:
+            return solve_straight_line(self.chain, qpos, tcp_in_base, stage="keyframe")
+        except PlanningError:
+            return None
+
+    def joint(self, qpos: Array, goal: Array) -> Array:
+        """Return a path (n, 7) from a configuration to another one, straight in joint space."""
+        count = max(2, int(np.ceil(np.abs(goal - qpos).max() / _JOINT_STEP)))
+        return np.linspace(qpos, goal, count + 1)[1:]
+
+    def rise(self, qpos: Array, tcp_in_base: Array, height: float) -> Array | None:
+        """Return a path (n, 7) that raises the TCP from its pose (4, 4) to a height in m, or None.
+
+        Where the pose above is out of reach, the TCP also moves towards the base, or stays up to 10 cm lower.
+        """
+        for lower in _LOWER:
+            for nearer in _NEARER:
+                goal = tcp_in_base.copy()
+                goal[2, 3] = max(height - lower, tcp_in_base[2, 3] + 0.02)
+                goal[:2, 3] *= nearer
+                path = self.straight(qpos, goal)
+                if path is not None:
+                    return path
+        return None
+
+    def reach(self, tcp_in_base: Array, qpos: Array) -> tuple[NDArray[np.bool_], Array]:
+        """Return which TCP poses (N, 4, 4) are in reach, (N,) bool, and the nearest configurations (N, 7)."""
+        return self.kinematics.nearest_solutions(tcp_in_base, qpos)
+
+    def nearest(self, tcp_in_base: Array, costs: Array, qpos: Array, weight: float) -> list[tuple[int, Array]]:
+        """Return the reachable poses (N, 4, 4) as pairs (index, configuration), the cheapest first.
+
+        costs: (N,) cost of each pose; ``weight`` times the joint distance from ``qpos`` (7,) is added.
+        """
+        reachable, found = self.reach(tcp_in_base, qpos)
+        total = costs + weight * joint_distance(found, qpos)
+        total[~reachable] = np.inf
+        order = np.argsort(total, kind="stable")[: int(reachable.sum())]
+        return [(int(index), found[index]) for index in order]
+
+    def plan_approach(self, grasps: Array, scores: Array, qpos: Array) -> tuple[int, Approach] | None:
+        """Return the index and the approach of the reachable grasp with the greatest score, or None.
+
+        grasps: (G, 4, 4) TCP poses in the arm's base frame. scores: (G,). qpos: (7,) present configuration.
+        """
+        order = np.argsort(-scores, kind="stable")
+        turned = grasps[order] @ np.diag([-1.0, -1.0, 1.0, 1.0])  # half a turn of the gripper gives the same grasp
+        both = np.stack([grasps[order], turned], axis=1).reshape(-1, 4, 4)
+        starts = both.copy()
+        starts[:, :3, 3] -= PREGRASP * both[:, :3, 2]
+        reachable, found = self.reach(starts, qpos)
+        reachable &= self.reach(both, qpos)[0]
+        distance = np.where(reachable, joint_distance(found, qpos), np.inf).reshape(-1, 2)
+        for number, index in enumerate(order.tolist()):
+            for turn in np.argsort(distance[number]).tolist():
+                row = 2 * number + turn
+                if not reachable[row]:
+                    continue
+                path = self.straight(found[row], both[row])
+                if path is None or self.rise(path[-1], both[row], float(both[row][2, 3]) + LIFT) is None:
+                    continue
+                return index, Approach(both[row], found[row], path)
+        return None
+
+
+class PathFollower:
+    """Follows a path with motions of the TCP that are relative to its present pose.
+
+    Args:
+        chain: kinematics of the arm.
+        path: (n, 7) configurations.
+        control_steps: control steps of 0.2 s per policy step.
+    """
+
+    def __init__(self, chain: ArmChain, path: Array, control_steps: int) -> None:
+        self._path, self._poses, self._index = path, chain.tcp(path), 0
+        self._limits = np.array([_MAX_TRANSLATION, _MAX_ROTATION, _MAX_JOINT_STEP]) * control_steps
+
+    @property
+    def goal(self) -> Array:
+        """TCP pose (4, 4) at the end of the path."""
+        return self._poses[-1]
+
+    @property
+    def is_last(self) -> bool:
+        """Whether the last motion led to the end of the path."""
+        return self._index == len(self._path) - 1
+
+    def next_pose(self, tcp_in_base: Array, qpos: Array) -> Array:
+        """Return the farthest TCP pose (4, 4) of the path that the next policy step can reach.
+
+        tcp_in_base: (4, 4) present TCP pose. qpos: (7,) present configuration.
+        """
+        ahead = inverse(tcp_in_base)[None] @ self._poses[self._index :]
+        turns = np.linalg.norm(Rotation.from_matrix(ahead[:, :3, :3]).as_rotvec(), axis=1)
+        joints = np.abs(self._path[self._index :] - qpos).max(axis=1)
+        sizes = np.stack([np.abs(ahead[:, :3, 3]).max(axis=1), turns, joints])
+        fits = (sizes <= self._limits[:, None]).all(axis=0)
+        fits[0] = True
+        steps = int(np.argmin(fits)) - 1 if not fits.all() else len(fits) - 1
+        self._index = min(self._index + max(steps, 1), len(self._path) - 1)
+        return self._poses[self._index]
+
+
+def find_looks(
+    camera_in_tcp: Array,
+    point: Array,
+    distances: Sequence[float],
+    elevations_deg: Sequence[float] = (90, 80, 70, 60, 50),
+) -> tuple[Array, Array]:
+    """Return TCP poses whose camera views a point, and their costs.
+
+    Args:
+        camera_in_tcp: (4, 4) pose of the OpenCV camera frame in the TCP frame.
+        point: (3,) point in the arm's base frame, m.
+        distances: distances of the camera from the point, m.
+        elevations_deg: elevations of the camera above the point, degrees.
+
+    Returns:
+        Poses (N, 4, 4) in the arm's base frame, and costs (N,): small for views from straight above.
+    """
+    poses, costs = [], []
+    azimuth, tcp_in_camera = float(np.arctan2(point[1], point[0])), inverse(camera_in_tcp)
+    for distance in distances:
+        for elevation in elevations_deg:
+            level, down = np.cos(np.deg2rad(elevation)), np.sin(np.deg2rad(elevation))
+            for turn in (0.0,) if elevation == 90 else (0.0, 0.5, -0.5, 1.0, -1.0):
+                forward = np.array([level * np.cos(azimuth + turn), level * np.sin(azimuth + turn), -down])
+                for roll in (0.0, 0.4, -0.4, 0.8, -0.8):
+                    up = np.array([np.cos(azimuth + roll), np.sin(azimuth + roll), 0.0])
+                    up -= forward * (up @ forward)
+                    if np.linalg.norm(up) < 0.1:
+                        continue
+                    up /= np.linalg.norm(up)
+                    camera = from_rotation(
+                        point - distance * forward, np.stack([np.cross(-up, forward), -up, forward], 1)
+                    )
+                    poses.append(camera @ tcp_in_camera)
+                    costs.append((90 - elevation) * 0.01 + abs(roll) * 0.1 + abs(turn) * 0.1)
+    return np.array(poses), np.array(costs)

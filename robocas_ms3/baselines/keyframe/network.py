@@ -1,0 +1,219 @@
+"""Networks of `keyframe`: segmentation of images, instructions, and success of grasps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+from torch.nn import functional as F
+
+from robocas_ms3.baselines.baseline import Batch
+from robocas_ms3.baselines.keyframe.config import KeyframeConfig
+from robocas_ms3.baselines.keyframe.gripper_crops import CROP_CHANNELS, POSE_FEATURES
+from robocas_ms3.scenes.language.embed import DIMENSIONS
+from robocas_ms3.scenes.relations import RELATIONS
+
+BACKGROUND, BASKET, ROBOT, FIRST_NAME = range(4)
+"""Classes of the cells of an image: other surfaces, the basket, the robot, and the first object name."""
+STRIDE = 4
+"""Pixels per cell, horizontally and vertically."""
+OFFSET_UNIT = 0.05
+"""m, unit of predicted offsets."""
+_INPUT_CHANNELS = 5
+_DROPPED = 0.1  # fraction of hidden values that dropout sets to 0
+
+
+def make_inputs(
+    rgb: NDArray[np.uint8], depth: NDArray[Any], intrinsics: NDArray[Any], camera_in_base: NDArray[Any]
+) -> NDArray[np.float32]:
+    """Return the inputs (5, H, W) of the segmentation network: RGB, height in the arm's base frame, and depth.
+
+    Args:
+        rgb: (H, W, 3) RGB image.
+        depth: (H, W) depth along the optical axis, mm; 0: no measurement.
+        intrinsics: (3, 3) intrinsic matrix, pixels.
+        camera_in_base: (4, 4) pose of the OpenCV camera frame in the arm's base frame.
+    """
+    meters = depth.astype(np.float32) / 1000
+    height, width = meters.shape
+    u = (np.arange(width, dtype=np.float32) + 0.5 - intrinsics[0, 2]) / intrinsics[0, 0]
+    v = (np.arange(height, dtype=np.float32) + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1]
+    up = camera_in_base[2].astype(np.float32)
+    heights = (up[0] * u[None] + up[1] * v[:, None] + up[2]) * meters + up[3]
+    heights = np.where(meters > 0, heights, -0.5)
+    colors = rgb.transpose(2, 0, 1).astype(np.float32) / 127.5 - 1
+    return np.concatenate([colors, 3 * np.clip(heights, -0.6, 1)[None], np.clip(meters, 0, 3)[None] - 0.5])
+
+
+def _convolution(inputs: int, outputs: int, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU(inplace=True)
+    )
+
+
+class _ResidualBlock(nn.Module):
+    def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
+        super().__init__()
+        self.first = _convolution(inputs, outputs, stride)
+        self.second = nn.Sequential(nn.Conv2d(outputs, outputs, 3, 1, 1, bias=False), nn.BatchNorm2d(outputs))
+        same = inputs == outputs and stride == 1
+        self.shortcut = (
+            nn.Identity()
+            if same
+            else nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
+        )
+
+    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
+        return F.relu(self.second(self.first(inputs)) + self.shortcut(inputs))
+
+
+class SegmentationNetwork(nn.Module):
+    """U-Net that classifies the cells of an RGB-D image and points to the centres of objects.
+
+    The classes are background, basket, robot, and the names of the objects.
+
+    Args:
+        channels: channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the image size.
+        decoder_channels: channels of the last feature maps, at 1/4 of the image size.
+        classes: number of classes.
+    """
+
+    def __init__(self, channels: tuple[int, ...], decoder_channels: int, classes: int) -> None:
+        super().__init__()
+        half, quarter, eighth, sixteenth, last = channels
+        self.stem = _convolution(_INPUT_CHANNELS, half, 2)
+        self.quarter = _ResidualBlock(half, quarter, 2)
+        self.eighth = _ResidualBlock(quarter, eighth, 2)
+        self.sixteenth = nn.Sequential(_ResidualBlock(eighth, sixteenth, 2), _ResidualBlock(sixteenth, sixteenth))
+        self.last = nn.Sequential(_ResidualBlock(sixteenth, last, 2), _ResidualBlock(last, last))
+        self.up_sixteenth = _convolution(last + sixteenth, sixteenth)
+        self.up_eighth = _convolution(sixteenth + eighth, eighth)
+        self.up_quarter = _convolution(eighth + quarter, decoder_channels)
+        self.output = nn.Conv2d(decoder_channels, classes + 3, 1)
+
+    def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return logits and offsets of the cells of images (B, 5, H, W); H and W are multiples of 32.
+
+        Returns:
+            Logits (B, classes, H / 4, W / 4). Offsets (B, 3, H / 4, W / 4) from the surface in each cell to the centre
+            of its object, in the OpenCV camera frame, in units of `OFFSET_UNIT`.
+        """
+        quarter = self.quarter(self.stem(images))
+        eighth = self.eighth(quarter)
+        sixteenth = self.sixteenth(eighth)
+        features = self.up_sixteenth(_upsample_and_join(self.last(sixteenth), sixteenth))
+        features = self.up_eighth(_upsample_and_join(features, eighth))
+        output = self.output(self.up_quarter(_upsample_and_join(features, quarter)))
+        return output[:, :-3], output[:, -3:]
+
+
+def _upsample_and_join(small: torch.Tensor, large: torch.Tensor) -> torch.Tensor:
+    size = large.shape[-2:]
+    return torch.cat([F.interpolate(small, size=size, mode="bilinear", align_corners=False), large], dim=1)
+
+
+class InstructionNetwork(nn.Module):
+    """MLP that predicts the name of the target and the relation from the sentence embedding of an instruction.
+
+    names: number of object names.
+    """
+
+    def __init__(self, names: int) -> None:
+        super().__init__()
+        self.hidden = nn.Sequential(nn.Linear(DIMENSIONS, 256), nn.ReLU(), nn.Dropout(_DROPPED))
+        self.name = nn.Linear(256, names)
+        self.relation = nn.Linear(256, 1 + len(RELATIONS))
+
+    def forward(self, embeddings: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return logits of the names (B, names), and of no relation and the relations (B, 1 + R).
+
+        embeddings: (B, 384) sentence embeddings.
+        """
+        hidden = self.hidden(embeddings)
+        return self.name(hidden), self.relation(hidden)
+
+
+class GraspNetwork(nn.Module):
+    """CNN that predicts the success of a grasp from a crop of the point cloud in the TCP frame.
+
+    channels: channels at the four resolutions.
+    """
+
+    def __init__(self, channels: tuple[int, ...]) -> None:
+        super().__init__()
+        first, second, third, last = channels
+        self.crop = nn.Sequential(
+            _convolution(CROP_CHANNELS, first),
+            _ResidualBlock(first, second, 2),
+            _ResidualBlock(second, third, 2),
+            _ResidualBlock(third, last, 2),
+        )
+        self.pose = nn.Sequential(nn.Linear(POSE_FEATURES, 32), nn.ReLU())
+        self.output = nn.Sequential(nn.Linear(2 * last + 32, 96), nn.ReLU(), nn.Dropout(0.2), nn.Linear(96, 1))
+
+    def forward(self, crops: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
+        """Return the logits (B,) of success for crops (B, 3, N, N) and pose features (B, 8) (`gripper_crops`)."""
+        features = self.crop(crops)
+        return self.output(torch.cat([features.mean((2, 3)), features.amax((2, 3)), self.pose(poses)], dim=1))[:, 0]
+
+
+class KeyframeNetwork(nn.Module):
+    """Networks of `keyframe`.
+
+    facts: facts of the data; ``names`` are the names of the objects.
+    """
+
+    def __init__(self, config: KeyframeConfig, facts: dict[str, Any]) -> None:
+        super().__init__()
+        names = len(facts["names"])
+        self.config = config
+        self.segmentation = SegmentationNetwork(config.channels, config.decoder_channels, FIRST_NAME + names)
+        self.instruction = InstructionNetwork(names)
+        self.grasp = GraspNetwork(config.grasp_channels)
+
+    def forward(self, batch: Batch) -> dict[str, torch.Tensor]:
+        """Return the loss and the metrics of a batch.
+
+        Args:
+            batch: ``image`` (B, 5, H, W), ``label`` (B, H / 4, W / 4) class and ``offset`` (B, 3, H / 4, W / 4) of each
+                cell, ``text`` (B, T, 384), ``name`` and ``relation`` (B, T) classes of the texts, ``crop``
+                (B, G, 3, N, N) and ``pose`` (B, G, 8) of grasps, ``outcome`` (B, G) 1: success, 0: failure, -1:
+                padding.
+
+        Returns:
+            ``loss`` and its terms ``segmentation``, ``offset``, ``text``, ``grasp``; ``cells``, the accuracy of the
+            cells with objects; ``names`` and ``grasps``, the accuracy of instructions and grasps.
+        """
+        logits, offsets = self.segmentation(batch["image"].contiguous(memory_format=torch.channels_last))
+        logits, label = logits.float(), batch["label"]
+        is_object = label >= FIRST_NAME
+        distance = (offsets.float() - batch["offset"]).abs().sum(dim=1)
+        offset = torch.stack([(distance * is_object).sum(), is_object.sum()])
+        weights = torch.where(is_object, 1.5, 0.5)
+        segmentation = (F.cross_entropy(logits, label, reduction="none") * weights).sum() / weights.sum()
+        names, relations = self.instruction(batch["text"].flatten(0, 1))
+        text = F.cross_entropy(names.float(), batch["name"].flatten())
+        text = text + F.cross_entropy(relations.float(), batch["relation"].flatten())
+        outcome = batch["outcome"].flatten()
+        known = outcome >= 0
+        success = self.grasp(batch["crop"].flatten(0, 1), batch["pose"].flatten(0, 1)).float()
+        errors = F.binary_cross_entropy_with_logits(success, 0.02 + 0.96 * outcome.clamp(min=0), reduction="none")
+        grasp = (errors * known).sum() / known.sum().clamp(min=1)
+        config, offset_loss = self.config, offset[0] / offset[1].clamp(min=1)
+        losses = segmentation + config.offset_weight * offset_loss + config.text_weight * text
+        with torch.no_grad():
+            cells = torch.stack([((logits.argmax(1) == label) & is_object).sum(), is_object.sum()])
+            grasps = torch.stack([(((success > 0) == (outcome > 0.5)) & known).sum(), known.sum()])
+        return {
+            "loss": losses + config.grasp_weight * grasp,
+            "segmentation": segmentation,
+            "offset": offset,
+            "text": text,
+            "grasp": torch.stack([(errors * known).sum(), known.sum()]),
+            "cells": cells.float(),
+            "names": (names.argmax(1) == batch["name"].flatten()).float().mean(),
+            "grasps": grasps.float(),
+        }

@@ -1,0 +1,130 @@
+"""The scene as a policy observes it: a point cloud with classes, its objects, and a height map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+VOTE_RADIUS = 0.035
+"""m within which votes for the centre of an object belong together."""
+_WORKSPACE = ((0.15, 1.15), (-0.9, 0.9), (-0.1, 0.6))  # m, least and greatest x, y and z in the arm's base frame
+_MAP_X, _MAP_Y, _MAP_CELL = (0.2, 1.05), (-0.8, 0.8), 0.02  # m
+_TABLE_BINS = (-0.1, 0.6, 200)  # m, m, number of bins of the histogram of heights
+_MAX_VOTES = 1200  # cells of an object that vote
+
+
+def unproject(depth: NDArray, intrinsics: NDArray, camera_in_base: NDArray) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the points (H, W, 3) of a depth image in the arm's base frame in m, and whether each is valid (H, W).
+
+    Args:
+        depth: (H, W) depth along the optical axis, mm; 0: no measurement.
+        intrinsics: (3, 3) intrinsic matrix, pixels.
+        camera_in_base: (4, 4) pose of the OpenCV camera frame in the arm's base frame.
+    """
+    meters = depth.astype(np.float64) / 1000
+    height, width = meters.shape
+    x = (np.arange(width) + 0.5 - intrinsics[0, 2]) / intrinsics[0, 0]
+    y = (np.arange(height) + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1]
+    points = np.stack([x[None] * meters, y[:, None] * meters, meters], axis=-1)
+    pose = camera_in_base.astype(np.float64)
+    return points @ pose[:3, :3].T + pose[:3, 3], meters > 0
+
+
+def is_in_workspace(points: Array) -> NDArray[np.bool_]:
+    """Return whether points (..., 3) are where the arm can reach objects."""
+    low, high = np.array(_WORKSPACE).T
+    return ((points > low) & (points < high)).all(axis=-1)
+
+
+def find_table_height(heights: Array) -> float:
+    """Return the commonest height of points (P,) that are on no object, m."""
+    low, high, bins = _TABLE_BINS
+    counts, edges = np.histogram(heights, bins=bins, range=(low, high))
+    return float(edges[counts.argmax()] + (high - low) / bins / 2)
+
+
+def cluster_votes(votes: Array, min_votes: int) -> list[NDArray[np.int64]]:
+    """Group votes (V, 3) for the centres of objects, the largest group first; return the indices of each group.
+
+    A group has all votes within `VOTE_RADIUS` of the vote with the most neighbours. Smaller groups than ``min_votes``
+    are left out.
+    """
+    remaining, groups = np.arange(len(votes)), []
+    if len(votes) > _MAX_VOTES:
+        remaining = remaining[:: len(votes) // _MAX_VOTES + 1]
+        min_votes = max(1, min_votes * len(remaining) // len(votes))
+    while len(remaining) >= min_votes:
+        distances = np.linalg.norm(votes[remaining][:, None] - votes[remaining][None], axis=2)
+        near = distances < VOTE_RADIUS
+        best = int(near.sum(axis=1).argmax())
+        if near[best].sum() < min_votes:
+            break
+        center = votes[remaining[near[best]]].mean(axis=0)
+        member = np.linalg.norm(votes[remaining] - center, axis=1) < 1.5 * VOTE_RADIUS
+        if not member.any():
+            break
+        groups.append(np.flatnonzero(np.linalg.norm(votes - center, axis=1) < 1.5 * VOTE_RADIUS))
+        remaining = remaining[~member]
+    return groups
+
+
+@dataclass(frozen=True)
+class ObservedObject:
+    """An object in the point cloud.
+
+    Attributes:
+        mask: (P,) whether each point of the cloud is on the object.
+        center: (3,) predicted centre in the arm's base frame, m.
+        label: class of the object.
+        probability: mean probability of its class.
+    """
+
+    mask: NDArray[np.bool_]
+    center: Array
+    label: int
+    probability: float
+
+
+@dataclass(frozen=True)
+class ObservedScene:
+    """Point cloud of one image with P points.
+
+    Attributes:
+        points: (P, 3) points in the arm's base frame, m.
+        target: (P,) probability that each point is on an object with the name in the instruction.
+        is_object: (P,) whether each point is on an object.
+        targets: objects that may be the target.
+        objects: all objects.
+    """
+
+    points: Array
+    target: Array
+    is_object: NDArray[np.bool_]
+    targets: list[ObservedObject]
+    objects: list[ObservedObject]
+
+
+class HeightMap:
+    """Greatest observed height of each cell of the workspace; NaN where nothing was observed."""
+
+    def __init__(self) -> None:
+        shape = tuple(round((high - low) / _MAP_CELL) for low, high in (_MAP_X, _MAP_Y))
+        self.heights = np.full(shape, np.nan)
+
+    def update(self, points: Array) -> None:
+        """Replace the heights of the cells that have points (P, 3)."""
+        cells = np.floor((points[:, :2] - (_MAP_X[0], _MAP_Y[0])) / _MAP_CELL).astype(int)
+        inside = ((cells >= 0) & (cells < self.heights.shape)).all(axis=1)
+        new = np.full(self.heights.shape, -np.inf)
+        np.maximum.at(new, tuple(cells[inside].T), points[inside, 2])
+        observed = np.isfinite(new)
+        self.heights[observed] = new[observed]
+
+    def find_free_squares(self, table: float, cells: int) -> Array:
+        """Return the middles (N, 2) of squares of ``cells`` x ``cells`` cells on the surface with nothing on it, m."""
+        free = np.isfinite(self.heights) & (self.heights < table + 0.012)
+        windows = np.lib.stride_tricks.sliding_window_view(free, (cells, cells)).all(axis=(2, 3))
+        return (np.argwhere(windows) + cells / 2) * _MAP_CELL + (_MAP_X[0], _MAP_Y[0])

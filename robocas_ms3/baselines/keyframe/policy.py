@@ -1,0 +1,105 @@
+"""Policy with the networks of `keyframe`."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.baselines.keyframe.config import KeyframeConfig
+from robocas_ms3.baselines.keyframe.episode import Command, KeyframeEpisode, RobotView
+from robocas_ms3.baselines.keyframe.motion import ArmPaths
+from robocas_ms3.baselines.keyframe.network import KeyframeNetwork
+from robocas_ms3.baselines.keyframe.perception import CameraFrame, Perception
+from robocas_ms3.core.poses import from_wxyz
+from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
+from robocas_ms3.robots.description import RobotDescription
+from robocas_ms3.robots.quantities import GRIPPER_WIDTH
+from robocas_ms3.robots.registry import find_robot
+
+_STREAM = 417  # random stream of the proposals
+
+
+class KeyframePolicy:
+    """Policy that looks at the scene, chooses the next keyframe, and moves there by inverse kinematics.
+
+    Images are requested only for decisions. The policy knows the kinematics of the robot and the nominal calibration
+    of the cameras; it uses no privileged state and no planner of the simulator.
+
+    Args:
+        config: configuration of the run.
+        facts: facts of the training data.
+        network: trained networks.
+    """
+
+    def __init__(self, config: KeyframeConfig, facts: dict[str, Any], network: KeyframeNetwork) -> None:
+        self._settings, self._hand_camera = config.decisions, facts["hand_camera"]
+        self._perception = Perception(network, config.decisions)
+        self.spec = PolicySpec(
+            convention="robocas",
+            reference="tcp",
+            rate_hz=5,
+            cameras=dict.fromkeys(facts["cameras"], config.image_size),
+            depth=True,
+            language="embedding",
+        )
+        self._paths: dict[str, ArmPaths] = {}  # by robot
+        self._specs: dict[int, EpisodeSpec] = {}  # by env
+        self._episodes: dict[int, KeyframeEpisode] = {}  # by env, from the first action on
+        self._runs: dict[int, Generator[Command, RobotView, RobotView]] = {}
+        self._image_requests: dict[int, bool] = {}
+
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
+        for episode in episodes:
+            self._paths.setdefault(episode.robot, ArmPaths(find_robot(episode.robot)))
+            self._specs[episode.env], self._image_requests[episode.env] = episode, True
+            self._runs.pop(episode.env, None)
+
+    def requests_images(self, envs: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return (E,) bool, whether the next decision of each env needs images."""
+        return np.array([self._image_requests[env] for env in envs.tolist()], dtype=bool)
+
+    def act(self, observations: Observations) -> NDArray[np.floating]:
+        """Return one action per env (E, 7)."""
+        tcp_in_base = from_wxyz(observations.tcp_in_base)
+        actions = []
+        for row, env in enumerate(observations.envs.tolist()):
+            frames = {}
+            if self._image_requests[env]:
+                frames = {camera: _select_frame(observations, camera, row) for camera in self.spec.cameras}
+            qpos = observations.qpos[row, RobotDescription.arm_slice].astype(np.float64)
+            width = float(observations.robot[GRIPPER_WIDTH].reshape(-1)[row])
+            view = RobotView(tcp_in_base[row], qpos, width, frames)
+            if env in self._runs:
+                command = self._runs[env].send(view)
+            else:
+                self._episodes[env] = self._start(env, observations, row)
+                self._runs[env] = self._episodes[env].run(view)
+                command = next(self._runs[env])
+            self._image_requests[env] = command.requests_images
+            actions.append(command.action)
+        return np.stack(actions)
+
+    def _start(self, env: int, observations: Observations, row: int) -> KeyframeEpisode:
+        spec = self._specs[env]
+        assert observations.embeddings is not None  # of language="embedding"
+        return KeyframeEpisode(
+            self._perception,
+            self._paths[spec.robot],
+            self._settings,
+            self._perception.read_instruction(observations.embeddings[row]),
+            np.random.default_rng([spec.episode, _STREAM]),
+            control_steps=1,
+            hand_camera=self._hand_camera,
+        )
+
+
+def _select_frame(observations: Observations, camera: str, row: int) -> CameraFrame:
+    return CameraFrame(
+        observations.images[camera][row],
+        observations.depths[camera][row, ..., 0],
+        observations.intrinsics[camera][row],
+        observations.camera_in_base[camera][row],
+    )
