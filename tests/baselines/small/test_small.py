@@ -223,7 +223,7 @@ def test_invalid_configurations(model, values):
 
 
 def _move_camera(folder):
-    path = sorted(folder.glob("episode_*/base_camera/cam_pos_wrt_arm_base.npy"))[2]
+    path = sorted(folder.glob("episode_*/base_camera/true_cam_pose_wrt_arm_base.npy"))[2]
     pose = np.load(path)
     pose[0, 3] += 0.002
     np.save(path, pose)

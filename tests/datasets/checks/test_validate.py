@@ -217,7 +217,8 @@ def turned(pose):
 
 
 def poses(parent, edit):
-    return lambda folder: [change_array(folder / f"{name}_wrt_{parent}.npy", edit) for name in ("cam_pos", "cam_pose")]
+    names = [f"{name}_wrt_{parent}.npy" for name in ("cam_pos", "cam_pose", "true_cam_pose")]
+    return lambda folder: [change_array(folder / name, edit) for name in names]
 
 
 def depth(edit):

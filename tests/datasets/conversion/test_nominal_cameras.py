@@ -78,6 +78,17 @@ def test_file_of_the_true_pose(folder, tmp_path, damage):
         np.testing.assert_array_equal(pose, NOMINAL["base_camera"])
 
 
+def test_nominal_pose_in_another_convention_is_reported(folder, tmp_path):
+    """A pose in the OpenGL frame is turned by 180 degrees."""
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    camera = copy / "episode_0000000/static_camera"
+    for name in ("cam_pos_wrt_world.npy", "cam_pose_wrt_world.npy"):
+        np.save(camera / name, np.load(camera / name) @ np.diag([1.0, -1, -1, 1]))
+    (violation,) = validate(copy).violations
+    assert violation.file == "episode_0000000/static_camera/true_cam_pose_wrt_world.npy"
+    assert violation.found.endswith("180 degrees")
+
+
 def test_lerobot_dataset(folder, trajectory, tmp_path):
     pytest.importorskip("av", reason="needs the extra 'lerobot'")
     pytest.importorskip("pyarrow", reason="needs the extra 'lerobot'")
