@@ -16,7 +16,7 @@ from robocas_ms3.baselines.baseline import Batch, OnRead, Split, make_empty_spli
 from robocas_ms3.baselines.keyframe.config import KeyframeConfig
 from robocas_ms3.baselines.keyframe.gripper_crops import CELLS, CROP_CHANNELS, POSE_FEATURES, augment_crops, make_crops
 from robocas_ms3.baselines.keyframe.network import FIRST_NAME, OFFSET_UNIT, STRIDE, make_inputs
-from robocas_ms3.baselines.keyframe.observed_scene import find_table_height, is_in_workspace, unproject
+from robocas_ms3.baselines.keyframe.observed_scene import find_table_height, is_in_workspace, sample_pixels, unproject
 from robocas_ms3.baselines.training.scenes import TrainingScenes, select_scene_settings
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_wxyz, transform_points
@@ -195,7 +195,7 @@ class KeyframeSamples:
         shifted = intrinsics - np.array([[0, 0, crop[0]], [0, 0, crop[1]], [0, 0, 0]])
         image = make_inputs(rgb[part], depth[part], shifted, pose)
         label, offset = self._make_labels(file, row, depth[part], segmentation[part], shifted, pose)
-        image, label, offset = _resize(image, label, offset, self._config.crop_size)
+        image = _resize(image, self._config.crop_size)
         if self._split == "train":
             image, label, offset = _augment(image, label, offset, rng, upside_down=is_look)
         grasps = self._read_grasps(file, row, depth, segmentation, intrinsics, pose, rng)
@@ -220,18 +220,20 @@ class KeyframeSamples:
         intrinsics: NDArray,
         pose: NDArray,
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Return the class (H, W) and the offset (3, H, W) of each pixel."""
-        decisions = file.candidates.decisions
-        names = decisions["object_name"][row]
-        classes = np.zeros(256, np.uint8)
+        """Return the class (h, w) and the offset (3, h, w) of each cell of a crop."""
+        width, height = (length // STRIDE for length in self._config.crop_size)
+        rows = ((np.arange(height) + 0.5) * depth.shape[0] / height).astype(np.int64)
+        columns = ((np.arange(width) + 0.5) * depth.shape[1] / width).astype(np.int64)
+        values = segmentation[np.ix_(rows, columns)]
+        names = file.candidates.decisions["object_name"][row]
+        classes, centers = np.zeros(256, np.uint8), np.zeros((256, 3))
         classes[:FIRST_SLOT] = range(FIRST_SLOT)
         classes[FIRST_SLOT : FIRST_SLOT + len(names)] = [self._class_of.get(str(name), 0) for name in names]
-        centers = np.zeros((256, 3))
         centers[FIRST_SLOT : FIRST_SLOT + len(names)] = np.nan_to_num(file.centers[row])
-        points, _ = unproject(depth, intrinsics, pose)
-        in_camera = (centers[segmentation] - points) @ pose[:3, :3]
-        is_object = segmentation >= FIRST_SLOT
-        return classes[segmentation], np.where(is_object, in_camera.transpose(2, 0, 1) / OFFSET_UNIT, 0.0)
+        points, _ = unproject(depth, intrinsics, pose, (rows, columns))
+        in_camera = (centers[values] - points) @ pose[:3, :3] / OFFSET_UNIT
+        in_camera[values < FIRST_SLOT] = 0
+        return classes[values], in_camera.transpose(2, 0, 1).astype(np.float32)
 
     def _read_grasps(
         self,
@@ -249,9 +251,9 @@ class KeyframeSamples:
         found = file.candidates.decision(row).candidates
         known = np.isin(found["primitive"], ("grasp", "lift")) & np.isfinite(found["start_in_base"][:, 0])
         known &= found["feasible"] | np.char.endswith(found["failure"], "collision")
-        points, valid = unproject(depth, intrinsics, pose)
-        step = (slice(None, None, _POINT_STEP), slice(None, None, _POINT_STEP))
-        values, points, valid = segmentation[step], points[step], valid[step]
+        pixels = sample_pixels(depth.shape, _POINT_STEP)
+        points, valid = unproject(depth, intrinsics, pose, pixels)
+        values = segmentation[np.ix_(*pixels)]
         valid &= (values != ROBOT) & is_in_workspace(points)
         values, points = values[valid], points[valid]
         others = points[values == 0][:, 2]
@@ -322,16 +324,11 @@ def _draw_crop(
     return left, top, crop_width, crop_height
 
 
-def _resize(
-    image: NDArray[np.float32], label: NDArray[np.uint8], offset: NDArray[np.float32], size: tuple[int, int]
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32]]:
-    """Scale an image (5, H, W) to ``size``, and its labels to the cells of the network."""
-    cells = size[0] // STRIDE, size[1] // STRIDE
+def _resize(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """Scale an image (5, H, W) to a width and height; heights and depths are not interpolated."""
     colors = [cv2.resize(channel, size, interpolation=cv2.INTER_LINEAR) for channel in image[:3]]
     distances = [cv2.resize(channel, size, interpolation=cv2.INTER_NEAREST) for channel in image[3:]]
-    small = cv2.resize(label, cells, interpolation=cv2.INTER_NEAREST)
-    moved = [cv2.resize(channel, cells, interpolation=cv2.INTER_NEAREST) for channel in offset.astype(np.float32)]
-    return np.stack([*colors, *distances]), np.asarray(small, np.uint8), np.stack(moved)
+    return np.stack([*colors, *distances])
 
 
 def _augment(
@@ -347,15 +344,15 @@ def _augment(
     upside_down: whether the image may be turned by half a turn, as images of the camera on the hand.
     """
     image, offset = image.copy(), offset.copy()
-    image[:3] = image[:3] * rng.uniform(0.75, 1.25) + rng.uniform(-0.15, 0.15) + rng.uniform(-0.06, 0.06, (3, 1, 1))
-    image[:3] += rng.normal(0, 0.02, image[:3].shape)
-    image[3] += rng.uniform(-0.15, 0.15)
-    image[4] += rng.uniform(-0.1, 0.1)
-    image[3:] += rng.normal(0, 0.006, image[3:].shape)
+    shifts = rng.uniform(-0.15, 0.15) + rng.uniform(-0.06, 0.06, 3)
+    image[:3] = image[:3] * np.float32(rng.uniform(0.75, 1.25)) + shifts.astype(np.float32)[:, None, None]
+    image[3:] += rng.uniform((-0.15, -0.1), (0.15, 0.1)).astype(np.float32)[:, None, None]
+    noise = np.array([0.02, 0.02, 0.02, 0.006, 0.006], np.float32)[:, None, None]
+    image += noise * rng.standard_normal(image.shape, np.float32)
     if upside_down and rng.random() < 0.5:
         image, label, offset = image[:, ::-1, ::-1], label[::-1, ::-1], offset[:, ::-1, ::-1]
-        offset = offset * np.array([-1, -1, 1])[:, None, None]
+        offset = offset * np.array([-1, -1, 1], np.float32)[:, None, None]
     if rng.random() < 0.5:
         image, label, offset = image[:, :, ::-1], label[:, ::-1], offset[:, :, ::-1]
-        offset = offset * np.array([-1, 1, 1])[:, None, None]
+        offset = offset * np.array([-1, 1, 1], np.float32)[:, None, None]
     return image, label, offset

@@ -16,21 +16,29 @@ _TABLE_BINS = (-0.1, 0.6, 200)  # m, m, number of bins of the histogram of heigh
 _MAX_VOTES = 1200  # cells of an object that vote
 
 
-def unproject(depth: NDArray, intrinsics: NDArray, camera_in_base: NDArray) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the points (H, W, 3) of a depth image in the arm's base frame in m, and whether each is valid (H, W).
+def unproject(
+    depth: NDArray, intrinsics: NDArray, camera_in_base: NDArray, pixels: tuple[NDArray, NDArray] | None = None
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the points (R, C, 3) of a depth image in the arm's base frame in m, and whether each is valid (R, C).
 
     Args:
         depth: (H, W) depth along the optical axis, mm; 0: no measurement.
         intrinsics: (3, 3) intrinsic matrix, pixels.
         camera_in_base: (4, 4) pose of the OpenCV camera frame in the arm's base frame.
+        pixels: rows (R,) and columns (C,) of the image; None: all.
     """
-    meters = depth.astype(np.float64) / 1000
-    height, width = meters.shape
-    x = (np.arange(width) + 0.5 - intrinsics[0, 2]) / intrinsics[0, 0]
-    y = (np.arange(height) + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1]
-    points = np.stack([x[None] * meters, y[:, None] * meters, meters], axis=-1)
-    pose = camera_in_base.astype(np.float64)
-    return points @ pose[:3, :3].T + pose[:3, 3], meters > 0
+    rows, columns = (np.arange(length) for length in depth.shape) if pixels is None else pixels
+    meters = (depth if pixels is None else depth[np.ix_(rows, columns)]).astype(np.float64) / 1000
+    x = (columns + 0.5 - intrinsics[0, 2]) / intrinsics[0, 0]
+    y = (rows + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1]
+    rotation, position = camera_in_base[:3, :3].astype(np.float64), camera_in_base[:3, 3].astype(np.float64)
+    rays = x[None, :, None] * rotation[:, 0] + y[:, None, None] * rotation[:, 1] + rotation[:, 2]
+    return rays * meters[..., None] + position, meters > 0
+
+
+def sample_pixels(size: tuple[int, ...], step: int, first: int = 0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return rows and columns of an image with a size (H, W), every ``step`` pixels from the pixel ``first`` on."""
+    return np.arange(first, size[0], step), np.arange(first, size[1], step)
 
 
 def is_in_workspace(points: Array) -> NDArray[np.bool_]:

@@ -27,6 +27,7 @@ from robocas_ms3.baselines.keyframe.observed_scene import (
     cluster_votes,
     find_table_height,
     is_in_workspace,
+    sample_pixels,
     unproject,
 )
 from robocas_ms3.scenes.relations import RELATIONS, Relation
@@ -136,10 +137,10 @@ class Perception:
         target = names @ request.names / max(float(request.names.max()), 1e-6)
         target = np.minimum(target, 1.0)
         probability = names.sum(-1)
-        points, valid = unproject(frame.depth, frame.intrinsics, frame.camera_in_base)
-        step = (slice(None, None, _POINT_STEP), slice(None, None, _POINT_STEP))
-        robot = _enlarge(cells.classes[..., ROBOT], size)[step]
-        points, valid = points[step], valid[step] & (robot < 0.4)
+        pixels = sample_pixels(size, _POINT_STEP)
+        points, valid = unproject(frame.depth, frame.intrinsics, frame.camera_in_base, pixels)
+        step = np.ix_(*pixels)
+        valid &= _enlarge(cells.classes[..., ROBOT], size)[step] < 0.4
         valid &= is_in_workspace(points) & (points[..., 2] > table - 0.02)
         cloud, rows = points[valid], np.flatnonzero(valid.ravel())
         number_of_cell = _cells_of_points(valid.shape, cells.valid.shape)[rows]
@@ -185,9 +186,9 @@ class Perception:
             logits, offsets = self._network.segmentation(image)
         classes = logits[0].softmax(dim=0).permute(1, 2, 0).cpu().numpy()
         in_camera = OFFSET_UNIT * offsets[0].permute(1, 2, 0).cpu().numpy().astype(np.float64)
-        points, valid = unproject(frame.depth, frame.intrinsics, frame.camera_in_base)
-        middle = (slice(1, None, STRIDE), slice(1, None, STRIDE))
-        return _Cells(points[middle], valid[middle], classes, in_camera @ frame.camera_in_base[:3, :3].T)
+        pixels = sample_pixels(frame.depth.shape, STRIDE, STRIDE // 2)
+        points, valid = unproject(frame.depth, frame.intrinsics, frame.camera_in_base, pixels)
+        return _Cells(points, valid, classes, in_camera @ frame.camera_in_base[:3, :3].T)
 
 
 def _find_basket(points: Array) -> Array | None:
