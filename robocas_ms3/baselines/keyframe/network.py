@@ -39,11 +39,12 @@ def make_inputs(
     """
     meters = depth.astype(np.float32) / 1000
     height, width = meters.shape
+    intrinsics = intrinsics.astype(np.float32)
     u = (np.arange(width, dtype=np.float32) + 0.5 - intrinsics[0, 2]) / intrinsics[0, 0]
     v = (np.arange(height, dtype=np.float32) + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1]
     up = camera_in_base[2].astype(np.float32)
     heights = (up[0] * u[None] + up[1] * v[:, None] + up[2]) * meters + up[3]
-    heights = np.where(meters > 0, heights, -0.5)
+    heights = np.where(meters > 0, heights, np.float32(-0.5))
     colors = rgb.transpose(2, 0, 1).astype(np.float32) / 127.5 - 1
     return np.concatenate([colors, 3 * np.clip(heights, -0.6, 1)[None], np.clip(meters, 0, 3)[None] - 0.5])
 

@@ -1,0 +1,132 @@
+"""Point cloud, objects, height map, crops and proposals of `keyframe`."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.baselines.keyframe.grasp_proposals import propose_colliding_grasps, propose_grasps
+from robocas_ms3.baselines.keyframe.gripper_crops import CELL, CELLS, augment_crops, make_crops
+from robocas_ms3.baselines.keyframe.network import make_inputs
+from robocas_ms3.baselines.keyframe.observed_scene import (
+    HeightMap,
+    cluster_votes,
+    find_table_height,
+    sample_pixels,
+    unproject,
+)
+
+INTRINSICS = np.array([[100.0, 0, 4], [0, 100.0, 3], [0, 0, 1]])
+DOWN = np.array([[0, 1, 0, 0.5], [1, 0, 0, 0.25], [0, 0, -1, 1.0], [0, 0, 0, 1]])  # a camera that looks down from 1 m
+
+
+def make_box(size=(0.04, 0.06, 0.05), center=(0.6, 0.0), bottom=0.1, count=2000, seed=0):
+    """Points on the top and the sides of a box."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.5, 0.5, (count, 3))
+    side = rng.integers(5, size=count)
+    for number, (axis, value) in enumerate(((2, 0.5), (0, 0.5), (0, -0.5), (1, 0.5), (1, -0.5))):
+        points[side == number, axis] = value
+    return points * size + np.array([*center, bottom + size[2] / 2])
+
+
+def test_points_of_a_depth_image():
+    depth = np.full((6, 8), 500, np.uint16)
+    depth[0, 0] = 0
+    points, valid = unproject(depth, INTRINSICS, DOWN)
+    # the middle of pixel (3, 4) is 0.5 pixels right of and below the principal point: 0.5 / 100 * 0.5 m = 2.5 mm
+    assert np.allclose(points[3, 4], [0.5 + 0.0025, 0.25 + 0.0025, 0.5])
+    assert valid.sum() == 47 and not valid[0, 0]
+    some, _ = unproject(depth, INTRINSICS, DOWN, sample_pixels(depth.shape, 2, 1))
+    assert some.shape == (3, 4, 3) and np.allclose(some[1, 1], points[3, 3])
+
+
+def test_inputs_have_colour_height_and_depth():
+    rgb = np.zeros((6, 8, 3), np.uint8)
+    rgb[..., 0] = 255
+    depth = np.full((6, 8), 800, np.uint16)
+    depth[0, 0] = 0
+    inputs = make_inputs(rgb, depth, INTRINSICS, DOWN)
+    assert inputs.shape == (5, 6, 8) and inputs.dtype == np.float32
+    assert np.allclose(inputs[:, 3, 4], [1, -1, -1, 3 * 0.2, 0.3])  # 0.2 m above the base, 0.8 m - 0.5
+    assert np.allclose(inputs[3:, 0, 0], [3 * -0.5, -0.5])  # no measurement
+
+
+def test_the_commonest_height_is_the_table():
+    heights = np.concatenate([np.full(50, 0.12), np.linspace(0.13, 0.4, 40)])
+    assert find_table_height(heights) == pytest.approx(0.12, abs=0.002)
+
+
+def test_votes_of_two_objects_make_two_groups():
+    rng = np.random.default_rng(0)
+    first, second = rng.normal(0, 0.005, (40, 3)), rng.normal(0, 0.005, (30, 3)) + [0.1, 0, 0]
+    groups = cluster_votes(np.concatenate([first, second, [[1.0, 1, 1]]]), 5)
+    assert [sorted(group.tolist()) for group in groups] == [list(range(40)), list(range(40, 70))]
+
+
+def test_free_squares_are_empty_and_observed():
+    heights = HeightMap()
+    x, y = np.meshgrid(np.arange(0.405, 0.6, 0.01), np.arange(-0.095, 0.1, 0.01))
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.12)], axis=1)
+    heights.update(points)
+    squares = heights.find_free_squares(0.12, 5)
+    assert len(squares) == 36 and np.allclose(squares.mean(axis=0), [0.5, 0], atol=1e-6)
+    heights.update(np.array([[0.5, 0.0, 0.2]]))  # an object in the middle
+    assert np.abs(heights.find_free_squares(0.12, 5) - [0.51, 0.01]).max(axis=1).min() > 0.05
+
+
+def test_crop_shows_the_surface_in_the_tcp_frame():
+    grasp = np.eye(4)
+    grasp[:3, :3] = Rotation.from_euler("x", np.pi).as_matrix()  # approach down
+    grasp[:3, 3] = 0.6, 0, 0.15
+    points = np.array([[0.601, -0.001, 0.17], [0.601, -0.001, 0.13], [0.601 + 5 * CELL, -0.001, 0.12]])
+    crops, poses = make_crops(points, np.array([0.25, 1.0, 0.5]), grasp[None], 0.12)
+    middle = CELLS // 2
+    assert crops.shape == (1, 3, CELLS, CELLS) and crops[0, 1].sum() == 2
+    assert crops[0, :, middle, middle] == pytest.approx([-0.2, 1, 0.25])  # the point nearest to the palm, 2 cm before
+    assert crops[0, :, middle + 5, middle] == pytest.approx([0.3, 1, 0.5])
+    assert poses[0, :3] == pytest.approx([-1, 0, 0.03 * 8], abs=1e-6)
+
+
+@given(st.integers(0, 1000))
+def test_augmentation_moves_no_more_than_a_cell(seed):
+    crops = np.zeros((2, 3, CELLS, CELLS), np.float32)
+    crops[:, 1, 10:30, 10:30] = 1
+    poses = np.ones((2, 8), np.float32)
+    found, changed = augment_crops(crops, poses, np.random.default_rng(seed))
+    assert found.shape == crops.shape and crops[:, 1].sum() == 800
+    assert found[:, 1, 12:28, 12:28].mean() > 0.9 and not found[:, 1, :8].any()
+    assert np.allclose(np.abs(changed), 1)
+
+
+def test_grasps_of_a_box_are_across_its_sides():
+    points = make_box()
+    rng = np.random.default_rng(1)
+    found = propose_colliding_grasps(points, 0.1, 200, rng)
+    assert 20 < len(found.heuristic) <= 200
+    best = found.tcp_in_base[found.heuristic.argmax()]
+    assert np.allclose(best[:2, 3], [0.6, 0], atol=0.012)  # near the middle
+    tip = found.tcp_in_base[:, 2, 3] + 0.0085 * found.tcp_in_base[:, 2, 2]
+    assert tip.min() > 0.1  # above the table
+    assert np.allclose(np.linalg.det(found.tcp_in_base[:, :3, :3]), 1)
+
+
+def test_a_wide_object_is_grasped_near_its_edges_only():
+    found = propose_colliding_grasps(make_box((0.1, 0.1, 0.02)), 0.1, 400, np.random.default_rng(0))
+    shift = found.tcp_in_base[:, :2, 3] - [0.6, 0]
+    assert len(shift) and np.linalg.norm(shift, axis=1).min() > 0.03
+
+
+def test_no_grasp_of_too_few_points():
+    assert not len(propose_colliding_grasps(make_box(count=10), 0.1, 100, np.random.default_rng(0)).heuristic)
+
+
+def test_grasps_touch_no_neighbour():
+    box, wall = make_box(), make_box((0.3, 0.02, 0.2), center=(0.6, 0.045))
+    points, is_object = np.concatenate([box, wall]), np.arange(4000) < 2000
+    alone = propose_grasps(box, np.ones(2000, bool), 0.1, 200, np.random.default_rng(2))
+    beside = propose_grasps(points, is_object, 0.1, 200, np.random.default_rng(2))
+    assert 0 < len(beside.heuristic) < len(alone.heuristic)
+    closing = np.abs(beside.tcp_in_base[:, 1, 1])
+    assert closing.max() < 0.8  # the fingers are not between the box and the wall

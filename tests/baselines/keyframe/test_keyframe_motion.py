@@ -1,0 +1,66 @@
+"""Paths and looks of `keyframe`."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from robocas_ms3.baselines.keyframe.motion import LIFT, PREGRASP, ArmPaths, PathFollower, find_looks
+from robocas_ms3.core.poses import from_rotation, inverse
+from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
+
+REST = np.array([0, np.pi / 8, 0, -5 * np.pi / 8, 0, 3 * np.pi / 4, np.pi / 4])
+DOWN = Rotation.from_euler("x", np.pi).as_matrix()
+
+
+@pytest.fixture(scope="module")
+def paths():
+    return ArmPaths(find_robot(DEFAULT_ROBOT))
+
+
+def test_approach_ends_at_the_grasp_with_the_greatest_score(paths):
+    grasps = from_rotation([[0.6, 0, 0.15], [0.55, 0.1, 0.15], [2.0, 0, 0.15]], np.stack([DOWN] * 3))
+    index, approach = paths.plan_approach(grasps, np.array([0.1, 0.5, 0.9]), REST)
+    assert index == 1  # the third one is out of reach
+    ends = paths.chain.tcp(np.stack([approach.start, approach.path[-1]]))
+    assert np.allclose(ends[1], approach.grasp, atol=1e-4)
+    assert np.allclose(ends[0][:3, 3], [0.55, 0.1, 0.15 + PREGRASP], atol=1e-4)
+    assert paths.rise(approach.path[-1], approach.grasp, 0.15 + LIFT) is not None
+
+
+def test_no_approach_out_of_reach(paths):
+    assert paths.plan_approach(from_rotation([[2.0, 0, 0.2]], DOWN[None]), np.ones(1), REST) is None
+
+
+def test_rise_moves_nearer_where_the_pose_above_is_out_of_reach(paths):
+    far = from_rotation([0.72, 0, 0.2], DOWN)
+    reachable, qpos = paths.reach(far[None], REST)
+    assert reachable[0]
+    path = paths.rise(qpos[0], far, 0.6)
+    end = paths.chain.tcp(path[-1:])[0]
+    assert end[2, 3] > 0.45 and np.linalg.norm(end[:2, 3]) < 0.72
+
+
+def test_a_follower_reaches_the_end_of_a_path_in_limited_steps(paths):
+    goal = REST + [0.8, 0, 0, 0, 0, 0, 0]
+    path = paths.joint(REST, goal)
+    follower, qpos, steps = PathFollower(paths.chain, path, 1), REST, 0
+    poses = paths.chain.tcp(path)
+    while not follower.is_last:
+        here = paths.chain.tcp(qpos[None])[0]
+        pose = follower.next_pose(here, qpos)
+        motion = inverse(here) @ pose
+        assert np.abs(motion[:3, 3]).max() < 0.1 and Rotation.from_matrix(motion[:3, :3]).magnitude() < 0.5
+        qpos = path[int(np.abs(poses - pose).sum(axis=(1, 2)).argmin())]  # the arm follows exactly
+        steps += 1
+    assert np.allclose(qpos, goal) and 2 <= steps <= 20
+    assert np.allclose(follower.goal, poses[-1])
+
+
+def test_looks_have_the_point_in_the_middle_of_the_image():
+    camera_in_tcp = from_rotation([0.05, 0.0, -0.05], Rotation.from_euler("z", np.pi / 2).as_matrix())
+    point = np.array([0.6, 0.1, 0.12])
+    poses, costs = find_looks(camera_in_tcp, point, (0.5, 0.4))
+    in_camera = np.einsum("nij,j->ni", inverse(poses @ camera_in_tcp), [*point, 1])[:, :3]
+    assert np.allclose(in_camera[:, :2], 0, atol=1e-9)
+    assert set(np.round(in_camera[:, 2], 6)) == {0.5, 0.4}
+    assert np.allclose((poses @ camera_in_tcp)[costs.argmin()][:3, 2], [0, 0, -1], atol=1e-9)  # straight down
