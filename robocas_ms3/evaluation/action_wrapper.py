@@ -22,7 +22,9 @@ Stepping = Literal["timed", "upstream"]
 V0_CONTROL_HZ = 5
 # A policy step of RoboCAS-v0: the gripper moves until it stops, at most 5 control steps; then the
 # arm moves, at most 2.
-_GRIPPER_STEPS, _MOTION_STEPS = 5, 2
+_GRIPPER_STEPS = 5
+MOTION_STEPS: dict[Stepping, int] = {"timed": 1, "upstream": 2}
+"""Maximum number of control steps in which an action moves the arm, by stepping."""
 _STOPPED = 0.0005  # largest change in gripper width per control step, m; velocities jitter while the fingers press
 _UNUSED_SIZE = 8  # pixels per side of cameras that the policy does not use; they are rendered all the same
 # RoboCAS-v0's motion ends early within this distance (m) and angle (rad) of its goal, below this speed (rad/s).
@@ -148,7 +150,7 @@ class PolicyActionWrapper(gym.Wrapper):
                 break
             result, turned = self._move_to(*held, motion.open), np.zeros_like(turned)
         goal = _apply_motion(self._tcp_pose() if self._reference == "tcp" else self._commanded_pose(), motion)
-        for _ in range(_MOTION_STEPS):
+        for _ in range(MOTION_STEPS["upstream"]):
             result = self._move_to(*goal, motion.open)
             if self._has_arrived(*goal).all():
                 break

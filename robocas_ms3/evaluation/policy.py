@@ -147,6 +147,7 @@ class EpisodeSpec:
         instruction: text of the instruction; may be empty.
         robot: name of the robot.
         max_steps: maximum number of policy steps of the episode; None: unknown.
+        motion_steps: maximum number of control steps in which an action moves the arm: 1, or 2 with RoboCAS-v0's steps.
     """
 
     env: int
@@ -159,6 +160,7 @@ class EpisodeSpec:
     instruction: str
     robot: str = DEFAULT_ROBOT
     max_steps: int | None = None
+    motion_steps: int = 1
 
 
 @dataclass(frozen=True)

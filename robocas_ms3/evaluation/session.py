@@ -21,6 +21,7 @@ from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.action_wrapper import (
+    MOTION_STEPS,
     V0_CONTROL_HZ,
     PolicyActionWrapper,
     check_action_noise_available,
@@ -155,6 +156,7 @@ class EvaluationSession:
             instruction=episode.instruction,
             robot=self.protocol.rules.robot,
             max_steps=self.max_steps(episode.task),
+            motion_steps=MOTION_STEPS[self.protocol.rules.stepping],
         )
 
     def run_episodes(self, episodes: Sequence[ProtocolEpisode], max_steps: int | None = None) -> Iterator[Outcome]:

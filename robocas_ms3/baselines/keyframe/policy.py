@@ -91,7 +91,7 @@ class KeyframePolicy:
             self._settings,
             self._perception.read_instruction(observations.embeddings[row]),
             np.random.default_rng([spec.episode, _STREAM]),
-            control_steps=1,
+            control_steps=spec.motion_steps,
             hand_camera=self._hand_camera,
         )
 

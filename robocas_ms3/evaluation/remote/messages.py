@@ -76,6 +76,7 @@ class _EpisodeFields(BaseModel):
     instruction: _Text | None = None
     robot: _Text = DEFAULT_ROBOT
     max_steps: _Number | None = None
+    motion_steps: _Number = 1
 
 
 class Request(BaseModel):
@@ -165,7 +166,7 @@ def make_observation_message(
     if start is not None:
         values = {name: value for name, value in vars(start).items() if name != "env"}
         values |= {name: message_file_name(values[name]) for name in ("config_file", "layouts_file")}
-        defaults = {"robot": DEFAULT_ROBOT, "max_steps": None}  # left out
+        defaults = {"robot": DEFAULT_ROBOT, "max_steps": None, "motion_steps": 1}  # left out
         values = {name: value for name, value in values.items() if name not in defaults or value != defaults[name]}
         message[START] = values
     return message
