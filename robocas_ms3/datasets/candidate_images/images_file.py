@@ -132,7 +132,7 @@ def read_images(file: h5py.File) -> dict[str, CameraImages]:
     for camera, group in file.items():
         rows = range(len(group["intrinsic"]))
         files = [[_read_png(group, kind, row).tobytes() for row in rows] if kind in group else [] for kind in KINDS]
-        images[camera] = CameraImages(*files, group["intrinsic"][:], *(group[name][:] for name in _POSES))
+        images[camera] = CameraImages(*files, *(group[name][:] for name in ("intrinsic", *_POSES)))
     return images
 
 
