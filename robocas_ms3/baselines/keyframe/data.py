@@ -187,7 +187,7 @@ class KeyframeSamples:
         images = file.images
         fx, fy, cx, cy = images.intrinsic(row, camera)
         intrinsics, pose = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), images.camera_in_base(row, camera)
-        rgb, depth, segmentation = (read(row, camera) for read in (images.rgb, images.depth, images.segmentation))
+        rgb, depth, segmentation = images.rgb(row, camera), images.depth(row, camera), images.segmentation(row, camera)
         is_look = camera in file.hand_cameras
         scale = self._config.crop_scale if is_look else _FIXED_CAMERA_SCALE
         crop = _draw_crop(segmentation, self._config.crop_size, scale, rng)

@@ -69,7 +69,7 @@ Motion = Generator[Command, RobotView, RobotView]
 """Generator that yields commands, receives observations, and returns the last observation."""
 
 
-class MotionFailed(Exception):
+class MotionError(Exception):
     """The arm has no path for a motion."""
 
 
@@ -246,7 +246,7 @@ class KeyframeEpisode:
             view = yield from self._straight(view, approach.grasp, OPEN)
             view = yield from self._wait(view, CLOSED)
             view = yield from self._rise(view, float(view.tcp_in_base[2, 3]) + LIFT, CLOSED)
-        except MotionFailed:
+        except MotionError:
             self._failed.append(approach.grasp)
             return view, False
         holds = view.width >= _EMPTY
@@ -264,7 +264,7 @@ class KeyframeEpisode:
             return view
         try:
             view = yield from self._carry(view, min(chosen.hanging, 0.16), chosen.safe_height)
-        except MotionFailed:
+        except MotionError:
             self.log.append("no path to the basket")
         return (yield from self._wait(view, OPEN))
 
@@ -276,14 +276,14 @@ class KeyframeEpisode:
             return view
         try:
             view = yield from self._place(view, chosen)
-        except MotionFailed:
+        except MotionError:
             self.log.append("no path to a free place")
         return (yield from self._wait(view, OPEN))
 
     def _carry(self, view: RobotView, hanging: float, safe_height: float) -> Motion:
         """Carry the held object over the basket."""
         if self._basket is None:
-            raise MotionFailed
+            raise MotionError
         rim = float(self._basket[2])
         azimuth = float(np.arctan2(self._basket[1], self._basket[0]))
         away = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
@@ -305,7 +305,7 @@ class KeyframeEpisode:
                         costs.append(0.01 * np.rad2deg(tilt) + 4 * nearer)
         found = self._paths.nearest(np.array(poses), np.array(costs), view.qpos, 0.5)
         if not found:
-            raise MotionFailed
+            raise MotionError
         view = yield from self._rise(view, max(safe_height, rim + 0.15), CLOSED)
         return (yield from self._follow(view, self._paths.joint(view.qpos, found[0][1]), CLOSED, _COARSE))
 
@@ -319,7 +319,7 @@ class KeyframeEpisode:
                 poses.append(from_rotation([*spot, self._table + chosen.hanging + 0.02], rotation))
                 costs.append(2 * float(np.linalg.norm(spot - view.tcp_in_base[:2, 3])))
         if not poses:
-            raise MotionFailed
+            raise MotionError
         above = np.array(poses)
         above[:, 2, 3] += LIFT
         for index, qpos in self._paths.nearest(above, np.array(costs), view.qpos, 0.5)[:10]:
@@ -328,7 +328,7 @@ class KeyframeEpisode:
             view = yield from self._rise(view, max(chosen.safe_height, 0.38), CLOSED)
             view = yield from self._follow(view, self._paths.joint(view.qpos, qpos), CLOSED, _COARSE)
             return (yield from self._straight(view, poses[index], CLOSED))
-        raise MotionFailed
+        raise MotionError
 
     def _find_spots(self, view: RobotView) -> Array:
         for cells in _FREE_CELLS:
@@ -364,7 +364,7 @@ class KeyframeEpisode:
     def _straight(self, view: RobotView, tcp_in_base: Array, gripper: float) -> Motion:
         path = self._paths.straight(view.qpos, tcp_in_base)
         if path is None:
-            raise MotionFailed
+            raise MotionError
         return (yield from self._follow(view, path, gripper))
 
     def _rise(self, view: RobotView, height: float, gripper: float, *, required: bool = True) -> Motion:
@@ -373,7 +373,7 @@ class KeyframeEpisode:
         path = self._paths.rise(view.qpos, view.tcp_in_base, height)
         if path is None:
             if required:
-                raise MotionFailed
+                raise MotionError
             return view
         return (yield from self._follow(view, path, gripper, _COARSE))
 

@@ -66,7 +66,7 @@ class ArmPaths:
     def joint(self, qpos: Array, goal: Array) -> Array:
         """Return a path (n, 7) from a configuration to another one, straight in joint space."""
         count = max(2, int(np.ceil(np.abs(goal - qpos).max() / _JOINT_STEP)))
-        return np.linspace(qpos, goal, count + 1)[1:]
+        return np.asarray(np.linspace(qpos, goal, count + 1)[1:], np.float64)
 
     def rise(self, qpos: Array, tcp_in_base: Array, height: float) -> Array | None:
         """Return a path (n, 7) that raises the TCP from its pose (4, 4) to a height in m, or None.
@@ -155,7 +155,7 @@ class PathFollower:
         turns = np.linalg.norm(Rotation.from_matrix(ahead[:, :3, :3]).as_rotvec(), axis=1)
         joints = np.abs(self._path[self._index :] - qpos).max(axis=1)
         sizes = np.stack([np.abs(ahead[:, :3, 3]).max(axis=1), turns, joints])
-        fits = (sizes <= self._limits[:, None]).all(axis=0)
+        fits = np.asarray((sizes <= self._limits[:, None]).all(axis=0))
         fits[0] = True
         steps = int(np.argmin(fits)) - 1 if not fits.all() else len(fits) - 1
         self._index = min(self._index + max(steps, 1), len(self._path) - 1)

@@ -102,14 +102,12 @@ class ObservedScene:
 
     Attributes:
         points: (P, 3) points in the arm's base frame, m.
-        target: (P,) probability that each point is on an object with the name in the instruction.
         is_object: (P,) whether each point is on an object.
         targets: objects that may be the target.
         objects: all objects.
     """
 
     points: Array
-    target: Array
     is_object: NDArray[np.bool_]
     targets: list[ObservedObject]
     objects: list[ObservedObject]
@@ -135,4 +133,5 @@ class HeightMap:
         """Return the middles (N, 2) of squares of ``cells`` x ``cells`` cells on the surface with nothing on it, m."""
         free = np.isfinite(self.heights) & (self.heights < table + 0.012)
         windows = np.lib.stride_tricks.sliding_window_view(free, (cells, cells)).all(axis=(2, 3))
-        return (np.argwhere(windows) + cells / 2) * _MAP_CELL + (_MAP_X[0], _MAP_Y[0])
+        squares = (np.argwhere(windows) + cells / 2) * _MAP_CELL + (_MAP_X[0], _MAP_Y[0])
+        return np.asarray(squares, np.float64)

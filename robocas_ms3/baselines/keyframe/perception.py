@@ -144,7 +144,6 @@ class Perception:
         valid &= is_in_workspace(points) & (points[..., 2] > table - 0.02)
         cloud, rows = points[valid], np.flatnonzero(valid.ravel())
         number_of_cell = _cells_of_points(valid.shape, cells.valid.shape)[rows]
-        large_target = _enlarge(target, size)[step][valid]
         large_object = _enlarge(probability, size)[step][valid]
 
         def find(mask: NDArray[np.bool_], of: NDArray[np.float32], label: int) -> list[ObservedObject]:
@@ -170,7 +169,7 @@ class Perception:
             for label in np.unique(labels[is_object]).tolist()
             for one in find(is_object & (labels == label), names[..., label], label)
         ]
-        return ObservedScene(cloud, large_target, large_object > settings.object_probability, targets, objects)
+        return ObservedScene(cloud, large_object > settings.object_probability, targets, objects)
 
     def score_grasps(self, scene: ObservedScene, mask: NDArray[np.bool_], grasps: Array, table: float) -> Array:
         """Return the predicted probability of success of grasps (G, 4, 4) of the object with the points ``mask``."""
@@ -200,7 +199,8 @@ def _find_basket(points: Array) -> Array | None:
 
 
 def _enlarge(cells: NDArray[np.float32], size: tuple[int, ...]) -> NDArray[np.float32]:
-    return np.asarray(cv2.resize(cells.astype(np.float32), (size[1], size[0]), interpolation=cv2.INTER_LINEAR))
+    large = cv2.resize(cells.astype(np.float32), (size[1], size[0]), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(large, np.float32)
 
 
 def _cells_of_points(points: tuple[int, ...], cells: tuple[int, ...]) -> NDArray[np.int64]:

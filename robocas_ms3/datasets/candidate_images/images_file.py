@@ -131,8 +131,10 @@ def read_images(file: h5py.File) -> dict[str, CameraImages]:
     images = {}
     for camera, group in file.items():
         rows = range(len(group["intrinsic"]))
-        files = [[_read_png(group, kind, row).tobytes() for row in rows] if kind in group else [] for kind in KINDS]
-        images[camera] = CameraImages(*files, *(group[name][:] for name in ("intrinsic", *_POSES)))
+        values: dict[str, Any] = {
+            kind: [_read_png(group, kind, row).tobytes() for row in rows] if kind in group else [] for kind in KINDS
+        }
+        images[camera] = CameraImages(**values, **{name: group[name][:] for name in ("intrinsic", *_POSES)})
     return images
 
 
