@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import h5py
 import numpy as np
 
 from robocas_ms3.datasets.images.image_files import ImageOptions, compute_bounding_box
-from robocas_ms3.datasets.sources.episode_source import StepImages
+from robocas_ms3.datasets.sources.episode_source import FIRST_SLOT, StepImages
 from robocas_ms3.robots.camera_models import CameraModel
 from robocas_ms3.robots.cameras import STANDARD_CAMERA_NAMES, standard_camera_parent
 from robocas_ms3.robots.description import MOBILE_PANDA
@@ -67,6 +68,15 @@ class RayCaster:
     def close(self):
         self.closed = True
 
+    @contextmanager
+    def select_cameras(self, names):
+        options = self.image_options
+        self.image_options = replace(options, cameras=tuple(names))
+        try:
+            yield
+        finally:
+            self.image_options = options
+
     def cameras(self):
         return {
             name: CameraModel(
@@ -98,7 +108,10 @@ class RayCaster:
             depth = {n: p[1] for n, p in shots.items() if self.image_options.depth}
             masks = {n: p[2] == 2 for n, p in shots.items() if self.image_options.boxes}  # after the table: the target
             found = {n: box for n, mask in masks.items() if (box := compute_bounding_box(mask))}
-            yield StepImages({n: p[0] for n, p in shots.items()}, depth, found)
+            values = np.maximum(np.arange(len(boxes) + 1) - 2 + FIRST_SLOT, 0) * (np.arange(len(boxes) + 1) > 1)
+            wanted_values = shots if self.image_options.segmentation else {}
+            segmentation = {n: values[p[2]].astype(np.uint8) for n, p in wanted_values.items()}
+            yield StepImages({n: p[0] for n, p in shots.items()}, depth, found, segmentation)
 
     def shoot(self, camera_in_world, boxes):
         width, height = self.size
