@@ -297,7 +297,14 @@ def _open(path: Path, size: tuple[int, int]) -> _File:
 def _compute_centers(file: CandidateFile) -> NDArray[np.float64]:
     """Return the centres (D, K, 3) of the objects in the arm's base frame, m; NaN in empty slots."""
     decisions, pack = file.decisions, load_pack(file.recorded_env.kwargs.get("pack", "builtin"))
-    middles = {one: pack.objects[one].surface_points().mean(axis=0) for one in np.unique(decisions["object_id"]) if one}
+    ids = [str(one) for one in np.unique(decisions["object_id"]) if one]
+    unknown = sorted(set(ids) - set(pack.objects))
+    if unknown:
+        fix = "Install the pack of the recording."
+        raise DatasetError(
+            "unknown objects", where=file.path, expected=f"objects of {pack.root}", found=unknown, fix=fix
+        )
+    middles = {one: pack.objects[one].surface_points().mean(axis=0) for one in ids}
     centers = np.full((*decisions["present"].shape, 3), np.nan)
     for row, slot in np.argwhere(decisions["present"]).tolist():
         pose = from_wxyz(decisions["object_in_base"][row, slot].astype(np.float64))

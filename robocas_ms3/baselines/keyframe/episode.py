@@ -26,7 +26,7 @@ _LOOK_HEIGHT = 0.4  # m of the TCP before a look
 _EMPTY = 0.003  # m, gripper width below which nothing is held
 _WAIT = 4  # control steps of 0.2 s in which the gripper closes or opens
 _PRECISE, _COARSE = (0.004, 0.03), (0.02, 0.1)  # m and rad from the goal at which a motion ends
-_PATIENCE = 5  # policy steps at the end of a path until it ends without arriving
+_PATIENCE = 5  # policy steps without progress, after which a motion ends
 _REPEAT_DISTANCE = 0.02  # m around a failed grasp in which similar grasps lose score
 _FREE_CELLS = (11, 7)  # sizes of free squares in cells of 2 cm, the preferred one first
 _SPOT_DISTANCES = (0.35, 0.8)  # m from the base, least and greatest distance of a place for an obstacle
@@ -349,16 +349,16 @@ class KeyframeEpisode:
     def _follow(
         self, view: RobotView, path: Array, gripper: float, tolerance: tuple[float, float] = _PRECISE
     ) -> Motion:
-        follower, waited = PathFollower(self._paths.chain, path, self._control_steps), 0
-        while waited < _PATIENCE:
-            pose = follower.next_pose(view.tcp_in_base, view.qpos)
+        follower, index, waited = PathFollower(self._paths.chain, path, self._control_steps), -1, 0
+        while waited < _PATIENCE:  # steps without progress: the arm has nearly arrived, or is blocked
+            pose = follower.next_pose(view.tcp_in_base)
             view = yield Command(_make_action(view, pose, gripper))
-            if follower.is_last:
-                error = inverse(view.tcp_in_base) @ follower.goal
-                turn = Rotation.from_matrix(error[:3, :3]).magnitude()
-                if np.linalg.norm(error[:3, 3]) < tolerance[0] and turn < tolerance[1]:
-                    break
-                waited += 1
+            error = inverse(view.tcp_in_base) @ follower.goal
+            turn = Rotation.from_matrix(error[:3, :3]).magnitude()
+            if follower.is_last and np.linalg.norm(error[:3, 3]) < tolerance[0] and turn < tolerance[1]:
+                break
+            waited = 0 if follower.index > index else waited + 1
+            index = follower.index
         return view
 
     def _straight(self, view: RobotView, tcp_in_base: Array, gripper: float) -> Motion:

@@ -18,7 +18,7 @@ PREGRASP = 0.1
 """m between pre-grasp and grasp."""
 LIFT = 0.12
 """m that an object is lifted after a grasp."""
-_JOINT_STEP = 0.05  # rad between the configurations of a joint motion
+_JOINT_STEP = 0.03  # rad between the configurations of a joint motion
 _MAX_TRANSLATION, _MAX_ROTATION = 0.095, 0.45  # m along an axis and rad per control step of 0.2 s; 5 % below the limits
 _MAX_JOINT_STEP = 0.4  # rad per control step
 _LOWER, _NEARER = (
@@ -130,10 +130,13 @@ class PathFollower:
         chain: kinematics of the arm.
         path: (n, 7) configurations.
         control_steps: control steps of 0.2 s per policy step.
+
+    Attributes:
+        index: index of the configuration to which the last motion led.
     """
 
     def __init__(self, chain: ArmChain, path: Array, control_steps: int) -> None:
-        self._path, self._poses, self._index = path, chain.tcp(path), 0
+        self._path, self._poses, self.index = path, chain.tcp(path), 0
         self._limits = np.array([_MAX_TRANSLATION, _MAX_ROTATION, _MAX_JOINT_STEP]) * control_steps
 
     @property
@@ -144,22 +147,19 @@ class PathFollower:
     @property
     def is_last(self) -> bool:
         """Whether the last motion led to the end of the path."""
-        return self._index == len(self._path) - 1
+        return self.index == len(self._path) - 1
 
-    def next_pose(self, tcp_in_base: Array, qpos: Array) -> Array:
-        """Return the farthest TCP pose (4, 4) of the path that the next policy step can reach.
-
-        tcp_in_base: (4, 4) present TCP pose. qpos: (7,) present configuration.
-        """
-        ahead = inverse(tcp_in_base)[None] @ self._poses[self._index :]
+    def next_pose(self, tcp_in_base: Array) -> Array:
+        """Return the farthest TCP pose (4, 4) of the path that the next policy step can reach from a pose (4, 4)."""
+        ahead = inverse(tcp_in_base)[None] @ self._poses[self.index :]
         turns = np.linalg.norm(Rotation.from_matrix(ahead[:, :3, :3]).as_rotvec(), axis=1)
-        joints = np.abs(self._path[self._index :] - qpos).max(axis=1)
+        joints = np.abs(self._path[self.index :] - self._path[self.index]).max(axis=1)
         sizes = np.stack([np.abs(ahead[:, :3, 3]).max(axis=1), turns, joints])
         fits = np.asarray((sizes <= self._limits[:, None]).all(axis=0))
         fits[0] = True
-        steps = int(np.argmin(fits)) - 1 if not fits.all() else len(fits) - 1
-        self._index = min(self._index + max(steps, 1), len(self._path) - 1)
-        return self._poses[self._index]
+        steps = len(fits) - 1 if fits.all() else int(np.argmin(fits)) - 1
+        self.index += steps
+        return self._poses[self.index]
 
 
 def find_looks(

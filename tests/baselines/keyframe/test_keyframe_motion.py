@@ -47,7 +47,7 @@ def test_a_follower_reaches_the_end_of_a_path_in_limited_steps(paths):
     poses = paths.chain.tcp(path)
     while not follower.is_last:
         here = paths.chain.tcp(qpos[None])[0]
-        pose = follower.next_pose(here, qpos)
+        pose = follower.next_pose(here)
         motion = inverse(here) @ pose
         assert np.abs(motion[:3, 3]).max() < 0.1 and Rotation.from_matrix(motion[:3, :3]).magnitude() < 0.5
         qpos = path[int(np.abs(poses - pose).sum(axis=(1, 2)).argmin())]  # the arm follows exactly

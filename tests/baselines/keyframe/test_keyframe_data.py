@@ -1,0 +1,101 @@
+"""Training samples and networks of `keyframe`."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from recorded_candidates import write_recorded_candidates
+from synthetic import RayCaster, write_trajectory
+
+from robocas_ms3.baselines.keyframe.config import KeyframeConfig
+from robocas_ms3.baselines.keyframe.data import KeyframeSamples
+from robocas_ms3.baselines.keyframe.network import FIRST_NAME, OFFSET_UNIT, KeyframeNetwork
+from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.datasets.candidate_images.render import render_candidates
+from robocas_ms3.datasets.candidate_images.settings import CandidateImageSettings
+
+OBJECTS = ["apple", "lemon", "pear"]
+SIZE = (64, 64)
+CONFIG = KeyframeConfig(image_size=SIZE, crop_size=SIZE, channels=(8, 8, 8, 8, 8), decoder_channels=8)
+
+
+def write_candidates_of(path, seeds=(3, 4, 5, 6)):
+    trajectory = write_trajectory(path.parent / "trajectory.h5", seeds)
+    description = trajectory.with_suffix(".json")
+    values = json.loads(description.read_text())
+    for episode in values["episodes"]:
+        episode["robocas"]["objects"] = OBJECTS
+    description.write_text(json.dumps(values))
+    return write_recorded_candidates(path, trajectory, (0, 8, 16))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = write_candidates_of(tmp_path_factory.mktemp("demos") / "candidates.h5")
+    settings = {"looks": 2, "segmentation": True, "size": SIZE, "open_renderer": RayCaster}
+    render_candidates(CandidateImageSettings(path, **settings))
+    return path.parent
+
+
+@pytest.fixture(scope="module")
+def validation(folder):
+    return KeyframeSamples(CONFIG, folder, "val")
+
+
+def test_samples_are_looks_and_first_images(folder, validation):
+    train = KeyframeSamples(CONFIG, folder, "train")
+    # three decisions per seed: two looks each, and three cameras at the first decision
+    assert len(validation) == 9 and len(train) == 3 * 9
+    assert train.facts["names"] == OBJECTS and train.facts["hand_camera"] == "gripper_camera"
+    assert train.scenes.objects == OBJECTS and train.scenes.tasks == ["pick"]
+
+
+def test_labels_point_to_the_centres(validation):
+    """In images without augmentation, surface plus offset is the centre of the cube, half an edge away or more."""
+    batch = validation.__getitems__(list(range(len(validation))))
+    assert batch["image"].shape == (len(validation), 5, 64, 64) and batch["label"].shape[1:] == (16, 16)
+    is_object = batch["label"] >= FIRST_NAME
+    assert is_object.float().mean() > 0.02
+    lengths = (batch["offset"] * OFFSET_UNIT).norm(dim=1)
+    assert (lengths[~is_object] == 0).all()
+    assert lengths[is_object].min() > 0.02 and lengths[is_object].max() < 0.2
+    assert batch["offset"][:, 2][is_object].mean() > 0.4  # centres are 2 cm or more behind most surfaces
+    known = batch["outcome"] >= 0
+    assert known.any() and (batch["crop"][known][:, 1].sum(dim=(1, 2)) > 0).all()
+    again = validation.__getitems__([0])
+    assert torch.equal(again["image"][0], batch["image"][0])
+
+
+def test_loss_of_a_batch_decreases(validation):
+    torch.manual_seed(0)
+    network = KeyframeNetwork(CONFIG, validation.facts)
+    batch, losses = validation.__getitems__(list(range(6))), []
+    optimizer = torch.optim.Adam(network.parameters(), 0.01)
+    for _ in range(12):
+        metrics = network(batch)
+        optimizer.zero_grad()
+        metrics["loss"].backward()
+        optimizer.step()
+        losses.append(float(metrics["loss"].detach()))
+    assert set(metrics) == {"loss", "segmentation", "offset", "text", "grasp", "cells", "names", "grasps"}
+    assert np.isfinite(losses).all() and losses[-1] < 0.7 * losses[0]
+
+
+@pytest.mark.parametrize("changes", [{"looks": 0}, {"segmentation": False}, {"depth": False}, {"size": (96, 64)}])
+def test_unsuitable_images_are_an_error(folder, tmp_path, changes):
+    path = Path(shutil.copy(folder / "candidates.h5", tmp_path))
+    settings = {"looks": 1, "segmentation": True, "size": SIZE, "open_renderer": RayCaster}
+    render_candidates(CandidateImageSettings(path, **settings | changes))
+    with pytest.raises(DatasetError):
+        KeyframeSamples(CONFIG, tmp_path, "train")
+
+
+def test_missing_files_are_an_error(folder, tmp_path):
+    with pytest.raises(DatasetError):
+        KeyframeSamples(CONFIG, tmp_path, "train")
+    shutil.copy(folder / "candidates.h5", tmp_path)  # without images
+    with pytest.raises(DatasetError):
+        KeyframeSamples(CONFIG, tmp_path, "train")

@@ -1,0 +1,172 @@
+"""Decisions of `keyframe` in a scene without a simulator: an arm that reaches every commanded pose."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from synthetic_observations import observe, start
+
+from robocas_ms3.baselines.keyframe import KeyframeConfig, KeyframeNetwork, KeyframePolicy
+from robocas_ms3.baselines.keyframe.episode import CLOSED, OPEN, KeyframeEpisode, RobotView
+from robocas_ms3.baselines.keyframe.motion import ArmPaths
+from robocas_ms3.baselines.keyframe.observed_scene import ObservedObject, ObservedScene
+from robocas_ms3.baselines.keyframe.perception import CameraFrame, Request, Survey
+from robocas_ms3.core.poses import from_rotation, to_wxyz
+from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
+
+REST = np.array([0, np.pi / 8, 0, -5 * np.pi / 8, 0, 3 * np.pi / 4, np.pi / 4])
+TABLE, BASKET = 0.1, np.array([0.5, 0.5, 0.25])
+SIZE = (64, 64)
+CONFIG = KeyframeConfig(image_size=SIZE, crop_size=SIZE, channels=(8, 8, 8, 8, 8), decoder_channels=8)
+CAMERAS = ("base_camera", "gripper_camera")
+FACTS = {"names": ["apple", "box"], "cameras": list(CAMERAS), "hand_camera": "gripper_camera"}
+
+
+def make_block(center, size=0.04, count=600):
+    """Points on the visible sides of a cube on the table."""
+    rng = np.random.default_rng(int(1000 * center[0]))
+    points = rng.uniform(-0.5, 0.5, (count, 3))
+    points[: count // 2, 2] = 0.5
+    points[count // 2 :, 0] = np.where(rng.random(count - count // 2) < 0.5, -0.5, 0.5)
+    return points * size + [*center, TABLE + size / 2]
+
+
+class FakePerception:
+    """Perception that sees the present blocks and the table; the first block is the target."""
+
+    def __init__(self, blocks):
+        self.blocks = blocks
+
+    def survey(self, frames, default_table):
+        return Survey(np.array([0.55, 0.0]), BASKET, TABLE)
+
+    def observe(self, frame, request, table):
+        x, y = np.meshgrid(np.arange(0.3, 0.8, 0.01), np.arange(-0.4, 0.3, 0.01))
+        surface = np.stack([x.ravel(), y.ravel(), np.full(x.size, TABLE)], axis=1)
+        clouds = [make_block(center) for center in self.blocks.values()]
+        points = np.concatenate([surface, *clouds])
+        bounds = len(surface) + np.cumsum([0, *map(len, clouds)])
+        objects = []
+        for number, name in enumerate(self.blocks):
+            mask = np.zeros(len(points), dtype=bool)
+            mask[bounds[number] : bounds[number + 1]] = True
+            objects.append((name, ObservedObject(mask, points[mask].mean(axis=0), 0, 0.9)))
+        targets = [one for name, one in objects if name.startswith("target")]
+        is_object = np.arange(len(points)) >= len(surface)
+        return ObservedScene(points, is_object, targets, [one for _, one in objects])
+
+    def score_grasps(self, scene, mask, grasps, table):
+        return np.full(len(grasps), 0.9)
+
+
+class FakeArm:
+    """Arm that reaches each commanded pose exactly and grasps a block that is between the closed fingers."""
+
+    def __init__(self, paths, blocks):
+        self.paths, self.blocks, self.qpos, self.held = paths, blocks, REST, None
+        self.released: list[tuple[str, np.ndarray]] = []
+
+    @property
+    def tcp(self):
+        return self.paths.chain.tcp(self.qpos[None])[0]
+
+    def view(self, images=False):
+        frame = CameraFrame(np.zeros((64, 64, 3), np.uint8), np.zeros((64, 64)), np.eye(3), self.tcp)
+        width = 0.04 if self.held else 0.08
+        return RobotView(self.tcp, self.qpos, width, {"gripper_camera": frame} if images else {})
+
+    def step(self, command):
+        motion = from_rotation(command.action[:3], Rotation.from_euler("xyz", command.action[3:6]).as_matrix())
+        assert np.abs(command.action[:3]).max() <= 0.1
+        goal = self.tcp @ motion
+        path = self.paths.straight(self.qpos, goal)
+        assert path is not None
+        self.qpos = path[-1]
+        position = self.tcp[:3, 3]
+        if command.action[6] == CLOSED and self.held is None:
+            near = [name for name, center in self.blocks.items() if np.linalg.norm(center - position[:2]) < 0.03]
+            if near and position[2] < TABLE + 0.06:
+                self.held = near[0]
+                del self.blocks[near[0]]
+        if command.action[6] == OPEN and self.held is not None:
+            self.released.append((self.held, position))
+            self.held = None
+        return self.view(command.requests_images)
+
+
+@pytest.fixture(scope="module")
+def paths():
+    return ArmPaths(find_robot(DEFAULT_ROBOT))
+
+
+def play(paths, blocks, request=None, steps=150):
+    arm = FakeArm(paths, blocks)
+    request = request or Request(np.ones(1, np.float32), None)
+    rng = np.random.default_rng(0)
+    perception = FakePerception(blocks)
+    episode = KeyframeEpisode(
+        perception, paths, CONFIG.decisions, request, rng, control_steps=1, hand_camera="gripper_camera"
+    )
+    run = episode.run(arm.view(images=True))
+    command = next(run)
+    for _ in range(steps):
+        command = run.send(arm.step(command))
+        if arm.released:
+            break
+    return arm, episode
+
+
+def test_the_target_is_released_over_the_basket(paths):
+    arm, episode = play(paths, {"target": np.array([0.55, -0.1])})
+    (name, position), *_ = arm.released
+    assert name == "target" and np.linalg.norm(position[:2] - BASKET[:2]) < 0.06 and position[2] > BASKET[2]
+
+
+def test_the_nearest_target_is_meant_without_a_relation(paths):
+    blocks = {"target far": np.array([0.65, 0.0]), "target near": np.array([0.45, -0.1])}
+    assert play(paths, dict(blocks))[0].released[0][0] == "target near"
+    far = Request(np.ones(1, np.float32), "farthest")
+    assert play(paths, dict(blocks), far)[0].released[0][0] == "target far"
+
+
+def test_an_object_is_moved_aside_if_the_target_is_not_seen(paths):
+    arm, _ = play(paths, {"other": np.array([0.55, 0.0])})
+    (name, position), *_ = arm.released
+    assert name == "other" and np.linalg.norm(position[:2] - BASKET[:2]) > 0.2 and position[2] < TABLE + 0.1
+
+
+def observe_with_images(envs):
+    height, width = SIZE
+    count = len(envs)
+    rng = np.random.default_rng(0)
+    tcp = ArmPaths(find_robot(DEFAULT_ROBOT)).chain.tcp(REST[None])
+    qpos = np.zeros((count, 12), np.float32)
+    qpos[:, 3:10] = REST
+    return replace(
+        observe(envs, qpos=qpos, tcp_in_base=np.tile(to_wxyz(tcp).astype(np.float32), (count, 1))),
+        embeddings=np.zeros((count, 384), np.float32),
+        images={name: rng.integers(0, 255, (count, height, width, 3), np.uint8) for name in CAMERAS},
+        depths={name: rng.integers(300, 900, (count, height, width, 1)).astype(np.int16) for name in CAMERAS},
+        intrinsics={
+            name: np.tile(np.float32([[32, 0, 32], [0, 32, 32], [0, 0, 1]]), (count, 1, 1)) for name in CAMERAS
+        },
+        camera_in_base={name: np.tile(tcp.astype(np.float32), (count, 1, 1)) for name in CAMERAS},
+    )
+
+
+def test_policy_requests_images_at_decisions_only():
+    torch.manual_seed(0)
+    policy = KeyframePolicy(CONFIG, FACTS, KeyframeNetwork(CONFIG, FACTS).eval())
+    assert policy.spec.depth and dict(policy.spec.cameras) == dict.fromkeys(CAMERAS, SIZE)
+    policy.reset([start(0), start(1)])
+    envs = np.array([0, 1])
+    requests = []
+    for _ in range(6):
+        requests.append(policy.requests_images(envs).tolist())
+        actions = policy.act(observe_with_images((0, 1)))
+        assert actions.shape == (2, 7) and np.isfinite(actions).all()
+    assert requests[0] == [True, True] and [False, False] in requests
+    policy.reset([start(1)])
+    assert policy.requests_images(np.array([1])).tolist() == [True]
