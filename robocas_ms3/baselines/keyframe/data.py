@@ -308,7 +308,7 @@ def _compute_centers(file: CandidateFile) -> NDArray[np.float64]:
     centers = np.full((*decisions["present"].shape, 3), np.nan)
     for row, slot in np.argwhere(decisions["present"]).tolist():
         pose = from_wxyz(decisions["object_in_base"][row, slot].astype(np.float64))
-        centers[row, slot] = transform_points(pose, middles[decisions["object_id"][row, slot]][None])[0]
+        centers[row, slot] = transform_points(pose, middles[str(decisions["object_id"][row, slot])][None])[0]
     return centers
 
 
