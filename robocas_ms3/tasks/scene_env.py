@@ -124,7 +124,6 @@ class SceneEnv(BaseEnv):
     def _setup_sensors(self, options: dict) -> None:
         super()._setup_sensors(options)
         sensors = cast("dict[str, Any]", self._sensors)
-        self.camera_shifts = draw_camera_shifts(self.task_config, len(self.cameras), self.appearance_seeds)
         if self.task_config.randomisation.cameras is not None:
             build.shift_cameras([sensors[spec.name].camera for spec in self.cameras], self.camera_shifts)
 
@@ -159,6 +158,7 @@ class SceneEnv(BaseEnv):
         self.agent.cameras = tuple(place_overview_camera(camera, self.overview_viewpoint()) for camera in self.cameras)
 
     def _load_scene(self, options: dict) -> None:
+        self.camera_shifts = draw_camera_shifts(self.task_config, len(self.cameras), self.appearance_seeds)
         self.fixtures = build.build_fixtures(self.scene, self.model, self._visual_level, self.appearance_seeds)
         assets, ids = self.model.object_pack.objects, self.seeds.object_ids
         self.object_assets: list[list[LoadedObject]] = [[assets[i] for i in row] for row in ids]

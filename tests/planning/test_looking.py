@@ -22,14 +22,29 @@ class Looking(Arm):
     env = property(lambda self: self._env)
 
 
-def test_camera_pose_includes_the_random_shift():
+def look(**options):
+    """Return the arm of a search env with random camera motions."""
     config = load_task_config("search_table_small_heap").model_dump(mode="json")
     config["randomisation"]["cameras"] = {"position": 0.1, "rotation_deg": 15}
-    made = gym.make("RoboCASSearch-v1", config=config, obs_mode="none")
+    made = gym.make("RoboCASSearch-v1", config=config, obs_mode="none", **options)
     made.reset(seed=1)
-    arm = Looking(made.unwrapped)
+    return Looking(made.unwrapped)
+
+
+def test_camera_pose_includes_the_random_shift():
+    arm = look()
     rendered = arm.env._sensors["gripper_camera"].camera._render_cameras[0].global_pose.to_transformation_matrix()
     pose, shift = arm.scene.arm_base_in_world @ camera_in_base(arm), _camera_shift(arm)
-    made.close()
+    arm.env.close()
     assert pose == pytest.approx(rendered, abs=1e-4)
     assert np.linalg.norm(shift[:3, 3]) > 0.02
+
+
+def test_camera_pose_is_the_same_without_a_renderer():
+    """Demonstrations are planned in environments without cameras."""
+    poses = []
+    for options in ({}, {"render_backend": "none"}):
+        arm = look(**options)
+        poses.append(camera_in_base(arm))
+        arm.env.close()
+    assert poses[1] == pytest.approx(poses[0], abs=1e-5)
