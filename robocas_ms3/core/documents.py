@@ -136,8 +136,12 @@ def _format_yaml_error(error: Exception) -> str:
     return one_line(error)
 
 
-def open_npz(path: Path) -> Any:
+def open_npz(path: Path, limit: int = ARRAYS_LIMIT) -> Any:
     """Open an ``.npz`` file without pickled objects.
+
+    Args:
+        path: of the file.
+        limit: maximum number of bytes of all arrays after decompression, and of the file.
 
     Returns:
         NumPy's reader of the file, a context manager.
@@ -148,13 +152,13 @@ def open_npz(path: Path) -> Any:
     import numpy as np  # slow to import, and not needed by every command
     from numpy.lib.npyio import NpzFile
 
-    check_regular_file(path)
+    check_regular_file(path, limit)
     file = np.load(path, allow_pickle=False)
     if not isinstance(file, NpzFile):
         raise DocumentError("expected an .npz archive, found a single array")
-    if file.zip is not None and sum(info.file_size for info in file.zip.infolist()) > ARRAYS_LIMIT:
+    if file.zip is not None and sum(info.file_size for info in file.zip.infolist()) > limit:
         file.close()
-        raise DocumentError(_describe_size(ARRAYS_LIMIT))
+        raise DocumentError(_describe_size(limit))
     return file
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,6 +111,7 @@ class Outcome:
         inference_ms: wall-clock time of the policy per policy step, ms.
         p_vis: visible fraction of the target at the reset, seen from above, 0..1; None if it was not measured.
         retrieval: retrieval order; None except in search.
+        actions_hash: hash of the executed actions (`stored_actions.hash_actions`); empty: the actions were not stored.
     """
 
     episode: Count
@@ -131,10 +132,21 @@ class Outcome:
     inference_ms: Measure = 0.0
     p_vis: Fraction | None = None
     retrieval: Retrieval | None = None
+    actions_hash: str = ""
 
     def reproducible_values(self) -> dict[str, Any]:
-        """Return all values but wall-clock times: these values are equal for equal seed and policy."""
-        return {name: value for name, value in asdict(self).items() if name != "inference_ms"}
+        """Return the values that are equal for equal seed and policy: all but wall-clock times and the actions' hash.
+
+        The last bits of the actions of a network depend on the processor and on the number of envs.
+        """
+        return {name: value for name, value in asdict(self).items() if name not in ("inference_ms", "actions_hash")}
+
+
+class EvaluatedEpisode(NamedTuple):
+    """Outcome of an episode and its executed actions (T, A) float32, one per policy step, without action noise."""
+
+    outcome: Outcome
+    actions: NDArray[np.float32]
 
 
 def find_failure_stage(flags: dict[str, int | None], error: str = "", order: Sequence[str] = DEFAULT_STAGES) -> str:

@@ -4,6 +4,7 @@
 
     run.json            protocol and its hash, policy, versions, backend, packs, machine (`RunRecord`)
     episodes.jsonl      one `Outcome` per line, in any order; an incomplete last line is dropped
+    actions/000012.npz  executed actions of episode 12 (`stored_actions`), written before its line
 
 Partial results of one evaluation, such as shards, are read (`read_result`) or written (`merge_results`) as one result.
 """
@@ -12,11 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from robocas_ms3.core.documents import load_json
@@ -25,8 +28,10 @@ from robocas_ms3.core.files import atomic_folder, write_json
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, list_setting_changes
 from robocas_ms3.core.strict_model import parse
-from robocas_ms3.evaluation.outcomes import Outcome
+from robocas_ms3.evaluation.outcomes import EvaluatedEpisode, Outcome
+from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec
 from robocas_ms3.evaluation.statistics import SuccessRate, compute_success_rate
+from robocas_ms3.evaluation.stored_actions import delete_other_actions, read_actions, write_actions
 
 RUN, OUTCOMES = "run.json", "episodes.jsonl"
 _PACKAGES = ("robocas_ms3", "mani_skill", "sapien", "gymnasium", "numpy", "torch")
@@ -135,11 +140,13 @@ class Result:
         folder: folder of the result, or of the first partial result.
         run: settings of the evaluation. For partial results: of the first, with all in ``merged_from``.
         outcomes: by number of the episode, in ascending order, the outcome.
+        folders: by number of the episode, the folder with its actions; an episode without an entry is in ``folder``.
     """
 
     folder: Path
     run: RunRecord
     outcomes: dict[int, Outcome]
+    folders: dict[int, Path] = field(default_factory=dict)
 
     def compute_rate(self, flag: str = "success", outcomes: Iterable[Outcome] | None = None) -> SuccessRate:
         """Return the fraction of episodes in which a stage or success rule held, with its 95 % interval.
@@ -152,6 +159,21 @@ class Result:
         chosen = list(self.outcomes.values() if outcomes is None else outcomes)
         held = [getattr(one, flag) if hasattr(one, flag) else one.flags.get(flag) is not None for one in chosen]
         return compute_success_rate(sum(held), len(held))
+
+    def read_actions(self, episode: int) -> NDArray[np.float32]:
+        """Read the executed actions (T, A) float32 of an episode, in the convention of the policy.
+
+        Raises:
+            EvaluationError: the actions are missing or damaged, or do not fit the outcome.
+        """
+        name = str(self.run.policy.spec.get("convention", PolicySpec.convention))
+        if name not in CONVENTIONS:
+            expected = f"one of {', '.join(CONVENTIONS)}"
+            raise EvaluationError(
+                "unknown action convention of the policy", where=self.folder / RUN, expected=expected, found=repr(name)
+            )
+        folder = self.folders.get(episode, self.folder)
+        return read_actions(folder, self.outcomes[episode], CONVENTIONS[name].size)
 
     def has_repeated_scenes(self) -> bool:
         """Return whether two episodes have the same scene, as in some splits; such episodes must not be pooled."""
@@ -178,6 +200,8 @@ def open_result(
 ) -> Iterator[dict[int, Outcome]]:
     """Lock a result folder, start or continue the result, and yield the recorded outcomes by episode number.
 
+    Stored actions of episodes without an outcome are deleted.
+
     Args:
         folder: folder of the result; created if it does not exist.
         run: settings of the evaluation.
@@ -197,12 +221,17 @@ def open_result(
         if retry_errors and any(one.error for one in outcomes.values()):
             outcomes = {number: one for number, one in outcomes.items() if not one.error}
             _outcomes_file(folder).rewrite(outcomes.values())
+        delete_other_actions(folder, outcomes)
         yield outcomes
 
 
-def append_outcome(folder: Path, outcome: Outcome) -> None:
-    """Append an outcome to ``episodes.jsonl`` in a result folder and flush it to disk."""
-    _outcomes_file(folder).append([outcome], sync=True)
+def append_episode(folder: Path, evaluated: EvaluatedEpisode) -> None:
+    """Write the actions of an episode in a result folder, then append its outcome to ``episodes.jsonl``.
+
+    Both are flushed to the disk, so that each outcome has its actions.
+    """
+    write_actions(folder, evaluated.outcome.episode, evaluated.actions)
+    _outcomes_file(folder).append([evaluated.outcome], sync=True)
 
 
 def read_result(*folders: Path) -> Result:
@@ -215,7 +244,7 @@ def read_result(*folders: Path) -> Result:
             episode.
     """
     parts = [_read_folder(folder) for folder in folders]
-    first, outcomes = parts[0], dict[int, Outcome]()
+    first, outcomes, sources = parts[0], dict[int, Outcome](), dict[int, Path]()
     for part in parts:
         expected, found = first.run.merge_settings(), part.run.merge_settings()
         if key := next((key for key in found if expected[key] != found[key]), ""):
@@ -227,6 +256,7 @@ def read_result(*folders: Path) -> Result:
             )
         for outcome in part.outcomes.values():
             _add_outcome(outcomes, outcome, str(part.folder))
+            sources.setdefault(outcome.episode, part.folder)
     run = first.run
     if len(parts) > 1:
         records = [
@@ -234,7 +264,7 @@ def read_result(*folders: Path) -> Result:
             for part in parts
         ]
         run = run.model_copy(update={"merged_from": records})
-    return Result(first.folder, run, dict(sorted(outcomes.items())))
+    return Result(first.folder, run, dict(sorted(outcomes.items())), sources)
 
 
 def group_partial_results(folders: Iterable[Path]) -> list[list[Path]]:
@@ -254,11 +284,18 @@ def group_partial_results(folders: Iterable[Path]) -> list[list[Path]]:
 
 
 def merge_results(folders: Sequence[Path], out: Path) -> Result:
-    """Merge partial results into one result and write its folder ``out`` atomically; return the result."""
+    """Merge partial results into one result and write its folder ``out`` atomically; return the result.
+
+    Raises:
+        EvaluationError: as `read_result`; or the actions of an episode are missing or damaged.
+        OutputExistsError: ``out`` exists.
+    """
     result = read_result(*folders)
     check_replaceable(out)
     with atomic_folder(out) as folder:
         write_json(folder / RUN, result.run.to_dict())
+        for number in result.outcomes:
+            write_actions(folder, number, result.read_actions(number))
         _outcomes_file(folder).rewrite(result.outcomes.values())
     return read_result(out)
 

@@ -47,6 +47,7 @@ class Rollout:
         at_end: by stage or success rule, whether it holds after the last step.
         retrieval: (K, 3) record of `metrics.RetrievalTracker.compute_record` for this env; None except in search.
         inference_seconds: wall-clock time of the policy; the time for a batch is divided equally between its envs.
+        actions: the executed actions, one (A,) float32 per policy step.
     """
 
     spec: EpisodeSpec
@@ -59,6 +60,7 @@ class Rollout:
     retrieval: NDArray[np.integer] | None = None
     inference_seconds: float = 0.0
     error: str = ""
+    actions: list[NDArray[np.float32]] = field(default_factory=list, compare=False)
 
     def make_outcome(self, episode: ProtocolEpisode, objects: Sequence[str]) -> Outcome:
         """Return the outcome of this rollout of an episode; ``objects``: ids of the K objects by slot."""
@@ -218,8 +220,9 @@ class EpisodeBatch:
         if not self.running:
             return
         self.obs, _, _, _, self._info = self.env.step(actions)
-        for episode in self.running.values():
+        for env, episode in self.running.items():
             episode.steps += 1
+            episode.actions.append(actions[env].copy())
         self._record_flags()
         for env in [env for env, episode in self.running.items() if self._is_over(episode)]:
             yield self._end_episode(env)

@@ -13,7 +13,7 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.core.errors import EvaluationError, VectorEnvCrashError
@@ -28,8 +28,9 @@ from robocas_ms3.evaluation.action_wrapper import (
     check_weld_available,
     make_env_kwargs,
 )
-from robocas_ms3.evaluation.outcomes import Outcome
+from robocas_ms3.evaluation.outcomes import EvaluatedEpisode, Outcome
 from robocas_ms3.evaluation.policy import (
+    CONVENTIONS,
     EpisodeSpec,
     Observations,
     Policy,
@@ -47,6 +48,7 @@ from robocas_ms3.evaluation.rollout import (
     run_rollouts,
 )
 from robocas_ms3.evaluation.settings import EvaluationSettings
+from robocas_ms3.evaluation.stored_actions import hash_actions
 from robocas_ms3.scenes.config import TaskConfig, load_task_config
 from robocas_ms3.scenes.layout_table import FrozenLayouts
 from robocas_ms3.scenes.task_specs import TASKS
@@ -79,6 +81,7 @@ class EvaluationSession:
         rate: control steps per second. A policy step is one control step; with RoboCAS-v0's steps it is 1 to 7 control
             steps at 5 Hz (`PolicyActionWrapper`).
         outcomes: by index of the env, the outcome of the episode that has ended since the last `reset`.
+        actions: by index of the env, the executed actions (T, A) float32 of the same episode.
 
     Raises:
         EvaluationError: the protocol does not exist, the policy or the weld does not fit it, no episode is selected,
@@ -108,6 +111,7 @@ class EvaluationSession:
         self.run_record = self._make_run_record(backend)
         self.folder = settings.choose_folder(rules.name, self.played_as)
         self.outcomes: dict[int, Outcome] = {}
+        self.actions: dict[int, NDArray[np.float32]] = {}
         objects = load_pack(rules.pack, usage=False).objects
         self._layouts_of = cache(lambda config: FrozenLayouts(self.protocol.layouts_file(config), objects))
         self._refill = backend != "gpu"
@@ -119,6 +123,8 @@ class EvaluationSession:
 
     def run(self, on_start: Callable[[int], None] = lambda count: None) -> Iterator[Outcome]:
         """Run the selected episodes that the result does not have yet; write and yield the outcome of each.
+
+        The result also gets the executed actions of each episode (`stored_actions`).
 
         ``on_start`` is called with the number of episodes to run.
 
@@ -133,9 +139,9 @@ class EvaluationSession:
         with closing(self), opened as done:
             missing = [episode for episode in self.episodes if episode.episode not in done]
             on_start(len(missing))
-            for outcome in self.run_episodes(missing):
-                results.append_outcome(self.folder, outcome)
-                yield outcome
+            for evaluated in self.run_episodes(missing):
+                results.append_episode(self.folder, evaluated)
+                yield evaluated.outcome
 
     def max_steps(self, task: str) -> int:
         """Return the maximum number of policy steps per episode of a task, by the rules of the protocol."""
@@ -159,8 +165,10 @@ class EvaluationSession:
             motion_steps=MOTION_STEPS[self.protocol.rules.stepping],
         )
 
-    def run_episodes(self, episodes: Sequence[ProtocolEpisode], max_steps: int | None = None) -> Iterator[Outcome]:
-        """Run episodes with the policy, one configuration after another; yield the outcome of each when it ends.
+    def run_episodes(
+        self, episodes: Sequence[ProtocolEpisode], max_steps: int | None = None
+    ) -> Iterator[EvaluatedEpisode]:
+        """Run episodes with the policy, one configuration after another; yield outcome and actions of each at its end.
 
         ``max_steps``: maximum number of policy steps per episode; None: the maximum of the protocol.
 
@@ -195,7 +203,7 @@ class EvaluationSession:
             )
         episodes = [known[number] for number in numbers]
         self.protocol.check_same_configuration(episodes)
-        self._current, self.outcomes = episodes, {}
+        self._current, self.outcomes, self.actions = episodes, {}, {}
         batch = self.open_batch(episodes[0], count)
         try:
             batch.start_episodes([(env, self.make_episode_spec(episode)) for env, episode in enumerate(episodes)])
@@ -229,7 +237,8 @@ class EvaluationSession:
                 rows = np.zeros((batch.num_envs, batch.action_size), np.float32)
                 rows[active] = chunks[active, step]
                 for ended in batch.step(rows):
-                    self.outcomes[ended.spec.env] = self._make_outcome(ended, self._current[ended.spec.env])
+                    env = ended.spec.env
+                    self.outcomes[env], self.actions[env] = self._make_episode(ended, self._current[env])
                 if not batch.running:
                     return None
         except Exception:
@@ -272,7 +281,7 @@ class EvaluationSession:
         if env is not None:
             env.close()
 
-    def _run_configuration(self, episodes: list[ProtocolEpisode], max_steps: int | None) -> Iterator[Outcome]:
+    def _run_configuration(self, episodes: list[ProtocolEpisode], max_steps: int | None) -> Iterator[EvaluatedEpisode]:
         left, crashes = {episode.episode: episode for episode in episodes}, Counter[int]()
         while left:
             batch = None
@@ -281,7 +290,7 @@ class EvaluationSession:
                 for ended in run_rollouts(
                     batch, self.policy, [self.make_episode_spec(episode) for episode in left.values()]
                 ):
-                    yield self._make_outcome(ended, left.pop(ended.spec.episode))
+                    yield self._make_episode(ended, left.pop(ended.spec.episode))
             except VectorEnvCrashError as error:
                 self.close()
                 lost = (
@@ -301,7 +310,7 @@ class EvaluationSession:
                     if crashes[number] < MAX_STARTS:
                         _log.warning("episode %d: %s; the episode is repeated once", number, ended.error)
                     else:
-                        yield self._make_outcome(ended, left.pop(number))
+                        yield self._make_episode(ended, left.pop(number))
 
     def _log_policy_warnings(self) -> None:
         """Log the warnings that ``policy.protocol_warnings`` returns for the configurations of the episodes."""
@@ -321,10 +330,12 @@ class EvaluationSession:
         self._observed = time.perf_counter()
         return observations
 
-    def _make_outcome(self, ended: Rollout, episode: ProtocolEpisode) -> Outcome:
+    def _make_episode(self, ended: Rollout, episode: ProtocolEpisode) -> EvaluatedEpisode:
         layouts = self._layouts_of(episode.config)
         outcome = ended.make_outcome(episode, layouts(episode.seed, episode.seed).object_ids)
-        return replace(outcome, task=self._find_task(episode))
+        actions = np.array(ended.actions, np.float32).reshape(-1, CONVENTIONS[self.spec.convention].size)
+        outcome = replace(outcome, task=self._find_task(episode), actions_hash=hash_actions(actions))
+        return EvaluatedEpisode(outcome, actions)
 
     def _find_task(self, episode: ProtocolEpisode) -> str:
         """Return the task that is evaluated in an episode."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.text import format_count
 from robocas_ms3.evaluation.outcomes import Outcome, compute_order_score, find_failure_stage
 from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol, ProtocolEpisode
@@ -14,7 +15,8 @@ from robocas_ms3.scenes.task_specs import TASKS
 def find_violations(result: Result, protocol: LoadedProtocol) -> list[str]:
     """Return one text per violation in a result; empty if the result fits the protocol and is consistent.
 
-    Violations are another hash, missing or unknown episodes, and values that contradict the protocol or other values.
+    Violations are another hash, missing or unknown episodes, values that contradict the protocol or other values, and
+    stored actions that are missing or do not fit their episode.
     """
     run, rules, count = result.run, protocol.rules, len(protocol.episodes)
     found = []
@@ -29,7 +31,8 @@ def find_violations(result: Result, protocol: LoadedProtocol) -> list[str]:
         found.append(f"played_as is {run.played_as}, but this protocol allows no such alias")
     for number, outcome in result.outcomes.items():
         if number < count:
-            of_episode = _find_outcome_violations(outcome, protocol.episodes[number], protocol, run)
+            of_episode = [*_find_outcome_violations(outcome, protocol.episodes[number], protocol, run)]
+            of_episode += _find_action_violations(result, number)
         else:
             of_episode = ["this episode is not in the protocol"]
         found += [f"episode {number}: {problem}" for problem in of_episode]
@@ -74,6 +77,14 @@ def _find_outcome_violations(
             yield f"{name} held at step {step}, where the protocol ends the episode, but the episode has {steps}"
     yield from _find_time_violations(outcome)
     yield from _find_retrieval_violations(outcome)
+
+
+def _find_action_violations(result: Result, number: int) -> list[str]:
+    try:
+        result.read_actions(number)
+    except EvaluationError as error:
+        return [str(error)]
+    return []
 
 
 def _find_time_violations(outcome: Outcome) -> Iterator[str]:

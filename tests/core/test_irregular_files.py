@@ -42,6 +42,12 @@ def write_result(root):
         (copy_protocol, "episodes.jsonl", load_protocol, EvaluationError),
         (write_result, results.RUN, results.read_result, EvaluationError),
         (write_result, results.OUTCOMES, results.read_result, EvaluationError),
+        (
+            write_result,
+            "actions/000000.npz",
+            lambda root: results.read_result(root).read_actions(0),
+            EvaluationError,
+        ),
         (Path.mkdir, PLAN, read_plan, PlanError),
         (
             Path.mkdir,

@@ -2,21 +2,23 @@
 
 import json
 
+import numpy as np
 import pytest
-from synthetic_results import RUN_OF, outcome, write
+from synthetic_results import RUN_OF, actions_of, outcome, write
 
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
-from robocas_ms3.evaluation.outcomes import find_failure_stage
+from robocas_ms3.evaluation.outcomes import EvaluatedEpisode, find_failure_stage
 from robocas_ms3.evaluation.results import (
     OUTCOMES,
     RUN,
     RunRecord,
-    append_outcome,
+    append_episode,
     group_partial_results,
     merge_results,
     open_result,
     read_result,
 )
+from robocas_ms3.evaluation.stored_actions import hash_actions
 
 SEARCH = dict.fromkeys(("obstacles_cleared", "reached_any", "target_grasped", "target_lifted", "success"))
 
@@ -25,8 +27,13 @@ def start(folder, run=RUN_OF, new=(), **options):
     """Start or continue a result, add outcomes, and return the numbers of the existing outcomes."""
     with open_result(folder, RunRecord.from_values(run, folder / RUN), **options) as done:
         for one in new:
-            append_outcome(folder, one)
+            append_episode(folder, EvaluatedEpisode(one, actions_of(one)))
         return list(done)
+
+
+def stored(folder):
+    """Return the numbers of the episodes with stored actions."""
+    return sorted(int(path.stem) for path in folder.glob("actions/*.npz"))
 
 
 def test_appended_outcomes_are_read_and_an_incomplete_line_is_overwritten(tmp_path):
@@ -38,6 +45,7 @@ def test_appended_outcomes_are_read_and_an_incomplete_line_is_overwritten(tmp_pa
     assert list(read_result(tmp_path / "a").outcomes) == [3]
     assert start(tmp_path / "a", new=[outcome(2)]) == [3]
     assert list(read_result(tmp_path / "a").outcomes) == [2, 3]
+    assert stored(tmp_path / "a") == [2, 3]  # the actions of the incomplete line were deleted
 
 
 def test_damaged_line_is_an_error_with_its_number(tmp_path):
@@ -73,6 +81,7 @@ def test_result_of_another_policy_is_not_continued(tmp_path):
         start(tmp_path / "a", other)
     assert (error.value.found, error.value.expected) == ("mine", "other")
     assert start(tmp_path / "a", other, overwrite=True) == []
+    assert stored(tmp_path / "a") == []
 
 
 @pytest.mark.parametrize(
@@ -112,9 +121,28 @@ def test_partial_results_with_other_clock_times_and_machines_are_merged(tmp_path
     first, second, merged = ((tmp_path / name / OUTCOMES).read_text() for name in "abc")
     assert merged == first + second.splitlines(keepends=True)[0]
     assert '"fallen": 3,' in merged
+    assert [both.read_actions(number)[0, 0] for number in (0, 1)] == [0, 1] and both.folder == tmp_path / "c"
     assert start(tmp_path / "c") == [0, 1]
     with pytest.raises(OutputExistsError):
         merge_results([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
+
+
+def test_partial_results_whose_actions_differ_in_the_last_bit_are_merged(tmp_path):
+    """The first partial result has its outcome and its actions in the merged result."""
+    write(tmp_path / "a", [outcome(0)])
+    almost = actions_of(outcome(0)) + np.float32(1e-7)
+    write(tmp_path / "b", [])
+    append_episode(tmp_path / "b", EvaluatedEpisode(outcome(0, actions_hash=hash_actions(almost)), almost))
+    merged = merge_results([tmp_path / "a", tmp_path / "b"], tmp_path / "c")
+    assert (merged.read_actions(0) == actions_of(outcome(0))).all()
+
+
+def test_partial_results_without_actions_are_not_merged(tmp_path):
+    write(tmp_path / "a", [outcome(0)])
+    (tmp_path / "a" / "actions" / "000000.npz").unlink()
+    with pytest.raises(EvaluationError):
+        merge_results([tmp_path / "a"], tmp_path / "c")
+    assert not (tmp_path / "c").exists()
 
 
 def test_partial_results_with_different_outcomes_are_refused(tmp_path):
@@ -202,7 +230,9 @@ def test_episodes_with_an_error_run_again_with_retry_errors(tmp_path):
     write(tmp_path / "a", [outcome(0), broken, outcome(2)])
     assert start(tmp_path / "a") == [0, 1, 2]
     assert read_result(tmp_path / "a").count_errors() == 1
-    assert start(tmp_path / "a", new=[outcome(1)], retry_errors=True) == [0, 2]
+    assert start(tmp_path / "a", retry_errors=True) == [0, 2]
+    assert stored(tmp_path / "a") == [0, 2]
+    assert start(tmp_path / "a", new=[outcome(1)]) == [0, 2]
     assert read_result(tmp_path / "a").outcomes[1].success
 
 

@@ -44,6 +44,7 @@ def test_external_loop_ends_episodes_by_the_rules_and_reset_drops_running_episod
     outcome = external.outcomes[0]
     assert (outcome.episode, outcome.success, outcome.steps, outcome.seconds) == (1, True, 5, 1.0)
     assert outcome.flags["reached_any"] == 2
+    assert external.actions[0].shape == (5, 7) and (external.actions[0] == 1).all()  # the sixth was not executed
     assert (outcome.config, outcome.seed, outcome.failure_stage) == ("pick_table_scattered", 110001, "")
     with pytest.raises(EvaluationError, match="no episode is running"):
         external.step(ones())
@@ -218,7 +219,11 @@ def test_episode_is_repeated_once_after_a_crash_and_then_counts_as_failed(
         "episode 1: the worker process crashed: SIGSEGV; the episode is repeated once"
     ]
     assert all(env.closed for env in made)
-    violations = find_violations(results.read_result(out), protocol)
+    result = results.read_result(out)
+    assert {number: len(result.read_actions(number)) for number in found} == {
+        number: one["steps"] for number, one in found.items()
+    }
+    violations = find_violations(result, protocol)
     assert not [one for one in violations if one.startswith("episode 1:") and times == 2]
     command = ["eval", "--policy", "noop", "--protocol", short, "--backend", "processes", "--out", out]
     assert cli([str(word) for word in command]) == times - 1  # the failed episode is not repeated
@@ -311,7 +316,7 @@ def test_scripted_policy_succeeds(tmp_path):
 @pytest.mark.slow
 def test_policy_of_the_docs_gets_the_declared_observations(short, tmp_path, monkeypatch, needs_renderer):
     page = (Path(__file__).resolve().parents[2] / "docs" / "evaluation.md").read_text(encoding="utf-8")
-    program = page.split("```python\n")[1].split("```")[0]
+    (program,) = (block.split("```")[0] for block in page.split("```python\n") if "class Descend" in block)
     program = program.replace("rate_hz=5,", "rate_hz=5, depth=True, state=True, language='text',")
     program = program.replace(
         "        return np.tile",

@@ -6,10 +6,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from synthetic_results import outcome, write
+from synthetic_results import actions_of, outcome, write
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation import results
+from robocas_ms3.evaluation.outcomes import EvaluatedEpisode
 from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec, describe_policy
 from robocas_ms3.evaluation.remote.server import PolicyServer
 from robocas_ms3.evaluation.report import write_report
@@ -57,7 +58,7 @@ def test_description_round_trips_and_does_not_rename_the_policy(tmp_path):
     policy = Policy({"name": 5, "sizes": (1, 2), "note": HOSTILE})
     run = EvaluationSession(policy, EvaluationSettings(policy="mine", protocol="smoke", backend="processes")).run_record
     with results.open_result(tmp_path / "out", run):
-        results.append_outcome(tmp_path / "out", outcome(0))
+        results.append_episode(tmp_path / "out", EvaluatedEpisode(outcome(0), actions_of(outcome(0))))
     assert results.read_result(tmp_path / "out").run.policy.name == "mine"
     with results.open_result(tmp_path / "out", run) as done:  # the record equals the written record
         assert list(done) == [0]
@@ -69,7 +70,7 @@ def test_error_text_of_a_policy_round_trips(tmp_path):
     made = Rollout(start, error=f"{HOSTILE}\udcff").make_outcome(episode, [])
     assert made.error.isprintable()
     write(tmp_path / "out", [])
-    results.append_outcome(tmp_path / "out", made)
+    results.append_episode(tmp_path / "out", EvaluatedEpisode(made, actions_of(made)))
     assert asdict(results.read_result(tmp_path / "out").outcomes[0]) == asdict(made)
 
 

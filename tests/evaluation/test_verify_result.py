@@ -4,7 +4,9 @@ import json
 import math
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 from synthetic_results import of_protocol
 
@@ -108,6 +110,20 @@ def test_another_protocol_or_pack_or_an_impossible_weld_is_found(folder, protoco
     tamper_run(folder, protocol_hash="ef" * 32, pack_hashes={"builtin": "00"})
     protocol_and_pack = find_violations(read_result(folder), protocol)[:2]
     assert [problem.partition(": ")[0][:13] for problem in protocol_and_pack] == ["protocol hash", "hash of pack "]
+
+
+@pytest.mark.parametrize("change", [Path.unlink, lambda path: np.savez(path, actions=np.ones((70, 7), np.float32))])
+def test_missing_or_changed_actions_are_found(folder, protocol, change):
+    change(folder / "actions" / "000003.npz")
+    (violation,) = find_violations(read_result(folder), protocol)
+    assert violation.startswith("episode 3: ") and "000003.npz" in violation
+
+
+def test_changed_hash_of_actions_is_found(folder, protocol):
+    for changed in ("", "ab" * 32):
+        tamper(folder, 0, actions_hash=changed)
+        (violation,) = find_violations(read_result(folder), protocol)
+        assert violation.startswith("episode 0: ")
 
 
 def test_an_outcome_of_select_is_valid_only_if_the_run_has_played_as(tmp_path):

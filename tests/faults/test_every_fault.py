@@ -210,7 +210,7 @@ def test_full_disk(command, expected_content, tmp_path, row):
     if subprocess.run(["unshare", "-rm", "true"], check=False).returncode:
         pytest.skip("this machine does not allow mounts in a namespace")
     row.command, row.injected = command.name, 1
-    size = {"generate": "500k", "convert": "3m", "plan run": "3500k", "eval": "8k"}[command.name]
+    size = {"generate": "500k", "convert": "3m", "plan run": "3500k", "eval": "16k"}[command.name]
     words = ["unshare", "-rm", "sh", "-c", ROOM, str(tmp_path), str(tmp_path), size]
     env = {**environment(), "AGAIN": "size=1g"}
     line = command.line(tmp_path / "disk" / "out", 2)

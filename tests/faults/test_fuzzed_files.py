@@ -315,6 +315,7 @@ CASES = [  # writer, file, reader, number of changed files, least number of erro
     *((write_protocol, name, load_protocol, 30, 0) for name in ("protocol.yaml", "episodes.jsonl")),
     (write_result, results.RUN, read_result, 40, 5),
     (write_result, results.OUTCOMES, read_result, 40, 0),
+    (write_result, "actions/000000.npz", lambda root: results.read_result(root).read_actions(0), 80, 40),
     (write_plan, PLAN, read_plan_folder, 25, 5),
     *((write_plan, name, read_plan_folder, 20, 0) for name in (OUTCOMES, OUTCOME)),
     (write_generation, "run.json", read_generation, 60, 10),

@@ -8,9 +8,13 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from robocas_ms3.evaluation.outcomes import Outcome, find_failure_stage
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.results import OUTCOMES, RUN, Result, read_result
+from robocas_ms3.evaluation.stored_actions import hash_actions, write_actions
 
 STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "target_in_basket")
 RUN_OF = {
@@ -48,12 +52,23 @@ def outcome(episode: int, came_to: int = 7, **others: Any) -> Outcome:
         measures={"path_length": 1.5, "contact_impulse": 2.0, "disturbed_most": 1.0, "fallen": 0.0},
         inference_ms=0.5,
     )
-    return replace(made, **others)
+    made = replace(made, **others)
+    return made if "actions_hash" in others else replace(made, actions_hash=hash_actions(actions_of(made)))
+
+
+def actions_of(made: Outcome) -> NDArray[np.float32]:
+    """Return the actions (T, 7) of an outcome: zeros, but the number of the episode in the first column."""
+    actions = np.zeros((made.steps, 7), np.float32)
+    actions[:, 0] = made.episode
+    return actions
 
 
 def write(folder: Path, outcomes: Iterable[Outcome], **run: Any) -> Result:
-    """Write a result with these outcomes; other arguments replace values of ``run.json``."""
+    """Write a result with these outcomes and their actions; other arguments replace values of ``run.json``."""
     folder.mkdir(parents=True)
+    outcomes = list(outcomes)
+    for one in outcomes:
+        write_actions(folder, one.episode, actions_of(one))
     (folder / RUN).write_text(json.dumps({**RUN_OF, **run}))
     (folder / OUTCOMES).write_text("".join(json.dumps(asdict(one)) + "\n" for one in outcomes))
     return read_result(folder)

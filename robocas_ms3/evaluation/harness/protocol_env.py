@@ -23,7 +23,7 @@ from robocas_ms3.evaluation.harness.proprioception import (
     depth_key,
     intrinsics_key,
 )
-from robocas_ms3.evaluation.outcomes import Outcome
+from robocas_ms3.evaluation.outcomes import EvaluatedEpisode, Outcome
 from robocas_ms3.evaluation.policy import CONVENTIONS, ExternalPolicy, Observations, PolicySpec
 from robocas_ms3.evaluation.rollout import CameraObservations
 from robocas_ms3.evaluation.session import EvaluationSession
@@ -125,7 +125,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
                 self._grippers[env] = command
             self._update_observations(running, observations)
         ended = self._has_ended(lambda outcome: True)
-        self._write_outcomes(np.flatnonzero(ended & ~before).tolist())
+        self._write_episodes(np.flatnonzero(ended & ~before).tolist())
         truncated = self._has_ended(lambda outcome: not outcome.success and outcome.steps >= self._max_steps)
         info = self._make_info(ended & ~before)
         reward = (info["is_success"] & ~before).astype(np.float64)
@@ -162,12 +162,14 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
         outcomes = [self._session.outcomes.get(env) for env in range(self.num_envs)]
         return np.array([outcome is not None and condition(outcome) for outcome in outcomes])
 
-    def _write_outcomes(self, envs: list[int]) -> None:
-        """Append the outcomes of the given envs to the result, each episode once."""
-        for outcome in (self._session.outcomes[env] for env in envs):
-            if self._folder is not None and outcome.episode not in self._recorded:
-                results.append_outcome(self._folder, outcome)
-                self._recorded.add(outcome.episode)
+    def _write_episodes(self, envs: list[int]) -> None:
+        """Write the outcomes and the actions of the given envs to the result, each episode once."""
+        for env in envs:
+            evaluated = EvaluatedEpisode(self._session.outcomes[env], self._session.actions[env])
+            number = evaluated.outcome.episode
+            if self._folder is not None and number not in self._recorded:
+                results.append_episode(self._folder, evaluated)
+                self._recorded.add(number)
 
     def _update_observations(self, envs: list[int], observations: Observations | None) -> None:
         """Update the observations of some envs; ``observations``: those of the envs whose episode is running."""

@@ -76,8 +76,8 @@ def record_videos(
             # As many steps as recorded, whatever ended the episode.
             fps = session.rate / recorder.period * _SPEED
             with atomic_file(path) as tmp, open_video(tmp, fps, quality=6) as recorder.writer:
-                (outcome,) = session.run_episodes([protocol.episodes[number]], before.steps)
-            yield path, outcome.reproducible_values() == before.reproducible_values()
+                (evaluated,) = session.run_episodes([protocol.episodes[number]], before.steps)
+            yield path, evaluated.outcome.reproducible_values() == before.reproducible_values()
 
 
 class _VideoRecorder:

@@ -132,6 +132,7 @@ def test_outcomes_are_written_once_per_episode(make, tmp_path):
     env.close()
     result = results.read_result(tmp_path / "result")
     assert sorted(result.outcomes) == [0, 1] and result.run.policy.name == "mine"
+    assert all((result.read_actions(number) == np.tile(act(1), (5, 1))).all() for number in (0, 1))
     for _ in range(2):  # a refused environment does not keep the lock
         with pytest.raises(EvaluationError, match="already has a result"):
             make(1, out=tmp_path / "result")
