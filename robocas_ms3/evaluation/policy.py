@@ -27,6 +27,7 @@ ROBOT_QUANTITIES = {quantity.policy_key: quantity for quantity in QUANTITIES if 
 Language = Literal["none", "text", "embedding"]
 Reference = Literal["tcp", "target"]
 Calibration = Literal["nominal", "true"]
+Track = Literal["privileged", "modular", "end-to-end"]
 Pixels = Annotated[int, Field(ge=1, le=4096)]
 """Width or height of an image."""
 Array = NDArray[np.float64]
@@ -103,6 +104,9 @@ class PolicySpec:
         calibration: camera poses in the observations: ``nominal``, as configured, or ``true``, with the random motion
             of the cameras (``randomisation.cameras``).
         simulation_state: whether the policy observes the state of the simulation (`SimulationState`).
+        track: kind of policy, which results and tables name. ``privileged``: the policy knows what a robot cannot
+            observe; always with ``state`` or ``simulation_state``. ``modular``: it uses known kinematics and camera
+            calibration between its decisions. ``end-to-end``: it maps observations directly to actions.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")  # for specifications in messages and addresses
@@ -116,14 +120,18 @@ class PolicySpec:
     language: Language = "text"
     calibration: Calibration = "nominal"
     simulation_state: bool = False
+    track: Track = "end-to-end"
 
     def __post_init__(self) -> None:
+        if self.state or self.simulation_state:
+            object.__setattr__(self, "track", "privileged")
         wrong_cameras = [name for name in self.cameras if not re.fullmatch(CAMERA_NAME, name)]
         for name, fits, expected in (
             ("convention", self.convention in CONVENTIONS, f"one of {sorted(CONVENTIONS)}"),
             ("reference", self.reference in get_args(Reference), f"one of {list(get_args(Reference))}"),
             ("language", self.language in get_args(Language), f"one of {list(get_args(Language))}"),
             ("calibration", self.calibration in get_args(Calibration), f"one of {list(get_args(Calibration))}"),
+            ("track", self.track in get_args(Track), f"one of {list(get_args(Track))}"),
             ("depth", not self.depth or bool(self.cameras), "a policy with cameras, or depth=False"),
             ("cameras", not wrong_cameras, "camera names that end in _camera, such as side_camera"),
         ):

@@ -53,6 +53,12 @@ class PolicyRecord(BaseModel):
     spec: dict[str, Any] = {}
     server: dict[str, Any] | None = None
 
+    @property
+    def track(self) -> str:
+        """Return the track of the policy (`PolicySpec.track`)."""
+        is_privileged = self.spec.get("state") or self.spec.get("simulation_state")
+        return "privileged" if is_privileged else str(self.spec.get("track", PolicySpec.track))
+
 
 class MergedFolder(BaseModel):
     """Partial result that was merged into a result.

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import get_args
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.text import format_count
 from robocas_ms3.evaluation.outcomes import Outcome, compute_order_score, find_failure_stage
+from robocas_ms3.evaluation.policy import Track
 from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol, ProtocolEpisode
 from robocas_ms3.evaluation.results import Result, RunRecord
 from robocas_ms3.scenes.task_specs import TASKS
@@ -29,6 +31,8 @@ def find_violations(result: Result, protocol: LoadedProtocol) -> list[str]:
         found.append("weld: true, but the weld needs a protocol with RoboCAS-v0's steps")
     if run.played_as != protocol.find_task_aliases(list(run.played_as)):
         found.append(f"played_as is {run.played_as}, but this protocol allows no such alias")
+    if run.policy.track not in get_args(Track):
+        found.append(f"policy.spec.track is {run.policy.track}, expected one of {', '.join(get_args(Track))}")
     for number, outcome in result.outcomes.items():
         if number < count:
             of_episode = [*_find_outcome_violations(outcome, protocol.episodes[number], protocol, run)]

@@ -62,12 +62,27 @@ def test_invalid_specifications_name_the_field():
     assert policy_spec_to_dict(PolicySpec(simulation_state=True))["simulation_state"] is True
     assert policy_spec_to_dict(PolicySpec(calibration="true"))["calibration"] == "true"
     assert not {"calibration", "simulation_state"} & policy_spec_to_dict(PolicySpec()).keys()  # defaults
-    for wrong in ({"convention": "words"}, {"language": "loud"}, {"reference": "me"}, {"calibration": "exact"}):
+    invalid = {"convention": "words", "language": "loud", "reference": "me", "calibration": "exact", "track": "fast"}
+    for name, value in invalid.items():
         with pytest.raises(EvaluationError) as error:
-            PolicySpec(**wrong)
-        assert error.value.where == next(iter(wrong))
+            PolicySpec(**{name: value})
+        assert error.value.where == name
     with pytest.raises(EvaluationError, match="end in _camera.*found 'wrist'"):
         PolicySpec(cameras={"wrist": (64, 48)})
+
+
+@pytest.mark.parametrize("track", ["privileged", "modular", "end-to-end"])
+def test_policies_with_privileged_observations_are_privileged_whatever_they_declare(track):
+    assert PolicySpec(track=track).track == policy_spec_to_dict(PolicySpec(track=track))["track"] == track
+    for observed in ("state", "simulation_state"):
+        assert PolicySpec(**{observed: True}, track=track).track == "privileged"
+
+
+def test_tracks_of_the_built_in_policies():
+    for name in ("scripted", "scripted-ee-delta", "scripted-perturbed"):
+        assert make_policy(name).spec.track == "privileged"
+    for name in ("noop", "random"):
+        assert make_policy(name).spec.track == "end-to-end"
 
 
 def test_policy_modules_in_the_working_directory_are_found(here):

@@ -126,6 +126,12 @@ def test_changed_hash_of_actions_is_found(folder, protocol):
         assert violation.startswith("episode 0: ")
 
 
+def test_unknown_track_is_found(folder, protocol):
+    tamper_run(folder, policy={"name": "mine", "spec": {"track": "fast"}})
+    (violation,) = find_violations(read_result(folder), protocol)
+    assert violation.startswith("policy.spec.track is fast")
+
+
 def test_an_outcome_of_select_is_valid_only_if_the_run_has_played_as(tmp_path):
     protocol = load_protocol("paper-v1")
     folder = of_protocol(tmp_path / "result", protocol).folder

@@ -157,11 +157,11 @@ def evaluated(site, tmp_path_factory):
 def test_protocol_is_frozen_and_evaluated(evaluated):
     folder, (frozen, scripted, noop, verified, compared) = evaluated
     assert "2 episodes" in frozen
-    assert "| push_zone | 2 | 100 % (16 to 100) | 100 % |  | 100 % | 0 % | 100 % |  |" in scripted
+    assert "| push_zone | privileged | 2 | 100 % (16 to 100) | 100 % |  | 100 % | 0 % | 100 % |  |" in scripted
     assert "| configuration | n | failed | an object touched |" in noop
     assert "| push_zone | 2 | 2 | 2 |" in noop
     assert "2 episodes of push-zone-v1, no violations" in verified
-    assert "| push_zone | A, B | 2 | 0 | 2 |" in compared
+    assert "| push_zone | A, B | end-to-end, privileged | 2 | 0 | 2 |" in compared
     page = (folder / "eval" / "noop" / "report.html").read_text()
     assert "target in zone" in page
     assert "target lifted" not in page

@@ -118,7 +118,8 @@ class ReplayPolicy:
             read_reset(one, f"{trajectory}, traj_{one['episode_id']}")[0]: one["episode_id"] for one in data["episodes"]
         }
         rate = env.kwargs.get("sim_config", {}).get("control_freq", 20)
-        self.spec = PolicySpec(convention="joint_positions", rate_hz=rate, language="none")
+        # The recorded targets were planned from privileged state.
+        self.spec = PolicySpec(convention="joint_positions", rate_hz=rate, language="none", track="privileged")
 
     def describe(self) -> dict[str, Any]:
         return {"trajectory": self._trajectory.name, "episodes": len(self._episodes)}

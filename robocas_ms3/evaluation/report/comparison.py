@@ -24,11 +24,13 @@ class ComparisonRow:
     Attributes:
         where: name of the configuration or task, or `ALL`.
         pair: names of the first and of the second result or split.
+        tracks: tracks of their policies.
         found: comparison with the second as run A and the first as run B.
     """
 
     where: str
     pair: tuple[str, str]
+    tracks: tuple[str, str]
     found: Comparison
 
 
@@ -81,7 +83,8 @@ def compare_results(results: Sequence[Result]) -> str:
         successes = [[result.outcomes[number].success for number in numbers] for result in results]
         for one, other in combinations(range(len(results)), 2):
             found = compare_successes(successes[other], successes[one])
-            rows.append(ComparisonRow(config, (names[one], names[other]), found))
+            tracks = results[one].run.policy.track, results[other].run.policy.track
+            rows.append(ComparisonRow(config, (names[one], names[other]), tracks, found))
     return _render_table(head, "configuration", rows)
 
 
@@ -111,7 +114,7 @@ def compare_splits(result: Result, protocol: LoadedProtocol) -> str:
     scenes: dict[tuple[str, bytes], list[tuple[str, str]]] = {}  # (split, configuration) with equal scenes
     for task, split, config in dict.fromkeys((one.task, one.split, one.config) for one in protocol.episodes):
         scenes.setdefault((task, protocol.layouts_file(config).read_bytes()), []).append((split, config))
-    rows = []
+    rows, track = [], result.run.policy.track
     for (task, _), (first, *others) in scenes.items():
         for other in others:
             successes_by_seed = [
@@ -127,7 +130,7 @@ def compare_splits(result: Result, protocol: LoadedProtocol) -> str:
                 found = compare_successes(
                     [successes_by_seed[1][seed] for seed in seeds], [successes_by_seed[0][seed] for seed in seeds]
                 )
-                rows.append(ComparisonRow(task, (first[0], other[0]), found))
+                rows.append(ComparisonRow(task, (first[0], other[0]), (track, track), found))
     if not rows:
         fix = "Pass a second result folder to compare with."
         raise EvaluationError("no two splits of the result have the same scenes", where=result.folder, fix=fix)
@@ -146,15 +149,17 @@ def _render_table(head: str, where: str, rows: list[ComparisonRow]) -> str:
         f"{head} McNemar's exact test, Tango's 95 % interval. Decide by Holm's p, adjusted for all rows except "
         f"`{ALL}`, and separately for the rows `{ALL}`.",
         "",
-        f"| {where} | first, second | n | first | second | only first | only second | second - first | p | Holm's p |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        f"| {where} | first, second | tracks | n | first | second | only first | only second | second - first | p "
+        "| Holm's p |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     warnings = []
     for number, row in enumerate(rows):
         c, (p, claims) = row.found, adjusted[number]
         change = f"{100 * c.difference:+.1f} ({100 * c.low:+.1f} to {100 * c.high:+.1f})"
         counts = (c.n, c.successes_b, c.successes_a, c.only_b, c.only_a, change, f"{c.p_value:.3g}", f"{p:.3g}")
-        names = (escape_markdown(row.where), escape_markdown(", ".join(row.pair)))
+        tracks = ", ".join(dict.fromkeys(row.tracks))
+        names = tuple(escape_markdown(text) for text in (row.where, ", ".join(row.pair), tracks))
         lines.append(f"| {' | '.join(map(str, (*names, *counts)))} |")
         warning = None if p <= _ALPHA else make_power_warning(c, alpha=_ALPHA / claims)
         if warning:

@@ -201,21 +201,22 @@ def _make_success_table(result: Result) -> Table:
         error_count = [one for one in outcomes if one.error and not one.flags]
         return result.compute_rate(flag, known + error_count) if known else None
 
-    groups, rows = result.group_by("config"), []
+    groups, rows, track = result.group_by("config"), [], result.run.policy.track
     for config, outcomes in groups.items() if result.has_repeated_scenes() else _add_pooled_group(groups):
         ends = (result.compute_rate("success_at_end", outcomes), stage_rate("success_v0", outcomes))
         stages = (stage_rate(stage, outcomes) for stage in PAPER_STAGES.values())
         steps, seconds = mean([one.steps for one in outcomes]), mean([one.seconds for one in outcomes])
         overall = result.compute_rate("success", outcomes)
-        rows.append((config, str(overall.n), overall, *ends, *stages, f"{steps:.0f}", f"{seconds:.1f}"))
+        rows.append((config, track, str(overall.n), overall, *ends, *stages, f"{steps:.0f}", f"{seconds:.1f}"))
     note = (
-        "success: success at some step; at the end: success after the last step; RoboCAS-v0: success by the rule of "
-        "RoboCAS-v0 after the last step. "
+        "track: kind of policy (docs/evaluation.md). success: success at some step; at the end: success after the last "
+        "step; RoboCAS-v0: success by the rule of RoboCAS-v0 after the last step. "
         f"{_STAGE_NOTE} Intervals: Clopper-Pearson, 95 %. Steps and simulated seconds are means over all episodes."
         + ("" if result.has_repeated_scenes() else " The row all pools the episodes of all configurations.")
     )
-    heads = ("configuration", "n#", "success%", "at the end#", "RoboCAS-v0#", *(f"{name}#" for name in PAPER_STAGES))
-    return Table("Success", note, (*heads, "steps#", "s#"), rows)
+    end_heads, stage_heads = ("at the end#", "RoboCAS-v0#"), [f"{name}#" for name in PAPER_STAGES]
+    heads = ("configuration", "track", "n#", "success%", *end_heads, *stage_heads, "steps#", "s#")
+    return Table("Success", note, heads, rows)
 
 
 def _make_split_table(result: Result) -> Table:

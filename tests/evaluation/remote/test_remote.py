@@ -300,9 +300,9 @@ def test_our_client_with_a_plain_openpi_server():
         return openpi.packb({"actions": np.ones((10, 8), np.float32) / 10, "server_timing": timing})
 
     with serve_answer(answer, {"reset_pose": np.zeros(3)}) as url:
-        options = "convention=joint_positions&cameras=base_camera:6x4&n_action_steps=4&language=text"
+        options = "convention=joint_positions&cameras=base_camera:6x4&n_action_steps=4&language=text&track=modular"
         remote = RemotePolicy(f"{url}?{options}&rename=base_camera:observation/image,prompt:text")
-        assert remote.spec == PolicySpec(convention="joint_positions", cameras={"base_camera": (6, 4)})
+        assert remote.spec == PolicySpec("joint_positions", cameras={"base_camera": (6, 4)}, track="modular")
         remote.reset([make_episode(1)])
         assert remote.act(make_observations(1, cameras=True)).shape == (1, 4, 8)
         remote.act(make_observations(1, cameras=True))

@@ -20,13 +20,15 @@ def rows(said: str) -> list[list[str]]:
 
 def test_comparison_uses_the_common_episodes(tmp_path):
     one = write(tmp_path / "a", [outcome(number, came_to=0) for number in range(8)])
-    other = write(tmp_path / "b", [outcome(number) for number in range(1, 9)], policy={"name": "better"})
+    policy = {"name": "better", "spec": {"simulation_state": True}}
+    other = write(tmp_path / "b", [outcome(number) for number in range(1, 9)], policy=policy)
     said = compare_results([one, other])
     assert said.startswith(
         f"A: mine ({one.folder}), B: better ({other.folder}); 7 episodes of made_up in both results."
     )
-    ((config, pair, *counts, change, p, adjusted),) = rows(said)
+    ((config, pair, tracks, *counts, change, p, adjusted),) = rows(said)
     assert (config, pair, counts) == ("table", "A, B", ["7", "0", "7", "0", "7"])
+    assert tracks == "end-to-end, privileged"
     assert change.startswith("+100.0 (")
     assert float(p) == float(adjusted) == pytest.approx(2 * 0.5**7, rel=0.01)
 
@@ -134,7 +136,7 @@ def test_splits_with_the_same_scenes_are_compared(tmp_path):
     assert [row[:2] for row in found] == [
         [task, f"seen, {split}"] for task in ("pick", "select", "search") for split in ("paraphrase", "wrong", "empty")
     ]
-    assert [row[3:5] for row in found[:3]] == [["50", "50"], ["50", "0"], ["50", "0"]]
+    assert [row[4:6] for row in found[:3]] == [["50", "50"], ["50", "0"], ["50", "0"]]
 
 
 def test_a_split_may_have_several_configurations(tmp_path):
@@ -149,8 +151,8 @@ def test_a_split_may_have_several_configurations(tmp_path):
         succeeds = one.split == "seen" or one.config == "select_table_orderly-far"
         outcomes.append(outcome(one.episode, 7 if succeeds else 0, **same))
     found = rows(compare_splits(write(tmp_path / "r", outcomes, protocol_hash=protocol.hash), protocol))
-    assert [row[1:5] for row in found] == [
-        [f"seen, {split}", "50", "50", second]
+    assert [row[1:6] for row in found] == [
+        [f"seen, {split}", "end-to-end", "50", "50", second]
         for split, second in (("near", "0"), ("far", "0"), ("near", "0"), ("far", "50"))
     ]
 

@@ -62,10 +62,10 @@ def result(tmp_path):
 def test_page_shows_rates_stages_failures_and_settings(result):
     read = Reader(render_page(result))
     # 2 of 4, 6.8 to 93.2; 2 of 2, 0.025 ** (1 / 2) = 15.8
-    assert read.after("table", 3) == ["4", "50 %", "7 to 93"]
-    assert read.after("heap", 3) == ["2", "100 %", "16 to 100"]
+    assert read.after("table", 4) == ["end-to-end", "4", "50 %", "7 to 93"]
+    assert read.after("heap", 4) == ["end-to-end", "2", "100 %", "16 to 100"]
     assert "2 of 4: 50.0 %, 6.8 to 93.2" in read.texts  # title of the bar
-    assert read.after("all", 2) == ["6", "67 %"]
+    assert read.after("all", 3) == ["end-to-end", "6", "67 %"]
     assert read.after("table, n 4", 3) == ["an object touched (RA)", "3 of 4: 75.0 %, 19.4 to 99.4", "75 %"]
     assert {"placed, at rest", "ended by an error", "Ended by an error: 1 episode, counted as failed."} <= set(
         read.texts

@@ -24,7 +24,7 @@ def row(text: str, first: str) -> list[str]:
 
 def test_tables_of_successes_failures_and_occlusion(result, tmp_path):
     # 2 of 4: Clopper and Pearson 6.8 to 93.2; steps (70 + 70 + 800 + 800) / 4; RA 3 of 4; no obstacles
-    expected = ["table", "4", "50 % (7 to 93)", "50 %", "50 %", "75 %", "75 %", "75 %", "", "435", "21.8"]
+    expected = ["table", "end-to-end", "4", "50 % (7 to 93)", "50 %", "50 %", "75 %", "75 %", "75 %", "", "435", "21.8"]
     assert row(render_markdown(result), "table") == expected
     said = render_markdown(result).partition("Where episodes failed")[2]
     assert row(said, "configuration") == ["configuration", "n", "failed", "an object touched", "placed, at rest"]
@@ -39,6 +39,15 @@ def test_tables_of_successes_failures_and_occlusion(result, tmp_path):
     assert row(render_markdown(result), "0.2 to 0.4") == ["0.2 to 0.4", "1", "100 % (3 to 100)"]
     assert row(render_markdown(result), "0.8 to 1") == ["0.8 to 1", "1", "0 % (0 to 98)"]
     assert row(render_markdown(result), "0 to 0.2") == ["0 to 0.2", "0", ""]
+
+
+@pytest.mark.parametrize(
+    ("spec", "track"),
+    [({}, "end-to-end"), ({"track": "modular"}, "modular"), ({"track": "modular", "state": True}, "privileged")],
+)
+def test_success_table_names_the_track(tmp_path, spec, track):
+    made = write(tmp_path / "a", [outcome(0)], policy={"name": "mine", "spec": spec})
+    assert row(render_markdown(made), "table")[1] == track
 
 
 def test_notes_name_task_aliases_and_the_conditions_of_the_paper(tmp_path):
