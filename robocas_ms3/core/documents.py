@@ -136,12 +136,12 @@ def _format_yaml_error(error: Exception) -> str:
     return one_line(error)
 
 
-def open_npz(path: Path, limit: int = ARRAYS_LIMIT) -> Any:
+def open_npz(path: Path, limit: int | None = None) -> Any:
     """Open an ``.npz`` file without pickled objects.
 
     Args:
         path: of the file.
-        limit: maximum number of bytes of all arrays after decompression, and of the file.
+        limit: maximum number of bytes of all arrays after decompression, and of the file; None: `ARRAYS_LIMIT`.
 
     Returns:
         NumPy's reader of the file, a context manager.
@@ -152,6 +152,7 @@ def open_npz(path: Path, limit: int = ARRAYS_LIMIT) -> Any:
     import numpy as np  # slow to import, and not needed by every command
     from numpy.lib.npyio import NpzFile
 
+    limit = ARRAYS_LIMIT if limit is None else limit
     check_regular_file(path, limit)
     file = np.load(path, allow_pickle=False)
     if not isinstance(file, NpzFile):

@@ -12,7 +12,7 @@ from robocas_ms3.datasets.images.image_files import read_image, write_image
 from robocas_ms3.datasets.images.image_headers import read_header
 from robocas_ms3.datasets.images.png import encode_png
 
-RGB, DEPTH = (np.uint8, (3,)), (np.uint16, ())
+RGB, DEPTH, GREY = (np.uint8, (3,)), (np.uint16, ()), (np.uint8, ())
 
 
 def arrays(kind, height, width):
@@ -27,7 +27,7 @@ def arrays(kind, height, width):
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 1), (1, 5), (16, 16), (17, 31), (120, 161)])
-@pytest.mark.parametrize("kind", [RGB, DEPTH], ids=["rgb", "depth"])
+@pytest.mark.parametrize("kind", [RGB, DEPTH, GREY], ids=["rgb", "depth", "grey"])
 def test_decodes_to_the_same(kind, height, width, tmp_path):
     for pixels in arrays(kind, height, width):
         data = encode_png(pixels)
@@ -44,7 +44,7 @@ def test_decodes_to_the_same(kind, height, width, tmp_path):
         assert (header.width, header.height, header.bits * header.channels) == (
             width,
             height,
-            24 if pixels.ndim == 3 else 16,
+            24 if pixels.ndim == 3 else 8 * pixels.itemsize,
         )
 
 
@@ -73,7 +73,7 @@ def test_size_is_close_to_opencv():
 @pytest.mark.parametrize(
     "pixels",
     [
-        np.zeros((4, 5), np.uint8),
+        np.zeros((4, 5), np.int16),
         np.zeros((4, 5, 4), np.uint8),
         np.zeros((4, 5, 3), np.uint16),
         np.zeros((4, 5), np.float32),
