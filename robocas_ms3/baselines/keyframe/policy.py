@@ -44,6 +44,7 @@ class KeyframePolicy:
             cameras=dict.fromkeys(facts["cameras"], config.image_size),
             depth=True,
             language="embedding",
+            track="modular",
         )
         self._paths: dict[str, ArmPaths] = {}  # by robot
         self._specs: dict[int, EpisodeSpec] = {}  # by env
