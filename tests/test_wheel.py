@@ -89,6 +89,7 @@ def test_wheel_contains_the_data_files(wheel):
             assert f"robocas_ms3/data/packs/builtin/{asset['id']}/{file}" in names
     for file in ("run.json", "weights.safetensors"):
         assert f"robocas_ms3/data/runs/small/{file}" in names
+    assert "robocas_ms3/data/published_results.json" in names
     assert {"robocas_ms3/py.typed", "asset_tools/py.typed"} <= names  # type checkers of users read the annotations
     assert any(name.endswith(".dist-info/licenses/LICENSE") for name in names)
     left_out = ("tests/", "scripts/", "task_configs/", "asset_tools/builtin")

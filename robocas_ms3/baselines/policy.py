@@ -41,6 +41,7 @@ class RunPolicy:
         import torch
 
         from robocas_ms3.baselines.training import checkpoints
+        from robocas_ms3.baselines.training.metrics import read_training_seconds
 
         if record.version != baseline.version:
             raise TrainingError(
@@ -75,6 +76,9 @@ class RunPolicy:
             "config": record.config,
             "init_from": record.init_from,
             "trained_with": record.versions,
+            "training_seconds": read_training_seconds(folder, weights.step),
+            "hardware": record.hardware or record.device,
+            "parameters": sum(parameter.numel() for parameter in model.parameters()),
             "weights": hash_weights(folder),
         }
 
@@ -84,7 +88,7 @@ class RunPolicy:
         return self._policy.spec
 
     def describe(self) -> dict[str, Any]:
-        """Return the baseline, training data, configuration and weights hash, for the record of a result."""
+        """Return the baseline, training data and cost, configuration and weights hash, for the record of a result."""
         return {**self._description, **getattr(self._policy, "describe", dict)()}
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
@@ -94,6 +98,16 @@ class RunPolicy:
     def requests_images(self, envs: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return (E,) bool, whether the next call of `act` needs images of each env."""
         return find_image_requests(self._policy, envs)
+
+    def list_training_differences(self, configs: dict[str, TaskConfig]) -> dict[str, list[str]] | None:
+        """Return by configuration the tasks, scene settings, objects and cameras that the training data lacks.
+
+        None: the scenes of the training data are unknown.
+        """
+        scenes, cameras = self._scenes, self.spec.cameras
+        if not (scenes.tasks and scenes.configs and scenes.objects):
+            return None
+        return {name: scenes.list_differences({name: config}, cameras) for name, config in configs.items()}
 
     def protocol_warnings(self, configs: dict[str, TaskConfig]) -> list[str]:
         """Warn if the training stopped early, or if its data lacks tasks, scenes, objects or cameras of configurations.

@@ -133,6 +133,7 @@ COMMANDS = {
     "compare": eval_results.compare,
     "verify": eval_results.verify,
     "videos": eval_results.videos,
+    "leaderboard": eval_results.leaderboard,
     "protocols": list_protocols,
     "freeze": freeze,
 }

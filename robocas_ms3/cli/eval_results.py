@@ -1,4 +1,4 @@
-"""``robocas eval report | merge | compare | verify | videos``: read and check results of evaluations."""
+"""``robocas eval report | merge | compare | verify | videos | leaderboard``: read and check results of evaluations."""
 
 from __future__ import annotations
 
@@ -56,6 +56,20 @@ class Compare(Results):
 
     Example: robocas eval compare eval/small eval/rt1
     """
+
+
+@dataclass(kw_only=True)
+class WriteLeaderboard(Results):
+    """Write the leaderboard of several results, with the published results of the RoboCAS paper.
+
+    Folders with equal settings are partial results of one evaluation. The Markdown tables are printed, and written next
+    to the JSON file.
+
+    Example: robocas eval leaderboard eval/small eval/rt1 --out docs/leaderboard/results.json
+    """
+
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE.json")]
+    """JSON file of the leaderboard; an existing leaderboard is replaced."""
 
 
 @dataclass
@@ -119,6 +133,31 @@ def compare(cfg: Compare) -> int:
         print_text(compare_splits(results[0], _protocol_of(results[0], cfg.protocol)))
     else:
         print_text(compare_results(results))
+    return 0
+
+
+def leaderboard(cfg: WriteLeaderboard) -> int:
+    from robocas_ms3.cli.terminal import print_line, print_text
+    from robocas_ms3.core.errors import EvaluationError
+    from robocas_ms3.core.files import atomic_file
+    from robocas_ms3.evaluation.leaderboard.markdown import render_leaderboard
+    from robocas_ms3.evaluation.leaderboard.result_rows import make_rows
+    from robocas_ms3.evaluation.leaderboard.rows import Leaderboard, read_published_rows, sort_rows, write_leaderboard
+    from robocas_ms3.evaluation.results import group_partial_results, read_result
+
+    _check_folders(cfg.folders)
+    if cfg.out.suffix != ".json":
+        what, expected = "invalid name of the leaderboard", "a name that ends in .json"
+        raise EvaluationError(what, where="--out", expected=expected, found=cfg.out.name, usage=True)
+    results = [read_result(*folders) for folders in group_partial_results(cfg.folders)]
+    measured = [row for one in results for row in make_rows(one, _find_protocol(one, cfg.protocol))]
+    rows = sort_rows([*measured, *read_published_rows()])
+    text, page = render_leaderboard(rows), cfg.out.with_suffix(".md")
+    write_leaderboard(cfg.out, Leaderboard(rows=rows))
+    with atomic_file(page) as tmp:
+        tmp.write_text(text, encoding="utf-8")
+    print_text(text)
+    print_line(f"wrote {cfg.out} and {page.name}: {format_count(len(rows), 'row')}")
     return 0
 
 

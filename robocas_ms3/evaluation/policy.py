@@ -238,6 +238,8 @@ class Policy(Protocol):
       bool, whether ``act`` needs images of each env. Other images are not rendered. Without this method, ``act`` gets
       all images. The method must not change the state of the policy, because it may be called more than once.
     - ``describe()`` returns a dict that ``run.json`` of a result records.
+    - ``list_training_differences(configs)`` gets the task configurations of a protocol by name. It returns by name a
+      list of what the training data lacks, or None if the training data is unknown. ``run.json`` records it.
     - ``protocol_warnings(configs)`` gets the task configurations of an evaluation by name. It returns a list of
       warnings, such as scenes that are not in the training data.
     - ``close()`` is called at the end of the evaluation.

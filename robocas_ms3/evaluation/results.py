@@ -85,6 +85,8 @@ class RunRecord(BaseModel):
         weld: whether lifted objects were fixed to the hand (--weld).
         action_noise: standard deviations of the noise on actions, in mm and degrees (--action-noise); None: no noise.
         played_as: tasks that were evaluated in the episodes of another task (`LoadedProtocol.find_task_aliases`).
+        training_differences: by name of a configuration of the protocol, what the training data of the policy lacks,
+            such as objects; None: unknown, or the policy was not trained.
         backend: ``processes`` or ``gpu``.
         versions: package versions by name.
         pack_hashes: sha256 of the manifests of the object packs by name.
@@ -100,6 +102,7 @@ class RunRecord(BaseModel):
     weld: bool = False
     action_noise: Annotated[tuple[float, float] | None, Field(strict=False)] = None
     played_as: dict[str, str] = {}
+    training_differences: dict[str, list[str]] | None = None
     backend: str
     versions: dict[str, str]
     pack_hashes: dict[str, str]

@@ -317,13 +317,26 @@ class EvaluationSession:
         warn: Callable[[dict[str, TaskConfig]], list[str]] | None = getattr(self.policy, "protocol_warnings", None)
         if warn is None:
             return
+        with forbid_policy_exit(self.policy):
+            for warning in warn(self._load_configs(self.episodes)):
+                _log.warning("%s", warning)
+
+    def _list_training_differences(self) -> dict[str, list[str]] | None:
+        """Return by configuration of the protocol what the training data of the policy lacks; None: unknown."""
+        find: Callable[[dict[str, TaskConfig]], dict[str, list[str]] | None] | None
+        find = getattr(self.policy, "list_training_differences", None)
+        if find is None:
+            return None
+        with forbid_policy_exit(self.policy):
+            return find(self._load_configs(self.protocol.episodes))
+
+    def _load_configs(self, episodes: Sequence[ProtocolEpisode]) -> dict[str, TaskConfig]:
+        """Load the configurations of episodes by name, with the evaluated task."""
         configs: dict[str, TaskConfig] = {}
-        for name, task in dict.fromkeys((episode.config, self._find_task(episode)) for episode in self.episodes):
+        for name, task in dict.fromkeys((episode.config, self._find_task(episode)) for episode in episodes):
             config = load_task_config(self.protocol.config_file(name))
             configs[name] = config if config.task == task else config.model_copy(update={"task": task})
-        with forbid_policy_exit(self.policy):
-            for warning in warn(configs):
-                _log.warning("%s", warning)
+        return configs
 
     def _observe(self, batch: EpisodeBatch) -> Observations:
         observations = batch.observe(sorted(batch.running))
@@ -379,6 +392,7 @@ class EvaluationSession:
             raise EvaluationError(
                 what, where=rules.name, expected=f"hash {rules.pack_hash}", found=f"hash {pack}", fix=fix
             )
+        differences = self._list_training_differences()
         values = {
             "protocol": rules.name,
             "protocol_hash": self.protocol.hash,
@@ -386,6 +400,7 @@ class EvaluationSession:
             "weld": self.settings.weld,
             **({"action_noise": self.settings.action_noise} if any(self.settings.action_noise) else {}),
             **({"played_as": self.played_as} if self.played_as else {}),
+            **({"training_differences": differences} if differences is not None else {}),
             "backend": backend,
             "versions": results.get_package_versions(),
             "pack_hashes": {rules.pack: pack},

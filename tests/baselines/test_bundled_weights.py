@@ -32,6 +32,8 @@ def test_policy_by_name():
     assert isinstance(policy, RunPolicy)
     assert (policy.spec.convention, policy.spec.rate_hz, policy.spec.language) == ("robocas", 5.0, "embedding")
     description = policy.describe()
+    assert (description["hardware"], description["training_seconds"]) == ("cpu", None)  # the log is not bundled
+    assert description["parameters"] == 1_864_415
     assert description["steps"] > 0 and description["trained_in"].startswith("pick, in pick_upstream_eval, objects ")
 
 
@@ -73,6 +75,20 @@ def test_warning_names_only_configurations_with_differences():
     configs = configs_of("paper-v1", "pick") | configs_of("paper-v1", "search")
     (message,) = make_policy("small").protocol_warnings(configs)
     assert message.startswith("policy small was not trained for search_upstream_eval: ")
+
+
+def test_run_record_lists_what_the_training_data_lacks(monkeypatch):
+    """Pick is evaluated in the scenes of the training; select is another task in these scenes."""
+    monkeypatch.setattr(session, "require_renderer", lambda: None)
+
+    def differences(*tasks):
+        settings = EvaluationSettings(tasks, "small", "paper-v1", backend="processes")
+        return session.EvaluationSession(make_policy("small"), settings).run_record.training_differences
+
+    pick = differences("pick")
+    assert pick == differences() and pick["pick_upstream_eval"] == []
+    assert "task search" in pick["search_upstream_eval"]
+    assert differences("select")["pick_upstream_eval"] == ["task select"]
 
 
 def test_warning_about_another_task_in_the_scenes_of_the_training_data(caplog, monkeypatch):

@@ -22,7 +22,7 @@ from robocas_ms3.core.documents import DocumentError
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import OutputFolder
-from robocas_ms3.core.paths import builtin_packs_dir
+from robocas_ms3.core.paths import builtin_packs_dir, published_results_file
 from robocas_ms3.core.poses import from_xyz_yaw
 from robocas_ms3.datasets import CandidateDataset, CandidateOptions
 from robocas_ms3.datasets.candidate_images.images_file import CandidateImages
@@ -48,6 +48,7 @@ from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.demos.trajectory_replay import RecordedEpisode
 from robocas_ms3.evaluation import results
 from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.leaderboard.rows import read_leaderboard
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.report.comparison import compare_results
 from robocas_ms3.evaluation.report.page import render_page
@@ -123,6 +124,11 @@ def write_protocol(root):
 
 def write_result(root):
     synthetic_results.write(root, [synthetic_results.outcome(i, came_to=7 - i) for i in range(3)])
+
+
+def write_published_rows(root):
+    root.mkdir()
+    shutil.copy(published_results_file(), root / "rows.json")
 
 
 COMPLETE, STARTED = WorkUnit(0, 0), WorkUnit(0, 1)
@@ -316,6 +322,7 @@ CASES = [  # writer, file, reader, number of changed files, least number of erro
     (write_result, results.RUN, read_result, 40, 5),
     (write_result, results.OUTCOMES, read_result, 40, 0),
     (write_result, "actions/000000.npz", lambda root: results.read_result(root).read_actions(0), 80, 40),
+    (write_published_rows, "rows.json", lambda root: read_leaderboard(root / "rows.json"), 60, 20),
     (write_plan, PLAN, read_plan_folder, 25, 5),
     *((write_plan, name, read_plan_folder, 20, 0) for name in (OUTCOMES, OUTCOME)),
     (write_generation, "run.json", read_generation, 60, 10),

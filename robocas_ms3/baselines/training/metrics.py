@@ -19,6 +19,17 @@ from robocas_ms3.core.files import add_path_to_errors, atomic_file, make_folder,
 _FIRST_COLUMNS = ("step", "split", "epoch", "seconds", "learning_rate")
 
 
+def read_training_seconds(folder: Path, step: int) -> float | None:
+    """Return the wall-clock time in s up to a training step, from the log of a run; None: not in the log."""
+    try:
+        with (folder / METRICS).open(newline="", encoding="utf-8") as file:
+            rows = [row for row in csv.DictReader(file) if _parse_number(row.get("step"), math.inf) <= step]
+    except (OSError, ValueError, csv.Error):
+        return None
+    seconds = [_parse_number(row.get("seconds"), math.nan) for row in rows]
+    return next((value for value in reversed(seconds) if math.isfinite(value)), None)
+
+
 def mean_of_sum_and_count(sum_and_count: torch.Tensor) -> torch.Tensor:
     """Return the mean () of values, from their sum and number (2,); 0 if there are no values."""
     return sum_and_count[0] / sum_and_count[1].clamp(min=1)

@@ -58,6 +58,7 @@ class RunRecord(StrictModel):
         versions: versions of the installed packages, by name.
         device, precision: device and precision of the training, which determine rounding.
         threads: number of CPU threads, which determines the order of sums; 0: a GPU, or unknown.
+        hardware: number of processes and their processor at the start, such as "1 x NVIDIA H100 PCIe"; empty: unknown.
         hardware_changes: one line for each time that the run continued with another device, precision or number of
             threads.
         init_from: folder name and hash of the run whose weights this run started from; empty: random weights.
@@ -73,6 +74,7 @@ class RunRecord(StrictModel):
     device: str
     precision: str
     threads: int = 0
+    hardware: str = ""
     hardware_changes: list[str] = []
     init_from: str = ""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import platform
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -21,6 +22,7 @@ from robocas_ms3.baselines.training.record import CHECKPOINT, WEIGHTS, RunRecord
 from robocas_ms3.core.errors import TrainingError
 from robocas_ms3.core.output_folder import OutputFolder
 from robocas_ms3.core.signals import defer_interrupts
+from robocas_ms3.core.text import format_count
 
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of malloc.h
 
@@ -160,6 +162,15 @@ def describe_hardware(accelerator: Accelerator) -> dict[str, Any]:
     device = accelerator.device.type
     threads = torch.get_num_threads() if device == "cpu" else 0
     return {"device": device, "precision": str(accelerator.mixed_precision), "threads": threads}
+
+
+def name_hardware(accelerator: Accelerator) -> str:
+    """Return the number of processes and the name of their processor, such as "1 x x86_64 CPU, 2 threads"."""
+    if accelerator.device.type == "cuda":
+        name = torch.cuda.get_device_name(accelerator.device)
+    else:
+        name = f"{platform.machine()} CPU, {format_count(torch.get_num_threads(), 'thread')}"
+    return f"{accelerator.num_processes} x {name}"
 
 
 def _keep_freed_memory() -> None:

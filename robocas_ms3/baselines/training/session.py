@@ -95,7 +95,12 @@ def train_run(options: RunOptions, progress: ProgressCallbacks | None = None) ->
     """
     require_extra("train", "baselines", "accelerate", "safetensors", "tensorboard")
     require_extra("train", "baselines", "transformers", load=False)  # only rt1 imports it
-    from robocas_ms3.baselines.training.run_folder import RunFolder, describe_hardware, make_accelerator
+    from robocas_ms3.baselines.training.run_folder import (
+        RunFolder,
+        describe_hardware,
+        make_accelerator,
+        name_hardware,
+    )
     from robocas_ms3.baselines.training.supervised import train_supervised
 
     baseline: Any = find_baseline(options.baseline)
@@ -142,6 +147,7 @@ def train_run(options: RunOptions, progress: ProgressCallbacks | None = None) ->
             ),
             versions=package_versions(),
             **describe_hardware(accelerator),
+            hardware=name_hardware(accelerator),
             init_from=initial.name if initial else "",
         )
         run = stack.enter_context(closing(RunFolder(output, record, accelerator, progress)))

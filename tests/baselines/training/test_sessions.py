@@ -38,6 +38,11 @@ def test_files_of_a_run_and_its_policy(whole):
     assert {path.stat().st_mode & 0o777 for path in whole.glob("*.safetensors")} == {0o644}  # for everybody to read
     description = make_policy(str(whole)).describe()
     assert (description["baseline"], description["steps"], description["data"]["samples"]) == ("stub", 40, 30)
+    assert 0 < description["training_seconds"] < 600
+    assert description["hardware"] == record["hardware"] and record["hardware"].startswith("1 x ")
+    assert description["parameters"] == sum(
+        tensor.numel() for tensor in load_file(whole / "weights.safetensors").values()
+    )
 
 
 def test_metrics_of_a_run(whole):

@@ -2,9 +2,10 @@
 
 import math
 
+import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from robocas_ms3.baselines.training.metrics import MetricsLog
+from robocas_ms3.baselines.training.metrics import MetricsLog, read_training_seconds
 
 HEAD = "step,split,epoch,seconds,learning_rate,loss\n"
 
@@ -28,6 +29,20 @@ def test_truncated_line_is_removed(tmp_path):
     log.close()
     assert path.read_text() == HEAD + "1000,train,1,60,0.1,2\n1050,train,1,70,0.1,1\n"
     assert log.seconds == 60
+
+
+@pytest.mark.parametrize(("step", "seconds"), [(1000, 61.0), (1049, 61.0), (1050, 63.5), (10, None)])
+def test_training_time_is_that_of_the_last_line_up_to_the_step(tmp_path, step, seconds):
+    lines = "1000,train,1,60,0.1,2\n1000,val,1,61,0.1,3\n1050,train,1,63.5,0.1,1.5\n1050,val"
+    (tmp_path / "metrics.csv").write_text(HEAD + lines)
+    assert read_training_seconds(tmp_path, step) == seconds
+
+
+@pytest.mark.parametrize("content", [None, b"", b"\xff\xfe", b"step,loss\n1,2\n"])
+def test_training_time_is_unknown_without_a_readable_log(tmp_path, content):
+    if content is not None:
+        (tmp_path / "metrics.csv").write_bytes(content)
+    assert read_training_seconds(tmp_path, 1000) is None
 
 
 def test_run_without_checkpoint_starts_new_curves(tmp_path):

@@ -1,0 +1,93 @@
+"""Leaderboard as Markdown tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from robocas_ms3.core.text import escape_markdown, format_count
+from robocas_ms3.evaluation.leaderboard.rows import LeaderboardRow, Training
+from robocas_ms3.evaluation.outcomes import PAPER_STAGES
+
+_HEADS = (
+    *("policy", "track", "task", "split", "n", "success", "RoboCAS-v0's rule", *PAPER_STAGES),
+    *("training data", "trained here", "training", "parameters", "notes"),
+)
+NOTE = (
+    "Success: success rate in % with its exact 95 % interval. RoboCAS-v0's rule: success rate by the rule of "
+    "RoboCAS-v0 after the last step. Trained here: whether the training data has the task, scenes, objects and cameras "
+    "of the episodes. Compare rows of the same table, task, split and track, without notes."
+)
+PUBLISHED_NOTE = (
+    "Published results are not comparable with the tables above: RoboCAS-v0's evaluator has another rule of success, "
+    "fixes lifted objects to the hand, and has other object meshes."
+)
+
+
+def render_leaderboard(rows: Sequence[LeaderboardRow]) -> str:
+    """Return rows as Markdown: one table per protocol and its hash, and one table of published results."""
+    lines, protocols = [NOTE], dict[tuple[str, str], list[LeaderboardRow]]()
+    for row in rows:
+        if not row.published:
+            protocols.setdefault((row.protocol, row.protocol_hash), []).append(row)
+    for (protocol, protocol_hash), chosen in protocols.items():
+        title = escape_markdown(f"{protocol}, hash {protocol_hash[:16]}")
+        lines += ["", f"## {title}", "", *_render_table(chosen)]
+    if published := [row for row in rows if row.published]:
+        lines += ["", "## Published results", "", PUBLISHED_NOTE, "", *_render_table(published)]
+    return "\n".join(lines) + "\n"
+
+
+def _render_table(rows: Sequence[LeaderboardRow]) -> Iterator[str]:
+    yield f"| {' | '.join(_HEADS)} |"
+    yield "|" + "---|" * len(_HEADS)
+    for row in rows:
+        yield f"| {' | '.join(map(escape_markdown, _make_cells(row)))} |"
+
+
+def _make_cells(row: LeaderboardRow) -> list[str]:
+    training = row.training or Training()
+    return [
+        *(row.policy, row.track, row.task, row.split),
+        "" if row.n is None else str(row.n),
+        _format_success(row),
+        _format_percent(row.rate_v0),
+        *(_format_percent(row.stages.get(stage)) for stage in PAPER_STAGES.values()),
+        _describe_data(training),
+        "" if row.trained_here is None else "yes" if row.trained_here else "no",
+        _describe_cost(training),
+        "" if row.parameters is None else f"{row.parameters / 1e6:.2f} M",
+        "; ".join(_list_notes(row)),
+    ]
+
+
+def _format_success(row: LeaderboardRow) -> str:
+    if row.rate is None or row.interval is None:
+        return _format_percent(row.rate)
+    low, high = row.interval
+    return f"{100 * row.rate:.1f} ({100 * low:.1f} to {100 * high:.1f})"
+
+
+def _format_percent(rate: float | None) -> str:
+    return "" if rate is None else f"{100 * rate:.1f}"
+
+
+def _describe_data(training: Training) -> str:
+    episodes = [] if training.episodes is None else [format_count(training.episodes, "episode")]
+    initial = [f"from {training.init_from}"] if training.init_from else []
+    return ", ".join([*episodes, *([training.scenes] if training.scenes else []), *initial])
+
+
+def _describe_cost(training: Training) -> str:
+    steps = [] if training.steps is None else [format_count(training.steps, "step")]
+    minutes = [] if training.seconds is None else [f"{training.seconds / 60:.0f} min"]
+    return ", ".join([*steps, *minutes, *([training.hardware] if training.hardware else [])])
+
+
+def _list_notes(row: LeaderboardRow) -> Iterator[str]:
+    if row.n is not None and row.n_protocol is not None and row.n < row.n_protocol:
+        yield f"{row.n} of {format_count(row.n_protocol, 'episode')}"
+    if row.errors:
+        yield f"{format_count(row.errors, 'episode')} ended by an error"
+    if row.calibration == "true":
+        yield "true camera calibration"
+    yield from row.differences

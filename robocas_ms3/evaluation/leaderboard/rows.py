@@ -1,0 +1,155 @@
+"""Rows of the leaderboard, and the JSON file that contains them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Literal, get_args
+
+from pydantic import Field, model_validator
+
+from robocas_ms3.core.documents import JSON_LIMIT, read_bytes
+from robocas_ms3.core.errors import EvaluationError, OutputExistsError
+from robocas_ms3.core.files import write_json
+from robocas_ms3.core.paths import published_results_file
+from robocas_ms3.core.strict_model import StrictModel, parse_json
+from robocas_ms3.evaluation.policy import Calibration, Track
+
+Rate = Annotated[float, Field(ge=0, le=1)]
+Count = Annotated[int, Field(ge=0)]
+
+
+class Training(StrictModel):
+    """Training data and training cost of a policy; None or empty: unknown.
+
+    Attributes:
+        data: name of the dataset.
+        episodes: number of episodes in the training split.
+        scenes: tasks, configurations and objects of the training data, as text.
+        init_from: weights from which the training started; empty: random weights. Their cost is not included.
+        steps: number of optimiser steps.
+        seconds: wall-clock time of the training, s.
+        hardware: processors of the training.
+    """
+
+    data: str = ""
+    episodes: Count | None = None
+    scenes: str = ""
+    init_from: str = ""
+    steps: Count | None = None
+    seconds: Annotated[float, Field(ge=0)] | None = None
+    hardware: str = ""
+
+
+class LeaderboardRow(StrictModel):
+    """Success of a policy in the episodes of a task in a split of a protocol.
+
+    Attributes:
+        policy: name of the policy.
+        track: track of the policy (`PolicySpec.track`).
+        published: whether the row was copied from a publication; False: measured with this package.
+        protocol, protocol_hash: name and hash of the protocol; no hash for published rows.
+        task, split: evaluated task, and split of the protocol.
+        n: number of episodes; None: not published.
+        n_protocol: number of these episodes in the protocol; None: the protocol is not known.
+        errors: number of episodes that ended with an error, which count as failed.
+        successes, rate, interval: number and rate of successes, and exact 95 % interval of the rate; None: unknown.
+        rate_v0: success rate by RoboCAS-v0's rule after the last step; None: the task has no basket.
+        stages: by stage of the task, the fraction of the episodes that reached it.
+        training: training data and training cost; None: not trained, or unknown.
+        trained_here: whether the training data has the task, scenes, objects and cameras of these episodes; None:
+            unknown, or not trained.
+        parameters: number of parameters of the network.
+        calibration: camera calibration that the policy observes; None: no cameras, or unknown.
+        differences: conditions that make the rates not comparable with rows of the same protocol without them.
+        weights: hash of the weights; empty: unknown.
+        backend, versions: backend and package versions of the evaluation.
+    """
+
+    policy: str
+    track: Track
+    published: bool = False
+    protocol: str
+    protocol_hash: str = ""
+    task: str
+    split: str
+    n: Annotated[int, Field(ge=1)] | None = None
+    n_protocol: Annotated[int, Field(ge=1)] | None = None
+    errors: Count = 0
+    successes: Count | None = None
+    rate: Rate | None = None
+    interval: tuple[Rate, Rate] | None = None
+    rate_v0: Rate | None = None
+    stages: dict[str, Rate] = {}
+    training: Training | None = None
+    trained_here: bool | None = None
+    parameters: Count | None = None
+    calibration: Calibration | None = None
+    differences: list[str] = []
+    weights: str = ""
+    backend: str = ""
+    versions: dict[str, str] = {}
+
+    @model_validator(mode="after")
+    def _check_rate(self) -> LeaderboardRow:
+        known = [value is not None for value in (self.n, self.successes, self.rate, self.interval)]
+        if not self.published and not all(known):
+            raise ValueError("a measured row needs n, successes, rate and interval")
+        if self.n is not None and self.successes is not None and self.rate is not None:
+            if self.successes > self.n:
+                raise ValueError(f"successes: expected at most n = {self.n}, found {self.successes}")
+            if abs(self.rate - self.successes / self.n) > 1e-4:
+                raise ValueError(f"rate: expected {self.successes / self.n:.4f} = successes / n, found {self.rate:g}")
+        return self
+
+
+class Leaderboard(StrictModel):
+    """Content of a leaderboard file.
+
+    Attributes:
+        kind: constant that identifies the file.
+        rows: the rows, sorted by `sort_rows`.
+    """
+
+    kind: Literal["robocas leaderboard"] = "robocas leaderboard"
+    rows: list[LeaderboardRow]
+
+
+def sort_rows(rows: Iterable[LeaderboardRow]) -> list[LeaderboardRow]:
+    """Sort rows: measured before published, then by protocol, task, split, track and descending rate."""
+    tracks = get_args(Track)
+
+    def key(row: LeaderboardRow) -> tuple:
+        rate = row.rate_v0 if row.rate is None else row.rate
+        return row.published, row.protocol, row.task, row.split, tracks.index(row.track), -(rate or 0.0), row.policy
+
+    return sorted(rows, key=key)
+
+
+def read_leaderboard(path: Path) -> Leaderboard:
+    """Read a leaderboard file; raise `EvaluationError` if it cannot be read or is invalid."""
+    try:
+        content = read_bytes(path, JSON_LIMIT)
+    except (OSError, ValueError) as error:
+        raise EvaluationError("cannot read the leaderboard", where=path, found=error) from error
+    return parse_json(Leaderboard, content, EvaluationError, where=path, about="invalid leaderboard")
+
+
+def read_published_rows() -> list[LeaderboardRow]:
+    """Return the bundled rows with results of the RoboCAS paper."""
+    return read_leaderboard(published_results_file()).rows
+
+
+def write_leaderboard(path: Path, leaderboard: Leaderboard) -> None:
+    """Write a leaderboard file; an existing leaderboard is replaced.
+
+    Raises:
+        OutputExistsError: the path has another file.
+    """
+    if path.exists():
+        try:
+            read_leaderboard(path)
+        except EvaluationError as error:
+            what, fix = "the output exists and is no leaderboard", "Choose another path."
+            raise OutputExistsError(what, where=path, found=error, fix=fix) from error
+    write_json(path, leaderboard.model_dump(mode="json"))
