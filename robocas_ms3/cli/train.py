@@ -72,7 +72,7 @@ class Keyframe(Training):
 
     data: Path
     """A candidates.h5 of `robocas generate --record-candidates`, or a folder that contains such files. Each file has
-    images of `robocas render-candidates --looks 3 --segmentation` next to it."""
+    images of `robocas render-candidates --views 3 --segmentation` next to it."""
 
 
 @dataclass(kw_only=True)

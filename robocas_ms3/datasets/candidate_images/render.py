@@ -35,7 +35,7 @@ from robocas_ms3.datasets.candidate_images.images_file import (
     write_attributes,
     write_images,
 )
-from robocas_ms3.datasets.candidate_images.looks import Looks, name_look
+from robocas_ms3.datasets.candidate_images.hand_views import HandViews, name_view
 from robocas_ms3.datasets.candidate_images.settings import CandidateImageResult, CandidateImageSettings
 from robocas_ms3.datasets.conversion.rendered_source import open_env_renderer
 from robocas_ms3.datasets.images.image_files import ImageOptions
@@ -83,7 +83,7 @@ def render_candidates(
         raise DatasetError("there are no decisions in this file", where=settings.candidates)
     parts = out.with_name(f"{out.name}.parts")
     if out.exists() and not settings.overwrite:
-        _check_existing(out, decisions, options, settings.looks)
+        _check_existing(out, decisions, options, settings.views)
         if parts.exists():  # of a process that was killed after the merge
             with lock_folder(parts):
                 shutil.rmtree(parts)
@@ -94,7 +94,7 @@ def render_candidates(
         "size": options.size,
         "depth": options.depth,
         "segmentation": options.segmentation,
-        "looks": settings.looks,
+        "views": settings.views,
         "pack": settings.pack,
     }
     with OutputFolder(parts, _FOLDER, recorded, overwrite=settings.overwrite) as output:
@@ -124,11 +124,11 @@ def iter_seeds(file: CandidateFile) -> Iterator[Rows]:
     yield from zip(bounds, bounds[1:], strict=False)
 
 
-def _check_existing(out: Path, decisions: str, options: ImageOptions, looks: int) -> None:
+def _check_existing(out: Path, decisions: str, options: ImageOptions, views: int) -> None:
     """Raise OutputExistsError unless a file has the requested images of these decisions."""
     found = CandidateImages(out, decisions)
     has_size = options.size in (None, found.size)
-    cameras = {*options.cameras, *(name_look(number) for number in range(looks))}
+    cameras = {*options.cameras, *(name_view(number) for number in range(views))}
     has_kinds = (found.has_depth, found.has_segmentation) == (options.depth, options.segmentation)
     if set(found.cameras) != cameras or not has_kinds or not has_size:
         what, (width, height) = "the images were rendered with other options", found.size
@@ -166,16 +166,16 @@ class _SeedWorker:
         self._file = CandidateFile(settings.candidates, pack=settings.pack)
         open_renderer = settings.open_renderer or open_env_renderer
         self._renderer: EnvRenderer = open_renderer(self._file.recorded_env, _CONTROL_MODE, options)
-        self._count = settings.looks
-        self._looks = Looks(self._file.recorded_env) if settings.looks else None
+        self._count = settings.views
+        self._views = HandViews(self._file.recorded_env) if settings.views else None
 
     def run(self, rows: Rows) -> int:
         first, last = rows
         recording = make_recording(self._file, rows)
         self._renderer.load_scene(recording)
         images = render_loaded(self._renderer, recording)
-        if self._looks is not None:
-            images |= self._render_looks(recording, rows)
+        if self._views is not None:
+            images |= self._render_views(recording, rows)
 
         def fill(file: h5py.File) -> None:
             create_datasets(file, last - first, count_bytes(images))
@@ -185,13 +185,13 @@ class _SeedWorker:
             write_hdf5(path, fill)
         return last - first
 
-    def _render_looks(self, recording: Recording, rows: Rows) -> dict[str, CameraImages]:
-        assert self._looks is not None
-        model, images = self._renderer.cameras()[self._looks.camera], {}
+    def _render_views(self, recording: Recording, rows: Rows) -> dict[str, CameraImages]:
+        assert self._views is not None
+        model, images = self._renderer.cameras()[self._views.camera], {}
         for number in range(self._count):
-            moved = self._looks.move_arm(self._file, rows, recording, model, number)
-            with self._renderer.select_cameras([self._looks.camera]):
-                images[name_look(number)] = render_loaded(self._renderer, moved)[self._looks.camera]
+            moved = self._views.move_arm(self._file, rows, recording, model, number)
+            with self._renderer.select_cameras([self._views.camera]):
+                images[name_view(number)] = render_loaded(self._renderer, moved)[self._views.camera]
         return images
 
     def close(self) -> None:

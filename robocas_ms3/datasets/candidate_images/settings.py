@@ -13,7 +13,7 @@ from robocas_ms3.core.errors import DatasetError
 if TYPE_CHECKING:
     from robocas_ms3.datasets.images.image_files import ImageOptions
 
-MAX_LOOKS = 32
+MAX_VIEWS = 32
 _NO_HINT = tyro.conf.arg(help_behavior_hint="")  # the help text states the default
 
 
@@ -36,9 +36,9 @@ class CandidateImageSettings:
     """Store depth images in addition to RGB."""
     segmentation: bool = False
     """Store segmentation images in addition to RGB."""
-    looks: int = 0
+    views: int = 0
     """Number of further views of each decision by the gripper camera, which the arm moves above an object.
-    They are stored as cameras look_1_camera, look_2_camera, ..."""
+    They are stored as cameras view_1_camera, view_2_camera, ..."""
     pack: Annotated[str | None, tyro.conf.arg(metavar="PACK"), _NO_HINT] = None
     """Name or folder of the object pack to use instead of the recorded one."""
     jobs: int = 1
@@ -52,9 +52,9 @@ class CandidateImageSettings:
         if self.jobs < 1:
             what, expected = "invalid number of processes", "1 or more"
             raise DatasetError(what, where="--jobs", expected=expected, found=self.jobs)
-        if not 0 <= self.looks <= MAX_LOOKS:
-            expected = f"0 to {MAX_LOOKS}"
-            raise DatasetError("invalid number of looks", where="--looks", expected=expected, found=self.looks)
+        if not 0 <= self.views <= MAX_VIEWS:
+            expected = f"0 to {MAX_VIEWS}"
+            raise DatasetError("invalid number of views", where="--views", expected=expected, found=self.views)
         if self.size is not None:
             from robocas_ms3.datasets.images.image_files import check_image_size
 

@@ -131,30 +131,30 @@ def test_complete_file_is_left_as_it_is(candidates):
     assert render_candidates(smaller).rendered == 0
 
 
-def test_looks_view_the_objects(candidates):
-    """Looks have the gripper camera above a cube where nothing is held, and segmentation shows the cubes."""
-    settings = CandidateImageSettings(candidates, looks=2, segmentation=True, open_renderer=RayCaster)
+def test_views_show_the_objects(candidates):
+    """In views, the gripper camera is above a cube where nothing is held; segmentation shows the cubes."""
+    settings = CandidateImageSettings(candidates, views=2, segmentation=True, open_renderer=RayCaster)
     render_candidates(settings)
     file, images = CandidateFile(candidates), CandidateImages(images_path(candidates))
     assert images.has_segmentation
-    assert images.cameras == ("base_camera", "gripper_camera", "look_1_camera", "look_2_camera", "static_camera")
+    assert images.cameras == ("base_camera", "gripper_camera", "static_camera", "view_1_camera", "view_2_camera")
     moved = 0
     for row in range(len(file)):
         own = images.camera_in_base(row, "gripper_camera")
-        looks = [images.camera_in_base(row, f"look_{number}_camera") for number in (1, 2)]
+        views = [images.camera_in_base(row, f"view_{number}_camera") for number in (1, 2)]
         if file.decisions["held_slot"][row] >= 0:
-            assert np.allclose(looks, own[None])
+            assert np.allclose(views, own[None])
             continue
         centres = file.decisions["object_in_base"][row][file.decisions["present"][row], :3]
-        for look in looks:
-            if np.allclose(look, own):  # no look is reachable
+        for view in views:
+            if np.allclose(view, own):  # no view is reachable
                 continue
             moved += 1
-            in_camera = (centres - look[:3, 3]) @ look[:3, :3]
+            in_camera = (centres - view[:3, 3]) @ view[:3, :3]
             angles = np.arctan2(np.linalg.norm(in_camera[:, :2], axis=1), in_camera[:, 2])
             assert np.rad2deg(angles.min()) < 45
-            assert look[2, 2] < -0.8  # down
-        values = images.segmentation(row, "look_1_camera")
+            assert view[2, 2] < -0.8  # down
+        values = images.segmentation(row, "view_1_camera")
         assert set(np.unique(values)) <= {0, *(FIRST_SLOT + slot for slot in range(3))}
         first = images.segmentation(row, "base_camera") == FIRST_SLOT
         assert (images.rgb(row, "base_camera")[first] == COLOURS[2]).all()
@@ -163,7 +163,7 @@ def test_looks_view_the_objects(candidates):
     with pytest.raises(OutputExistsError):
         render_candidates(CandidateImageSettings(candidates, open_renderer=RayCaster))
     with pytest.raises(DatasetError):
-        CandidateImageSettings(candidates, looks=-1)
+        CandidateImageSettings(candidates, views=-1)
 
 
 def test_images_of_other_decisions_are_an_error(images, tmp_path):

@@ -17,18 +17,18 @@ from robocas_ms3.robots.camera_models import OPENCV_IN_SAPIEN, CameraModel
 
 _DISTANCE, _FIRST_DISTANCE = (0.28, 0.5), (0.42, 0.55)  # m from the camera to the point that it views
 _SPREAD = 0.04  # m, standard deviation of this point from an object
-_TRIES, _VIEWS = 10, 64  # points per look, and camera poses per point
+_TRIES, _POSES = 10, 64  # points per view, and camera poses per point
 _NEAREST = 8  # camera poses with the smallest joint motion, of which one is drawn
-_STREAM = 418  # random stream of the looks
+_STREAM = 418  # random stream of the views
 _QPOS = 13  # first joint angle in the state of an articulation, after its pose and velocities
 
 
-def name_look(number: int) -> str:
-    """Return the name of the camera of a look, from number 0 on."""
-    return f"look_{number + 1}_camera"
+def name_view(number: int) -> str:
+    """Return the name of the camera of a view, from number 0 on."""
+    return f"view_{number + 1}_camera"
 
 
-class Looks:
+class HandViews:
     """Arm configurations from which the gripper camera views the objects.
 
     Args:
@@ -44,7 +44,7 @@ class Looks:
     def __init__(self, env: RecordedEnv) -> None:
         names = [camera.name for camera in env.cameras() if camera.mount == "hand"]
         if not names:
-            raise DatasetError("looks need a camera on the hand", where="--looks", found=env.robot().description.uid)
+            raise DatasetError("views need a camera on the hand", where="--views", found=env.robot().description.uid)
         self.camera = names[0]
         robot = env.robot()
         self._description = robot.description
@@ -53,9 +53,9 @@ class Looks:
     def move_arm(
         self, file: CandidateFile, rows: tuple[int, int], recording: Recording, model: CameraModel, number: int
     ) -> Recording:
-        """Return the recording of the decisions of a seed with the arm at the look ``number`` of each decision.
+        """Return the recording of the decisions of a seed with the arm at the view ``number`` of each decision.
 
-        The arm stays where no look is reachable, and where the gripper holds an object.
+        The arm stays where no view is reachable, and where the gripper holds an object.
 
         Args:
             file: candidates file.
@@ -80,13 +80,13 @@ class Looks:
     def _draw(
         self, objects: Array, qpos: Array, model: CameraModel, number: int, rng: np.random.Generator
     ) -> Array | None:
-        """Draw the configuration (7,) of a look; the first look views the middle of the objects (n, 3)."""
+        """Draw the configuration (7,) of a view; the first view shows the middle of the objects (n, 3)."""
         for _ in range(_TRIES if len(objects) else 0):
             point = objects.mean(axis=0) if number == 0 else objects[rng.integers(len(objects))]
             point = point + [*rng.normal(0, _SPREAD, 2), 0.0]
-            views = sample_views(rng, point, _FIRST_DISTANCE if number == 0 else _DISTANCE, _VIEWS)
+            poses = sample_views(rng, point, _FIRST_DISTANCE if number == 0 else _DISTANCE, _POSES)
             reachable, found = self._kinematics.nearest_solutions(
-                views @ OPENCV_IN_SAPIEN @ inverse(model.camera_in_parent), qpos
+                poses @ OPENCV_IN_SAPIEN @ inverse(model.camera_in_parent), qpos
             )
             if reachable.any():
                 found = found[reachable]
