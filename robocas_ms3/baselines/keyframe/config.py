@@ -12,8 +12,8 @@ class DecisionSettings(StrictModel):
     """Settings of the decisions of the policy; they can be changed after the training.
 
     Attributes:
-        look_distances: distances of the gripper camera from the point that it views, m, the preferred one first.
-        close_look_distances: the same for a closer view, after no keyframe was found.
+        view_distances: distances of the gripper camera from the point that it views, m, the preferred one first.
+        close_view_distances: the same for a closer view, after no keyframe was found.
         proposals: grasps that are proposed per object.
         scored: proposals with the best heuristic score that the grasp network scores.
         target_probability: least probability of the target in a cell of its mask.
@@ -21,8 +21,8 @@ class DecisionSettings(StrictModel):
         min_points: least number of points of an object.
     """
 
-    look_distances: tuple[float, ...] = (0.5, 0.45, 0.55, 0.4)
-    close_look_distances: tuple[float, ...] = (0.34, 0.3, 0.38, 0.42)
+    view_distances: tuple[float, ...] = (0.5, 0.45, 0.55, 0.4)
+    close_view_distances: tuple[float, ...] = (0.34, 0.3, 0.38, 0.42)
     proposals: int = Field(default=350, ge=1, le=10_000)
     scored: int = Field(default=96, ge=1, le=10_000)
     target_probability: float = Field(default=0.45, gt=0, lt=1)
@@ -55,7 +55,7 @@ class KeyframeConfig(BaselineConfig):
     decoder_channels: int = Field(default=56, ge=8, le=1024)
     grasp_channels: tuple[int, int, int, int] = (24, 32, 48, 64)
     grasps: int = Field(default=4, ge=1, le=1000)
-    offset_weight: float = Field(default=0.15, ge=0)
+    offset_weight: float = Field(default=0.5, ge=0)
     grasp_weight: float = Field(default=1.0, ge=0)
     text_weight: float = Field(default=0.5, ge=0)
     decisions: DecisionSettings = DecisionSettings()

@@ -2,93 +2,71 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.baselines.keyframe.arm_control import (
+    CLOSED,
+    OPEN,
+    ArmControl,
+    Command,
+    EpisodeObservation,
+    Motion,
+    MotionError,
+)
 from robocas_ms3.baselines.keyframe.config import DecisionSettings
 from robocas_ms3.baselines.keyframe.grasp_proposals import propose_colliding_grasps, propose_grasps
-from robocas_ms3.baselines.keyframe.motion import LIFT, Approach, ArmPaths, PathFollower, find_looks
+from robocas_ms3.baselines.keyframe.motion import LIFT, Approach, find_release_poses, find_views
 from robocas_ms3.baselines.keyframe.observed_scene import HeightMap, ObservedObject, ObservedScene
-from robocas_ms3.baselines.keyframe.perception import CameraFrame, Perception, Request
+from robocas_ms3.baselines.keyframe.perception import Perception, Request
 from robocas_ms3.core.poses import Array, from_rotation, inverse
 from robocas_ms3.scenes.grasp_checks import is_gripper_clear
 from robocas_ms3.scenes.relations import select_by_relation
 
-OPEN, CLOSED = 1.0, 0.0
-"""Gripper commands of the convention ``robocas``."""
 _TABLE = 0.12  # m, height of a table in the arm's base frame if it is not seen
 _SAFE_HEIGHT = (0.35, 0.55)  # m, least and greatest height of the TCP for motions above objects
 _CLEARANCE = 0.12  # m between the TCP and the highest object near a grasp
-_LOOK_HEIGHT = 0.4  # m of the TCP before a look
+_VIEW_HEIGHT = 0.4  # m of the TCP before it moves to a view
+_FALLBACK_DISTANCES = (0.3, 0.35, 0.4, 0.45, 0.25)  # m from the camera to a point that is nearer to the base
+_NEAR_START = (0.008, 0.05)  # m and rad from the pre-grasp at which the motion to it ends
 _EMPTY = 0.003  # m, gripper width below which nothing is held
-_WAIT = 4  # control steps of 0.2 s in which the gripper closes or opens
-_PRECISE, _COARSE = (0.004, 0.03), (0.02, 0.1)  # m and rad from the goal at which a motion ends
-_PATIENCE = 5  # policy steps without progress, after which a motion ends
+_HANGING = (0.015, 0.16)  # m from the TCP down to the lowest point of a held object, least and greatest value
+_RELEASE_CLEARANCE = 0.03  # m between the rim of the basket and the lowest point of a held object
+_CARRY_CLEARANCE = 0.15  # m between the rim and the TCP on the way to the basket
+_PLACE_HEIGHT = 0.38  # m, least height of the TCP on the way to a free place
+_DROP = 0.02  # m that an object falls at a free place
 _REPEAT_DISTANCE = 0.02  # m around a failed grasp in which similar grasps lose score
 _FREE_CELLS = (11, 7)  # sizes of free squares in cells of 2 cm, the preferred one first
-_SPOT_DISTANCES = (0.35, 0.8)  # m from the base, least and greatest distance of a place for an obstacle
-_TARGET_GAP, _BASKET_GAP = 0.16, 0.28  # m between such a place and the target, and the basket
-_RELEASE_TILTS, _RELEASE_SIDES = (0, 15, 30, 45, 60, 72), (0.0, -0.4, 0.4)  # degrees; rad about the vertical
+_PLACES, _PLACE_POSES = 20, 10  # free places, and poses at them, that are tried
+_PLACE_DISTANCES = (0.35, 0.8)  # m from the base, least and greatest distance of a free place
+_TARGET_GAP, _BASKET_GAP = 0.16, 0.28  # m between a free place and the target, and the basket
+_IN_BASKET = 0.14  # m from the middle of the basket, within which an object is in it
+_SURE = 0.6  # probability of a target, above which less probable targets are ignored
 _MAX_OBSTACLES = 5  # obstacles for which grasps are computed per decision
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class RobotView:
-    """Observation of one env.
-
-    Attributes:
-        tcp_in_base: (4, 4) TCP pose in the arm's base frame.
-        qpos: (7,) joint angles of the arm, rad.
-        width: gripper width, m.
-        frames: images by camera name; empty if none were requested.
-    """
-
-    tcp_in_base: Array
-    qpos: Array
-    width: float
-    frames: dict[str, CameraFrame]
-
-
-@dataclass(frozen=True)
-class Command:
-    """Command of one policy step.
-
-    Attributes:
-        action: (7,) action of the convention ``robocas``, relative to the present TCP pose.
-        requests_images: whether the next observation needs images.
-    """
-
-    action: Array
-    requests_images: bool = False
-
-
-Motion = Generator[Command, RobotView, RobotView]
-"""Generator that yields commands, receives observations, and returns the last observation."""
-
-
-class MotionError(Exception):
-    """The arm has no path for a motion."""
-
-
-@dataclass
 class _Keyframe:
-    """A grasp that was chosen: the object, the scene and the approach."""
+    """Grasp that was chosen: the object, its scene, and the approach."""
 
     scene: ObservedScene
     object: ObservedObject
     approach: Approach
-    value: float
 
     @property
     def hanging(self) -> float:
         """Distance in m from the TCP down to the lowest visible point of the object."""
-        return max(0.015, float(self.approach.grasp[2, 3] - self.scene.points[self.object.mask][:, 2].min()))
+        low = self.scene.points[self.object.mask][:, 2].min()
+        return float(np.clip(self.approach.grasp[2, 3] - low, *_HANGING))
 
     @property
     def safe_height(self) -> float:
+        """Height of the TCP in m at which it passes over all objects near the grasp."""
         points = self.scene.points
         near = points[np.linalg.norm(points[:, :2] - self.approach.grasp[:2, 3], axis=1) < 0.35]
         return float(np.clip(near[:, 2].max() + _CLEARANCE, *_SAFE_HEIGHT))
@@ -99,69 +77,78 @@ class KeyframeEpisode:
 
     Args:
         perception: networks.
-        paths: kinematics of the arm.
+        arm: motions of the arm.
         settings: settings of the decisions.
         request: what the instruction asks for.
         rng: random generator of the proposals.
-        control_steps: control steps of 0.2 s per policy step.
         hand_camera: name of the camera on the hand.
-
-    Attributes:
-        log: decisions in words, for diagnosis.
     """
 
     def __init__(
         self,
         perception: Perception,
-        paths: ArmPaths,
+        arm: ArmControl,
         settings: DecisionSettings,
         request: Request,
         rng: np.random.Generator,
-        *,
-        control_steps: int,
         hand_camera: str,
     ) -> None:
-        self._perception, self._paths, self._settings = perception, paths, settings
-        self._request, self._rng, self._control_steps, self._hand_camera = request, rng, control_steps, hand_camera
+        self._perception, self._arm, self._settings = perception, arm, settings
+        self._request, self._rng, self._hand_camera = request, rng, hand_camera
         self._failed: list[Array] = []  # TCP poses of failed grasps
         self._map = HeightMap()
         self._table, self._focus = _TABLE, np.array([0.6, 0.0])
-        self._basket: Array | None = None
+        self._basket: Array | None = None  # middle in x and y, and height of the rim
         self._camera_in_tcp = np.eye(4)
-        self.log: list[str] = []
 
-    def run(self, view: RobotView) -> Motion:
-        """Run the episode from its first observation, which has images, until it ends."""
-        self._survey(view)
+    def run(self, observation: EpisodeObservation) -> Motion:
+        """Run the episode from its first observation, which has images, until it is ended from outside."""
+        self._survey(observation)
         close = False
         while True:
-            view = yield from self._look(view, close)
-            scene = self._perception.observe(view.frames[self._hand_camera], self._request, self._table)
+            observation = yield from self._look(observation, close)
+            scene = self._perception.observe(observation.frames[self._hand_camera], self._request, self._table)
             self._map.update(scene.points)
             target = self._choose_target(scene)
-            chosen = None if target is None else self._plan_grasp(scene, target, view)
+            chosen = None
             if target is not None:
                 self._focus = scene.points[target.mask].mean(axis=0)[:2]
+                chosen = self._plan_grasp(scene, target, observation)
             if chosen is not None:
-                view = yield from self._move_to_basket(view, chosen)
+                observation = yield from self._move_to_basket(observation, chosen)
                 close = False
                 continue
-            chosen = self._choose_obstacle(scene, target, view)
+            chosen = self._choose_obstacle(scene, target, observation)
             if chosen is not None:
-                view = yield from self._move_aside(view, chosen)
+                observation = yield from self._move_aside(observation, chosen)
                 close = False
                 continue
-            self.log.append(f"no keyframe; target {'seen' if target else 'not seen'}")
+            _log.debug("no keyframe; the target is %s", "not seen" if target is None else "seen")
             close = not close
-            middle = self._focus if target is not None or not scene.is_object.any() else _middle(scene)
-            self._focus = middle + self._rng.normal(0, 0.05, 2)
+            if target is None and scene.is_object.any():
+                self._focus = _find_middle(scene)
+            self._focus = self._focus + self._rng.normal(0, 0.05, 2)
 
-    def _survey(self, view: RobotView) -> None:
-        survey = self._perception.survey(list(view.frames.values()), _TABLE)
+    def _survey(self, observation: EpisodeObservation) -> None:
+        survey = self._perception.survey(list(observation.frames.values()), _TABLE)
         self._focus, self._basket, self._table = survey.focus, survey.basket, survey.table
-        self._camera_in_tcp = inverse(view.tcp_in_base) @ view.frames[self._hand_camera].camera_in_base
-        seen = "not seen" if self._basket is None else f"at {np.round(self._basket, 2).tolist()}"
-        self.log.append(f"objects around {np.round(self._focus, 2).tolist()}, basket {seen}")
+        camera_in_base = observation.frames[self._hand_camera].camera_in_base
+        self._camera_in_tcp = inverse(observation.tcp_in_base) @ camera_in_base
+
+    def _look(self, observation: EpisodeObservation, close: bool) -> Motion:
+        """Move the gripper camera to a view of the focus, and return an observation with images."""
+        try:
+            observation = yield from self._arm.rise(observation, _VIEW_HEIGHT, OPEN)
+        except MotionError:
+            _log.debug("no path up before a view")
+        distances = self._settings.close_view_distances if close else self._settings.view_distances
+        for focus, of in ((self._focus, distances), (0.9 * self._focus, _FALLBACK_DISTANCES)):
+            poses, costs = find_views(self._camera_in_tcp, np.array([*focus, self._table]), of)
+            found = self._arm.paths.nearest(poses, costs, observation.qpos, 0.3)
+            if found:
+                observation = yield from self._arm.move_joints(observation, found[0][1], OPEN)
+                break
+        return (yield from self._arm.request_images(observation, OPEN))
 
     # Decisions
 
@@ -169,17 +156,20 @@ class KeyframeEpisode:
         found = [one for one in scene.targets if not self._is_in_basket(one)]
         if not found:
             return None
-        sure = [one for one in found if one.probability > 0.6] or found
+        sure = [one for one in found if one.probability > _SURE] or found
         xy = np.stack([one.center[:2] for one in sure])
         index = select_by_relation(self._request.relation, xy) if self._request.relation else None
-        if index is None:  # no relation, or it does not tell: the nearest one is meant
+        if index is None:  # without a relation, or if it fits no object, the nearest one is meant
             index = int(np.linalg.norm(xy, axis=1).argmin())
         return sure[index]
 
     def _is_in_basket(self, one: ObservedObject) -> bool:
-        return self._basket is not None and bool(np.linalg.norm(one.center[:2] - self._basket[:2]) < 0.14)
+        return self._basket is not None and bool(np.linalg.norm(one.center[:2] - self._basket[:2]) < _IN_BASKET)
 
-    def _plan_grasp(self, scene: ObservedScene, one: ObservedObject, view: RobotView) -> _Keyframe | None:
+    def _plan_grasp(
+        self, scene: ObservedScene, one: ObservedObject, observation: EpisodeObservation
+    ) -> _Keyframe | None:
+        """Return the reachable grasp of an object that the grasp network prefers, or None."""
         settings = self._settings
         proposals = propose_grasps(scene.points, one.mask, self._table, settings.proposals, self._rng)
         if not len(proposals.heuristic):
@@ -187,208 +177,143 @@ class KeyframeEpisode:
         best = np.argsort(-proposals.heuristic, kind="stable")[: settings.scored]
         proposals = proposals.select(best)
         grasps = proposals.tcp_in_base
-        values = self._perception.score_grasps(scene, one.mask, grasps, self._table)
-        scores = values + 0.02 * proposals.heuristic
+        scores = self._perception.score_grasps(scene, one.mask, grasps, self._table) + 0.02 * proposals.heuristic
         for failed in self._failed:
             near = np.exp(-((np.linalg.norm(grasps[:, :3, 3] - failed[:3, 3], axis=1) / _REPEAT_DISTANCE) ** 2))
             similar = np.einsum("gij,ij->g", grasps[:, :3, :3], failed[:3, :3]) > 2.6  # trace; 3: equal rotations
             scores -= 2 * near * similar
-        planned = self._paths.plan_approach(grasps, scores, view.qpos)
-        return None if planned is None else _Keyframe(scene, one, planned[1], float(values[planned[0]]))
+        approach = self._arm.paths.plan_approach(grasps, scores, observation.qpos)
+        return None if approach is None else _Keyframe(scene, one, approach)
 
     def _choose_obstacle(
-        self, scene: ObservedScene, target: ObservedObject | None, view: RobotView
+        self, scene: ObservedScene, target: ObservedObject | None, observation: EpisodeObservation
     ) -> _Keyframe | None:
-        """Choose the object to move aside: it blocks grasps of the target, or is on top if the target is not seen."""
+        """Return the grasp of the object to move aside, or None."""
         objects = [one for one in scene.objects if not self._is_in_basket(one)]
-        if target is not None:
+        if not objects:
+            return None
+        if target is None:
+            scores = self._score_highest(scene, objects)
+        else:
             objects = [one for one in objects if (one.mask & target.mask).sum() < 0.5 * one.mask.sum()]
-            goal = scene.points[target.mask]
-            grasps = propose_colliding_grasps(goal, self._table, self._settings.proposals // 3, self._rng).tcp_in_base
-        scores = []
-        for one in objects:
-            points = scene.points[one.mask]
-            top = float(np.percentile(points[:, 2], 95))
-            if target is None:
-                scores.append(6 * top - float(np.linalg.norm(points.mean(axis=0)[:2] - _middle(scene))))
-                continue
-            blocked = 1 - is_gripper_clear(grasps, points).mean() if len(grasps) else 0.0
-            gap = float(np.linalg.norm(points[:, :2] - goal.mean(axis=0)[:2], axis=1).min())
-            scores.append(1.5 * blocked - 5 * gap + 4 * (top - goal[:, 2].max()))
+            scores = self._score_blocking(scene, objects, scene.points[target.mask])
         for index in np.argsort(scores)[::-1][:_MAX_OBSTACLES].tolist():
-            chosen = self._plan_grasp(scene, objects[index], view)
+            chosen = self._plan_grasp(scene, objects[index], observation)
             if chosen is not None:
                 return chosen
         return None
 
-    # Motions of keyframes
+    def _score_highest(self, scene: ObservedScene, objects: list[ObservedObject]) -> list[float]:
+        """Return a score per object: greater for high objects near the middle of all objects."""
+        clouds, middle = [scene.points[one.mask] for one in objects], _find_middle(scene)
+        return [
+            6 * float(np.percentile(points[:, 2], 95)) - float(np.linalg.norm(points.mean(axis=0)[:2] - middle))
+            for points in clouds
+        ]
 
-    def _look(self, view: RobotView, close: bool) -> Motion:
-        view = yield from self._rise(view, _LOOK_HEIGHT, OPEN, required=False)
-        distances = self._settings.close_look_distances if close else self._settings.look_distances
-        found: list = []
-        for point, of in (
-            (np.array([*self._focus, self._table]), distances),
-            (np.array([*0.9 * self._focus, self._table]), (0.3, 0.35, 0.4, 0.45, 0.25)),
-        ):
-            poses, costs = find_looks(self._camera_in_tcp, point, of)
-            found = found or self._paths.nearest(poses, costs, view.qpos, 0.3)
-        if found:
-            view = yield from self._follow(view, self._paths.joint(view.qpos, found[0][1]), OPEN, _COARSE)
-        return (yield Command(_make_action(view, view.tcp_in_base, OPEN), requests_images=True))
+    def _score_blocking(self, scene: ObservedScene, objects: list[ObservedObject], target: Array) -> list[float]:
+        """Return a score per object: greater for objects that block grasps of the target, are near it and above it.
 
-    def _grasp(self, view: RobotView, chosen: _Keyframe) -> Generator[Command, RobotView, tuple[RobotView, bool]]:
+        target: (P, 3) points of the target, m.
+        """
+        count = self._settings.proposals // 3
+        grasps = propose_colliding_grasps(target, self._table, count, self._rng).tcp_in_base
+        middle, top, scores = target.mean(axis=0)[:2], target[:, 2].max(), []
+        for one in objects:
+            points = scene.points[one.mask]
+            blocked = 1 - is_gripper_clear(grasps, points).mean() if len(grasps) else 0.0
+            gap = np.linalg.norm(points[:, :2] - middle, axis=1).min()
+            scores.append(float(1.5 * blocked - 5 * gap + 4 * (np.percentile(points[:, 2], 95) - top)))
+        return scores
+
+    # Execution of keyframes
+
+    def _grasp(
+        self, observation: EpisodeObservation, chosen: _Keyframe
+    ) -> Generator[Command, EpisodeObservation, tuple[EpisodeObservation, bool]]:
         """Grasp and lift; return the last observation, and whether the gripper holds something."""
-        approach = chosen.approach
+        approach, arm, holds = chosen.approach, self._arm, False
         try:
-            view = yield from self._rise(view, chosen.safe_height, OPEN)
-            view = yield from self._follow(view, self._paths.joint(view.qpos, approach.start), OPEN, (0.008, 0.05))
-            view = yield from self._straight(view, approach.grasp, OPEN)
-            view = yield from self._wait(view, CLOSED)
-            view = yield from self._rise(view, float(view.tcp_in_base[2, 3]) + LIFT, CLOSED)
+            observation = yield from arm.rise(observation, chosen.safe_height, OPEN)
+            observation = yield from arm.move_joints(observation, approach.start, OPEN, _NEAR_START)
+            observation = yield from arm.move_straight(observation, approach.grasp, OPEN)
+            observation = yield from arm.wait(observation, CLOSED)
+            observation = yield from arm.rise(observation, float(observation.tcp_in_base[2, 3]) + LIFT, CLOSED)
+            holds = observation.width >= _EMPTY
         except MotionError:
-            self._failed.append(approach.grasp)
-            return view, False
-        holds = view.width >= _EMPTY
+            _log.debug("no path to or from a grasp")
         if not holds:
             self._failed.append(approach.grasp)
-        return view, holds
+        return observation, holds
 
-    def _move_to_basket(self, view: RobotView, chosen: _Keyframe) -> Motion:
-        self.log.append(
-            f"grasp target at {np.round(chosen.approach.grasp[:3, 3], 3).tolist()}, value {chosen.value:.2f}"
-        )
-        view, holds = yield from self._grasp(view, chosen)
+    def _move_to_basket(self, observation: EpisodeObservation, chosen: _Keyframe) -> Motion:
+        observation, holds = yield from self._grasp(observation, chosen)
         if not holds:
-            self.log.append("empty")
-            return view
+            return observation
         try:
-            view = yield from self._carry(view, min(chosen.hanging, 0.16), chosen.safe_height)
+            observation = yield from self._carry(observation, chosen)
         except MotionError:
-            self.log.append("no path to the basket")
-        return (yield from self._wait(view, OPEN))
+            _log.debug("no path to the basket")
+        return (yield from self._arm.wait(observation, OPEN))
 
-    def _move_aside(self, view: RobotView, chosen: _Keyframe) -> Motion:
-        self.log.append(f"move aside at {np.round(chosen.approach.grasp[:3, 3], 3).tolist()}, value {chosen.value:.2f}")
-        view, holds = yield from self._grasp(view, chosen)
+    def _move_aside(self, observation: EpisodeObservation, chosen: _Keyframe) -> Motion:
+        observation, holds = yield from self._grasp(observation, chosen)
         if not holds:
-            self.log.append("empty")
-            return view
+            return observation
         try:
-            view = yield from self._place(view, chosen)
+            observation = yield from self._place(observation, chosen)
         except MotionError:
-            self.log.append("no path to a free place")
-        return (yield from self._wait(view, OPEN))
+            _log.debug("no path to a free place")
+        return (yield from self._arm.wait(observation, OPEN))
 
-    def _carry(self, view: RobotView, hanging: float, safe_height: float) -> Motion:
+    def _carry(self, observation: EpisodeObservation, chosen: _Keyframe) -> Motion:
         """Carry the held object over the basket."""
         if self._basket is None:
             raise MotionError
-        rim = float(self._basket[2])
-        azimuth = float(np.arctan2(self._basket[1], self._basket[0]))
-        away = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        poses, costs = [], []
-        for tilt in np.deg2rad(_RELEASE_TILTS):
-            for side in _RELEASE_SIDES:
-                level = np.array([np.cos(azimuth + side), np.sin(azimuth + side), 0.0])
-                approach = np.sin(tilt) * level - np.array([0, 0, np.cos(tilt)])
-                for turn in np.arange(0, 2 * np.pi, np.pi / 6):
-                    closing = np.array([np.cos(turn), np.sin(turn), 0.0])
-                    closing -= approach * (approach @ closing)
-                    if np.linalg.norm(closing) < 0.2:
-                        continue
-                    closing /= np.linalg.norm(closing)
-                    rotation = np.stack([np.cross(closing, approach), closing, approach], axis=1)
-                    for nearer in (0.0, 0.05):
-                        position = np.array([*self._basket[:2], rim + 0.03 + hanging]) - nearer * away
-                        poses.append(from_rotation(position, rotation))
-                        costs.append(0.01 * np.rad2deg(tilt) + 4 * nearer)
-        found = self._paths.nearest(np.array(poses), np.array(costs), view.qpos, 0.5)
+        poses, costs = find_release_poses(self._basket + [0, 0, _RELEASE_CLEARANCE + chosen.hanging])
+        found = self._arm.paths.nearest(poses, costs, observation.qpos, 0.5)
         if not found:
             raise MotionError
-        view = yield from self._rise(view, max(safe_height, rim + 0.15), CLOSED)
-        return (yield from self._follow(view, self._paths.joint(view.qpos, found[0][1]), CLOSED, _COARSE))
+        height = max(chosen.safe_height, float(self._basket[2]) + _CARRY_CLEARANCE)
+        observation = yield from self._arm.rise(observation, height, CLOSED)
+        return (yield from self._arm.move_joints(observation, found[0][1], CLOSED))
 
-    def _place(self, view: RobotView, chosen: _Keyframe) -> Motion:
+    def _place(self, observation: EpisodeObservation, chosen: _Keyframe) -> Motion:
         """Place the held object at a free place of the surface."""
-        spots = self._find_spots(view)
         poses, costs = [], []
-        for spot in spots:
+        for place in self._find_free_places(observation):
             for turn in np.arange(-np.pi, np.pi, np.pi / 4):
                 rotation = Rotation.from_euler("z", turn).as_matrix() @ chosen.approach.grasp[:3, :3]
-                poses.append(from_rotation([*spot, self._table + chosen.hanging + 0.02], rotation))
-                costs.append(2 * float(np.linalg.norm(spot - view.tcp_in_base[:2, 3])))
+                poses.append(from_rotation([*place, self._table + chosen.hanging + _DROP], rotation))
+                costs.append(2 * float(np.linalg.norm(place - observation.tcp_in_base[:2, 3])))
         if not poses:
             raise MotionError
         above = np.array(poses)
         above[:, 2, 3] += LIFT
-        for index, qpos in self._paths.nearest(above, np.array(costs), view.qpos, 0.5)[:10]:
-            if self._paths.straight(qpos, poses[index]) is None:
-                continue
-            view = yield from self._rise(view, max(chosen.safe_height, 0.38), CLOSED)
-            view = yield from self._follow(view, self._paths.joint(view.qpos, qpos), CLOSED, _COARSE)
-            return (yield from self._straight(view, poses[index], CLOSED))
+        nearest = self._arm.paths.nearest(above, np.array(costs), observation.qpos, 0.5)
+        for index, qpos in nearest[:_PLACE_POSES]:
+            if self._arm.paths.straight(qpos, poses[index]) is not None:
+                observation = yield from self._arm.rise(observation, max(chosen.safe_height, _PLACE_HEIGHT), CLOSED)
+                observation = yield from self._arm.move_joints(observation, qpos, CLOSED)
+                return (yield from self._arm.move_straight(observation, poses[index], CLOSED))
         raise MotionError
 
-    def _find_spots(self, view: RobotView) -> Array:
+    def _find_free_places(self, observation: EpisodeObservation) -> Array:
+        """Return free places (N, 2) of the surface, the nearest first, m."""
         for cells in _FREE_CELLS:
-            spots = self._map.find_free_squares(self._table, cells)
-            distance = np.linalg.norm(spots, axis=1)
-            fits = (distance > _SPOT_DISTANCES[0]) & (distance < _SPOT_DISTANCES[1])
-            fits &= np.linalg.norm(spots - self._focus, axis=1) > _TARGET_GAP
+            places = self._map.find_free_squares(self._table, cells)
+            distance = np.linalg.norm(places, axis=1)
+            fits = (distance > _PLACE_DISTANCES[0]) & (distance < _PLACE_DISTANCES[1])
+            fits &= np.linalg.norm(places - self._focus, axis=1) > _TARGET_GAP
             if self._basket is not None:
-                fits &= np.linalg.norm(spots - self._basket[:2], axis=1) > _BASKET_GAP
+                fits &= np.linalg.norm(places - self._basket[:2], axis=1) > _BASKET_GAP
             if fits.any():
-                spots = spots[fits]
-                order = np.argsort(np.linalg.norm(spots - view.tcp_in_base[:2, 3], axis=1), kind="stable")
-                return spots[order[:40:2]]
+                places = places[fits]
+                order = np.argsort(np.linalg.norm(places - observation.tcp_in_base[:2, 3], axis=1), kind="stable")
+                return places[order[: 2 * _PLACES : 2]]  # neighbours are 2 cm apart
         return np.zeros((0, 2))
 
-    # Motions
 
-    def _follow(
-        self, view: RobotView, path: Array, gripper: float, tolerance: tuple[float, float] = _PRECISE
-    ) -> Motion:
-        follower, index, waited = PathFollower(self._paths.chain, path, self._control_steps), -1, 0
-        while waited < _PATIENCE:  # steps without progress: the arm has nearly arrived, or is blocked
-            pose = follower.next_pose(view.tcp_in_base)
-            view = yield Command(_make_action(view, pose, gripper))
-            error = inverse(view.tcp_in_base) @ follower.goal
-            turn = Rotation.from_matrix(error[:3, :3]).magnitude()
-            if follower.is_last and np.linalg.norm(error[:3, 3]) < tolerance[0] and turn < tolerance[1]:
-                break
-            waited = 0 if follower.index > index else waited + 1
-            index = follower.index
-        return view
-
-    def _straight(self, view: RobotView, tcp_in_base: Array, gripper: float) -> Motion:
-        path = self._paths.straight(view.qpos, tcp_in_base)
-        if path is None:
-            raise MotionError
-        return (yield from self._follow(view, path, gripper))
-
-    def _rise(self, view: RobotView, height: float, gripper: float, *, required: bool = True) -> Motion:
-        if view.tcp_in_base[2, 3] >= height - 0.01:
-            return view
-        path = self._paths.rise(view.qpos, view.tcp_in_base, height)
-        if path is None:
-            if required:
-                raise MotionError
-            return view
-        return (yield from self._follow(view, path, gripper, _COARSE))
-
-    def _wait(self, view: RobotView, gripper: float) -> Motion:
-        for _ in range(-(-_WAIT // self._control_steps)):
-            view = yield Command(_make_action(view, view.tcp_in_base, gripper))
-        return view
-
-
-def _make_action(view: RobotView, tcp_in_base: Array, gripper: float) -> Array:
-    """Return the action (7,) that moves the TCP to a pose (4, 4)."""
-    motion = inverse(view.tcp_in_base) @ tcp_in_base
-    return np.array([*motion[:3, 3], *Rotation.from_matrix(motion[:3, :3]).as_euler("xyz"), gripper])
-
-
-def _middle(scene: ObservedScene) -> Array:
+def _find_middle(scene: ObservedScene) -> Array:
     """Return the middle (2,) of all objects, m."""
     return np.median(scene.points[scene.is_object][:, :2], axis=0)

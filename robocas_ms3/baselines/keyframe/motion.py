@@ -21,6 +21,8 @@ LIFT = 0.12
 _JOINT_STEP = 0.03  # rad between the configurations of a joint motion
 _MAX_TRANSLATION, _MAX_ROTATION = 0.095, 0.45  # m along an axis and rad per control step of 0.2 s; 5 % below the limits
 _MAX_JOINT_STEP = 0.4  # rad per control step
+_RELEASE_TILTS_DEG, _RELEASE_SIDES = (0, 15, 30, 45, 60, 72), (0.0, -0.4, 0.4)  # degrees; rad about the vertical
+_RELEASE_NEARER = (0.0, 0.05)  # m towards the base
 _LOWER, _NEARER = (
     (0.0, 0.05, 0.1),
     (1.0, 0.93, 0.86, 0.78),
@@ -98,8 +100,8 @@ class ArmPaths:
         order = np.argsort(total, kind="stable")[: int(reachable.sum())]
         return [(int(index), found[index]) for index in order]
 
-    def plan_approach(self, grasps: Array, scores: Array, qpos: Array) -> tuple[int, Approach] | None:
-        """Return the index and the approach of the reachable grasp with the greatest score, or None.
+    def plan_approach(self, grasps: Array, scores: Array, qpos: Array) -> Approach | None:
+        """Return the approach of the reachable grasp with the greatest score, or None.
 
         grasps: (G, 4, 4) TCP poses in the arm's base frame. scores: (G,). qpos: (7,) present configuration.
         """
@@ -111,7 +113,7 @@ class ArmPaths:
         reachable, found = self.reach(starts, qpos)
         reachable &= self.reach(both, qpos)[0]
         distance = np.where(reachable, joint_distance(found, qpos), np.inf).reshape(-1, 2)
-        for number, index in enumerate(order.tolist()):
+        for number in range(len(order)):
             for turn in np.argsort(distance[number]).tolist():
                 row = 2 * number + turn
                 if not reachable[row]:
@@ -119,7 +121,7 @@ class ArmPaths:
                 path = self.straight(found[row], both[row])
                 if path is None or self.rise(path[-1], both[row], float(both[row][2, 3]) + LIFT) is None:
                     continue
-                return index, Approach(both[row], found[row], path)
+                return Approach(both[row], found[row], path)
         return None
 
 
@@ -162,7 +164,7 @@ class PathFollower:
         return self._poses[self.index]
 
 
-def find_looks(
+def find_views(
     camera_in_tcp: Array,
     point: Array,
     distances: Sequence[float],
@@ -197,4 +199,35 @@ def find_looks(
                     )
                     poses.append(camera @ tcp_in_camera)
                     costs.append((90 - elevation) * 0.01 + abs(roll) * 0.1 + abs(turn) * 0.1)
+    return np.array(poses), np.array(costs)
+
+
+def find_release_poses(point: Array) -> tuple[Array, Array]:
+    """Return TCP poses at which the gripper may release an object, and their costs.
+
+    The poses point down or are tilted away from the base, because a tilted gripper reaches farther.
+
+    Args:
+        point: (3,) TCP position in the arm's base frame, m.
+
+    Returns:
+        Poses (N, 4, 4) in the arm's base frame, and costs (N,): small for vertical poses exactly at the point.
+    """
+    azimuth = float(np.arctan2(point[1], point[0]))
+    away = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    poses, costs = [], []
+    for tilt in _RELEASE_TILTS_DEG:
+        for side in _RELEASE_SIDES:
+            level = np.array([np.cos(azimuth + side), np.sin(azimuth + side), 0.0])
+            approach = np.sin(np.deg2rad(tilt)) * level - np.array([0, 0, np.cos(np.deg2rad(tilt))])
+            for turn in np.arange(0, 2 * np.pi, np.pi / 6):
+                closing = np.array([np.cos(turn), np.sin(turn), 0.0])
+                closing -= approach * (approach @ closing)
+                if np.linalg.norm(closing) < 0.2:
+                    continue
+                closing /= np.linalg.norm(closing)
+                rotation = np.stack([np.cross(closing, approach), closing, approach], axis=1)
+                for nearer in _RELEASE_NEARER:
+                    poses.append(from_rotation(point - nearer * away, rotation))
+                    costs.append(0.01 * tilt + 4 * nearer)
     return np.array(poses), np.array(costs)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.baselines.keyframe.arm_control import ArmControl, EpisodeObservation, Motion
 from robocas_ms3.baselines.keyframe.config import KeyframeConfig
-from robocas_ms3.baselines.keyframe.episode import Command, KeyframeEpisode, RobotView
+from robocas_ms3.baselines.keyframe.episode import KeyframeEpisode
 from robocas_ms3.baselines.keyframe.motion import ArmPaths
 from robocas_ms3.baselines.keyframe.network import KeyframeNetwork
 from robocas_ms3.baselines.keyframe.perception import CameraFrame, Perception
@@ -48,8 +48,7 @@ class KeyframePolicy:
         )
         self._paths: dict[str, ArmPaths] = {}  # by robot
         self._specs: dict[int, EpisodeSpec] = {}  # by env
-        self._episodes: dict[int, KeyframeEpisode] = {}  # by env, from the first action on
-        self._runs: dict[int, Generator[Command, RobotView, RobotView]] = {}
+        self._runs: dict[int, Motion] = {}  # by env, from the first action on
         self._image_requests: dict[int, bool] = {}
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
@@ -72,12 +71,11 @@ class KeyframePolicy:
                 frames = {camera: _select_frame(observations, camera, row) for camera in self.spec.cameras}
             qpos = observations.qpos[row, RobotDescription.arm_slice].astype(np.float64)
             width = float(observations.robot[GRIPPER_WIDTH].reshape(-1)[row])
-            view = RobotView(tcp_in_base[row], qpos, width, frames)
+            observation = EpisodeObservation(tcp_in_base[row], qpos, width, frames)
             if env in self._runs:
-                command = self._runs[env].send(view)
+                command = self._runs[env].send(observation)
             else:
-                self._episodes[env] = self._start(env, observations, row)
-                self._runs[env] = self._episodes[env].run(view)
+                self._runs[env] = self._start(env, observations, row).run(observation)
                 command = next(self._runs[env])
             self._image_requests[env] = command.requests_images
             actions.append(command.action)
@@ -88,12 +86,11 @@ class KeyframePolicy:
         assert observations.embeddings is not None  # of language="embedding"
         return KeyframeEpisode(
             self._perception,
-            self._paths[spec.robot],
+            ArmControl(self._paths[spec.robot], spec.motion_steps),
             self._settings,
             self._perception.read_instruction(observations.embeddings[row]),
             np.random.default_rng([spec.episode, _STREAM]),
-            control_steps=spec.motion_steps,
-            hand_camera=self._hand_camera,
+            self._hand_camera,
         )
 
 

@@ -24,6 +24,7 @@ from robocas_ms3.core.files import atomic_file
 from robocas_ms3.core.locks import lock_folder
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
 from robocas_ms3.core.workers import WorkerPool, use_one_torch_thread
+from robocas_ms3.datasets.candidate_images.hand_views import HandViews, name_view
 from robocas_ms3.datasets.candidate_images.images_file import (
     KINDS,
     CameraImages,
@@ -35,7 +36,6 @@ from robocas_ms3.datasets.candidate_images.images_file import (
     write_attributes,
     write_images,
 )
-from robocas_ms3.datasets.candidate_images.hand_views import HandViews, name_view
 from robocas_ms3.datasets.candidate_images.settings import CandidateImageResult, CandidateImageSettings
 from robocas_ms3.datasets.conversion.rendered_source import open_env_renderer
 from robocas_ms3.datasets.images.image_files import ImageOptions

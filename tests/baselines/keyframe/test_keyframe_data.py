@@ -11,7 +11,7 @@ from recorded_candidates import write_recorded_candidates
 from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.baselines.keyframe.config import KeyframeConfig
-from robocas_ms3.baselines.keyframe.data import KeyframeSamples
+from robocas_ms3.baselines.keyframe.data import KeyframeSamples, find_labelled_grasps
 from robocas_ms3.baselines.keyframe.network import FIRST_NAME, OFFSET_UNIT, KeyframeNetwork
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.candidate_images.render import render_candidates
@@ -35,7 +35,7 @@ def write_candidates_of(path, seeds=(3, 4, 5, 6)):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = write_candidates_of(tmp_path_factory.mktemp("demos") / "candidates.h5")
-    settings = {"looks": 2, "segmentation": True, "size": SIZE, "open_renderer": RayCaster}
+    settings = {"views": 2, "segmentation": True, "size": SIZE, "open_renderer": RayCaster}
     render_candidates(CandidateImageSettings(path, **settings))
     return path.parent
 
@@ -45,10 +45,10 @@ def validation(folder):
     return KeyframeSamples(CONFIG, folder, "val")
 
 
-def test_samples_are_looks_and_first_images(folder, validation):
+def test_samples_are_views_and_first_images(folder, validation):
     train = KeyframeSamples(CONFIG, folder, "train")
-    # three decisions per seed: two looks each, and three cameras at the first decision
-    assert len(validation) == 9 and len(train) == 3 * 9
+    # three decisions per seed: two views each, with 64 crops each in training, and three cameras at the first decision
+    assert len(validation) == 9 and len(train) == 64 * 3 * 9
     assert train.facts["names"] == OBJECTS and train.facts["hand_camera"] == "gripper_camera"
     assert train.scenes.objects == OBJECTS and train.scenes.tasks == ["pick"]
 
@@ -65,8 +65,27 @@ def test_labels_point_to_the_centres(validation):
     assert batch["offset"][:, 2][is_object].mean() > 0.4  # centres are 2 cm or more behind most surfaces
     known = batch["outcome"] >= 0
     assert known.any() and (batch["crop"][known][:, 1].sum(dim=(1, 2)) > 0).all()
-    again = validation.__getitems__([0])
-    assert torch.equal(again["image"][0], batch["image"][0])
+
+
+def test_crops_depend_on_seed_and_index_only(folder):
+    train = KeyframeSamples(CONFIG, folder, "train")
+    first, later = train.__getitems__([5, 5 + 27]), train.__getitems__([5])
+    assert torch.equal(first["image"][0], later["image"][0])
+    assert not torch.equal(first["image"][0], first["image"][1])  # another crop of the same image
+    seeded = CONFIG.model_copy(update={"train": CONFIG.train.model_copy(update={"seed": 1})})
+    other = KeyframeSamples(seeded, folder, "train").__getitems__([5])
+    assert not torch.equal(first["image"][0], other["image"][0])
+
+
+def test_unreachable_grasps_have_no_label():
+    failures = ["", "approach: straight_line_blocked", "approach: no_ik", "reach: goal_in_collision", ""]
+    candidates = {
+        "failure": np.array(failures),
+        "feasible": np.array([True, False, False, False, True]),
+        "primitive": np.array(["grasp", "lift", "grasp", "grasp", "push"]),
+        "start_in_base": np.zeros((5, 7)),
+    }
+    assert find_labelled_grasps(candidates).tolist() == [True, True, False, True, False]
 
 
 def test_loss_of_a_batch_decreases(validation):
@@ -84,10 +103,10 @@ def test_loss_of_a_batch_decreases(validation):
     assert np.isfinite(losses).all() and losses[-1] < 0.7 * losses[0]
 
 
-@pytest.mark.parametrize("changes", [{"looks": 0}, {"segmentation": False}, {"depth": False}, {"size": (96, 64)}])
+@pytest.mark.parametrize("changes", [{"views": 0}, {"segmentation": False}, {"depth": False}, {"size": (96, 64)}])
 def test_unsuitable_images_are_an_error(folder, tmp_path, changes):
     path = Path(shutil.copy(folder / "candidates.h5", tmp_path))
-    settings = {"looks": 1, "segmentation": True, "size": SIZE, "open_renderer": RayCaster}
+    settings = {"views": 1, "segmentation": True, "size": SIZE, "open_renderer": RayCaster}
     render_candidates(CandidateImageSettings(path, **settings | changes))
     with pytest.raises(DatasetError):
         KeyframeSamples(CONFIG, tmp_path, "train")

@@ -1,10 +1,10 @@
-"""Paths and looks of `keyframe`."""
+"""Paths and views of `keyframe`."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.baselines.keyframe.motion import LIFT, PREGRASP, ArmPaths, PathFollower, find_looks
+from robocas_ms3.baselines.keyframe.motion import LIFT, PREGRASP, ArmPaths, PathFollower, find_release_poses, find_views
 from robocas_ms3.core.poses import from_rotation, inverse
 from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
 
@@ -19,11 +19,10 @@ def paths():
 
 def test_approach_ends_at_the_grasp_with_the_greatest_score(paths):
     grasps = from_rotation([[0.6, 0, 0.15], [0.55, 0.1, 0.15], [2.0, 0, 0.15]], np.stack([DOWN] * 3))
-    index, approach = paths.plan_approach(grasps, np.array([0.1, 0.5, 0.9]), REST)
-    assert index == 1  # the third one is out of reach
+    approach = paths.plan_approach(grasps, np.array([0.1, 0.5, 0.9]), REST)
     ends = paths.chain.tcp(np.stack([approach.start, approach.path[-1]]))
     assert np.allclose(ends[1], approach.grasp, atol=1e-4)
-    assert np.allclose(ends[0][:3, 3], [0.55, 0.1, 0.15 + PREGRASP], atol=1e-4)
+    assert np.allclose(ends[0][:3, 3], [0.55, 0.1, 0.15 + PREGRASP], atol=1e-4)  # the third grasp is out of reach
     assert paths.rise(approach.path[-1], approach.grasp, 0.15 + LIFT) is not None
 
 
@@ -56,11 +55,20 @@ def test_a_follower_reaches_the_end_of_a_path_in_limited_steps(paths):
     assert np.allclose(follower.goal, poses[-1])
 
 
-def test_looks_have_the_point_in_the_middle_of_the_image():
+def test_views_have_the_point_in_the_middle_of_the_image():
     camera_in_tcp = from_rotation([0.05, 0.0, -0.05], Rotation.from_euler("z", np.pi / 2).as_matrix())
     point = np.array([0.6, 0.1, 0.12])
-    poses, costs = find_looks(camera_in_tcp, point, (0.5, 0.4))
+    poses, costs = find_views(camera_in_tcp, point, (0.5, 0.4))
     in_camera = np.einsum("nij,j->ni", inverse(poses @ camera_in_tcp), [*point, 1])[:, :3]
     assert np.allclose(in_camera[:, :2], 0, atol=1e-9)
     assert set(np.round(in_camera[:, 2], 6)) == {0.5, 0.4}
     assert np.allclose((poses @ camera_in_tcp)[costs.argmin()][:3, 2], [0, 0, -1], atol=1e-9)  # straight down
+
+
+def test_release_poses_tilt_away_from_the_base():
+    point = np.array([0.3, 0.4, 0.4])
+    poses, costs = find_release_poses(point)
+    assert np.allclose(poses[costs.argmin()][:3, 2], [0, 0, -1]) and np.allclose(poses[costs.argmin()][:3, 3], point)
+    assert np.allclose(np.linalg.det(poses[:, :3, :3]), 1)
+    assert (poses[:, :3, 2] @ [0.6, 0.8, 0] >= -1e-9).all()  # outward, along the direction of the point
+    assert np.linalg.norm(poses[:, :3, 3] - point, axis=1).max() == pytest.approx(0.05)

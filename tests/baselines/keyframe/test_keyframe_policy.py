@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from synthetic_observations import observe, start
 
 from robocas_ms3.baselines.keyframe import KeyframeConfig, KeyframeNetwork, KeyframePolicy
-from robocas_ms3.baselines.keyframe.episode import CLOSED, OPEN, KeyframeEpisode, RobotView
+from robocas_ms3.baselines.keyframe.arm_control import CLOSED, OPEN, ArmControl, EpisodeObservation
+from robocas_ms3.baselines.keyframe.episode import KeyframeEpisode
 from robocas_ms3.baselines.keyframe.motion import ArmPaths
 from robocas_ms3.baselines.keyframe.observed_scene import ObservedObject, ObservedScene
 from robocas_ms3.baselines.keyframe.perception import CameraFrame, Request, Survey
@@ -75,7 +76,7 @@ class FakeArm:
     def view(self, images=False):
         frame = CameraFrame(np.zeros((64, 64, 3), np.uint8), np.zeros((64, 64)), np.eye(3), self.tcp)
         width = 0.04 if self.held else 0.08
-        return RobotView(self.tcp, self.qpos, width, {"gripper_camera": frame} if images else {})
+        return EpisodeObservation(self.tcp, self.qpos, width, {"gripper_camera": frame} if images else {})
 
     def step(self, command):
         motion = from_rotation(command.action[:3], Rotation.from_euler("xyz", command.action[3:6]).as_matrix())
@@ -106,33 +107,32 @@ def play(paths, blocks, request=None, steps=150):
     request = request or Request(np.ones(1, np.float32), None)
     rng = np.random.default_rng(0)
     perception = FakePerception(blocks)
-    episode = KeyframeEpisode(
-        perception, paths, CONFIG.decisions, request, rng, control_steps=1, hand_camera="gripper_camera"
-    )
+    control = ArmControl(paths, 1)
+    episode = KeyframeEpisode(perception, control, CONFIG.decisions, request, rng, "gripper_camera")
     run = episode.run(arm.view(images=True))
     command = next(run)
     for _ in range(steps):
         command = run.send(arm.step(command))
         if arm.released:
             break
-    return arm, episode
+    return arm
 
 
 def test_the_target_is_released_over_the_basket(paths):
-    arm, episode = play(paths, {"target": np.array([0.55, -0.1])})
+    arm = play(paths, {"target": np.array([0.55, -0.1])})
     (name, position), *_ = arm.released
     assert name == "target" and np.linalg.norm(position[:2] - BASKET[:2]) < 0.06 and position[2] > BASKET[2]
 
 
 def test_the_nearest_target_is_meant_without_a_relation(paths):
     blocks = {"target far": np.array([0.65, 0.0]), "target near": np.array([0.45, -0.1])}
-    assert play(paths, dict(blocks))[0].released[0][0] == "target near"
+    assert play(paths, dict(blocks)).released[0][0] == "target near"
     far = Request(np.ones(1, np.float32), "farthest")
-    assert play(paths, dict(blocks), far)[0].released[0][0] == "target far"
+    assert play(paths, dict(blocks), far).released[0][0] == "target far"
 
 
 def test_an_object_is_moved_aside_if_the_target_is_not_seen(paths):
-    arm, _ = play(paths, {"other": np.array([0.55, 0.0])})
+    arm = play(paths, {"other": np.array([0.55, 0.0])})
     (name, position), *_ = arm.released
     assert name == "other" and np.linalg.norm(position[:2] - BASKET[:2]) > 0.2 and position[2] < TABLE + 0.1
 
