@@ -25,15 +25,16 @@ THREE_OBJECT_RELATIONS: tuple[Relation, ...] = ("second_nearest", "second_from_l
 MARGIN = 0.03  # m, least difference between the named object and every other in the compared quantity
 
 
-def select_by_relation(relation: Relation, xy_in_robot: NDArray[np.float64]) -> int | None:
+def select_by_relation(relation: Relation, xy_in_robot: NDArray[np.float64], margin: float = MARGIN) -> int | None:
     """Return the index of the object to which a relation refers.
 
     Args:
         relation: relation of the instruction, such as ``leftmost``.
         xy_in_robot: (n, 2) centres of n identical objects in the robot's frame, m: x forward, y left.
+        margin: least difference between the named object and every other in the compared quantity, m.
 
     Returns:
-        Index of the object. None if there are too few objects, or if another object is closer than `MARGIN` in the
+        Index of the object. None if there are too few objects, or if another object is closer than ``margin`` in the
         compared quantity.
     """
     by_distance = relation in {"nearest", "second_nearest", "farthest"}
@@ -53,4 +54,4 @@ def select_by_relation(relation: Relation, xy_in_robot: NDArray[np.float64]) -> 
         "rightmost": -1,
     }[relation]
     chosen = order[place]
-    return int(chosen) if np.abs(np.delete(key, chosen) - key[chosen]).min() >= MARGIN else None
+    return int(chosen) if np.abs(np.delete(key, chosen) - key[chosen]).min() >= margin else None

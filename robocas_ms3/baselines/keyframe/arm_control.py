@@ -81,10 +81,15 @@ class ArmControl:
         return observation
 
     def follow(
-        self, observation: EpisodeObservation, path: Array, gripper: float, tolerance: tuple[float, float] = PRECISE
+        self,
+        observation: EpisodeObservation,
+        path: Array,
+        gripper: float,
+        tolerance: tuple[float, float] = PRECISE,
+        speed: float = 1.0,
     ) -> Motion:
-        """Follow a path (n, 7) until the arm arrives or makes no progress."""
-        follower, index, waited = PathFollower(self.paths.chain, path, self._control_steps), -1, 0
+        """Follow a path (n, 7) until the arm arrives or makes no progress; ``speed`` is a fraction of the limits."""
+        follower, index, waited = PathFollower(self.paths.chain, path, self._control_steps, speed), -1, 0
         while waited < _PATIENCE:
             pose = follower.next_pose(observation.tcp_in_base)
             observation = yield Command(_make_action(observation, pose, gripper))

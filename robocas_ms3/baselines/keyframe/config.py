@@ -42,6 +42,7 @@ class KeyframeConfig(BaselineConfig):
         grasp_channels: channels of the grasp network at its four resolutions.
         grasps: candidates per image of a training batch.
         offset_weight: loss weight of the offsets to the centres of objects.
+        pull_weight: loss weight of the pulls of handles.
         grasp_weight: loss weight of the grasp network.
         text_weight: loss weight of the instruction network.
         decisions: settings of the decisions.
@@ -56,6 +57,7 @@ class KeyframeConfig(BaselineConfig):
     grasp_channels: tuple[int, int, int, int] = (24, 32, 48, 64)
     grasps: int = Field(default=4, ge=1, le=1000)
     offset_weight: float = Field(default=0.5, ge=0)
+    pull_weight: float = Field(default=0.1, ge=0)
     grasp_weight: float = Field(default=1.0, ge=0)
     text_weight: float = Field(default=0.5, ge=0)
     decisions: DecisionSettings = DecisionSettings()

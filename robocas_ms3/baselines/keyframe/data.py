@@ -14,8 +14,9 @@ from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.baselines.baseline import Batch, OnRead, Split, make_empty_split_error
 from robocas_ms3.baselines.keyframe.config import KeyframeConfig
 from robocas_ms3.baselines.keyframe.gripper_crops import CELLS, CROP_CHANNELS, POSE_FEATURES, augment_crops, make_crops
+from robocas_ms3.baselines.keyframe.handles import HANDLE_RADIUS, Handle, find_pulled_handle
 from robocas_ms3.baselines.keyframe.image_crops import augment_image, draw_crop, resize_inputs
-from robocas_ms3.baselines.keyframe.network import FIRST_NAME, OFFSET_UNIT, STRIDE, make_inputs
+from robocas_ms3.baselines.keyframe.network import FIRST_NAME, HANDLE, OFFSET_UNIT, PULL_UNIT, STRIDE, make_inputs
 from robocas_ms3.baselines.keyframe.observed_scene import find_table_height, is_in_workspace, sample_pixels, unproject
 from robocas_ms3.baselines.keyframe.perception import CameraFrame
 from robocas_ms3.baselines.training.scenes import TrainingScenes, select_scene_settings
@@ -173,8 +174,9 @@ class KeyframeSamples:
 
     def _cameras_of(self, number: int, row: int) -> list[str]:
         file = self._files[number]
-        is_first = self._decisions(number)["decision"][row] == 0
-        return [*file.hand_cameras[1:], *((*file.other_cameras, file.hand_cameras[0]) if is_first else ())]
+        decisions = self._decisions(number)
+        is_survey = decisions["decision"][row] == 0 or np.isfinite(decisions["opening"][row])
+        return [*file.hand_cameras[1:], *((*file.other_cameras, file.hand_cameras[0]) if is_survey else ())]
 
     def _draw_texts(
         self, rows: list[tuple[int, int]]
@@ -218,13 +220,19 @@ class KeyframeSamples:
         is_train, is_on_hand = self._split == "train", camera in file.hand_cameras
         image = file.read_image(row, camera)
         scale = self._config.crop_scale if is_on_hand else _FIXED_CAMERA_SCALE
-        crop = image.crop(*draw_crop(image.segmentation, self._config.crop_size, scale, rng))
+        found = file.candidates.decision(row).candidates
+        handle = find_pulled_handle(found)
+        is_object = (image.segmentation >= FIRST_SLOT) | _find_handle_cells(image, handle)
+        crop = image.crop(*draw_crop(is_object, self._config.crop_size, scale, rng))
         inputs = make_inputs(crop.rgb, crop.depth, crop.intrinsics, crop.camera_in_base)
         inputs = resize_inputs(inputs, self._config.crop_size)
-        label, offset = self._make_labels(file, row, crop)
+        label, offset = self._make_labels(file, row, crop, handle)
+        pull = _make_pull(crop, handle)
         if is_train:
-            inputs, label, offset = augment_image(inputs, label, offset, rng, upside_down=is_on_hand)
-        crops, poses, outcome = self._read_grasps(file, row, image, rng)
+            vectors = [offset, *pull.reshape(3, 3, 1, 1)]
+            inputs, label, (offset, *pulls) = augment_image(inputs, label, vectors, rng, upside_down=is_on_hand)
+            pull = np.concatenate(pulls).ravel()
+        crops, poses, outcome = self._read_grasps(found, image, rng)
         if is_train:
             crops, poses = augment_crops(crops, poses, rng)
         texts = self._texts[sample.file, row]
@@ -233,6 +241,7 @@ class KeyframeSamples:
             "image": np.ascontiguousarray(inputs, np.float32),
             "label": np.ascontiguousarray(label, np.int64),
             "offset": np.ascontiguousarray(offset, np.float32),
+            "pull": np.ascontiguousarray(pull, np.float32),
             "text": self._embeddings[[text.embedding for text in chosen]],
             "name": np.array([text.name for text in chosen]),
             "relation": np.array([text.relation for text in chosen]),
@@ -241,7 +250,9 @@ class KeyframeSamples:
             "outcome": outcome,
         }
 
-    def _make_labels(self, file: _File, row: int, crop: _Image) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    def _make_labels(
+        self, file: _File, row: int, crop: _Image, handle: Handle | None
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Return the class (h, w) and the offset (3, h, w) of each cell of a crop."""
         width, height = (length // STRIDE for length in self._config.crop_size)
         rows = ((np.arange(height) + 0.5) * crop.depth.shape[0] / height).astype(np.int64)
@@ -253,12 +264,16 @@ class KeyframeSamples:
         classes[FIRST_SLOT : FIRST_SLOT + len(names)] = [self._class_of.get(str(name), 0) for name in names]
         centers[FIRST_SLOT : FIRST_SLOT + len(names)] = np.nan_to_num(file.centers[row])
         points, _ = unproject(crop.depth, crop.intrinsics, crop.camera_in_base, (rows, columns))
-        in_camera = (centers[values] - points) @ crop.camera_in_base[:3, :3] / OFFSET_UNIT
-        in_camera[values < FIRST_SLOT] = 0
-        return classes[values], in_camera.transpose(2, 0, 1).astype(np.float32)
+        label, ends = classes[values], centers[values]
+        if handle is not None:
+            is_handle = (values == NOTHING) & (np.linalg.norm(points - handle.position, axis=-1) < HANDLE_RADIUS)
+            label[is_handle], ends[is_handle] = HANDLE, handle.position
+        in_camera = (ends - points) @ crop.camera_in_base[:3, :3] / OFFSET_UNIT
+        in_camera[label < HANDLE] = 0
+        return label, in_camera.transpose(2, 0, 1).astype(np.float32)
 
     def _read_grasps(
-        self, file: _File, row: int, image: _Image, rng: np.random.Generator
+        self, found: Arrays, image: _Image, rng: np.random.Generator
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Return crops, pose features and outcomes of some candidates whose object is visible in an image."""
         count = self._config.grasps
@@ -269,10 +284,10 @@ class KeyframeSamples:
         values = image.segmentation[np.ix_(*pixels)]
         valid &= (values != ROBOT) & is_in_workspace(points)
         values, points = values[valid], points[valid]
-        others = points[values == NOTHING][:, 2]
+        others = points[values == NOTHING]
         if not len(others):
             return crops, poses, outcome
-        table, number, found = find_table_height(others), 0, file.candidates.decision(row).candidates
+        table, number = find_table_height(others, points[values >= FIRST_SLOT]), 0
         for index in rng.permutation(np.flatnonzero(find_labelled_grasps(found))).tolist():
             mask = values == FIRST_SLOT + int(found["slot"][index])
             if number < count and mask.sum() >= _MIN_POINTS:
@@ -292,6 +307,22 @@ def find_labelled_grasps(candidates: Arrays) -> NDArray[np.bool_]:
     reasons = np.array([text.rpartition(": ")[2] for text in candidates["failure"].tolist()])
     known = candidates["feasible"] | np.isin(reasons, _BLOCKED)
     return known & np.isin(candidates["primitive"], ("grasp", "lift")) & np.isfinite(candidates["start_in_base"][:, 0])
+
+
+def _find_handle_cells(image: _Image, handle: Handle | None) -> NDArray[np.bool_]:
+    """Return the pixels (H, W) near a handle."""
+    if handle is None:
+        return np.zeros(image.segmentation.shape, dtype=bool)
+    points, valid = unproject(image.depth, image.intrinsics, image.camera_in_base)
+    return valid & (np.linalg.norm(points - handle.position, axis=-1) < HANDLE_RADIUS)
+
+
+def _make_pull(image: _Image, handle: Handle | None) -> NDArray[np.float64]:
+    """Return the pull (9,) of a handle in the camera frame; zeros without a handle."""
+    if handle is None:
+        return np.zeros(9)
+    vectors = np.stack([handle.motion / PULL_UNIT, handle.approach, handle.bar])
+    return (vectors @ image.camera_in_base[:3, :3]).ravel()
 
 
 def _open(path: Path, size: tuple[int, int]) -> _File:

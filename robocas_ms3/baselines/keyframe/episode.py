@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.baselines.keyframe.arm_control import (
     CLOSED,
+    COARSE,
     OPEN,
     ArmControl,
     Command,
@@ -20,7 +21,8 @@ from robocas_ms3.baselines.keyframe.arm_control import (
 )
 from robocas_ms3.baselines.keyframe.config import DecisionSettings
 from robocas_ms3.baselines.keyframe.grasp_proposals import propose_colliding_grasps, propose_grasps
-from robocas_ms3.baselines.keyframe.motion import LIFT, Approach, find_release_poses, find_views
+from robocas_ms3.baselines.keyframe.handles import Handle
+from robocas_ms3.baselines.keyframe.motion import LIFT, TOP_VIEWS_DEG, Approach, find_release_poses, find_views
 from robocas_ms3.baselines.keyframe.observed_scene import HeightMap, ObservedObject, ObservedScene
 from robocas_ms3.baselines.keyframe.perception import Perception, Request
 from robocas_ms3.core.poses import Array, from_rotation, inverse
@@ -47,6 +49,8 @@ _TARGET_GAP, _BASKET_GAP = 0.16, 0.28  # m between a free place and the target, 
 _IN_BASKET = 0.14  # m from the middle of the basket, within which an object is in it
 _SURE = 0.6  # probability of a target, above which less probable targets are ignored
 _MAX_OBSTACLES = 5  # obstacles for which grasps are computed per decision
+_MAX_PULLS, _PULL_SPEED = 4, 0.3  # pulls per episode; fraction of the limits
+_FRONT_VIEWS_DEG = (40, 30, 50, 20)  # elevations of the gripper camera before a compartment, degrees
 _log = logging.getLogger(__name__)
 
 
@@ -99,11 +103,14 @@ class KeyframeEpisode:
         self._map = HeightMap()
         self._table, self._focus = _TABLE, np.array([0.6, 0.0])
         self._basket: Array | None = None  # middle in x and y, and height of the rim
+        self._handle: Handle | None = None
+        self._is_front, self._pulls = False, 0
         self._camera_in_tcp = np.eye(4)
 
     def run(self, observation: EpisodeObservation) -> Motion:
         """Run the episode from its first observation, which has images, until it is ended from outside."""
         self._survey(observation)
+        observation = yield from self._open_compartment(observation)
         close = False
         while True:
             observation = yield from self._look(observation, close)
@@ -118,32 +125,39 @@ class KeyframeEpisode:
                 observation = yield from self._move_to_basket(observation, chosen)
                 close = False
                 continue
-            chosen = self._choose_obstacle(scene, target, observation)
+            chosen = None if self._is_front else self._choose_obstacle(scene, target, observation)
             if chosen is not None:
                 observation = yield from self._move_aside(observation, chosen)
                 close = False
                 continue
             _log.debug("no keyframe; the target is %s", "not seen" if target is None else "seen")
             close = not close
+            if target is None:
+                self._survey(observation)
+                observation = yield from self._open_compartment(observation)
             if target is None and scene.is_object.any():
                 self._focus = _find_middle(scene)
             self._focus = self._focus + self._rng.normal(0, 0.05, 2)
 
     def _survey(self, observation: EpisodeObservation) -> None:
         survey = self._perception.survey(list(observation.frames.values()), _TABLE)
-        self._focus, self._basket, self._table = survey.focus, survey.basket, survey.table
+        self._focus, self._table = survey.focus, survey.table
+        self._basket = self._basket if survey.basket is None else survey.basket
+        self._handle, self._is_front = survey.handle, survey.has_roof
         camera_in_base = observation.frames[self._hand_camera].camera_in_base
         self._camera_in_tcp = inverse(observation.tcp_in_base) @ camera_in_base
 
     def _look(self, observation: EpisodeObservation, close: bool) -> Motion:
         """Move the gripper camera to a view of the focus, and return an observation with images."""
-        try:
-            observation = yield from self._arm.rise(observation, _VIEW_HEIGHT, OPEN)
-        except MotionError:
-            _log.debug("no path up before a view")
+        if not self._is_front:
+            try:
+                observation = yield from self._arm.rise(observation, _VIEW_HEIGHT, OPEN)
+            except MotionError:
+                _log.debug("no path up before a view")
         distances = self._settings.close_view_distances if close else self._settings.view_distances
+        elevations = _FRONT_VIEWS_DEG if self._is_front else TOP_VIEWS_DEG
         for focus, of in ((self._focus, distances), (0.9 * self._focus, _FALLBACK_DISTANCES)):
-            poses, costs = find_views(self._camera_in_tcp, np.array([*focus, self._table]), of)
+            poses, costs = find_views(self._camera_in_tcp, np.array([*focus, self._table]), of, elevations)
             found = self._arm.paths.nearest(poses, costs, observation.qpos, 0.3)
             if found:
                 observation = yield from self._arm.move_joints(observation, found[0][1], OPEN)
@@ -158,7 +172,7 @@ class KeyframeEpisode:
             return None
         sure = [one for one in found if one.probability > _SURE] or found
         xy = np.stack([one.center[:2] for one in sure])
-        index = select_by_relation(self._request.relation, xy) if self._request.relation else None
+        index = select_by_relation(self._request.relation, xy, 0.0) if self._request.relation else None
         if index is None:  # without a relation, or if it fits no object, the nearest one is meant
             index = int(np.linalg.norm(xy, axis=1).argmin())
         return sure[index]
@@ -171,7 +185,9 @@ class KeyframeEpisode:
     ) -> _Keyframe | None:
         """Return the reachable grasp of an object that the grasp network prefers, or None."""
         settings = self._settings
-        proposals = propose_grasps(scene.points, one.mask, self._table, settings.proposals, self._rng)
+        proposals = propose_grasps(
+            scene.points, one.mask, self._table, settings.proposals, self._rng, from_front=self._is_front
+        )
         if not len(proposals.heuristic):
             return None
         best = np.argsort(-proposals.heuristic, kind="stable")[: settings.scored]
@@ -182,7 +198,8 @@ class KeyframeEpisode:
             near = np.exp(-((np.linalg.norm(grasps[:, :3, 3] - failed[:3, 3], axis=1) / _REPEAT_DISTANCE) ** 2))
             similar = np.einsum("gij,ij->g", grasps[:, :3, :3], failed[:3, :3]) > 2.6  # trace; 3: equal rotations
             scores -= 2 * near * similar
-        approach = self._arm.paths.plan_approach(grasps, scores, observation.qpos)
+        plan = self._arm.paths.plan_front_approach if self._is_front else self._arm.paths.plan_approach
+        approach = plan(grasps, scores, observation.qpos)
         return None if approach is None else _Keyframe(scene, one, approach)
 
     def _choose_obstacle(
@@ -228,17 +245,43 @@ class KeyframeEpisode:
 
     # Execution of keyframes
 
+    def _open_compartment(self, observation: EpisodeObservation) -> Motion:
+        """Pull the handle until the door or drawer is open; then survey the scene again."""
+        arm = self._arm
+        while self._handle is not None and self._pulls < _MAX_PULLS:
+            handle, self._handle = self._handle, None
+            self._pulls += 1
+            planned = arm.paths.plan_pull(handle, observation.qpos)
+            if planned is None:
+                _log.debug("no path to the handle")
+                break
+            observation = yield from arm.move_joints(observation, planned.start, OPEN, _NEAR_START)
+            observation = yield from arm.follow(observation, planned.path, OPEN)
+            observation = yield from arm.wait(observation, CLOSED)
+            observation = yield from arm.follow(observation, planned.pull, CLOSED, COARSE, _PULL_SPEED)
+            observation = yield from arm.wait(observation, OPEN)
+            observation = yield from arm.follow(observation, planned.way_back, OPEN, COARSE)
+            observation = yield from arm.request_images(observation, OPEN)
+            self._survey(observation)
+        return observation
+
     def _grasp(
         self, observation: EpisodeObservation, chosen: _Keyframe
     ) -> Generator[Command, EpisodeObservation, tuple[EpisodeObservation, bool]]:
         """Grasp and lift; return the last observation, and whether the gripper holds something."""
         approach, arm, holds = chosen.approach, self._arm, False
         try:
-            observation = yield from arm.rise(observation, chosen.safe_height, OPEN)
-            observation = yield from arm.move_joints(observation, approach.start, OPEN, _NEAR_START)
-            observation = yield from arm.move_straight(observation, approach.grasp, OPEN)
-            observation = yield from arm.wait(observation, CLOSED)
-            observation = yield from arm.rise(observation, float(observation.tcp_in_base[2, 3]) + LIFT, CLOSED)
+            if approach.way_back is None:
+                observation = yield from arm.rise(observation, chosen.safe_height, OPEN)
+                observation = yield from arm.move_joints(observation, approach.start, OPEN, _NEAR_START)
+                observation = yield from arm.move_straight(observation, approach.grasp, OPEN)
+                observation = yield from arm.wait(observation, CLOSED)
+                observation = yield from arm.rise(observation, float(observation.tcp_in_base[2, 3]) + LIFT, CLOSED)
+            else:
+                observation = yield from arm.move_joints(observation, approach.start, OPEN, _NEAR_START)
+                observation = yield from arm.follow(observation, approach.path, OPEN)
+                observation = yield from arm.wait(observation, CLOSED)
+                observation = yield from arm.follow(observation, approach.way_back, CLOSED)
             holds = observation.width >= _EMPTY
         except MotionError:
             _log.debug("no path to or from a grasp")
@@ -274,7 +317,8 @@ class KeyframeEpisode:
         found = self._arm.paths.nearest(poses, costs, observation.qpos, 0.5)
         if not found:
             raise MotionError
-        height = max(chosen.safe_height, float(self._basket[2]) + _CARRY_CLEARANCE)
+        height = float(self._basket[2]) + _CARRY_CLEARANCE
+        height = height if self._is_front else max(chosen.safe_height, height)
         observation = yield from self._arm.rise(observation, height, CLOSED)
         return (yield from self._arm.move_joints(observation, found[0][1], CLOSED))
 

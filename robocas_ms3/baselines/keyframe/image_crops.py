@@ -6,19 +6,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.datasets.sources.episode_source import FIRST_SLOT
-
 _OBJECT_CROPS = 0.9  # fraction of crops near an object
 
 
 def draw_crop(
-    segmentation: NDArray[np.uint8], size: tuple[int, int], scale: tuple[float, float], rng: np.random.Generator
+    is_object: NDArray[np.bool_], size: tuple[int, int], scale: tuple[float, float], rng: np.random.Generator
 ) -> tuple[int, int, int, int]:
-    """Draw a crop, mostly near an object; return left, top, width and height in pixels."""
-    height, width = segmentation.shape
+    """Draw a crop, mostly near an object; return left, top, width and height in pixels.
+
+    is_object: (H, W) pixels of objects and handles.
+    """
+    height, width = is_object.shape
     factor = np.exp(rng.uniform(*np.log(scale)))
     crop_width, crop_height = min(width, int(size[0] * factor)), min(height, int(size[1] * factor))
-    rows, columns = np.nonzero(segmentation[::4, ::4] >= FIRST_SLOT)
+    rows, columns = np.nonzero(is_object[::4, ::4])
     if len(rows) and rng.random() < _OBJECT_CROPS:
         index = rng.integers(len(rows))
         x = 4 * columns[index] + rng.integers(-crop_width // 3, crop_width // 3 + 1)
@@ -40,25 +41,30 @@ def resize_inputs(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[
 def augment_image(
     image: NDArray[np.float32],
     label: NDArray[np.uint8],
-    offset: NDArray[np.float32],
+    vectors: list[NDArray[np.float32]],
     rng: np.random.Generator,
     *,
     upside_down: bool,
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32]]:
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], list[NDArray[np.float32]]]:
     """Change colours and distances randomly, and turn and reflect the image.
 
-    upside_down: whether the image may be turned by half a turn, as images of the camera on the hand.
+    Args:
+        image: (5, H, W) inputs.
+        label: (h, w) classes.
+        vectors: offsets (3, h, w), and other vectors (3, 1, 1) in the camera frame.
+        rng: random generator.
+        upside_down: whether the image may be turned by half a turn, as images of the camera on the hand.
     """
-    image, offset = image.copy(), offset.copy()
+    image = image.copy()
     shifts = rng.uniform(-0.15, 0.15) + rng.uniform(-0.06, 0.06, 3)
     image[:3] = image[:3] * np.float32(rng.uniform(0.75, 1.25)) + shifts.astype(np.float32)[:, None, None]
     image[3:] += rng.uniform((-0.15, -0.1), (0.15, 0.1)).astype(np.float32)[:, None, None]
     noise = np.array([0.02, 0.02, 0.02, 0.006, 0.006], np.float32)[:, None, None]
     image += noise * rng.standard_normal(image.shape, np.float32)
     if upside_down and rng.random() < 0.5:
-        image, label, offset = image[:, ::-1, ::-1], label[::-1, ::-1], offset[:, ::-1, ::-1]
-        offset = offset * np.array([-1, -1, 1], np.float32)[:, None, None]
+        image, label = image[:, ::-1, ::-1], label[::-1, ::-1]
+        vectors = [vector[:, ::-1, ::-1] * np.array([-1, -1, 1], np.float32)[:, None, None] for vector in vectors]
     if rng.random() < 0.5:
-        image, label, offset = image[:, :, ::-1], label[:, ::-1], offset[:, :, ::-1]
-        offset = offset * np.array([-1, 1, 1], np.float32)[:, None, None]
-    return image, label, offset
+        image, label = image[:, :, ::-1], label[:, ::-1]
+        vectors = [vector[:, :, ::-1] * np.array([-1, 1, 1], np.float32)[:, None, None] for vector in vectors]
+    return image, label, vectors

@@ -9,20 +9,27 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.baselines.keyframe.handles import Handle
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.core.poses import Array, from_rotation, inverse
 from robocas_ms3.planning.kinematics import ArmChain, InverseKinematics, joint_distance, solve_straight_line
+from robocas_ms3.planning.pull_path import count_reached_poses, rotate_about_bar, track_handle
 from robocas_ms3.robots.registry import RobotSpec
 
 PREGRASP = 0.1
 """m between pre-grasp and grasp."""
 LIFT = 0.12
 """m that an object is lifted after a grasp."""
+TOP_VIEWS_DEG = (90, 80, 70, 60, 50)
+"""Elevations of the camera in views from above, degrees, the preferred one first."""
 _JOINT_STEP = 0.03  # rad between the configurations of a joint motion
 _MAX_TRANSLATION, _MAX_ROTATION = 0.095, 0.45  # m along an axis and rad per control step of 0.2 s; 5 % below the limits
 _MAX_JOINT_STEP = 0.4  # rad per control step
 _RELEASE_TILTS_DEG, _RELEASE_SIDES = (0, 15, 30, 45, 60, 72), (0.0, -0.4, 0.4)  # degrees; rad about the vertical
 _RELEASE_NEARER = (0.0, 0.05)  # m towards the base
+_FRONT_DISTANCE, _FRONT_LIFT = 0.2, 0.025  # m in front of the pre-grasp, and above it on the way back
+_PULL_STEP, _PULL_STANDOFF, _RETREATS = 0.015, 0.08, (0.15, 0.1, 0.06)  # m
+_PULL_TURNS = np.deg2rad((0, -20, 20, -40, 40))  # about the bar
 _LOWER, _NEARER = (
     (0.0, 0.05, 0.1),
     (1.0, 0.93, 0.86, 0.78),
@@ -37,11 +44,30 @@ class Approach:
         grasp: (4, 4) TCP pose of the grasp in the arm's base frame.
         start: (7,) configuration at the pre-grasp, rad.
         path: (n, 7) straight path from the pre-grasp to the grasp, rad.
+        way_back: (n, 7) path with the object out of a compartment; None: upwards.
     """
 
     grasp: Array
     start: Array
     path: Array
+    way_back: Array | None = None
+
+
+@dataclass(frozen=True)
+class Pull:
+    """Motion that opens a door or drawer.
+
+    Attributes:
+        start: (7,) configuration at the pre-grasp of the handle, rad.
+        path: (n, 7) straight path from the pre-grasp to the grasp, rad.
+        pull: (m, 7) path of the closed gripper, rad.
+        way_back: (k, 7) straight path away from the handle, rad.
+    """
+
+    start: Array
+    path: Array
+    pull: Array
+    way_back: Array
 
 
 class ArmPaths:
@@ -100,6 +126,74 @@ class ArmPaths:
         order = np.argsort(total, kind="stable")[: int(reachable.sum())]
         return [(int(index), found[index]) for index in order]
 
+    def plan_pull(self, handle: Handle, qpos: Array) -> Pull | None:
+        """Return the longest pull of a handle, or None. The gripper may turn about the bar.
+
+        qpos: (7,) present configuration.
+        """
+        count = max(2, int(np.ceil(np.linalg.norm(handle.motion) / _PULL_STEP)) + 1)
+        held = np.tile(handle.grasp, (count, 1, 1))
+        held[:, :3, 3] += np.linspace(0, 1, count)[:, None] * handle.motion
+        turned = held @ np.diag([-1.0, -1.0, 1.0, 1.0])
+        goals = [one for one in (held, turned) for _ in _PULL_TURNS]
+        starts = [rotate_about_bar(one[0], turn) for one in (held, turned) for turn in _PULL_TURNS]
+        reachable, found = self.reach(np.array(starts), qpos)
+        if not reachable.any():
+            return None
+        paths = track_handle(self.chain, found[reachable], np.stack(goals, axis=1)[:, reachable])
+        lengths, distance = count_reached_poses(paths), joint_distance(found[reachable], qpos)
+        for index in np.lexsort((distance, -lengths)).tolist():
+            path = paths[: lengths[index], index]
+            if len(path) < 2:
+                continue
+            back = self._back_off(path[0], _PULL_STANDOFF)
+            away = next((one for one in (self._back_off(path[-1], far) for far in _RETREATS) if one is not None), None)
+            if back is not None and away is not None:
+                return Pull(back[-1], np.concatenate([back[-2::-1], path[:1]]), path, away)
+        return None
+
+    def _back_off(self, qpos: Array, distance: float) -> Array | None:
+        """Return a straight path (n, 7) against the approach direction, or None."""
+        goal = self.chain.tcp(qpos[None])[0]
+        goal[:3, 3] -= distance * goal[:3, 2]
+        return self.straight(qpos, goal)
+
+    def plan_front_approach(self, grasps: Array, scores: Array, qpos: Array) -> Approach | None:
+        """Return the approach of the grasp with the greatest score that is reachable from outside of a compartment.
+
+        The gripper enters towards the object, and moves back out after a short lift. Arguments as in `plan_approach`.
+        """
+        for index in np.argsort(-scores, kind="stable").tolist():
+            for grasp in (grasps[index], grasps[index] @ np.diag([-1.0, -1.0, 1.0, 1.0])):
+                before = grasp.copy()
+                before[:3, 3] -= PREGRASP * grasp[:3, 2]
+                outside = before.copy()
+                outside[:2, 3] -= _FRONT_DISTANCE * grasp[:2, 2] / np.linalg.norm(grasp[:2, 2])
+                reachable, found = self.reach(np.stack([outside, before, grasp]), qpos)
+                if not reachable.all():
+                    continue
+                inwards = self._connect(found[0], [before, grasp])
+                if inwards is None:
+                    continue
+                raised = [pose.copy() for pose in (grasp, before, outside)]
+                for pose in raised:
+                    pose[2, 3] += _FRONT_LIFT
+                way_back = self._connect(inwards[-1], raised)
+                if way_back is not None:
+                    return Approach(grasp, found[0], inwards, way_back)
+        return None
+
+    def _connect(self, qpos: Array, poses: list[Array]) -> Array | None:
+        """Return straight paths (n, 7) through TCP poses (4, 4), one after another, or None."""
+        paths = []
+        for pose in poses:
+            path = self.straight(qpos, pose)
+            if path is None:
+                return None
+            paths.append(path)
+            qpos = path[-1]
+        return np.concatenate(paths)
+
     def plan_approach(self, grasps: Array, scores: Array, qpos: Array) -> Approach | None:
         """Return the approach of the reachable grasp with the greatest score, or None.
 
@@ -132,14 +226,15 @@ class PathFollower:
         chain: kinematics of the arm.
         path: (n, 7) configurations.
         control_steps: control steps of 0.2 s per policy step.
+        speed: fraction of the greatest motions.
 
     Attributes:
         index: index of the configuration to which the last motion led.
     """
 
-    def __init__(self, chain: ArmChain, path: Array, control_steps: int) -> None:
+    def __init__(self, chain: ArmChain, path: Array, control_steps: int, speed: float = 1.0) -> None:
         self._path, self._poses, self.index = path, chain.tcp(path), 0
-        self._limits = np.array([_MAX_TRANSLATION, _MAX_ROTATION, _MAX_JOINT_STEP]) * control_steps
+        self._limits = np.array([_MAX_TRANSLATION, _MAX_ROTATION, _MAX_JOINT_STEP]) * control_steps * speed
 
     @property
     def goal(self) -> Array:
@@ -168,7 +263,7 @@ def find_views(
     camera_in_tcp: Array,
     point: Array,
     distances: Sequence[float],
-    elevations_deg: Sequence[float] = (90, 80, 70, 60, 50),
+    elevations_deg: Sequence[float] = TOP_VIEWS_DEG,
 ) -> tuple[Array, Array]:
     """Return TCP poses whose camera views a point, and their costs.
 
@@ -179,7 +274,7 @@ def find_views(
         elevations_deg: elevations of the camera above the point, degrees.
 
     Returns:
-        Poses (N, 4, 4) in the arm's base frame, and costs (N,): small for views from straight above.
+        Poses (N, 4, 4) in the arm's base frame, and costs (N,): small for views at the first elevation.
     """
     poses, costs = [], []
     azimuth, tcp_in_camera = float(np.arctan2(point[1], point[0])), inverse(camera_in_tcp)
@@ -198,7 +293,7 @@ def find_views(
                         point - distance * forward, np.stack([np.cross(-up, forward), -up, forward], 1)
                     )
                     poses.append(camera @ tcp_in_camera)
-                    costs.append((90 - elevation) * 0.01 + abs(roll) * 0.1 + abs(turn) * 0.1)
+                    costs.append(abs(elevations_deg[0] - elevation) * 0.01 + abs(roll) * 0.1 + abs(turn) * 0.1)
     return np.array(poses), np.array(costs)
 
 

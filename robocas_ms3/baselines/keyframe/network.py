@@ -16,12 +16,16 @@ from robocas_ms3.baselines.keyframe.gripper_crops import CROP_CHANNELS, POSE_FEA
 from robocas_ms3.scenes.language.embed import DIMENSIONS
 from robocas_ms3.scenes.relations import RELATIONS
 
-BACKGROUND, BASKET, ROBOT, FIRST_NAME = range(4)
-"""Classes of the cells of an image: other surfaces, the basket, the robot, and the first object name."""
+BACKGROUND, BASKET, ROBOT, HANDLE, FIRST_NAME = range(5)
+"""Classes of the cells of an image: other surfaces, the basket, the robot, the handle of a closed door or drawer, and
+the first object name."""
 STRIDE = 4
 """Pixels per cell, horizontally and vertically."""
 OFFSET_UNIT = 0.05
 """m, unit of predicted offsets."""
+PULL_UNIT = 0.25
+"""m, unit of predicted pulls."""
+_OFFSETS, _PULLS = 3, 9  # channels
 _INPUT_CHANNELS = 5
 _DROPPED = 0.1  # fraction of hidden values that dropout sets to 0
 
@@ -72,9 +76,9 @@ class _ResidualBlock(nn.Module):
 
 
 class SegmentationNetwork(nn.Module):
-    """U-Net that classifies the cells of an RGB-D image and points to the centres of objects.
+    """U-Net that classifies the cells of an RGB-D image, points to the centres of objects, and predicts pulls.
 
-    The classes are background, basket, robot, and the names of the objects.
+    The classes are background, basket, robot, handle, and the names of the objects.
 
     Args:
         channels: channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the image size.
@@ -93,14 +97,16 @@ class SegmentationNetwork(nn.Module):
         self.up_sixteenth = _convolution(last + sixteenth, sixteenth)
         self.up_eighth = _convolution(sixteenth + eighth, eighth)
         self.up_quarter = _convolution(eighth + quarter, decoder_channels)
-        self.output = nn.Conv2d(decoder_channels, classes + 3, 1)
+        self.output = nn.Conv2d(decoder_channels, classes + _OFFSETS + _PULLS, 1)
 
-    def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return logits and offsets of the cells of images (B, 5, H, W); H and W are multiples of 32.
+    def forward(self, images: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return logits, offsets and pulls of the cells of images (B, 5, H, W); H and W are multiples of 32.
 
         Returns:
             Logits (B, classes, H / 4, W / 4). Offsets (B, 3, H / 4, W / 4) from the surface in each cell to the centre
-            of its object, in the OpenCV camera frame, in units of `OFFSET_UNIT`.
+            of its object, or to the grasp of its handle, in units of `OFFSET_UNIT`. Pulls (B, 9, H / 4, W / 4) of
+            the handle: motion in units of `PULL_UNIT`, approach, and axis of the bar. All vectors are in the OpenCV
+            camera frame.
         """
         quarter = self.quarter(self.stem(images))
         eighth = self.eighth(quarter)
@@ -108,7 +114,8 @@ class SegmentationNetwork(nn.Module):
         features = self.up_sixteenth(_upsample_and_join(self.last(sixteenth), sixteenth))
         features = self.up_eighth(_upsample_and_join(features, eighth))
         output = self.output(self.up_quarter(_upsample_and_join(features, quarter)))
-        return output[:, :-3], output[:, -3:]
+        logits, offsets, pulls = output.split([output.shape[1] - _OFFSETS - _PULLS, _OFFSETS, _PULLS], dim=1)
+        return logits, offsets, pulls
 
 
 def _upsample_and_join(small: torch.Tensor, large: torch.Tensor) -> torch.Tensor:
@@ -180,19 +187,21 @@ class KeyframeNetwork(nn.Module):
 
         Args:
             batch: ``image`` (B, 5, H, W), ``label`` (B, H / 4, W / 4) class and ``offset`` (B, 3, H / 4, W / 4) of each
-                cell, ``text`` (B, T, 384), ``name`` and ``relation`` (B, T) classes of the texts, ``crop``
-                (B, G, 3, N, N) and ``pose`` (B, G, 8) of grasps, ``outcome`` (B, G) 1: success, 0: failure, -1:
-                padding.
+                cell, ``pull`` (B, 9) of the handle in the image, ``text`` (B, T, 384), ``name`` and ``relation``
+                (B, T) classes of the texts, ``crop`` (B, G, 3, N, N) and ``pose`` (B, G, 8) of grasps, ``outcome``
+                (B, G) 1: success, 0: failure, -1: padding.
 
         Returns:
-            ``loss`` and its terms ``segmentation``, ``offset``, ``text``, ``grasp``; ``cells``, the accuracy of the
-            cells with objects; ``names`` and ``grasps``, the accuracy of instructions and grasps.
+            ``loss`` and its terms ``segmentation``, ``offset``, ``pull``, ``text``, ``grasp``; ``cells``, the accuracy
+            of the cells with objects and handles; ``names`` and ``grasps``, the accuracy of instructions and grasps.
         """
-        logits, offsets = self.segmentation(batch["image"].contiguous(memory_format=torch.channels_last))
+        logits, offsets, pulls = self.segmentation(batch["image"].contiguous(memory_format=torch.channels_last))
         logits, label = logits.float(), batch["label"]
-        is_object = label >= FIRST_NAME
+        is_object, is_handle = label >= HANDLE, label == HANDLE
         distance = (offsets.float() - batch["offset"]).abs().sum(dim=1)
         offset = torch.stack([(distance * is_object).sum(), is_object.sum()])
+        distance = (pulls.float() - batch["pull"][:, :, None, None]).abs().sum(dim=1)
+        pull = torch.stack([(distance * is_handle).sum(), is_handle.sum()])
         weights = torch.where(is_object, 1.5, 0.5)
         segmentation = (F.cross_entropy(logits, label, reduction="none") * weights).sum() / weights.sum()
         names, relations = self.instruction(batch["text"].flatten(0, 1))
@@ -205,6 +214,7 @@ class KeyframeNetwork(nn.Module):
         grasp = (errors * known).sum() / known.sum().clamp(min=1)
         config, offset_loss = self.config, offset[0] / offset[1].clamp(min=1)
         losses = segmentation + config.offset_weight * offset_loss + config.text_weight * text
+        losses = losses + config.pull_weight * pull[0] / pull[1].clamp(min=1)
         with torch.no_grad():
             cells = torch.stack([((logits.argmax(1) == label) & is_object).sum(), is_object.sum()])
             grasps = torch.stack([(((success > 0) == (outcome > 0.5)) & known).sum(), known.sum()])
@@ -212,6 +222,7 @@ class KeyframeNetwork(nn.Module):
             "loss": losses + config.grasp_weight * grasp,
             "segmentation": segmentation,
             "offset": offset,
+            "pull": pull,
             "text": text,
             "grasp": torch.stack([(errors * known).sum(), known.sum()]),
             "cells": cells.float(),

@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-VOTE_RADIUS = 0.035
-"""m within which votes for the centre of an object belong together."""
+WIDE_RADIUS, NARROW_RADIUS = 0.035, 0.015
+"""m within which votes for the centre of an object belong together; the narrow one tells touching copies apart."""
 _WORKSPACE = ((0.15, 1.15), (-0.9, 0.9), (-0.1, 0.6))  # m, least and greatest x, y and z in the arm's base frame
 _MAP_X, _MAP_Y, _MAP_CELL = (0.2, 1.05), (-0.8, 0.8), 0.02  # m
 _TABLE_BINS = (-0.1, 0.6, 200)  # m, m, number of bins of the histogram of heights
 _MAX_VOTES = 1200  # cells of an object that vote
+_FARTHEST_VOTE = 2.0  # radii from the centre, beyond which a vote belongs to another object
+_LEAST_SHARE = 0.1  # of the votes of the largest group; smaller groups are errors
+_SUPPORT_RANGE, _SUPPORT_POINTS = 0.04, 100  # m around the lowest objects; least number of points on their support
 
 
 def unproject(
@@ -47,36 +50,56 @@ def is_in_workspace(points: Array) -> NDArray[np.bool_]:
     return ((points > low) & (points < high)).all(axis=-1)
 
 
-def find_table_height(heights: Array) -> float:
-    """Return the commonest height of points (P,) that are on no object, m."""
+def find_table_height(others: Array, objects: Array) -> float:
+    """Return the height of the surface on which objects stand, m: the commonest height of points near their bottom.
+
+    Args:
+        others: (P, 3) points on no object, m.
+        objects: (Q, 3) points on objects, m; without objects, the commonest height of all points is returned.
+    """
+    heights = others[:, 2]
+    if len(objects):
+        bottom = np.percentile(objects[:, 2], 2)
+        heights = heights[np.abs(heights - bottom) < _SUPPORT_RANGE]
+        if len(heights) < _SUPPORT_POINTS:
+            return float(bottom)
     low, high, bins = _TABLE_BINS
     counts, edges = np.histogram(heights, bins=bins, range=(low, high))
     return float(edges[counts.argmax()] + (high - low) / bins / 2)
 
 
-def cluster_votes(votes: Array, min_votes: int) -> list[NDArray[np.int64]]:
+def cluster_votes(votes: Array, min_votes: int, radius: float) -> list[NDArray[np.int64]]:
     """Group votes (V, 3) for the centres of objects, the largest group first; return the indices of each group.
 
-    A group has all votes within `VOTE_RADIUS` of the vote with the most neighbours. Smaller groups than ``min_votes``
-    are left out.
+    The first centre is the mean of the votes within ``radius`` of the vote with the most neighbours; the votes within
+    two radii of it are left out for the next one. Then each vote joins the nearest centre.
+
+    Args:
+        votes: (V, 3) predicted centres, m.
+        min_votes: least number of votes of a group.
+        radius: see `WIDE_RADIUS`, m.
     """
-    remaining, groups = np.arange(len(votes)), []
+    remaining, centers = np.arange(len(votes)), list[Array]()
     if len(votes) > _MAX_VOTES:
         remaining = remaining[:: len(votes) // _MAX_VOTES + 1]
-        min_votes = max(1, min_votes * len(remaining) // len(votes))
-    while len(remaining) >= min_votes:
-        distances = np.linalg.norm(votes[remaining][:, None] - votes[remaining][None], axis=2)
-        near = distances < VOTE_RADIUS
+    least = max(1, min_votes * len(remaining) // max(len(votes), 1))
+    while len(remaining) >= least:
+        near = np.linalg.norm(votes[remaining][:, None] - votes[remaining][None], axis=2) < radius
         best = int(near.sum(axis=1).argmax())
-        if near[best].sum() < min_votes:
+        if near[best].sum() < least:
             break
-        center = votes[remaining[near[best]]].mean(axis=0)
-        member = np.linalg.norm(votes[remaining] - center, axis=1) < 1.5 * VOTE_RADIUS
-        if not member.any():
+        centers.append(votes[remaining[near[best]]].mean(axis=0))
+        is_far = np.linalg.norm(votes[remaining] - centers[-1], axis=1) >= _FARTHEST_VOTE * radius
+        if is_far.all():
             break
-        groups.append(np.flatnonzero(np.linalg.norm(votes - center, axis=1) < 1.5 * VOTE_RADIUS))
-        remaining = remaining[~member]
-    return groups
+        remaining = remaining[is_far]
+    if not centers:
+        return []
+    distances = np.linalg.norm(votes[:, None] - np.stack(centers)[None], axis=2)
+    nearest = np.where(distances.min(axis=1) < 2 * WIDE_RADIUS, distances.argmin(axis=1), -1)
+    groups = sorted((np.flatnonzero(nearest == number) for number in range(len(centers))), key=len, reverse=True)
+    least = max(min_votes, _LEAST_SHARE * len(groups[0]))
+    return [group for group in groups if len(group) >= least]
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,21 @@ from numpy.typing import NDArray
 
 from robocas_ms3.baselines.keyframe.config import DecisionSettings
 from robocas_ms3.baselines.keyframe.gripper_crops import make_crops
+from robocas_ms3.baselines.keyframe.handles import Handle
 from robocas_ms3.baselines.keyframe.network import (
     BASKET,
     FIRST_NAME,
+    HANDLE,
     OFFSET_UNIT,
+    PULL_UNIT,
     ROBOT,
     STRIDE,
     KeyframeNetwork,
     make_inputs,
 )
 from robocas_ms3.baselines.keyframe.observed_scene import (
+    NARROW_RADIUS,
+    WIDE_RADIUS,
     ObservedObject,
     ObservedScene,
     cluster_votes,
@@ -35,6 +40,8 @@ from robocas_ms3.scenes.relations import RELATIONS, Relation
 Array = NDArray[np.float64]
 _POINT_STEP = 2  # pixels between points of the cloud
 _SURE = 0.6  # probability of an object or the basket in the images of a survey
+_MIN_HANDLE_CELLS = 8
+_ROOF_RADIUS, _ROOF_CLEARANCE, _ROOF_CELLS = 0.2, 0.12, 60  # m around and above the objects; least number of cells
 _EDGE = 2  # percent of the points of the basket that may be outside of its bounds
 
 
@@ -70,27 +77,40 @@ class Request:
 
 @dataclass(frozen=True)
 class Survey:
-    """Result of the first look at the scene.
+    """What the three cameras show.
 
     Attributes:
         focus: (2,) middle of the objects, m, in the arm's base frame.
         basket: (3,) middle of the basket in x and y, and the height of its rim, m; None: not seen.
         table: height of the surface, m.
+        handle: handle of a closed door or drawer, or None.
+        has_roof: whether something is above the objects, so that they have to be grasped from the front.
     """
 
     focus: Array
     basket: Array | None
     table: float
+    handle: Handle | None = None
+    has_roof: bool = False
 
 
 @dataclass(frozen=True)
 class _Cells:
-    """Predictions for the cells (h, w) of an image: classes (h, w, C), offsets (h, w, 3) in the base frame, m."""
+    """Predictions for the cells (h, w) of an image, with vectors in the arm's base frame.
+
+    Attributes:
+        points: (h, w, 3) points on the surface, m.
+        valid: (h, w) whether the depth was measured.
+        classes: (h, w, C) probabilities of the classes.
+        offsets: (h, w, 3) from the surface to the centre of the object, or to the grasp of the handle, m.
+        pulls: (h, w, 3, 3) motion of the handle in m, approach, and axis of the bar.
+    """
 
     points: Array
     valid: NDArray[np.bool_]
     classes: NDArray[np.float32]
     offsets: Array
+    pulls: Array
 
 
 class Perception:
@@ -113,8 +133,8 @@ class Perception:
         return Request(names[0].softmax(dim=0).cpu().numpy(), RELATIONS[relation - 1] if relation else None)
 
     def survey(self, frames: list[CameraFrame], default_table: float) -> Survey:
-        """Find the objects, the basket and the height of the surface in the first images of an episode."""
-        objects, basket, others = [], [], []
+        """Find the objects, the basket, a handle and the height of the surface in the images of all cameras."""
+        objects, basket, others, handles = [], [], [], []
         for frame in frames:
             cells = self._classify(frame)
             seen = cells.valid & (cells.classes[..., ROBOT] < 0.3)
@@ -122,12 +142,21 @@ class Perception:
             is_object, is_basket = cells.classes[..., FIRST_NAME:].sum(-1), cells.classes[..., BASKET]
             objects.append(cells.points[inside & (is_object > _SURE)])
             basket.append(cells.points[seen & (is_basket > _SURE)])
-            others.append(cells.points[inside & (is_object < 0.2) & (is_basket < 0.2)][:, 2])
-        heights, found, rim = np.concatenate(others), np.concatenate(objects), np.concatenate(basket)
-        table = find_table_height(heights) if len(heights) else default_table
+            others.append(cells.points[inside & (is_object < 0.2) & (is_basket < 0.2)])
+            is_handle = inside & (cells.classes[..., HANDLE] > _SURE)
+            grasps = (cells.points + cells.offsets)[is_handle]
+            handles.append(np.concatenate([grasps[:, None], cells.pulls[is_handle]], axis=1))
+        surfaces, found, rim = np.concatenate(others), np.concatenate(objects), np.concatenate(basket)
+        table = find_table_height(surfaces, found) if len(surfaces) else default_table
         found = found[found[:, 2] > table + 0.005]
-        focus = np.median(found[:, :2], axis=0) if len(found) >= 10 else np.array([0.6, 0.0])
-        return Survey(focus, _find_basket(rim), table)
+        seen = len(found) >= 10
+        focus = np.median(found[:, :2], axis=0) if seen else np.array([0.6, 0.0])
+        has_roof = False
+        if seen:
+            roof = np.percentile(found[:, 2], 95) + _ROOF_CLEARANCE
+            above = (surfaces[:, 2] > roof) & (np.linalg.norm(surfaces[:, :2] - focus, axis=1) < _ROOF_RADIUS)
+            has_roof = int(above.sum()) >= _ROOF_CELLS
+        return Survey(focus, _find_basket(rim), table, _find_handle(np.concatenate(handles)), has_roof)
 
     def observe(self, frame: CameraFrame, request: Request, table: float) -> ObservedScene:
         """Return the objects and the points in the workspace of an image of the gripper camera."""
@@ -146,11 +175,13 @@ class Perception:
         number_of_cell = _cells_of_points(valid.shape, cells.valid.shape)[rows]
         large_object = _enlarge(probability, size)[step][valid]
 
-        def find(mask: NDArray[np.bool_], of: NDArray[np.float32], label: int) -> list[ObservedObject]:
+        def find(
+            mask: NDArray[np.bool_], of: NDArray[np.float32], label: int, radius: float = WIDE_RADIUS
+        ) -> list[ObservedObject]:
             where = np.flatnonzero(mask)
             votes = (cells.points + cells.offsets).reshape(-1, 3)[where]
             found = []
-            for group in cluster_votes(votes, max(1, settings.min_points * _POINT_STEP**2 // STRIDE**2)):
+            for group in cluster_votes(votes, max(1, settings.min_points * _POINT_STEP**2 // STRIDE**2), radius):
                 member = np.zeros(mask.size, dtype=bool)
                 member[where[group]] = True
                 on_object = member[number_of_cell]
@@ -161,7 +192,7 @@ class Perception:
 
         inside = cells.valid & is_in_workspace(cells.points)
         is_target = inside & (target > settings.target_probability)
-        targets = find(is_target, target, -1)
+        targets = find(is_target, target, -1, NARROW_RADIUS if request.relation else WIDE_RADIUS)
         is_object = inside & (probability > settings.object_probability)
         labels = names.argmax(-1)
         objects = [
@@ -182,12 +213,14 @@ class Perception:
         inputs = make_inputs(frame.rgb, frame.depth, frame.intrinsics, frame.camera_in_base)
         image = torch.from_numpy(inputs)[None].to(self._device).contiguous(memory_format=torch.channels_last)
         with torch.inference_mode():
-            logits, offsets = self._network.segmentation(image)
+            logits, offsets, pulls = self._network.segmentation(image)
         classes = logits[0].softmax(dim=0).permute(1, 2, 0).cpu().numpy()
         in_camera = OFFSET_UNIT * offsets[0].permute(1, 2, 0).cpu().numpy().astype(np.float64)
         pixels = sample_pixels(frame.depth.shape, STRIDE, STRIDE // 2)
         points, valid = unproject(frame.depth, frame.intrinsics, frame.camera_in_base, pixels)
-        return _Cells(points, valid, classes, in_camera @ frame.camera_in_base[:3, :3].T)
+        to_base = frame.camera_in_base[:3, :3].T
+        vectors = pulls[0].permute(1, 2, 0).cpu().numpy().astype(np.float64).reshape(*classes.shape[:2], 3, 3)
+        return _Cells(points, valid, classes, in_camera @ to_base, vectors @ to_base * [[PULL_UNIT], [1], [1]])
 
 
 def _find_basket(points: Array) -> Array | None:
@@ -196,6 +229,12 @@ def _find_basket(points: Array) -> Array | None:
         return None
     low, high = np.percentile(points, [_EDGE, 100 - _EDGE], axis=0)
     return np.array([*(low[:2] + high[:2]) / 2, high[2]])
+
+
+def _find_handle(cells: Array) -> Handle | None:
+    """Return the handle from the predictions (C, 4, 3) of its cells: grasp, motion, approach and bar; or None."""
+    groups = cluster_votes(cells[:, 0], _MIN_HANDLE_CELLS, WIDE_RADIUS)
+    return Handle(*np.median(cells[groups[0]], axis=0)) if groups else None
 
 
 def _enlarge(cells: NDArray[np.float32], size: tuple[int, ...]) -> NDArray[np.float32]:

@@ -1,10 +1,11 @@
-"""Further views of a decision: the gripper camera at random poses above the objects."""
+"""Further views of a decision: the gripper camera at random poses before or above the objects or a handle."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import Array, inverse
@@ -17,6 +18,7 @@ from robocas_ms3.robots.camera_models import OPENCV_IN_SAPIEN, CameraModel
 
 _DISTANCE, _FIRST_DISTANCE = (0.28, 0.5), (0.42, 0.55)  # m from the camera to the point that it views
 _SPREAD = 0.04  # m, standard deviation of this point from an object
+_FRONT_ELEVATION_DEG, _FRONT_AZIMUTH = (15.0, 55.0), 0.7  # of views from the front; rad to both sides
 _TRIES, _POSES = 10, 64  # points per view, and camera poses per point
 _NEAREST = 8  # camera poses with the smallest joint motion, of which one is drawn
 _STREAM = 418  # random stream of the views
@@ -30,6 +32,9 @@ def name_view(number: int) -> str:
 
 class HandViews:
     """Arm configurations from which the gripper camera views the objects.
+
+    The views are from above, or from the front if the objects are grasped from the front. Before a pull, they show the
+    handle from the front.
 
     Args:
         env: environment of the decisions.
@@ -49,6 +54,7 @@ class HandViews:
         robot = env.robot()
         self._description = robot.description
         self._kinematics = InverseKinematics(ArmChain(robot.files().arm_urdf, robot.description))
+        self._is_front = env.task_config().target.approach == "front"
 
     def move_arm(
         self, file: CandidateFile, rows: tuple[int, int], recording: Recording, model: CameraModel, number: int
@@ -70,21 +76,21 @@ class HandViews:
             if decisions["held_slot"][row] >= 0:
                 continue
             rng = np.random.default_rng([int(decisions["seed"][row]), int(decisions["decision"][row]), number, _STREAM])
-            objects = decisions["object_in_base"][row][decisions["present"][row] & ~decisions["fallen"][row]][:, :3]
-            qpos = self._draw(objects.astype(np.float64), states[index, arm].astype(np.float64), model, number, rng)
+            points = find_handle(file, row)
+            is_front = self._is_front or len(points) > 0
+            if not len(points):
+                points = decisions["object_in_base"][row][decisions["present"][row] & ~decisions["fallen"][row]][:, :3]
+            point = _Subject(points.astype(np.float64), is_front, number == 0)
+            qpos = self._draw(point, states[index, arm].astype(np.float64), model, rng)
             if qpos is not None:
                 states[index, arm] = qpos
         articulations = {**recording.states["articulations"], uid: states}
         return replace(recording, states={**recording.states, "articulations": articulations})
 
-    def _draw(
-        self, objects: Array, qpos: Array, model: CameraModel, number: int, rng: np.random.Generator
-    ) -> Array | None:
-        """Draw the configuration (7,) of a view; the first view shows the middle of the objects (n, 3)."""
-        for _ in range(_TRIES if len(objects) else 0):
-            point = objects.mean(axis=0) if number == 0 else objects[rng.integers(len(objects))]
-            point = point + [*rng.normal(0, _SPREAD, 2), 0.0]
-            poses = sample_views(rng, point, _FIRST_DISTANCE if number == 0 else _DISTANCE, _POSES)
+    def _draw(self, subject: _Subject, qpos: Array, model: CameraModel, rng: np.random.Generator) -> Array | None:
+        """Draw the configuration (7,) of a view, near a configuration (7,)."""
+        for _ in range(_TRIES if len(subject.points) else 0):
+            poses = subject.draw_cameras(rng)
             reachable, found = self._kinematics.nearest_solutions(
                 poses @ OPENCV_IN_SAPIEN @ inverse(model.camera_in_parent), qpos
             )
@@ -93,3 +99,31 @@ class HandViews:
                 nearest = found[np.argsort(joint_distance(found, qpos), kind="stable")[:_NEAREST]]
                 return nearest[rng.integers(len(nearest))]
         return None
+
+
+@dataclass(frozen=True)
+class _Subject:
+    """What a view shows: one of the points (n, 3) in the arm's base frame, or the middle of all in the first view."""
+
+    points: Array
+    is_front: bool
+    is_first: bool
+
+    def draw_cameras(self, rng: np.random.Generator) -> Array:
+        """Draw a point and camera poses (N, 4, 4) that view it."""
+        points = self.points
+        point = points.mean(axis=0) if self.is_first else points[rng.integers(len(points))]
+        point = point + [*rng.normal(0, _SPREAD, 2), 0.0]
+        distance, outward = _FIRST_DISTANCE if self.is_first else _DISTANCE, float(np.arctan2(point[1], point[0]))
+        front = {}
+        if self.is_front:
+            azimuth = (outward - _FRONT_AZIMUTH, outward + _FRONT_AZIMUTH)
+            front = {"elevation_deg": _FRONT_ELEVATION_DEG, "azimuth": azimuth}
+        return sample_views(rng, point, distance, _POSES, **front)
+
+
+def find_handle(file: CandidateFile, row: int) -> NDArray[np.float32]:
+    """Return the positions (n, 3) at which successful pulls of a decision grasp the handle; n is 0 without a pull."""
+    found = file.decision(row).candidates
+    pulls = (found["primitive"] == "pull") & found["success"]
+    return found["start_in_base"][pulls][:, :3]

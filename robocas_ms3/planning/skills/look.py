@@ -108,16 +108,34 @@ def _camera_config(arm: Arm) -> CameraConfig:
     return arm.env.agent.camera_config(_hand_camera(arm))
 
 
-def sample_views(rng: np.random.Generator, point: Array, distance: tuple[float, float], count: int) -> Array:
+def sample_views(
+    rng: np.random.Generator,
+    point: Array,
+    distance: tuple[float, float],
+    count: int,
+    *,
+    elevation_deg: tuple[float, float] = ELEVATION_DEG,
+    azimuth: tuple[float, float] = (-np.pi, np.pi),
+) -> Array:
     """Sample camera poses (count, 4, 4) that view a point (3,) from above, with a random roll.
 
-    The axes of the camera are x forward, y left, z up. ``distance`` is the minimum and maximum distance of the camera
-    from the point, m.
+    The axes of the camera are x forward, y left, z up.
+
+    Args:
+        rng: random generator.
+        point: (3,) point in some frame with z up, m.
+        distance: minimum and maximum distance of the camera from the point, m.
+        count: number of poses.
+        elevation_deg: minimum and maximum elevation of the camera above the point, degrees.
+        azimuth: minimum and maximum azimuth of the viewing direction, rad from the x axis.
+
+    Returns:
+        Poses (count, 4, 4) in the frame of the point.
     """
-    elevation = np.deg2rad(rng.uniform(*ELEVATION_DEG, count))
-    azimuth, roll = rng.uniform(-np.pi, np.pi, (2, count))
+    elevation = np.deg2rad(rng.uniform(*elevation_deg, count))
+    directions, roll = rng.uniform(*azimuth, count), rng.uniform(-np.pi, np.pi, count)
     # x (forward) is rotated down by the elevation and about the vertical by the azimuth
-    turn = Rotation.from_euler("ZYX", np.column_stack([azimuth, elevation, roll]))
+    turn = Rotation.from_euler("ZYX", np.column_stack([directions, elevation, roll]))
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3] = turn.as_matrix()
     poses[:, :3, 3] = point - rng.uniform(*distance, (count, 1)) * poses[:, :3, 0]

@@ -99,7 +99,7 @@ def test_loss_of_a_batch_decreases(validation):
         metrics["loss"].backward()
         optimizer.step()
         losses.append(float(metrics["loss"].detach()))
-    assert set(metrics) == {"loss", "segmentation", "offset", "text", "grasp", "cells", "names", "grasps"}
+    assert set(metrics) == {"loss", "segmentation", "offset", "pull", "text", "grasp", "cells", "names", "grasps"}
     assert np.isfinite(losses).all() and losses[-1] < 0.7 * losses[0]
 
 

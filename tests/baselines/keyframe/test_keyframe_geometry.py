@@ -10,6 +10,8 @@ from robocas_ms3.baselines.keyframe.grasp_proposals import propose_colliding_gra
 from robocas_ms3.baselines.keyframe.gripper_crops import CELL, CELLS, augment_crops, make_crops
 from robocas_ms3.baselines.keyframe.network import make_inputs
 from robocas_ms3.baselines.keyframe.observed_scene import (
+    NARROW_RADIUS,
+    WIDE_RADIUS,
     HeightMap,
     cluster_votes,
     find_table_height,
@@ -55,14 +57,33 @@ def test_inputs_have_colour_height_and_depth():
 
 def test_the_commonest_height_is_the_table():
     heights = np.concatenate([np.full(50, 0.12), np.linspace(0.13, 0.4, 40)])
-    assert find_table_height(heights) == pytest.approx(0.12, abs=0.002)
+    others = np.stack([np.zeros(90), np.zeros(90), heights], axis=1)
+    assert find_table_height(others, np.zeros((0, 3))) == pytest.approx(0.12, abs=0.002)
+
+
+def test_the_table_is_below_the_objects():
+    """The commonest height is the floor of a cabinet at -0.05 m; the objects stand on a layer at 0.2 m."""
+    heights = np.concatenate([np.full(900, -0.05), np.full(150, 0.2), np.linspace(0.3, 0.5, 100)])
+    others = np.stack([np.zeros(1150), np.zeros(1150), heights], axis=1)
+    objects = np.stack([np.zeros(100), np.zeros(100), np.linspace(0.205, 0.35, 100)], axis=1)
+    assert find_table_height(others, objects) == pytest.approx(0.2, abs=0.004)
+    assert find_table_height(others[:950], objects) == pytest.approx(0.2, abs=0.01)  # too few points: the lowest ones
 
 
 def test_votes_of_two_objects_make_two_groups():
     rng = np.random.default_rng(0)
     first, second = rng.normal(0, 0.005, (40, 3)), rng.normal(0, 0.005, (30, 3)) + [0.1, 0, 0]
-    groups = cluster_votes(np.concatenate([first, second, [[1.0, 1, 1]]]), 5)
+    groups = cluster_votes(np.concatenate([first, second, [[1.0, 1, 1]]]), 5, WIDE_RADIUS)
     assert [sorted(group.tolist()) for group in groups] == [list(range(40)), list(range(40, 70))]
+
+
+def test_the_narrow_radius_tells_touching_copies_apart():
+    rng = np.random.default_rng(0)
+    votes = np.concatenate([rng.normal(0, 0.005, (40, 3)), rng.normal(0, 0.005, (40, 3)) + [0.045, 0, 0]])
+    groups = cluster_votes(votes, 5, NARROW_RADIUS)
+    assert sorted(sorted(group.tolist()) for group in groups) == [list(range(40)), list(range(40, 80))]
+    assert len(cluster_votes(votes, 5, WIDE_RADIUS)) == 1
+    assert cluster_votes(np.zeros((0, 3)), 5, NARROW_RADIUS) == []
 
 
 def test_free_squares_are_empty_and_observed():
@@ -114,6 +135,17 @@ def test_grasps_of_a_box_are_across_its_sides():
 
 def test_no_grasp_of_too_few_points():
     assert not len(propose_colliding_grasps(make_box(count=10), 0.1, 100, np.random.default_rng(0)).heuristic)
+
+
+def test_grasps_from_the_front_are_outward_and_above_the_surface():
+    points, rng = make_box(size=(0.04, 0.06, 0.15)), np.random.default_rng(3)
+    found = propose_grasps(points, np.ones(len(points), bool), 0.1, 400, rng, from_front=True)
+    approach = found.tcp_in_base[:, :3, 2]
+    assert len(found.heuristic) > 10
+    assert (approach[:, 0] > 0.3).all() and np.abs(approach[:, 2]).max() < np.cos(np.deg2rad(34))
+    # the hand is 2 x 3 cm thick along the TCP's x axis, which is almost vertical in horizontal approaches
+    flat = approach[:, 2] > -0.2
+    assert flat.any() and found.tcp_in_base[flat, 2, 3].min() > 0.12
 
 
 def test_grasps_touch_no_neighbour():

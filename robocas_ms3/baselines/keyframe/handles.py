@@ -1,0 +1,56 @@
+"""Handles of doors and drawers, and how they are pulled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.core.poses import from_rotation, from_wxyz
+from robocas_ms3.demos.candidates.tables import Arrays
+
+Array = NDArray[np.float64]
+HANDLE_RADIUS = 0.06
+"""m around the grasp of a handle, within which surfaces belong to it."""
+
+
+@dataclass(frozen=True)
+class Handle:
+    """Handle of a closed door or drawer, in the arm's base frame.
+
+    Attributes:
+        position: (3,) TCP position of the grasp, m.
+        motion: (3,) straight motion of the TCP that opens the door or drawer, m.
+        approach: (3,) approach direction of the gripper, a unit vector.
+        bar: (3,) axis of the bar, a unit vector.
+    """
+
+    position: Array
+    motion: Array
+    approach: Array
+    bar: Array
+
+    @property
+    def grasp(self) -> Array:
+        """TCP pose (4, 4) of the grasp: x along the bar, z along the approach."""
+        z = self.approach / np.linalg.norm(self.approach)
+        x = self.bar - z * (z @ self.bar)
+        x /= np.linalg.norm(x)
+        return from_rotation(self.position, np.stack([x, np.cross(z, x), z], axis=1))
+
+
+def find_pulled_handle(candidates: Arrays) -> Handle | None:
+    """Return the handle that successful pulls of a decision grasp, the mean of them, or None."""
+    pulls = (candidates["primitive"] == "pull") & candidates["success"]
+    pulls &= np.isfinite(candidates["final_in_base"]).all(axis=1)
+    if not pulls.any():
+        return None
+    start = from_wxyz(candidates["start_in_base"][pulls].astype(np.float64))
+    final = from_wxyz(candidates["final_in_base"][pulls].astype(np.float64))
+    bars = start[:, :3, 0]
+    bars = bars * np.where((bars @ (0.1, 0.3, 1.0)) < 0, -1.0, 1.0)[:, None]  # mostly upwards, or to the left
+    directions = [vectors.mean(axis=0) for vectors in (start[:, :3, 2], bars)]
+    approach, bar = (direction / np.linalg.norm(direction) for direction in directions)
+    position, end = start[:, :3, 3].mean(axis=0), final[:, :3, 3].mean(axis=0)
+    return Handle(position, end - position, approach, bar)
