@@ -1,4 +1,4 @@
-"""Scripts: valid syntax, no host names; scripts of `small` call valid commands whose inputs exist at that time."""
+"""Scripts: valid syntax, no host names; scripts of baselines call valid commands whose inputs exist at that time."""
 
 import os
 import re
@@ -71,6 +71,30 @@ def test_scripts_call_valid_commands(tmp_path, words):
     assert sum(counts) == 100
 
 
+@pytest.mark.parametrize(("row", "parts", "tasks"), [("A", 4, 4), ("B", 3, 2), ("C", 3, 2)])
+def test_rows_of_keyframe_call_valid_commands(tmp_path, row, parts, tasks):
+    out = tmp_path / "out"
+    done, calls = run_with_stub(tmp_path, "reproduce_keyframe.sh", row, str(out), SCALE="10", STEPS="7", EPISODES="3")
+    assert done.returncode == 0, done.stderr
+    names = ["generate", "render-candidates"] * parts + ["train"] + ["eval"] * tasks
+    assert [call[0] for call in calls] == names
+    for call in calls:
+        cli.parse(call)
+    for generate, render in zip(calls[0 : 2 * parts : 2], calls[1 : 2 * parts : 2], strict=True):
+        config = generate[generate.index("--config") + 1]
+        assert bundled_configs()[config] and 6 <= int(generate[generate.index("-n") + 1]) <= 15
+        assert (
+            render[1]
+            == f"{generate[generate.index('--out') + 1]}/candidates.h5"
+            == f"{out}/data/{config}/candidates.h5"
+        )
+    train = calls[2 * parts]
+    assert train[train.index("--data") + 1] == str(out / "data") and train[train.index("--steps") + 1] == "7"
+    assert all(call[call.index("--policy") + 1] == train[train.index("--out") + 1] for call in calls[2 * parts + 1 :])
+    again, _ = run_with_stub(tmp_path, "reproduce_keyframe.sh", row, str(out), SCALE="20")
+    assert again.returncode == 2 and "other settings" in again.stderr
+
+
 def make_dataset(tmp_path, episodes):
     """Return the folder of a reproduction with an empty dataset, the input of a study."""
     data = tmp_path / "out" / "data"
@@ -105,6 +129,7 @@ def test_study_trains_on_the_dataset_or_on_a_fraction(tmp_path, what):
     [
         (["study_small.sh", "nowhere"], "nowhere: no dataset. Run: bash scripts/reproduce_small.sh pick nowhere"),
         (["reproduce_small.sh"], "invalid task ''"),
+        (["reproduce_keyframe.sh", "D"], "invalid row 'D'"),
         (["reproduce_small.sh", "open_pick"], "invalid task 'open_pick'"),
         (
             ["dagger_small.sh", "pick", "nowhere"],

@@ -10,25 +10,27 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.baselines.baseline import Batch, OnRead, Split, make_empty_split_error
 from robocas_ms3.baselines.keyframe.config import KeyframeConfig
+from robocas_ms3.baselines.keyframe.decision_files import (
+    RENDER_COMMAND,
+    DecisionFile,
+    DecisionImage,
+    open_decisions,
+)
 from robocas_ms3.baselines.keyframe.gripper_crops import CELLS, CROP_CHANNELS, POSE_FEATURES, augment_crops, make_crops
 from robocas_ms3.baselines.keyframe.handles import HANDLE_RADIUS, Handle, find_pulled_handle
 from robocas_ms3.baselines.keyframe.image_crops import augment_image, draw_crop, resize_inputs
 from robocas_ms3.baselines.keyframe.network import FIRST_NAME, HANDLE, OFFSET_UNIT, PULL_UNIT, STRIDE, make_inputs
 from robocas_ms3.baselines.keyframe.observed_scene import find_table_height, is_in_workspace, sample_pixels, unproject
-from robocas_ms3.baselines.keyframe.perception import CameraFrame
 from robocas_ms3.baselines.training.scenes import TrainingScenes, select_scene_settings
 from robocas_ms3.core.errors import DatasetError
-from robocas_ms3.core.poses import from_wxyz, transform_points
-from robocas_ms3.datasets.candidate_images.images_file import CandidateImages, hash_decisions, images_path
+from robocas_ms3.core.poses import from_wxyz
 from robocas_ms3.datasets.sources.episode_source import FIRST_SLOT, NOTHING, ROBOT
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.training.target_instructions import draw_target_instruction, find_relations
-from robocas_ms3.demos.candidates.candidates_file import FILE_NAME, CandidateFile
+from robocas_ms3.demos.candidates.candidates_file import FILE_NAME
 from robocas_ms3.demos.candidates.tables import Arrays
-from robocas_ms3.robots.camera_models import to_intrinsic_matrix
 from robocas_ms3.scenes.language.embed import DIMENSIONS, TextEmbedder
 from robocas_ms3.scenes.relations import RELATIONS
 
@@ -39,42 +41,6 @@ _FIXED_CAMERA_SCALE = (0.35, 0.8)  # of crops of other cameras than the one on t
 _MIN_POINTS = 15  # on the object of a grasp
 _POINT_STEP = 2  # pixels between points of the cloud
 _BLOCKED = ("straight_line_blocked", "goal_in_collision")  # reasons of failures
-_RENDER = "robocas render-candidates CANDIDATES --views 3 --segmentation"
-
-
-@dataclass(frozen=True)
-class _Image(CameraFrame):
-    """Image of one camera with its segmentation (H, W), see `StepImages`."""
-
-    segmentation: NDArray[np.uint8]
-
-    def crop(self, left: int, top: int, width: int, height: int) -> _Image:
-        """Return a part of the image, in pixels."""
-        part = (slice(top, top + height), slice(left, left + width))
-        intrinsics = self.intrinsics - np.array([[0, 0, left], [0, 0, top], [0, 0, 0]])
-        return _Image(self.rgb[part], self.depth[part], intrinsics, self.camera_in_base, self.segmentation[part])
-
-
-@dataclass(frozen=True)
-class _File:
-    """A candidates file with its images, and by row and slot the centres of the objects (D, K, 3) in the base frame."""
-
-    candidates: CandidateFile
-    images: CandidateImages
-    hand_cameras: tuple[str, ...]
-    other_cameras: tuple[str, ...]
-    centers: NDArray[np.float64]
-
-    def read_image(self, row: int, camera: str) -> _Image:
-        """Return the image of a camera at the decision of a row."""
-        images = self.images
-        return _Image(
-            images.rgb(row, camera),
-            images.depth(row, camera),
-            to_intrinsic_matrix(images.intrinsic(row, camera)),
-            images.camera_in_base(row, camera),
-            images.segmentation(row, camera),
-        )
 
 
 @dataclass(frozen=True)
@@ -117,11 +83,11 @@ class KeyframeSamples:
         self._config, self._split = config, split
         paths = [path] if path.is_file() else sorted(path.rglob(FILE_NAME))
         if not paths:
-            fix = f"Pass a folder of robocas generate --record-candidates, and render its images: {_RENDER}."
+            fix = f"Pass a folder of robocas generate --record-candidates, and render its images: {RENDER_COMMAND}."
             raise DatasetError("no candidates file", where=path, expected=FILE_NAME, fix=fix)
-        self._files: list[_File] = []
+        self._files: list[DecisionFile] = []
         for number, one in enumerate(paths):
-            self._files.append(_open(one, config.image_size))
+            self._files.append(open_decisions(one, config.image_size))
             on_read(number + 1, len(paths))
         names = sorted(
             {str(name) for file in self._files for name in np.unique(file.candidates.decisions["object_name"]) if name}
@@ -251,7 +217,7 @@ class KeyframeSamples:
         }
 
     def _make_labels(
-        self, file: _File, row: int, crop: _Image, handle: Handle | None
+        self, file: DecisionFile, row: int, crop: DecisionImage, handle: Handle | None
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Return the class (h, w) and the offset (3, h, w) of each cell of a crop."""
         width, height = (length // STRIDE for length in self._config.crop_size)
@@ -273,7 +239,7 @@ class KeyframeSamples:
         return label, in_camera.transpose(2, 0, 1).astype(np.float32)
 
     def _read_grasps(
-        self, found: Arrays, image: _Image, rng: np.random.Generator
+        self, found: Arrays, image: DecisionImage, rng: np.random.Generator
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Return crops, pose features and outcomes of some candidates whose object is visible in an image."""
         count = self._config.grasps
@@ -309,15 +275,7 @@ def find_labelled_grasps(candidates: Arrays) -> NDArray[np.bool_]:
     return known & np.isin(candidates["primitive"], ("grasp", "lift")) & np.isfinite(candidates["start_in_base"][:, 0])
 
 
-def _find_handle_cells(image: _Image, handle: Handle | None) -> NDArray[np.bool_]:
-    """Return the pixels (H, W) near a handle."""
-    if handle is None:
-        return np.zeros(image.segmentation.shape, dtype=bool)
-    points, valid = unproject(image.depth, image.intrinsics, image.camera_in_base)
-    return valid & (np.linalg.norm(points - handle.position, axis=-1) < HANDLE_RADIUS)
-
-
-def _make_pull(image: _Image, handle: Handle | None) -> NDArray[np.float64]:
+def _make_pull(image: DecisionImage, handle: Handle | None) -> NDArray[np.float64]:
     """Return the pull (9,) of a handle in the camera frame; zeros without a handle."""
     if handle is None:
         return np.zeros(9)
@@ -325,41 +283,9 @@ def _make_pull(image: _Image, handle: Handle | None) -> NDArray[np.float64]:
     return (vectors @ image.camera_in_base[:3, :3]).ravel()
 
 
-def _open(path: Path, size: tuple[int, int]) -> _File:
-    file = CandidateFile(path)
-    images = CandidateImages(images_path(path), hash_decisions(file))
-    specs = file.recorded_env.cameras()
-    hand = [camera.name for camera in specs if camera.mount == "hand" and camera.name in images.cameras]
-    views = [name for name in images.cameras if name.startswith("view_")]
-    for what, has, expected in (
-        ("depth", images.has_depth, "depth images"),
-        ("segmentation", images.has_segmentation, "segmentation images"),
-        ("views", bool(views and hand), "views of a camera on the hand"),
-        ("size", images.size == size, f"{size[0]} x {size[1]} pixels"),
-    ):
-        if not has:
-            found = f"{images.size[0]} x {images.size[1]} pixels" if what == "size" else f"no {what}"
-            fix = f"Render the images again: {_RENDER} --size {size[0]} {size[1]} --overwrite."
-            raise DatasetError(
-                "these images do not suit keyframe", where=images.path, expected=expected, found=found, fix=fix
-            )
-    others = [camera.name for camera in specs if camera.mount != "hand" and camera.name in images.cameras]
-    return _File(file, images, (hand[0], *views), tuple(others), _compute_centers(file))
-
-
-def _compute_centers(file: CandidateFile) -> NDArray[np.float64]:
-    """Return the centres (D, K, 3) of the objects in the arm's base frame, m; NaN in empty slots."""
-    decisions, pack = file.decisions, load_pack(file.recorded_env.kwargs.get("pack", "builtin"))
-    ids = [str(one) for one in np.unique(decisions["object_id"]) if one]
-    unknown = sorted(set(ids) - set(pack.objects))
-    if unknown:
-        fix = "Install the pack of the recording."
-        raise DatasetError(
-            "unknown objects", where=file.path, expected=f"objects of {pack.root}", found=unknown, fix=fix
-        )
-    middles = {one: pack.objects[one].surface_points().mean(axis=0) for one in ids}
-    centers = np.full((*decisions["present"].shape, 3), np.nan)
-    for row, slot in np.argwhere(decisions["present"]).tolist():
-        pose = from_wxyz(decisions["object_in_base"][row, slot].astype(np.float64))
-        centers[row, slot] = transform_points(pose, middles[str(decisions["object_id"][row, slot])][None])[0]
-    return centers
+def _find_handle_cells(image: DecisionImage, handle: Handle | None) -> NDArray[np.bool_]:
+    """Return the pixels (H, W) near a handle."""
+    if handle is None:
+        return np.zeros(image.segmentation.shape, dtype=bool)
+    points, valid = unproject(image.depth, image.intrinsics, image.camera_in_base)
+    return valid & (np.linalg.norm(points - handle.position, axis=-1) < HANDLE_RADIUS)

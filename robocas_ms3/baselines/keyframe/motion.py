@@ -27,7 +27,7 @@ _MAX_TRANSLATION, _MAX_ROTATION = 0.095, 0.45  # m along an axis and rad per con
 _MAX_JOINT_STEP = 0.4  # rad per control step
 _RELEASE_TILTS_DEG, _RELEASE_SIDES = (0, 15, 30, 45, 60, 72), (0.0, -0.4, 0.4)  # degrees; rad about the vertical
 _RELEASE_NEARER = (0.0, 0.05)  # m towards the base
-_FRONT_DISTANCE, _FRONT_LIFT = 0.2, 0.025  # m in front of the pre-grasp, and above it on the way back
+_FRONT_DISTANCES, _FRONT_LIFT = (0.2, 0.15, 0.1, 0.06), 0.025  # m before the pre-grasp; m of the way back above it
 _PULL_STEP, _PULL_STANDOFF, _RETREATS = 0.015, 0.08, (0.15, 0.1, 0.06)  # m
 _PULL_TURNS = np.deg2rad((0, -20, 20, -40, 40))  # about the bar
 _LOWER, _NEARER = (
@@ -163,25 +163,29 @@ class ArmPaths:
 
         The gripper enters towards the object, and moves back out after a short lift. Arguments as in `plan_approach`.
         """
+        turn = np.diag([-1.0, -1.0, 1.0, 1.0])
         for index in np.argsort(-scores, kind="stable").tolist():
-            for grasp in (grasps[index], grasps[index] @ np.diag([-1.0, -1.0, 1.0, 1.0])):
-                before = grasp.copy()
-                before[:3, 3] -= PREGRASP * grasp[:3, 2]
-                outside = before.copy()
-                outside[:2, 3] -= _FRONT_DISTANCE * grasp[:2, 2] / np.linalg.norm(grasp[:2, 2])
-                reachable, found = self.reach(np.stack([outside, before, grasp]), qpos)
-                if not reachable.all():
-                    continue
-                inwards = self._connect(found[0], [before, grasp])
-                if inwards is None:
-                    continue
-                raised = [pose.copy() for pose in (grasp, before, outside)]
-                for pose in raised:
-                    pose[2, 3] += _FRONT_LIFT
-                way_back = self._connect(inwards[-1], raised)
-                if way_back is not None:
-                    return Approach(grasp, found[0], inwards, way_back)
+            for grasp in (grasps[index], grasps[index] @ turn):
+                for distance in _FRONT_DISTANCES:
+                    found = self._plan_entry(grasp, distance, qpos)
+                    if found is not None:
+                        return found
         return None
+
+    def _plan_entry(self, grasp: Array, distance: float, qpos: Array) -> Approach | None:
+        """Return the approach of a grasp (4, 4) that starts ``distance`` m before the pre-grasp, or None."""
+        before = grasp.copy()
+        before[:3, 3] -= PREGRASP * grasp[:3, 2]
+        outside = before.copy()
+        outside[:2, 3] -= distance * grasp[:2, 2] / np.linalg.norm(grasp[:2, 2])
+        reachable, found = self.reach(np.stack([outside, before, grasp]), qpos)
+        inwards = self._connect(found[0], [before, grasp]) if reachable.all() else None
+        if inwards is None:
+            return None
+        raised = np.stack([grasp, before, outside])
+        raised[:, 2, 3] += _FRONT_LIFT
+        way_back = self._connect(inwards[-1], list(raised))
+        return None if way_back is None else Approach(grasp, found[0], inwards, way_back)
 
     def _connect(self, qpos: Array, poses: list[Array]) -> Array | None:
         """Return straight paths (n, 7) through TCP poses (4, 4), one after another, or None."""

@@ -12,6 +12,7 @@ from synthetic import RayCaster, write_trajectory
 
 from robocas_ms3.baselines.keyframe.config import KeyframeConfig
 from robocas_ms3.baselines.keyframe.data import KeyframeSamples, find_labelled_grasps
+from robocas_ms3.baselines.keyframe.handles import find_pulled_handle
 from robocas_ms3.baselines.keyframe.network import FIRST_NAME, OFFSET_UNIT, KeyframeNetwork
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.datasets.candidate_images.render import render_candidates
@@ -86,6 +87,26 @@ def test_unreachable_grasps_have_no_label():
         "start_in_base": np.zeros((5, 7)),
     }
     assert find_labelled_grasps(candidates).tolist() == [True, True, False, True, False]
+
+
+def test_the_handle_is_the_mean_of_successful_pulls():
+    half = np.sqrt(0.5)  # TCP: x up, z along the x axis of the base
+    poses = np.array(
+        [[0.47, -0.27, 0.06, half, 0, half, 0], [0.49, -0.27, 0.1, half, 0, half, 0], [0.9, 0, 0, 1, 0, 0, 0]]
+    )
+    poses[0, 3:] = 0, half, 0, half  # half a turn about the approach
+    ends = poses + [0.0, 0.5, 0, 0, 0, 0, 0]
+    candidates = {
+        "primitive": np.array(["pull"] * 3),
+        "success": np.array([True, True, False]),
+        "start_in_base": poses,
+        "final_in_base": ends,
+    }
+    handle = find_pulled_handle(candidates)
+    assert np.allclose(handle.position, [0.48, -0.27, 0.08]) and np.allclose(handle.motion, [0, 0.5, 0])
+    assert np.allclose(handle.approach, [1, 0, 0]) and np.allclose(np.abs(handle.bar), [0, 0, 1])
+    assert np.allclose(handle.grasp[:3, 2], [1, 0, 0]) and np.linalg.det(handle.grasp[:3, :3]) == pytest.approx(1)
+    assert find_pulled_handle(candidates | {"success": np.zeros(3, bool)}) is None
 
 
 def test_loss_of_a_batch_decreases(validation):

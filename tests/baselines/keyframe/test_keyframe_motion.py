@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.baselines.keyframe.handles import Handle
 from robocas_ms3.baselines.keyframe.motion import LIFT, PREGRASP, ArmPaths, PathFollower, find_release_poses, find_views
 from robocas_ms3.core.poses import from_rotation, inverse
 from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
@@ -63,6 +64,46 @@ def test_views_have_the_point_in_the_middle_of_the_image():
     assert np.allclose(in_camera[:, :2], 0, atol=1e-9)
     assert set(np.round(in_camera[:, 2], 6)) == {0.5, 0.4}
     assert np.allclose((poses @ camera_in_tcp)[costs.argmin()][:3, 2], [0, 0, -1], atol=1e-9)  # straight down
+
+
+def make_handle(motion):
+    return Handle(np.array([0.475, -0.27, 0.08]), np.array(motion), np.array([1.0, 0, 0]), np.array([0, 0, 1.0]))
+
+
+def test_pull_moves_the_handle_along_its_line(paths):
+    handle = make_handle([0.0, 0.5, 0.0])
+    pull = paths.plan_pull(handle, REST)
+    start = paths.chain.tcp(pull.start[None])[0]
+    assert np.allclose(start[:3, 3] + 0.08 * start[:3, 2], handle.position, atol=1e-3)  # straight back from the handle
+    held = paths.chain.tcp(pull.pull)
+    assert np.allclose(held[0, :3, 3], handle.position, atol=1e-3)
+    assert np.allclose(held[-1, :3, 3], handle.position + handle.motion, atol=1e-3)
+    assert np.abs(held[:, [0, 2], 3] - held[0, [0, 2], 3]).max() < 1e-3
+    assert np.abs(np.abs(held[:, 2, 0]) - 1).max() < 1e-2  # the gripper turns about the bar only
+    away = paths.chain.tcp(pull.way_back[-1:])[0]
+    assert np.linalg.norm(away[:3, 3] - held[-1, :3, 3]) > 0.05
+
+
+def test_a_pull_out_of_reach_is_as_long_as_possible(paths):
+    pull = paths.plan_pull(make_handle([0.0, 1.5, 0.0]), REST)
+    end = paths.chain.tcp(pull.pull[-1:])[0, 1, 3]
+    assert 0.2 < end < 0.9
+    far = Handle(np.array([3.0, 0, 0]), np.array([0, 0.5, 0]), np.array([1.0, 0, 0]), np.array([0, 0, 1.0]))
+    assert paths.plan_pull(far, REST) is None
+
+
+def test_front_approach_enters_and_leaves_a_compartment(paths):
+    approach = np.array([np.sin(1.2), 0, -np.cos(1.2)])  # 69 degrees from the vertical
+    closing = np.array([0.0, 1.0, 0.0])
+    grasp = from_rotation([0.65, -0.05, 0.2], np.stack([np.cross(closing, approach), closing, approach], axis=1))
+    far = from_rotation([2.0, 0, 0.2], grasp[:3, :3])
+    found = paths.plan_front_approach(np.stack([far, grasp]), np.array([0.9, 0.5]), REST)
+    assert np.allclose(found.grasp[:3, 3], grasp[:3, 3])
+    outside, inside, after = paths.chain.tcp(np.stack([found.start, found.path[-1], found.way_back[-1]]))
+    assert np.allclose(inside, found.grasp, atol=1e-3)
+    assert outside[0, 3] < 0.65 - 0.15 and after[0, 3] < 0.65 - 0.15  # 6 cm or more before the pre-grasp
+    heights = paths.chain.tcp(found.way_back)[:, 2, 3]
+    assert heights.min() > 0.199 and after[2, 3] == pytest.approx(outside[2, 3] + 0.025, abs=1e-3)
 
 
 def test_release_poses_tilt_away_from_the_base():
