@@ -11,6 +11,7 @@ from synthetic_observations import observe, start
 from robocas_ms3.baselines.keyframe import KeyframeConfig, KeyframeNetwork, KeyframePolicy
 from robocas_ms3.baselines.keyframe.arm_control import CLOSED, OPEN, ArmControl, EpisodeObservation
 from robocas_ms3.baselines.keyframe.episode import KeyframeEpisode
+from robocas_ms3.baselines.keyframe.handles import Handle
 from robocas_ms3.baselines.keyframe.motion import ArmPaths
 from robocas_ms3.baselines.keyframe.observed_scene import ObservedObject, ObservedScene
 from robocas_ms3.baselines.keyframe.perception import CameraFrame, Request, Survey
@@ -35,13 +36,14 @@ def make_block(center, size=0.04, count=600):
 
 
 class FakePerception:
-    """Perception that sees the present blocks and the table; the first block is the target."""
+    """Perception that sees the present blocks and the table, or a closed door with a handle before them."""
 
-    def __init__(self, blocks):
-        self.blocks = blocks
+    def __init__(self, blocks, door=None):
+        self.blocks, self.door = blocks, door
 
     def survey(self, frames, default_table):
-        return Survey(np.array([0.55, 0.0]), BASKET, TABLE)
+        handle = None if self.door is None or self.door.opening > 0.9 else self.door.handle
+        return Survey(np.array([0.55, 0.0]), BASKET, TABLE, handle, has_roof=self.door is not None)
 
     def observe(self, frame, request, table):
         x, y = np.meshgrid(np.arange(0.3, 0.8, 0.01), np.arange(-0.4, 0.3, 0.01))
@@ -63,10 +65,10 @@ class FakePerception:
 
 
 class FakeArm:
-    """Arm that reaches each commanded pose exactly and grasps a block that is between the closed fingers."""
+    """Arm that reaches each commanded pose exactly and grasps a block or handle that is between the closed fingers."""
 
-    def __init__(self, paths, blocks):
-        self.paths, self.blocks, self.qpos, self.held = paths, blocks, REST, None
+    def __init__(self, paths, blocks, door=None):
+        self.paths, self.blocks, self.qpos, self.held, self.door = paths, blocks, REST, None, door
         self.released: list[tuple[str, np.ndarray]] = []
 
     @property
@@ -82,19 +84,36 @@ class FakeArm:
         motion = from_rotation(command.action[:3], Rotation.from_euler("xyz", command.action[3:6]).as_matrix())
         assert np.abs(command.action[:3]).max() <= 0.1
         goal = self.tcp @ motion
-        path = self.paths.straight(self.qpos, goal)
-        assert path is not None
-        self.qpos = path[-1]
+        reachable, found = self.paths.reach(goal[None], self.qpos)
+        assert reachable[0]
+        self.qpos = found[0]
         position = self.tcp[:3, 3]
         if command.action[6] == CLOSED and self.held is None:
             near = [name for name, center in self.blocks.items() if np.linalg.norm(center - position[:2]) < 0.03]
             if near and position[2] < TABLE + 0.06:
                 self.held = near[0]
                 del self.blocks[near[0]]
+        if self.door is not None:
+            self.door.follow(position, command.action[6] == CLOSED)
         if command.action[6] == OPEN and self.held is not None:
             self.released.append((self.held, position))
             self.held = None
         return self.view(command.requests_images)
+
+
+class FakeDoor:
+    """Door that follows a closed gripper at its handle."""
+
+    def __init__(self):
+        ends = np.array([0.45, -0.27, 0.2]), np.array([0.0, 0.4, 0.0])
+        self.handle = Handle(*ends, np.array([1.0, 0, 0]), np.array([0, 0, 1.0]))
+        self.opening, self.is_held = 0.0, False
+
+    def follow(self, position, closed):
+        here = self.handle.position + self.opening * self.handle.motion
+        self.is_held = closed and (self.is_held or np.linalg.norm(position - here) < 0.01)
+        if self.is_held:
+            self.opening = float((position - self.handle.position) @ self.handle.motion / 0.4**2)
 
 
 @pytest.fixture(scope="module")
@@ -102,11 +121,11 @@ def paths():
     return ArmPaths(find_robot(DEFAULT_ROBOT))
 
 
-def play(paths, blocks, request=None, steps=150):
-    arm = FakeArm(paths, blocks)
+def play(paths, blocks, request=None, steps=150, door=None):
+    arm = FakeArm(paths, blocks, door)
     request = request or Request(np.ones(1, np.float32), None)
     rng = np.random.default_rng(0)
-    perception = FakePerception(blocks)
+    perception = FakePerception(blocks, door)
     control = ArmControl(paths, 1)
     episode = KeyframeEpisode(perception, control, CONFIG.decisions, request, rng, "gripper_camera")
     run = episode.run(arm.view(images=True))
@@ -135,6 +154,14 @@ def test_an_object_is_moved_aside_if_the_target_is_not_seen(paths):
     arm = play(paths, {"other": np.array([0.55, 0.0])})
     (name, position), *_ = arm.released
     assert name == "other" and np.linalg.norm(position[:2] - BASKET[:2]) > 0.2 and position[2] < TABLE + 0.1
+
+
+def test_the_door_is_opened_before_the_target_is_grasped(paths):
+    door = FakeDoor()
+    arm = play(paths, {"target": np.array([0.62, -0.1])}, door=door)
+    assert door.opening > 0.95
+    (name, position), *_ = arm.released
+    assert name == "target" and np.linalg.norm(position[:2] - BASKET[:2]) < 0.06
 
 
 def observe_with_images(envs):
