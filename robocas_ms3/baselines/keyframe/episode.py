@@ -20,10 +20,11 @@ from robocas_ms3.baselines.keyframe.arm_control import (
     MotionError,
 )
 from robocas_ms3.baselines.keyframe.config import DecisionSettings
+from robocas_ms3.baselines.keyframe.free_places import HeightMap
 from robocas_ms3.baselines.keyframe.grasp_proposals import propose_colliding_grasps, propose_grasps
 from robocas_ms3.baselines.keyframe.handles import Handle
 from robocas_ms3.baselines.keyframe.motion import LIFT, TOP_VIEWS_DEG, Approach, find_release_poses, find_views
-from robocas_ms3.baselines.keyframe.observed_scene import HeightMap, ObservedObject, ObservedScene
+from robocas_ms3.baselines.keyframe.observed_scene import ObservedObject, ObservedScene
 from robocas_ms3.baselines.keyframe.perception import Perception, Request
 from robocas_ms3.core.poses import Array, from_rotation, inverse
 from robocas_ms3.scenes.grasp_checks import is_gripper_clear
@@ -42,9 +43,7 @@ _CARRY_CLEARANCE = 0.15  # m between the rim and the TCP on the way to the baske
 _PLACE_HEIGHT = 0.38  # m, least height of the TCP on the way to a free place
 _DROP = 0.02  # m that an object falls at a free place
 _REPEAT_DISTANCE = 0.02  # m around a failed grasp in which similar grasps lose score
-_FREE_CELLS = (11, 7)  # sizes of free squares in cells of 2 cm, the preferred one first
-_PLACES, _PLACE_POSES = 20, 10  # free places, and poses at them, that are tried
-_PLACE_DISTANCES = (0.35, 0.8)  # m from the base, least and greatest distance of a free place
+_PLACE_POSES = 10  # poses at free places that are tried
 _TARGET_GAP, _BASKET_GAP = 0.16, 0.28  # m between a free place and the target, and the basket
 _IN_BASKET = 0.14  # m from the middle of the basket, within which an object is in it
 _SURE = 0.6  # probability of a target, above which less probable targets are ignored
@@ -325,7 +324,10 @@ class KeyframeEpisode:
     def _place(self, observation: EpisodeObservation, chosen: _Keyframe) -> Motion:
         """Place the held object at a free place of the surface."""
         poses, costs = [], []
-        for place in self._find_free_places(observation):
+        avoid = [(self._focus, _TARGET_GAP)]
+        if self._basket is not None:
+            avoid.append((self._basket[:2], _BASKET_GAP))
+        for place in self._map.find_free_places(self._table, observation.tcp_in_base[:2, 3], avoid):
             for turn in np.arange(-np.pi, np.pi, np.pi / 4):
                 rotation = Rotation.from_euler("z", turn).as_matrix() @ chosen.approach.grasp[:3, :3]
                 poses.append(from_rotation([*place, self._table + chosen.hanging + _DROP], rotation))
@@ -341,21 +343,6 @@ class KeyframeEpisode:
                 observation = yield from self._arm.move_joints(observation, qpos, CLOSED)
                 return (yield from self._arm.move_straight(observation, poses[index], CLOSED))
         raise MotionError
-
-    def _find_free_places(self, observation: EpisodeObservation) -> Array:
-        """Return free places (N, 2) of the surface, the nearest first, m."""
-        for cells in _FREE_CELLS:
-            places = self._map.find_free_squares(self._table, cells)
-            distance = np.linalg.norm(places, axis=1)
-            fits = (distance > _PLACE_DISTANCES[0]) & (distance < _PLACE_DISTANCES[1])
-            fits &= np.linalg.norm(places - self._focus, axis=1) > _TARGET_GAP
-            if self._basket is not None:
-                fits &= np.linalg.norm(places - self._basket[:2], axis=1) > _BASKET_GAP
-            if fits.any():
-                places = places[fits]
-                order = np.argsort(np.linalg.norm(places - observation.tcp_in_base[:2, 3], axis=1), kind="stable")
-                return places[order[: 2 * _PLACES : 2]]  # neighbours are 2 cm apart
-        return np.zeros((0, 2))
 
 
 def _find_middle(scene: ObservedScene) -> Array:

@@ -1,4 +1,4 @@
-"""The scene as a policy observes it: a point cloud with classes, its objects, and a height map."""
+"""The scene as a policy observes it: a point cloud with classes, and its objects."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ Array = NDArray[np.float64]
 WIDE_RADIUS, NARROW_RADIUS = 0.035, 0.015
 """m within which votes for the centre of an object belong together; the narrow one tells touching copies apart."""
 _WORKSPACE = ((0.15, 1.15), (-0.9, 0.9), (-0.1, 0.6))  # m, least and greatest x, y and z in the arm's base frame
-_MAP_X, _MAP_Y, _MAP_CELL = (0.2, 1.05), (-0.8, 0.8), 0.02  # m
 _TABLE_BINS = (-0.1, 0.6, 200)  # m, m, number of bins of the histogram of heights
 _MAX_VOTES = 1200  # cells of an object that vote
 _FARTHEST_VOTE = 2.0  # radii from the centre, beyond which a vote belongs to another object
@@ -134,27 +133,3 @@ class ObservedScene:
     is_object: NDArray[np.bool_]
     targets: list[ObservedObject]
     objects: list[ObservedObject]
-
-
-class HeightMap:
-    """Greatest observed height of each cell of the workspace; NaN where nothing was observed."""
-
-    def __init__(self) -> None:
-        shape = tuple(round((high - low) / _MAP_CELL) for low, high in (_MAP_X, _MAP_Y))
-        self.heights = np.full(shape, np.nan)
-
-    def update(self, points: Array) -> None:
-        """Replace the heights of the cells that have points (P, 3)."""
-        cells = np.floor((points[:, :2] - (_MAP_X[0], _MAP_Y[0])) / _MAP_CELL).astype(int)
-        inside = ((cells >= 0) & (cells < self.heights.shape)).all(axis=1)
-        new = np.full(self.heights.shape, -np.inf)
-        np.maximum.at(new, tuple(cells[inside].T), points[inside, 2])
-        observed = np.isfinite(new)
-        self.heights[observed] = new[observed]
-
-    def find_free_squares(self, table: float, cells: int) -> Array:
-        """Return the middles (N, 2) of squares of ``cells`` x ``cells`` cells on the surface with nothing on it, m."""
-        free = np.isfinite(self.heights) & (self.heights < table + 0.012)
-        windows = np.lib.stride_tricks.sliding_window_view(free, (cells, cells)).all(axis=(2, 3))
-        squares = (np.argwhere(windows) + cells / 2) * _MAP_CELL + (_MAP_X[0], _MAP_Y[0])
-        return np.asarray(squares, np.float64)

@@ -6,13 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.baselines.keyframe.free_places import HeightMap
 from robocas_ms3.baselines.keyframe.grasp_proposals import propose_colliding_grasps, propose_grasps
 from robocas_ms3.baselines.keyframe.gripper_crops import CELL, CELLS, augment_crops, make_crops
 from robocas_ms3.baselines.keyframe.network import make_inputs
 from robocas_ms3.baselines.keyframe.observed_scene import (
     NARROW_RADIUS,
     WIDE_RADIUS,
-    HeightMap,
     cluster_votes,
     find_table_height,
     sample_pixels,
@@ -95,6 +95,18 @@ def test_free_squares_are_empty_and_observed():
     assert len(squares) == 36 and np.allclose(squares.mean(axis=0), [0.5, 0], atol=1e-6)
     heights.update(np.array([[0.5, 0.0, 0.2]]))  # an object in the middle
     assert np.abs(heights.find_free_squares(0.12, 5) - [0.51, 0.01]).max(axis=1).min() > 0.05
+
+
+def test_free_places_keep_their_distances():
+    heights = HeightMap()
+    x, y = np.meshgrid(np.arange(0.3, 0.9, 0.01), np.arange(-0.4, 0.4, 0.01))
+    heights.update(np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.12)], axis=1))
+    focus, near = np.array([0.6, 0.0]), np.array([0.6, -0.3])
+    places = heights.find_free_places(0.12, near, [(focus, 0.16)])
+    assert 0 < len(places) <= 20 and (np.linalg.norm(places - focus, axis=1) > 0.16).all()
+    distances = np.linalg.norm(places - near, axis=1)
+    assert (np.diff(distances) >= 0).all() and distances[0] < 0.05
+    assert not len(heights.find_free_places(0.12, near, [(focus, 2.0)]))
 
 
 def test_crop_shows_the_surface_in_the_tcp_frame():
