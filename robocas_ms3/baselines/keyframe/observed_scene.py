@@ -15,7 +15,8 @@ _TABLE_BINS = (-0.1, 0.6, 200)  # m, m, number of bins of the histogram of heigh
 _MAX_VOTES = 1200  # cells of an object that vote
 _FARTHEST_VOTE = 2.0  # radii from the centre, beyond which a vote belongs to another object
 _LEAST_SHARE = 0.1  # of the votes of the largest group; smaller groups are errors
-_SUPPORT_RANGE, _SUPPORT_POINTS = 0.04, 100  # m around the lowest objects; least number of points on their support
+_SUPPORT_RANGE = (-0.12, 0.02)  # m from the lowest visible point of the objects, which may be the top of an object
+_SUPPORT_MARGIN, _SUPPORT_POINTS = 0.1, 100  # m around the objects; least number of points on their support
 
 
 def unproject(
@@ -50,7 +51,7 @@ def is_in_workspace(points: Array) -> NDArray[np.bool_]:
 
 
 def find_table_height(others: Array, objects: Array) -> float:
-    """Return the height of the surface on which objects stand, m: the commonest height of points near their bottom.
+    """Return the height of the surface on which objects stand, m: the commonest height of points around and below them.
 
     Args:
         others: (P, 3) points on no object, m.
@@ -59,7 +60,9 @@ def find_table_height(others: Array, objects: Array) -> float:
     heights = others[:, 2]
     if len(objects):
         bottom = np.percentile(objects[:, 2], 2)
-        heights = heights[np.abs(heights - bottom) < _SUPPORT_RANGE]
+        low_xy, high_xy = objects[:, :2].min(axis=0) - _SUPPORT_MARGIN, objects[:, :2].max(axis=0) + _SUPPORT_MARGIN
+        around = ((others[:, :2] > low_xy) & (others[:, :2] < high_xy)).all(axis=1)
+        heights = heights[around & (heights > bottom + _SUPPORT_RANGE[0]) & (heights < bottom + _SUPPORT_RANGE[1])]
         if len(heights) < _SUPPORT_POINTS:
             return float(bottom)
     low, high, bins = _TABLE_BINS
