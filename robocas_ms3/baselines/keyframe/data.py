@@ -19,7 +19,7 @@ from robocas_ms3.baselines.keyframe.decision_files import (
     open_decisions,
 )
 from robocas_ms3.baselines.keyframe.gripper_crops import CELLS, CROP_CHANNELS, POSE_FEATURES, augment_crops, make_crops
-from robocas_ms3.baselines.keyframe.handles import HANDLE_RADIUS, Handle, find_pulled_handle
+from robocas_ms3.baselines.keyframe.handles import Handle, find_pulled_handle
 from robocas_ms3.baselines.keyframe.image_crops import augment_image, draw_crop, resize_inputs
 from robocas_ms3.baselines.keyframe.network import FIRST_NAME, HANDLE, OFFSET_UNIT, PULL_UNIT, STRIDE, make_inputs
 from robocas_ms3.baselines.keyframe.observed_scene import find_table_height, is_in_workspace, sample_pixels, unproject
@@ -37,7 +37,7 @@ from robocas_ms3.scenes.relations import RELATIONS
 _CROPS = 64  # random crops of each image per epoch of the training; a sample is one of them
 _TEXTS = 4  # instructions per image of a batch
 _DRAWN_TEXTS = 3  # instructions per object and decision, of which one is from the paraphrases for training
-_FIXED_CAMERA_SCALE = (0.35, 0.8)  # of crops of other cameras than the one on the hand, which are farther away
+_FIXED_CAMERA_SCALE = (0.6, 1.2)  # of crops of other cameras than the one on the hand, which are farther away
 _MIN_POINTS = 15  # on the object of a grasp
 _POINT_STEP = 2  # pixels between points of the cloud
 _BLOCKED = ("straight_line_blocked", "goal_in_collision")  # reasons of failures
@@ -101,6 +101,7 @@ class KeyframeSamples:
         self._samples = [
             _Sample(number, row, camera) for number, row in rows for camera in self._cameras_of(number, row)
         ]
+        self._handles = {place: handle for place in rows if (handle := self._find_handle(*place)) is not None}
         self.episodes = len({(number, int(self._decisions(number)["seed"][row])) for number, row in rows})
         first = self._files[0]
         self.facts: dict[str, Any] = {
@@ -137,6 +138,18 @@ class KeyframeSamples:
             chosen = split_by_seed(seeds)[split == "val"]
             found += [(number, row) for row in chosen if decisions["held_slot"][row] < 0]
         return found
+
+    def _find_handle(self, number: int, row: int) -> Handle | None:
+        """Return the handle that a decision pulls, or that an earlier decision of the same seed has pulled, or None."""
+        file, decisions = self._files[number], self._decisions(number)
+        if not np.isfinite(decisions["opening"][row]):
+            return None
+        for earlier in range(row, row - int(decisions["decision"][row]) - 1, -1):
+            if decisions["kind"][earlier] == "pull":
+                handle = find_pulled_handle(file.candidates.decision(earlier).candidates)
+                if handle is not None:
+                    return handle if earlier == row else handle.open()
+        return None
 
     def _cameras_of(self, number: int, row: int) -> list[str]:
         file = self._files[number]
@@ -186,9 +199,11 @@ class KeyframeSamples:
         is_train, is_on_hand = self._split == "train", camera in file.hand_cameras
         image = file.read_image(row, camera)
         scale = self._config.crop_scale if is_on_hand else _FIXED_CAMERA_SCALE
-        found = file.candidates.decision(row).candidates
-        handle = find_pulled_handle(found)
-        is_object = (image.segmentation >= FIRST_SLOT) | _find_handle_cells(image, handle)
+        found, handle = file.candidates.decision(row).candidates, self._handles.get((sample.file, row))
+        is_object = image.segmentation >= FIRST_SLOT
+        if handle is not None:
+            points, valid = unproject(image.depth, image.intrinsics, image.camera_in_base)
+            is_object |= valid & handle.contains(points)
         crop = image.crop(*draw_crop(is_object, self._config.crop_size, scale, rng))
         inputs = make_inputs(crop.rgb, crop.depth, crop.intrinsics, crop.camera_in_base)
         inputs = resize_inputs(inputs, self._config.crop_size)
@@ -232,7 +247,7 @@ class KeyframeSamples:
         points, _ = unproject(crop.depth, crop.intrinsics, crop.camera_in_base, (rows, columns))
         label, ends = classes[values], centers[values]
         if handle is not None:
-            is_handle = (values == NOTHING) & (np.linalg.norm(points - handle.position, axis=-1) < HANDLE_RADIUS)
+            is_handle = (values == NOTHING) & handle.contains(points)
             label[is_handle], ends[is_handle] = HANDLE, handle.position
         in_camera = (ends - points) @ crop.camera_in_base[:3, :3] / OFFSET_UNIT
         in_camera[label < HANDLE] = 0
@@ -281,11 +296,3 @@ def _make_pull(image: DecisionImage, handle: Handle | None) -> NDArray[np.float6
         return np.zeros(9)
     vectors = np.stack([handle.motion / PULL_UNIT, handle.approach, handle.bar])
     return (vectors @ image.camera_in_base[:3, :3]).ravel()
-
-
-def _find_handle_cells(image: DecisionImage, handle: Handle | None) -> NDArray[np.bool_]:
-    """Return the pixels (H, W) near a handle."""
-    if handle is None:
-        return np.zeros(image.segmentation.shape, dtype=bool)
-    points, valid = unproject(image.depth, image.intrinsics, image.camera_in_base)
-    return valid & (np.linalg.norm(points - handle.position, axis=-1) < HANDLE_RADIUS)

@@ -49,6 +49,7 @@ _IN_BASKET = 0.14  # m from the middle of the basket, within which an object is 
 _SURE = 0.6  # probability of a target, above which less probable targets are ignored
 _MAX_OBSTACLES = 5  # obstacles for which grasps are computed per decision
 _MAX_PULLS, _PULL_SPEED = 4, 0.3  # pulls per episode; fraction of the limits
+_OPEN = 0.08  # m, length of a pull below which a door or drawer is open
 _FRONT_VIEWS_DEG = (40, 30, 50, 20)  # elevations of the gripper camera before a compartment, degrees
 _log = logging.getLogger(__name__)
 
@@ -247,7 +248,7 @@ class KeyframeEpisode:
     def _open_compartment(self, observation: EpisodeObservation) -> Motion:
         """Pull the handle until the door or drawer is open; then survey the scene again."""
         arm = self._arm
-        while self._handle is not None and self._pulls < _MAX_PULLS:
+        while self._handle is not None and np.linalg.norm(self._handle.motion) > _OPEN and self._pulls < _MAX_PULLS:
             handle, self._handle = self._handle, None
             self._pulls += 1
             planned = arm.paths.plan_pull(handle, observation.qpos)

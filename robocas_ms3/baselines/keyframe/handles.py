@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,17 +11,16 @@ from robocas_ms3.core.poses import from_rotation, from_wxyz
 from robocas_ms3.demos.candidates.tables import Arrays
 
 Array = NDArray[np.float64]
-HANDLE_RADIUS = 0.06
-"""m around the grasp of a handle, within which surfaces belong to it."""
+_BAR_RADIUS, _BAR_HALF_LENGTH = 0.025, 0.08  # m from the axis of the bar, and along it from the grasp
 
 
 @dataclass(frozen=True)
 class Handle:
-    """Handle of a closed door or drawer, in the arm's base frame.
+    """Handle of a door or drawer, in the arm's base frame.
 
     Attributes:
         position: (3,) TCP position of the grasp, m.
-        motion: (3,) straight motion of the TCP that opens the door or drawer, m.
+        motion: (3,) straight motion of the TCP that opens the door or drawer, m; zero if it is open.
         approach: (3,) approach direction of the gripper, a unit vector.
         bar: (3,) axis of the bar, a unit vector.
     """
@@ -38,6 +37,17 @@ class Handle:
         x = self.bar - z * (z @ self.bar)
         x /= np.linalg.norm(x)
         return from_rotation(self.position, np.stack([x, np.cross(z, x), z], axis=1))
+
+    def contains(self, points: Array) -> NDArray[np.bool_]:
+        """Return which points (..., 3) are on the bar near the grasp, up to 2.5 cm from its axis."""
+        offsets = points - self.position
+        along = offsets @ self.bar
+        away = np.linalg.norm(offsets - along[..., None] * self.bar, axis=-1)
+        return (away < _BAR_RADIUS) & (np.abs(along) < _BAR_HALF_LENGTH)
+
+    def open(self) -> Handle:
+        """Return the handle after the motion."""
+        return replace(self, position=self.position + self.motion, motion=np.zeros(3))
 
 
 def find_pulled_handle(candidates: Arrays) -> Handle | None:

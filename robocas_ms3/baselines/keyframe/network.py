@@ -17,7 +17,7 @@ from robocas_ms3.scenes.language.embed import DIMENSIONS
 from robocas_ms3.scenes.relations import RELATIONS
 
 BACKGROUND, BASKET, ROBOT, HANDLE, FIRST_NAME = range(5)
-"""Classes of the cells of an image: other surfaces, the basket, the robot, the handle of a closed door or drawer, and
+"""Classes of the cells of an image: other surfaces, the basket, the robot, the handle of a door or drawer, and
 the first object name."""
 STRIDE = 4
 """Pixels per cell, horizontally and vertically."""
@@ -202,7 +202,7 @@ class KeyframeNetwork(nn.Module):
         offset = torch.stack([(distance * is_object).sum(), is_object.sum()])
         distance = (pulls.float() - batch["pull"][:, :, None, None]).abs().sum(dim=1)
         pull = torch.stack([(distance * is_handle).sum(), is_handle.sum()])
-        weights = torch.where(is_object, 1.5, 0.5)
+        weights = torch.where(is_handle, 4.0, torch.where(is_object, 1.5, 0.5))
         segmentation = (F.cross_entropy(logits, label, reduction="none") * weights).sum() / weights.sum()
         names, relations = self.instruction(batch["text"].flatten(0, 1))
         text = F.cross_entropy(names.float(), batch["name"].flatten())

@@ -40,7 +40,7 @@ from robocas_ms3.scenes.relations import RELATIONS, Relation
 Array = NDArray[np.float64]
 _POINT_STEP = 2  # pixels between points of the cloud
 _SURE = 0.6  # probability of an object or the basket in the images of a survey
-_MIN_HANDLE_CELLS = 8
+_SURE_HANDLE, _MIN_HANDLE_CELLS = 0.4, 5  # probability and number of cells of a handle
 _ROOF_RADIUS, _ROOF_CLEARANCE, _ROOF_CELLS = 0.2, 0.12, 60  # m around and above the objects; least number of cells
 _EDGE = 2  # percent of the points of the basket that may be outside of its bounds
 
@@ -83,7 +83,7 @@ class Survey:
         focus: (2,) middle of the objects, m, in the arm's base frame.
         basket: (3,) middle of the basket in x and y, and the height of its rim, m; None: not seen.
         table: height of the surface, m.
-        handle: handle of a closed door or drawer, or None.
+        handle: handle of a door or drawer, or None.
         has_roof: whether something is above the objects, so that they have to be grasped from the front.
     """
 
@@ -143,7 +143,7 @@ class Perception:
             objects.append(cells.points[inside & (is_object > _SURE)])
             basket.append(cells.points[seen & (is_basket > _SURE)])
             others.append(cells.points[inside & (is_object < 0.2) & (is_basket < 0.2)])
-            is_handle = inside & (cells.classes[..., HANDLE] > _SURE)
+            is_handle = inside & (cells.classes[..., HANDLE] > _SURE_HANDLE)
             grasps = (cells.points + cells.offsets)[is_handle]
             handles.append(np.concatenate([grasps[:, None], cells.pulls[is_handle]], axis=1))
         surfaces, found, rim = np.concatenate(others), np.concatenate(objects), np.concatenate(basket)
