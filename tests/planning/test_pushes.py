@@ -125,6 +125,15 @@ def test_views_look_at_the_point_from_above():
     assert np.all((elevation >= 60 - 1e-6) & (elevation <= 90))
 
 
+def test_views_from_the_front_are_within_the_given_angles():
+    point, rng = np.array([0.5, 0.1, 0.2]), np.random.default_rng(1)
+    views = sample_views(rng, point, (0.4, 0.5), 200, elevation_deg=(15, 55), azimuth=(-0.7, 0.7))
+    forward = views[:, :3, 0]
+    elevation, azimuth = np.rad2deg(np.arcsin(-forward[:, 2])), np.arctan2(forward[:, 1], forward[:, 0])
+    assert elevation.min() >= 15 and elevation.max() <= 55 and np.abs(azimuth).max() <= 0.7
+    assert elevation.min() < 20 and elevation.max() > 50 and azimuth.min() < -0.5 and azimuth.max() > 0.5
+
+
 BRICK = np.array([[x, y, z] for x in (-0.01, 0.01) for y in (-0.02, 0.02) for z in (-0.05, 0.05)])
 
 

@@ -79,3 +79,9 @@ def test_named_object_differs_from_all_others(points):
         found = select_by_relation(relation, here)
         if found is not None:
             assert np.delete(key, found).max() <= key[found] - MARGIN + 1e-12
+
+
+def test_without_a_margin_the_order_decides():
+    close = np.array([[0.5, 0.01], [0.5, 0.0]])
+    assert select_by_relation("leftmost", close) is None
+    assert select_by_relation("leftmost", close, margin=0.0) == 0

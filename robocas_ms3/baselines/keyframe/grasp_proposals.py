@@ -90,7 +90,8 @@ def propose_colliding_grasps(
     rotations, tilt = _draw_rotations(starts, rng, from_front=from_front)
     local = np.einsum("gpi,gij->gpj", points[None] - starts[:, None], rotations)
     between = np.abs(local[..., 0]) < _SLICE
-    top = np.where(between, local[..., 2], np.inf).min(axis=1)
+    fits = between.sum(axis=1) >= _MIN_SLICE_POINTS
+    top = np.where(fits, np.where(between, local[..., 2], np.inf).min(axis=1), 0.0)
     depth = top + rng.uniform(*_DEPTHS, count)
     approach = rotations[:, :, 2]
     tip = starts[:, 2] + approach[:, 2] * (depth + _TIP)
@@ -98,7 +99,7 @@ def propose_colliding_grasps(
     between &= local[..., 2] < (depth + _SLICE)[:, None]
     left = np.where(between, local[..., 1], np.inf).min(axis=1)
     right = np.where(between, local[..., 1], -np.inf).max(axis=1)
-    fits = (between.sum(axis=1) >= _MIN_SLICE_POINTS) & (right - left <= _MAX_WIDTH)
+    fits &= (between.sum(axis=1) >= _MIN_SLICE_POINTS) & (right - left <= _MAX_WIDTH)
     if not fits.any():
         return none
     starts, rotations, tilt, depth, top = starts[fits], rotations[fits], tilt[fits], depth[fits], top[fits]

@@ -142,12 +142,13 @@ class Perception:
             is_object, is_basket = cells.classes[..., FIRST_NAME:].sum(-1), cells.classes[..., BASKET]
             objects.append(cells.points[inside & (is_object > _SURE)])
             basket.append(cells.points[seen & (is_basket > _SURE)])
-            others.append(cells.points[inside & (is_object < 0.2) & (is_basket < 0.2)])
+            others.append(cells.points[seen & (is_object < 0.2) & (is_basket < 0.2)])
             is_handle = inside & (cells.classes[..., HANDLE] > _SURE_HANDLE)
             grasps = (cells.points + cells.offsets)[is_handle]
             handles.append(np.concatenate([grasps[:, None], cells.pulls[is_handle]], axis=1))
         surfaces, found, rim = np.concatenate(others), np.concatenate(objects), np.concatenate(basket)
-        table = find_table_height(surfaces, found) if len(surfaces) else default_table
+        near = surfaces[is_in_workspace(surfaces)]
+        table = find_table_height(near, found) if len(near) else default_table
         found = found[found[:, 2] > table + 0.005]
         seen = len(found) >= 10
         focus = np.median(found[:, :2], axis=0) if seen else np.array([0.6, 0.0])

@@ -107,6 +107,11 @@ def test_the_handle_is_the_mean_of_successful_pulls():
     assert np.allclose(handle.approach, [1, 0, 0]) and np.allclose(np.abs(handle.bar), [0, 0, 1])
     assert np.allclose(handle.grasp[:3, 2], [1, 0, 0]) and np.linalg.det(handle.grasp[:3, :3]) == pytest.approx(1)
     assert find_pulled_handle(candidates | {"success": np.zeros(3, bool)}) is None
+    # on the bar; behind it on the door; beyond the part near the grasp; after the pull
+    points = np.array([[0.49, -0.28, 0.12], [0.52, -0.27, 0.08], [0.48, -0.27, 0.2], [0.48, 0.23, 0.08]])
+    assert handle.contains(points).tolist() == [True, False, False, False]
+    opened = handle.open()
+    assert opened.contains(points).tolist() == [False, False, False, True] and not opened.motion.any()
 
 
 def test_loss_of_a_batch_decreases(validation):
