@@ -20,6 +20,7 @@ from robocas_ms3.baselines.keyframe.arm_control import (
     MotionError,
 )
 from robocas_ms3.baselines.keyframe.config import DecisionSettings
+from robocas_ms3.baselines.keyframe.free_paths import FreePaths
 from robocas_ms3.baselines.keyframe.free_places import HeightMap
 from robocas_ms3.baselines.keyframe.grasp_proposals import propose_colliding_grasps, propose_grasps
 from robocas_ms3.baselines.keyframe.handles import Handle
@@ -56,11 +57,12 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class _Keyframe:
-    """Grasp that was chosen: the object, its scene, and the approach."""
+    """Grasp that was chosen: the object, its scene, the approach, and from the front the path (n, 7) to its start."""
 
     scene: ObservedScene
     object: ObservedObject
     approach: Approach
+    path: Array | None = None
 
     @property
     def hanging(self) -> float:
@@ -109,6 +111,7 @@ class KeyframeEpisode:
 
     def run(self, observation: EpisodeObservation) -> Motion:
         """Run the episode from its first observation, which has images, until it is ended from outside."""
+        self._free = FreePaths(self._arm.paths, observation.qpos)
         self._survey(observation)
         observation = yield from self._open_compartment(observation)
         close = False
@@ -144,6 +147,8 @@ class KeyframeEpisode:
         self._focus, self._table = survey.focus, survey.table
         self._basket = self._basket if survey.basket is None else survey.basket
         self._handle, self._is_front = survey.handle, survey.has_roof
+        is_enclosed = survey.has_roof or survey.handle is not None
+        self._free.set_points(survey.points if is_enclosed else np.zeros((0, 3)))
         camera_in_base = observation.frames[self._hand_camera].camera_in_base
         self._camera_in_tcp = inverse(observation.tcp_in_base) @ camera_in_base
 
@@ -159,8 +164,9 @@ class KeyframeEpisode:
         for focus, of in ((self._focus, distances), (0.9 * self._focus, _FALLBACK_DISTANCES)):
             poses, costs = find_views(self._camera_in_tcp, np.array([*focus, self._table]), of, elevations)
             found = self._arm.paths.nearest(poses, costs, observation.qpos, 0.3)
-            if found:
-                observation = yield from self._arm.move_joints(observation, found[0][1], OPEN)
+            chosen = self._free.choose(observation.qpos, found, lambda pair: pair[1])
+            if chosen is not None:
+                observation = yield from self._arm.follow(observation, chosen[1], OPEN, COARSE)
                 break
         return (yield from self._arm.request_images(observation, OPEN))
 
@@ -198,8 +204,12 @@ class KeyframeEpisode:
             near = np.exp(-((np.linalg.norm(grasps[:, :3, 3] - failed[:3, 3], axis=1) / _REPEAT_DISTANCE) ** 2))
             similar = np.einsum("gij,ij->g", grasps[:, :3, :3], failed[:3, :3]) > 2.6  # trace; 3: equal rotations
             scores -= 2 * near * similar
-        plan = self._arm.paths.plan_front_approach if self._is_front else self._arm.paths.plan_approach
-        approach = plan(grasps, scores, observation.qpos)
+        paths, qpos = self._arm.paths, observation.qpos
+        if self._is_front:
+            approaches = paths.plan_front_approaches(grasps, scores, qpos)
+            found = self._free.choose(qpos, approaches, lambda approach: approach.start)
+            return None if found is None else _Keyframe(scene, one, *found)
+        approach = paths.plan_approach(grasps, scores, qpos)
         return None if approach is None else _Keyframe(scene, one, approach)
 
     def _choose_obstacle(
@@ -251,11 +261,13 @@ class KeyframeEpisode:
         while self._handle is not None and np.linalg.norm(self._handle.motion) > _OPEN and self._pulls < _MAX_PULLS:
             handle, self._handle = self._handle, None
             self._pulls += 1
-            planned = arm.paths.plan_pull(handle, observation.qpos)
-            if planned is None:
+            pulls = arm.paths.plan_pulls(handle, observation.qpos)
+            found = self._free.choose(observation.qpos, pulls, lambda pull: pull.start)
+            if found is None:
                 _log.debug("no path to the handle")
                 break
-            observation = yield from arm.move_joints(observation, planned.start, OPEN, _NEAR_START)
+            planned, path = found
+            observation = yield from arm.follow(observation, path, OPEN, _NEAR_START)
             observation = yield from arm.follow(observation, planned.path, OPEN)
             observation = yield from arm.wait(observation, CLOSED)
             observation = yield from arm.follow(observation, planned.pull, CLOSED, COARSE, _PULL_SPEED)
@@ -271,14 +283,14 @@ class KeyframeEpisode:
         """Grasp and lift; return the last observation, and whether the gripper holds something."""
         approach, arm, holds = chosen.approach, self._arm, False
         try:
-            if approach.way_back is None:
+            if approach.way_back is None or chosen.path is None:
                 observation = yield from arm.rise(observation, chosen.safe_height, OPEN)
                 observation = yield from arm.move_joints(observation, approach.start, OPEN, _NEAR_START)
                 observation = yield from arm.move_straight(observation, approach.grasp, OPEN)
                 observation = yield from arm.wait(observation, CLOSED)
                 observation = yield from arm.rise(observation, float(observation.tcp_in_base[2, 3]) + LIFT, CLOSED)
             else:
-                observation = yield from arm.move_joints(observation, approach.start, OPEN, _NEAR_START)
+                observation = yield from arm.follow(observation, chosen.path, OPEN, _NEAR_START)
                 observation = yield from arm.follow(observation, approach.path, OPEN)
                 observation = yield from arm.wait(observation, CLOSED)
                 observation = yield from arm.follow(observation, approach.way_back, CLOSED)
@@ -314,13 +326,15 @@ class KeyframeEpisode:
         if self._basket is None:
             raise MotionError
         poses, costs = find_release_poses(self._basket + [0, 0, _RELEASE_CLEARANCE + chosen.hanging])
+        height = float(self._basket[2]) + _CARRY_CLEARANCE
+        height = height if self._is_front else max(chosen.safe_height, height)
         found = self._arm.paths.nearest(poses, costs, observation.qpos, 0.5)
         if not found:
             raise MotionError
-        height = float(self._basket[2]) + _CARRY_CLEARANCE
-        height = height if self._is_front else max(chosen.safe_height, height)
         observation = yield from self._arm.rise(observation, height, CLOSED)
-        return (yield from self._arm.move_joints(observation, found[0][1], CLOSED))
+        nearest = self._free.choose(observation.qpos, found, lambda pair: pair[1])
+        assert nearest is not None
+        return (yield from self._arm.follow(observation, nearest[1], CLOSED, COARSE))
 
     def _place(self, observation: EpisodeObservation, chosen: _Keyframe) -> Motion:
         """Place the held object at a free place of the surface."""

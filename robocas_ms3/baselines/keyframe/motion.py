@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,8 +126,8 @@ class ArmPaths:
         order = np.argsort(total, kind="stable")[: int(reachable.sum())]
         return [(int(index), found[index]) for index in order]
 
-    def plan_pull(self, handle: Handle, qpos: Array) -> Pull | None:
-        """Return the longest pull of a handle, or None. The gripper may turn about the bar.
+    def plan_pulls(self, handle: Handle, qpos: Array) -> Iterator[Pull]:
+        """Yield pulls of a handle, the longest first. The gripper may turn about the bar.
 
         qpos: (7,) present configuration.
         """
@@ -139,7 +139,7 @@ class ArmPaths:
         starts = [rotate_about_bar(one[0], turn) for one in (held, turned) for turn in _PULL_TURNS]
         reachable, found = self.reach(np.array(starts), qpos)
         if not reachable.any():
-            return None
+            return
         paths = track_handle(self.chain, found[reachable], np.stack(goals, axis=1)[:, reachable])
         lengths, distance = count_reached_poses(paths), joint_distance(found[reachable], qpos)
         for index in np.lexsort((distance, -lengths)).tolist():
@@ -149,8 +149,7 @@ class ArmPaths:
             back = self._back_off(path[0], _PULL_STANDOFF)
             away = next((one for one in (self._back_off(path[-1], far) for far in _RETREATS) if one is not None), None)
             if back is not None and away is not None:
-                return Pull(back[-1], np.concatenate([back[-2::-1], path[:1]]), path, away)
-        return None
+                yield Pull(back[-1], np.concatenate([back[-2::-1], path[:1]]), path, away)
 
     def _back_off(self, qpos: Array, distance: float) -> Array | None:
         """Return a straight path (n, 7) against the approach direction, or None."""
@@ -158,8 +157,8 @@ class ArmPaths:
         goal[:3, 3] -= distance * goal[:3, 2]
         return self.straight(qpos, goal)
 
-    def plan_front_approach(self, grasps: Array, scores: Array, qpos: Array) -> Approach | None:
-        """Return the approach of the grasp with the greatest score that is reachable from outside of a compartment.
+    def plan_front_approaches(self, grasps: Array, scores: Array, qpos: Array) -> Iterator[Approach]:
+        """Yield approaches of grasps from outside of a compartment, the one with the greatest score first.
 
         The gripper enters towards the object, and moves back out after a short lift. Arguments as in `plan_approach`.
         """
@@ -169,8 +168,8 @@ class ArmPaths:
                 for distance in _FRONT_DISTANCES:
                     found = self._plan_entry(grasp, distance, qpos)
                     if found is not None:
-                        return found
-        return None
+                        yield found
+                        break
 
     def _plan_entry(self, grasp: Array, distance: float, qpos: Array) -> Approach | None:
         """Return the approach of a grasp (4, 4) that starts ``distance`` m before the pre-grasp, or None."""

@@ -84,12 +84,14 @@ class Survey:
         basket: (3,) middle of the basket in x and y, and the height of its rim, m; None: not seen.
         table: height of the surface, m.
         handle: handle of a door or drawer, or None.
+        points: (P, 3) points on everything but the robot, m.
         has_roof: whether something is above the objects, so that they have to be grasped from the front.
     """
 
     focus: Array
     basket: Array | None
     table: float
+    points: Array
     handle: Handle | None = None
     has_roof: bool = False
 
@@ -157,7 +159,9 @@ class Perception:
             roof = np.percentile(found[:, 2], 95) + _ROOF_CLEARANCE
             above = (surfaces[:, 2] > roof) & (np.linalg.norm(surfaces[:, :2] - focus, axis=1) < _ROOF_RADIUS)
             has_roof = int(above.sum()) >= _ROOF_CELLS
-        return Survey(focus, _find_basket(rim), table, _find_handle(np.concatenate(handles)), has_roof)
+        everything = np.concatenate([surfaces, found, rim])
+        handle = _find_handle(np.concatenate(handles))
+        return Survey(focus, _find_basket(rim), table, everything, handle, has_roof)
 
     def observe(self, frame: CameraFrame, request: Request, table: float) -> ObservedScene:
         """Return the objects and the points in the workspace of an image of the gripper camera."""

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.baselines.keyframe.free_paths import FreePaths
 from robocas_ms3.baselines.keyframe.handles import Handle
 from robocas_ms3.baselines.keyframe.motion import LIFT, PREGRASP, ArmPaths, PathFollower, find_release_poses, find_views
 from robocas_ms3.core.poses import from_rotation, inverse
@@ -72,7 +73,7 @@ def make_handle(motion):
 
 def test_pull_moves_the_handle_along_its_line(paths):
     handle = make_handle([0.0, 0.5, 0.0])
-    pull = paths.plan_pull(handle, REST)
+    pull = next(paths.plan_pulls(handle, REST))
     start = paths.chain.tcp(pull.start[None])[0]
     assert np.allclose(start[:3, 3] + 0.08 * start[:3, 2], handle.position, atol=1e-3)  # straight back from the handle
     held = paths.chain.tcp(pull.pull)
@@ -85,11 +86,11 @@ def test_pull_moves_the_handle_along_its_line(paths):
 
 
 def test_a_pull_out_of_reach_is_as_long_as_possible(paths):
-    pull = paths.plan_pull(make_handle([0.0, 1.5, 0.0]), REST)
+    pull = next(paths.plan_pulls(make_handle([0.0, 1.5, 0.0]), REST))
     end = paths.chain.tcp(pull.pull[-1:])[0, 1, 3]
     assert 0.2 < end < 0.9
     far = Handle(np.array([3.0, 0, 0]), np.array([0, 0.5, 0]), np.array([1.0, 0, 0]), np.array([0, 0, 1.0]))
-    assert paths.plan_pull(far, REST) is None
+    assert not list(paths.plan_pulls(far, REST))
 
 
 def test_front_approach_enters_and_leaves_a_compartment(paths):
@@ -97,7 +98,7 @@ def test_front_approach_enters_and_leaves_a_compartment(paths):
     closing = np.array([0.0, 1.0, 0.0])
     grasp = from_rotation([0.65, -0.05, 0.2], np.stack([np.cross(closing, approach), closing, approach], axis=1))
     far = from_rotation([2.0, 0, 0.2], grasp[:3, :3])
-    found = paths.plan_front_approach(np.stack([far, grasp]), np.array([0.9, 0.5]), REST)
+    found = next(paths.plan_front_approaches(np.stack([far, grasp]), np.array([0.9, 0.5]), REST))
     assert np.allclose(found.grasp[:3, 3], grasp[:3, 3])
     outside, inside, after = paths.chain.tcp(np.stack([found.start, found.path[-1], found.way_back[-1]]))
     assert np.allclose(inside, found.grasp, atol=1e-3)
@@ -113,3 +114,20 @@ def test_release_poses_tilt_away_from_the_base():
     assert np.allclose(np.linalg.det(poses[:, :3, :3]), 1)
     assert (poses[:, :3, 2] @ [0.6, 0.8, 0] >= -1e-9).all()  # outward, along the direction of the point
     assert np.linalg.norm(poses[:, :3, 3] - point, axis=1).max() == pytest.approx(0.05)
+
+
+def test_free_paths_go_around_points_by_the_rest_configuration(paths):
+    free = FreePaths(paths, REST)
+    first, last = (paths.joint(REST, REST + [turn, 0.3, 0, 0, 0, 0, 0])[-1] for turn in (0.9, -0.9))
+    direct = free.find_path(first, last)
+    assert np.allclose(direct, paths.joint(first, last))  # nothing to avoid
+    middle = paths.chain.tcp(direct[len(direct) // 2][None])[0, :3, 3]
+    free.set_points(middle + np.random.default_rng(0).normal(0, 0.01, (200, 3)))
+    found = free.find_path(first, last)
+    assert found is None or np.abs(found - REST).max(axis=1).min() < 1e-9
+    candidates = [last, first + 0.01]
+    goal, path = free.choose(first, candidates, lambda qpos: qpos)
+    assert np.allclose(path[-1], goal)
+    assert free.choose(first, [], lambda qpos: qpos) is None
+    free.set_points(middle + np.array([5.0, 0, 0]) + np.zeros((1, 3)))
+    assert np.allclose(free.find_path(first, last), direct)

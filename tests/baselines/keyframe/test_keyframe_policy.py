@@ -43,7 +43,7 @@ class FakePerception:
 
     def survey(self, frames, default_table):
         handle = None if self.door is None or self.door.opening > 0.9 else self.door.handle
-        return Survey(np.array([0.55, 0.0]), BASKET, TABLE, handle, has_roof=self.door is not None)
+        return Survey(np.array([0.55, 0.0]), BASKET, TABLE, np.zeros((0, 3)), handle, has_roof=self.door is not None)
 
     def observe(self, frame, request, table):
         x, y = np.meshgrid(np.arange(0.3, 0.8, 0.01), np.arange(-0.4, 0.3, 0.01))
