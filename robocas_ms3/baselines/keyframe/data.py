@@ -22,7 +22,13 @@ from robocas_ms3.baselines.keyframe.gripper_crops import CELLS, CROP_CHANNELS, P
 from robocas_ms3.baselines.keyframe.handles import Handle, find_pulled_handle
 from robocas_ms3.baselines.keyframe.image_crops import augment_image, draw_crop, resize_inputs
 from robocas_ms3.baselines.keyframe.network import FIRST_NAME, HANDLE, OFFSET_UNIT, PULL_UNIT, STRIDE, make_inputs
-from robocas_ms3.baselines.keyframe.observed_scene import find_table_height, is_in_workspace, sample_pixels, unproject
+from robocas_ms3.baselines.keyframe.observed_scene import (
+    find_table_height,
+    is_below_camera,
+    is_in_workspace,
+    sample_pixels,
+    unproject,
+)
 from robocas_ms3.baselines.training.scenes import TrainingScenes, select_scene_settings
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_wxyz
@@ -265,7 +271,7 @@ class KeyframeSamples:
         values = image.segmentation[np.ix_(*pixels)]
         valid &= (values != ROBOT) & is_in_workspace(points)
         values, points = values[valid], points[valid]
-        others = points[values == NOTHING]
+        others = points[(values == NOTHING) & is_below_camera(points, image.camera_in_base)]
         if not len(others):
             return crops, poses, outcome
         table, number = find_table_height(others, points[values >= FIRST_SLOT]), 0

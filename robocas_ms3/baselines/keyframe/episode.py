@@ -26,9 +26,9 @@ from robocas_ms3.baselines.keyframe.grasp_proposals import propose_colliding_gra
 from robocas_ms3.baselines.keyframe.handles import Handle
 from robocas_ms3.baselines.keyframe.motion import LIFT, TOP_VIEWS_DEG, Approach, find_release_poses, find_views
 from robocas_ms3.baselines.keyframe.observed_scene import ObservedObject, ObservedScene
+from robocas_ms3.baselines.keyframe.obstacles import find_middle, score_blocking, score_height
 from robocas_ms3.baselines.keyframe.perception import Perception, Request
 from robocas_ms3.core.poses import Array, from_rotation, inverse
-from robocas_ms3.scenes.grasp_checks import is_gripper_clear
 from robocas_ms3.scenes.relations import select_by_relation
 
 _TABLE = 0.12  # m, height of a table in the arm's base frame if it is not seen
@@ -139,7 +139,7 @@ class KeyframeEpisode:
                 self._survey(observation)
                 observation = yield from self._open_compartment(observation)
             if target is None and scene.is_object.any():
-                self._focus = _find_middle(scene)
+                self._focus = find_middle(scene)
             self._focus = self._focus + self._rng.normal(0, 0.05, 2)
 
     def _survey(self, observation: EpisodeObservation) -> None:
@@ -220,38 +220,17 @@ class KeyframeEpisode:
         if not objects:
             return None
         if target is None:
-            scores = self._score_highest(scene, objects)
+            scores = score_height(scene, objects)
         else:
             objects = [one for one in objects if (one.mask & target.mask).sum() < 0.5 * one.mask.sum()]
-            scores = self._score_blocking(scene, objects, scene.points[target.mask])
+            count = self._settings.proposals // 3
+            grasps = propose_colliding_grasps(scene.points[target.mask], self._table, count, self._rng).tcp_in_base
+            scores = score_blocking(scene, objects, target, grasps)
         for index in np.argsort(scores)[::-1][:_MAX_OBSTACLES].tolist():
             chosen = self._plan_grasp(scene, objects[index], observation)
             if chosen is not None:
                 return chosen
         return None
-
-    def _score_highest(self, scene: ObservedScene, objects: list[ObservedObject]) -> list[float]:
-        """Return a score per object: greater for high objects near the middle of all objects."""
-        clouds, middle = [scene.points[one.mask] for one in objects], _find_middle(scene)
-        return [
-            6 * float(np.percentile(points[:, 2], 95)) - float(np.linalg.norm(points.mean(axis=0)[:2] - middle))
-            for points in clouds
-        ]
-
-    def _score_blocking(self, scene: ObservedScene, objects: list[ObservedObject], target: Array) -> list[float]:
-        """Return a score per object: greater for objects that block grasps of the target, are near it and above it.
-
-        target: (P, 3) points of the target, m.
-        """
-        count = self._settings.proposals // 3
-        grasps = propose_colliding_grasps(target, self._table, count, self._rng).tcp_in_base
-        middle, top, scores = target.mean(axis=0)[:2], target[:, 2].max(), []
-        for one in objects:
-            points = scene.points[one.mask]
-            blocked = 1 - is_gripper_clear(grasps, points).mean() if len(grasps) else 0.0
-            gap = np.linalg.norm(points[:, :2] - middle, axis=1).min()
-            scores.append(float(1.5 * blocked - 5 * gap + 4 * (np.percentile(points[:, 2], 95) - top)))
-        return scores
 
     # Execution of keyframes
 
@@ -358,8 +337,3 @@ class KeyframeEpisode:
                 observation = yield from self._arm.move_joints(observation, qpos, CLOSED)
                 return (yield from self._arm.move_straight(observation, poses[index], CLOSED))
         raise MotionError
-
-
-def _find_middle(scene: ObservedScene) -> Array:
-    """Return the middle (2,) of all objects, m."""
-    return np.median(scene.points[scene.is_object][:, :2], axis=0)

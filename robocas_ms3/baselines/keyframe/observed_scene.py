@@ -16,6 +16,7 @@ _MAX_VOTES = 1200  # cells of an object that vote
 _FARTHEST_VOTE = 2.0  # radii from the centre, beyond which a vote belongs to another object
 _LEAST_SHARE = 0.1  # of the votes of the largest group; smaller groups are errors
 _SUPPORT_RANGE = (-0.12, 0.02)  # m from the lowest visible point of the objects, which may be the top of an object
+_BELOW = 0.02  # m below a camera, from which it sees the upper side of a surface
 _SUPPORT_MARGIN, _SUPPORT_POINTS = 0.1, 100  # m around the objects; least number of points on their support
 
 
@@ -50,11 +51,16 @@ def is_in_workspace(points: Array) -> NDArray[np.bool_]:
     return ((points > low) & (points < high)).all(axis=-1)
 
 
+def is_below_camera(points: Array, camera_in_base: NDArray) -> NDArray[np.bool_]:
+    """Return whether a camera can see the upper side of a horizontal surface at points (..., 3)."""
+    return points[..., 2] < camera_in_base[2, 3] - _BELOW
+
+
 def find_table_height(others: Array, objects: Array) -> float:
     """Return the height of the surface on which objects stand, m: the commonest height of points around and below them.
 
     Args:
-        others: (P, 3) points on no object, m.
+        others: (P, 3) points on no object and below the camera (`is_below_camera`), m.
         objects: (Q, 3) points on objects, m; without objects, the commonest height of all points is returned.
     """
     heights = others[:, 2]

@@ -31,6 +31,7 @@ from robocas_ms3.baselines.keyframe.observed_scene import (
     ObservedScene,
     cluster_votes,
     find_table_height,
+    is_below_camera,
     is_in_workspace,
     sample_pixels,
     unproject,
@@ -136,7 +137,7 @@ class Perception:
 
     def survey(self, frames: list[CameraFrame], default_table: float) -> Survey:
         """Find the objects, the basket, a handle and the height of the surface in the images of all cameras."""
-        objects, basket, others, handles = [], [], [], []
+        objects, basket, others, below, handles = [], [], [], [], []
         for frame in frames:
             cells = self._classify(frame)
             seen = cells.valid & (cells.classes[..., ROBOT] < 0.3)
@@ -144,13 +145,15 @@ class Perception:
             is_object, is_basket = cells.classes[..., FIRST_NAME:].sum(-1), cells.classes[..., BASKET]
             objects.append(cells.points[inside & (is_object > _SURE)])
             basket.append(cells.points[seen & (is_basket > _SURE)])
-            others.append(cells.points[seen & (is_object < 0.2) & (is_basket < 0.2)])
+            is_other = seen & (is_object < 0.2) & (is_basket < 0.2)
+            others.append(cells.points[is_other])
+            below.append(cells.points[is_other & inside & is_below_camera(cells.points, frame.camera_in_base)])
             is_handle = inside & (cells.classes[..., HANDLE] > _SURE_HANDLE)
             grasps = (cells.points + cells.offsets)[is_handle]
             handles.append(np.concatenate([grasps[:, None], cells.pulls[is_handle]], axis=1))
         surfaces, found, rim = np.concatenate(others), np.concatenate(objects), np.concatenate(basket)
-        near = surfaces[is_in_workspace(surfaces)]
-        table = find_table_height(near, found) if len(near) else default_table
+        supports = np.concatenate(below)
+        table = find_table_height(supports, found) if len(supports) else default_table
         found = found[found[:, 2] > table + 0.005]
         seen = len(found) >= 10
         focus = np.median(found[:, :2], axis=0) if seen else np.array([0.6, 0.0])

@@ -13,11 +13,15 @@ from robocas_ms3.baselines.keyframe.network import make_inputs
 from robocas_ms3.baselines.keyframe.observed_scene import (
     NARROW_RADIUS,
     WIDE_RADIUS,
+    ObservedObject,
+    ObservedScene,
     cluster_votes,
     find_table_height,
+    is_below_camera,
     sample_pixels,
     unproject,
 )
+from robocas_ms3.baselines.keyframe.obstacles import find_middle, score_blocking, score_height
 
 INTRINSICS = np.array([[100.0, 0, 4], [0, 100.0, 3], [0, 0, 1]])
 DOWN = np.array([[0, 1, 0, 0.5], [1, 0, 0, 0.25], [0, 0, -1, 1.0], [0, 0, 0, 1]])  # a camera that looks down from 1 m
@@ -68,6 +72,16 @@ def test_the_table_is_below_the_objects():
     objects = np.stack([np.zeros(100), np.zeros(100), np.linspace(0.205, 0.35, 100)], axis=1)
     assert find_table_height(others, objects) == pytest.approx(0.2, abs=0.004)
     assert find_table_height(others[:950], objects) == pytest.approx(0.2, abs=0.01)  # too few points: the lowest ones
+
+
+def test_a_camera_sees_the_upper_side_below_it():
+    camera = np.eye(4)
+    camera[2, 3] = 0.3
+    assert is_below_camera(np.array([[1.0, 0, 0.25], [1, 0, 0.29], [1, 0, 0.4]]), camera).tolist() == [
+        True,
+        False,
+        False,
+    ]
 
 
 def test_votes_of_two_objects_make_two_groups():
@@ -168,3 +182,27 @@ def test_grasps_touch_no_neighbour():
     assert 0 < len(beside.heuristic) < len(alone.heuristic)
     closing = np.abs(beside.tcp_in_base[:, 1, 1])
     assert closing.max() < 0.8  # the fingers are not between the box and the wall
+
+
+def make_scene_of(*boxes):
+    """Return a scene with boxes, given as (size, center)."""
+    clouds = [make_box(size, center, count=500) for size, center in boxes]
+    points, owner = np.concatenate(clouds), np.repeat(np.arange(len(boxes)), 500)
+    objects = [ObservedObject(owner == one, clouds[one].mean(axis=0), one, 0.9) for one in range(len(boxes))]
+    return ObservedScene(points, np.ones(len(points), bool), [], objects)
+
+
+def test_the_object_that_blocks_the_target_has_the_greatest_score():
+    flat, tall = (0.04, 0.04, 0.03), (0.04, 0.04, 0.15)
+    scene = make_scene_of((flat, (0.6, 0.0)), (tall, (0.6, 0.045)), (tall, (0.6, 0.3)))
+    target, beside, far = scene.objects
+    grasps = propose_colliding_grasps(scene.points[target.mask], 0.1, 200, np.random.default_rng(0)).tcp_in_base
+    scores = score_blocking(scene, [beside, far], target, grasps)
+    assert scores[0] > scores[1] + 1
+
+
+def test_the_highest_object_in_the_middle_has_the_greatest_score():
+    low, high = (0.04, 0.04, 0.03), (0.04, 0.04, 0.15)
+    scene = make_scene_of((low, (0.6, 0.0)), (high, (0.6, 0.05)), (high, (0.6, 0.6)))
+    assert int(np.argmax(score_height(scene, scene.objects))) == 1
+    assert np.allclose(find_middle(scene), [0.6, 0.05], atol=0.02)
