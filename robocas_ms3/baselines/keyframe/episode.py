@@ -311,7 +311,9 @@ class KeyframeEpisode:
         if not found:
             raise MotionError
         observation = yield from self._arm.rise(observation, height, CLOSED)
+        self._free.hold(chosen.scene.points[chosen.object.mask], chosen.approach.grasp)
         nearest = self._free.choose(observation.qpos, found, lambda pair: pair[1])
+        self._free.release()
         assert nearest is not None
         return (yield from self._arm.follow(observation, nearest[1], CLOSED, COARSE))
 

@@ -8,8 +8,10 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from robocas_ms3.baselines.keyframe.motion import ArmPaths
+from robocas_ms3.core.poses import inverse, transform_points
 from robocas_ms3.scenes.grasp_checks import is_gripper_clear
 
 Array = NDArray[np.float64]
@@ -18,11 +20,12 @@ _CELL = 0.015  # m, greatest distance between points on a surface
 _CHECKED = 3  # every third configuration of a path is checked
 _START = 0.06  # m from the start of a path, within which contact is allowed: the gripper leaves what it has touched
 _CANDIDATES = 12  # goals that are tried
-_CLEARANCE = 0.005  # m
+_CLEARANCE, _HELD_CLEARANCE = 0.005, 0.02  # m around the gripper, and around the visible side of a held object
+_SAME_OBJECT = 0.025  # m from the points of an object, within which other points are on it or under it
 
 
 class FreePaths:
-    """Joint motions that keep the gripper clear of observed points; the arm is not checked.
+    """Joint motions that keep the gripper and a held object clear of observed points; the arm is not checked.
 
     Args:
         paths: kinematics of the arm.
@@ -32,11 +35,22 @@ class FreePaths:
     def __init__(self, paths: ArmPaths, rest: Array) -> None:
         self._paths, self._rest = paths, rest
         self._points: Array = np.zeros((0, 3))
+        self._held: Array = np.zeros((0, 3))  # in the TCP frame
 
     def set_points(self, points: Array) -> None:
         """Set the points (P, 3) to avoid in the arm's base frame, m."""
-        cells = np.floor(points / _CELL).astype(np.int64)
-        self._points = points[np.unique(cells, axis=0, return_index=True)[1]]
+        self._points = _thin_out(points)
+
+    def hold(self, points: Array, grasp: Array) -> None:
+        """Move an object with points (P, 3) together with the gripper that grasps it at a TCP pose (4, 4)."""
+        if len(self._points) and len(points):
+            distance, _ = KDTree(points).query(self._points, distance_upper_bound=_SAME_OBJECT)
+            self._points = self._points[~np.isfinite(distance)]
+            self._held = transform_points(inverse(grasp), _thin_out(points))
+
+    def release(self) -> None:
+        """Move the gripper without an object."""
+        self._held = np.zeros((0, 3))
 
     def find_path(self, qpos: Array, goal: Array) -> Array | None:
         """Return a clear path (n, 7) from a configuration (7,) to another one, or None."""
@@ -69,4 +83,13 @@ class FreePaths:
             return True
         poses = self._paths.chain.tcp(np.concatenate([path[:-1:_CHECKED], path[-1:]]))
         away = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1) > _START
-        return bool(is_gripper_clear(poses[away], self._points, _CLEARANCE).all())
+        clear = bool(is_gripper_clear(poses[away], self._points, _CLEARANCE).all())
+        if clear and len(self._held) and away.any():
+            held = np.concatenate([transform_points(pose, self._held) for pose in poses[away]])
+            clear = KDTree(self._points).query(held, distance_upper_bound=_HELD_CLEARANCE)[0].min() == np.inf
+        return clear
+
+
+def _thin_out(points: Array) -> Array:
+    cells = np.floor(points / _CELL).astype(np.int64)
+    return points[np.unique(cells, axis=0, return_index=True)[1]]

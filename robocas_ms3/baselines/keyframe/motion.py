@@ -28,6 +28,7 @@ _MAX_JOINT_STEP = 0.4  # rad per control step
 _RELEASE_TILTS_DEG, _RELEASE_SIDES = (0, 15, 30, 45, 60, 72), (0.0, -0.4, 0.4)  # degrees; rad about the vertical
 _RELEASE_NEARER = (0.0, 0.05)  # m towards the base
 _FRONT_DISTANCES, _FRONT_LIFT = (0.2, 0.15, 0.1, 0.06), 0.025  # m before the pre-grasp; m of the way back above it
+_EXIT_DISTANCES = (0.3, 0.25, 0.2, 0.15, 0.1, 0.06)  # m from the pre-grasp back to the end of the way out
 _PULL_STEP, _PULL_STANDOFF, _RETREATS = 0.015, 0.08, (0.15, 0.1, 0.06)  # m
 _PULL_TURNS = np.deg2rad((0, -20, 20, -40, 40))  # about the bar
 _LOWER, _NEARER = (
@@ -181,10 +182,15 @@ class ArmPaths:
         inwards = self._connect(found[0], [before, grasp]) if reachable.all() else None
         if inwards is None:
             return None
-        raised = np.stack([grasp, before, outside])
-        raised[:, 2, 3] += _FRONT_LIFT
-        way_back = self._connect(inwards[-1], list(raised))
-        return None if way_back is None else Approach(grasp, found[0], inwards, way_back)
+        for farther in _EXIT_DISTANCES:
+            end = before.copy()
+            end[:2, 3] -= farther * grasp[:2, 2] / np.linalg.norm(grasp[:2, 2])
+            raised = np.stack([grasp, before, end])
+            raised[:, 2, 3] += _FRONT_LIFT
+            way_back = self._connect(inwards[-1], list(raised))
+            if way_back is not None:
+                return Approach(grasp, found[0], inwards, way_back)
+        return None
 
     def _connect(self, qpos: Array, poses: list[Array]) -> Array | None:
         """Return straight paths (n, 7) through TCP poses (4, 4), one after another, or None."""

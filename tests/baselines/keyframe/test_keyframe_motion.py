@@ -116,18 +116,32 @@ def test_release_poses_tilt_away_from_the_base():
     assert np.linalg.norm(poses[:, :3, 3] - point, axis=1).max() == pytest.approx(0.05)
 
 
-def test_free_paths_go_around_points_by_the_rest_configuration(paths):
+def test_free_paths_avoid_points(paths):
     free = FreePaths(paths, REST)
-    first, last = (paths.joint(REST, REST + [turn, 0.3, 0, 0, 0, 0, 0])[-1] for turn in (0.9, -0.9))
+    first, last = (REST + [turn, 0.3, 0, 0, 0, 0, 0] for turn in (0.9, -0.9))
     direct = free.find_path(first, last)
     assert np.allclose(direct, paths.joint(first, last))  # nothing to avoid
-    middle = paths.chain.tcp(direct[len(direct) // 2][None])[0, :3, 3]
+    poses = paths.chain.tcp(direct)
+    middle = poses[len(direct) // 2][:3, 3]
     free.set_points(middle + np.random.default_rng(0).normal(0, 0.01, (200, 3)))
     found = free.find_path(first, last)
-    assert found is None or np.abs(found - REST).max(axis=1).min() < 1e-9
-    candidates = [last, first + 0.01]
-    goal, path = free.choose(first, candidates, lambda qpos: qpos)
-    assert np.allclose(path[-1], goal)
+    assert found is None or np.abs(found - REST).max(axis=1).min() < 1e-9  # by the rest configuration
+    near = first + [0.05, 0, 0, 0, 0, 0, 0]
+    chosen, path = free.choose(first, [last, near] if found is None else [near], lambda qpos: qpos)
+    assert chosen is near and np.allclose(path[-1], near)
     assert free.choose(first, [], lambda qpos: qpos) is None
-    free.set_points(middle + np.array([5.0, 0, 0]) + np.zeros((1, 3)))
-    assert np.allclose(free.find_path(first, last), direct)
+
+
+def test_a_held_object_avoids_points(paths):
+    """A post under the path is clear of the gripper, but not of an object that hangs 10 cm below it."""
+    free = FreePaths(paths, REST)
+    first, last = (REST + [turn, 0, 0, 0, 0, 0, 0] for turn in (0.9, -0.9))
+    grasp = paths.chain.tcp(first[None])[0]
+    middle = paths.chain.tcp(REST[None])[0, :3, 3]
+    post = middle - [0, 0, 0.1] + np.random.default_rng(0).uniform(-0.005, 0.005, (50, 3))
+    free.set_points(post)
+    assert free.find_path(first, last) is not None
+    free.hold(grasp[:3, 3] - [0, 0, 0.1] + np.linspace(-0.02, 0.02, 20)[:, None] * [0, 0, 1.0], grasp)
+    assert free.find_path(first, last) is None
+    free.release()
+    assert free.find_path(first, last) is not None
