@@ -50,6 +50,7 @@ _IN_BASKET = 0.14  # m from the middle of the basket, within which an object is 
 _SURE = 0.6  # probability of a target, above which less probable targets are ignored
 _MAX_OBSTACLES = 5  # obstacles for which grasps are computed per decision
 _MAX_PULLS, _PULL_SPEED = 4, 0.3  # pulls per episode; fraction of the limits
+_COMPARTMENT_SPEED = 0.5  # fraction of the limits with an object that was grasped from the front
 _OPEN = 0.08  # m, length of a pull below which a door or drawer is open
 _FRONT_VIEWS_DEG = (40, 30, 50, 20)  # elevations of the gripper camera before a compartment, degrees
 _log = logging.getLogger(__name__)
@@ -272,7 +273,7 @@ class KeyframeEpisode:
                 observation = yield from arm.follow(observation, chosen.path, OPEN, _NEAR_START)
                 observation = yield from arm.follow(observation, approach.path, OPEN)
                 observation = yield from arm.wait(observation, CLOSED)
-                observation = yield from arm.follow(observation, approach.way_back, CLOSED)
+                observation = yield from arm.follow(observation, approach.way_back, CLOSED, speed=_COMPARTMENT_SPEED)
             holds = observation.width >= _EMPTY
         except MotionError:
             _log.debug("no path to or from a grasp")
@@ -304,7 +305,8 @@ class KeyframeEpisode:
         """Carry the held object over the basket."""
         if self._basket is None:
             raise MotionError
-        poses, costs = find_release_poses(self._basket + [0, 0, _RELEASE_CLEARANCE + chosen.hanging])
+        point = self._basket + [0, 0, _RELEASE_CLEARANCE + chosen.hanging]
+        poses, costs = find_release_poses(point, chosen.approach.grasp[2, :3] if self._is_front else None)
         height = float(self._basket[2]) + _CARRY_CLEARANCE
         height = height if self._is_front else max(chosen.safe_height, height)
         found = self._arm.paths.nearest(poses, costs, observation.qpos, 0.5)
@@ -315,7 +317,8 @@ class KeyframeEpisode:
         nearest = self._free.choose(observation.qpos, found, lambda pair: pair[1])
         self._free.release()
         assert nearest is not None
-        return (yield from self._arm.follow(observation, nearest[1], CLOSED, COARSE))
+        speed = _COMPARTMENT_SPEED if self._is_front else 1.0
+        return (yield from self._arm.follow(observation, nearest[1], CLOSED, COARSE, speed))
 
     def _place(self, observation: EpisodeObservation, chosen: _Keyframe) -> Motion:
         """Place the held object at a free place of the surface."""

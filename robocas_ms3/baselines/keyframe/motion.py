@@ -306,16 +306,18 @@ def find_views(
     return np.array(poses), np.array(costs)
 
 
-def find_release_poses(point: Array) -> tuple[Array, Array]:
+def find_release_poses(point: Array, upright: Array | None = None) -> tuple[Array, Array]:
     """Return TCP poses at which the gripper may release an object, and their costs.
 
     The poses point down or are tilted away from the base, because a tilted gripper reaches farther.
 
     Args:
         point: (3,) TCP position in the arm's base frame, m.
+        upright: (3,) axis in the TCP frame that was vertical at the grasp; None: any.
 
     Returns:
-        Poses (N, 4, 4) in the arm's base frame, and costs (N,): small for vertical poses exactly at the point.
+        Poses (N, 4, 4) in the arm's base frame, and costs (N,): small for vertical poses exactly at the point, or for
+        poses in which the axis ``upright`` is vertical.
     """
     azimuth = float(np.arctan2(point[1], point[0]))
     away = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
@@ -333,5 +335,6 @@ def find_release_poses(point: Array) -> tuple[Array, Array]:
                 rotation = np.stack([np.cross(closing, approach), closing, approach], axis=1)
                 for nearer in _RELEASE_NEARER:
                     poses.append(from_rotation(point - nearer * away, rotation))
-                    costs.append(0.01 * tilt + 4 * nearer)
+                    lean = 0.01 * tilt if upright is None else float(np.arccos(np.clip(rotation[2] @ upright, -1, 1)))
+                    costs.append(lean + 4 * nearer)
     return np.array(poses), np.array(costs)

@@ -114,6 +114,11 @@ def test_release_poses_tilt_away_from_the_base():
     assert np.allclose(np.linalg.det(poses[:, :3, :3]), 1)
     assert (poses[:, :3, 2] @ [0.6, 0.8, 0] >= -1e-9).all()  # outward, along the direction of the point
     assert np.linalg.norm(poses[:, :3, 3] - point, axis=1).max() == pytest.approx(0.05)
+    # an object that was upright in a grasp 60 degrees from the vertical stays upright
+    tilt = np.deg2rad(60)
+    upright = np.array([np.sin(tilt), 0, -np.cos(tilt)])  # the vertical in the TCP frame
+    poses, costs = find_release_poses(point, upright)
+    assert costs.min() < 0.01 and np.allclose(poses[costs.argmin()][:3, :3] @ upright, [0, 0, 1], atol=0.01)
 
 
 def test_free_paths_avoid_points(paths):
