@@ -312,7 +312,11 @@ class KeyframeEpisode:
         found = self._arm.paths.nearest(poses, costs, observation.qpos, 0.5)
         if not found:
             raise MotionError
-        observation = yield from self._arm.rise(observation, height, CLOSED)
+        try:
+            observation = yield from self._arm.rise(observation, height, CLOSED)
+        except MotionError:
+            if not self._is_front:
+                raise
         self._free.hold(chosen.scene.points[chosen.object.mask], chosen.approach.grasp)
         nearest = self._free.choose(observation.qpos, found, lambda pair: pair[1])
         self._free.release()

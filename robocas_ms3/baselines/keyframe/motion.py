@@ -29,6 +29,7 @@ _RELEASE_TILTS_DEG, _RELEASE_SIDES = (0, 15, 30, 45, 60, 72), (0.0, -0.4, 0.4)  
 _RELEASE_NEARER = (0.0, 0.05)  # m towards the base
 _FRONT_DISTANCES, _FRONT_LIFT = (0.2, 0.15, 0.1, 0.06), 0.025  # m before the pre-grasp; m of the way back above it
 _EXIT_DISTANCES = (0.3, 0.25, 0.2, 0.15, 0.1, 0.06)  # m from the pre-grasp back to the end of the way out
+_FAR_OUT = 0.28  # m from the grasp to the end of the way out, horizontally, at which an object is out of a compartment
 _PULL_STEP, _PULL_STANDOFF, _RETREATS = 0.015, 0.08, (0.15, 0.1, 0.06)  # m
 _PULL_TURNS = np.deg2rad((0, -20, 20, -40, 40))  # about the bar
 _LOWER, _NEARER = (
@@ -161,35 +162,51 @@ class ArmPaths:
     def plan_front_approaches(self, grasps: Array, scores: Array, qpos: Array) -> Iterator[Approach]:
         """Yield approaches of grasps from outside of a compartment, the one with the greatest score first.
 
+        Approaches that do not leave the compartment far enough come last.
+
         The gripper enters towards the object, and moves back out after a short lift. Arguments as in `plan_approach`.
         """
         turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+        short = []
         for index in np.argsort(-scores, kind="stable").tolist():
             for grasp in (grasps[index], grasps[index] @ turn):
-                for distance in _FRONT_DISTANCES:
-                    found = self._plan_entry(grasp, distance, qpos)
-                    if found is not None:
-                        yield found
-                        break
+                found = self._plan_entry(grasp, qpos)
+                if found is None:
+                    continue
+                if self._is_far_out(found):
+                    yield found
+                else:
+                    short.append(found)
+        yield from short
 
-    def _plan_entry(self, grasp: Array, distance: float, qpos: Array) -> Approach | None:
-        """Return the approach of a grasp (4, 4) that starts ``distance`` m before the pre-grasp, or None."""
+    def _is_far_out(self, approach: Approach) -> bool:
+        """Return whether the way out ends far enough from the grasp."""
+        assert approach.way_back is not None
+        out = self.chain.tcp(approach.way_back[-1:])[0, :2, 3]
+        return bool(np.linalg.norm(out - approach.grasp[:2, 3]) > _FAR_OUT)
+
+    def _plan_entry(self, grasp: Array, qpos: Array) -> Approach | None:
+        """Return the approach of a grasp (4, 4) that starts as far before the pre-grasp as possible, or None."""
         before = grasp.copy()
         before[:3, 3] -= PREGRASP * grasp[:3, 2]
-        outside = before.copy()
-        outside[:2, 3] -= distance * grasp[:2, 2] / np.linalg.norm(grasp[:2, 2])
-        reachable, found = self.reach(np.stack([outside, before, grasp]), qpos)
-        inwards = self._connect(found[0], [before, grasp]) if reachable.all() else None
+        backwards = grasp[:2, 2] / np.linalg.norm(grasp[:2, 2])
+        starts = np.tile(before, (len(_FRONT_DISTANCES), 1, 1))
+        starts[:, :2, 3] -= np.array(_FRONT_DISTANCES)[:, None] * backwards
+        reachable, found = self.reach(np.concatenate([starts, [before, grasp]]), qpos)
+        if not reachable[-2:].all():
+            return None
+        entries = ((one, self._connect(one, [before, grasp])) for one in found[:-2][reachable[:-2]])
+        start, inwards = next(((one, path) for one, path in entries if path is not None), (qpos, None))
         if inwards is None:
             return None
         for farther in _EXIT_DISTANCES:
             end = before.copy()
-            end[:2, 3] -= farther * grasp[:2, 2] / np.linalg.norm(grasp[:2, 2])
+            end[:2, 3] -= farther * backwards
             raised = np.stack([grasp, before, end])
             raised[:, 2, 3] += _FRONT_LIFT
             way_back = self._connect(inwards[-1], list(raised))
             if way_back is not None:
-                return Approach(grasp, found[0], inwards, way_back)
+                return Approach(grasp, start, inwards, way_back)
         return None
 
     def _connect(self, qpos: Array, poses: list[Array]) -> Array | None:
