@@ -41,10 +41,7 @@ jobs=${JOBS:-$(env -u OMP_NUM_THREADS nproc)}
 robocas=${ROBOCAS:-.venv/bin/robocas}
 command -v "$robocas" >/dev/null || fail "no such command: $robocas. Run bash scripts/setup.sh, or set ROBOCAS."
 
-mkdir -p "$out"
-settings="EPISODES=$episodes SEED=$seed" # recordings with other settings must not be mixed
-[[ -f $out/settings.txt ]] || echo "$settings" >"$out/settings.txt"
-[[ $(<"$out/settings.txt") == "$settings" ]] || fail "$out was recorded with other settings: expected $(<"$out/settings.txt"), found $settings. Choose another FOLDER."
+require_settings "$out" "EPISODES=$episodes SEED=$seed"
 data=() left=$episodes
 for part in "${parts[@]}"; do
     read -r percent offset of config first <<<"$part"

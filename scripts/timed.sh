@@ -9,3 +9,10 @@ timed() {
     fi
     printf '%s: %s: %d min\n' "$(basename "$0" .sh)" "$2" $(((SECONDS - start + 30) / 60))
 }
+
+# `require_settings FOLDER SETTINGS`: fails if FOLDER was recorded with other settings, which must not be mixed.
+require_settings() {
+    mkdir -p "$1"
+    [[ -f $1/settings.txt ]] || echo "$2" >"$1/settings.txt"
+    [[ $(<"$1/settings.txt") == "$2" ]] || fail "$1 was recorded with other settings: expected $(<"$1/settings.txt"), found $2. Choose another FOLDER."
+}

@@ -154,7 +154,7 @@ class KeyframeSamples:
             if decisions["kind"][earlier] == "pull":
                 handle = find_pulled_handle(file.candidates.decision(earlier).candidates)
                 if handle is not None:
-                    return handle if earlier == row else handle.open()
+                    return handle if earlier == row else handle.move_to_end()
         return None
 
     def _cameras_of(self, number: int, row: int) -> list[str]:

@@ -1,4 +1,4 @@
-"""One episode of `keyframe`: look, choose the next keyframe, execute it, and look again."""
+"""One episode of `keyframe`: view the scene, choose the next keyframe, execute it, and repeat."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ from robocas_ms3.baselines.keyframe.free_paths import FreePaths
 from robocas_ms3.baselines.keyframe.free_places import HeightMap
 from robocas_ms3.baselines.keyframe.grasp_proposals import propose_colliding_grasps, propose_grasps
 from robocas_ms3.baselines.keyframe.handles import Handle
-from robocas_ms3.baselines.keyframe.motion import LIFT, TOP_VIEWS_DEG, Approach, find_release_poses, find_views
+from robocas_ms3.baselines.keyframe.motion import LIFT, Approach
 from robocas_ms3.baselines.keyframe.observed_scene import ObservedObject, ObservedScene
 from robocas_ms3.baselines.keyframe.obstacles import find_middle, score_blocking, score_height
 from robocas_ms3.baselines.keyframe.perception import Perception, Request
+from robocas_ms3.baselines.keyframe.tcp_poses import TOP_VIEWS_DEG, find_release_poses, find_views
 from robocas_ms3.core.poses import Array, from_rotation, inverse
 from robocas_ms3.scenes.relations import select_by_relation
 
@@ -51,7 +52,7 @@ _SURE = 0.6  # probability of a target, above which less probable targets are ig
 _MAX_OBSTACLES = 5  # obstacles for which grasps are computed per decision
 _MAX_PULLS, _PULL_SPEED = 4, 0.3  # pulls per episode; fraction of the limits
 _COMPARTMENT_SPEED = 0.5  # fraction of the limits with an object that was grasped from the front
-_OPEN = 0.08  # m, length of a pull below which a door or drawer is open
+_MIN_PULL = 0.08  # m, length of a pull below which a door or drawer is open
 _FRONT_VIEWS_DEG = (40, 30, 50, 20)  # elevations of the gripper camera before a compartment, degrees
 _log = logging.getLogger(__name__)
 
@@ -117,7 +118,7 @@ class KeyframeEpisode:
         observation = yield from self._open_compartment(observation)
         close = False
         while True:
-            observation = yield from self._look(observation, close)
+            observation = yield from self._view(observation, close)
             scene = self._perception.observe(observation.frames[self._hand_camera], self._request, self._table)
             self._map.update(scene.points)
             target = self._choose_target(scene)
@@ -136,7 +137,7 @@ class KeyframeEpisode:
                 continue
             _log.debug("no keyframe; the target is %s", "not seen" if target is None else "seen")
             close = not close
-            if target is None:
+            if target is None and (self._is_front or self._pulls):  # the door may be closed
                 self._survey(observation)
                 observation = yield from self._open_compartment(observation)
             if target is None and scene.is_object.any():
@@ -146,14 +147,15 @@ class KeyframeEpisode:
     def _survey(self, observation: EpisodeObservation) -> None:
         survey = self._perception.survey(list(observation.frames.values()), _TABLE)
         self._focus, self._table = survey.focus, survey.table
-        self._basket = self._basket if survey.basket is None else survey.basket
+        if self._basket is None:  # later surveys show objects in the basket, or a part of it
+            self._basket = survey.basket
         self._handle, self._is_front = survey.handle, survey.has_roof
         is_enclosed = survey.has_roof or survey.handle is not None
         self._free.set_points(survey.points if is_enclosed else np.zeros((0, 3)))
         camera_in_base = observation.frames[self._hand_camera].camera_in_base
         self._camera_in_tcp = inverse(observation.tcp_in_base) @ camera_in_base
 
-    def _look(self, observation: EpisodeObservation, close: bool) -> Motion:
+    def _view(self, observation: EpisodeObservation, close: bool) -> Motion:
         """Move the gripper camera to a view of the focus, and return an observation with images."""
         if not self._is_front:
             try:
@@ -238,7 +240,7 @@ class KeyframeEpisode:
     def _open_compartment(self, observation: EpisodeObservation) -> Motion:
         """Pull the handle until the door or drawer is open; then survey the scene again."""
         arm = self._arm
-        while self._handle is not None and np.linalg.norm(self._handle.motion) > _OPEN and self._pulls < _MAX_PULLS:
+        while self._handle is not None and np.linalg.norm(self._handle.motion) > _MIN_PULL and self._pulls < _MAX_PULLS:
             handle, self._handle = self._handle, None
             self._pulls += 1
             pulls = arm.paths.plan_pulls(handle, observation.qpos)
@@ -246,13 +248,13 @@ class KeyframeEpisode:
             if found is None:
                 _log.debug("no path to the handle")
                 break
-            planned, path = found
+            pull, path = found
             observation = yield from arm.follow(observation, path, OPEN, _NEAR_START)
-            observation = yield from arm.follow(observation, planned.path, OPEN)
+            observation = yield from arm.follow(observation, pull.path, OPEN)
             observation = yield from arm.wait(observation, CLOSED)
-            observation = yield from arm.follow(observation, planned.pull, CLOSED, COARSE, _PULL_SPEED)
+            observation = yield from arm.follow(observation, pull.pull, CLOSED, COARSE, _PULL_SPEED)
             observation = yield from arm.wait(observation, OPEN)
-            observation = yield from arm.follow(observation, planned.way_back, OPEN, COARSE)
+            observation = yield from arm.follow(observation, pull.way_back, OPEN, COARSE)
             observation = yield from arm.request_images(observation, OPEN)
             self._survey(observation)
         return observation

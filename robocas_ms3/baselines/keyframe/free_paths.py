@@ -1,4 +1,4 @@
-"""Joint motions that keep the gripper clear of observed points."""
+"""Joint motions that keep the gripper and a held object clear of observed points."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class Handle:
         away = np.linalg.norm(offsets - along[..., None] * self.bar, axis=-1)
         return (away < _BAR_RADIUS) & (np.abs(along) < _BAR_HALF_LENGTH)
 
-    def open(self) -> Handle:
+    def move_to_end(self) -> Handle:
         """Return the handle after the motion."""
         return replace(self, position=self.position + self.motion, motion=np.zeros(3))
 

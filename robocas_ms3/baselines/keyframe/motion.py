@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.baselines.keyframe.handles import Handle
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.core.poses import Array, from_rotation, inverse
+from robocas_ms3.core.poses import Array, inverse
 from robocas_ms3.planning.kinematics import ArmChain, InverseKinematics, joint_distance, solve_straight_line
 from robocas_ms3.planning.pull_path import count_reached_poses, rotate_about_bar, track_handle
 from robocas_ms3.robots.registry import RobotSpec
@@ -20,13 +20,9 @@ PREGRASP = 0.1
 """m between pre-grasp and grasp."""
 LIFT = 0.12
 """m that an object is lifted after a grasp."""
-TOP_VIEWS_DEG = (90, 80, 70, 60, 50)
-"""Elevations of the camera in views from above, degrees, the preferred one first."""
 _JOINT_STEP = 0.03  # rad between the configurations of a joint motion
 _MAX_TRANSLATION, _MAX_ROTATION = 0.095, 0.45  # m along an axis and rad per control step of 0.2 s; 5 % below the limits
 _MAX_JOINT_STEP = 0.4  # rad per control step
-_RELEASE_TILTS_DEG, _RELEASE_SIDES = (0, 15, 30, 45, 60, 72), (0.0, -0.4, 0.4)  # degrees; rad about the vertical
-_RELEASE_NEARER = (0.0, 0.05)  # m towards the base
 _FRONT_DISTANCES, _FRONT_LIFT = (0.2, 0.15, 0.1, 0.06), 0.025  # m before the pre-grasp; m of the way back above it
 _EXIT_DISTANCES = (0.3, 0.25, 0.2, 0.15, 0.1, 0.06)  # m from the pre-grasp back to the end of the way out
 _FAR_OUT = 0.28  # m from the grasp to the end of the way out, horizontally, at which an object is out of a compartment
@@ -283,75 +279,3 @@ class PathFollower:
         steps = len(fits) - 1 if fits.all() else int(np.argmin(fits)) - 1
         self.index += steps
         return self._poses[self.index]
-
-
-def find_views(
-    camera_in_tcp: Array,
-    point: Array,
-    distances: Sequence[float],
-    elevations_deg: Sequence[float] = TOP_VIEWS_DEG,
-) -> tuple[Array, Array]:
-    """Return TCP poses whose camera views a point, and their costs.
-
-    Args:
-        camera_in_tcp: (4, 4) pose of the OpenCV camera frame in the TCP frame.
-        point: (3,) point in the arm's base frame, m.
-        distances: distances of the camera from the point, m.
-        elevations_deg: elevations of the camera above the point, degrees.
-
-    Returns:
-        Poses (N, 4, 4) in the arm's base frame, and costs (N,): small for views at the first elevation.
-    """
-    poses, costs = [], []
-    azimuth, tcp_in_camera = float(np.arctan2(point[1], point[0])), inverse(camera_in_tcp)
-    for distance in distances:
-        for elevation in elevations_deg:
-            level, down = np.cos(np.deg2rad(elevation)), np.sin(np.deg2rad(elevation))
-            for turn in (0.0,) if elevation == 90 else (0.0, 0.5, -0.5, 1.0, -1.0):
-                forward = np.array([level * np.cos(azimuth + turn), level * np.sin(azimuth + turn), -down])
-                for roll in (0.0, 0.4, -0.4, 0.8, -0.8):
-                    up = np.array([np.cos(azimuth + roll), np.sin(azimuth + roll), 0.0])
-                    up -= forward * (up @ forward)
-                    if np.linalg.norm(up) < 0.1:
-                        continue
-                    up /= np.linalg.norm(up)
-                    camera = from_rotation(
-                        point - distance * forward, np.stack([np.cross(-up, forward), -up, forward], 1)
-                    )
-                    poses.append(camera @ tcp_in_camera)
-                    costs.append(abs(elevations_deg[0] - elevation) * 0.01 + abs(roll) * 0.1 + abs(turn) * 0.1)
-    return np.array(poses), np.array(costs)
-
-
-def find_release_poses(point: Array, upright: Array | None = None) -> tuple[Array, Array]:
-    """Return TCP poses at which the gripper may release an object, and their costs.
-
-    The poses point down or are tilted away from the base, because a tilted gripper reaches farther.
-
-    Args:
-        point: (3,) TCP position in the arm's base frame, m.
-        upright: (3,) axis in the TCP frame that was vertical at the grasp; None: any.
-
-    Returns:
-        Poses (N, 4, 4) in the arm's base frame, and costs (N,): small for vertical poses exactly at the point, or for
-        poses in which the axis ``upright`` is vertical.
-    """
-    azimuth = float(np.arctan2(point[1], point[0]))
-    away = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    poses, costs = [], []
-    for tilt in _RELEASE_TILTS_DEG:
-        for side in _RELEASE_SIDES:
-            level = np.array([np.cos(azimuth + side), np.sin(azimuth + side), 0.0])
-            approach = np.sin(np.deg2rad(tilt)) * level - np.array([0, 0, np.cos(np.deg2rad(tilt))])
-            for turn in np.arange(0, 2 * np.pi, np.pi / 6):
-                closing = np.array([np.cos(turn), np.sin(turn), 0.0])
-                closing -= approach * (approach @ closing)
-                if np.linalg.norm(closing) < 0.2:
-                    continue
-                closing /= np.linalg.norm(closing)
-                rotation = np.stack([np.cross(closing, approach), closing, approach], axis=1)
-                for nearer in _RELEASE_NEARER:
-                    poses.append(from_rotation(point - nearer * away, rotation))
-                    lean = 0.01 * tilt if upright is None else float(np.arccos(np.clip(rotation[2] @ upright, -1, 1)))
-                    costs.append(lean + 4 * nearer)
-    return np.array(poses), np.array(costs)

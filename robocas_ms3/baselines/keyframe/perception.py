@@ -155,10 +155,10 @@ class Perception:
         supports = np.concatenate(below)
         table = find_table_height(supports, found) if len(supports) else default_table
         found = found[found[:, 2] > table + 0.005]
-        seen = len(found) >= 10
-        focus = np.median(found[:, :2], axis=0) if seen else np.array([0.6, 0.0])
+        has_objects = len(found) >= 10
+        focus = np.median(found[:, :2], axis=0) if has_objects else np.array([0.6, 0.0])
         has_roof = False
-        if seen:
+        if has_objects:
             roof = np.percentile(found[:, 2], 95) + _ROOF_CLEARANCE
             above = (surfaces[:, 2] > roof) & (np.linalg.norm(surfaces[:, :2] - focus, axis=1) < _ROOF_RADIUS)
             has_roof = int(above.sum()) >= _ROOF_CELLS

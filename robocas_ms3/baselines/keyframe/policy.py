@@ -23,7 +23,7 @@ _STREAM = 417  # random stream of the proposals
 
 
 class KeyframePolicy:
-    """Policy that looks at the scene, chooses the next keyframe, and moves there by inverse kinematics.
+    """Policy that views the scene, chooses the next keyframe, and moves there by inverse kinematics.
 
     Images are requested only for decisions. The policy knows the kinematics of the robot and the nominal calibration
     of the cameras; it uses no privileged state and no planner of the simulator.

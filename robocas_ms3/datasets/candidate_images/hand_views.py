@@ -76,12 +76,12 @@ class HandViews:
             if decisions["held_slot"][row] >= 0:
                 continue
             rng = np.random.default_rng([int(decisions["seed"][row]), int(decisions["decision"][row]), number, _STREAM])
-            points = find_handle(file, row)
+            points = _find_handle_positions(file, row)
             is_front = self._is_front or len(points) > 0
             if not len(points):
                 points = decisions["object_in_base"][row][decisions["present"][row] & ~decisions["fallen"][row]][:, :3]
-            point = _Subject(points.astype(np.float64), is_front, number == 0)
-            qpos = self._draw(point, states[index, arm].astype(np.float64), model, rng)
+            subject = _Subject(points.astype(np.float64), is_front, number == 0)
+            qpos = self._draw(subject, states[index, arm].astype(np.float64), model, rng)
             if qpos is not None:
                 states[index, arm] = qpos
         articulations = {**recording.states["articulations"], uid: states}
@@ -122,7 +122,7 @@ class _Subject:
         return sample_views(rng, point, distance, _POSES, **front)
 
 
-def find_handle(file: CandidateFile, row: int) -> NDArray[np.float32]:
+def _find_handle_positions(file: CandidateFile, row: int) -> NDArray[np.float32]:
     """Return the positions (n, 3) at which successful pulls of a decision grasp the handle; n is 0 without a pull."""
     found = file.decision(row).candidates
     pulls = (found["primitive"] == "pull") & found["success"]

@@ -110,7 +110,7 @@ def test_the_handle_is_the_mean_of_successful_pulls():
     # on the bar; behind it on the door; beyond the part near the grasp; after the pull
     points = np.array([[0.49, -0.28, 0.12], [0.52, -0.27, 0.08], [0.48, -0.27, 0.2], [0.48, 0.23, 0.08]])
     assert handle.contains(points).tolist() == [True, False, False, False]
-    opened = handle.open()
+    opened = handle.move_to_end()
     assert opened.contains(points).tolist() == [False, False, False, True] and not opened.motion.any()
 
 

@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.baselines.keyframe.free_paths import FreePaths
 from robocas_ms3.baselines.keyframe.handles import Handle
-from robocas_ms3.baselines.keyframe.motion import LIFT, PREGRASP, ArmPaths, PathFollower, find_release_poses, find_views
+from robocas_ms3.baselines.keyframe.motion import LIFT, PREGRASP, ArmPaths, PathFollower
+from robocas_ms3.baselines.keyframe.tcp_poses import find_release_poses, find_views
 from robocas_ms3.core.poses import from_rotation, inverse
 from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
 

@@ -39,9 +39,10 @@ class FakePerception:
     """Perception that sees the present blocks and the table, or a closed door with a handle before them."""
 
     def __init__(self, blocks, door=None):
-        self.blocks, self.door = blocks, door
+        self.blocks, self.door, self.surveys = blocks, door, 0
 
     def survey(self, frames, default_table):
+        self.surveys += 1
         handle = None if self.door is None or self.door.opening > 0.9 else self.door.handle
         return Survey(np.array([0.55, 0.0]), BASKET, TABLE, np.zeros((0, 3)), handle, has_roof=self.door is not None)
 
@@ -154,6 +155,18 @@ def test_an_object_is_moved_aside_if_the_target_is_not_seen(paths):
     arm = play(paths, {"other": np.array([0.55, 0.0])})
     (name, position), *_ = arm.released
     assert name == "other" and np.linalg.norm(position[:2] - BASKET[:2]) > 0.2 and position[2] < TABLE + 0.1
+
+
+def test_a_table_is_surveyed_once(paths):
+    """Later images may show a part of the basket, or objects in it."""
+    perception, arm = FakePerception({}), FakeArm(paths, {})
+    request, rng = Request(np.ones(1, np.float32), None), np.random.default_rng(0)
+    episode = KeyframeEpisode(perception, ArmControl(paths, 1), CONFIG.decisions, request, rng, "gripper_camera")
+    run = episode.run(arm.view(images=True))
+    command = next(run)
+    for _ in range(60):
+        command = run.send(arm.step(command))
+    assert perception.surveys == 1
 
 
 def test_the_door_is_opened_before_the_target_is_grasped(paths):
