@@ -23,6 +23,7 @@ from robocas_ms3.core.strict_model import StrictModel, parse
 
 RUN, METRICS, TENSORBOARD = "run.json", "metrics.csv", "tensorboard"
 CHECKPOINT, WEIGHTS = "checkpoint.safetensors", "weights.safetensors"
+_GENERATION_FILES = ("run.json", "summary.json", "failures.jsonl")  # with durations and attempts
 BUNDLED = Path(__file__).parents[2] / "data" / "runs"
 """Folder of the bundled runs, which have weights and no checkpoint."""
 _PACKAGES = ("robocas-ms3", "torch", "accelerate", "safetensors", "transformers", "numpy")
@@ -120,7 +121,8 @@ def hash_dataset(data: Path) -> str:
     """Return the hex SHA-256 of a dataset folder or a trajectory file.
 
     The hash of a trajectory covers the bytes of the file and of the JSON file next to it. The hash of a folder covers
-    the names and sizes of all files, and the bytes of JSON files, tables and arrays. It does not cover image bytes.
+    the names and sizes of all files, and the bytes of JSON files, tables, arrays and candidates. It does not cover
+    image bytes, nor the files of `robocas generate` that change when its command is repeated.
 
     Raises:
         TrainingError: there is no such file or folder.
@@ -133,10 +135,10 @@ def hash_dataset(data: Path) -> str:
     elif data.is_dir():
         for path in sorted(path for path in data.rglob("*") if path.is_file()):
             name = path.relative_to(data).as_posix()
-            if name.startswith("preview/") or path.name.startswith("."):
+            if name.startswith("preview/") or path.name.startswith(".") or path.name in _GENERATION_FILES:
                 continue
             digest.update(f"{name} {path.stat().st_size}\n".encode())
-            if path.suffix in {".json", ".npz", ".npy", ".parquet"}:
+            if path.suffix in {".json", ".npz", ".npy", ".parquet"} or path.name == "candidates.h5":
                 _hash_file(digest, path)
     else:
         raise TrainingError("no such dataset", where=data, expected="a dataset folder or a trajectory.h5", usage=True)

@@ -45,3 +45,15 @@ def test_hash_of_weights(tmp_path):
     assert (
         hash_weights(tmp_path) == "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
     )  # of an empty file
+
+
+def test_a_repeated_recording_has_the_same_hash(tmp_path):
+    """`robocas generate` updates the durations in its own files when a finished run is repeated."""
+    (tmp_path / "pick").mkdir()
+    (tmp_path / "pick" / "candidates.h5").write_bytes(b"decisions")
+    before = hash_dataset(tmp_path)
+    for name in ("run.json", "summary.json", "failures.jsonl"):
+        (tmp_path / "pick" / name).write_text("durations")
+    assert hash_dataset(tmp_path) == before
+    (tmp_path / "pick" / "candidates.h5").write_bytes(b"otherwise")
+    assert hash_dataset(tmp_path) != before
