@@ -65,6 +65,7 @@ class TrainSettings(StrictModel):
             the policy has the last weights.
         seed: random seed.
         precision: precision of the forward pass. ``auto``: bf16 if the device has bf16 hardware, otherwise fp32.
+        weights_precision: precision of the weights file. ``fp16``: half the size. The network still computes in fp32.
         workers: number of processes that read samples; 0: the training process reads them.
         log_every, validate_every, save_every: steps between lines of the log, between validations, and between
             checkpoints.
@@ -85,6 +86,7 @@ class TrainSettings(StrictModel):
     ema: float = Field(default=0.999, ge=0, lt=1)
     seed: int = Field(default=0, ge=0)
     precision: Precision = "auto"
+    weights_precision: Literal["fp32", "fp16"] = "fp32"
     workers: int = Field(default=0, ge=0, le=1024)
     log_every: int = Field(default=50, ge=1)
     validate_every: int = Field(default=1000, ge=1)

@@ -95,6 +95,10 @@ class RunPolicy:
         """Start new episodes in some of the envs."""
         self._policy.reset(episodes)
 
+    def check_robot(self, robot: str) -> None:
+        """Raise a `RobocasError` if the policy cannot control the robot with this name."""
+        getattr(self._policy, "check_robot", lambda robot: None)(robot)
+
     def requests_images(self, envs: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return (E,) bool, whether the next call of `act` needs images of each env."""
         return find_image_requests(self._policy, envs)

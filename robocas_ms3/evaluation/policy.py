@@ -237,6 +237,8 @@ class Policy(Protocol):
     - ``requests_images(envs)`` gets the indices (E,) int64 of the envs of the next call of ``act``. It returns (E,)
       bool, whether ``act`` needs images of each env. Other images are not rendered. Without this method, ``act`` gets
       all images. The method must not change the state of the policy, because it may be called more than once.
+    - ``check_robot(robot)`` gets the name of the robot of an evaluation, before any environment is made. It raises a
+      `RobocasError` if the policy cannot control this robot.
     - ``describe()`` returns a dict that ``run.json`` of a result records.
     - ``list_training_differences(configs)`` gets the task configurations of a protocol by name. It returns by name a
       list of what the training data lacks, or None if the training data is unknown. ``run.json`` records it.

@@ -107,6 +107,8 @@ class EvaluationSession:
         if self.spec.cameras:
             self.protocol.check_cameras(self.spec, self.episodes)
             require_renderer()
+        if (check_robot := getattr(self.policy, "check_robot", None)) is not None:
+            check_robot(rules.robot)
         self._log_policy_warnings()
         self.run_record = self._make_run_record(backend)
         self.folder = settings.choose_folder(rules.name, self.played_as)

@@ -51,6 +51,16 @@ def test_external_loop_ends_episodes_by_the_rules_and_reset_drops_running_episod
     external.close()
 
 
+def test_a_policy_that_cannot_control_the_robot_fails_before_an_env_is_made(made):
+    class OtherArmPolicy(ExternalPolicy):
+        def check_robot(self, robot):
+            raise RobocasError("no inverse kinematics", where=robot)
+
+    with pytest.raises(RobocasError, match=SMOKE.rules.robot):
+        EvaluationSession(OtherArmPolicy(AT_5_HZ), EvaluationSettings(protocol="smoke", backend="processes"))
+    assert made == []
+
+
 def test_env_stays_open_while_the_configuration_is_the_same(made):
     external = open_session()
     for number in (0, 1, 2, 0):

@@ -62,5 +62,11 @@ class KeyframeConfig(BaselineConfig):
     text_weight: float = Field(default=0.5, ge=0)
     decisions: DecisionSettings = DecisionSettings()
     train: TrainSettings = TrainSettings(
-        steps=4_000, batch_size=12, learning_rate=2e-3, weight_decay=0.01, precision="bf16", validation_samples=240
+        steps=4_000,
+        batch_size=12,
+        learning_rate=2e-3,
+        weight_decay=0.01,
+        precision="bf16",
+        weights_precision="fp16",
+        validation_samples=240,
     )

@@ -51,9 +51,14 @@ class KeyframePolicy:
         self._runs: dict[int, Motion] = {}  # by env, from the first action on
         self._image_requests: dict[int, bool] = {}
 
+    def check_robot(self, robot: str) -> None:
+        """Raise RobotDescriptionError or RobocasError if there is no inverse kinematics for the robot."""
+        if robot not in self._paths:
+            self._paths[robot] = ArmPaths(find_robot(robot))
+
     def reset(self, episodes: list[EpisodeSpec]) -> None:
         for episode in episodes:
-            self._paths.setdefault(episode.robot, ArmPaths(find_robot(episode.robot)))
+            self.check_robot(episode.robot)
             self._specs[episode.env], self._image_requests[episode.env] = episode, True
             self._runs.pop(episode.env, None)
 

@@ -104,8 +104,11 @@ class Learner:
                 raise self._run.make_step_error(f"the {name} is NaN or infinite", step)
 
     def policy_weights(self) -> dict[str, torch.Tensor]:
-        """Return the state dict of the policy's network."""
-        return self._policy_model().state_dict()
+        """Return the state dict of the policy's network in the precision of the weights file."""
+        weights = self._policy_model().state_dict()
+        if self._settings.weights_precision == "fp16":
+            weights = {name: value.half() if value.is_floating_point() else value for name, value in weights.items()}
+        return weights
 
     def save(self) -> None:
         """Write the checkpoint and the policy's weights; all processes must call this function.

@@ -15,8 +15,10 @@ from robocas_ms3.baselines.keyframe.handles import Handle
 from robocas_ms3.baselines.keyframe.motion import ArmPaths
 from robocas_ms3.baselines.keyframe.observed_scene import ObservedObject, ObservedScene
 from robocas_ms3.baselines.keyframe.perception import CameraFrame, Request, Survey
+from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.poses import from_rotation, to_wxyz
-from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
+from robocas_ms3.robots.description import MOBILE_PANDA
+from robocas_ms3.robots.registry import DEFAULT_ROBOT, PANDA, ROBOTS, find_robot
 
 REST = np.array([0, np.pi / 8, 0, -5 * np.pi / 8, 0, 3 * np.pi / 4, np.pi / 4])
 TABLE, BASKET = 0.1, np.array([0.5, 0.5, 0.25])
@@ -210,3 +212,12 @@ def test_policy_requests_images_at_decisions_only():
     assert requests[0] == [True, True] and [False, False] in requests
     policy.reset([start(1)])
     assert policy.requests_images(np.array([1])).tolist() == [True]
+
+
+def test_a_robot_without_inverse_kinematics_is_refused(monkeypatch):
+    description = replace(MOBILE_PANDA, uid="other", inverse_kinematics="robocas_ms3.planning.analytic:Missing")
+    monkeypatch.setitem(ROBOTS.builtin, "other", replace(PANDA, description=description))
+    policy = KeyframePolicy(CONFIG, FACTS, KeyframeNetwork(CONFIG, FACTS).eval())
+    policy.check_robot(DEFAULT_ROBOT)
+    with pytest.raises(RobocasError):
+        policy.check_robot("other")

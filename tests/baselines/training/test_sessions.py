@@ -84,6 +84,15 @@ def test_weights_are_repaired_from_the_checkpoint(whole, data, damage):
     assert (whole / "weights.safetensors").read_bytes() == before
 
 
+def test_half_precision_weights_are_half_the_size(whole, data, tmp_path):
+    train("stub", data, tmp_path / "half", {"train": {"weights_precision": "fp16"}})
+    weights, full = (load_file(run / "weights.safetensors") for run in (tmp_path / "half", whole))
+    assert {value.dtype for value in weights.values()} == {torch.float16}
+    for name, value in full.items():
+        assert torch.equal(weights[name], value.half())
+    assert RunPolicy(tmp_path / "half").describe()["steps"] == 40
+
+
 @pytest.mark.parametrize("room", [0, 4, 8, 16])
 def test_a_full_disk_is_an_error_and_the_run_continues(whole, data, small_disk, capsys, room):
     """On a real small disk with ``room`` kB: writing the record, log, curves or checkpoint fails."""
