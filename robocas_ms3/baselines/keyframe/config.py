@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from robocas_ms3.baselines.baseline import BaselineConfig, TrainSettings
 from robocas_ms3.core.strict_model import StrictModel
 
 
 class DecisionSettings(StrictModel):
-    """Settings of the decisions of the policy; they can be changed after the training.
+    """Settings of the decisions of the policy.
 
     Attributes:
         view_distances: distances of the gripper camera from the point that it views, m, the preferred one first.
@@ -70,3 +70,10 @@ class KeyframeConfig(BaselineConfig):
         weights_precision="fp16",
         validation_samples=240,
     )
+
+    @model_validator(mode="after")
+    def _check(self) -> KeyframeConfig:
+        for name, size in (("image_size", self.image_size), ("crop_size", self.crop_size)):
+            if min(size) < 32 or any(length % 32 for length in size):
+                raise ValueError(f"invalid {name} {list(size)}: expected multiples of 32 pixels")
+        return self

@@ -24,6 +24,7 @@ from robocas_ms3.baselines.keyframe.image_crops import augment_image, draw_crop,
 from robocas_ms3.baselines.keyframe.network import FIRST_NAME, HANDLE, OFFSET_UNIT, PULL_UNIT, STRIDE, make_inputs
 from robocas_ms3.baselines.keyframe.observed_scene import (
     find_table_height,
+    is_above_table,
     is_below_camera,
     is_in_workspace,
     sample_pixels,
@@ -274,13 +275,16 @@ class KeyframeSamples:
         others = points[(values == NOTHING) & is_below_camera(points, image.camera_in_base)]
         if not len(others):
             return crops, poses, outcome
+        is_held = found["success"] | found["held"]  # also where the object could not be placed afterwards
         table, number = find_table_height(others, points[values >= FIRST_SLOT]), 0
+        kept = is_above_table(points, table)
+        values, points = values[kept], points[kept]
         for index in rng.permutation(np.flatnonzero(find_labelled_grasps(found))).tolist():
             mask = values == FIRST_SLOT + int(found["slot"][index])
             if number < count and mask.sum() >= _MIN_POINTS:
                 grasp = from_wxyz(found["start_in_base"][index].astype(np.float64))[None]
                 one, feature = make_crops(points, mask.astype(np.float32), grasp, table)
-                crops[number], poses[number], outcome[number] = one[0], feature[0], float(found["success"][index])
+                crops[number], poses[number], outcome[number] = one[0], feature[0], float(is_held[index])
                 number += 1
         return crops, poses, outcome
 

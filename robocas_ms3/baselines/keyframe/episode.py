@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Generator
+from collections.abc import Callable, Generator
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,7 @@ from robocas_ms3.baselines.keyframe.obstacles import find_middle, score_blocking
 from robocas_ms3.baselines.keyframe.perception import Perception, Request
 from robocas_ms3.baselines.keyframe.tcp_poses import TOP_VIEWS_DEG, find_release_poses, find_views
 from robocas_ms3.core.poses import Array, from_rotation, inverse
+from robocas_ms3.scenes.grasp_checks import HALF_TURN
 from robocas_ms3.scenes.relations import select_by_relation
 
 _TABLE = 0.12  # m, height of a table in the arm's base frame if it is not seen
@@ -39,16 +41,18 @@ _VIEW_HEIGHT = 0.4  # m of the TCP before it moves to a view
 _FALLBACK_DISTANCES = (0.3, 0.35, 0.4, 0.45, 0.25)  # m from the camera to a point that is nearer to the base
 _NEAR_START = (0.008, 0.05)  # m and rad from the pre-grasp at which the motion to it ends
 _EMPTY = 0.003  # m, gripper width below which nothing is held
-_HANGING = (0.015, 0.16)  # m from the TCP down to the lowest point of a held object, least and greatest value
+_HANGING = (0.015, 0.3)  # m from the TCP down to the lowest point of a held object, least and greatest value
 _RELEASE_CLEARANCE = 0.03  # m between the rim of the basket and the lowest point of a held object
 _CARRY_CLEARANCE = 0.15  # m between the rim and the TCP on the way to the basket
 _PLACE_HEIGHT = 0.38  # m, least height of the TCP on the way to a free place
 _DROP = 0.02  # m that an object falls at a free place
 _REPEAT_DISTANCE = 0.02  # m around a failed grasp in which similar grasps lose score
+_SIMILAR_TRACE = 2.6  # of the rotation between two grasps, above which they are similar: 37 degrees
 _PLACE_POSES = 10  # poses at free places that are tried
 _TARGET_GAP, _BASKET_GAP = 0.16, 0.28  # m between a free place and the target, and the basket
 _IN_BASKET = 0.14  # m from the middle of the basket, within which an object is in it
 _SURE = 0.6  # probability of a target, above which less probable targets are ignored
+_SAME_TARGET = 0.05  # m between the centres of the target in two views
 _MAX_OBSTACLES = 5  # obstacles for which grasps are computed per decision
 _MAX_PULLS, _PULL_SPEED = 4, 0.3  # pulls per episode; fraction of the limits
 _COMPARTMENT_SPEED = 0.5  # fraction of the limits with an object that was grasped from the front
@@ -68,8 +72,12 @@ class _Keyframe:
 
     @property
     def hanging(self) -> float:
-        """Distance in m from the TCP down to the lowest visible point of the object."""
-        low = self.scene.points[self.object.mask][:, 2].min()
+        """Distance in m from the TCP down to the lowest point of the object.
+
+        It may be hidden, so the object is taken to be as high above its predicted centre as below it.
+        """
+        heights = self.scene.points[self.object.mask][:, 2]
+        low = min(heights.min(), 2 * self.object.center[2] - heights.max())
         return float(np.clip(self.approach.grasp[2, 3] - low, *_HANGING))
 
     @property
@@ -103,6 +111,7 @@ class KeyframeEpisode:
     ) -> None:
         self._perception, self._arm, self._settings = perception, arm, settings
         self._request, self._rng, self._hand_camera = request, rng, hand_camera
+        self._target_xy: Array | None = None  # predicted centre of the target in the last view that showed it
         self._failed: list[Array] = []  # TCP poses of failed grasps
         self._map = HeightMap()
         self._table, self._focus = _TABLE, np.array([0.6, 0.0])
@@ -119,6 +128,8 @@ class KeyframeEpisode:
         close = False
         while True:
             observation = yield from self._view(observation, close)
+            if self._basket is None:
+                self._basket = self._perception.survey(list(observation.frames.values()), self._table).basket
             scene = self._perception.observe(observation.frames[self._hand_camera], self._request, self._table)
             self._map.update(scene.points)
             target = self._choose_target(scene)
@@ -127,12 +138,12 @@ class KeyframeEpisode:
                 self._focus = scene.points[target.mask].mean(axis=0)[:2]
                 chosen = self._plan_grasp(scene, target, observation)
             if chosen is not None:
-                observation = yield from self._move_to_basket(observation, chosen)
+                observation = yield from self._move(observation, chosen, self._carry)
                 close = False
                 continue
             chosen = None if self._is_front else self._choose_obstacle(scene, target, observation)
             if chosen is not None:
-                observation = yield from self._move_aside(observation, chosen)
+                observation = yield from self._move(observation, chosen, self._place)
                 close = False
                 continue
             _log.debug("no keyframe; the target is %s", "not seen" if target is None else "seen")
@@ -140,7 +151,7 @@ class KeyframeEpisode:
             if target is None and (self._is_front or self._pulls):  # the door may be closed
                 self._survey(observation)
                 observation = yield from self._open_compartment(observation)
-            if target is None and scene.is_object.any():
+            elif target is None and scene.is_object.any():
                 self._focus = find_middle(scene)
             self._focus = self._focus + self._rng.normal(0, 0.05, 2)
 
@@ -181,9 +192,15 @@ class KeyframeEpisode:
             return None
         sure = [one for one in found if one.probability > _SURE] or found
         xy = np.stack([one.center[:2] for one in sure])
-        index = select_by_relation(self._request.relation, xy, 0.0) if self._request.relation else None
+        index = None
+        if self._target_xy is not None:  # later views may show fewer objects of this name
+            distances = np.linalg.norm(xy - self._target_xy, axis=1)
+            index = int(distances.argmin()) if distances.min() < _SAME_TARGET else None
+        if index is None and self._request.relation is not None:
+            index = select_by_relation(self._request.relation, xy, 0.0)
         if index is None:  # without a relation, or if it fits no object, the nearest one is meant
             index = int(np.linalg.norm(xy, axis=1).argmin())
+        self._target_xy = xy[index]
         return sure[index]
 
     def _is_in_basket(self, one: ObservedObject) -> bool:
@@ -197,6 +214,8 @@ class KeyframeEpisode:
         proposals = propose_grasps(
             scene.points, one.mask, self._table, settings.proposals, self._rng, from_front=self._is_front
         )
+        paths, qpos = self._arm.paths, observation.qpos
+        proposals = proposals.select(paths.is_grasp_in_reach(proposals.tcp_in_base, qpos))
         if not len(proposals.heuristic):
             return None
         best = np.argsort(-proposals.heuristic, kind="stable")[: settings.scored]
@@ -205,9 +224,9 @@ class KeyframeEpisode:
         scores = self._perception.score_grasps(scene, one.mask, grasps, self._table) + 0.02 * proposals.heuristic
         for failed in self._failed:
             near = np.exp(-((np.linalg.norm(grasps[:, :3, 3] - failed[:3, 3], axis=1) / _REPEAT_DISTANCE) ** 2))
-            similar = np.einsum("gij,ij->g", grasps[:, :3, :3], failed[:3, :3]) > 2.6  # trace; 3: equal rotations
-            scores -= 2 * near * similar
-        paths, qpos = self._arm.paths, observation.qpos
+            rotations = np.stack([failed[:3, :3], (failed @ HALF_TURN)[:3, :3]])
+            traces = np.einsum("gij,kij->gk", grasps[:, :3, :3], rotations).max(axis=1)  # 3: equal rotations
+            scores -= 2 * near * (traces > _SIMILAR_TRACE)
         if self._is_front:
             approaches = paths.plan_front_approaches(grasps, scores, qpos)
             found = self._free.choose(qpos, approaches, lambda approach: approach.start)
@@ -283,24 +302,25 @@ class KeyframeEpisode:
             self._failed.append(approach.grasp)
         return observation, holds
 
-    def _move_to_basket(self, observation: EpisodeObservation, chosen: _Keyframe) -> Motion:
+    def _move(
+        self,
+        observation: EpisodeObservation,
+        chosen: _Keyframe,
+        transfer: Callable[[EpisodeObservation, _Keyframe], Motion],
+    ) -> Motion:
+        """Grasp an object, transfer it by ``transfer``, and release it; put it back if there is no path."""
         observation, holds = yield from self._grasp(observation, chosen)
         if not holds:
             return observation
+        approach = chosen.approach
         try:
-            observation = yield from self._carry(observation, chosen)
+            observation = yield from transfer(observation, chosen)
         except MotionError:
-            _log.debug("no path to the basket")
-        return (yield from self._arm.wait(observation, OPEN))
-
-    def _move_aside(self, observation: EpisodeObservation, chosen: _Keyframe) -> Motion:
-        observation, holds = yield from self._grasp(observation, chosen)
-        if not holds:
-            return observation
-        try:
-            observation = yield from self._place(observation, chosen)
-        except MotionError:
-            _log.debug("no path to a free place")
+            _log.debug("no path for a held object")
+            self._failed.append(approach.grasp)
+            if approach.way_back is None:
+                with suppress(MotionError):
+                    observation = yield from self._arm.move_straight(observation, approach.grasp, CLOSED)
         return (yield from self._arm.wait(observation, OPEN))
 
     def _carry(self, observation: EpisodeObservation, chosen: _Keyframe) -> Motion:
@@ -309,7 +329,7 @@ class KeyframeEpisode:
             raise MotionError
         point = self._basket + [0, 0, _RELEASE_CLEARANCE + chosen.hanging]
         poses, costs = find_release_poses(point, chosen.approach.grasp[2, :3] if self._is_front else None)
-        height = float(self._basket[2]) + _CARRY_CLEARANCE
+        height = float(self._basket[2]) + max(_CARRY_CLEARANCE, _RELEASE_CLEARANCE + chosen.hanging)
         height = height if self._is_front else max(chosen.safe_height, height)
         found = self._arm.paths.nearest(poses, costs, observation.qpos, 0.5)
         if not found:

@@ -117,6 +117,7 @@ def _is_above(tcp_in_base: Array, table: float) -> NDArray[np.bool_]:
     """Return for each grasp (G, 4, 4) whether the whole gripper is above a surface."""
     corners = np.stack(np.meshgrid(*[(0, 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     points = np.concatenate([box[corners, range(3)] for box in GRIPPER_BOXES])
+    points = np.concatenate([points, points * (1, -1, 1)])  # the boxes are one half of the gripper
     heights = tcp_in_base[:, 2, 3][:, None] + tcp_in_base[:, 2, :3] @ points.T
     return np.asarray(heights.min(axis=1) > table)
 

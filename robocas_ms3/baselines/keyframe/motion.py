@@ -15,23 +15,21 @@ from robocas_ms3.core.poses import Array, inverse
 from robocas_ms3.planning.kinematics import ArmChain, InverseKinematics, joint_distance, solve_straight_line
 from robocas_ms3.planning.pull_path import count_reached_poses, rotate_about_bar, track_handle
 from robocas_ms3.robots.registry import RobotSpec
+from robocas_ms3.scenes.grasp_checks import HALF_TURN, PREGRASP_DISTANCE
 
-PREGRASP = 0.1
-"""m between pre-grasp and grasp."""
 LIFT = 0.12
 """m that an object is lifted after a grasp."""
 _JOINT_STEP = 0.03  # rad between the configurations of a joint motion
 _MAX_TRANSLATION, _MAX_ROTATION = 0.095, 0.45  # m along an axis and rad per control step of 0.2 s; 5 % below the limits
 _MAX_JOINT_STEP = 0.4  # rad per control step
+_MAX_HALVINGS, _LEAST_MOTION = 3, 0.01  # of motions that the arm does not follow; m of a motion that is checked
 _FRONT_DISTANCES, _FRONT_LIFT = (0.2, 0.15, 0.1, 0.06), 0.025  # m before the pre-grasp; m of the way back above it
 _EXIT_DISTANCES = (0.3, 0.25, 0.2, 0.15, 0.1, 0.06)  # m from the pre-grasp back to the end of the way out
 _FAR_OUT = 0.28  # m from the grasp to the end of the way out, horizontally, at which an object is out of a compartment
 _PULL_STEP, _PULL_STANDOFF, _RETREATS = 0.015, 0.08, (0.15, 0.1, 0.06)  # m
 _PULL_TURNS = np.deg2rad((0, -20, 20, -40, 40))  # about the bar
-_LOWER, _NEARER = (
-    (0.0, 0.05, 0.1),
-    (1.0, 0.93, 0.86, 0.78),
-)  # alternative ends of a rise, m and fraction of the distance
+_LOWER = (0.0, 0.05, 0.1)  # m below the height of a rise, of its alternative ends
+_NEARER = (1.0, 0.93, 0.86, 0.78)  # fractions of the distance from the base
 
 
 @dataclass(frozen=True)
@@ -113,6 +111,18 @@ class ArmPaths:
         """Return which TCP poses (N, 4, 4) are in reach, (N,) bool, and the nearest configurations (N, 7)."""
         return self.kinematics.nearest_solutions(tcp_in_base, qpos)
 
+    def is_grasp_in_reach(self, grasps: Array, qpos: Array) -> NDArray[np.bool_]:
+        """Return (G,) bool, whether grasps (G, 4, 4) and their pre-grasps are in reach, also after half a turn.
+
+        qpos: (7,) present configuration.
+        """
+        poses = np.stack([grasps, grasps @ HALF_TURN])
+        before = poses.copy()
+        before[..., :3, 3] -= PREGRASP_DISTANCE * poses[..., :3, 2]
+        reachable, _ = self.reach(np.concatenate([poses, before]).reshape(-1, 4, 4), qpos)
+        of_grasp, of_pregrasp = reachable.reshape(2, 2, len(grasps))
+        return np.asarray((of_grasp & of_pregrasp).any(axis=0))
+
     def nearest(self, tcp_in_base: Array, costs: Array, qpos: Array, weight: float) -> list[tuple[int, Array]]:
         """Return the reachable poses (N, 4, 4) as pairs (index, configuration), the cheapest first.
 
@@ -132,7 +142,7 @@ class ArmPaths:
         count = max(2, int(np.ceil(np.linalg.norm(handle.motion) / _PULL_STEP)) + 1)
         held = np.tile(handle.grasp, (count, 1, 1))
         held[:, :3, 3] += np.linspace(0, 1, count)[:, None] * handle.motion
-        turned = held @ np.diag([-1.0, -1.0, 1.0, 1.0])
+        turned = held @ HALF_TURN
         goals = [one for one in (held, turned) for _ in _PULL_TURNS]
         starts = [rotate_about_bar(one[0], turn) for one in (held, turned) for turn in _PULL_TURNS]
         reachable, found = self.reach(np.array(starts), qpos)
@@ -162,10 +172,9 @@ class ArmPaths:
 
         The gripper enters towards the object, and moves back out after a short lift. Arguments as in `plan_approach`.
         """
-        turn = np.diag([-1.0, -1.0, 1.0, 1.0])
         short = []
         for index in np.argsort(-scores, kind="stable").tolist():
-            for grasp in (grasps[index], grasps[index] @ turn):
+            for grasp in (grasps[index], grasps[index] @ HALF_TURN):
                 found = self._plan_entry(grasp, qpos)
                 if found is None:
                     continue
@@ -184,7 +193,7 @@ class ArmPaths:
     def _plan_entry(self, grasp: Array, qpos: Array) -> Approach | None:
         """Return the approach of a grasp (4, 4) that starts as far before the pre-grasp as possible, or None."""
         before = grasp.copy()
-        before[:3, 3] -= PREGRASP * grasp[:3, 2]
+        before[:3, 3] -= PREGRASP_DISTANCE * grasp[:3, 2]
         backwards = grasp[:2, 2] / np.linalg.norm(grasp[:2, 2])
         starts = np.tile(before, (len(_FRONT_DISTANCES), 1, 1))
         starts[:, :2, 3] -= np.array(_FRONT_DISTANCES)[:, None] * backwards
@@ -222,10 +231,10 @@ class ArmPaths:
         grasps: (G, 4, 4) TCP poses in the arm's base frame. scores: (G,). qpos: (7,) present configuration.
         """
         order = np.argsort(-scores, kind="stable")
-        turned = grasps[order] @ np.diag([-1.0, -1.0, 1.0, 1.0])  # half a turn of the gripper gives the same grasp
+        turned = grasps[order] @ HALF_TURN
         both = np.stack([grasps[order], turned], axis=1).reshape(-1, 4, 4)
         starts = both.copy()
-        starts[:, :3, 3] -= PREGRASP * both[:, :3, 2]
+        starts[:, :3, 3] -= PREGRASP_DISTANCE * both[:, :3, 2]
         reachable, found = self.reach(starts, qpos)
         reachable &= self.reach(both, qpos)[0]
         distance = np.where(reachable, joint_distance(found, qpos), np.inf).reshape(-1, 2)
@@ -244,6 +253,9 @@ class ArmPaths:
 class PathFollower:
     """Follows a path with motions of the TCP that are relative to its present pose.
 
+    If the arm does not follow a motion, because its controller finds no joint positions for a pose that far away, the
+    motion is repeated and the following ones are half as long, at most three times.
+
     Args:
         chain: kinematics of the arm.
         path: (n, 7) configurations.
@@ -257,6 +269,8 @@ class PathFollower:
     def __init__(self, chain: ArmChain, path: Array, control_steps: int, speed: float = 1.0) -> None:
         self._path, self._poses, self.index = path, chain.tcp(path), 0
         self._limits = np.array([_MAX_TRANSLATION, _MAX_ROTATION, _MAX_JOINT_STEP]) * control_steps * speed
+        self._halvings, self._before = 0, 0
+        self._start: Array | None = None  # TCP pose before the last motion
 
     @property
     def goal(self) -> Array:
@@ -270,6 +284,11 @@ class PathFollower:
 
     def next_pose(self, tcp_in_base: Array) -> Array:
         """Return the farthest TCP pose (4, 4) of the path that the next policy step can reach from a pose (4, 4)."""
+        if self._halvings < _MAX_HALVINGS and self._start is not None and self._has_stayed(self._start, tcp_in_base):
+            self._halvings += 1
+            self._limits /= 2
+            self.index = self._before
+        self._start, self._before = tcp_in_base, self.index
         ahead = inverse(tcp_in_base)[None] @ self._poses[self.index :]
         turns = np.linalg.norm(Rotation.from_matrix(ahead[:, :3, :3]).as_rotvec(), axis=1)
         joints = np.abs(self._path[self.index :] - self._path[self.index]).max(axis=1)
@@ -279,3 +298,9 @@ class PathFollower:
         steps = len(fits) - 1 if fits.all() else int(np.argmin(fits)) - 1
         self.index += steps
         return self._poses[self.index]
+
+    def _has_stayed(self, start: Array, tcp_in_base: Array) -> bool:
+        """Return whether less than half of the last motion, from the pose ``start`` (4, 4), was executed."""
+        commanded = float(np.linalg.norm(self._poses[self.index][:3, 3] - start[:3, 3]))
+        moved = float(np.linalg.norm(tcp_in_base[:3, 3] - start[:3, 3]))
+        return commanded > _LEAST_MOTION and moved < 0.5 * commanded

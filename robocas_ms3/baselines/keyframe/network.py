@@ -200,32 +200,40 @@ class KeyframeNetwork(nn.Module):
         is_object, is_handle = label >= HANDLE, label == HANDLE
         distance = (offsets.float() - batch["offset"]).abs().sum(dim=1)
         offset = torch.stack([(distance * is_object).sum(), is_object.sum()])
-        distance = (pulls.float() - batch["pull"][:, :, None, None]).abs().sum(dim=1)
+        distance = _compute_pull_errors(pulls.float(), batch["pull"][:, :, None, None])
         pull = torch.stack([(distance * is_handle).sum(), is_handle.sum()])
         weights = torch.where(is_handle, 4.0, torch.where(is_object, 1.5, 0.5))
         segmentation = (F.cross_entropy(logits, label, reduction="none") * weights).sum() / weights.sum()
         names, relations = self.instruction(batch["text"].flatten(0, 1))
         text = F.cross_entropy(names.float(), batch["name"].flatten())
         text = text + F.cross_entropy(relations.float(), batch["relation"].flatten())
-        outcome = batch["outcome"].flatten()
-        known = outcome >= 0
-        success = self.grasp(batch["crop"].flatten(0, 1), batch["pose"].flatten(0, 1)).float()
-        errors = F.binary_cross_entropy_with_logits(success, 0.02 + 0.96 * outcome.clamp(min=0), reduction="none")
-        grasp = (errors * known).sum() / known.sum().clamp(min=1)
+        known = batch["outcome"] >= 0
+        outcome = batch["outcome"][known]
+        # without padding, which would change the statistics of the norms
+        success = self.grasp(batch["crop"][known], batch["pose"][known]).float() if len(outcome) else outcome
+        errors = F.binary_cross_entropy_with_logits(success, 0.02 + 0.96 * outcome, reduction="none")
+        grasp, count = errors.sum(), torch.as_tensor(len(outcome), device=outcome.device)
         config, offset_loss = self.config, offset[0] / offset[1].clamp(min=1)
         losses = segmentation + config.offset_weight * offset_loss + config.text_weight * text
         losses = losses + config.pull_weight * pull[0] / pull[1].clamp(min=1)
         with torch.no_grad():
             cells = torch.stack([((logits.argmax(1) == label) & is_object).sum(), is_object.sum()])
-            grasps = torch.stack([(((success > 0) == (outcome > 0.5)) & known).sum(), known.sum()])
+            grasps = torch.stack([((success > 0) == (outcome > 0.5)).sum(), count])
         return {
-            "loss": losses + config.grasp_weight * grasp,
+            "loss": losses + config.grasp_weight * grasp / max(len(outcome), 1),
             "segmentation": segmentation,
             "offset": offset,
             "pull": pull,
             "text": text,
-            "grasp": torch.stack([(errors * known).sum(), known.sum()]),
+            "grasp": torch.stack([grasp, count]),
             "cells": cells.float(),
             "names": (names.argmax(1) == batch["name"].flatten()).float().mean(),
             "grasps": grasps.float(),
         }
+
+
+def _compute_pull_errors(pulls: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+    """Return the absolute errors (B, h, w) of pulls (B, 9, h, w), summed; both directions of the bar are correct."""
+    errors = (pulls - labels).abs()
+    other_way = (pulls[:, 6:] + labels[:, 6:]).abs()
+    return errors[:, :6].sum(dim=1) + torch.minimum(errors[:, 6:].sum(dim=1), other_way.sum(dim=1))

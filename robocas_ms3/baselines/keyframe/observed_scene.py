@@ -17,6 +17,7 @@ _FARTHEST_VOTE = 2.0  # radii from the centre, beyond which a vote belongs to an
 _LEAST_SHARE = 0.1  # of the votes of the largest group; smaller groups are errors
 _SUPPORT_RANGE = (-0.12, 0.02)  # m from the lowest visible point of the objects, which may be the top of an object
 _BELOW = 0.02  # m below a camera, from which it sees the upper side of a surface
+_TABLE_THICKNESS = 0.02  # m below the height of a surface, within which points are on it
 _SUPPORT_MARGIN, _SUPPORT_POINTS = 0.1, 100  # m around the objects; least number of points on their support
 
 
@@ -54,6 +55,11 @@ def is_in_workspace(points: Array) -> NDArray[np.bool_]:
 def is_below_camera(points: Array, camera_in_base: NDArray) -> NDArray[np.bool_]:
     """Return whether a camera can see the upper side of a horizontal surface at points (..., 3)."""
     return points[..., 2] < camera_in_base[2, 3] - _BELOW
+
+
+def is_above_table(points: Array, table: float) -> NDArray[np.bool_]:
+    """Return whether points (..., 3) are above a surface at the height ``table`` in m, or on it."""
+    return points[..., 2] > table - _TABLE_THICKNESS
 
 
 def find_table_height(others: Array, objects: Array) -> float:

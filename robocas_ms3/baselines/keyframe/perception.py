@@ -31,6 +31,7 @@ from robocas_ms3.baselines.keyframe.observed_scene import (
     ObservedScene,
     cluster_votes,
     find_table_height,
+    is_above_table,
     is_below_camera,
     is_in_workspace,
     sample_pixels,
@@ -137,11 +138,12 @@ class Perception:
 
     def survey(self, frames: list[CameraFrame], default_table: float) -> Survey:
         """Find the objects, the basket, a handle and the height of the surface in the images of all cameras."""
-        objects, basket, others, below, handles = [], [], [], [], []
+        objects, basket, others, below, handles, everything = [], [], [], [], [], []
         for frame in frames:
             cells = self._classify(frame)
             seen = cells.valid & (cells.classes[..., ROBOT] < 0.3)
             inside = seen & is_in_workspace(cells.points)
+            everything.append(cells.points[seen])
             is_object, is_basket = cells.classes[..., FIRST_NAME:].sum(-1), cells.classes[..., BASKET]
             objects.append(cells.points[inside & (is_object > _SURE)])
             basket.append(cells.points[seen & (is_basket > _SURE)])
@@ -162,9 +164,8 @@ class Perception:
             roof = np.percentile(found[:, 2], 95) + _ROOF_CLEARANCE
             above = (surfaces[:, 2] > roof) & (np.linalg.norm(surfaces[:, :2] - focus, axis=1) < _ROOF_RADIUS)
             has_roof = int(above.sum()) >= _ROOF_CELLS
-        everything = np.concatenate([surfaces, found, rim])
         handle = _find_handle(np.concatenate(handles))
-        return Survey(focus, _find_basket(rim), table, everything, handle, has_roof)
+        return Survey(focus, _find_basket(rim), table, np.concatenate(everything), handle, has_roof)
 
     def observe(self, frame: CameraFrame, request: Request, table: float) -> ObservedScene:
         """Return the objects and the points in the workspace of an image of the gripper camera."""
@@ -178,7 +179,7 @@ class Perception:
         points, valid = unproject(frame.depth, frame.intrinsics, frame.camera_in_base, pixels)
         step = np.ix_(*pixels)
         valid &= _enlarge(cells.classes[..., ROBOT], size)[step] < 0.4
-        valid &= is_in_workspace(points) & (points[..., 2] > table - 0.02)
+        valid &= is_in_workspace(points) & is_above_table(points, table)
         cloud, rows = points[valid], np.flatnonzero(valid.ravel())
         number_of_cell = _cells_of_points(valid.shape, cells.valid.shape)[rows]
         large_object = _enlarge(probability, size)[step][valid]

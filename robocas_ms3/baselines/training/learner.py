@@ -30,7 +30,9 @@ class Learner:
         self.step = 0
         self._run, self._accelerator, self._settings = run, run.accelerator, settings
         self._network = model
-        self._average = AveragedModel(model, multi_avg_fn=self._update_average) if settings.ema else None
+        self._average = (
+            AveragedModel(model, multi_avg_fn=self._update_average, use_buffers=True) if settings.ema else None
+        )
         self._sums: dict[str, torch.Tensor] = {}  # of metrics since the last line of the log
         self._norms = torch.zeros((), dtype=torch.float64, device=self._accelerator.device)  # sum of gradients' norms
         if run.checkpoint is None:
@@ -108,6 +110,8 @@ class Learner:
         weights = self._policy_model().state_dict()
         if self._settings.weights_precision == "fp16":
             weights = {name: value.half() if value.is_floating_point() else value for name, value in weights.items()}
+            if not all(torch.isfinite(value).all() for value in weights.values()):
+                raise self._run.make_step_error("a weight is too large for fp16 (train.weights_precision)", self.step)
         return weights
 
     def save(self) -> None:
@@ -140,10 +144,13 @@ class Learner:
         return self._average.module if self._average is not None else self._network
 
     def _update_average(self, average: Any, weights: Any, _: Any) -> None:
-        """Update the average of the weights.
+        """Update the average of the weights and of the statistics of norms; counters are copied.
 
         The decay is lower at the start, because the first weights are random.
         """
+        if not average[0].is_floating_point():
+            torch._foreach_copy_(average, weights)  # pyright: ignore[reportPrivateImportUsage]
+            return
         decay = min(self._settings.ema, (self.step + 1) / (self.step + 10))
         torch._foreach_lerp_(average, weights, 1 - decay)  # pyright: ignore[reportPrivateImportUsage]
 

@@ -6,10 +6,11 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.baselines.keyframe.free_paths import FreePaths
 from robocas_ms3.baselines.keyframe.handles import Handle
-from robocas_ms3.baselines.keyframe.motion import LIFT, PREGRASP, ArmPaths, PathFollower
+from robocas_ms3.baselines.keyframe.motion import LIFT, ArmPaths, PathFollower
 from robocas_ms3.baselines.keyframe.tcp_poses import find_release_poses, find_views
 from robocas_ms3.core.poses import from_rotation, inverse
 from robocas_ms3.robots.registry import DEFAULT_ROBOT, find_robot
+from robocas_ms3.scenes.grasp_checks import PREGRASP_DISTANCE
 
 REST = np.array([0, np.pi / 8, 0, -5 * np.pi / 8, 0, 3 * np.pi / 4, np.pi / 4])
 DOWN = Rotation.from_euler("x", np.pi).as_matrix()
@@ -25,7 +26,9 @@ def test_approach_ends_at_the_grasp_with_the_greatest_score(paths):
     approach = paths.plan_approach(grasps, np.array([0.1, 0.5, 0.9]), REST)
     ends = paths.chain.tcp(np.stack([approach.start, approach.path[-1]]))
     assert np.allclose(ends[1], approach.grasp, atol=1e-4)
-    assert np.allclose(ends[0][:3, 3], [0.55, 0.1, 0.15 + PREGRASP], atol=1e-4)  # the third grasp is out of reach
+    assert np.allclose(
+        ends[0][:3, 3], [0.55, 0.1, 0.15 + PREGRASP_DISTANCE], atol=1e-4
+    )  # the third grasp is out of reach
     assert paths.rise(approach.path[-1], approach.grasp, 0.15 + LIFT) is not None
 
 
