@@ -14,6 +14,7 @@ _WORKSPACE = ((0.15, 1.15), (-0.9, 0.9), (-0.1, 0.6))  # m, least and greatest x
 _TABLE_BINS = (-0.1, 0.6, 200)  # m, m, number of bins of the histogram of heights
 _MAX_VOTES = 1200  # cells of an object that vote
 _FARTHEST_VOTE = 2.0  # radii from the centre, beyond which a vote belongs to another object
+_COLUMN_RADIUS = 0.025  # m between the middles of groups that are above each other
 _LEAST_SHARE = 0.1  # of the votes of the largest group; smaller groups are errors
 _SUPPORT_RANGE = (-0.12, 0.02)  # m from the lowest visible point of the objects, which may be the top of an object
 _BELOW = 0.02  # m below a camera, from which it sees the upper side of a surface
@@ -114,6 +115,25 @@ def cluster_votes(votes: Array, min_votes: int, radius: float) -> list[NDArray[n
     groups = sorted((np.flatnonzero(nearest == number) for number in range(len(centers))), key=len, reverse=True)
     least = max(min_votes, _LEAST_SHARE * len(groups[0]))
     return [group for group in groups if len(group) >= least]
+
+
+def join_columns(votes: Array, groups: list[NDArray[np.int64]]) -> list[NDArray[np.int64]]:
+    """Join the groups of votes (V, 3) whose middles are above each other: parts of one standing object.
+
+    groups: indices of the votes of each group, the largest group first.
+    """
+    joined: list[NDArray[np.int64]] = []
+    middles: list[Array] = []
+    for group in groups:
+        middle = votes[group, :2].mean(axis=0)
+        distances = [float(np.linalg.norm(middle - other)) for other in middles]
+        if distances and min(distances) < _COLUMN_RADIUS:
+            nearest = int(np.argmin(distances))
+            joined[nearest] = np.concatenate([joined[nearest], group])
+        else:
+            joined.append(group)
+            middles.append(middle)
+    return joined
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ from robocas_ms3.baselines.keyframe.observed_scene import (
     is_above_table,
     is_below_camera,
     is_in_workspace,
+    join_columns,
     sample_pixels,
     unproject,
 )
@@ -190,7 +191,8 @@ class Perception:
             where = np.flatnonzero(mask)
             votes = (cells.points + cells.offsets).reshape(-1, 3)[where]
             found = []
-            for group in cluster_votes(votes, max(1, settings.min_points * _POINT_STEP**2 // STRIDE**2), radius):
+            groups = cluster_votes(votes, max(1, settings.min_points * _POINT_STEP**2 // STRIDE**2), radius)
+            for group in join_columns(votes, groups):
                 member = np.zeros(mask.size, dtype=bool)
                 member[where[group]] = True
                 on_object = member[number_of_cell]
