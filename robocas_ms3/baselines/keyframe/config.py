@@ -56,7 +56,7 @@ class KeyframeConfig(BaselineConfig):
     decoder_channels: int = Field(default=56, ge=8, le=1024)
     grasp_channels: tuple[int, int, int, int] = (24, 32, 48, 64)
     grasps: int = Field(default=4, ge=1, le=1000)
-    offset_weight: float = Field(default=0.5, ge=0)
+    offset_weight: float = Field(default=1.0, ge=0)
     pull_weight: float = Field(default=0.1, ge=0)
     grasp_weight: float = Field(default=1.0, ge=0)
     text_weight: float = Field(default=0.5, ge=0)

@@ -125,10 +125,12 @@ def join_columns(votes: Array, groups: list[NDArray[np.int64]]) -> list[NDArray[
     joined: list[NDArray[np.int64]] = []
     middles: list[Array] = []
     for group in groups:
-        middle = votes[group, :2].mean(axis=0)
-        distances = [float(np.linalg.norm(middle - other)) for other in middles]
-        if distances and min(distances) < _COLUMN_RADIUS:
-            nearest = int(np.argmin(distances))
+        middle = votes[group].mean(axis=0)
+        offsets = np.array(middles).reshape(-1, 3) - middle
+        sideways, upwards = np.linalg.norm(offsets[:, :2], axis=1), np.abs(offsets[:, 2])
+        above = np.flatnonzero((sideways < _COLUMN_RADIUS) & (sideways < upwards))
+        if len(above):
+            nearest = int(above[sideways[above].argmin()])
             joined[nearest] = np.concatenate([joined[nearest], group])
         else:
             joined.append(group)
