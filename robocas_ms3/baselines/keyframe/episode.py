@@ -23,16 +23,15 @@ from robocas_ms3.baselines.keyframe.arm_control import (
 from robocas_ms3.baselines.keyframe.config import DecisionSettings
 from robocas_ms3.baselines.keyframe.free_paths import FreePaths
 from robocas_ms3.baselines.keyframe.free_places import HeightMap
-from robocas_ms3.baselines.keyframe.grasp_proposals import propose_colliding_grasps, propose_grasps
+from robocas_ms3.baselines.keyframe.grasp_proposals import compute_similarity, propose_colliding_grasps, propose_grasps
 from robocas_ms3.baselines.keyframe.handles import Handle
 from robocas_ms3.baselines.keyframe.motion import LIFT, Approach
 from robocas_ms3.baselines.keyframe.observed_scene import ObservedObject, ObservedScene
 from robocas_ms3.baselines.keyframe.obstacles import find_middle, score_blocking, score_height
 from robocas_ms3.baselines.keyframe.perception import Perception, Request
+from robocas_ms3.baselines.keyframe.targets import TargetChoice
 from robocas_ms3.baselines.keyframe.tcp_poses import TOP_VIEWS_DEG, find_release_poses, find_views
 from robocas_ms3.core.poses import Array, from_rotation, inverse
-from robocas_ms3.scenes.grasp_checks import HALF_TURN
-from robocas_ms3.scenes.relations import select_by_relation
 
 _TABLE = 0.12  # m, height of a table in the arm's base frame if it is not seen
 _SAFE_HEIGHT = (0.35, 0.55)  # m, least and greatest height of the TCP for motions above objects
@@ -46,13 +45,10 @@ _RELEASE_CLEARANCE = 0.03  # m between the rim of the basket and the lowest poin
 _CARRY_CLEARANCE = 0.15  # m between the rim and the TCP on the way to the basket
 _PLACE_HEIGHT = 0.38  # m, least height of the TCP on the way to a free place
 _DROP = 0.02  # m that an object falls at a free place
-_REPEAT_DISTANCE = 0.02  # m around a failed grasp in which similar grasps lose score
-_SIMILAR_TRACE = 2.6  # of the rotation between two grasps, above which they are similar: 37 degrees
+_FAILURE_PENALTY = 2.0  # of the score of a grasp that equals a failed one; scores are probabilities
 _PLACE_POSES = 10  # poses at free places that are tried
 _TARGET_GAP, _BASKET_GAP = 0.16, 0.28  # m between a free place and the target, and the basket
 _IN_BASKET = 0.14  # m from the middle of the basket, within which an object is in it
-_SURE = 0.6  # probability of a target, above which less probable targets are ignored
-_SAME_TARGET = 0.05  # m between the centres of the target in two views
 _MAX_OBSTACLES = 5  # obstacles for which grasps are computed per decision
 _MAX_PULLS, _PULL_SPEED = 4, 0.3  # pulls per episode; fraction of the limits
 _COMPARTMENT_SPEED = 0.5  # fraction of the limits with an object that was grasped from the front
@@ -111,7 +107,7 @@ class KeyframeEpisode:
     ) -> None:
         self._perception, self._arm, self._settings = perception, arm, settings
         self._request, self._rng, self._hand_camera = request, rng, hand_camera
-        self._target_xy: Array | None = None  # predicted centre of the target in the last view that showed it
+        self._targets = TargetChoice(request.relation)
         self._failed: list[Array] = []  # TCP poses of failed grasps
         self._map = HeightMap()
         self._table, self._focus = _TABLE, np.array([0.6, 0.0])
@@ -132,7 +128,7 @@ class KeyframeEpisode:
                 self._basket = self._perception.survey(list(observation.frames.values()), self._table).basket
             scene = self._perception.observe(observation.frames[self._hand_camera], self._request, self._table)
             self._map.update(scene.points)
-            target = self._choose_target(scene)
+            target = self._targets.choose([one for one in scene.targets if not self._is_in_basket(one)])
             chosen = None
             if target is not None:
                 self._focus = scene.points[target.mask].mean(axis=0)[:2]
@@ -186,23 +182,6 @@ class KeyframeEpisode:
 
     # Decisions
 
-    def _choose_target(self, scene: ObservedScene) -> ObservedObject | None:
-        found = [one for one in scene.targets if not self._is_in_basket(one)]
-        if not found:
-            return None
-        sure = [one for one in found if one.probability > _SURE] or found
-        xy = np.stack([one.center[:2] for one in sure])
-        index = None
-        if self._target_xy is not None:  # later views may show fewer objects of this name
-            distances = np.linalg.norm(xy - self._target_xy, axis=1)
-            index = int(distances.argmin()) if distances.min() < _SAME_TARGET else None
-        if index is None and self._request.relation is not None:
-            index = select_by_relation(self._request.relation, xy, 0.0)
-        if index is None:  # without a relation, or if it fits no object, the nearest one is meant
-            index = int(np.linalg.norm(xy, axis=1).argmin())
-        self._target_xy = xy[index]
-        return sure[index]
-
     def _is_in_basket(self, one: ObservedObject) -> bool:
         return self._basket is not None and bool(np.linalg.norm(one.center[:2] - self._basket[:2]) < _IN_BASKET)
 
@@ -223,10 +202,7 @@ class KeyframeEpisode:
         grasps = proposals.tcp_in_base
         scores = self._perception.score_grasps(scene, one.mask, grasps, self._table) + 0.02 * proposals.heuristic
         for failed in self._failed:
-            near = np.exp(-((np.linalg.norm(grasps[:, :3, 3] - failed[:3, 3], axis=1) / _REPEAT_DISTANCE) ** 2))
-            rotations = np.stack([failed[:3, :3], (failed @ HALF_TURN)[:3, :3]])
-            traces = np.einsum("gij,kij->gk", grasps[:, :3, :3], rotations).max(axis=1)  # 3: equal rotations
-            scores -= 2 * near * (traces > _SIMILAR_TRACE)
+            scores -= _FAILURE_PENALTY * compute_similarity(grasps, failed)
         if self._is_front:
             approaches = paths.plan_front_approaches(grasps, scores, qpos)
             found = self._free.choose(qpos, approaches, lambda approach: approach.start)

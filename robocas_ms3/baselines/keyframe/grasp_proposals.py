@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.poses import from_rotation
-from robocas_ms3.scenes.grasp_checks import GRIPPER_BOXES, is_gripper_clear
+from robocas_ms3.scenes.grasp_checks import GRIPPER_BOXES, HALF_TURN, is_gripper_clear
 
 Array = NDArray[np.float64]
 MIN_POINTS = 15
@@ -26,6 +26,7 @@ _ANY_DIRECTION = np.deg2rad(15)  # tilt below which the approach may come from a
 _VERTICAL_FRACTION, _INNER_FRACTION = 0.35, 0.6  # fractions of vertical approaches, and of grasps near the middle
 _NEIGHBOURHOOD = 0.3  # m from the middle of the object, beyond which other points are ignored
 _SIDE_CLEARANCE = 0.002  # m beside the gripper
+_SIMILAR_DISTANCE, _SIMILAR_ANGLE = 0.02, np.deg2rad(37)  # m and rad between similar grasps
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,18 @@ def propose_colliding_grasps(
     if not from_front:
         heuristic -= 0.8 * tilt
     return Proposals(from_rotation(positions, rotations), heuristic)
+
+
+def compute_similarity(grasps: Array, other: Array) -> Array:
+    """Return the similarity (G,) of grasps (G, 4, 4) to another grasp (4, 4).
+
+    It is 1 for equal grasps, also after half a turn of the gripper, decreases with the distance, and is 0 if the
+    rotations differ by more than `_SIMILAR_ANGLE`.
+    """
+    rotations = np.stack([other[:3, :3], (other @ HALF_TURN)[:3, :3]])
+    traces = np.einsum("gij,kij->gk", grasps[:, :3, :3], rotations).max(axis=1)
+    distances = np.linalg.norm(grasps[:, :3, 3] - other[:3, 3], axis=1)
+    return np.exp(-((distances / _SIMILAR_DISTANCE) ** 2)) * (traces > 1 + 2 * np.cos(_SIMILAR_ANGLE))
 
 
 def _is_above(tcp_in_base: Array, table: float) -> NDArray[np.bool_]:

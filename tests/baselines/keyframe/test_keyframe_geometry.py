@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.baselines.keyframe.free_places import HeightMap
-from robocas_ms3.baselines.keyframe.grasp_proposals import propose_colliding_grasps, propose_grasps
+from robocas_ms3.baselines.keyframe.grasp_proposals import compute_similarity, propose_colliding_grasps, propose_grasps
 from robocas_ms3.baselines.keyframe.gripper_crops import CELL, CELLS, augment_crops, make_crops
 from robocas_ms3.baselines.keyframe.network import make_inputs
 from robocas_ms3.baselines.keyframe.observed_scene import (
@@ -18,6 +18,7 @@ from robocas_ms3.baselines.keyframe.observed_scene import (
     cluster_votes,
     find_table_height,
     is_below_camera,
+    join_columns,
     sample_pixels,
     unproject,
 )
@@ -46,6 +47,20 @@ def test_points_of_a_depth_image():
     assert valid.sum() == 47 and not valid[0, 0]
     some, _ = unproject(depth, INTRINSICS, DOWN, sample_pixels(depth.shape, 2, 1))
     assert some.shape == (3, 4, 3) and np.allclose(some[1, 1], points[3, 3])
+
+
+def test_points_of_a_tilted_camera_are_projected_back_to_their_pixels():
+    camera = np.eye(4)
+    camera[:3, :3] = Rotation.from_euler("xyz", (200, 25, 40), degrees=True).as_matrix()
+    camera[:3, 3] = 0.3, -0.2, 0.9
+    depth = np.random.default_rng(0).integers(300, 900, (6, 8)).astype(np.uint16)
+    points, _ = unproject(depth, INTRINSICS, camera)
+    local = (points - camera[:3, 3]) @ camera[:3, :3]  # transposed rotation: from the base to the camera frame
+    pixels = local / local[..., 2:] @ INTRINSICS.T
+    assert np.allclose(1000 * local[..., 2], depth)
+    assert np.allclose(pixels[..., 0], np.arange(8) + 0.5) and np.allclose(pixels[..., 1].T, np.arange(6) + 0.5)
+    inputs = make_inputs(np.zeros((6, 8, 3), np.uint8), depth, INTRINSICS, camera)
+    assert np.allclose(inputs[3], 3 * np.clip(points[..., 2], -0.6, 1), atol=1e-5)
 
 
 def test_inputs_have_colour_height_and_depth():
@@ -100,6 +115,14 @@ def test_the_narrow_radius_tells_touching_copies_apart():
     assert cluster_votes(np.zeros((0, 3)), 5, NARROW_RADIUS) == []
 
 
+def test_parts_of_a_standing_object_are_joined():
+    middles = np.array([[0.5, 0, 0.2], [0.51, 0, 0.24], [0.515, 0, 0.2], [0.56, 0, 0.25]])
+    groups = [np.array([2 * number, 2 * number + 1]) for number in range(4)]
+    joined = join_columns(np.repeat(middles, 2, axis=0), groups)
+    # the second is above the first; the third is beside the first, and below the second; the fourth is too far away
+    assert [group.tolist() for group in joined] == [[0, 1, 2, 3], [4, 5], [6, 7]]
+
+
 def test_free_squares_are_empty_and_observed():
     heights = HeightMap()
     x, y = np.meshgrid(np.arange(0.405, 0.6, 0.01), np.arange(-0.095, 0.1, 0.01))
@@ -145,6 +168,25 @@ def test_augmentation_moves_no_more_than_a_cell(seed):
     assert found.shape == crops.shape and crops[:, 1].sum() == 800
     assert found[:, 1, 12:28, 12:28].mean() > 0.9 and not found[:, 1, :8].any()
     assert np.allclose(np.abs(changed), 1)
+
+
+def test_both_fingers_stay_above_the_table():
+    points, table = make_box(size=(0.04, 0.05, 0.03)), 0.1
+    grasps = propose_grasps(points, np.ones(len(points), bool), table, 500, np.random.default_rng(0)).tcp_in_base
+    tips = np.array([[x, side * y, 0.0085] for x in (-0.01, 0.01) for side in (-1, 1) for y in (0.04, 0.046)])
+    heights = grasps[:, 2, 3, None] + grasps[:, 2, :3] @ tips.T
+    assert len(grasps) > 30 and heights.min() > table
+
+
+def test_similarity_of_grasps():
+    other = np.eye(4)
+    other[:3, 3] = 0.5, 0.1, 0.2
+    grasps = np.stack([other] * 5)
+    grasps[1, 0, 3] += 0.02
+    grasps[2] = other @ np.diag([-1, -1, 1, 1])  # half a turn about the approach axis
+    grasps[3, :3, :3] = Rotation.from_euler("y", 30, degrees=True).as_matrix()
+    grasps[4, :3, :3] = Rotation.from_euler("z", 45, degrees=True).as_matrix()
+    assert compute_similarity(grasps, other) == pytest.approx([1, np.exp(-1), 1, 1, 0])
 
 
 def test_grasps_of_a_box_are_across_its_sides():

@@ -61,6 +61,32 @@ def test_a_follower_reaches_the_end_of_a_path_in_limited_steps(paths):
     assert np.allclose(follower.goal, poses[-1])
 
 
+def test_motions_that_the_controller_refuses_are_shortened(paths):
+    path = paths.joint(REST, REST + [0.8, 0, 0, 0, 0, 0, 0])
+    follower, qpos, lengths, poses = PathFollower(paths.chain, path, 1), REST, [], paths.chain.tcp(path)
+    for _ in range(40):
+        here = paths.chain.tcp(qpos[None])[0]
+        pose = follower.next_pose(here)
+        lengths.append(np.linalg.norm(pose[:3, 3] - here[:3, 3]))
+        if lengths[-1] < 0.06:  # the controller finds no joint positions for a longer motion
+            qpos = path[int(np.abs(poses - pose).sum(axis=(1, 2)).argmin())]
+    assert lengths[0] > 0.06 and np.allclose(qpos, path[-1])
+
+
+def test_a_blocked_arm_does_not_advance(paths):
+    path = paths.joint(REST, REST + [0.8, 0, 0, 0, 0, 0, 0])
+    follower, here = PathFollower(paths.chain, path, 1), paths.chain.tcp(REST[None])[0]
+    found = [follower.next_pose(here) for _ in range(10)]
+    assert not follower.is_last and np.linalg.norm(found[-1][:3, 3] - here[:3, 3]) < 0.03
+
+
+def test_grasps_in_reach(paths):
+    tilted = Rotation.from_euler("y", 140, degrees=True).as_matrix()  # away from the base
+    grasps = from_rotation([[0.6, 0, 0.15], [0.86, 0, 0.15], [0.86, 0, 0.15]], np.stack([DOWN, DOWN, tilted]))
+    assert paths.is_grasp_in_reach(grasps, REST).tolist() == [True, False, True]
+    assert paths.is_grasp_in_reach(grasps[:0], REST).shape == (0,)
+
+
 def test_views_have_the_point_in_the_middle_of_the_image():
     camera_in_tcp = from_rotation([0.05, 0.0, -0.05], Rotation.from_euler("z", np.pi / 2).as_matrix())
     point = np.array([0.6, 0.1, 0.12])

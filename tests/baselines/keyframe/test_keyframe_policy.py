@@ -11,6 +11,7 @@ from synthetic_observations import observe, start
 from robocas_ms3.baselines.keyframe import KeyframeConfig, KeyframeNetwork, KeyframePolicy
 from robocas_ms3.baselines.keyframe.arm_control import CLOSED, OPEN, ArmControl, EpisodeObservation
 from robocas_ms3.baselines.keyframe.episode import KeyframeEpisode
+from robocas_ms3.baselines.keyframe.grasp_proposals import compute_similarity
 from robocas_ms3.baselines.keyframe.handles import Handle
 from robocas_ms3.baselines.keyframe.motion import ArmPaths
 from robocas_ms3.baselines.keyframe.observed_scene import ObservedObject, ObservedScene
@@ -28,37 +29,45 @@ CAMERAS = ("base_camera", "gripper_camera")
 FACTS = {"names": ["apple", "box"], "cameras": list(CAMERAS), "hand_camera": "gripper_camera"}
 
 
-def make_block(center, size=0.04, count=600):
-    """Points on the visible sides of a cube on the table."""
+def make_block(center, size=(0.04, 0.04, 0.04), count=600):
+    """Points on the visible sides of a box on the table."""
     rng = np.random.default_rng(int(1000 * center[0]))
     points = rng.uniform(-0.5, 0.5, (count, 3))
     points[: count // 2, 2] = 0.5
     points[count // 2 :, 0] = np.where(rng.random(count - count // 2) < 0.5, -0.5, 0.5)
-    return points * size + [*center, TABLE + size / 2]
+    return points * size + [*center, TABLE + size[2] / 2]
 
 
 class FakePerception:
-    """Perception that sees the present blocks and the table, or a closed door with a handle before them."""
+    """Perception that sees the present blocks and the table, or a closed door with a handle before them.
 
-    def __init__(self, blocks, door=None):
-        self.blocks, self.door, self.surveys = blocks, door, 0
+    Blocks named "late" are visible from the second view on. The basket is visible from the survey ``basket_from`` on.
+    """
+
+    def __init__(self, blocks, door=None, basket_from=1):
+        self.blocks, self.door, self.surveys, self.views, self.basket_from = blocks, door, 0, 0, basket_from
 
     def survey(self, frames, default_table):
         self.surveys += 1
         handle = None if self.door is None or self.door.opening > 0.9 else self.door.handle
-        return Survey(np.array([0.55, 0.0]), BASKET, TABLE, np.zeros((0, 3)), handle, has_roof=self.door is not None)
+        basket = BASKET if self.surveys >= self.basket_from else None
+        return Survey(np.array([0.55, 0.0]), basket, TABLE, np.zeros((0, 3)), handle, has_roof=self.door is not None)
 
     def observe(self, frame, request, table):
         x, y = np.meshgrid(np.arange(0.3, 0.8, 0.01), np.arange(-0.4, 0.3, 0.01))
         surface = np.stack([x.ravel(), y.ravel(), np.full(x.size, TABLE)], axis=1)
-        clouds = [make_block(center) for center in self.blocks.values()]
+        self.views += 1
+        seen = {name: center for name, center in self.blocks.items() if self.views > 1 or "late" not in name}
+        sizes = [(0.04, 0.04, 0.25 if "tall" in name else 0.04) for name in seen]
+        clouds = [make_block(center, size) for center, size in zip(seen.values(), sizes, strict=True)]
         points = np.concatenate([surface, *clouds])
         bounds = len(surface) + np.cumsum([0, *map(len, clouds)])
         objects = []
-        for number, name in enumerate(self.blocks):
+        for number, (name, center) in enumerate(seen.items()):
             mask = np.zeros(len(points), dtype=bool)
             mask[bounds[number] : bounds[number + 1]] = True
-            objects.append((name, ObservedObject(mask, points[mask].mean(axis=0), 0, 0.9)))
+            middle = np.array([*center, TABLE + sizes[number][2] / 2])
+            objects.append((name, ObservedObject(mask, middle, 0, 0.9)))
         targets = [one for name, one in objects if name.startswith("target")]
         is_object = np.arange(len(points)) >= len(surface)
         return ObservedScene(points, is_object, targets, [one for _, one in objects])
@@ -68,11 +77,16 @@ class FakePerception:
 
 
 class FakeArm:
-    """Arm that reaches each commanded pose exactly and grasps a block or handle that is between the closed fingers."""
+    """Arm that reaches each commanded pose exactly and grasps a block or handle that is between the closed fingers.
 
-    def __init__(self, paths, blocks, door=None):
+    The first ``slips`` grasps of blocks fail.
+    """
+
+    def __init__(self, paths, blocks, door=None, slips=0):
+        self.slips, self.grasps = slips, []
         self.paths, self.blocks, self.qpos, self.held, self.door = paths, blocks, REST, None, door
         self.released: list[tuple[str, np.ndarray]] = []
+        self.is_closed = False
 
     @property
     def tcp(self):
@@ -80,7 +94,7 @@ class FakeArm:
 
     def view(self, images=False):
         frame = CameraFrame(np.zeros((64, 64, 3), np.uint8), np.zeros((64, 64)), np.eye(3), self.tcp)
-        width = 0.04 if self.held else 0.08
+        width = 0.04 if self.held else 0.0 if self.is_closed else 0.08
         return EpisodeObservation(self.tcp, self.qpos, width, {"gripper_camera": frame} if images else {})
 
     def step(self, command):
@@ -93,14 +107,18 @@ class FakeArm:
         position = self.tcp[:3, 3]
         if command.action[6] == CLOSED and self.held is None:
             near = [name for name, center in self.blocks.items() if np.linalg.norm(center - position[:2]) < 0.03]
-            if near and position[2] < TABLE + 0.06:
-                self.held = near[0]
-                del self.blocks[near[0]]
+            low = TABLE + (0.27 if near and "tall" in near[0] else 0.06)
+            if near and position[2] < low and not self.is_closed:
+                self.grasps.append(self.tcp)
+                if len(self.grasps) > self.slips:
+                    self.held = near[0]
+                    del self.blocks[near[0]]
         if self.door is not None:
             self.door.follow(position, command.action[6] == CLOSED)
         if command.action[6] == OPEN and self.held is not None:
             self.released.append((self.held, position))
             self.held = None
+        self.is_closed = command.action[6] == CLOSED
         return self.view(command.requests_images)
 
 
@@ -124,11 +142,11 @@ def paths():
     return ArmPaths(find_robot(DEFAULT_ROBOT))
 
 
-def play(paths, blocks, request=None, steps=150, door=None):
-    arm = FakeArm(paths, blocks, door)
+def play(paths, blocks, request=None, steps=150, door=None, slips=0, basket_from=1):
+    arm = FakeArm(paths, blocks, door, slips)
     request = request or Request(np.ones(1, np.float32), None)
     rng = np.random.default_rng(0)
-    perception = FakePerception(blocks, door)
+    perception = FakePerception(blocks, door, basket_from)
     control = ArmControl(paths, 1)
     episode = KeyframeEpisode(perception, control, CONFIG.decisions, request, rng, "gripper_camera")
     run = episode.run(arm.view(images=True))
@@ -151,6 +169,36 @@ def test_the_nearest_target_is_meant_without_a_relation(paths):
     assert play(paths, dict(blocks)).released[0][0] == "target near"
     far = Request(np.ones(1, np.float32), "farthest")
     assert play(paths, dict(blocks), far).released[0][0] == "target far"
+
+
+def test_a_tall_object_is_carried_above_the_rim(paths):
+    arm = play(paths, {"target tall": np.array([0.55, -0.1])})
+    (name, position), *_ = arm.released
+    below_tcp = arm.grasps[0][2, 3] - TABLE  # the object stands on the table
+    assert name == "target tall" and below_tcp > 0.15 and position[2] - below_tcp > BASKET[2]
+
+
+def test_a_failed_grasp_is_not_repeated(paths):
+    arm = play(paths, {"target": np.array([0.55, -0.1])}, slips=4, steps=300)
+    assert arm.released[0][0] == "target" and len(arm.grasps) == 5
+    for number, grasp in enumerate(arm.grasps):
+        assert (compute_similarity(np.stack(arm.grasps[number + 1 :] or [np.eye(4)]), grasp) < 0.7).all()
+
+
+def test_the_target_of_a_relation_stays_the_same(paths):
+    blocks = {
+        "target far": np.array([0.68, 0.0]),
+        "target near": np.array([0.58, -0.1]),
+        "target late": np.array([0.48, 0.0]),
+    }
+    arm = play(paths, blocks, Request(np.ones(1, np.float32), "nearest"), slips=1)
+    assert arm.released[0][0] == "target near"
+
+
+def test_the_basket_is_searched_until_it_is_seen(paths):
+    arm = play(paths, {"target": np.array([0.55, -0.1])}, basket_from=2)
+    (name, position), *_ = arm.released
+    assert name == "target" and np.linalg.norm(position[:2] - BASKET[:2]) < 0.06
 
 
 def test_an_object_is_moved_aside_if_the_target_is_not_seen(paths):

@@ -84,6 +84,31 @@ def test_weights_are_repaired_from_the_checkpoint(whole, data, damage):
     assert (whole / "weights.safetensors").read_bytes() == before
 
 
+class NormModel(stub_baseline.StubModel):
+    """The stub network with a BatchNorm before it."""
+
+    def __init__(self, config, facts):
+        super().__init__(config, facts)
+        self.norm = torch.nn.BatchNorm1d(facts["inputs"])
+
+    def forward(self, batch):
+        return super().forward({**batch, "x": self.norm(batch["x"])})
+
+
+def test_statistics_of_norms_are_averaged_as_the_weights(stub, data, tmp_path):
+    stub(model=NormModel)
+    means = {}
+    for steps in (1, 2):
+        train("stub", data, tmp_path / str(steps), {"train": {"steps": steps, "ema": 0.25}})
+        state = load_file(tmp_path / str(steps) / "checkpoint.safetensors")
+        weights = load_file(tmp_path / str(steps) / "weights.safetensors")
+        assert weights["norm.num_batches_tracked"] == steps
+        means[steps] = state["model.norm.running_mean"], weights["norm.running_mean"]
+    assert torch.equal(*means[1])  # the average starts with the first weights
+    expected = 0.25 * means[1][1] + 0.75 * means[2][0]
+    assert torch.allclose(means[2][1], expected) and not torch.equal(*means[2])
+
+
 def test_half_precision_weights_are_half_the_size(whole, data, tmp_path):
     train("stub", data, tmp_path / "half", {"train": {"weights_precision": "fp16"}})
     weights, full = (load_file(run / "weights.safetensors") for run in (tmp_path / "half", whole))
