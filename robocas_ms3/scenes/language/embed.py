@@ -66,7 +66,8 @@ class TextEmbedder:
         if new:
             if self._model is None:
                 self._model = _load(sentence_model_source())
-            vectors = np.asarray(self._model.encode(new, show_progress_bar=False), dtype=np.float32)
+            # one text per batch: the padding of a batch changes the last bits
+            vectors = np.asarray(self._model.encode(new, batch_size=1, show_progress_bar=False), dtype=np.float32)
             if vectors.shape != (len(new), DIMENSIONS):
                 what, expected = "the sentence model is not all-MiniLM-L6-v2", f"{DIMENSIONS} numbers per text"
                 fix = "Set $ROBOCAS_SENTENCE_MODEL to a folder with all-MiniLM-L6-v2, or unset it."

@@ -58,6 +58,8 @@ def test_real_embeddings(monkeypatch):
     assert vectors.dtype == np.float32
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-6)
     np.testing.assert_array_equal(vectors[0], vectors[3])
+    long = embed.TextEmbedder()(["grasp the farthest mouth rinse bottle on the table", "grasp the apple"])
+    np.testing.assert_array_equal(long[1], vectors[0])  # also with other texts
     near, far = vectors[0] @ vectors[1], vectors[0] @ vectors[2]
     assert near > 0.7 > far + 0.3, "what means the same lies closer"
     # A text's vector must not depend on what else is in the batch.
