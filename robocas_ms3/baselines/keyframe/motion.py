@@ -25,6 +25,7 @@ _MAX_JOINT_STEP = 0.4  # rad per control step
 _MAX_HALVINGS, _LEAST_MOTION = 3, 0.01  # of motions that the arm does not follow; m of a motion that is checked
 _FRONT_DISTANCES, _FRONT_LIFT = (0.2, 0.15, 0.1, 0.06), 0.025  # m before the pre-grasp; m of the way back above it
 _EXIT_DISTANCES = (0.3, 0.25, 0.2, 0.15, 0.1, 0.06)  # m from the pre-grasp back to the end of the way out
+_MAX_ENTRIES, _MAX_APPROACHES = 32, 48  # grasps for which approaches are planned, from the front and from above
 _FAR_OUT = 0.28  # m from the grasp to the end of the way out, horizontally, at which an object is out of a compartment
 _PULL_STEP, _PULL_STANDOFF, _RETREATS = 0.015, 0.08, (0.15, 0.1, 0.06)  # m
 _PULL_TURNS = np.deg2rad((0, -20, 20, -40, 40))  # about the bar
@@ -166,14 +167,14 @@ class ArmPaths:
         return self.straight(qpos, goal)
 
     def plan_front_approaches(self, grasps: Array, scores: Array, qpos: Array) -> Iterator[Approach]:
-        """Yield approaches of grasps from outside of a compartment, the one with the greatest score first.
+        """Yield approaches of the best grasps from outside of a compartment, the one with the greatest score first.
 
         Approaches that do not leave the compartment far enough come last.
 
         The gripper enters towards the object, and moves back out after a short lift. Arguments as in `plan_approach`.
         """
         short = []
-        for index in np.argsort(-scores, kind="stable").tolist():
+        for index in np.argsort(-scores, kind="stable")[:_MAX_ENTRIES].tolist():
             for grasp in (grasps[index], grasps[index] @ HALF_TURN):
                 found = self._plan_entry(grasp, qpos)
                 if found is None:
@@ -230,7 +231,7 @@ class ArmPaths:
 
         grasps: (G, 4, 4) TCP poses in the arm's base frame. scores: (G,). qpos: (7,) present configuration.
         """
-        order = np.argsort(-scores, kind="stable")
+        order = np.argsort(-scores, kind="stable")[:_MAX_APPROACHES]
         turned = grasps[order] @ HALF_TURN
         both = np.stack([grasps[order], turned], axis=1).reshape(-1, 4, 4)
         starts = both.copy()
