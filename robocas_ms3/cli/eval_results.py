@@ -69,7 +69,9 @@ class WriteLeaderboard(Results):
     """
 
     out: Annotated[Path, tyro.conf.arg(metavar="FILE.json")]
-    """JSON file of the leaderboard; an existing leaderboard is replaced."""
+    """JSON file of the leaderboard."""
+    update: bool = False
+    """Add the rows to an existing leaderboard. Without this option, they replace all rows."""
 
 
 @dataclass
@@ -142,7 +144,14 @@ def leaderboard(cfg: WriteLeaderboard) -> int:
     from robocas_ms3.core.files import atomic_file
     from robocas_ms3.evaluation.leaderboard.markdown import render_leaderboard
     from robocas_ms3.evaluation.leaderboard.result_rows import make_rows
-    from robocas_ms3.evaluation.leaderboard.rows import Leaderboard, read_published_rows, sort_rows, write_leaderboard
+    from robocas_ms3.evaluation.leaderboard.rows import (
+        Leaderboard,
+        read_leaderboard,
+        read_published_rows,
+        replace_rows,
+        sort_rows,
+        write_leaderboard,
+    )
     from robocas_ms3.evaluation.results import group_partial_results, read_result
 
     _check_folders(cfg.folders)
@@ -151,6 +160,8 @@ def leaderboard(cfg: WriteLeaderboard) -> int:
         raise EvaluationError(what, where="--out", expected=expected, found=cfg.out.name, usage=True)
     results = [read_result(*folders) for folders in group_partial_results(cfg.folders)]
     measured = [row for one in results for row in make_rows(one, _find_protocol(one, cfg.protocol))]
+    if cfg.update and cfg.out.exists():
+        measured = replace_rows(read_leaderboard(cfg.out).rows, measured)
     rows = sort_rows([*measured, *read_published_rows()])
     text, page = render_leaderboard(rows), cfg.out.with_suffix(".md")
     write_leaderboard(cfg.out, Leaderboard(rows=rows))

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from robocas_ms3.cli import main as cli
+from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
 from robocas_ms3.scenes.config import bundled_configs
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -93,6 +94,20 @@ def test_rows_of_keyframe_call_valid_commands(tmp_path, row, parts, tasks):
     assert all(call[call.index("--policy") + 1] == train[train.index("--out") + 1] for call in calls[2 * parts + 1 :])
     again, _ = run_with_stub(tmp_path, "reproduce_keyframe.sh", row, str(out), SCALE="20")
     assert again.returncode == 2 and "other settings" in again.stderr
+
+
+def test_a_policy_is_evaluated_on_all_protocols(tmp_path):
+    settings = {"OUT": str(tmp_path / "out"), "LEADERBOARD": str(tmp_path / "board" / "rows.json")}
+    done, calls = run_with_stub(tmp_path, "evaluate_protocols.sh", "runs/mine", **settings)
+    assert done.returncode == 0, done.stderr
+    for call in calls:
+        cli.parse(call)
+    played = [call[call.index("--protocol") + 1] for call in calls if call[1] == "run"]
+    assert sorted(played) == sorted(set(bundled_protocols()) - {"smoke"})
+    rows = [call for call in calls if call[1] == "leaderboard"]
+    assert [call[2] for call in rows] == [str(tmp_path / "out" / "mine" / name) for name in played]
+    assert all("--update" in call and call[-1] == settings["LEADERBOARD"] for call in rows)
+    assert run_with_stub(tmp_path, "evaluate_protocols.sh")[0].returncode == 2
 
 
 def make_dataset(tmp_path, episodes):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
@@ -124,6 +124,21 @@ def sort_rows(rows: Iterable[LeaderboardRow]) -> list[LeaderboardRow]:
         return row.published, row.protocol, row.task, row.split, tracks.index(row.track), -(rate or 0.0), row.policy
 
     return sorted(rows, key=key)
+
+
+def replace_rows(rows: Iterable[LeaderboardRow], new: Sequence[LeaderboardRow]) -> list[LeaderboardRow]:
+    """Return the measured rows that new ones do not replace, and the new ones.
+
+    A row replaces one with the same policy, training data, protocol, task, split and conditions.
+    """
+
+    def key(row: LeaderboardRow) -> tuple:
+        training = row.training or Training()
+        data = training.data, training.scenes, training.init_from
+        return row.policy, data, row.protocol, row.task, row.split, row.calibration, tuple(row.differences)
+
+    replaced = {key(row) for row in new}
+    return [*(row for row in rows if not row.published and key(row) not in replaced), *new]
 
 
 def read_leaderboard(path: Path) -> Leaderboard:

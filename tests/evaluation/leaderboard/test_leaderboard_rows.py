@@ -8,8 +8,10 @@ from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.evaluation.leaderboard.rows import (
     Leaderboard,
     LeaderboardRow,
+    Training,
     read_leaderboard,
     read_published_rows,
+    replace_rows,
     sort_rows,
     write_leaderboard,
 )
@@ -46,6 +48,14 @@ def test_rows_are_sorted_by_protocol_task_split_track_and_rate(tmp_path):
     assert rows == [other, knowing, better, make_row(), search, published]
     write_leaderboard(tmp_path / "rows.json", Leaderboard(rows=rows))
     assert read_leaderboard(tmp_path / "rows.json").rows == rows
+
+
+def test_new_rows_replace_those_with_the_same_conditions():
+    published = read_published_rows()[0]
+    trained = make_row(training=Training(data="other"))
+    kept = [make_row(task="search"), make_row(policy="other"), make_row(differences=["weld"]), trained]
+    new = make_row(successes=2, rate=0.5, weights="ab")
+    assert replace_rows([published, make_row(), *kept], [new]) == [*kept, new]
 
 
 @pytest.mark.parametrize(

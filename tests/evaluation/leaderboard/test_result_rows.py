@@ -116,6 +116,9 @@ def test_command_writes_rows_of_all_results_and_the_published_ones(tmp_path, cap
     rows = read_leaderboard(out).rows
     assert [(row.policy, row.n) for row in rows if not row.published] == [("runs/mine", 1), ("mine", 2)]
     assert sum(row.published for row in rows) == 6
+    write(tmp_path / "d", [outcome(0)], policy={**TRAINED, "name": "another"})
+    assert leaderboard(WriteLeaderboard((tmp_path / "d",), out=out, update=True)) == 0
+    assert [row.policy for row in read_leaderboard(out).rows if not row.published] == ["another", "runs/mine", "mine"]
     text = out.with_suffix(".md").read_text()
     assert text in capsys.readouterr().out and "RoboFlamingo" in text
     with pytest.raises(EvaluationError):

@@ -1,0 +1,36 @@
+#!/usr/bin/env bash
+# Evaluate a policy on all bundled protocols, and add its rows to the leaderboard.
+#
+#   bash scripts/evaluate_protocols.sh POLICY [PROTOCOL ...]
+#
+# POLICY    a name of `robocas list`, or a run folder of `robocas train`
+# PROTOCOL  names of protocols (default: all but smoke)
+#
+# After an interruption, run the script again to continue. Results: OUT/POLICY/PROTOCOL.
+#
+# OUT          folder of the results (default: reproduced/protocols)
+# LEADERBOARD  file of the leaderboard (default: docs/leaderboard/results.json)
+# JOBS         number of processes that evaluate (default: one per core)
+# ROBOCAS      robocas command (default: .venv/bin/robocas)
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+source scripts/timed.sh
+
+fail() { printf 'evaluate_protocols: error: %s\n' "$*" >&2; exit 2; }
+
+policy=${1:-}
+[[ -n $policy ]] || fail "missing policy. Usage: bash scripts/evaluate_protocols.sh POLICY [PROTOCOL ...]"
+protocols=("${@:2}")
+((${#protocols[@]})) || protocols=(
+    ms3-v1 paper-v1 paper-words-v1 objects-v1 clutter-v1 arrangement-v1 looks-v1 cameras-v1 furniture-v1 instructions-v1)
+out=${OUT:-reproduced/protocols} leaderboard=${LEADERBOARD:-docs/leaderboard/results.json}
+jobs=${JOBS:-$(env -u OMP_NUM_THREADS nproc)}
+robocas=${ROBOCAS:-.venv/bin/robocas}
+command -v "$robocas" >/dev/null || fail "no such command: $robocas. Run bash scripts/setup.sh, or set ROBOCAS."
+
+for protocol in "${protocols[@]}"; do
+    folder=$out/$(basename "$policy")/$protocol
+    timed "$robocas" eval run --policy "$policy" --protocol "$protocol" --envs "$jobs" --out "$folder"
+    mkdir -p "$(dirname "$leaderboard")"
+    "$robocas" eval leaderboard "$folder" --update --out "$leaderboard" >/dev/null
+done
