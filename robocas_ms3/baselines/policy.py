@@ -24,6 +24,11 @@ def shipped_small() -> RunPolicy:
     return RunPolicy(BUNDLED / "small")
 
 
+def shipped_keyframe() -> RunPolicy:
+    """Make the policy `keyframe` with the bundled weights, which were trained for all four tasks."""
+    return RunPolicy(BUNDLED / "keyframe")
+
+
 class RunPolicy:
     """Policy with the weights of a training run.
 

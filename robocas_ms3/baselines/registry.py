@@ -46,7 +46,9 @@ BASELINES: Registry[Callable[[], Baseline]] = Registry(
             "small", "base and gripper camera, language; action chunks by a small transformer; bundled weights for pick"
         ),
         "keyframe": BuiltinBaseline(
-            "keyframe", "RGB-D images of three cameras, language; next keyframe by segmentation and ranked grasps"
+            "keyframe",
+            "RGB-D images of three cameras, language; next keyframe by segmentation and ranked grasps; bundled weights "
+            "for all tasks",
         ),
         "bc-state": BuiltinBaseline("bc_state", "privileged state of the simulator; action chunks by a residual MLP"),
         "rt1": BuiltinBaseline(

@@ -1,13 +1,16 @@
-"""The bundled weights of `small`."""
+"""The bundled weights of `small` and `keyframe`."""
 
 import json
 import re
 from pathlib import Path
 
 import pytest
+import torch
 from pages import ROOT, blocks
+from safetensors.torch import load_file
 
 from robocas_ms3.baselines.policy import RunPolicy
+from robocas_ms3.baselines.registry import find_baseline
 from robocas_ms3.baselines.small import BASELINE
 from robocas_ms3.baselines.training.record import BUNDLED, CHECKPOINT, read_run
 from robocas_ms3.baselines.training.session import load_initial_weights
@@ -20,11 +23,32 @@ from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.scenes.config import load_task_config
 
 
-def test_file_size_and_version():
-    record = read_run(BUNDLED / "small")
-    assert (record.baseline, record.version) == ("small", BASELINE.version)
-    assert sum(path.stat().st_size for path in BUNDLED.rglob("*")) < 10e6
-    assert not (BUNDLED / "small" / CHECKPOINT).exists()
+@pytest.mark.parametrize("name", ["small", "keyframe"])
+def test_version_and_files(name):
+    record = read_run(BUNDLED / name)
+    assert (record.baseline, record.version) == (name, find_baseline(name).version)
+    assert not (BUNDLED / name / CHECKPOINT).exists()
+
+
+def test_files_are_small_and_have_model_cards():
+    runs = [path for path in BUNDLED.iterdir() if path.is_dir()]
+    assert {path.name for path in runs} == {"small", "keyframe"}
+    assert sum(path.stat().st_size for path in BUNDLED.rglob("*")) < 20e6
+    for folder in runs:
+        card = (folder / "README.md").read_text()
+        assert all(word in card for word in ("track", "trained on", "training cost", "**Works**", "**Does not work**"))
+
+
+def test_keyframe_has_half_precision_weights():
+    weights = load_file(BUNDLED / "keyframe" / "weights.safetensors")
+    assert {value.dtype for value in weights.values()} == {torch.float16, torch.int64}  # counters of norms
+    assert sum(value.numel() for value in weights.values()) < 6e6
+    policy = make_policy("keyframe")
+    assert policy.spec.track == "modular" and policy.spec.depth
+    description = policy.describe()
+    assert description["training_seconds"] > 600 and len(policy.spec.cameras) == 3
+    configs = configs_of("ms3-v1", "pick") | configs_of("ms3-v1", "open_pick")
+    assert policy.protocol_warnings(configs) == []
 
 
 def test_policy_by_name():

@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-WIDE_RADIUS, NARROW_RADIUS = 0.035, 0.015
-"""m within which votes for the centre of an object belong together; the narrow one tells touching copies apart."""
+WIDE_RADIUS, NARROW_RADIUS = 0.035, 0.01
+"""m within which votes for the centre of an object belong together; the narrow one tells touching copies apart, with
+votes that are shrunk along the view (`shrink_along_view`)."""
 _WORKSPACE = ((0.15, 1.15), (-0.9, 0.9), (-0.1, 0.6))  # m, least and greatest x, y and z in the arm's base frame
 _TABLE_BINS = (-0.1, 0.6, 200)  # m, m, number of bins of the histogram of heights
 _MAX_VOTES = 1200  # cells of an object that vote
 _FARTHEST_VOTE = 2.0  # radii from the centre, beyond which a vote belongs to another object
-_COLUMN_RADIUS = 0.025  # m between the middles of groups that are above each other
+_ALONG_VIEW = 0.15  # factor of distances along the view
 _LEAST_SHARE = 0.1  # of the votes of the largest group; smaller groups are errors
 _SUPPORT_RANGE = (-0.12, 0.02)  # m from the lowest visible point of the objects, which may be the top of an object
 _BELOW = 0.02  # m below a camera, from which it sees the upper side of a surface
@@ -117,25 +118,14 @@ def cluster_votes(votes: Array, min_votes: int, radius: float) -> list[NDArray[n
     return [group for group in groups if len(group) >= least]
 
 
-def join_columns(votes: Array, groups: list[NDArray[np.int64]]) -> list[NDArray[np.int64]]:
-    """Join the groups of votes (V, 3) whose middles are above each other: parts of one standing object.
+def shrink_along_view(votes: Array, camera: Array) -> Array:
+    """Return votes (V, 3) for centres that are closer to each other along the view from a camera at (3,).
 
-    groups: indices of the votes of each group, the largest group first.
+    Predicted centres are least certain along the view. This tells copies apart whose votes run into each other there.
     """
-    joined: list[NDArray[np.int64]] = []
-    middles: list[Array] = []
-    for group in groups:
-        middle = votes[group].mean(axis=0)
-        offsets = np.array(middles).reshape(-1, 3) - middle
-        sideways, upwards = np.linalg.norm(offsets[:, :2], axis=1), np.abs(offsets[:, 2])
-        above = np.flatnonzero((sideways < _COLUMN_RADIUS) & (sideways < upwards))
-        if len(above):
-            nearest = int(above[sideways[above].argmin()])
-            joined[nearest] = np.concatenate([joined[nearest], group])
-        else:
-            joined.append(group)
-            middles.append(middle)
-    return joined
+    view = (votes - camera).mean(axis=0)
+    view /= np.linalg.norm(view)
+    return votes - (1 - _ALONG_VIEW) * ((votes - votes.mean(axis=0)) @ view)[:, None] * view
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,8 @@ from robocas_ms3.baselines.keyframe.observed_scene import (
     is_above_table,
     is_below_camera,
     is_in_workspace,
-    join_columns,
     sample_pixels,
+    shrink_along_view,
     unproject,
 )
 from robocas_ms3.scenes.relations import RELATIONS, Relation
@@ -191,8 +191,10 @@ class Perception:
             where = np.flatnonzero(mask)
             votes = (cells.points + cells.offsets).reshape(-1, 3)[where]
             found = []
-            groups = cluster_votes(votes, max(1, settings.min_points * _POINT_STEP**2 // STRIDE**2), radius)
-            for group in join_columns(votes, groups):
+            clustered = votes
+            if radius == NARROW_RADIUS and len(votes):
+                clustered = shrink_along_view(votes, frame.camera_in_base[:3, 3])
+            for group in cluster_votes(clustered, max(1, settings.min_points * _POINT_STEP**2 // STRIDE**2), radius):
                 member = np.zeros(mask.size, dtype=bool)
                 member[where[group]] = True
                 on_object = member[number_of_cell]

@@ -18,8 +18,8 @@ from robocas_ms3.baselines.keyframe.observed_scene import (
     cluster_votes,
     find_table_height,
     is_below_camera,
-    join_columns,
     sample_pixels,
+    shrink_along_view,
     unproject,
 )
 from robocas_ms3.baselines.keyframe.obstacles import find_middle, score_blocking, score_height
@@ -115,12 +115,23 @@ def test_the_narrow_radius_tells_touching_copies_apart():
     assert cluster_votes(np.zeros((0, 3)), 5, NARROW_RADIUS) == []
 
 
-def test_parts_of_a_standing_object_are_joined():
-    middles = np.array([[0.5, 0, 0.2], [0.51, 0, 0.24], [0.515, 0, 0.2], [0.56, 0, 0.25]])
-    groups = [np.array([2 * number, 2 * number + 1]) for number in range(4)]
-    joined = join_columns(np.repeat(middles, 2, axis=0), groups)
-    # the second is above the first; the third is beside the first, and below the second; the fourth is too far away
-    assert [group.tolist() for group in joined] == [[0, 1, 2, 3], [4, 5], [6, 7]]
+def test_votes_are_shrunk_along_the_view():
+    camera, middle = np.array([0.5, 0, 1.2]), np.array([0.5, 0, 0.2])
+    votes = middle + np.array([[0, 0, 0.1], [0, 0, -0.1], [0.02, 0, 0], [-0.02, 0, 0]])
+    expected = middle + np.array([[0, 0, 0.015], [0, 0, -0.015], [0.02, 0, 0], [-0.02, 0, 0]])
+    assert np.allclose(shrink_along_view(votes, camera), expected)
+
+
+def test_copies_with_votes_that_are_smeared_along_the_view_are_told_apart():
+    """Two copies, 4 cm apart across the view; their votes are smeared by 8 cm along the view."""
+    rng, camera, count = np.random.default_rng(0), np.array([0.2, 0, 0.6]), 60
+    view = np.array([0.4, 0, -0.4]) / np.hypot(0.4, 0.4)
+    across = np.repeat([[0, 0.02, 0], [0, -0.02, 0]], count, axis=0)
+    votes = np.array([0.6, 0, 0.2]) + across + rng.normal(0, 0.003, (2 * count, 3))
+    votes += rng.uniform(-0.04, 0.04, 2 * count)[:, None] * view
+    groups = cluster_votes(shrink_along_view(votes, camera), 5, NARROW_RADIUS)
+    assert sorted(sorted(group.tolist()) for group in groups) == [list(range(count)), list(range(count, 2 * count))]
+    assert len(cluster_votes(votes, 5, NARROW_RADIUS)) > 2
 
 
 def test_free_squares_are_empty_and_observed():
