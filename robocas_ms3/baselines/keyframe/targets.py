@@ -23,7 +23,7 @@ class TargetChoice:
     """
 
     def __init__(self, relation: Relation | None) -> None:
-        self._relation = relation
+        self._relation: Relation | None = relation
         self._last_xy: Array | None = None  # predicted centre in the last view that showed the target
 
     def choose(self, found: list[ObservedObject]) -> ObservedObject | None:
