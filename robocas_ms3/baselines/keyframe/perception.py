@@ -45,6 +45,7 @@ _POINT_STEP = 2  # pixels between points of the cloud
 _SURE = 0.6  # probability of an object or the basket in the images of a survey
 _SURE_HANDLE, _MIN_HANDLE_CELLS = 0.4, 5  # probability and number of cells of a handle
 _ROOF_RADIUS, _ROOF_CLEARANCE, _ROOF_CELLS = 0.2, 0.12, 60  # m around and above the objects; least number of cells
+_BASKET_RADIUS = 0.4  # m from the median of the points to the farthest point of a basket
 _EDGE = 2  # percent of the points of the basket that may be outside of its bounds
 
 
@@ -237,9 +238,13 @@ class Perception:
 
 
 def _find_basket(points: Array) -> Array | None:
-    """Return the middle of the basket (x, y) and the height of its rim (z) from points (P, 3) on it, or None."""
+    """Return the middle of the basket (x, y) and the height of its rim (z) from points (P, 3) on it, or None.
+
+    Points far from the median are left out. At the outline of the basket, cells may show the floor or a wall.
+    """
     if len(points) < 20:
         return None
+    points = points[np.linalg.norm(points - np.median(points, axis=0), axis=1) < _BASKET_RADIUS]
     low, high = np.percentile(points, [_EDGE, 100 - _EDGE], axis=0)
     return np.array([*(low[:2] + high[:2]) / 2, high[2]])
 

@@ -81,6 +81,15 @@ def test_survey_of_a_table():
     assert survey.handle is None and not survey.has_roof
 
 
+def test_cells_behind_the_outline_of_the_basket_do_not_move_it():
+    scene = make_scene()
+    scene.add(BASKET, (0.2, 0.23), (-0.65, -0.45), -0.3, end=[0, 0, 0])  # the floor, 6 % of the basket's cells
+    perception, frame = scene.perceive()
+    strays = (scene.labels == BASKET) & (scene.ends[..., 2] == 0)
+    assert 0.04 < strays.sum() / (scene.labels == BASKET).sum() < 0.2
+    assert np.allclose(perception.survey([frame], 0.3).basket, [0.6, 0.2, TABLE + 0.12], atol=0.012)
+
+
 def test_survey_before_a_door():
     scene = make_scene()
     cells = scene.add(HANDLE, (0.45, 0.5), (-0.3, -0.25), TABLE + 0.05, end=[0.48, -0.28, 0.13])
