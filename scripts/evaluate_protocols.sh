@@ -6,7 +6,7 @@
 # POLICY    a name of `robocas list`, or a run folder of `robocas train`
 # PROTOCOL  names of protocols (default: all but smoke)
 #
-# After an interruption, run the script again to continue. Results: OUT/POLICY/PROTOCOL.
+# After an interruption, run the script again to continue. Results: OUT/POLICY/PROTOCOL, with _ in place of / in POLICY.
 #
 # OUT          folder of the results (default: reproduced/protocols)
 # LEADERBOARD  file of the leaderboard (default: docs/leaderboard/results.json)
@@ -29,7 +29,7 @@ robocas=${ROBOCAS:-.venv/bin/robocas}
 command -v "$robocas" >/dev/null || fail "no such command: $robocas. Run bash scripts/setup.sh, or set ROBOCAS."
 
 for protocol in "${protocols[@]}"; do
-    folder=$out/$(basename "$policy")/$protocol
+    folder=$out/${policy//\//_}/$protocol
     timed "$robocas" eval run --policy "$policy" --protocol "$protocol" --envs "$jobs" --out "$folder"
     mkdir -p "$(dirname "$leaderboard")"
     "$robocas" eval leaderboard "$folder" --update --out "$leaderboard" >/dev/null

@@ -105,7 +105,7 @@ def test_a_policy_is_evaluated_on_all_protocols(tmp_path):
     played = [call[call.index("--protocol") + 1] for call in calls if call[1] == "run"]
     assert sorted(played) == sorted(set(bundled_protocols()) - {"smoke"})
     rows = [call for call in calls if call[1] == "leaderboard"]
-    assert [call[2] for call in rows] == [str(tmp_path / "out" / "mine" / name) for name in played]
+    assert [call[2] for call in rows] == [str(tmp_path / "out" / "runs_mine" / name) for name in played]
     assert all("--update" in call and call[-1] == settings["LEADERBOARD"] for call in rows)
     assert run_with_stub(tmp_path, "evaluate_protocols.sh")[0].returncode == 2
 

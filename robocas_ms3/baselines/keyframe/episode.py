@@ -70,7 +70,8 @@ class _Keyframe:
     def hanging(self) -> float:
         """Distance in m from the TCP down to the lowest point of the object.
 
-        It may be hidden, so the object is taken to be as high above its predicted centre as below it.
+        The lowest point may be hidden. Therefore the object is assumed to reach as far below its predicted centre as
+        above it.
         """
         heights = self.scene.points[self.object.mask][:, 2]
         low = min(heights.min(), 2 * self.object.center[2] - heights.max())

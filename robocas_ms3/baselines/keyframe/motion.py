@@ -22,7 +22,8 @@ LIFT = 0.12
 _JOINT_STEP = 0.03  # rad between the configurations of a joint motion
 _MAX_TRANSLATION, _MAX_ROTATION = 0.095, 0.45  # m along an axis and rad per control step of 0.2 s; 5 % below the limits
 _MAX_JOINT_STEP = 0.4  # rad per control step
-_MAX_HALVINGS, _LEAST_MOTION = 3, 0.01  # of motions that the arm does not follow; m of a motion that is checked
+_MAX_HALVINGS = 3  # of the limits, after motions that the arm did not execute
+_LEAST_MOTION = 0.01  # m, commanded motion from which on the executed motion is checked
 _FRONT_DISTANCES, _FRONT_LIFT = (0.2, 0.15, 0.1, 0.06), 0.025  # m before the pre-grasp; m of the way back above it
 _EXIT_DISTANCES = (0.3, 0.25, 0.2, 0.15, 0.1, 0.06)  # m from the pre-grasp back to the end of the way out
 _MAX_ENTRIES, _MAX_APPROACHES = 32, 48  # grasps for which approaches are planned, from the front and from above
@@ -254,8 +255,8 @@ class ArmPaths:
 class PathFollower:
     """Follows a path with motions of the TCP that are relative to its present pose.
 
-    If the arm does not follow a motion, because its controller finds no joint positions for a pose that far away, the
-    motion is repeated and the following ones are half as long, at most three times.
+    The controller of the arm may find no joint positions for a distant pose. Then the arm stays, and the follower
+    repeats the motion with half the limits. It halves the limits at most three times.
 
     Args:
         chain: kinematics of the arm.

@@ -187,14 +187,14 @@ class Perception:
         large_object = _enlarge(probability, size)[step][valid]
 
         def find(
-            mask: NDArray[np.bool_], of: NDArray[np.float32], label: int, radius: float = WIDE_RADIUS
+            mask: NDArray[np.bool_], of: NDArray[np.float32], label: int, *, separates_copies: bool = False
         ) -> list[ObservedObject]:
             where = np.flatnonzero(mask)
             votes = (cells.points + cells.offsets).reshape(-1, 3)[where]
             found = []
-            clustered = votes
-            if radius == NARROW_RADIUS and len(votes):
-                clustered = shrink_along_view(votes, frame.camera_in_base[:3, 3])
+            clustered, radius = votes, WIDE_RADIUS
+            if separates_copies and len(votes):
+                clustered, radius = shrink_along_view(votes, frame.camera_in_base[:3, 3]), NARROW_RADIUS
             for group in cluster_votes(clustered, max(1, settings.min_points * _POINT_STEP**2 // STRIDE**2), radius):
                 member = np.zeros(mask.size, dtype=bool)
                 member[where[group]] = True
@@ -206,7 +206,7 @@ class Perception:
 
         inside = cells.valid & is_in_workspace(cells.points)
         is_target = inside & (target > settings.target_probability)
-        targets = find(is_target, target, -1, NARROW_RADIUS if request.relation else WIDE_RADIUS)
+        targets = find(is_target, target, -1, separates_copies=request.relation is not None)
         is_object = inside & (probability > settings.object_probability)
         labels = names.argmax(-1)
         objects = [
