@@ -15,6 +15,7 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 source scripts/timed.sh
+source scripts/shards.sh
 
 fail() { printf 'evaluate_protocols: error: %s\n' "$*" >&2; exit 2; }
 
@@ -30,7 +31,7 @@ command -v "$robocas" >/dev/null || fail "no such command: $robocas. Run bash sc
 
 for protocol in "${protocols[@]}"; do
     folder=$out/${policy//\//_}/$protocol
-    timed "$robocas" eval run --policy "$policy" --protocol "$protocol" --envs "$jobs" --out "$folder"
+    evaluate "$folder" --policy "$policy" --protocol "$protocol"
     mkdir -p "$(dirname "$leaderboard")"
     "$robocas" eval leaderboard "$folder" --update --out "$leaderboard" >/dev/null
 done

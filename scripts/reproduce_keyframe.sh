@@ -18,6 +18,7 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 source scripts/timed.sh
+source scripts/shards.sh
 
 fail() { printf 'reproduce_keyframe: error: %s\n' "$*" >&2; exit 2; }
 
@@ -62,6 +63,5 @@ for part in "${parts[@]}"; do
 done
 timed "$robocas" train keyframe --data "$out/data" --out "$out/run" --steps "$steps"
 for task in "${tasks[@]}"; do
-    timed "$robocas" eval "$task" --policy "$out/run" --protocol "$protocol" --episodes "$episodes" --envs "$jobs" \
-        --out "$out/eval/$task"
+    evaluate "$out/eval/$task" "$task" --policy "$out/run" --protocol "$protocol" --episodes "$episodes"
 done

@@ -72,13 +72,26 @@ def test_scripts_call_valid_commands(tmp_path, words):
     assert sum(counts) == 100
 
 
+def check_shards(calls):
+    """Check that evaluations in two shards, in any order, are followed by their merge; return one shard of each."""
+    played = []
+    for *shards, merge in zip(calls[0::3], calls[1::3], calls[2::3], strict=True):
+        shards.sort(key=lambda call: call[call.index("--shard") + 1])
+        folders = [call[call.index("--out") + 1] for call in shards]
+        assert [call[call.index("--shard") + 1] for call in shards] == ["0/2", "1/2"]
+        assert merge[:4] == ["eval", "merge", *folders]
+        assert folders == [f"{merge[-1]}_shards/{number}" for number in range(2)]
+        played.append(shards[0])
+    return played
+
+
 @pytest.mark.parametrize(("row", "parts", "tasks"), [("A", 4, 4), ("B", 3, 2), ("C", 3, 2)])
 def test_rows_of_keyframe_call_valid_commands(tmp_path, row, parts, tasks):
     out = tmp_path / "out"
     done, calls = run_with_stub(tmp_path, "reproduce_keyframe.sh", row, str(out), SCALE="10", STEPS="7", EPISODES="3")
     assert done.returncode == 0, done.stderr
-    names = ["generate", "render-candidates"] * parts + ["train"] + ["eval"] * tasks
-    assert [call[0] for call in calls] == names
+    evaluations = calls[2 * parts + 1 :]
+    assert [call[0] for call in calls[: 2 * parts + 1]] == ["generate", "render-candidates"] * parts + ["train"]
     for call in calls:
         cli.parse(call)
     for generate, render in zip(calls[0 : 2 * parts : 2], calls[1 : 2 * parts : 2], strict=True):
@@ -91,7 +104,9 @@ def test_rows_of_keyframe_call_valid_commands(tmp_path, row, parts, tasks):
         )
     train = calls[2 * parts]
     assert train[train.index("--data") + 1] == str(out / "data") and train[train.index("--steps") + 1] == "7"
-    assert all(call[call.index("--policy") + 1] == train[train.index("--out") + 1] for call in calls[2 * parts + 1 :])
+    played = check_shards(evaluations)
+    assert len(played) == tasks
+    assert all(call[call.index("--policy") + 1] == train[train.index("--out") + 1] for call in played)
     again, _ = run_with_stub(tmp_path, "reproduce_keyframe.sh", row, str(out), SCALE="20")
     assert again.returncode == 2 and "other settings" in again.stderr
 
@@ -102,12 +117,23 @@ def test_a_policy_is_evaluated_on_all_protocols(tmp_path):
     assert done.returncode == 0, done.stderr
     for call in calls:
         cli.parse(call)
-    played = [call[call.index("--protocol") + 1] for call in calls if call[1] == "run"]
-    assert sorted(played) == sorted(set(bundled_protocols()) - {"smoke"})
     rows = [call for call in calls if call[1] == "leaderboard"]
+    evaluations = check_shards([call for call in calls if call not in rows])
+    played = [call[call.index("--protocol") + 1] for call in evaluations]
+    assert sorted(played) == sorted(set(bundled_protocols()) - {"smoke"})
     assert [call[2] for call in rows] == [str(tmp_path / "out" / "runs_mine" / name) for name in played]
     assert all("--update" in call and call[-1] == settings["LEADERBOARD"] for call in rows)
     assert run_with_stub(tmp_path, "evaluate_protocols.sh")[0].returncode == 2
+
+
+def test_an_evaluation_with_a_failed_shard_is_not_merged(tmp_path):
+    stub = tmp_path / "fails"
+    stub.write_text(STUB + 'case "$*" in *"--shard 1/2"*) exit 1 ;; esac\n')
+    stub.chmod(0o755)
+    settings = {"OUT": str(tmp_path / "out"), "LEADERBOARD": str(tmp_path / "rows.json"), "ROBOCAS": str(stub)}
+    done, calls = run_with_stub(tmp_path, "evaluate_protocols.sh", "small", "smoke", **settings)
+    assert done.returncode != 0 and [call[1] for call in calls] == ["run", "run"]
+    assert "_shards" in done.stderr
 
 
 def make_dataset(tmp_path, episodes):

@@ -199,22 +199,22 @@ class ArmPaths:
         backwards = grasp[:2, 2] / np.linalg.norm(grasp[:2, 2])
         starts = np.tile(before, (len(_FRONT_DISTANCES), 1, 1))
         starts[:, :2, 3] -= np.array(_FRONT_DISTANCES)[:, None] * backwards
-        reachable, found = self.reach(np.concatenate([starts, [before, grasp]]), qpos)
-        if not reachable[-2:].all():
+        ends = np.tile(before, (len(_EXIT_DISTANCES), 1, 1))
+        ends[:, :2, 3] -= np.array(_EXIT_DISTANCES)[:, None] * backwards
+        raised = np.stack([grasp, before, *ends])
+        raised[:, 2, 3] += _FRONT_LIFT
+        reachable, found = self.reach(np.concatenate([[grasp, before], raised, starts]), qpos)
+        if not reachable[:4].all():  # the grasp, the pre-grasp, and both raised
             return None
-        entries = ((one, self._connect(one, [before, grasp])) for one in found[:-2][reachable[:-2]])
-        start, inwards = next(((one, path) for one, path in entries if path is not None), (qpos, None))
+        exits = raised[2:][reachable[4 : -len(starts)]]
+        entries = found[-len(starts) :][reachable[-len(starts) :]]
+        paths = ((start, self._connect(start, [before, grasp])) for start in entries)
+        start, inwards = next(((start, path) for start, path in paths if path is not None), (qpos, None))
         if inwards is None:
             return None
-        for farther in _EXIT_DISTANCES:
-            end = before.copy()
-            end[:2, 3] -= farther * backwards
-            raised = np.stack([grasp, before, end])
-            raised[:, 2, 3] += _FRONT_LIFT
-            way_back = self._connect(inwards[-1], list(raised))
-            if way_back is not None:
-                return Approach(grasp, start, inwards, way_back)
-        return None
+        outwards = (self._connect(inwards[-1], [*raised[:2], end]) for end in exits)
+        way_back = next((path for path in outwards if path is not None), None)
+        return None if way_back is None else Approach(grasp, start, inwards, way_back)
 
     def _connect(self, qpos: Array, poses: list[Array]) -> Array | None:
         """Return straight paths (n, 7) through TCP poses (4, 4), one after another, or None."""
