@@ -1,4 +1,4 @@
-"""``robocas eval``: evaluate a policy on a protocol; report, compare and verify results; freeze protocols."""
+"""``robocas eval``: evaluate a policy on a protocol; report, compare, verify and audit results; freeze protocols."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Annotated
 
 import tyro
 
-from robocas_ms3.cli import eval_results
+from robocas_ms3.cli import eval_audit, eval_results
 from robocas_ms3.cli.options import Overrides, resumable
 from robocas_ms3.core.text import format_count
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
-DESCRIPTION = """Evaluate a policy on a protocol, and report, compare and verify results.
+DESCRIPTION = """Evaluate a policy on a protocol, and report, compare, verify and audit results.
 
 `robocas eval pick --policy small` is short for `robocas eval run pick --policy small`.
 """
@@ -132,6 +132,7 @@ COMMANDS = {
     "merge": eval_results.merge,
     "compare": eval_results.compare,
     "verify": eval_results.verify,
+    "audit": eval_audit.audit,
     "videos": eval_results.videos,
     "leaderboard": eval_results.leaderboard,
     "protocols": list_protocols,

@@ -132,7 +132,7 @@ def compare(cfg: Compare) -> int:
     groups = [[folder] for folder in cfg.folders] if len(cfg.folders) == 2 else group_partial_results(cfg.folders)
     results = [read_result(*parts) for parts in groups]
     if len(results) == 1:
-        print_text(compare_splits(results[0], _protocol_of(results[0], cfg.protocol)))
+        print_text(compare_splits(results[0], find_protocol_of(results[0], cfg.protocol)))
     else:
         print_text(compare_results(results))
     return 0
@@ -178,7 +178,7 @@ def verify(cfg: Verify) -> int:
     from robocas_ms3.evaluation.verify import find_violations
 
     result = _read(cfg.folders)
-    found = find_violations(result, _protocol_of(result, cfg.protocol))
+    found = find_violations(result, find_protocol_of(result, cfg.protocol))
     for violation in found:
         print_line(violation)
     if broken := result.count_errors():
@@ -197,7 +197,7 @@ def videos(cfg: Videos) -> int:
 
     check_number("--count", cfg.count, 1)
     result = _read((cfg.folder,))
-    protocol, name = _protocol_of(result, cfg.protocol), result.run.policy.name
+    protocol, name = find_protocol_of(result, cfg.protocol), result.run.policy.name
     if name not in {*POLICIES.builtin, *POLICIES.entry_points} and cfg.policy != name:
         fix = f"Add --policy {name} if you trust its code."
         raise EvaluationError("the policy of this result has no registered name", where=cfg.folder, found=name, fix=fix)
@@ -249,13 +249,13 @@ def _find_protocol(result: Result, given: str | None) -> LoadedProtocol | None:
     from robocas_ms3.core.errors import EvaluationError
 
     try:
-        loaded = _protocol_of(result, given)
+        loaded = find_protocol_of(result, given)
     except EvaluationError:
         return None
     return loaded if loaded.hash == result.run.protocol_hash else None
 
 
-def _protocol_of(result: Result, given: str | None) -> LoadedProtocol:
+def find_protocol_of(result: Result, given: str | None) -> LoadedProtocol:
     """Load the protocol of --protocol, or the bundled protocol that the result names."""
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.evaluation.bundled_protocols import bundled_protocols

@@ -14,8 +14,10 @@ from robocas_ms3.evaluation.results import Result, RunRecord
 from robocas_ms3.scenes.task_specs import TASKS
 
 
-def find_violations(result: Result, protocol: LoadedProtocol) -> list[str]:
+def find_violations(result: Result, protocol: LoadedProtocol, *, is_complete: bool = True) -> list[str]:
     """Return one text per violation in a result; empty if the result fits the protocol and is consistent.
+
+    ``is_complete``: whether the result must have all episodes of the protocol.
 
     Violations are another hash, missing or unknown episodes, values that contradict the protocol or other values, and
     stored actions that are missing or do not fit their episode.
@@ -40,10 +42,14 @@ def find_violations(result: Result, protocol: LoadedProtocol) -> list[str]:
         else:
             of_episode = ["this episode is not in the protocol"]
         found += [f"episode {number}: {problem}" for problem in of_episode]
-    missing = len(set(range(count)) - result.outcomes.keys())
-    if missing:
+    if is_complete and (missing := count_missing_episodes(result, protocol)):
         found.append(f"{missing} of {format_count(count, 'episode')} missing")
     return found
+
+
+def count_missing_episodes(result: Result, protocol: LoadedProtocol) -> int:
+    """Return the number of episodes of the protocol that a result does not have."""
+    return len(set(range(len(protocol.episodes))) - result.outcomes.keys())
 
 
 def _find_outcome_violations(

@@ -111,6 +111,27 @@ def test_rows_of_keyframe_call_valid_commands(tmp_path, row, parts, tasks):
     assert again.returncode == 2 and "other settings" in again.stderr
 
 
+@pytest.mark.parametrize(
+    ("baseline", "step", "runs"), [("small", "convert", ["run"] * 4), ("bc-state", "train", ["run/pick", "run/select"])]
+)
+def test_row_a_of_other_baselines_calls_valid_commands(tmp_path, baseline, step, runs):
+    out = tmp_path / "out"
+    done, calls = run_with_stub(tmp_path, "reproduce_ms3.sh", baseline, str(out), SCALE="10", EPISODES="3")
+    assert done.returncode == 0, done.stderr
+    for call in calls:
+        cli.parse(call)
+    assert [call[0] for call in calls[:8]] == ["generate", step] * 4
+    for generate, reads in zip(calls[0:8:2], calls[1:8:2], strict=True):
+        assert f"{generate[generate.index('--out') + 1]}/trajectory.h5" in reads
+        assert generate[generate.index("--config") + 1] in bundled_configs()
+    trained = [call[call.index("--out") + 1] for call in calls if call[0] == "train"]
+    played = check_shards([call for call in calls[8:] if call[0] == "eval"])
+    assert [call[call.index("--protocol") + 1] for call in played] == ["ms3-v1"] * 4
+    policies = [call[call.index("--policy") + 1] for call in played]
+    assert set(policies) == set(trained)
+    assert policies[: len(runs)] == [str(out / baseline / run) for run in runs]
+
+
 def test_a_policy_is_evaluated_on_all_protocols(tmp_path):
     settings = {"OUT": str(tmp_path / "out"), "LEADERBOARD": str(tmp_path / "board" / "rows.json")}
     done, calls = run_with_stub(tmp_path, "evaluate_protocols.sh", "runs/mine", **settings)
@@ -171,6 +192,7 @@ def test_study_trains_on_the_dataset_or_on_a_fraction(tmp_path, what):
         (["study_small.sh", "nowhere"], "nowhere: no dataset. Run: bash scripts/reproduce_small.sh pick nowhere"),
         (["reproduce_small.sh"], "invalid task ''"),
         (["reproduce_keyframe.sh", "D"], "invalid row 'D'"),
+        (["reproduce_ms3.sh", "ppo"], "invalid baseline 'ppo'"),
         (["reproduce_small.sh", "open_pick"], "invalid task 'open_pick'"),
         (
             ["dagger_small.sh", "pick", "nowhere"],

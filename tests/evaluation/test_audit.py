@@ -1,0 +1,198 @@
+"""`robocas eval audit` plays the stored actions of a result again, and finds forged outcomes."""
+
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from robocas_ms3.cli.eval_audit import Audit, audit
+from robocas_ms3.cli.main import run as cli
+from robocas_ms3.evaluation.audit import bound_differing_episodes, choose_episodes, find_audit_obstacle, run_audit
+from robocas_ms3.evaluation.policy import PolicySpec
+from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.results import OUTCOMES, RUN, read_result
+from robocas_ms3.evaluation.session import EvaluationSession
+from robocas_ms3.evaluation.settings import EvaluationSettings
+from robocas_ms3.evaluation.stored_actions import hash_actions, write_actions
+from robocas_ms3.evaluation.verify import find_violations
+
+SMOKE = load_protocol("smoke")
+
+
+class CountingPolicy:
+    """Policy whose first action value is 1, 2, ... by number of the episode; a `CountingEnv` succeeds at a sum of 5."""
+
+    spec = PolicySpec(rate_hz=5)
+
+    def __init__(self):
+        self._numbers = {}
+
+    def reset(self, episodes):
+        self._numbers.update({one.env: one.episode for one in episodes})
+
+    def act(self, observations):
+        actions = np.zeros((len(observations.envs), 7), np.float32)
+        actions[:, 0] = [self._numbers[env] + 1 for env in observations.envs.tolist()]
+        return actions
+
+
+@pytest.fixture
+def folder(made, tmp_path):
+    """A result of four episodes with 5, 3, 2 and 2 steps."""
+    out = tmp_path / "result"
+    settings = EvaluationSettings(("pick", "select"), "mine", "smoke", out, envs=1, backend="processes")
+    steps = [one.steps for one in EvaluationSession(CountingPolicy(), settings).run()]
+    assert steps == [5, 3, 2, 2]
+    return out
+
+
+def play(folder, out="audit", **settings):
+    """Return the numbers of the audited episodes and of those that differ."""
+    audited = list(run_audit(read_result(folder), SMOKE, folder.parent / out, envs=1, **settings))
+    return [one.episode for one in audited], [one.episode for one in audited if one.differences]
+
+
+def forge(folder, number, actions=None, **values):
+    """Change values of an outcome, and its stored actions together with their hash."""
+    if actions is not None:
+        actions = np.asarray(actions, np.float32)
+        write_actions(folder, number, actions)
+        values["actions_hash"] = hash_actions(actions)
+    lines = [json.loads(line) for line in (folder / OUTCOMES).read_text().splitlines()]
+    lines = [line | (values if line["episode"] == number else {}) for line in lines]
+    (folder / OUTCOMES).write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def test_a_true_result_has_no_differences_and_a_second_audit_plays_only_changed_episodes(folder, made):
+    assert play(folder) == ([0, 1, 2, 3], [])
+    seeds = [seed for env in made for seed in env.seeds]
+    assert seeds[4:] == [one.seed for one in SMOKE.episodes[:4]]
+    assert play(folder) == ([0, 1, 2, 3], [])
+    assert sum(len(env.seeds) for env in made) == 8  # nothing was played
+    forge(folder, 2, measures=read_result(folder).outcomes[2].measures | {"path_length": 7.0})
+    assert play(folder)[1] == [2]
+    assert sum(len(env.seeds) for env in made) == 9
+
+
+def failed(one):
+    """Return the values of an outcome as if it had failed at its end."""
+    flags = {**one.flags, "success": None}
+    seconds = {**one.flag_seconds, "success": None}
+    return {"success": False, "success_at_end": False, "flags": flags, "flag_seconds": seconds}
+
+
+def forge_longer_path(folder, one):
+    forge(folder, one.episode, measures=one.measures | {"path_length": one.measures["path_length"] + 0.5})
+
+
+def forge_impulse(folder, one):
+    forge(folder, one.episode, measures=one.measures | {"contact_impulse": 1.0})
+
+
+def forge_earlier_stage(folder, one):
+    flags, seconds = one.flags | {"reached_any": 1}, one.flag_seconds | {"reached_any": 0.2}
+    forge(folder, one.episode, flags=flags, flag_seconds=seconds)
+
+
+def forge_failure(folder, one):
+    forge(folder, one.episode, **failed(one), failure_stage="placed")
+
+
+def forge_smaller_actions(folder, one):
+    actions = read_result(folder).read_actions(one.episode)
+    forge(folder, one.episode, actions * 0.9)
+
+
+def forge_exchanged_actions(folder, one):
+    actions = read_result(folder).read_actions(one.episode).copy()
+    actions[:, 0] = (3, 1, 1, 1, 1)
+    forge(folder, one.episode, actions)
+
+
+def forge_fewer_steps(folder, one):
+    actions = read_result(folder).read_actions(one.episode)[:3]
+    forge(folder, one.episode, actions, **failed(one), failure_stage="placed", steps=3, seconds=0.6)
+
+
+def forge_more_steps(folder, one):
+    actions = np.concatenate([read_result(folder).read_actions(one.episode), np.zeros((2, 7))])
+    late = {"success": 7, "success_v0": None, "fail": None, "reached_any": 2}
+    seconds = {name: None if step is None else step / 5 for name, step in late.items()}
+    forge(folder, one.episode, actions, steps=7, seconds=1.4, flags=late, flag_seconds=seconds)
+
+
+def forge_success_at_end(folder, one):
+    forge(folder, one.episode, success_at_end=False)
+
+
+FORGERIES = [
+    forge_longer_path,
+    forge_impulse,
+    forge_earlier_stage,
+    forge_failure,
+    forge_smaller_actions,
+    forge_exchanged_actions,
+    forge_fewer_steps,
+    forge_more_steps,
+    forge_success_at_end,
+]
+
+
+@pytest.mark.parametrize("forgery", FORGERIES)
+def test_consistent_forgeries_are_found(folder, forgery):
+    before = read_result(folder).outcomes[0]
+    forgery(folder, before)
+    assert read_result(folder).outcomes[0] != before
+    assert find_violations(read_result(folder), SMOKE, is_complete=False) == []
+    assert play(folder) == ([0, 1, 2, 3], [0])
+
+
+def test_the_outcome_of_another_episode_is_found(folder):
+    first, second = read_result(folder).outcomes[0], read_result(folder).outcomes[1]
+    moved = replace(second, episode=0, seed=first.seed)
+    forge(folder, 0, read_result(folder).read_actions(1)[:, ::-1], **asdict(moved))
+    assert find_violations(read_result(folder), SMOKE, is_complete=False) == []
+    assert play(folder)[1] == [0]
+
+
+def test_a_sample_is_repeatable_and_leaves_out_episodes_with_errors(folder):
+    result = read_result(folder)
+    assert choose_episodes(result, 2, 5) == choose_episodes(result, 2, 5)
+    assert {tuple(choose_episodes(result, 2, seed)) for seed in range(50)} > {(0, 1), (2, 3)}
+    assert choose_episodes(result, 9, 5) == [0, 1, 2, 3]
+    assert play(folder, sample=2, seed=5)[0] == choose_episodes(result, 2, 5)
+    drawn = play(folder, "drawn", sample=2)
+    assert play(folder, "drawn", sample=2) == drawn  # an audit that is continued keeps its sample
+    forge(folder, 1, success=False, error="the connection was lost", failure_stage="error")
+    assert choose_episodes(read_result(folder), None, 0) == [0, 2, 3]
+
+
+def test_bound_of_a_sample():
+    # two of four: one differing episode is not seen in 3 of 6 samples, two in 1 of 6, three in none
+    assert bound_differing_episodes(2, 4) == 2
+    assert bound_differing_episodes(4, 4) == 0
+    # 19 of 20 find one differing episode in 95 % of the samples, which does not exceed 95 %
+    assert bound_differing_episodes(50, 200) == 10
+
+
+def test_results_of_other_physics_or_versions_cannot_be_audited(folder):
+    assert find_audit_obstacle(read_result(folder)) == ""
+    record = json.loads((folder / RUN).read_text())
+    for changes, word in (({"backend": "gpu"}, "gpu"), ({"versions": {"sapien": "2.0"}}, "sapien 2.0")):
+        (folder / RUN).write_text(json.dumps(record | changes))
+        assert word in find_audit_obstacle(read_result(folder))
+        assert audit(Audit(folder)) == 1
+
+
+def test_an_evaluation_can_be_audited(short, tmp_path, capsys):
+    out = tmp_path / "result"
+    words = ["eval", "pick", "search", "--policy", "random", "--protocol", str(short), "--backend", "processes"]
+    assert cli([*words, "--out", str(out)]) == 0
+    command = ["eval", "audit", str(out), "--protocol", str(short)]
+    assert cli(command) == 0
+    assert "4 of 4 episodes played" in capsys.readouterr().out
+    one = read_result(out).outcomes[0]
+    forge(out, 0, measures=one.measures | {"path_length": one.measures["path_length"] + 0.001})
+    assert cli(command) == 1
+    assert "measures.path_length" in capsys.readouterr().out
