@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from robocas_ms3.core.arrays import as_float32, as_tensor, known_all_false, maximum, norm, to_native, where
+from robocas_ms3.evaluation.outcomes import MEASURES
 from robocas_ms3.tasks import terms
 from robocas_ms3.tasks.base import RoboCASEnv
 from robocas_ms3.tasks.bodies import read_link_poses
@@ -16,7 +17,6 @@ from robocas_ms3.tasks.goals import TaskState
 from robocas_ms3.tasks.search import ENVS_AT_ONCE, RoboCASSearchEnv
 
 V0_RADIUS = 0.1  # m between the origins of target and basket in xy: RoboCAS-v0's success
-MEASURES = ("path_length", "contact_impulse", "disturbed_most", "fallen")
 SUMS = (*MEASURES, "v0_steps")  # columns of ``info["sums"]``
 _PATH, _IMPULSE, _DISTURBED, _FALLEN, _V0_STEPS = range(len(SUMS))
 # An object is on top of another object if it hides this fraction of it from above. The fraction is estimated from

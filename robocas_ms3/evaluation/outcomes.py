@@ -15,6 +15,9 @@ from robocas_ms3.scenes.task_specs import STAGES as DEFAULT_STAGES
 # Abbreviations in the result table of the paper (docs/evaluation.md)
 PAPER_STAGES = {"RA": "reached_any", "PA": "picked_any", "RR": "reached_target", "CO": "obstacles_cleared"}
 
+MEASURES = ("path_length", "contact_impulse", "disturbed_most", "fallen")
+"""Names of the measures of each episode."""
+
 Measure = Annotated[int | float, Field(ge=0, le=1e12)]  # int stays int, so that a value is written as it was read
 Fraction = Annotated[int | float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=0, le=10**12)]
@@ -103,7 +106,7 @@ class Outcome:
         steps: number of policy steps.
         seconds: simulated duration of the episode, s.
         failure_stage: stage after the last reached stage (`find_failure_stage`); empty if the task succeeded.
-        error: error that ended the episode; empty: no error.
+        error: error that ended the episode; empty: no error. Such an episode has failed.
         flags: by stage or success rule, the policy step after which it first held; None: never.
         flag_seconds: by stage or success rule, the simulated time in s after which it first held; None: never.
         measures: ``path_length``, path length of the TCP in m; ``contact_impulse`` in N s; ``disturbed_most`` and
@@ -133,6 +136,10 @@ class Outcome:
     p_vis: Fraction | None = None
     retrieval: Retrieval | None = None
     actions_hash: str = ""
+
+    def __post_init__(self) -> None:
+        if self.error and (self.success or self.success_at_end or self.success_v0):
+            raise ValueError(f"episode {self.episode}: success, but an error ended the episode: expected no success")
 
     def reproducible_values(self) -> dict[str, Any]:
         """Return the values that are equal for equal seed and policy: all but wall-clock times and the actions' hash.

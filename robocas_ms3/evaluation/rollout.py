@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from robocas_ms3.core.errors import PolicyError
 from robocas_ms3.core.text import escape_controls
 from robocas_ms3.evaluation.calibration import CameraCalibration
-from robocas_ms3.evaluation.metrics import MEASURES, read_metric
-from robocas_ms3.evaluation.outcomes import Outcome, Retrieval, find_failure_stage
+from robocas_ms3.evaluation.metrics import read_metric
+from robocas_ms3.evaluation.outcomes import MEASURES, Outcome, Retrieval, find_failure_stage
 from robocas_ms3.evaluation.policy import (
     CONVENTIONS,
     ROBOT_QUANTITIES,
@@ -74,9 +74,9 @@ class Rollout:
             config=episode.config,
             seed=episode.seed,
             split=episode.split,
-            success=flags.get("success") is not None,
-            success_at_end=self.at_end.get("success", False),
-            success_v0=self.at_end.get("success_v0", False),
+            success=not self.error and flags.get("success") is not None,
+            success_at_end=not self.error and self.at_end.get("success", False),
+            success_v0=not self.error and self.at_end.get("success_v0", False),
             steps=self.steps,
             seconds=round(self.seconds, 4),
             failure_stage=find_failure_stage(flags, self.error, TASKS[episode.task].stages),

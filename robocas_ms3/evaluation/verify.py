@@ -7,11 +7,25 @@ from typing import get_args
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.text import format_count
-from robocas_ms3.evaluation.outcomes import Outcome, compute_order_score, find_failure_stage
+from robocas_ms3.evaluation.outcomes import MEASURES, Outcome, compute_order_score, find_failure_stage
 from robocas_ms3.evaluation.policy import Track
-from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol, ProtocolEpisode
+from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol, Protocol, ProtocolEpisode
 from robocas_ms3.evaluation.results import Result, RunRecord
 from robocas_ms3.scenes.task_specs import TASKS
+
+_FLAGS = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "success", "fail")
+_FLAGS_OF_TASK = {"search": ("obstacles_cleared", "cleared_at_reset"), "open_pick": ("furniture_opened",)}
+# Pairs of flags: the first holds as soon as the second, by their definitions (`tasks.success`).
+_IMPLIED = (
+    ("reached_any", "reached_target"),
+    ("reached_any", "picked_any"),
+    ("reached_target", "target_grasped"),
+    ("target_grasped", "target_lifted"),
+    ("picked_any", "target_lifted"),
+    ("target_lifted", "success"),
+    ("target_in_basket", "success"),
+)
+_TIME_TOLERANCE = 1e-3  # s
 
 
 def find_violations(result: Result, protocol: LoadedProtocol, *, is_complete: bool = True) -> list[str]:
@@ -55,7 +69,7 @@ def count_missing_episodes(result: Result, protocol: LoadedProtocol) -> int:
 def _find_outcome_violations(
     outcome: Outcome, episode: ProtocolEpisode, protocol: LoadedProtocol, run: RunRecord
 ) -> Iterator[str]:
-    rules, flags, steps = protocol.rules, outcome.flags, format_count(outcome.steps, "step")
+    rules, flags = protocol.rules, outcome.flags
     task = next((task for task, other in run.played_as.items() if other == episode.task), episode.task)
     expected = {name: getattr(episode, name) for name in ("config", "seed", "split", "p_vis")}
     for name, value in {"task": task, **expected}.items():
@@ -63,13 +77,16 @@ def _find_outcome_violations(
             yield f"{name} is {getattr(outcome, name)}, expected {value}"
     if ("welds" in outcome.measures) != run.weld:
         yield f"{'missing' if run.weld else 'unexpected'} value measures.welds: the run has weld: {run.weld}"
+    if missing := [name for name in MEASURES if name not in outcome.measures]:
+        yield f"measures: missing {', '.join(missing)}"
+    of_task = _FLAGS_OF_TASK.get(episode.task, ())
+    if not outcome.error and (missing := [name for name in (*_FLAGS, *of_task) if name not in flags]):
+        yield f"flags: missing {', '.join(missing)}"
     rate = rules.rate_hz or run.policy.spec.get("rate_hz") or DEFAULT_HZ
-    limit = rules.step_limit(episode.task, rate)
-    if limit is not None and outcome.steps > limit:
-        yield f"{steps}, expected at most {limit} by the rules of the protocol"
-    if rules.stepping == "timed" and abs(outcome.seconds - outcome.steps / rate) > 1e-3:
-        yield f"seconds is {outcome.seconds:g}, expected {outcome.steps / rate:g} for {steps} at {rate:g} Hz"
-    if outcome.success != (flags.get("success") is not None):
+    yield from _find_length_violations(outcome, rules, rules.step_limit(episode.task, rate))
+    if rules.stepping == "timed":
+        yield from _find_rate_violations(outcome, rate)
+    if not outcome.error and outcome.success != (flags.get("success") is not None):
         yield f"success is {outcome.success}, but flags.success is {flags.get('success')}"
     if outcome.success_at_end and not outcome.success:
         yield "success_at_end is True, but success is False"
@@ -81,12 +98,41 @@ def _find_outcome_violations(
     late = [name for name, step in flags.items() if step is not None and step > outcome.steps]
     if late:
         yield f"flags: {', '.join(late)} first held after the last step, expected at most {outcome.steps}"
+    for before, after in _IMPLIED:
+        at, later = flags.get(before), flags.get(after)
+        if before in flags and later is not None and (at is None or at > later):
+            yield f"flags: {after} held at step {later}, expected {before} at the same step or before, found {at}"
+    yield from _find_time_violations(outcome)
+    yield from _find_retrieval_violations(outcome)
+
+
+def _find_length_violations(outcome: Outcome, rules: Protocol, limit: int | None) -> Iterator[str]:
+    """Yield how the number of steps contradicts the end conditions; ``limit``: maximum number of steps."""
+    flags, steps = outcome.flags, format_count(outcome.steps, "step")
+    if limit is not None and outcome.steps > limit:
+        yield f"{steps}, expected at most {limit} by the rules of the protocol"
     for name in rules.ends_on:
         step = flags.get(name)
         if step is not None and 0 < step < outcome.steps:  # a flag that holds at the reset ends no episode
             yield f"{name} held at step {step}, where the protocol ends the episode, but the episode has {steps}"
-    yield from _find_time_violations(outcome)
-    yield from _find_retrieval_violations(outcome)
+    if outcome.error or limit is None or outcome.steps >= limit:
+        return
+    at_v0, count = flags.get("success_v0"), rules.max_v0_steps
+    may_end_by_v0 = count is not None and at_v0 is not None and outcome.steps >= at_v0 + count - 1
+    if not may_end_by_v0 and not any(flags.get(name) is not None for name in rules.ends_on):
+        yield f"{steps}, but nothing ended the episode before step {limit}"
+
+
+def _find_rate_violations(outcome: Outcome, rate: float) -> Iterator[str]:
+    """Yield times that are not those of their steps at a rate in Hz."""
+    times = {"seconds": (outcome.steps, outcome.seconds)}
+    for name, second in outcome.flag_seconds.items():
+        step = outcome.flags.get(name)
+        if step is not None and second is not None:
+            times[f"flag_seconds.{name}"] = step, second
+    for name, (step, second) in times.items():
+        if abs(second - step / rate) > _TIME_TOLERANCE:
+            yield f"{name} is {second:g}, expected {step / rate:g} for {format_count(step, 'step')} at {rate:g} Hz"
 
 
 def _find_action_violations(result: Result, number: int) -> list[str]:

@@ -40,6 +40,60 @@ def tamper(folder, line, **values):
     path.write_text("\n".join(lines) + "\n")
 
 
+def seconds_of(flags):
+    return {name: None if step is None else step / 20 for name, step in flags.items()}
+
+
+@pytest.mark.parametrize(
+    ("changes", "violation"),
+    [
+        (
+            {"reached_any": None},
+            "reached_target held at step 30, expected reached_any at the same step or before, found None",
+        ),
+        (
+            {"target_lifted": None},
+            "success held at step 70, expected target_lifted at the same step or before, found None",
+        ),
+        (
+            {"target_in_basket": None},
+            "success held at step 70, expected target_in_basket at the same step or before, found None",
+        ),
+        ({"picked_any": 55}, "target_lifted held at step 50, expected picked_any at the same step or before, found 55"),
+        (
+            {"reached_target": 45},
+            "target_grasped held at step 40, expected reached_target at the same step or before, found 45",
+        ),
+    ],
+)
+def test_flags_in_an_impossible_order_are_found(folder, protocol, changes, violation):
+    flags = read_result(folder).outcomes[0].flags | changes
+    tamper(folder, 0, flags=flags, flag_seconds=seconds_of(flags))
+    assert f"episode 0: flags: {violation}" in find_violations(read_result(folder), protocol)
+
+
+def test_an_episode_that_nothing_ended_and_times_of_other_steps_are_found(folder, protocol):
+    before = read_result(folder).outcomes[0]
+    flags = {**before.flags, "success": None}
+    failed = {"success": False, "success_at_end": False, "failure_stage": "placed"}
+    tamper(folder, 0, flags=flags, flag_seconds=seconds_of(flags), **failed)
+    assert find_violations(read_result(folder), protocol) == [
+        "episode 0: 70 steps, but nothing ended the episode before step 800"
+    ]
+    tamper(folder, 0, flags=flags, flag_seconds=seconds_of(flags), **failed, error="lost", success_v0=False)
+    found = find_violations(read_result(folder), protocol)
+    assert found == ["episode 0: failure_stage is placed, expected error from the flags"]
+    tamper(folder, 1, flag_seconds={**before.flag_seconds, "reached_any": 0.6})
+    found = find_violations(read_result(folder), protocol)
+    assert "episode 1: flag_seconds.reached_any is 0.6, expected 0.5 for 10 steps at 20 Hz" in found
+
+
+def test_success_of_an_episode_with_an_error_is_refused(folder):
+    tamper(folder, 0, error="the connection was lost")
+    with pytest.raises(EvaluationError, match=f"{OUTCOMES}:1: "):
+        read_result(folder)
+
+
 def tamper_run(folder, **values):
     path = folder / RUN
     path.write_text(json.dumps(json.loads(path.read_text()) | values))
@@ -64,6 +118,14 @@ def tamper_run(folder, **values):
         ({"success_at_end": True, "success": False}, "episode 0: success_at_end is True, but success is False"),
         ({"flags": {"success_v0": None}}, "episode 0: success_v0 is True, but flags.success_v0 is None"),
         ({"seconds": 3.0}, "episode 0: seconds is 3, expected 3.5 for 70 steps at 20 Hz"),
+        (
+            {"flags": {"success": 70}},
+            "episode 0: flags: missing reached_any, picked_any, reached_target, target_grasped, target_lifted, fail",
+        ),
+        (
+            {"measures": {"path_length": 1.0, "fallen": 0.0}},
+            "episode 0: measures: missing contact_impulse, disturbed_most",
+        ),
         (
             {"flag_seconds": {"success": 3.6}},
             "episode 0: flag_seconds: success first held after the end of the episode at 3.5 s",
@@ -168,15 +230,14 @@ def test_inconsistent_retrieval_orders_are_found(folder, protocol, changed, well
 def test_failure_stage_is_checked_with_the_stages_of_the_task(folder, protocol, monkeypatch):
     row = replace(TASKS["pick"], stages=("reached_target", "aligned"))
     monkeypatch.setitem(TASKS.builtin, "pick", row)
-    flags = {"reached_any": 1, "reached_target": 2, "aligned": None, "success": None}
+    never = dict.fromkeys(read_result(folder).outcomes[0].flags)
+    flags = {**never, "reached_any": 1, "reached_target": 2, "aligned": None, "fail": 70}
     failed = {"success": False, "success_at_end": False, "success_v0": False, "failure_stage": "aligned"}
-    tamper(
-        folder, 0, flags=flags, flag_seconds=dict.fromkeys(flags, 0.5) | {"aligned": None, "success": None}, **failed
-    )
+    tamper(folder, 0, flags=flags, flag_seconds=seconds_of(flags), **failed)
     assert find_violations(read_result(folder), protocol) == []
     monkeypatch.undo()
     assert find_violations(read_result(folder), protocol) == [
-        "episode 0: failure_stage is aligned, expected placed from the flags"
+        "episode 0: failure_stage is aligned, expected target_grasped from the flags"
     ]
 
 

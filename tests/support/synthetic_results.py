@@ -76,10 +76,18 @@ def write(folder: Path, outcomes: Iterable[Outcome], **run: Any) -> Result:
 
 def of_protocol(folder: Path, protocol: LoadedProtocol) -> Result:
     """Write a valid result in which every episode of a protocol succeeded."""
-    outcomes = [
-        outcome(one.episode, task=one.task, config=one.config, seed=one.seed, split=one.split, p_vis=one.p_vis)
-        for one in protocol.episodes
-    ]
+    outcomes, v0_steps = [], protocol.rules.max_v0_steps
+    more: dict[str, tuple[str, ...]] = {
+        "search": ("obstacles_cleared", "cleared_at_reset"),
+        "open_pick": ("furniture_opened",),
+    }
+    for one in protocol.episodes:
+        made = outcome(one.episode, task=one.task, config=one.config, seed=one.seed, split=one.split, p_vis=one.p_vis)
+        flags, seconds = (of | dict.fromkeys(more.get(one.task, ())) for of in (made.flags, made.flag_seconds))
+        if v0_steps is not None:  # the episode ends after this number of steps with RoboCAS-v0's success
+            flags["success_v0"] = made.steps - v0_steps + 1
+            seconds["success_v0"] = flags["success_v0"] / 20
+        outcomes.append(replace(made, flags=flags, flag_seconds=seconds))
     packs = {protocol.rules.pack: protocol.rules.pack_hash}
     name = protocol.rules.name
     return write(folder, outcomes, protocol=name, protocol_hash=protocol.hash, pack_hashes=packs)

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.harness.proprioception import WIDTHS, Proprioception
-from robocas_ms3.evaluation.metrics import MEASURES
-from robocas_ms3.evaluation.outcomes import PAPER_STAGES
+from robocas_ms3.evaluation.outcomes import MEASURES, PAPER_STAGES
 from robocas_ms3.evaluation.policy import ExternalPolicy, Observations
 from robocas_ms3.evaluation.protocol import ProtocolEpisode
 from robocas_ms3.evaluation.remote.messages import parse_actions, parse_policy_spec

@@ -60,7 +60,7 @@ def test_notes_name_task_aliases_and_the_conditions_of_the_paper(tmp_path):
 def test_stage_rates_count_only_episodes_with_the_stage(tmp_path):
     made = outcome(1)
     cleared = replace(made, config="heap", flags={**made.flags, "obstacles_cleared": 20})
-    broken = replace(outcome(2), config="heap", flags={}, error="out of memory")  # before its first step
+    broken = replace(outcome(2, 0), config="heap", flags={}, error="out of memory")  # before its first step
     text = render_markdown(write(tmp_path / "a", [outcome(0), cleared, broken]))
     assert [row(text, name)[-3] for name in ("table", "heap", "all")] == ["", "50 %", "50 %"]
 
