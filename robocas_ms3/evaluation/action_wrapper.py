@@ -12,6 +12,7 @@ from mani_skill.utils.structs import Pose
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.evaluation.checkpoints import flatten_state, unflatten_state
 from robocas_ms3.evaluation.metrics import EpisodeMetrics
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec, TcpMotion
 from robocas_ms3.planning.action_noise import draw_noise
@@ -23,6 +24,8 @@ V0_CONTROL_HZ = 5
 # A policy step of RoboCAS-v0: the gripper moves until it stops, at most 5 control steps; then the
 # arm moves, at most 2.
 _GRIPPER_STEPS = 5
+CHECKPOINT = "checkpoint"
+"""Key of ``info`` with the checkpoint (`PolicyActionWrapper.restore`)."""
 MOTION_STEPS: dict[Stepping, int] = {"timed": 1, "upstream": 2}
 """Maximum number of control steps in which an action moves the arm, by stepping."""
 _STOPPED = 0.0005  # largest change in gripper width per control step, m; velocities jitter while the fingers press
@@ -50,6 +53,8 @@ class PolicyActionWrapper(gym.Wrapper):
         weld: whether lifted objects are fixed to the hand (`Weld`); only for one env on the CPU.
         action_noise: standard deviations of normal noise that is added to each component of each motion of the TCP, in
             mm and degrees. The noise of an episode depends on its seed only.
+        checkpoints: whether ``info`` has a checkpoint (N, D) float32 of each env: state of the simulation, gripper
+            command (1: open), and change of the gripper width in the last control step in m.
     """
 
     def __init__(
@@ -60,9 +65,11 @@ class PolicyActionWrapper(gym.Wrapper):
         *,
         weld: bool = False,
         action_noise: tuple[float, float] = (0.0, 0.0),
+        checkpoints: bool = False,
     ) -> None:
         super().__init__(env)
         self._observes_simulation, self._noise = spec.simulation_state, action_noise
+        self._records_checkpoints = checkpoints
         self._convention, self._reference, self._stepping = CONVENTIONS[spec.convention], spec.reference, stepping
         self._base: Any = env.unwrapped
         self._base.observes_images = False
@@ -134,8 +141,22 @@ class PolicyActionWrapper(gym.Wrapper):
         gripper = torch.from_numpy(np.where(self._open, 1.0, -1.0))
         return {**obs, "simulation": {"values": values, "gripper": gripper}}
 
+    def restore(self, checkpoint: np.ndarray) -> None:
+        """Set the state of the envs to checkpoints (N, D) of ``info``; metrics and the weld stay unchanged."""
+        bodies, rows = self._base.bodies, torch.from_numpy(checkpoint)
+        size = bodies.read().shape[1]
+        extra = unflatten_state(rows[:, size:-2], self._base.extra_state())
+        self._base.set_state_dict({**bodies.to_state_dict(rows[:, :size]), **extra})
+        self._open, self._width_change = checkpoint[:, -2] > 0, checkpoint[:, -1].astype(np.float64)
+
     def _compute_metrics(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
-        return {**self._metrics.compute_info(), **(self._weld.compute_info(info) if self._weld else {})}
+        welds = self._weld.compute_info(info) if self._weld else {}
+        checkpoint = {CHECKPOINT: self._make_checkpoint()} if self._records_checkpoints else {}
+        return {**self._metrics.compute_info(), **welds, **checkpoint}
+
+    def _make_checkpoint(self) -> torch.Tensor:
+        own = torch.from_numpy(np.stack([self._open, self._width_change], axis=1).astype(np.float32))
+        return torch.cat([self._base.bodies.read(), flatten_state(self._base.extra_state()), own], dim=1)
 
     def _timed_step(self, motion: TcpMotion) -> tuple:
         start = self._tcp_pose() if self._reference == "tcp" else self._commanded_pose()

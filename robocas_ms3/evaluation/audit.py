@@ -1,4 +1,4 @@
-"""Audit of a result: play the stored actions again in the frozen scenes, and compare the outcomes.
+"""Audit of a result: play the stored actions again in the frozen scenes, and compare outcomes and checkpoints.
 
 An audit shows that the stored actions have the recorded outcomes. It does not show which policy chose the actions.
 Neither the policy nor a renderer is needed.
@@ -22,7 +22,7 @@ from scipy.stats import hypergeom
 from robocas_ms3.core.errors import PolicyError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder, list_setting_changes
-from robocas_ms3.evaluation.outcomes import Count, Outcome
+from robocas_ms3.evaluation.outcomes import Checkpoints, Count, Outcome
 from robocas_ms3.evaluation.policy import CONVENTIONS, EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.results import Result, get_package_versions
@@ -179,9 +179,9 @@ def run_audit(
         with closing(session):
             for evaluated in session.run_episodes([protocol.episodes[number] for number in waiting]):
                 recorded = result.outcomes[evaluated.outcome.episode]
-                audited = AuditedEpisode(
-                    recorded.episode, hash_outcome(recorded), list_differences(recorded, evaluated.outcome)
-                )
+                differences = list_differences(recorded, evaluated.outcome)
+                differences += list_state_differences(result.read_checkpoints(recorded.episode), evaluated.checkpoints)
+                audited = AuditedEpisode(recorded.episode, hash_outcome(recorded), differences)
                 file.append([audited])
                 yield audited
 
@@ -190,6 +190,16 @@ def list_differences(recorded: Outcome, played: Outcome) -> list[str]:
     """Return a text per value of a recorded outcome that differs from the outcome of its stored actions."""
     before, now = recorded.reproducible_values(), played.reproducible_values()
     return [change for key in now for change in list_setting_changes(before[key], now[key], key)]
+
+
+def list_state_differences(recorded: Checkpoints, played: Checkpoints) -> list[str]:
+    """Return a text if recorded checkpoints differ from those of the stored actions; no recorded ones never differ."""
+    if not len(recorded.steps):
+        return []
+    if recorded.states.shape != played.states.shape or (recorded.steps != played.steps).any():
+        return [f"{len(recorded.steps)} checkpoints {recorded.states.shape} -> {played.states.shape}"]
+    differing = recorded.steps[(recorded.states != played.states).any(axis=1)]
+    return [f"the state after step {differing[0]} differs"] if len(differing) else []
 
 
 def hash_outcome(outcome: Outcome) -> str:

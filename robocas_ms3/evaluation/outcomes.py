@@ -114,7 +114,7 @@ class Outcome:
         inference_ms: wall-clock time of the policy per policy step, ms.
         p_vis: visible fraction of the target at the reset, seen from above, 0..1; None if it was not measured.
         retrieval: retrieval order; None except in search.
-        actions_hash: hash of the executed actions (`stored_actions.hash_actions`); empty: the actions were not stored.
+        actions_hash: hash of the executed actions (`stored_episodes.hash_actions`); empty: the actions were not stored.
     """
 
     episode: Count
@@ -149,11 +149,33 @@ class Outcome:
         return {name: value for name, value in asdict(self).items() if name not in ("inference_ms", "actions_hash")}
 
 
+class Checkpoints(NamedTuple):
+    """Checkpoints of an episode, from which an audit can continue it.
+
+    Attributes:
+        steps: (C,) int32 policy steps in ascending order; the last is the last of the episode.
+        states: (C, D) float32 states after these steps (`action_wrapper.PolicyActionWrapper`).
+    """
+
+    steps: NDArray[np.int32]
+    states: NDArray[np.float32]
+
+
+NO_CHECKPOINTS = Checkpoints(np.zeros(0, np.int32), np.zeros((0, 0), np.float32))
+
+
 class EvaluatedEpisode(NamedTuple):
-    """Outcome of an episode and its executed actions (T, A) float32, one per policy step, without action noise."""
+    """Episode that has ended.
+
+    Attributes:
+        outcome: its outcome.
+        actions: (T, A) executed actions, one per policy step, without action noise.
+        checkpoints: its checkpoints; none if its physics is not repeatable.
+    """
 
     outcome: Outcome
     actions: NDArray[np.float32]
+    checkpoints: Checkpoints = NO_CHECKPOINTS
 
 
 def find_failure_stage(flags: dict[str, int | None], error: str = "", order: Sequence[str] = DEFAULT_STAGES) -> str:

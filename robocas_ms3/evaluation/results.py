@@ -4,13 +4,16 @@
 
     run.json            protocol and its hash, policy, versions, backend, packs, machine (`RunRecord`)
     episodes.jsonl      one `Outcome` per line, in any order; an incomplete last line is dropped
-    actions/000012.npz  executed actions of episode 12 (`stored_actions`), written before its line
+    actions/000012.npz  executed actions of episode 12 (`stored_episodes`), written before its line
+    checkpoints/000012.npz  its checkpoints (not from a GPU)
 
 Partial results of one evaluation, such as shards, are read (`read_result`) or written (`merge_results`) as one result.
 """
 
 from __future__ import annotations
 
+import platform
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -28,10 +31,16 @@ from robocas_ms3.core.files import atomic_folder, write_json
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder, check_replaceable, list_setting_changes
 from robocas_ms3.core.strict_model import parse
-from robocas_ms3.evaluation.outcomes import EvaluatedEpisode, Outcome
+from robocas_ms3.evaluation.outcomes import Checkpoints, EvaluatedEpisode, Outcome
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec
 from robocas_ms3.evaluation.statistics import SuccessRate, compute_success_rate
-from robocas_ms3.evaluation.stored_actions import delete_other_actions, read_actions, write_actions
+from robocas_ms3.evaluation.stored_episodes import (
+    delete_other_episodes,
+    read_actions,
+    read_checkpoints,
+    write_actions,
+    write_checkpoints,
+)
 
 RUN, OUTCOMES = "run.json", "episodes.jsonl"
 _PACKAGES = ("robocas_ms3", "mani_skill", "sapien", "gymnasium", "numpy", "torch")
@@ -90,7 +99,7 @@ class RunRecord(BaseModel):
         backend: ``processes`` or ``gpu``.
         versions: package versions by name.
         pack_hashes: sha256 of the manifests of the object packs by name.
-        machine: processor and Python version of the machine.
+        machine: processor and Python version of the machine (`describe_machine`).
         merged_from: the partial results, if the result was merged.
     """
 
@@ -149,7 +158,8 @@ class Result:
         folder: folder of the result, or of the first partial result.
         run: settings of the evaluation. For partial results: of the first, with all in ``merged_from``.
         outcomes: by number of the episode, in ascending order, the outcome.
-        folders: by number of the episode, the folder with its actions; an episode without an entry is in ``folder``.
+        folders: by number of the episode, the folder with its actions and checkpoints; an episode without an entry is
+            in ``folder``.
     """
 
     folder: Path
@@ -184,6 +194,14 @@ class Result:
         folder = self.folders.get(episode, self.folder)
         return read_actions(folder, self.outcomes[episode], CONVENTIONS[name].size)
 
+    def read_checkpoints(self, episode: int) -> Checkpoints:
+        """Read the checkpoints of an episode; without stored checkpoints, none.
+
+        Raises:
+            EvaluationError: the file is damaged, or the checkpoints do not fit the outcome.
+        """
+        return read_checkpoints(self.folders.get(episode, self.folder), self.outcomes[episode])
+
     def has_repeated_scenes(self) -> bool:
         """Return whether two episodes have the same scene, as in some splits; such episodes must not be pooled."""
         return len({(one.task, one.seed) for one in self.outcomes.values()}) < len(self.outcomes)
@@ -209,7 +227,7 @@ def open_result(
 ) -> Iterator[dict[int, Outcome]]:
     """Lock a result folder, start or continue the result, and yield the recorded outcomes by episode number.
 
-    Stored actions of episodes without an outcome are deleted.
+    Stored actions and checkpoints of episodes without an outcome are deleted.
 
     Args:
         folder: folder of the result; created if it does not exist.
@@ -230,15 +248,16 @@ def open_result(
         if retry_errors and any(one.error for one in outcomes.values()):
             outcomes = {number: one for number, one in outcomes.items() if not one.error}
             _outcomes_file(folder).rewrite(outcomes.values())
-        delete_other_actions(folder, outcomes)
+        delete_other_episodes(folder, outcomes)
         yield outcomes
 
 
 def append_episode(folder: Path, evaluated: EvaluatedEpisode) -> None:
-    """Write the actions of an episode in a result folder, then append its outcome to ``episodes.jsonl``.
+    """Write actions and checkpoints of an episode in a result folder, then append its outcome to ``episodes.jsonl``.
 
-    Both are flushed to the disk, so that each outcome has its actions.
+    All are flushed to the disk, so that each outcome has its actions.
     """
+    write_checkpoints(folder, evaluated.outcome.episode, evaluated.checkpoints)
     write_actions(folder, evaluated.outcome.episode, evaluated.actions)
     _outcomes_file(folder).append([evaluated.outcome], sync=True)
 
@@ -304,6 +323,7 @@ def merge_results(folders: Sequence[Path], out: Path) -> Result:
     with atomic_folder(out) as folder:
         write_json(folder / RUN, result.run.to_dict())
         for number in result.outcomes:
+            write_checkpoints(folder, number, result.read_checkpoints(number))
             write_actions(folder, number, result.read_actions(number))
         _outcomes_file(folder).rewrite(result.outcomes.values())
     return read_result(out)
@@ -312,6 +332,14 @@ def merge_results(folders: Sequence[Path], out: Path) -> Result:
 def get_package_versions() -> dict[str, str]:
     """Return the installed versions, by name, of the packages that can change a result."""
     return {name: version(name) for name in _PACKAGES}
+
+
+def describe_machine() -> dict[str, str]:
+    """Return architecture and model of the processor, and the Python version; equal models compute equal outcomes."""
+    info = Path("/proc/cpuinfo")  # only on Linux
+    names = re.findall(r"^model name\s*:\s*(.+)$", info.read_text() if info.exists() else "", re.MULTILINE)
+    model = names[0] if names else platform.processor()
+    return {"processor": platform.machine(), "model": model, "python": platform.python_version()}
 
 
 def _check_policy(folder: Path, recorded: dict[str, Any], run: RunRecord) -> None:

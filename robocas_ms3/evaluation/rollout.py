@@ -12,9 +12,17 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import PolicyError
 from robocas_ms3.core.text import escape_controls
+from robocas_ms3.evaluation.action_wrapper import CHECKPOINT
 from robocas_ms3.evaluation.calibration import CameraCalibration
 from robocas_ms3.evaluation.metrics import read_metric
-from robocas_ms3.evaluation.outcomes import MEASURES, Outcome, Retrieval, find_failure_stage
+from robocas_ms3.evaluation.outcomes import (
+    MEASURES,
+    NO_CHECKPOINTS,
+    Checkpoints,
+    Outcome,
+    Retrieval,
+    find_failure_stage,
+)
 from robocas_ms3.evaluation.policy import (
     CONVENTIONS,
     ROBOT_QUANTITIES,
@@ -35,6 +43,7 @@ from robocas_ms3.scenes.task_specs import TASKS
 
 NOT_FINITE = "NaN or infinite action of the policy"
 _WELDS = "welds"  # key of ``info`` with the weld (`action_wrapper.Weld`)
+_CHECKPOINT_SECONDS = 1.0  # simulated time between checkpoints, if a policy step is a control step
 
 
 @dataclass
@@ -48,6 +57,7 @@ class Rollout:
         retrieval: (K, 3) record of `metrics.RetrievalTracker.compute_record` for this env; None except in search.
         inference_seconds: wall-clock time of the policy; the time for a batch is divided equally between its envs.
         actions: the executed actions, one (A,) float32 per policy step.
+        checkpoints: policy step and state (D,) float32 of each checkpoint.
     """
 
     spec: EpisodeSpec
@@ -61,6 +71,14 @@ class Rollout:
     inference_seconds: float = 0.0
     error: str = ""
     actions: list[NDArray[np.float32]] = field(default_factory=list, compare=False)
+    checkpoints: list[tuple[int, NDArray[np.float32]]] = field(default_factory=list, compare=False)
+
+    def stack_checkpoints(self) -> Checkpoints:
+        """Return the checkpoints as arrays."""
+        if not self.checkpoints:
+            return NO_CHECKPOINTS
+        steps, states = zip(*self.checkpoints, strict=True)
+        return Checkpoints(np.array(steps, np.int32), np.stack(states))
 
     def make_outcome(self, episode: ProtocolEpisode, objects: Sequence[str]) -> Outcome:
         """Return the outcome of this rollout of an episode; ``objects``: ids of the K objects by slot."""
@@ -133,6 +151,7 @@ class EpisodeBatch:
 
     def __init__(self, env: Any, spec: PolicySpec, ends: EndConditions, control_dt: float, *, refill: bool) -> None:
         self.env, self._spec, self._ends, self._dt, self.refill = env, spec, ends, control_dt, refill
+        self._checkpoint_steps = max(1, round(_CHECKPOINT_SECONDS / control_dt))
         self.action_size = CONVENTIONS[spec.convention].size
         self.num_envs: int = env.num_envs
         self.running: dict[int, Rollout] = {}
@@ -223,6 +242,8 @@ class EpisodeBatch:
         for env, episode in self.running.items():
             episode.steps += 1
             episode.actions.append(actions[env].copy())
+            if episode.steps % self._checkpoint_steps == 0:
+                self._record_checkpoint(episode)
         self._record_flags()
         for env in [env for env, episode in self.running.items() if self._is_over(episode)]:
             yield self._end_episode(env)
@@ -248,7 +269,13 @@ class EpisodeBatch:
             episode.measures[_WELDS] = float(info[_WELDS][env])
         if "retrieval" in info:
             episode.retrieval = info["retrieval"][env].copy()
+        if episode.steps % self._checkpoint_steps:
+            self._record_checkpoint(episode)
         return episode
+
+    def _record_checkpoint(self, episode: Rollout) -> None:
+        if CHECKPOINT in self._info:
+            episode.checkpoints.append((episode.steps, self._info[CHECKPOINT][episode.spec.env].copy()))
 
     def _record_flags(self) -> None:
         new = np.array([self._info[name] for name in self._flags]) & ~self._held

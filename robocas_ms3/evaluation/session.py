@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import platform
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -13,7 +12,7 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.core.errors import EvaluationError, VectorEnvCrashError
@@ -48,7 +47,7 @@ from robocas_ms3.evaluation.rollout import (
     run_rollouts,
 )
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.evaluation.stored_actions import hash_actions
+from robocas_ms3.evaluation.stored_episodes import hash_actions
 from robocas_ms3.scenes.config import TaskConfig, load_task_config
 from robocas_ms3.scenes.layout_table import FrozenLayouts
 from robocas_ms3.scenes.task_specs import TASKS
@@ -80,8 +79,7 @@ class EvaluationSession:
         played_as: tasks that are evaluated in the episodes of another task (`LoadedProtocol.find_task_aliases`).
         rate: control steps per second. A policy step is one control step; with RoboCAS-v0's steps it is 1 to 7 control
             steps at 5 Hz (`PolicyActionWrapper`).
-        outcomes: by index of the env, the outcome of the episode that has ended since the last `reset`.
-        actions: by index of the env, the executed actions (T, A) float32 of the same episode.
+        evaluated: by index of the env, the episode that has ended since the last `reset`.
 
     Raises:
         EvaluationError: the protocol does not exist, the policy or the weld does not fit it, no episode is selected,
@@ -112,8 +110,7 @@ class EvaluationSession:
         self._log_policy_warnings()
         self.run_record = self._make_run_record(backend)
         self.folder = settings.choose_folder(rules.name, self.played_as)
-        self.outcomes: dict[int, Outcome] = {}
-        self.actions: dict[int, NDArray[np.float32]] = {}
+        self.evaluated: dict[int, EvaluatedEpisode] = {}
         objects = load_pack(rules.pack, usage=False).objects
         self._layouts_of = cache(lambda config: FrozenLayouts(self.protocol.layouts_file(config), objects))
         self._refill = backend != "gpu"
@@ -126,7 +123,7 @@ class EvaluationSession:
     def run(self, on_start: Callable[[int], None] = lambda count: None) -> Iterator[Outcome]:
         """Run the selected episodes that the result does not have yet; write and yield the outcome of each.
 
-        The result also gets the executed actions of each episode (`stored_actions`).
+        The result also gets the executed actions and the checkpoints of each episode (`stored_episodes`).
 
         ``on_start`` is called with the number of episodes to run.
 
@@ -205,7 +202,7 @@ class EvaluationSession:
             )
         episodes = [known[number] for number in numbers]
         self.protocol.check_same_configuration(episodes)
-        self._current, self.outcomes, self.actions = episodes, {}, {}
+        self._current, self.evaluated = episodes, {}
         batch = self.open_batch(episodes[0], count)
         try:
             batch.start_episodes([(env, self.make_episode_spec(episode)) for env, episode in enumerate(episodes)])
@@ -239,14 +236,18 @@ class EvaluationSession:
                 rows = np.zeros((batch.num_envs, batch.action_size), np.float32)
                 rows[active] = chunks[active, step]
                 for ended in batch.step(rows):
-                    env = ended.spec.env
-                    self.outcomes[env], self.actions[env] = self._make_episode(ended, self._current[env])
+                    self.evaluated[ended.spec.env] = self._make_episode(ended, self._current[ended.spec.env])
                 if not batch.running:
                     return None
         except Exception:
             self.close()
             raise
         return self._observe(batch)
+
+    @property
+    def outcomes(self) -> dict[int, Outcome]:
+        """Return the outcomes of the episodes that have ended since the last `reset`, by index of the env."""
+        return {env: one.outcome for env, one in self.evaluated.items()}
 
     @property
     def observation(self) -> dict[str, Any]:
@@ -350,7 +351,7 @@ class EvaluationSession:
         outcome = ended.make_outcome(episode, layouts(episode.seed, episode.seed).object_ids)
         actions = np.array(ended.actions, np.float32).reshape(-1, CONVENTIONS[self.spec.convention].size)
         outcome = replace(outcome, task=self._find_task(episode), actions_hash=hash_actions(actions))
-        return EvaluatedEpisode(outcome, actions)
+        return EvaluatedEpisode(outcome, actions, ended.stack_checkpoints())
 
     def _find_task(self, episode: ProtocolEpisode) -> str:
         """Return the task that is evaluated in an episode."""
@@ -358,7 +359,7 @@ class EvaluationSession:
 
     def _make_env(self, episode: ProtocolEpisode, num_envs: int) -> Any:
         rules, settings = self.protocol.rules, self.settings
-        changes = {"weld": settings.weld, "action_noise": settings.action_noise}
+        changes = {"weld": settings.weld, "action_noise": settings.action_noise, "checkpoints": self._refill}
         stepping = partial(PolicyActionWrapper, spec=self.spec, stepping=rules.stepping, **changes)
         render: dict[str, Any] = {}
         if settings.render_size is not None:
@@ -406,6 +407,6 @@ class EvaluationSession:
             "backend": backend,
             "versions": results.get_package_versions(),
             "pack_hashes": {rules.pack: pack},
-            "machine": {"processor": platform.machine(), "python": platform.python_version()},
+            "machine": results.describe_machine(),
         }
         return results.RunRecord.from_values(values, f"policy {name}")

@@ -12,6 +12,7 @@ from robocas_ms3.evaluation.policy import EpisodeSpec, Policy
 from robocas_ms3.evaluation.rollout import EndConditions, EpisodeBatch, Rollout, run_rollouts
 from robocas_ms3.robots.camera_models import CameraModel
 
+STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted")
 BREAKS = 13.0  # an action with this number raises
 POSE = [1, 2, 3, 0.4, 0.1, 0.2, 0.3]  # m; quaternion wxyz
 
@@ -81,7 +82,7 @@ class CountingEnv:
         no, sums = np.zeros(self.num_envs, bool), np.zeros((self.num_envs, len(SUMS)), np.float32)
         sums[:, 0] = self.sums  # path_length
         done = self.sums >= (self.seed_of if self._goal is None else self._goal)
-        flags = {"reached_any": self.sums > 1, "success": done, "fail": no, "success_v0": no}
+        flags = {**{stage: self.sums > 1 for stage in STAGES}, "success": done, "fail": no, "success_v0": no}
         return {"sums": sums, **flags, "elapsed_steps": self.elapsed.copy()}
 
 

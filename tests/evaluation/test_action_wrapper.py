@@ -61,6 +61,24 @@ def test_slow_motion_reaches_its_goal(reference):
     assert read_metric(info, "path_length") == pytest.approx(0.1, abs=0.004)
 
 
+@pytest.mark.parametrize("stepping", ["timed", "upstream"])
+def test_an_episode_continues_from_a_checkpoint(stepping):
+    env = PolicyActionWrapper(pick("robocas", 5), PolicySpec("robocas"), stepping, checkpoints=True)
+    env.reset(seed=3)
+    env.step(along(0.02))
+    *_, info = env.step(along(0.01, 0.0))  # the gripper is closing
+    checkpoint = info["checkpoint"].numpy()
+    *_, info = env.step(along(0.02, 0.0))
+    after, position = info["checkpoint"].numpy(), tcp(env)
+    env.step(along(-0.05))
+    env.restore(checkpoint)
+    np.testing.assert_array_equal(env.get_info()["checkpoint"].numpy(), checkpoint)
+    *_, info = env.step(along(0.02, 0.0))
+    np.testing.assert_allclose(tcp(env), position, atol=1e-4)
+    assert info["checkpoint"].shape == after.shape and after[0, -2] == 0  # closed
+    np.testing.assert_allclose(info["checkpoint"].numpy()[0, -2:], after[0, -2:], atol=1e-3)
+
+
 def test_motions_start_from_the_tcp_or_from_the_last_commanded_pose():
     gone = {}
     for reference in ("tcp", "target"):

@@ -14,7 +14,7 @@ from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.results import OUTCOMES, RUN, read_result
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
-from robocas_ms3.evaluation.stored_actions import hash_actions, write_actions
+from robocas_ms3.evaluation.stored_episodes import hash_actions, write_actions, write_checkpoints
 from robocas_ms3.evaluation.verify import find_violations
 
 SMOKE = load_protocol("smoke")
@@ -76,10 +76,11 @@ def test_a_true_result_has_no_differences_and_a_second_audit_plays_only_changed_
 
 
 def failed(one):
-    """Return the values of an outcome as if it had failed at its end."""
-    flags = {**one.flags, "success": None}
-    seconds = {**one.flag_seconds, "success": None}
-    return {"success": False, "success_at_end": False, "flags": flags, "flag_seconds": seconds}
+    """Return the values of an outcome as if the target had fallen in the last step."""
+    flags = {**one.flags, "success": None, "fail": one.steps}
+    seconds = {**one.flag_seconds, "success": None, "fail": one.steps / 5}
+    failed = {"success": False, "success_at_end": False, "flags": flags, "flag_seconds": seconds}
+    return failed | {"failure_stage": "placed"}
 
 
 def forge_longer_path(folder, one):
@@ -96,7 +97,7 @@ def forge_earlier_stage(folder, one):
 
 
 def forge_failure(folder, one):
-    forge(folder, one.episode, **failed(one), failure_stage="placed")
+    forge(folder, one.episode, **failed(one))
 
 
 def forge_smaller_actions(folder, one):
@@ -112,14 +113,13 @@ def forge_exchanged_actions(folder, one):
 
 def forge_fewer_steps(folder, one):
     actions = read_result(folder).read_actions(one.episode)[:3]
-    forge(folder, one.episode, actions, **failed(one), failure_stage="placed", steps=3, seconds=0.6)
+    forge(folder, one.episode, actions, **failed(replace(one, steps=3)), steps=3, seconds=0.6)
 
 
 def forge_more_steps(folder, one):
     actions = np.concatenate([read_result(folder).read_actions(one.episode), np.zeros((2, 7))])
-    late = {"success": 7, "success_v0": None, "fail": None, "reached_any": 2}
-    seconds = {name: None if step is None else step / 5 for name, step in late.items()}
-    forge(folder, one.episode, actions, steps=7, seconds=1.4, flags=late, flag_seconds=seconds)
+    flags, seconds = {**one.flags, "success": 7}, {**one.flag_seconds, "success": 1.4}
+    forge(folder, one.episode, actions, steps=7, seconds=1.4, flags=flags, flag_seconds=seconds)
 
 
 def forge_success_at_end(folder, one):
@@ -164,7 +164,8 @@ def test_a_sample_is_repeatable_and_leaves_out_episodes_with_errors(folder):
     assert play(folder, sample=2, seed=5)[0] == choose_episodes(result, 2, 5)
     drawn = play(folder, "drawn", sample=2)
     assert play(folder, "drawn", sample=2) == drawn  # an audit that is continued keeps its sample
-    forge(folder, 1, success=False, error="the connection was lost", failure_stage="error")
+    lost = {"success": False, "success_at_end": False, "success_v0": False, "failure_stage": "error"}
+    forge(folder, 1, error="the connection was lost", **lost)
     assert choose_episodes(read_result(folder), None, 0) == [0, 2, 3]
 
 
@@ -196,3 +197,10 @@ def test_an_evaluation_can_be_audited(short, tmp_path, capsys):
     forge(out, 0, measures=one.measures | {"path_length": one.measures["path_length"] + 0.001})
     assert cli(command) == 1
     assert "measures.path_length" in capsys.readouterr().out
+    forge(out, 0, measures=one.measures)
+    checkpoints = read_result(out).read_checkpoints(0)
+    assert checkpoints.steps.tolist() == [20] and checkpoints.states.shape[1] > 100
+    checkpoints.states[0, 3] += 1e-6
+    write_checkpoints(out, 0, checkpoints)
+    assert cli([*command, "--overwrite"]) == 1
+    assert "the state after step 20 differs" in capsys.readouterr().out

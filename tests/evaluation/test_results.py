@@ -18,7 +18,7 @@ from robocas_ms3.evaluation.results import (
     open_result,
     read_result,
 )
-from robocas_ms3.evaluation.stored_actions import hash_actions
+from robocas_ms3.evaluation.stored_episodes import hash_actions
 
 SEARCH = dict.fromkeys(("obstacles_cleared", "reached_any", "target_grasped", "target_lifted", "success"))
 

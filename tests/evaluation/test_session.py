@@ -44,7 +44,8 @@ def test_external_loop_ends_episodes_by_the_rules_and_reset_drops_running_episod
     outcome = external.outcomes[0]
     assert (outcome.episode, outcome.success, outcome.steps, outcome.seconds) == (1, True, 5, 1.0)
     assert outcome.flags["reached_any"] == 2
-    assert external.actions[0].shape == (5, 7) and (external.actions[0] == 1).all()  # the sixth was not executed
+    actions = external.evaluated[0].actions
+    assert actions.shape == (5, 7) and (actions == 1).all()  # the sixth was not executed
     assert (outcome.config, outcome.seed, outcome.failure_stage) == ("pick_table_scattered", 110001, "")
     with pytest.raises(EvaluationError, match="no episode is running"):
         external.step(ones())

@@ -23,7 +23,7 @@ from robocas_ms3.evaluation.harness.proprioception import (
     depth_key,
     intrinsics_key,
 )
-from robocas_ms3.evaluation.outcomes import EvaluatedEpisode, Outcome
+from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.policy import CONVENTIONS, ExternalPolicy, Observations, PolicySpec
 from robocas_ms3.evaluation.rollout import CameraObservations
 from robocas_ms3.evaluation.session import EvaluationSession
@@ -165,7 +165,7 @@ class ProtocolVectorEnv(gym.vector.VectorEnv):
     def _write_episodes(self, envs: list[int]) -> None:
         """Write the outcomes and the actions of the given envs to the result, each episode once."""
         for env in envs:
-            evaluated = EvaluatedEpisode(self._session.outcomes[env], self._session.actions[env])
+            evaluated = self._session.evaluated[env]
             number = evaluated.outcome.episode
             if self._folder is not None and number not in self._recorded:
                 results.append_episode(self._folder, evaluated)

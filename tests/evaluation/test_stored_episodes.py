@@ -12,14 +12,18 @@ from counting_env import CountingEnv, run_policy
 from synthetic_results import actions_of, outcome, write
 
 from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.evaluation.outcomes import NO_CHECKPOINTS, Checkpoints
 from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec
 from robocas_ms3.evaluation.results import read_result
-from robocas_ms3.evaluation.stored_actions import (
-    delete_other_actions,
+from robocas_ms3.evaluation.stored_episodes import (
+    delete_other_episodes,
     find_actions_file,
+    find_checkpoints_file,
     hash_actions,
     read_actions,
+    read_checkpoints,
     write_actions,
+    write_checkpoints,
 )
 
 TWO = np.array([[1, 2, 3], [4, 5, 6.5]], np.float32)
@@ -73,6 +77,45 @@ def test_missing_damaged_or_other_actions_are_an_error_with_the_path(tmp_path, d
     assert error.value.where == path and error.value.fix
 
 
+TWO_STATES = Checkpoints(np.array([5, 7], np.int32), np.array([[1, 2], [3, 4.5]], np.float32))
+
+
+def test_checkpoints_that_were_written_are_read(tmp_path):
+    assert len(read_checkpoints(tmp_path, outcome(0, steps=7)).steps) == 0  # no file
+    write_checkpoints(tmp_path, 0, NO_CHECKPOINTS)
+    assert not find_checkpoints_file(tmp_path, 0).exists()
+    write_checkpoints(tmp_path, 0, TWO_STATES)
+    read = read_checkpoints(tmp_path, outcome(0, steps=7))
+    assert read.steps.tolist() == [5, 7] and read.states.tolist() == [[1, 2], [3, 4.5]]
+    assert (read.steps.dtype, read.states.dtype) == (np.int32, np.float32)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"steps": np.array([5, 8], np.int32)},  # not the last step
+        {"steps": np.array([7, 7], np.int32)},
+        {"steps": np.array([0, 7], np.int32)},
+        {"steps": np.array([5.0, 7.0])},
+        {"steps": np.array(7, np.int32)},
+        {"states": np.zeros((3, 2), np.float32)},
+        {"states": np.zeros((2, 2))},
+        {"states": np.full((2, 2), np.nan, np.float32)},
+        {"states": np.zeros(2, np.float32)},
+    ],
+)
+def test_invalid_checkpoints_are_an_error_with_the_path(tmp_path, changes):
+    path = find_checkpoints_file(tmp_path, 0)
+    path.parent.mkdir()
+    np.savez(path, **(TWO_STATES._asdict() | changes))
+    with pytest.raises(EvaluationError) as error:
+        read_checkpoints(tmp_path, outcome(0, steps=7))
+    assert error.value.where == path and error.value.fix
+    path.write_bytes(path.read_bytes()[:50])
+    with pytest.raises(EvaluationError):
+        read_checkpoints(tmp_path, outcome(0, steps=7))
+
+
 def test_array_that_declares_a_huge_shape_is_an_error(tmp_path):
     write_actions(tmp_path, 0, actions_of(outcome(0)))
     path = find_actions_file(tmp_path, 0)
@@ -87,9 +130,9 @@ def test_actions_of_other_episodes_are_deleted_and_other_files_stay(tmp_path):
     for number in (0, 1, 1234567):
         write_actions(tmp_path, number, TWO)
     (tmp_path / "actions" / "notes.npz").touch()
-    delete_other_actions(tmp_path, {1: outcome(1)})
+    delete_other_episodes(tmp_path, {1: outcome(1)})
     assert sorted(path.name for path in tmp_path.glob("actions/*")) == ["000001.npz", "notes.npz"]
-    delete_other_actions(tmp_path / "missing", {})
+    delete_other_episodes(tmp_path / "missing", {})
 
 
 def test_result_reads_the_actions_in_the_convention_of_its_policy(tmp_path):
