@@ -48,7 +48,7 @@ for part in "${parts[@]}"; do
     # a few heaps would take most of the time, so they are skipped after three attempts
     timed "$robocas" generate "$task" --config "$config" -n "$count" --seed "$seed" --jobs "$jobs" --max-attempts 3 --out "$demos"
     if [[ $baseline == small ]]; then
-        timed "$robocas" convert "$demos/trajectory.h5" --out "$out/parts/$config" --size 512 384 --no-depth --no-video \
+        timed "$robocas" convert "$demos/trajectory.h5" --out "$out/parts/$config" --size 320 240 --no-depth --no-video \
             --cameras base_camera gripper_camera --jobs "$jobs"
         data+=("$out/parts/$config")
     else
@@ -58,7 +58,8 @@ done
 if [[ $baseline == small ]]; then
     timed "$robocas" merge "${data[@]}" --out "$out/data"
     timed "$robocas" train small --data "$out/data" --out "$out/small/run" --steps "$steps" \
-        --set "views.base_camera.crop=[0,0,1,1]"
+        --set "views.base_camera.crop=[0,0,1,1]" --set "views.base_camera.size=[192,144]" \
+        --set "views.base_camera.image_size=[320,240]" --set "views.gripper_camera.image_size=[320,240]"
 fi
 for task in pick select search open_pick; do
     run=$out/$baseline/run
