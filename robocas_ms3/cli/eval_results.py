@@ -46,6 +46,8 @@ class Merge(Results):
 
     out: Path
     """Output folder of the merged result."""
+    overwrite: bool = False
+    """Replace an existing result."""
 
 
 @dataclass
@@ -117,7 +119,7 @@ def merge(cfg: Merge) -> int:
     from robocas_ms3.evaluation.results import merge_results
 
     _check_folders(cfg.folders)
-    result = merge_results(cfg.folders, cfg.out)
+    result = merge_results(cfg.folders, cfg.out, overwrite=cfg.overwrite)
     print_line(f"{cfg.out}: {format_count(len(result.outcomes), 'episode')}")
     write_pages(result, cfg.out, cfg.protocol)
     return 0

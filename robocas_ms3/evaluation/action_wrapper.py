@@ -141,13 +141,24 @@ class PolicyActionWrapper(gym.Wrapper):
         gripper = torch.from_numpy(np.where(self._open, 1.0, -1.0))
         return {**obs, "simulation": {"values": values, "gripper": gripper}}
 
-    def restore(self, checkpoint: np.ndarray) -> None:
-        """Set the state of the envs to checkpoints (N, D) of ``info``; metrics and the weld stay unchanged."""
+    def restore(self, checkpoint: np.ndarray, *, stages: bool = True) -> None:
+        """Set the state of the envs to checkpoints (N, D) of ``info``; metrics and the weld stay unchanged.
+
+        ``stages``: whether to set the reached stages, too.
+        """
         bodies, rows = self._base.bodies, torch.from_numpy(checkpoint)
         size = bodies.read().shape[1]
         extra = unflatten_state(rows[:, size:-2], self._base.extra_state())
+        if not stages:
+            del extra["task"]
         self._base.set_state_dict({**bodies.to_state_dict(rows[:, :size]), **extra})
         self._open, self._width_change = checkpoint[:, -2] > 0, checkpoint[:, -1].astype(np.float64)
+
+    def find_position_columns(self) -> np.ndarray:
+        """Return the columns (B, 3) of a checkpoint with the positions of the B bodies in the world, m."""
+        bodies = self._base.bodies
+        columns = bodies.to_state_dict(np.arange(bodies.read().shape[1]))
+        return np.array([of_body[:3] for of_kind in columns.values() for of_body in of_kind.values()])
 
     def _compute_metrics(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
         welds = self._weld.compute_info(info) if self._weld else {}

@@ -140,7 +140,8 @@ class RunRecord(BaseModel):
 
     def resume_settings(self) -> dict[str, Any]:
         """Return the values that must be equal to continue a result."""
-        return {**self.merge_settings(), "machine": self.machine}
+        machine = self.machine and {name: value for name, value in self.machine.items() if name != "model"}
+        return {**self.merge_settings(), "machine": machine}
 
 
 def _parse_settings(values: dict[str, Any]) -> dict[str, Any]:
@@ -311,15 +312,17 @@ def group_partial_results(folders: Iterable[Path]) -> list[list[Path]]:
     return [group for _, _, group in groups]
 
 
-def merge_results(folders: Sequence[Path], out: Path) -> Result:
+def merge_results(folders: Sequence[Path], out: Path, *, overwrite: bool = False) -> Result:
     """Merge partial results into one result and write its folder ``out`` atomically; return the result.
+
+    ``overwrite``: whether to replace an existing result.
 
     Raises:
         EvaluationError: as `read_result`; or the actions of an episode are missing or damaged.
         OutputExistsError: ``out`` exists.
     """
     result = read_result(*folders)
-    check_replaceable(out)
+    check_replaceable(out, overwrite=overwrite, markers=(RUN,))
     with atomic_folder(out) as folder:
         write_json(folder / RUN, result.run.to_dict())
         for number in result.outcomes:
@@ -335,7 +338,10 @@ def get_package_versions() -> dict[str, str]:
 
 
 def describe_machine() -> dict[str, str]:
-    """Return architecture and model of the processor, and the Python version; equal models compute equal outcomes."""
+    """Return architecture and model of the processor, and the Python version.
+
+    On equal models, equal actions have equal outcomes.
+    """
     info = Path("/proc/cpuinfo")  # only on Linux
     names = re.findall(r"^model name\s*:\s*(.+)$", info.read_text() if info.exists() else "", re.MULTILINE)
     model = names[0] if names else platform.processor()

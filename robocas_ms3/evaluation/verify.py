@@ -13,9 +13,11 @@ from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol, Protocol
 from robocas_ms3.evaluation.results import Result, RunRecord
 from robocas_ms3.scenes.task_specs import TASKS
 
+# Flags of the built-in tasks. Custom tasks may have other stages.
 _FLAGS = ("reached_any", "picked_any", "reached_target", "target_grasped", "target_lifted", "success", "fail")
 _FLAGS_OF_TASK = {"search": ("obstacles_cleared", "cleared_at_reset"), "open_pick": ("furniture_opened",)}
-# Pairs of flags: the first holds as soon as the second, by their definitions (`tasks.success`).
+# Pairs (a, b) of flags of the built-in tasks with a basket: if b held, a held at the same step or before, by their
+# definitions in `tasks.success`.
 _IMPLIED = (
     ("reached_any", "reached_target"),
     ("reached_any", "picked_any"),
@@ -34,7 +36,7 @@ def find_violations(result: Result, protocol: LoadedProtocol, *, is_complete: bo
     ``is_complete``: whether the result must have all episodes of the protocol.
 
     Violations are another hash, missing or unknown episodes, values that contradict the protocol or other values, and
-    stored actions that are missing or do not fit their episode.
+    stored actions or checkpoints that are missing or do not fit their episode.
     """
     run, rules, count = result.run, protocol.rules, len(protocol.episodes)
     found = []
@@ -56,14 +58,10 @@ def find_violations(result: Result, protocol: LoadedProtocol, *, is_complete: bo
         else:
             of_episode = ["this episode is not in the protocol"]
         found += [f"episode {number}: {problem}" for problem in of_episode]
-    if is_complete and (missing := count_missing_episodes(result, protocol)):
+    missing = len(set(range(count)) - result.outcomes.keys())
+    if is_complete and missing:
         found.append(f"{missing} of {format_count(count, 'episode')} missing")
     return found
-
-
-def count_missing_episodes(result: Result, protocol: LoadedProtocol) -> int:
-    """Return the number of episodes of the protocol that a result does not have."""
-    return len(set(range(len(protocol.episodes))) - result.outcomes.keys())
 
 
 def _find_outcome_violations(
@@ -75,12 +73,13 @@ def _find_outcome_violations(
     for name, value in {"task": task, **expected}.items():
         if getattr(outcome, name) != value:
             yield f"{name} is {getattr(outcome, name)}, expected {value}"
-    if ("welds" in outcome.measures) != run.weld:
+    if not outcome.error and ("welds" in outcome.measures) != run.weld:
         yield f"{'missing' if run.weld else 'unexpected'} value measures.welds: the run has weld: {run.weld}"
     if missing := [name for name in MEASURES if name not in outcome.measures]:
         yield f"measures: missing {', '.join(missing)}"
-    of_task = _FLAGS_OF_TASK.get(episode.task, ())
-    if not outcome.error and (missing := [name for name in (*_FLAGS, *of_task) if name not in flags]):
+    is_builtin = episode.task in TASKS.builtin
+    expected_flags = (*_FLAGS, *_FLAGS_OF_TASK.get(episode.task, ())) if is_builtin else ("success", "fail")
+    if not outcome.error and (missing := [name for name in expected_flags if name not in flags]):
         yield f"flags: missing {', '.join(missing)}"
     rate = rules.rate_hz or run.policy.spec.get("rate_hz") or DEFAULT_HZ
     yield from _find_length_violations(outcome, rules, rules.step_limit(episode.task, rate))
@@ -98,7 +97,7 @@ def _find_outcome_violations(
     late = [name for name, step in flags.items() if step is not None and step > outcome.steps]
     if late:
         yield f"flags: {', '.join(late)} first held after the last step, expected at most {outcome.steps}"
-    for before, after in _IMPLIED:
+    for before, after in _IMPLIED if is_builtin and "target_in_basket" in flags else ():
         at, later = flags.get(before), flags.get(after)
         if before in flags and later is not None and (at is None or at > later):
             yield f"flags: {after} held at step {later}, expected {before} at the same step or before, found {at}"
@@ -138,6 +137,7 @@ def _find_rate_violations(outcome: Outcome, rate: float) -> Iterator[str]:
 def _find_action_violations(result: Result, number: int) -> list[str]:
     try:
         result.read_actions(number)
+        result.read_checkpoints(number)
     except EvaluationError as error:
         return [str(error)]
     return []

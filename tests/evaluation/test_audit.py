@@ -1,14 +1,24 @@
-"""`robocas eval audit` plays the stored actions of a result again, and finds forged outcomes."""
+"""`robocas eval audit` replays the stored actions of a result, and finds forged outcomes."""
 
 import json
+import shutil
 from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+from counting_env import CrashingEnv
 
 from robocas_ms3.cli.eval_audit import Audit, audit
 from robocas_ms3.cli.main import run as cli
-from robocas_ms3.evaluation.audit import bound_differing_episodes, choose_episodes, find_audit_obstacle, run_audit
+from robocas_ms3.core.errors import EvaluationError, OutputExistsError
+from robocas_ms3.evaluation import session
+from robocas_ms3.evaluation.audit import (
+    bound_differing_episodes,
+    choose_episodes,
+    choose_method,
+    find_audit_obstacle,
+    run_audit,
+)
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.results import OUTCOMES, RUN, read_result
@@ -47,9 +57,10 @@ def folder(made, tmp_path):
     return out
 
 
-def play(folder, out="audit", **settings):
-    """Return the numbers of the audited episodes and of those that differ."""
-    audited = list(run_audit(read_result(folder), SMOKE, folder.parent / out, envs=1, **settings))
+def replay(folder, out="audit", **settings):
+    """Return the numbers of the replayed episodes and of those that differ."""
+    settings = {"method": "exact", "envs": 1, **settings}
+    audited = list(run_audit(read_result(folder), SMOKE, folder.parent / out, **settings))
     return [one.episode for one in audited], [one.episode for one in audited if one.differences]
 
 
@@ -64,15 +75,26 @@ def forge(folder, number, actions=None, **values):
     (folder / OUTCOMES).write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 
-def test_a_true_result_has_no_differences_and_a_second_audit_plays_only_changed_episodes(folder, made):
-    assert play(folder) == ([0, 1, 2, 3], [])
+def test_a_true_result_has_no_differences_and_an_audit_is_continued(folder, made):
+    assert replay(folder) == ([0, 1, 2, 3], [])
     seeds = [seed for env in made for seed in env.seeds]
     assert seeds[4:] == [one.seed for one in SMOKE.episodes[:4]]
-    assert play(folder) == ([0, 1, 2, 3], [])
-    assert sum(len(env.seeds) for env in made) == 8  # nothing was played
+    plans = []
+    assert replay(folder, on_start=plans.append) == ([0, 1, 2, 3], [])
+    assert plans[0].replayed == 4
+    assert sum(len(env.seeds) for env in made) == 8  # nothing was replayed
+
+
+def test_the_audit_of_a_result_that_has_changed_is_not_continued(folder):
+    replay(folder)
     forge(folder, 2, measures=read_result(folder).outcomes[2].measures | {"path_length": 7.0})
-    assert play(folder)[1] == [2]
-    assert sum(len(env.seeds) for env in made) == 9
+    with pytest.raises(OutputExistsError):
+        replay(folder)
+    assert replay(folder, overwrite=True)[1] == [2]
+    record = json.loads((folder / RUN).read_text())
+    (folder / RUN).write_text(json.dumps(record | {"action_noise": [1.0, 1.0]}))
+    with pytest.raises(OutputExistsError):
+        replay(folder)
 
 
 def failed(one):
@@ -145,7 +167,7 @@ def test_consistent_forgeries_are_found(folder, forgery):
     forgery(folder, before)
     assert read_result(folder).outcomes[0] != before
     assert find_violations(read_result(folder), SMOKE, is_complete=False) == []
-    assert play(folder) == ([0, 1, 2, 3], [0])
+    assert replay(folder) == ([0, 1, 2, 3], [0])
 
 
 def test_the_outcome_of_another_episode_is_found(folder):
@@ -153,7 +175,7 @@ def test_the_outcome_of_another_episode_is_found(folder):
     moved = replace(second, episode=0, seed=first.seed)
     forge(folder, 0, read_result(folder).read_actions(1)[:, ::-1], **asdict(moved))
     assert find_violations(read_result(folder), SMOKE, is_complete=False) == []
-    assert play(folder)[1] == [0]
+    assert replay(folder)[1] == [0]
 
 
 def test_a_sample_is_repeatable_and_leaves_out_episodes_with_errors(folder):
@@ -161,12 +183,43 @@ def test_a_sample_is_repeatable_and_leaves_out_episodes_with_errors(folder):
     assert choose_episodes(result, 2, 5) == choose_episodes(result, 2, 5)
     assert {tuple(choose_episodes(result, 2, seed)) for seed in range(50)} > {(0, 1), (2, 3)}
     assert choose_episodes(result, 9, 5) == [0, 1, 2, 3]
-    assert play(folder, sample=2, seed=5)[0] == choose_episodes(result, 2, 5)
-    drawn = play(folder, "drawn", sample=2)
-    assert play(folder, "drawn", sample=2) == drawn  # an audit that is continued keeps its sample
+    assert replay(folder, sample=2, seed=5)[0] == choose_episodes(result, 2, 5)
+    drawn = replay(folder, "drawn", sample=2)
+    assert replay(folder, "drawn", sample=2) == drawn  # an audit that is continued keeps its sample
+
+
+def test_episodes_with_errors_are_replayed_up_to_the_error(folder):
     lost = {"success": False, "success_at_end": False, "success_v0": False, "failure_stage": "error"}
-    forge(folder, 1, error="the connection was lost", **lost)
-    assert choose_episodes(read_result(folder), None, 0) == [0, 2, 3]
+    one = read_result(folder).outcomes[0]
+    flags, seconds = {**one.flags, "success": None}, {**one.flag_seconds, "success": None}
+    measures = one.measures | {"path_length": 3.0}
+    actions = read_result(folder).read_actions(0)[:3]
+    forge(
+        folder,
+        0,
+        actions,
+        **lost,
+        error="lost",
+        flags=flags,
+        flag_seconds=seconds,
+        steps=3,
+        seconds=0.6,
+        measures=measures,
+    )
+    assert find_violations(read_result(folder), SMOKE, is_complete=False) == []
+    assert replay(folder) == ([0, 1, 2, 3], [])
+    forge(folder, 0, flags=flags | {"reached_any": 1}, flag_seconds=seconds | {"reached_any": 0.2})
+    assert replay(folder, overwrite=True)[1] == [0]
+    none = {"flags": dict.fromkeys(flags), "flag_seconds": dict.fromkeys(flags), "steps": 0, "seconds": 0.0}
+    forge(folder, 0, np.zeros((0, 7)), **lost, error="the worker process crashed", **none)
+    assert choose_episodes(read_result(folder), None, 0) == [1, 2, 3]
+
+
+def test_a_crash_of_a_worker_is_no_difference(folder, monkeypatch):
+    envs = [CrashingEnv(1, SMOKE.episodes[1].seed, [2])] * 3
+    monkeypatch.setattr(session, "make_vec", lambda *args, **kwargs: envs.pop())
+    with pytest.raises(EvaluationError, match="could not be replayed"):
+        replay(folder)
 
 
 def test_bound_of_a_sample():
@@ -177,30 +230,59 @@ def test_bound_of_a_sample():
     assert bound_differing_episodes(50, 200) == 10
 
 
-def test_results_of_other_physics_or_versions_cannot_be_audited(folder):
-    assert find_audit_obstacle(read_result(folder)) == ""
+def test_results_of_other_physics_or_versions_cannot_be_audited(folder, tmp_path):
+    assert find_audit_obstacle(read_result(folder), "exact") == ""
+    assert "checkpoints" in find_audit_obstacle(read_result(folder), "checkpoints")  # it has none
     record = json.loads((folder / RUN).read_text())
     for changes, word in (({"backend": "gpu"}, "gpu"), ({"versions": {"sapien": "2.0"}}, "sapien 2.0")):
         (folder / RUN).write_text(json.dumps(record | changes))
-        assert word in find_audit_obstacle(read_result(folder))
-        assert audit(Audit(folder)) == 1
+        assert word in find_audit_obstacle(read_result(folder), "exact")
+        assert audit(Audit(folder, out=tmp_path / "audit")) == 1
+    assert not (tmp_path / "audit").exists()
 
 
-def test_an_evaluation_can_be_audited(short, tmp_path, capsys):
-    out = tmp_path / "result"
+def test_the_method_depends_on_the_model_of_the_processor(folder):
+    result = read_result(folder)
+    assert choose_method(result) == "exact"
+    for machine, method in (({"model": "Other"}, "checkpoints"), (None, "exact"), ({"processor": "x86_64"}, "exact")):
+        run = result.run.model_copy(update={"machine": machine})
+        assert choose_method(replace(result, run=run)) == method
+
+
+@pytest.fixture(scope="module")
+def picked(short, tmp_path_factory):
+    """A result of two episodes of pick and two of search with physics, 20 steps each."""
+    out = tmp_path_factory.mktemp("audit") / "result"
     words = ["eval", "pick", "search", "--policy", "random", "--protocol", str(short), "--backend", "processes"]
     assert cli([*words, "--out", str(out)]) == 0
-    command = ["eval", "audit", str(out), "--protocol", str(short)]
+    return out
+
+
+@pytest.mark.parametrize("method", ["exact", "checkpoints"])
+def test_an_evaluation_can_be_audited(picked, short, tmp_path, capsys, method):
+    out = tmp_path / "result"
+    shutil.copytree(picked, out)
+    command = [
+        "eval",
+        "audit",
+        str(out),
+        "--protocol",
+        str(short),
+        "--method",
+        method,
+        "--out",
+        str(tmp_path / "audit"),
+    ]
     assert cli(command) == 0
-    assert "4 of 4 episodes played" in capsys.readouterr().out
+    assert "4 of 4 episodes replayed" in capsys.readouterr().out
     one = read_result(out).outcomes[0]
-    forge(out, 0, measures=one.measures | {"path_length": one.measures["path_length"] + 0.001})
-    assert cli(command) == 1
-    assert "measures.path_length" in capsys.readouterr().out
+    forge(out, 0, measures=one.measures | {"path_length": one.measures["path_length"] * 1.2})
+    assert cli([*command, "--overwrite"]) == 1
+    assert "path_length" in capsys.readouterr().out
     forge(out, 0, measures=one.measures)
     checkpoints = read_result(out).read_checkpoints(0)
     assert checkpoints.steps.tolist() == [20] and checkpoints.states.shape[1] > 100
-    checkpoints.states[0, 3] += 1e-6
+    checkpoints.states[0, 13] += 0.2  # x of the second body
     write_checkpoints(out, 0, checkpoints)
     assert cli([*command, "--overwrite"]) == 1
-    assert "the state after step 20 differs" in capsys.readouterr().out
+    assert "episode 0, recorded -> replayed: checkpoints: " in capsys.readouterr().out

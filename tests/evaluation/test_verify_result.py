@@ -5,6 +5,7 @@ import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from synthetic_results import of_protocol
 
 from robocas_ms3.cli.eval_results import Verify, verify
 from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.evaluation import verify as verify_module
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.results import OUTCOMES, RUN, read_result
 from robocas_ms3.evaluation.verify import find_violations
@@ -70,6 +72,30 @@ def test_flags_in_an_impossible_order_are_found(folder, protocol, changes, viola
     flags = read_result(folder).outcomes[0].flags | changes
     tamper(folder, 0, flags=flags, flag_seconds=seconds_of(flags))
     assert f"episode 0: flags: {violation}" in find_violations(read_result(folder), protocol)
+
+
+def test_stages_of_goals_without_a_basket_and_of_custom_tasks_may_differ(folder, protocol, monkeypatch):
+    before = read_result(folder).outcomes[0]
+    flags = {name: step for name, step in before.flags.items() if name != "target_in_basket"} | {"target_lifted": None}
+    tamper(folder, 0, flags=flags, flag_seconds=seconds_of(flags))  # a pushed target
+    assert find_violations(read_result(folder), protocol) == []
+    flags = {"success": 70, "fail": None, "success_v0": 70}
+    tamper(folder, 0, flags=flags, flag_seconds=seconds_of(flags))
+    assert "flags: missing reached_any" in find_violations(read_result(folder), protocol)[0]
+
+    class CustomTasks(dict):
+        builtin: ClassVar[dict] = {}
+
+    monkeypatch.setattr(verify_module, "TASKS", CustomTasks(TASKS.builtin))
+    assert not any("flags: " in text for text in find_violations(read_result(folder), protocol) if "episode 0" in text)
+
+
+def test_damaged_checkpoints_are_found(folder, protocol):
+    path = folder / "checkpoints" / "000003.npz"
+    path.parent.mkdir()
+    path.write_bytes(b"PK")
+    (violation,) = find_violations(read_result(folder), protocol)
+    assert violation.startswith("episode 3: ") and "000003.npz" in violation
 
 
 def test_an_episode_that_nothing_ended_and_times_of_other_steps_are_found(folder, protocol):

@@ -79,8 +79,10 @@ def check_shards(calls):
         shards.sort(key=lambda call: call[call.index("--shard") + 1])
         folders = [call[call.index("--out") + 1] for call in shards]
         assert [call[call.index("--shard") + 1] for call in shards] == ["0/2", "1/2"]
-        assert merge[:4] == ["eval", "merge", *folders]
-        assert folders == [f"{merge[-1]}_shards/{number}" for number in range(2)]
+        assert merge[:4] == ["eval", "merge", *folders[::-1]]
+        out = merge[merge.index("--out") + 1]
+        assert folders == [f"{out}_shards/{number}" for number in range(2)]
+        assert all({"--retry-errors", "processes"} < set(call) for call in shards)
         played.append(shards[0])
     return played
 

@@ -102,7 +102,7 @@ def _render_stages(result: Result) -> str:
 
 def _render_seconds(result: Result) -> str:
     taken = {
-        config: [s for one in outcomes if (s := one.flag_seconds.get("success")) is not None]
+        config: [s for one in outcomes if one.success and (s := one.flag_seconds.get("success")) is not None]
         for config, outcomes in result.group_by("config").items()
     }
     if not any(taken.values()):
