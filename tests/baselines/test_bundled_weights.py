@@ -23,16 +23,19 @@ from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.scenes.config import load_task_config
 
 
-@pytest.mark.parametrize("name", ["small", "keyframe"])
-def test_version_and_files(name):
+KEYFRAME = ("keyframe", "keyframe-upstream-eval")
+
+
+@pytest.mark.parametrize(("name", "baseline"), [("small", "small"), *((name, "keyframe") for name in KEYFRAME)])
+def test_version_and_files(name, baseline):
     record = read_run(BUNDLED / name)
-    assert (record.baseline, record.version) == (name, find_baseline(name).version)
+    assert (record.baseline, record.version) == (baseline, find_baseline(baseline).version)
     assert not (BUNDLED / name / CHECKPOINT).exists()
 
 
 def test_files_are_small_and_have_model_cards():
     runs = [path for path in BUNDLED.iterdir() if path.is_dir()]
-    assert {path.name for path in runs} == {"small", "keyframe"}
+    assert {path.name for path in runs} == {"small", *KEYFRAME}
     assert sum(path.stat().st_size for path in BUNDLED.rglob("*")) < 20e6
     for folder in runs:
         card = (folder / "README.md").read_text()
@@ -40,14 +43,24 @@ def test_files_are_small_and_have_model_cards():
 
 
 def test_keyframe_has_half_precision_weights():
-    weights = load_file(BUNDLED / "keyframe" / "weights.safetensors")
-    assert {value.dtype for value in weights.values()} == {torch.float16, torch.int64}  # counters of norms
-    assert sum(value.numel() for value in weights.values()) < 6e6
-    policy = make_policy("keyframe")
+    found = [load_file(BUNDLED / name / "weights.safetensors") for name in KEYFRAME]
+    assert {value.dtype for weights in found for value in weights.values()} == {
+        torch.float16,
+        torch.int64,
+    }  # counters of norms
+    assert sum(value.numel() for weights in found for value in weights.values()) < 6e6
+
+
+@pytest.mark.parametrize(
+    ("name", "protocol", "tasks"),
+    [("keyframe", "ms3-v1", ("pick", "open_pick")), ("keyframe-upstream-eval", "paper-v1", ("pick", "search"))],
+)
+def test_keyframe_is_evaluated_in_the_scenes_of_its_training(name, protocol, tasks):
+    policy = make_policy(name)
     assert policy.spec.track == "modular" and policy.spec.depth
     description = policy.describe()
     assert description["training_seconds"] > 600 and len(policy.spec.cameras) == 3
-    configs = configs_of("ms3-v1", "pick") | configs_of("ms3-v1", "open_pick")
+    configs = {key: config for task in tasks for key, config in configs_of(protocol, task).items()}
     assert policy.protocol_warnings(configs) == []
 
 
