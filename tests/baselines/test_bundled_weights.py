@@ -22,7 +22,6 @@ from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.scenes.config import load_task_config
 
-
 KEYFRAME = ("keyframe", "keyframe-upstream-eval")
 
 
