@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -38,12 +38,8 @@ class Audit:
     """Replay only N episodes, chosen at random. Default: all."""
     seed: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
     """Random seed of --sample. Default: a number that nobody can predict; it is printed and recorded."""
-    method: Literal["auto", "exact", "checkpoints"] = "auto"
-    """exact: all values must be equal, as they are on the model of processor that made the result.
-    checkpoints, for other processors: the replay continues from each recorded checkpoint and must be near the next one.
-    auto: depends on the model of the processor."""
     envs: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
-    """Number of environments that run at the same time. Default: one per CPU core; one for checkpoints."""
+    """Number of environments that run at the same time. Default: one per CPU core."""
     overwrite: bool = False
     """Delete an existing audit and start again. Default: continue it."""
 
@@ -54,7 +50,7 @@ def audit(cfg: Audit) -> int:
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.checks import check_number
-    from robocas_ms3.evaluation.audit import choose_method, find_audit_obstacle, run_audit
+    from robocas_ms3.evaluation.audit import find_audit_obstacle, list_other_processors, run_audit
     from robocas_ms3.evaluation.results import read_result
     from robocas_ms3.evaluation.verify import find_violations
 
@@ -68,10 +64,11 @@ def audit(cfg: Audit) -> int:
             print_line(violation)
         print_line(f"{cfg.folder}: {format_count(len(violations), 'violation')}; no episode was replayed")
         return 1
-    method = choose_method(result) if cfg.method == "auto" else cfg.method
-    if obstacle := find_audit_obstacle(result, method):
+    if obstacle := find_audit_obstacle(result):
         print_line(f"{cfg.folder}: cannot be audited: {obstacle}")
         return 1
+    if models := list_other_processors(result):
+        print_line(f"note: made on another model of processor, so contacts may diverge: {', '.join(models)}")
     plans: list[AuditPlan] = []
     differing = 0
     with ProgressBar("episodes replayed") as bar:
@@ -84,7 +81,6 @@ def audit(cfg: Audit) -> int:
             result,
             protocol,
             cfg.out or Path("audit") / cfg.folder.absolute().name,
-            method=method,
             sample=cfg.sample,
             seed=cfg.seed,
             envs=cfg.envs or len(os.sched_getaffinity(0)),
@@ -105,15 +101,14 @@ def _print_summary(folder: Path, result: Result, protocol: LoadedProtocol, plan:
     count, total = len(plan.episodes), len(result.outcomes)
     print_line(
         f"{folder}: {count} of {format_count(total, 'episode')} replayed ({plan.replayed} of them earlier), "
-        f"of {len(protocol.episodes)} in the protocol; method: {plan.method}"
+        f"of {len(protocol.episodes)} in the protocol"
     )
     if failed := result.count_errors():
         print_line(f"note: {format_count(failed, 'episode')} ended with an error and counted as failed")
     if differing:
         print_line(f"{differing} of {format_count(count, 'episode')} differ from the result")
         return 1
-    near = "equal the result" if plan.method == "exact" else "are within the tolerances of the result"
-    print_line(f"all {near}")
+    print_line("all equal the result")
     if count < total:
         bound = bound_differing_episodes(count, total)
         print_line(f"sample with seed {plan.seed}: at most {bound} of the {total} differ (95 % confidence)")

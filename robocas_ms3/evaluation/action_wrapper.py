@@ -12,7 +12,7 @@ from mani_skill.utils.structs import Pose
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.checkpoints import flatten_state, unflatten_state
+from robocas_ms3.evaluation.checkpoints import flatten_state
 from robocas_ms3.evaluation.metrics import EpisodeMetrics
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec, TcpMotion
 from robocas_ms3.planning.action_noise import draw_noise
@@ -25,7 +25,7 @@ V0_CONTROL_HZ = 5
 # arm moves, at most 2.
 _GRIPPER_STEPS = 5
 CHECKPOINT = "checkpoint"
-"""Key of ``info`` with the checkpoint (`PolicyActionWrapper.restore`)."""
+"""Key of ``info`` with the checkpoint of each env."""
 MOTION_STEPS: dict[Stepping, int] = {"timed": 1, "upstream": 2}
 """Maximum number of control steps in which an action moves the arm, by stepping."""
 _STOPPED = 0.0005  # largest change in gripper width per control step, m; velocities jitter while the fingers press
@@ -140,25 +140,6 @@ class PolicyActionWrapper(gym.Wrapper):
         values = {kind: of for kind, of in self._base.get_state_dict().items() if kind != "controller"}
         gripper = torch.from_numpy(np.where(self._open, 1.0, -1.0))
         return {**obs, "simulation": {"values": values, "gripper": gripper}}
-
-    def restore(self, checkpoint: np.ndarray, *, stages: bool = True) -> None:
-        """Set the state of the envs to checkpoints (N, D) of ``info``; metrics and the weld stay unchanged.
-
-        ``stages``: whether to set the reached stages, too.
-        """
-        bodies, rows = self._base.bodies, torch.from_numpy(checkpoint)
-        size = bodies.read().shape[1]
-        extra = unflatten_state(rows[:, size:-2], self._base.extra_state())
-        if not stages:
-            del extra["task"]
-        self._base.set_state_dict({**bodies.to_state_dict(rows[:, :size]), **extra})
-        self._open, self._width_change = checkpoint[:, -2] > 0, checkpoint[:, -1].astype(np.float64)
-
-    def find_position_columns(self) -> np.ndarray:
-        """Return the columns (B, 3) of a checkpoint with the positions of the B bodies in the world, m."""
-        bodies = self._base.bodies
-        columns = bodies.to_state_dict(np.arange(bodies.read().shape[1]))
-        return np.array([of_body[:3] for of_kind in columns.values() for of_body in of_kind.values()])
 
     def _compute_metrics(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
         welds = self._weld.compute_info(info) if self._weld else {}

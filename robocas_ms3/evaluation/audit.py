@@ -1,14 +1,8 @@
 """Audit of a result: replay the stored actions in the frozen scenes, and compare outcomes and checkpoints.
 
 An audit shows that the stored actions have the recorded outcomes. It does not show which policy chose the actions.
-Neither the policy nor a renderer is needed.
-
-Two methods (`Method`):
-
-- ``exact``: all values must be equal, except for the rounding of contact impulses. This holds on the processor model
-  of the result.
-- ``checkpoints``: for other processors, whose rounding errors let heaps diverge. The simulation continues from each
-  recorded checkpoint, and must be near the next one.
+Neither the policy nor a renderer is needed. All values must be equal, except for the rounding of contact impulses. This
+holds on the processor model of the result; on other models, contacts may diverge.
 """
 
 from __future__ import annotations
@@ -20,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,19 +23,12 @@ from scipy.stats import hypergeom
 from robocas_ms3.core.errors import EvaluationError, PolicyError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder, list_setting_changes
-from robocas_ms3.evaluation.audit_checkpoints import (
-    SECONDS_TOLERANCE,
-    CheckpointEnv,
-    list_differences_within_tolerance,
-)
 from robocas_ms3.evaluation.outcomes import Checkpoints, Count, Outcome
 from robocas_ms3.evaluation.policy import CONVENTIONS, EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.protocol import LoadedProtocol, ProtocolEpisode
 from robocas_ms3.evaluation.results import Result, describe_machine, get_package_versions
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
-
-Method = Literal["exact", "checkpoints"]
 
 OUTPUT = FolderKind("robocas eval audit", ("audit.json",), "result_hash")
 _EPISODES = "episodes.jsonl"
@@ -67,13 +54,11 @@ class AuditPlan(NamedTuple):
     """What an audit will do.
 
     Attributes:
-        method: how episodes are compared.
         episodes: numbers of the episodes.
         seed: random seed by which they were chosen.
         replayed: number of these episodes that were replayed in an earlier run of the audit.
     """
 
-    method: Method
     episodes: list[int]
     seed: int
     replayed: int
@@ -86,25 +71,17 @@ class StoredActionsPolicy:
 
     Args:
         result: the result.
-        waits: whether an episode first gets actions without motion for `SECONDS_TOLERANCE`.
-        on_start: is called with the number of each episode that starts.
     """
 
-    def __init__(
-        self, result: Result, *, waits: bool = False, on_start: Callable[[int], None] = lambda number: None
-    ) -> None:
-        self._result, self._waits, self._on_start, values = result, waits, on_start, result.run.policy.spec
+    def __init__(self, result: Result) -> None:
+        self._result, values = result, result.run.policy.spec
         motion = {name: values[name] for name in ("convention", "reference", "rate_hz") if name in values}
         self.spec = PolicySpec(**motion, language="none")
         self._actions: dict[int, Iterator[NDArray[np.float32]]] = {}  # by env
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
         for episode in episodes:
-            actions = self._result.read_actions(episode.episode)
-            if self._waits and len(actions):
-                actions = np.concatenate([actions, self._make_waiting_actions(episode.episode, actions[-1])])
-            self._actions[episode.env] = iter(actions)
-            self._on_start(episode.episode)
+            self._actions[episode.env] = iter(self._result.read_actions(episode.episode))
 
     def act(self, observations: Observations) -> NDArray[np.float32]:
         """Return one action per env (E, A)."""
@@ -121,24 +98,15 @@ class StoredActionsPolicy:
             raise PolicyError(missing, actions)
         return actions
 
-    def _make_waiting_actions(self, number: int, last: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return actions (W, A) that keep the pose, or the joint targets, and the gripper command of an action (A,)."""
-        outcome, action = self._result.outcomes[number], last.copy()
-        if CONVENTIONS[self.spec.convention].decode is not None:
-            action[:-1] = 0
-        steps_per_second = outcome.steps / max(outcome.seconds, 1e-9)
-        return np.tile(action, (round(SECONDS_TOLERANCE * steps_per_second), 1))
 
-
-def choose_method(result: Result) -> Method:
-    """Return ``exact`` if the result was made on this model of processor, or on an unknown one."""
+def list_other_processors(result: Result) -> list[str]:
+    """Return the models of the processors that made a result, without the model of this machine."""
     machines = [part.machine for part in result.run.merged_from] or [result.run.machine]
-    models = {(machine or {}).get("model", "") for machine in machines} - {"", describe_machine()["model"]}
-    return "checkpoints" if models else "exact"
+    return sorted({(machine or {}).get("model", "") for machine in machines} - {"", describe_machine()["model"]})
 
 
-def find_audit_obstacle(result: Result, method: Method) -> str:
-    """Return why the episodes of a result cannot be replayed with a method; empty if they can."""
+def find_audit_obstacle(result: Result) -> str:
+    """Return why the episodes of a result cannot be replayed; empty if they can."""
     if result.run.backend != "processes":
         return f"its backend is {result.run.backend}, whose physics is not repeatable; expected processes"
     if not choose_episodes(result, None, 0):
@@ -147,11 +115,6 @@ def find_audit_obstacle(result: Result, method: Method) -> str:
     if differing := [name for name in recorded if name in installed and installed[name] != recorded[name]]:
         names = ", ".join(f"{name} {recorded[name]}" for name in differing)
         return f"it was made with other versions: {names}. Install these versions"
-    if method == "checkpoints":
-        if result.run.weld:
-            return "the method checkpoints is not available with the weld"
-        if any(not len(result.read_checkpoints(number).steps) for number in choose_episodes(result, None, 0)):
-            return "the method checkpoints needs checkpoints of all episodes"
     return ""
 
 
@@ -176,7 +139,6 @@ def run_audit(
     protocol: LoadedProtocol,
     out: Path,
     *,
-    method: Method,
     sample: int | None = None,
     seed: int | None = None,
     envs: int = 2,
@@ -189,74 +151,53 @@ def run_audit(
         result: the result, without violations (`verify`).
         protocol: its protocol.
         out: folder of the audit. It must not come from the author of the result.
-        method: how episodes are compared.
         sample: number of episodes to replay, chosen at random; None: all (`choose_episodes`).
         seed: random seed of the choice; None: that of the audit in ``out``, or a number that nobody can predict.
-        envs: number of environments that run at the same time; only for ``exact``.
+        envs: number of environments that run at the same time.
         overwrite: whether to delete an earlier audit.
         on_start: is called before the first episode.
 
     Raises:
-        OutputExistsError: ``out`` has an audit of another result, or with another method or other versions.
+        OutputExistsError: ``out`` has an audit of another result, or with other versions.
         EvaluationError: an episode could not be replayed, for example because its worker process crashed.
     """
-    settings = {"result_hash": hash_result(result), "method": method, "versions": get_package_versions()}
+    settings = {"result_hash": hash_result(result), "versions": get_package_versions()}
     with OutputFolder(out, OUTPUT, settings, overwrite=overwrite) as output:
         earlier = None if overwrite or output.recorded is None else int(output.recorded["seed"])
         seed = seed if seed is not None else secrets.randbits(32) if earlier is None else earlier
         output.start({**settings, "seed": seed})
         file = JsonLinesFile[AuditedEpisode](output.path / _EPISODES, AuditedEpisode)
         replayed, chosen = {one.episode: one for one in file.read()}, choose_episodes(result, sample, seed)
-        on_start(AuditPlan(method, chosen, seed, len(replayed.keys() & set(chosen))))
+        on_start(AuditPlan(chosen, seed, len(replayed.keys() & set(chosen))))
         yield from (replayed[number] for number in chosen if number in replayed)
         episodes = [protocol.episodes[number] for number in chosen if number not in replayed]
-        for number, differences in _replay(result, protocol, episodes, method, envs) if episodes else ():
+        for number, differences in _replay(result, protocol, episodes, envs) if episodes else ():
             file.append([AuditedEpisode(number, differences)])
             yield AuditedEpisode(number, differences)
 
 
 def _replay(
-    result: Result, protocol: LoadedProtocol, episodes: Sequence[ProtocolEpisode], method: Method, envs: int
+    result: Result, protocol: LoadedProtocol, episodes: Sequence[ProtocolEpisode], envs: int
 ) -> Iterator[tuple[int, list[str]]]:
     """Yield the number and the differences of each episode."""
-    is_exact, run = method == "exact", result.run
-    opened: list[CheckpointEnv] = []  # the last is in use
-
-    def wrap(env: Any) -> Any:
-        if is_exact:
-            return env
-        opened.append(CheckpointEnv(env))
-        return opened[-1]
-
-    def start(number: int) -> None:
-        if not is_exact:
-            opened[-1].start(result.read_checkpoints(number))
-
+    run = result.run
     settings = EvaluationSettings(
         tasks=tuple(run.played_as),
         policy="audit",
         protocol=str(protocol.folder),
         weld=run.weld,
         action_noise=run.action_noise or (0.0, 0.0),
-        envs=envs if is_exact else 1,
+        envs=envs,
         backend="processes",
     )
-    policy = StoredActionsPolicy(result, waits=not is_exact, on_start=start)
-    with closing(EvaluationSession(policy, settings, wrap)) as session:
+    with closing(EvaluationSession(StoredActionsPolicy(result), settings)) as session:
         for replayed in session.run_episodes(episodes):
             number, error = replayed.outcome.episode, replayed.outcome.error
             if error not in ("", _NO_ACTIONS_LEFT):
                 where, fix = f"episode {number}", "Run the same command again."
                 raise EvaluationError("an episode could not be replayed", where=where, found=error, fix=fix)
-            recorded = result.outcomes[number]
-            if is_exact:
-                differences = list_differences(recorded, replayed.outcome)
-                differences = differences or list_state_differences(
-                    result.read_checkpoints(number), replayed.checkpoints
-                )
-            else:
-                differences = opened[-1].differences or list_differences_within_tolerance(recorded, replayed.outcome)
-            yield number, differences
+            differences = list_differences(result.outcomes[number], replayed.outcome)
+            yield number, differences or list_state_differences(result.read_checkpoints(number), replayed.checkpoints)
 
 
 def list_differences(recorded: Outcome, replayed: Outcome) -> list[str]:

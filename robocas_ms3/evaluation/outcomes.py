@@ -150,7 +150,7 @@ class Outcome:
 
 
 class Checkpoints(NamedTuple):
-    """Checkpoints of an episode, from which an audit can continue it.
+    """States of the simulation during an episode, which an audit compares.
 
     Attributes:
         steps: (C,) int32 policy steps in ascending order; the last is the last of the episode.
