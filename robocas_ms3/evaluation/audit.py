@@ -1,8 +1,8 @@
 """Audit of a result: replay the stored actions in the frozen scenes, and compare outcomes and checkpoints.
 
 An audit shows that the stored actions have the recorded outcomes. It does not show which policy chose the actions.
-Neither the policy nor a renderer is needed. All values must be equal, except for the rounding of contact impulses. This
-holds on the processor model of the result; on other models, contacts may diverge.
+Neither the policy nor a renderer is needed. All values must be equal, except wall-clock times. This holds on the
+processor model of the result; on other models, contacts may diverge.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ from robocas_ms3.evaluation.settings import EvaluationSettings
 OUTPUT = FolderKind("robocas eval audit", ("audit.json",), "result_hash")
 _EPISODES = "episodes.jsonl"
 _CONFIDENCE = 0.95
-_IMPULSE_TOLERANCE = 1e-5  # relative; in 1 of 400 episodes a float32 sum of forces differed in its last bits
 _NO_ACTIONS_LEFT = "the stored actions end before the episode"
 
 
@@ -203,9 +202,6 @@ def _replay(
 def list_differences(recorded: Outcome, replayed: Outcome) -> list[str]:
     """Return a text per value of a recorded outcome that differs from that of the stored actions."""
     before, now = recorded.reproducible_values(), replayed.reproducible_values()
-    impulse, impulse_now = (of["measures"].get("contact_impulse", 0.0) for of in (before, now))
-    if abs(impulse - impulse_now) <= _IMPULSE_TOLERANCE * max(impulse, impulse_now):
-        before["measures"]["contact_impulse"] = impulse_now
     if before["error"]:  # an error of the policy cannot be repeated, but it ends the episode after the last action
         before["error"] = _NO_ACTIONS_LEFT
     return [change for key in now for change in list_setting_changes(before[key], now[key], key)]

@@ -229,7 +229,8 @@ class ContactForceReader:
             return impulses / self._px.timestep
         if self._no_object_near(object_state):
             return self._none
-        impulses, rows, columns = np.zeros((1, *self._shape, 3), np.float32), self._rows, self._columns
+        # summed as float64, because the order of the contacts is not fixed, and with it the rounding of float32 sums
+        impulses, rows, columns = np.zeros((1, *self._shape, 3)), self._rows, self._columns
         for contact in self._px.get_contacts():
             first, second = contact.bodies
             if first in rows and second in columns:
@@ -240,7 +241,7 @@ class ContactForceReader:
                 continue
             for point in contact.points:
                 total += sign * point.impulse
-        return impulses / np.float32(self._px.timestep)
+        return (impulses / self._px.timestep).astype(np.float32)
 
     def _no_object_near(self, object_state: object) -> bool:
         """Return whether every object is too far from every body for a contact; only on a CPU."""
