@@ -1,4 +1,4 @@
-"""States that `BodyStateReader` reads equal the states that ManiSkill reads."""
+"""States that `BodyStateReader` reads equal those of ManiSkill; contact forces do not depend on an order."""
 
 from types import SimpleNamespace
 
@@ -12,7 +12,7 @@ from mani_skill.utils.structs import Articulation, Pose
 import robocas_ms3.tasks  # noqa: F401
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.robots.description import MOBILE_PANDA
-from robocas_ms3.tasks.bodies import BodyStateReader
+from robocas_ms3.tasks.bodies import BodyStateReader, ContactForceReader
 
 pytestmark = pytest.mark.slow
 
@@ -111,3 +111,24 @@ def test_unexpected_packed_state_is_an_error(env, monkeypatch):
     monkeypatch.setattr(scene, "px", system)
     with pytest.raises(RobocasError, match="SAPIEN.s packed state"):
         BodyStateReader(scene, env.unwrapped.agent.robot)
+
+
+def test_forces_do_not_depend_on_the_order_of_the_contacts():
+    """As float32, 1 + 6e-8 + 6e-8 is 1 and 6e-8 + 6e-8 + 1 is more than 1."""
+
+    class Box:
+        def get_global_aabb_fast(self):
+            return np.array([[0.0, 0, 0], [1, 1, 1]])
+
+    finger, cup = Box(), Box()
+    impulses = [np.array([value, 0, 0], np.float32) for value in (1.0, 6e-8, 6e-8)]
+    contacts = [SimpleNamespace(bodies=(finger, cup), points=[SimpleNamespace(impulse=one)]) for one in impulses]
+    found = []
+    for ordered in (contacts, contacts[::-1]):
+        px = SimpleNamespace(timestep=0.5, get_contacts=lambda ordered=ordered: ordered)
+        scene = SimpleNamespace(gpu_sim_enabled=False, px=px)
+        reader = ContactForceReader(scene, [SimpleNamespace(_bodies=[finger])], [SimpleNamespace(_bodies=[cup])])
+        found.append(reader.read_forces())
+    np.testing.assert_array_equal(*found)
+    assert found[0].dtype == np.float32 and found[0].shape == (1, 1, 1, 3)
+    assert found[0][0, 0, 0].tolist() == [np.float32(2.0000002384185791), 0, 0]
