@@ -26,7 +26,8 @@ from robocas_ms3.core.output_folder import FolderKind, OutputFolder, list_settin
 from robocas_ms3.evaluation.outcomes import Checkpoints, Count, Outcome
 from robocas_ms3.evaluation.policy import CONVENTIONS, EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.protocol import LoadedProtocol, ProtocolEpisode
-from robocas_ms3.evaluation.results import Result, describe_machine, get_package_versions
+from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.run_record import describe_machine, get_package_versions
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 

@@ -46,6 +46,7 @@ from robocas_ms3.evaluation.rollout import (
     Rollout,
     run_rollouts,
 )
+from robocas_ms3.evaluation.run_record import RunRecord, describe_machine, get_package_versions
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.evaluation.stored_episodes import hash_actions
 from robocas_ms3.scenes.config import TaskConfig, load_task_config
@@ -384,7 +385,7 @@ class EvaluationSession:
             **render,
         )
 
-    def _make_run_record(self, backend: str) -> results.RunRecord:
+    def _make_run_record(self, backend: str) -> RunRecord:
         rules, name = self.protocol.rules, self.settings.policy
         pack = sha256(load_pack(rules.pack, usage=False).root / MANIFEST)
         if pack != rules.pack_hash:
@@ -405,8 +406,8 @@ class EvaluationSession:
             **({"played_as": self.played_as} if self.played_as else {}),
             **({"training_differences": differences} if differences is not None else {}),
             "backend": backend,
-            "versions": results.get_package_versions(),
+            "versions": get_package_versions(),
             "pack_hashes": {rules.pack: pack},
-            "machine": results.describe_machine(),
+            "machine": describe_machine(),
         }
-        return results.RunRecord.from_values(values, f"policy {name}")
+        return RunRecord.from_values(values, f"policy {name}")

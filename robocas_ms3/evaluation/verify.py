@@ -10,7 +10,8 @@ from robocas_ms3.core.text import format_count
 from robocas_ms3.evaluation.outcomes import MEASURES, Outcome, compute_order_score, find_failure_stage
 from robocas_ms3.evaluation.policy import Track
 from robocas_ms3.evaluation.protocol import DEFAULT_HZ, LoadedProtocol, Protocol, ProtocolEpisode
-from robocas_ms3.evaluation.results import Result, RunRecord
+from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.run_record import RunRecord
 from robocas_ms3.scenes.task_specs import TASKS
 
 # Flags of the built-in tasks. Custom tasks may have other stages.

@@ -11,13 +11,13 @@ from robocas_ms3.evaluation.outcomes import EvaluatedEpisode, find_failure_stage
 from robocas_ms3.evaluation.results import (
     OUTCOMES,
     RUN,
-    RunRecord,
     append_episode,
     group_partial_results,
     merge_results,
     open_result,
     read_result,
 )
+from robocas_ms3.evaluation.run_record import RunRecord
 from robocas_ms3.evaluation.stored_episodes import hash_actions
 
 SEARCH = dict.fromkeys(("obstacles_cleared", "reached_any", "target_grasped", "target_lifted", "success"))

@@ -11,7 +11,8 @@ from robocas_ms3.evaluation.leaderboard.rows import LeaderboardRow
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.tables import describe_action_noise, get_stage_names
-from robocas_ms3.evaluation.results import Result, RunRecord
+from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.run_record import RunRecord
 
 _DIGITS = 4  # of rates
 
