@@ -17,6 +17,7 @@ OPEN, CLOSED = 1.0, 0.0
 PRECISE, COARSE = (0.004, 0.03), (0.02, 0.1)
 """m and rad from the goal at which a motion ends."""
 _WAIT = 4  # control steps of 0.2 s in which the gripper closes or opens
+_ARRIVED = 0.05  # m from the goal, within which a motion was not stopped
 _PATIENCE = 5  # policy steps without progress, after which a motion ends
 
 
@@ -55,7 +56,14 @@ Motion = Generator[Command, EpisodeObservation, EpisodeObservation]
 
 
 class MotionError(Exception):
-    """The arm has no path for a motion."""
+    """The arm has no path for a motion, or was stopped.
+
+    Args:
+        observation: last observation.
+    """
+
+    def __init__(self, observation: EpisodeObservation) -> None:
+        self.observation = observation
 
 
 class ArmControl:
@@ -101,6 +109,24 @@ class ArmControl:
             index = follower.index
         return observation
 
+    def follow_or_return(
+        self,
+        observation: EpisodeObservation,
+        path: Array,
+        gripper: float,
+        tolerance: tuple[float, float] = PRECISE,
+        speed: float = 1.0,
+    ) -> Motion:
+        """Follow a path; if the arm is stopped before its end, return to the start and raise MotionError."""
+        start = observation.qpos
+        observation = yield from self.follow(observation, path, gripper, tolerance, speed)
+        away = np.linalg.norm(self.paths.chain.tcp(path)[:, :3, 3] - observation.tcp_in_base[:3, 3], axis=1)
+        if away[-1] < _ARRIVED:
+            return observation
+        back = np.concatenate([path[int(away.argmin()) :: -1], start[None]])
+        observation = yield from self.follow(observation, back, gripper, COARSE, speed)
+        raise MotionError(observation)
+
     def move_joints(
         self, observation: EpisodeObservation, goal: Array, gripper: float, tolerance: tuple[float, float] = COARSE
     ) -> Motion:
@@ -112,7 +138,7 @@ class ArmControl:
         """Move the TCP on a straight line to a pose (4, 4); raise MotionError without a path."""
         path = self.paths.straight(observation.qpos, tcp_in_base)
         if path is None:
-            raise MotionError
+            raise MotionError(observation)
         return (yield from self.follow(observation, path, gripper))
 
     def rise(self, observation: EpisodeObservation, height: float, gripper: float) -> Motion:
@@ -121,7 +147,7 @@ class ArmControl:
             return observation
         path = self.paths.rise(observation.qpos, observation.tcp_in_base, height)
         if path is None:
-            raise MotionError
+            raise MotionError(observation)
         return (yield from self.follow(observation, path, gripper, COARSE))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Generator
 from contextlib import suppress
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,9 +22,11 @@ from robocas_ms3.baselines.keyframe.arm_control import (
 from robocas_ms3.baselines.keyframe.config import DecisionSettings
 from robocas_ms3.baselines.keyframe.free_paths import FreePaths
 from robocas_ms3.baselines.keyframe.free_places import HeightMap
+from robocas_ms3.baselines.keyframe.front_approaches import Front, plan_front_approaches
 from robocas_ms3.baselines.keyframe.grasp_proposals import compute_similarity, propose_colliding_grasps, propose_grasps
 from robocas_ms3.baselines.keyframe.handles import Handle
-from robocas_ms3.baselines.keyframe.motion import LIFT, Approach
+from robocas_ms3.baselines.keyframe.keyframes import Keyframe
+from robocas_ms3.baselines.keyframe.motion import LIFT
 from robocas_ms3.baselines.keyframe.observed_scene import ObservedObject, ObservedScene
 from robocas_ms3.baselines.keyframe.obstacles import find_middle, score_blocking, score_height
 from robocas_ms3.baselines.keyframe.perception import Perception, Request
@@ -34,13 +35,10 @@ from robocas_ms3.baselines.keyframe.tcp_poses import TOP_VIEWS_DEG, find_release
 from robocas_ms3.core.poses import Array, from_rotation, inverse
 
 _TABLE = 0.12  # m, height of a table in the arm's base frame if it is not seen
-_SAFE_HEIGHT = (0.35, 0.55)  # m, least and greatest height of the TCP for motions above objects
-_CLEARANCE = 0.12  # m between the TCP and the highest object near a grasp
 _VIEW_HEIGHT = 0.4  # m of the TCP before it moves to a view
 _FALLBACK_DISTANCES = (0.3, 0.35, 0.4, 0.45, 0.25)  # m from the camera to a point that is nearer to the base
 _NEAR_START = (0.008, 0.05)  # m and rad from the pre-grasp at which the motion to it ends
 _EMPTY = 0.003  # m, gripper width below which nothing is held
-_HANGING = (0.015, 0.3)  # m from the TCP down to the lowest point of a held object, least and greatest value
 _RELEASE_CLEARANCE = 0.03  # m between the rim of the basket and the lowest point of a held object
 _CARRY_CLEARANCE = 0.15  # m between the rim and the TCP on the way to the basket
 _PLACE_HEIGHT = 0.38  # m, least height of the TCP on the way to a free place
@@ -55,34 +53,6 @@ _COMPARTMENT_SPEED = 0.5  # fraction of the limits with an object that was grasp
 _MIN_PULL = 0.08  # m, length of a pull below which a door or drawer is open
 _FRONT_VIEWS_DEG = (40, 30, 50, 20)  # elevations of the gripper camera before a compartment, degrees
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class _Keyframe:
-    """Grasp that was chosen: the object, its scene, the approach, and from the front the path (n, 7) to its start."""
-
-    scene: ObservedScene
-    object: ObservedObject
-    approach: Approach
-    path: Array | None = None
-
-    @property
-    def hanging(self) -> float:
-        """Distance in m from the TCP down to the lowest point of the object.
-
-        The lowest point may be hidden. Therefore the object is assumed to reach as far below its predicted centre as
-        above it.
-        """
-        heights = self.scene.points[self.object.mask][:, 2]
-        low = min(heights.min(), 2 * self.object.center[2] - heights.max())
-        return float(np.clip(self.approach.grasp[2, 3] - low, *_HANGING))
-
-    @property
-    def safe_height(self) -> float:
-        """Height of the TCP in m at which it passes over all objects near the grasp."""
-        points = self.scene.points
-        near = points[np.linalg.norm(points[:, :2] - self.approach.grasp[:2, 3], axis=1) < 0.35]
-        return float(np.clip(near[:, 2].max() + _CLEARANCE, *_SAFE_HEIGHT))
 
 
 class KeyframeEpisode:
@@ -114,7 +84,8 @@ class KeyframeEpisode:
         self._table, self._focus = _TABLE, np.array([0.6, 0.0])
         self._basket: Array | None = None  # middle in x and y, and height of the rim
         self._handle: Handle | None = None
-        self._is_front, self._pulls = False, 0
+        self._front: Front | None = None  # of a compartment that had a closed door
+        self._is_front, self._sees_objects, self._pulls = False, False, 0
         self._camera_in_tcp = np.eye(4)
 
     def run(self, observation: EpisodeObservation) -> Motion:
@@ -145,16 +116,17 @@ class KeyframeEpisode:
                 continue
             _log.debug("no keyframe; the target is %s", "not seen" if target is None else "seen")
             close = not close
-            if target is None and (self._is_front or self._pulls):  # the door may be closed
+            if target is None and (self._is_front or self._pulls):
                 self._survey(observation)
-                observation = yield from self._open_compartment(observation)
+                if not self._sees_objects:  # the door may be closed
+                    observation = yield from self._open_compartment(observation)
             elif target is None and scene.is_object.any():
                 self._focus = find_middle(scene)
             self._focus = self._focus + self._rng.normal(0, 0.05, 2)
 
     def _survey(self, observation: EpisodeObservation) -> None:
         survey = self._perception.survey(list(observation.frames.values()), _TABLE)
-        self._focus, self._table = survey.focus, survey.table
+        self._focus, self._table, self._sees_objects = survey.focus, survey.table, survey.has_objects
         if self._basket is None:  # later surveys show objects in the basket, or a part of it
             self._basket = survey.basket
         self._handle, self._is_front = survey.handle, survey.has_roof
@@ -168,7 +140,8 @@ class KeyframeEpisode:
         if not self._is_front:
             try:
                 observation = yield from self._arm.rise(observation, _VIEW_HEIGHT, OPEN)
-            except MotionError:
+            except MotionError as error:
+                observation = error.observation
                 _log.debug("no path up before a view")
         distances = self._settings.close_view_distances if close else self._settings.view_distances
         elevations = _FRONT_VIEWS_DEG if self._is_front else TOP_VIEWS_DEG
@@ -188,7 +161,7 @@ class KeyframeEpisode:
 
     def _plan_grasp(
         self, scene: ObservedScene, one: ObservedObject, observation: EpisodeObservation
-    ) -> _Keyframe | None:
+    ) -> Keyframe | None:
         """Return the reachable grasp of an object that the grasp network prefers, or None."""
         settings = self._settings
         proposals = propose_grasps(
@@ -205,15 +178,15 @@ class KeyframeEpisode:
         for failed in self._failed:
             scores -= _FAILURE_PENALTY * compute_similarity(grasps, failed)
         if self._is_front:
-            approaches = paths.plan_front_approaches(grasps, scores, qpos)
+            approaches = plan_front_approaches(paths, grasps, scores, qpos, self._front, self._free.is_clear)
             found = self._free.choose(qpos, approaches, lambda approach: approach.start)
-            return None if found is None else _Keyframe(scene, one, *found)
+            return None if found is None else Keyframe(scene, one, *found)
         approach = paths.plan_approach(grasps, scores, qpos)
-        return None if approach is None else _Keyframe(scene, one, approach)
+        return None if approach is None else Keyframe(scene, one, approach)
 
     def _choose_obstacle(
         self, scene: ObservedScene, target: ObservedObject | None, observation: EpisodeObservation
-    ) -> _Keyframe | None:
+    ) -> Keyframe | None:
         """Return the grasp of the object to move aside, or None."""
         objects = [one for one in scene.objects if not self._is_in_basket(one)]
         if not objects:
@@ -245,6 +218,7 @@ class KeyframeEpisode:
                 _log.debug("no path to the handle")
                 break
             pull, path = found
+            self._front = self._front or Front.from_handle(handle)
             observation = yield from arm.follow(observation, path, OPEN, _NEAR_START)
             observation = yield from arm.follow(observation, pull.path, OPEN)
             observation = yield from arm.wait(observation, CLOSED)
@@ -256,7 +230,7 @@ class KeyframeEpisode:
         return observation
 
     def _grasp(
-        self, observation: EpisodeObservation, chosen: _Keyframe
+        self, observation: EpisodeObservation, chosen: Keyframe
     ) -> Generator[Command, EpisodeObservation, tuple[EpisodeObservation, bool]]:
         """Grasp and lift; return the last observation, and whether the gripper holds something."""
         approach, arm, holds = chosen.approach, self._arm, False
@@ -269,11 +243,12 @@ class KeyframeEpisode:
                 observation = yield from arm.rise(observation, float(observation.tcp_in_base[2, 3]) + LIFT, CLOSED)
             else:
                 observation = yield from arm.follow(observation, chosen.path, OPEN, _NEAR_START)
-                observation = yield from arm.follow(observation, approach.path, OPEN)
+                observation = yield from arm.follow_or_return(observation, approach.path, OPEN)
                 observation = yield from arm.wait(observation, CLOSED)
                 observation = yield from arm.follow(observation, approach.way_back, CLOSED, speed=_COMPARTMENT_SPEED)
             holds = observation.width >= _EMPTY
-        except MotionError:
+        except MotionError as error:
+            observation = error.observation
             _log.debug("no path to or from a grasp")
         if not holds:
             self._failed.append(approach.grasp)
@@ -282,8 +257,8 @@ class KeyframeEpisode:
     def _move(
         self,
         observation: EpisodeObservation,
-        chosen: _Keyframe,
-        transfer: Callable[[EpisodeObservation, _Keyframe], Motion],
+        chosen: Keyframe,
+        transfer: Callable[[EpisodeObservation, Keyframe], Motion],
     ) -> Motion:
         """Grasp an object, transfer it by ``transfer``, and release it; put it back if there is no path."""
         observation, holds = yield from self._grasp(observation, chosen)
@@ -292,38 +267,51 @@ class KeyframeEpisode:
         approach = chosen.approach
         try:
             observation = yield from transfer(observation, chosen)
-        except MotionError:
+        except MotionError as error:
+            observation = error.observation
             _log.debug("no path for a held object")
             self._failed.append(approach.grasp)
             if approach.way_back is None:
                 with suppress(MotionError):
                     observation = yield from self._arm.move_straight(observation, approach.grasp, CLOSED)
+            else:
+                way_in = approach.way_back[::-1]
+                observation = yield from self._arm.follow(observation, way_in, CLOSED, speed=_COMPARTMENT_SPEED)
+                observation = yield from self._arm.wait(observation, OPEN)
+                return (yield from self._arm.follow(observation, approach.way_back, OPEN))
         return (yield from self._arm.wait(observation, OPEN))
 
-    def _carry(self, observation: EpisodeObservation, chosen: _Keyframe) -> Motion:
+    def _carry(self, observation: EpisodeObservation, chosen: Keyframe) -> Motion:
         """Carry the held object over the basket."""
         if self._basket is None:
-            raise MotionError
+            raise MotionError(observation)
         point = self._basket + [0, 0, _RELEASE_CLEARANCE + chosen.hanging]
         poses, costs = find_release_poses(point, chosen.approach.grasp[2, :3] if self._is_front else None)
         height = float(self._basket[2]) + max(_CARRY_CLEARANCE, _RELEASE_CLEARANCE + chosen.hanging)
         height = height if self._is_front else max(chosen.safe_height, height)
         found = self._arm.paths.nearest(poses, costs, observation.qpos, 0.5)
         if not found:
-            raise MotionError
+            raise MotionError(observation)
         try:
             observation = yield from self._arm.rise(observation, height, CLOSED)
-        except MotionError:
+        except MotionError as error:
             if not self._is_front:
                 raise
-        self._free.hold(chosen.scene.points[chosen.object.mask], chosen.approach.grasp)
-        nearest = self._free.choose(observation.qpos, found, lambda pair: pair[1])
-        self._free.release()
-        assert nearest is not None
-        speed = _COMPARTMENT_SPEED if self._is_front else 1.0
-        return (yield from self._arm.follow(observation, nearest[1], CLOSED, COARSE, speed))
+            observation = error.observation
+        points, speed = chosen.scene.points[chosen.object.mask], _COMPARTMENT_SPEED if self._is_front else 1.0
+        for by_rest in (False, True) if self._is_front else (False,):  # the rest pose may be close to a table
+            self._free.hold(points, chosen.approach.grasp)
+            way = self._free.choose(observation.qpos, found, lambda pair: pair[1], by_rest=by_rest)
+            self._free.release()
+            assert way is not None  # of a pose in reach
+            try:
+                return (yield from self._arm.follow_or_return(observation, way[1], CLOSED, COARSE, speed))
+            except MotionError as error:
+                observation = error.observation
+                _log.debug("stopped on the way to the basket")
+        raise MotionError(observation)
 
-    def _place(self, observation: EpisodeObservation, chosen: _Keyframe) -> Motion:
+    def _place(self, observation: EpisodeObservation, chosen: Keyframe) -> Motion:
         """Place the held object at a free place of the surface."""
         poses, costs = [], []
         avoid = [(self._focus, _TARGET_GAP)]
@@ -335,7 +323,7 @@ class KeyframeEpisode:
                 poses.append(from_rotation([*place, self._table + chosen.hanging + _DROP], rotation))
                 costs.append(2 * float(np.linalg.norm(place - observation.tcp_in_base[:2, 3])))
         if not poses:
-            raise MotionError
+            raise MotionError(observation)
         above = np.array(poses)
         above[:, 2, 3] += LIFT
         nearest = self._arm.paths.nearest(above, np.array(costs), observation.qpos, 0.5)
@@ -344,4 +332,4 @@ class KeyframeEpisode:
                 observation = yield from self._arm.rise(observation, max(chosen.safe_height, _PLACE_HEIGHT), CLOSED)
                 observation = yield from self._arm.move_joints(observation, qpos, CLOSED)
                 return (yield from self._arm.move_straight(observation, poses[index], CLOSED))
-        raise MotionError
+        raise MotionError(observation)

@@ -52,34 +52,47 @@ class FreePaths:
         """Move the gripper without an object."""
         self._held = np.zeros((0, 3))
 
-    def find_path(self, qpos: Array, goal: Array) -> Array | None:
-        """Return a clear path (n, 7) from a configuration (7,) to another one, or None."""
-        direct = self._paths.joint(qpos, goal)
-        if self._is_clear(direct):
-            return direct
-        detour = np.concatenate([self._paths.joint(qpos, self._rest), self._paths.joint(self._rest, goal)])
-        return detour if self._is_clear(detour) else None
+    def find_path(self, qpos: Array, goal: Array, *, by_rest: bool = False) -> Array | None:
+        """Return a clear path (n, 7) from a configuration (7,) to another one, or None.
 
-    def choose(self, qpos: Array, candidates: Iterable[T], start_of: Callable[[T], Array]) -> tuple[T, Array] | None:
+        by_rest: whether the path has to go through the rest configuration.
+        """
+        direct = self._paths.joint(qpos, goal)
+        if not by_rest and self.is_clear(direct):
+            return direct
+        detour = self._find_detour(qpos, goal)
+        return detour if self.is_clear(detour) else None
+
+    def _find_detour(self, qpos: Array, goal: Array) -> Array:
+        return np.concatenate([self._paths.joint(qpos, self._rest), self._paths.joint(self._rest, goal)])
+
+    def choose(
+        self, qpos: Array, candidates: Iterable[T], start_of: Callable[[T], Array], *, by_rest: bool = False
+    ) -> tuple[T, Array] | None:
         """Return the first candidate to whose start a clear path (n, 7) leads, and the path.
 
-        Without a clear path, the first candidate and the direct path are returned; without a candidate, None.
+        Without a clear path, the first candidate and the path to it are returned; without a candidate, None.
 
         Args:
             qpos: (7,) present configuration.
             candidates: candidates, the best first.
             start_of: returns the start configuration (7,) of a candidate.
+            by_rest: whether the path has to go through the rest configuration.
         """
         first: T | None = None
         for candidate in islice(candidates, _CANDIDATES):
-            path = self.find_path(qpos, start_of(candidate))
+            path = self.find_path(qpos, start_of(candidate), by_rest=by_rest)
             if path is not None:
                 return candidate, path
             first = candidate if first is None else first
-        return None if first is None else (first, self._paths.joint(qpos, start_of(first)))
+        if first is None:
+            return None
+        to_first = self._find_detour if by_rest else self._paths.joint
+        return first, to_first(qpos, start_of(first))
 
-    def _is_clear(self, path: Array) -> bool:
-        if not len(self._points):
+    def is_clear(self, path: Array) -> bool:
+        """Return whether the gripper and a held object keep clear of the points on a path (n, 7) from its start on."""
+        if not len(self._points) or not len(path):
             return True
         poses = self._paths.chain.tcp(np.concatenate([path[:-1:_CHECKED], path[-1:]]))
         away = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1) > _START

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from robocas_ms3.baselines.keyframe.handles import Handle
 from robocas_ms3.core.errors import PlanningError
-from robocas_ms3.core.poses import Array, inverse
+from robocas_ms3.core.poses import Array, from_rotation, inverse
 from robocas_ms3.planning.kinematics import ArmChain, InverseKinematics, joint_distance, solve_straight_line
 from robocas_ms3.planning.pull_path import count_reached_poses, rotate_about_bar, track_handle
 from robocas_ms3.robots.registry import RobotSpec
@@ -24,10 +24,7 @@ _MAX_TRANSLATION, _MAX_ROTATION = 0.095, 0.45  # m along an axis and rad per con
 _MAX_JOINT_STEP = 0.4  # rad per control step
 _MAX_HALVINGS = 3  # of the limits, after motions that the arm did not execute
 _LEAST_MOTION = 0.01  # m, commanded motion from which on the executed motion is checked
-_FRONT_DISTANCES, _FRONT_LIFT = (0.2, 0.15, 0.1, 0.06), 0.025  # m before the pre-grasp; m of the way back above it
-_EXIT_DISTANCES = (0.3, 0.25, 0.2, 0.15, 0.1, 0.06)  # m from the pre-grasp back to the end of the way out
-_MAX_ENTRIES, _MAX_APPROACHES = 32, 48  # grasps for which approaches are planned, from the front and from above
-_FAR_OUT = 0.28  # m from the grasp to the end of the way out, horizontally, at which an object is out of a compartment
+_MAX_APPROACHES = 48  # grasps for which approaches are planned
 _PULL_STEP, _PULL_STANDOFF, _RETREATS = 0.015, 0.08, (0.15, 0.1, 0.06)  # m
 _PULL_TURNS = np.deg2rad((0, -20, 20, -40, 40))  # about the bar
 _LOWER = (0.0, 0.05, 0.1)  # m below the height of a rise, of its alternative ends
@@ -167,66 +164,6 @@ class ArmPaths:
         goal[:3, 3] -= distance * goal[:3, 2]
         return self.straight(qpos, goal)
 
-    def plan_front_approaches(self, grasps: Array, scores: Array, qpos: Array) -> Iterator[Approach]:
-        """Yield approaches of the best grasps from outside of a compartment, the one with the greatest score first.
-
-        Approaches that do not leave the compartment far enough come last.
-
-        The gripper enters towards the object, and moves back out after a short lift. Arguments as in `plan_approach`.
-        """
-        short = []
-        for index in np.argsort(-scores, kind="stable")[:_MAX_ENTRIES].tolist():
-            for grasp in (grasps[index], grasps[index] @ HALF_TURN):
-                found = self._plan_entry(grasp, qpos)
-                if found is None:
-                    continue
-                if self._is_far_out(found):
-                    yield found
-                else:
-                    short.append(found)
-        yield from short
-
-    def _is_far_out(self, approach: Approach) -> bool:
-        """Return whether the way out ends far enough from the grasp."""
-        assert approach.way_back is not None
-        out = self.chain.tcp(approach.way_back[-1:])[0, :2, 3]
-        return bool(np.linalg.norm(out - approach.grasp[:2, 3]) > _FAR_OUT)
-
-    def _plan_entry(self, grasp: Array, qpos: Array) -> Approach | None:
-        """Return the approach of a grasp (4, 4) that starts as far before the pre-grasp as possible, or None."""
-        before = grasp.copy()
-        before[:3, 3] -= PREGRASP_DISTANCE * grasp[:3, 2]
-        backwards = grasp[:2, 2] / np.linalg.norm(grasp[:2, 2])
-        starts = np.tile(before, (len(_FRONT_DISTANCES), 1, 1))
-        starts[:, :2, 3] -= np.array(_FRONT_DISTANCES)[:, None] * backwards
-        ends = np.tile(before, (len(_EXIT_DISTANCES), 1, 1))
-        ends[:, :2, 3] -= np.array(_EXIT_DISTANCES)[:, None] * backwards
-        raised = np.stack([grasp, before, *ends])
-        raised[:, 2, 3] += _FRONT_LIFT
-        reachable, found = self.reach(np.concatenate([[grasp, before], raised, starts]), qpos)
-        if not reachable[:4].all():  # the grasp, the pre-grasp, and both raised
-            return None
-        exits = raised[2:][reachable[4 : -len(starts)]]
-        entries = found[-len(starts) :][reachable[-len(starts) :]]
-        paths = ((start, self._connect(start, [before, grasp])) for start in entries)
-        start, inwards = next(((start, path) for start, path in paths if path is not None), (qpos, None))
-        if inwards is None:
-            return None
-        outwards = (self._connect(inwards[-1], [*raised[:2], end]) for end in exits)
-        way_back = next((path for path in outwards if path is not None), None)
-        return None if way_back is None else Approach(grasp, start, inwards, way_back)
-
-    def _connect(self, qpos: Array, poses: list[Array]) -> Array | None:
-        """Return straight paths (n, 7) through TCP poses (4, 4), one after another, or None."""
-        paths = []
-        for pose in poses:
-            path = self.straight(qpos, pose)
-            if path is None:
-                return None
-            paths.append(path)
-            qpos = path[-1]
-        return np.concatenate(paths)
-
     def plan_approach(self, grasps: Array, scores: Array, qpos: Array) -> Approach | None:
         """Return the approach of the reachable grasp with the greatest score, or None.
 
@@ -256,7 +193,8 @@ class PathFollower:
     """Follows a path with motions of the TCP that are relative to its present pose.
 
     The controller of the arm may find no joint positions for a distant pose. Then the arm stays, and the follower
-    repeats the motion with half the limits. It halves the limits at most three times.
+    repeats the motion with half the limits. It halves the limits at most three times. If the arm is far from the path,
+    the follower first moves straight to it.
 
     Args:
         chain: kinematics of the arm.
@@ -272,7 +210,8 @@ class PathFollower:
         self._path, self._poses, self.index = path, chain.tcp(path), 0
         self._limits = np.array([_MAX_TRANSLATION, _MAX_ROTATION, _MAX_JOINT_STEP]) * control_steps * speed
         self._halvings, self._before = 0, 0
-        self._start: Array | None = None  # TCP pose before the last motion
+        self._start: Array | None = None  # TCP pose before the last motion, and its goal
+        self._goal = self._poses[0]
 
     @property
     def goal(self) -> Array:
@@ -292,17 +231,21 @@ class PathFollower:
             self.index = self._before
         self._start, self._before = tcp_in_base, self.index
         ahead = inverse(tcp_in_base)[None] @ self._poses[self.index :]
-        turns = np.linalg.norm(Rotation.from_matrix(ahead[:, :3, :3]).as_rotvec(), axis=1)
+        turns = Rotation.from_matrix(ahead[:, :3, :3]).magnitude()
         joints = np.abs(self._path[self.index :] - self._path[self.index]).max(axis=1)
         sizes = np.stack([np.abs(ahead[:, :3, 3]).max(axis=1), turns, joints])
         fits = np.asarray((sizes <= self._limits[:, None]).all(axis=0))
-        fits[0] = True
-        steps = len(fits) - 1 if fits.all() else int(np.argmin(fits)) - 1
-        self.index += steps
-        return self._poses[self.index]
+        if fits[0]:
+            self.index += len(fits) - 1 if fits.all() else int(np.argmin(fits)) - 1
+            self._goal = self._poses[self.index]
+        else:
+            part = float((self._limits[:2] / np.maximum(sizes[:2, 0], 1e-9)).min())
+            turn = Rotation.from_rotvec(part * Rotation.from_matrix(ahead[0, :3, :3]).as_rotvec())
+            self._goal = tcp_in_base @ from_rotation(part * ahead[0, :3, 3], turn.as_matrix())
+        return self._goal
 
     def _has_stayed(self, start: Array, tcp_in_base: Array) -> bool:
         """Return whether less than half of the last motion, from the pose ``start`` (4, 4), was executed."""
-        commanded = float(np.linalg.norm(self._poses[self.index][:3, 3] - start[:3, 3]))
+        commanded = float(np.linalg.norm(self._goal[:3, 3] - start[:3, 3]))
         moved = float(np.linalg.norm(tcp_in_base[:3, 3] - start[:3, 3]))
         return commanded > _LEAST_MOTION and moved < 0.5 * commanded

@@ -89,6 +89,7 @@ class Survey:
         table: height of the surface, m.
         handle: handle of a door or drawer, or None.
         points: (P, 3) points on everything but the robot, m.
+        has_objects: whether objects are seen; otherwise the focus is a default.
         has_roof: whether something is above the objects, so that they have to be grasped from the front.
     """
 
@@ -97,6 +98,7 @@ class Survey:
     table: float
     points: Array
     handle: Handle | None = None
+    has_objects: bool = False
     has_roof: bool = False
 
 
@@ -167,7 +169,7 @@ class Perception:
             above = (surfaces[:, 2] > roof) & (np.linalg.norm(surfaces[:, :2] - focus, axis=1) < _ROOF_RADIUS)
             has_roof = int(above.sum()) >= _ROOF_CELLS
         handle = _find_handle(np.concatenate(handles))
-        return Survey(focus, _find_basket(rim), table, np.concatenate(everything), handle, has_roof)
+        return Survey(focus, _find_basket(rim), table, np.concatenate(everything), handle, has_objects, has_roof)
 
     def observe(self, frame: CameraFrame, request: Request, table: float) -> ObservedScene:
         """Return the objects and the points in the workspace of an image of the gripper camera."""

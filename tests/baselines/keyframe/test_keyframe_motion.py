@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.baselines.keyframe.free_paths import FreePaths
+from robocas_ms3.baselines.keyframe.front_approaches import Front, plan_front_approaches
 from robocas_ms3.baselines.keyframe.handles import Handle
 from robocas_ms3.baselines.keyframe.motion import LIFT, ArmPaths, PathFollower
 from robocas_ms3.baselines.keyframe.tcp_poses import find_release_poses, find_views
@@ -123,18 +124,58 @@ def test_a_pull_out_of_reach_is_as_long_as_possible(paths):
     assert not list(paths.plan_pulls(far, REST))
 
 
+def plan_approaches(paths, grasps, front=None, is_clear=lambda path: True):
+    scores = np.linspace(0.9, 0.5, len(grasps))
+    return plan_front_approaches(paths, np.stack(grasps), scores, REST, front, is_clear)
+
+
 def test_front_approach_enters_and_leaves_a_compartment(paths):
     approach = np.array([np.sin(1.2), 0, -np.cos(1.2)])  # 69 degrees from the vertical
     closing = np.array([0.0, 1.0, 0.0])
     grasp = from_rotation([0.65, -0.05, 0.2], np.stack([np.cross(closing, approach), closing, approach], axis=1))
     far = from_rotation([2.0, 0, 0.2], grasp[:3, :3])
-    found = next(paths.plan_front_approaches(np.stack([far, grasp]), np.array([0.9, 0.5]), REST))
+    found = next(
+        plan_front_approaches(paths, np.stack([far, grasp]), np.array([0.9, 0.5]), REST, None, lambda path: True)
+    )
     assert np.allclose(found.grasp[:3, 3], grasp[:3, 3])
     outside, inside, after = paths.chain.tcp(np.stack([found.start, found.path[-1], found.way_back[-1]]))
     assert np.allclose(inside, found.grasp, atol=1e-3)
     assert outside[0, 3] < 0.65 - 0.15 and after[0, 3] < 0.65 - 0.15  # 6 cm or more before the pre-grasp
     heights = paths.chain.tcp(found.way_back)[:, 2, 3]
     assert heights.min() > 0.199 and after[2, 3] == pytest.approx(outside[2, 3] + 0.025, abs=1e-3)
+
+
+def test_points_before_a_front_are_outside():
+    front = Front.from_handle(Handle(np.array([0.5, 0.1, 0.2]), np.zeros(3), np.array([0.6, 0, 0.8]), np.ones(3)))
+    assert np.allclose(front.inwards, [1, 0, 0]) and np.allclose(front.position, [0.38, 0.1, 0.2])  # 12 cm before it
+    assert np.allclose(front.depths(np.array([[0.5, 0.3, 0.9], [0.3, 0, 0]])), [0.12, -0.08])
+    poses = from_rotation([[0.5, 0.3, 0.9], [0.3, 0, 0]], np.stack([DOWN] * 2))
+    assert np.allclose(front.move_out(poses)[:, :3, 3], [[0.38, 0.3, 0.9], [0.3, 0, 0]])
+
+
+def test_the_way_out_of_a_compartment_ends_before_its_front(paths):
+    """A grasp at an angle leads back along the front, so that the gripper has to move on perpendicularly to it."""
+    approach = np.array([np.sin(1.2) * 0.6, np.sin(1.2) * 0.8, -np.cos(1.2)])
+    closing = np.array([0.8, -0.6, 0.0])
+    grasp = from_rotation([0.62, 0.05, 0.2], np.stack([np.cross(closing, approach), closing, approach], axis=1))
+    front = Front(np.array([0.32, 0, 0]), np.array([1.0, 0, 0]))
+    ends = [next(plan_approaches(paths, [grasp], of)).way_back[-1] for of in (None, front)]
+    inside, outside = paths.chain.tcp(np.stack(ends))[:, 0, 3]
+    assert inside > 0.38 and outside == pytest.approx(0.32, abs=1e-3)
+
+
+def test_approaches_through_obstacles_come_last(paths):
+    approach, closing = np.array([np.sin(1.2), 0, -np.cos(1.2)]), np.array([0.0, 1.0, 0.0])
+    rotation = np.stack([np.cross(closing, approach), closing, approach], axis=1)
+    grasps = [from_rotation([0.65, y, 0.2], rotation) for y in (-0.05, 0.1)]
+
+    def is_clear(path):
+        tcp = paths.chain.tcp(path)[:, :3, 3]
+        assert np.linalg.norm(tcp - [0.65, -0.05 if tcp[0, 1] < 0 else 0.1, 0.2], axis=1).min() > PREGRASP_DISTANCE
+        return bool((tcp[:, 1] > 0).all())
+
+    found = [one.grasp[1, 3] for one in plan_approaches(paths, grasps, is_clear=is_clear)]
+    assert found == sorted(found, reverse=True) and set(found) == {0.1, -0.05}
 
 
 def test_release_poses_tilt_away_from_the_base():
@@ -165,6 +206,8 @@ def test_free_paths_avoid_points(paths):
     chosen, path = free.choose(first, [last, near] if found is None else [near], lambda qpos: qpos)
     assert chosen is near and np.allclose(path[-1], near)
     assert free.choose(first, [], lambda qpos: qpos) is None
+    _, path = free.choose(first, [near], lambda qpos: qpos, by_rest=True)
+    assert np.abs(path - REST).max(axis=1).min() < 1e-9 and np.allclose(path[-1], near)
 
 
 def test_a_held_object_avoids_points(paths):

@@ -44,14 +44,16 @@ class FakePerception:
     Blocks named "late" are visible from the second view on. The basket is visible from the survey ``basket_from`` on.
     """
 
-    def __init__(self, blocks, door=None, basket_from=1):
+    def __init__(self, blocks, door=None, basket_from=1, *, has_objects=False):
         self.blocks, self.door, self.surveys, self.views, self.basket_from = blocks, door, 0, 0, basket_from
+        self.has_objects = has_objects
 
     def survey(self, frames, default_table):
         self.surveys += 1
         handle = None if self.door is None or self.door.opening > 0.9 else self.door.handle
         basket = BASKET if self.surveys >= self.basket_from else None
-        return Survey(np.array([0.55, 0.0]), basket, TABLE, np.zeros((0, 3)), handle, has_roof=self.door is not None)
+        has_roof, focus = self.door is not None, np.array([0.55, 0.0])
+        return Survey(focus, basket, TABLE, np.zeros((0, 3)), handle, self.has_objects, has_roof)
 
     def observe(self, frame, request, table):
         x, y = np.meshgrid(np.arange(0.3, 0.8, 0.01), np.arange(-0.4, 0.3, 0.01))
@@ -79,11 +81,11 @@ class FakePerception:
 class FakeArm:
     """Arm that reaches each commanded pose exactly and grasps a block or handle that is between the closed fingers.
 
-    The first ``slips`` grasps of blocks fail.
+    The first ``slips`` grasps of blocks fail. The first ``stops`` motions of a block beyond y = 15 cm are not executed.
     """
 
-    def __init__(self, paths, blocks, door=None, slips=0):
-        self.slips, self.grasps = slips, []
+    def __init__(self, paths, blocks, door=None, slips=0, stops=0):
+        self.slips, self.stops, self.grasps = slips, stops, []
         self.paths, self.blocks, self.qpos, self.held, self.door = paths, blocks, REST, None, door
         self.released: list[tuple[str, np.ndarray]] = []
         self.is_closed = False
@@ -103,7 +105,10 @@ class FakeArm:
         goal = self.tcp @ motion
         reachable, found = self.paths.reach(goal[None], self.qpos)
         assert reachable[0]
-        self.qpos = found[0]
+        if self.held and self.stops and goal[1, 3] > 0.15:
+            self.stops -= 1
+        else:
+            self.qpos = found[0]
         position = self.tcp[:3, 3]
         if command.action[6] == CLOSED and self.held is None:
             near = [name for name, center in self.blocks.items() if np.linalg.norm(center - position[:2]) < 0.03]
@@ -142,8 +147,8 @@ def paths():
     return ArmPaths(find_robot(DEFAULT_ROBOT))
 
 
-def play(paths, blocks, request=None, steps=150, door=None, slips=0, basket_from=1):
-    arm = FakeArm(paths, blocks, door, slips)
+def play(paths, blocks, request=None, steps=150, door=None, slips=0, stops=0, basket_from=1):
+    arm = FakeArm(paths, blocks, door, slips, stops)
     request = request or Request(np.ones(1, np.float32), None)
     rng = np.random.default_rng(0)
     perception = FakePerception(blocks, door, basket_from)
@@ -225,6 +230,37 @@ def test_the_door_is_opened_before_the_target_is_grasped(paths):
     assert door.opening > 0.95
     (name, position), *_ = arm.released
     assert name == "target" and np.linalg.norm(position[:2] - BASKET[:2]) < 0.06
+
+
+def test_an_arm_that_is_stopped_before_a_compartment_takes_another_way(paths):
+    arm = play(paths, {"target": np.array([0.62, -0.1])}, door=FakeDoor(), stops=6, steps=300)
+    (name, position), *_ = arm.released
+    assert name == "target" and arm.stops == 0 and np.linalg.norm(position[:2] - BASKET[:2]) < 0.06
+
+
+@pytest.mark.parametrize("is_front", [False, True])
+def test_an_object_without_a_way_to_the_basket_is_put_back(paths, is_front):
+    place = np.array([0.62, -0.1])
+    arm = play(paths, {"target": place}, door=FakeDoor() if is_front else None, stops=1000, steps=300)
+    (name, position), *_ = arm.released
+    assert name == "target" and np.linalg.norm(position[:2] - place) < 0.03 and position[2] < TABLE + 0.08
+
+
+def test_an_open_door_is_not_pulled_again_while_objects_are_seen(paths):
+    door = FakeDoor()
+    arm = FakeArm(paths, {}, door)
+    perception = FakePerception({}, door, has_objects=True)
+    request, rng = Request(np.ones(1, np.float32), None), np.random.default_rng(0)
+    episode = KeyframeEpisode(perception, ArmControl(paths, 1), CONFIG.decisions, request, rng, "gripper_camera")
+    run = episode.run(arm.view(images=True))
+    command = next(run)
+    closed = []
+    for step in range(150):
+        command = run.send(arm.step(command))
+        if perception.surveys == 2 and not closed:
+            door.handle, door.opening = replace(door.handle, motion=-door.handle.motion), 0.0  # as if it were closed
+            closed.append(step)
+    assert closed and perception.surveys > 2 and door.opening == 0.0
 
 
 def observe_with_images(envs):
