@@ -175,7 +175,7 @@ def test_approaches_through_obstacles_come_last(paths):
         return bool((tcp[:, 1] > 0).all())
 
     found = [one.grasp[1, 3] for one in plan_approaches(paths, grasps, is_clear=is_clear)]
-    assert found == sorted(found, reverse=True) and set(found) == {0.1, -0.05}
+    assert found[0] == 0.1 and -0.05 in found[1:]  # although its score is greater
 
 
 def test_release_poses_tilt_away_from_the_base():
