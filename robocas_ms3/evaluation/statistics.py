@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import root_scalar
-from scipy.stats import beta, binom, norm
+from scipy.stats import beta, binom, binomtest, norm
 
 _TAIL = (1 - 0.95) / 2  # error probability at each end of an interval
 _POWER = 0.8
@@ -84,6 +84,21 @@ def compute_success_rate(k: int, n: int) -> SuccessRate:
     low = float(beta.ppf(_TAIL, k, n - k + 1)) if k else 0.0
     high = float(beta.isf(_TAIL, k + 1, n - k)) if k < n else 1.0
     return SuccessRate(k, n, low, high)
+
+
+def compute_unpaired_interval(a: tuple[int, int], b: tuple[int, int]) -> tuple[float, float]:
+    """Return Newcombe's 95 % interval of the difference of two independent rates, A - B.
+
+    Method 10 of Newcombe, Statistics in Medicine 17 (1998) 873-890, which combines Wilson's intervals of both rates.
+    For runs over the same scenes, `compute_paired_interval` is narrower.
+
+    Args:
+        a, b: (k, n): k successes of n episodes.
+    """
+    (low_a, high_a), (low_b, high_b) = (binomtest(*one).proportion_ci(1 - 2 * _TAIL, "wilson") for one in (a, b))
+    rate_a, rate_b = a[0] / a[1], b[0] / b[1]
+    below, above = np.hypot(rate_a - low_a, high_b - rate_b), np.hypot(high_a - rate_a, rate_b - low_b)
+    return float(rate_a - rate_b - below), float(rate_a - rate_b + above)
 
 
 def mcnemar_p_value(only_a: int, only_b: int) -> float:

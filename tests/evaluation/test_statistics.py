@@ -15,6 +15,7 @@ from robocas_ms3.evaluation.statistics import (
     compare_successes,
     compute_paired_interval,
     compute_success_rate,
+    compute_unpaired_interval,
     find_smallest_difference,
     make_power_warning,
     mcnemar_p_value,
@@ -74,6 +75,18 @@ def test_exact_interval_has_half_of_the_error_at_each_end(counts):
 def test_mcnemar_equals_published_values(only_a, only_b, p_value):
     assert mcnemar_p_value(only_a, only_b) == pytest.approx(p_value, abs=5e-7)
     assert mcnemar_p_value(only_b, only_a) == mcnemar_p_value(only_a, only_b)
+
+
+def test_unpaired_interval_equals_published_values():
+    """Examples a, c and e of Newcombe (1998), table II, method 10."""
+    for a, b, limits in [
+        ((56, 70), (48, 80), (0.0524, 0.3339)),
+        ((6, 7), (2, 7), (0.0582, 0.8062)),
+        ((5, 56), (0, 29), (-0.0381, 0.1926)),
+    ]:
+        low, high = compute_unpaired_interval(a, b)
+        assert (round(low, 4), round(high, 4)) == limits
+        assert compute_unpaired_interval(b, a) == pytest.approx((-high, -low))
 
 
 def test_paired_interval_equals_published_values():

@@ -5,17 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from robocas_ms3.core.text import escape_markdown, format_count
-from robocas_ms3.evaluation.leaderboard.rows import LeaderboardRow, Training
+from robocas_ms3.evaluation.leaderboard.rows import SEEN, LeaderboardRow, Training, find_seen_row
 from robocas_ms3.evaluation.outcomes import PAPER_STAGES
+from robocas_ms3.evaluation.statistics import compute_unpaired_interval
 
 _HEADS = (
     *("policy", "track", "task", "split", "n", "success", "RoboCAS-v0's rule", *PAPER_STAGES),
     *("training data", "trained here", "training", "parameters", "notes"),
 )
+_CHANGE, _SUCCESS = f"change from {SEEN}", _HEADS.index("success") + 1
 NOTE = (
     "Success: success rate in % with its exact 95 % interval. RoboCAS-v0's rule: success rate by the rule of "
     "RoboCAS-v0 after the last step. Trained here: whether the training data has the task, scenes, objects and cameras "
-    "of the episodes. Compare rows of the same table, task, split and track, without notes."
+    "of the episodes. Change from seen: difference of the success rate from that of the policy in the split seen, in "
+    "percentage points, with Newcombe's 95 % interval for independent episodes. Compare rows of the same table, task, "
+    "split and track, without notes."
 )
 PUBLISHED_NOTE = (
     "Published results are not comparable with the tables above: RoboCAS-v0's evaluator has another rule of success, "
@@ -38,10 +42,15 @@ def render_leaderboard(rows: Sequence[LeaderboardRow]) -> str:
 
 
 def _render_table(rows: Sequence[LeaderboardRow]) -> Iterator[str]:
-    yield f"| {' | '.join(_HEADS)} |"
-    yield "|" + "---|" * len(_HEADS)
+    has_seen = any(row.split == SEEN and not row.published for row in rows)
+    heads = (*_HEADS[:_SUCCESS], _CHANGE, *_HEADS[_SUCCESS:]) if has_seen else _HEADS
+    yield f"| {' | '.join(heads)} |"
+    yield "|" + "---|" * len(heads)
     for row in rows:
-        yield f"| {' | '.join(map(escape_markdown, _make_cells(row)))} |"
+        cells = _make_cells(row)
+        if has_seen:
+            cells.insert(_SUCCESS, _format_change(row, find_seen_row(row, rows)))
+        yield f"| {' | '.join(map(escape_markdown, cells))} |"
 
 
 def _make_cells(row: LeaderboardRow) -> list[str]:
@@ -65,6 +74,14 @@ def _format_success(row: LeaderboardRow) -> str:
         return _format_percent(row.rate)
     low, high = row.interval
     return f"{100 * row.rate:.1f} ({100 * low:.1f} to {100 * high:.1f})"
+
+
+def _format_change(row: LeaderboardRow, seen: LeaderboardRow | None) -> str:
+    if seen is None or row.successes is None or row.n is None or seen.successes is None or seen.n is None:
+        return ""
+    difference = row.successes / row.n - seen.successes / seen.n
+    low, high = compute_unpaired_interval((row.successes, row.n), (seen.successes, seen.n))
+    return f"{100 * difference:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
 
 
 def _format_percent(rate: float | None) -> str:

@@ -15,6 +15,8 @@ from robocas_ms3.core.paths import published_results_file
 from robocas_ms3.core.strict_model import StrictModel, parse_json
 from robocas_ms3.evaluation.policy import Calibration, Track
 
+SEEN = "seen"
+"""Split with scenes of the training configurations, in protocols with a held-out condition."""
 Rate = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=0)]
 
@@ -124,6 +126,18 @@ def sort_rows(rows: Iterable[LeaderboardRow]) -> list[LeaderboardRow]:
         return row.published, row.protocol, row.task, row.split, tracks.index(row.track), -(rate or 0.0), row.policy
 
     return sorted(rows, key=key)
+
+
+def find_seen_row(row: LeaderboardRow, rows: Iterable[LeaderboardRow]) -> LeaderboardRow | None:
+    """Return the row of the split `SEEN` of the same policy and conditions; None: there is none, or it is this row."""
+
+    def key(one: LeaderboardRow) -> tuple:
+        conditions = one.calibration, tuple(one.differences), one.backend
+        return one.policy, one.weights, one.training, one.protocol, one.protocol_hash, one.task, *conditions
+
+    if row.published or row.split == SEEN:
+        return None
+    return next((one for one in rows if one.split == SEEN and key(one) == key(row)), None)
 
 
 def replace_rows(rows: Iterable[LeaderboardRow], new: Sequence[LeaderboardRow]) -> list[LeaderboardRow]:

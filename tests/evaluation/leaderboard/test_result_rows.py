@@ -106,6 +106,18 @@ def test_markdown_has_a_table_per_protocol_and_names_what_is_not_comparable(tmp_
     assert "| no |" in second and text.count("\n## ") == 2
 
 
+def test_markdown_has_the_change_from_the_seen_split(tmp_path):
+    (row,) = make_rows(write(tmp_path / "a", [outcome(0)], policy=TRAINED))
+    counts = {"n": 80, "successes": 48, "rate": 0.6, "interval": (0.48, 0.71)}
+    seen = row.model_copy(update={"split": "seen", **counts})
+    new = row.model_copy(update={"split": "new", "n": 70, "successes": 56, "rate": 0.8, "interval": (0.69, 0.89)})
+    other = new.model_copy(update={"weights": "ff" * 32})  # other weights have no row of the split
+    text = render_leaderboard([seen, new, other])
+    cells = [line.split(" | ")[6] for line in text.splitlines() if line.startswith("| runs/mine")]
+    assert cells == ["", "+20.0 (+5.2 to +33.4)", ""] and "| success | change from seen |" in text
+    assert "change from seen |" not in render_leaderboard([row])
+
+
 def test_command_writes_rows_of_all_results_and_the_published_ones(tmp_path, capsys):
     write(tmp_path / "a", [outcome(0)])
     write(tmp_path / "b", [outcome(1, 0)])  # a shard of the same evaluation
