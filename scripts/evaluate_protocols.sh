@@ -3,10 +3,11 @@
 #
 #   bash scripts/evaluate_protocols.sh POLICY [PROTOCOL ...]
 #
-# POLICY    a name of `robocas list`, or a run folder of `robocas train`
+# POLICY    a name of `robocas list`, a run folder of `robocas train`, or a folder with one run per task (FOLDER/pick, ...)
 # PROTOCOL  names of protocols (default: all but smoke)
 #
-# After an interruption, run the script again to continue. Results: OUT/POLICY/PROTOCOL, with _ in place of / in POLICY.
+# After an interruption, run the script again to continue. Results: OUT/POLICY/PROTOCOL, with _ in place of / in POLICY. With
+# one run per task: OUT/POLICY/PROTOCOL/TASK; tasks without a run are left out.
 #
 # OUT          folder of the results (default: reproduced/protocols)
 # LEADERBOARD  file of the leaderboard (default: docs/leaderboard/results.json)
@@ -29,9 +30,22 @@ jobs=${JOBS:-$(env -u OMP_NUM_THREADS nproc)}
 robocas=${ROBOCAS:-.venv/bin/robocas}
 command -v "$robocas" >/dev/null || fail "no such command: $robocas. Run bash scripts/setup.sh, or set ROBOCAS."
 
+add_rows() {
+    mkdir -p "$(dirname "$leaderboard")"
+    "$robocas" eval leaderboard "$1" --update --out "$leaderboard" >/dev/null
+}
+
 for protocol in "${protocols[@]}"; do
     folder=$out/${policy//\//_}/$protocol
-    evaluate "$folder" --policy "$policy" --protocol "$protocol"
-    mkdir -p "$(dirname "$leaderboard")"
-    "$robocas" eval leaderboard "$folder" --update --out "$leaderboard" >/dev/null
+    if compgen -G "$policy/*/run.json" >/dev/null; then
+        for task in pick select search open_pick; do
+            [[ -e $policy/$task/run.json ]] || continue
+            grep -q "\"task\":\"$task\"" "robocas_ms3/data/protocols/$protocol/episodes.jsonl" || continue
+            evaluate "$folder/$task" "$task" --policy "$policy/$task" --protocol "$protocol"
+            add_rows "$folder/$task"
+        done
+    else
+        evaluate "$folder" --policy "$policy" --protocol "$protocol"
+        add_rows "$folder"
+    fi
 done

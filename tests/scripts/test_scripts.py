@@ -149,6 +149,21 @@ def test_a_policy_is_evaluated_on_all_protocols(tmp_path):
     assert run_with_stub(tmp_path, "evaluate_protocols.sh")[0].returncode == 2
 
 
+def test_the_runs_of_a_baseline_are_evaluated_in_their_tasks(tmp_path):
+    settings = {"OUT": str(tmp_path / "out"), "LEADERBOARD": str(tmp_path / "rows.json")}
+    runs = tmp_path / "runs"
+    for task in ("pick", "search"):
+        (runs / task).mkdir(parents=True)
+        (runs / task / "run.json").touch()
+    done, calls = run_with_stub(tmp_path, "evaluate_protocols.sh", str(runs), "paper-v1", "looks-v1", **settings)
+    assert done.returncode == 0, done.stderr
+    evaluations = check_shards([call for call in calls if call[1] != "leaderboard"])
+    played = [(call[2], *(call[call.index(name) + 1] for name in ("--policy", "--protocol"))) for call in evaluations]
+    pick, search = str(runs / "pick"), str(runs / "search")
+    assert played == [("pick", pick, "paper-v1"), ("search", search, "paper-v1"), ("pick", pick, "looks-v1")]
+    assert len(calls) == 3 * 4  # two shards, their merge, and the rows
+
+
 def test_an_evaluation_with_a_failed_shard_is_not_merged(tmp_path):
     stub = tmp_path / "fails"
     stub.write_text(STUB + 'case "$*" in *"--shard 1/2"*) exit 1 ;; esac\n')
