@@ -41,12 +41,14 @@ _NEAR_START = (0.008, 0.05)  # m and rad from the pre-grasp at which the motion 
 _EMPTY = 0.003  # m, gripper width below which nothing is held
 _RELEASE_CLEARANCE = 0.03  # m between the rim of the basket and the lowest point of a held object
 _CARRY_CLEARANCE = 0.15  # m between the rim and the TCP on the way to the basket
+_LOWERED = 0.12  # m that an object from a compartment is lowered into the basket
 _PLACE_HEIGHT = 0.38  # m, least height of the TCP on the way to a free place
 _DROP = 0.02  # m that an object falls at a free place
 _FAILURE_PENALTY = 2.0  # of the score of a grasp that equals a failed one; scores are probabilities
 _PLACE_POSES = 10  # poses at free places that are tried
 _TARGET_GAP, _BASKET_GAP = 0.16, 0.28  # m between a free place and the target, and the basket
 _IN_BASKET = 0.14  # m from the middle of the basket, within which an object is in it
+_SURVEY_INTERVAL = 3  # views without the target, of a compartment, after which all cameras are surveyed again
 _MAX_OBSTACLES = 5  # obstacles for which grasps are computed per decision
 _MAX_PULLS, _PULL_SPEED = 4, 0.3  # pulls per episode; fraction of the limits
 _COMPARTMENT_SPEED = 0.5  # fraction of the limits with an object that was grasped from the front
@@ -93,7 +95,7 @@ class KeyframeEpisode:
         self._free = FreePaths(self._arm.paths, observation.qpos)
         self._survey(observation)
         observation = yield from self._open_compartment(observation)
-        close = False
+        close, lost = False, 0
         while True:
             observation = yield from self._view(observation, close)
             if self._basket is None:
@@ -101,8 +103,9 @@ class KeyframeEpisode:
             scene = self._perception.observe(observation.frames[self._hand_camera], self._request, self._table)
             self._map.update(scene.points)
             target = self._targets.choose([one for one in scene.targets if not self._is_in_basket(one)])
-            chosen = None
+            chosen, lost = None, lost + 1
             if target is not None:
+                lost = 0
                 self._focus = scene.points[target.mask].mean(axis=0)[:2]
                 chosen = self._plan_grasp(scene, target, observation)
             if chosen is not None:
@@ -116,7 +119,7 @@ class KeyframeEpisode:
                 continue
             _log.debug("no keyframe; the target is %s", "not seen" if target is None else "seen")
             close = not close
-            if target is None and (self._is_front or self._pulls):
+            if lost % _SURVEY_INTERVAL == 1 and (self._is_front or self._pulls):
                 self._survey(observation)
                 if not self._sees_objects:  # the door may be closed
                     observation = yield from self._open_compartment(observation)
@@ -224,7 +227,9 @@ class KeyframeEpisode:
             observation = yield from arm.wait(observation, CLOSED)
             observation = yield from arm.follow(observation, pull.pull, CLOSED, COARSE, _PULL_SPEED)
             observation = yield from arm.wait(observation, OPEN)
-            observation = yield from arm.follow(observation, pull.way_back, OPEN, COARSE)
+            away = arm.paths.retreat(observation.qpos)  # from the actual pose, so that the bar is not dragged back
+            if away is not None:
+                observation = yield from arm.follow(observation, away, OPEN, COARSE, _PULL_SPEED)
             observation = yield from arm.request_images(observation, OPEN)
             self._survey(observation)
         return observation
@@ -285,11 +290,14 @@ class KeyframeEpisode:
         """Carry the held object over the basket."""
         if self._basket is None:
             raise MotionError(observation)
+        upright = chosen.approach.grasp[2, :3] if self._is_front else None
         point = self._basket + [0, 0, _RELEASE_CLEARANCE + chosen.hanging]
-        poses, costs = find_release_poses(point, chosen.approach.grasp[2, :3] if self._is_front else None)
+        found = self._arm.paths.nearest(*find_release_poses(point, upright), observation.qpos, 0.5)
+        if self._is_front:  # the object may come from below the rim
+            above = find_release_poses(point + [0, 0, _LOWERED], upright)
+            found = self._arm.paths.nearest(*above, observation.qpos, 0.5) or found
         height = float(self._basket[2]) + max(_CARRY_CLEARANCE, _RELEASE_CLEARANCE + chosen.hanging)
         height = height if self._is_front else max(chosen.safe_height, height)
-        found = self._arm.paths.nearest(poses, costs, observation.qpos, 0.5)
         if not found:
             raise MotionError(observation)
         try:
@@ -305,10 +313,17 @@ class KeyframeEpisode:
             self._free.release()
             assert way is not None  # of a pose in reach
             try:
-                return (yield from self._arm.follow_or_return(observation, way[1], CLOSED, COARSE, speed))
+                observation = yield from self._arm.follow_or_return(observation, way[1], CLOSED, COARSE, speed)
             except MotionError as error:
                 observation = error.observation
                 _log.debug("stopped on the way to the basket")
+                continue
+            if self._is_front:
+                release = observation.tcp_in_base.copy()
+                release[2, 3] = min(release[2, 3], point[2])
+                with suppress(MotionError):
+                    observation = yield from self._arm.move_straight(observation, release, CLOSED)
+            return observation
         raise MotionError(observation)
 
     def _place(self, observation: EpisodeObservation, chosen: Keyframe) -> Motion:

@@ -13,7 +13,7 @@ from robocas_ms3.core.poses import Array
 from robocas_ms3.scenes.grasp_checks import HALF_TURN, PREGRASP_DISTANCE
 
 _ENTRY_DISTANCES, _LIFT = (0.2, 0.15, 0.1, 0.06), 0.025  # m before the pre-grasp; m of the way out above the way in
-_EXIT_DISTANCES = (0.3, 0.25, 0.2, 0.15, 0.1, 0.06)  # m from the pre-grasp back to the end of the way out
+_EXIT_DISTANCES = (0.06, 0.1, 0.15, 0.2, 0.25, 0.3)  # m from the pre-grasp back to poses on the way out
 _MAX_ENTRIES = 32  # grasps for which approaches are planned
 _FAR_OUT = 0.28  # m from the grasp to the end of the way out, horizontally, if the front is not known
 _OUTSIDE = 0.12  # m from the front to the TCP outside of the compartment
@@ -119,25 +119,30 @@ def _plan_entry(paths: ArmPaths, grasp: Array, qpos: Array, front: Front | None)
 
 
 def _plan_way_out(paths: ArmPaths, qpos: Array, exits: Array, front: Front | None) -> Array | None:
-    """Return the path (n, 7) to the first of the exits (E, 4, 4) from which the arm gets outside, else to any, or None.
+    """Return the path (n, 7) through poses (E, 4, 4) on the way out as far as there is one, or None.
 
-    At an exit that is not outside, the gripper moves on perpendicularly to the front.
+    If the last pose is not outside, the gripper moves on perpendicularly to the front.
     """
-    outside = exits if front is None else front.move_out(exits)
-    goes_on = np.linalg.norm(outside[:, :3, 3] - exits[:, :3, 3], axis=1) > _OUTSIDE / 2
-    reachable, _ = paths.reach(outside, qpos)
-    shortest = None
-    for number, pose in enumerate(exits):
-        path = paths.straight(qpos, pose)
+    found = []
+    for pose in exits:
+        path = paths.straight(qpos, pose, one_by_one=False)
         if path is None:
-            continue
-        if not goes_on[number]:
-            return path
-        rest = paths.straight(path[-1], outside[number]) if reachable[number] else None
-        if rest is not None:
-            return np.concatenate([path, rest])
-        shortest = path if shortest is None else shortest
-    return shortest
+            break
+        found.append(path)
+        qpos = path[-1]
+        if front is not None and front.depths(pose[:3, 3]) <= 0:
+            break
+    if not found:
+        return None
+    if front is not None:
+        last = paths.chain.tcp(qpos[None])
+        rest = (
+            None
+            if front.depths(last[0, :3, 3]) <= 0
+            else paths.straight(qpos, front.move_out(last)[0], one_by_one=False)
+        )
+        found += [] if rest is None else [rest]
+    return np.concatenate(found)
 
 
 def _move_back(pose: Array, direction: Array, distances: tuple[float, ...]) -> Array:
@@ -151,7 +156,7 @@ def _connect(paths: ArmPaths, qpos: Array, poses: list[Array]) -> Array | None:
     """Return straight paths (n, 7) through TCP poses (4, 4), one after another, or None."""
     found = []
     for pose in poses:
-        path = paths.straight(qpos, pose)
+        path = paths.straight(qpos, pose, one_by_one=False)
         if path is None:
             return None
         found.append(path)

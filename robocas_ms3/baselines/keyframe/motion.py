@@ -56,13 +56,11 @@ class Pull:
         start: (7,) configuration at the pre-grasp of the handle, rad.
         path: (n, 7) straight path from the pre-grasp to the grasp, rad.
         pull: (m, 7) path of the closed gripper, rad.
-        way_back: (k, 7) straight path away from the handle, rad.
     """
 
     start: Array
     path: Array
     pull: Array
-    way_back: Array
 
 
 class ArmPaths:
@@ -79,10 +77,13 @@ class ArmPaths:
         self.chain = ArmChain(robot.files().arm_urdf, robot.description)
         self.kinematics = InverseKinematics(self.chain)
 
-    def straight(self, qpos: Array, tcp_in_base: Array) -> Array | None:
-        """Return a straight path (n, 7) from a configuration (7,) to a TCP pose (4, 4), or None."""
+    def straight(self, qpos: Array, tcp_in_base: Array, *, one_by_one: bool = True) -> Array | None:
+        """Return a straight path (n, 7) from a configuration (7,) to a TCP pose (4, 4), or None.
+
+        one_by_one: see `solve_straight_line`.
+        """
         try:
-            return solve_straight_line(self.chain, qpos, tcp_in_base, stage="keyframe")
+            return solve_straight_line(self.chain, qpos, tcp_in_base, stage="keyframe", one_by_one=one_by_one)
         except PlanningError:
             return None
 
@@ -154,9 +155,13 @@ class ArmPaths:
             if len(path) < 2:
                 continue
             back = self._back_off(path[0], _PULL_STANDOFF)
-            away = next((one for one in (self._back_off(path[-1], far) for far in _RETREATS) if one is not None), None)
-            if back is not None and away is not None:
-                yield Pull(back[-1], np.concatenate([back[-2::-1], path[:1]]), path, away)
+            if back is not None and self.retreat(path[-1]) is not None:
+                yield Pull(back[-1], np.concatenate([back[-2::-1], path[:1]]), path)
+
+    def retreat(self, qpos: Array) -> Array | None:
+        """Return the longest straight path (n, 7) away from a handle at a configuration (7,), or None."""
+        paths = (self._back_off(qpos, distance) for distance in _RETREATS)
+        return next((path for path in paths if path is not None), None)
 
     def _back_off(self, qpos: Array, distance: float) -> Array | None:
         """Return a straight path (n, 7) against the approach direction, or None."""

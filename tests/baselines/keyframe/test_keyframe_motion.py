@@ -112,8 +112,12 @@ def test_pull_moves_the_handle_along_its_line(paths):
     assert np.allclose(held[-1, :3, 3], handle.position + handle.motion, atol=1e-3)
     assert np.abs(held[:, [0, 2], 3] - held[0, [0, 2], 3]).max() < 1e-3
     assert np.abs(np.abs(held[:, 2, 0]) - 1).max() < 1e-2  # the gripper turns about the bar only
-    away = paths.chain.tcp(pull.way_back[-1:])[0]
-    assert np.linalg.norm(away[:3, 3] - held[-1, :3, 3]) > 0.05
+    away = paths.chain.tcp(paths.retreat(pull.pull[-1]))
+    distances = np.linalg.norm(away[:, :3, 3] - held[-1, :3, 3], axis=1)
+    along = (held[-1, :3, 3] - away[:, :3, 3]) @ held[
+        -1, :3, 2
+    ]  # against the approach, with the bar between the fingers
+    assert distances[-1] > 0.05 and np.allclose(along, distances, atol=1e-3)
 
 
 def test_a_pull_out_of_reach_is_as_long_as_possible(paths):
@@ -167,15 +171,15 @@ def test_the_way_out_of_a_compartment_ends_before_its_front(paths):
 def test_approaches_through_obstacles_come_last(paths):
     approach, closing = np.array([np.sin(1.2), 0, -np.cos(1.2)]), np.array([0.0, 1.0, 0.0])
     rotation = np.stack([np.cross(closing, approach), closing, approach], axis=1)
-    grasps = [from_rotation([0.65, y, 0.2], rotation) for y in (-0.05, 0.1)]
+    grasps = [from_rotation([0.65, y, 0.2], rotation) for y in (-0.2, 0.2)]
 
     def is_clear(path):
         tcp = paths.chain.tcp(path)[:, :3, 3]
-        assert np.linalg.norm(tcp - [0.65, -0.05 if tcp[0, 1] < 0 else 0.1, 0.2], axis=1).min() > PREGRASP_DISTANCE
+        assert np.linalg.norm(tcp - [0.65, -0.2 if tcp[0, 1] < 0 else 0.2, 0.2], axis=1).min() > PREGRASP_DISTANCE
         return bool((tcp[:, 1] > 0).all())
 
     found = [one.grasp[1, 3] for one in plan_approaches(paths, grasps, is_clear=is_clear)]
-    assert found[0] == 0.1 and -0.05 in found[1:]  # although its score is greater
+    assert found[0] == 0.2 and -0.2 in found[1:]  # although its score is greater
 
 
 def test_release_poses_tilt_away_from_the_base():

@@ -233,7 +233,7 @@ def test_the_door_is_opened_before_the_target_is_grasped(paths):
 
 
 def test_an_arm_that_is_stopped_before_a_compartment_takes_another_way(paths):
-    arm = play(paths, {"target": np.array([0.62, -0.1])}, door=FakeDoor(), stops=6, steps=300)
+    arm = play(paths, {"target": np.array([0.62, -0.1])}, door=FakeDoor(), stops=2, steps=300)
     (name, position), *_ = arm.released
     assert name == "target" and arm.stops == 0 and np.linalg.norm(position[:2] - BASKET[:2]) < 0.06
 
