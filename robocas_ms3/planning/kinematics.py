@@ -257,7 +257,7 @@ def solve_positive_definite(matrices: Array, values: Array) -> Array:
 
 
 def solve_straight_line(
-    chain: ArmChain, start: Array, tcp_in_base: Array, *, stage: str, one_by_one: bool = True
+    chain: ArmChain, start: Array, tcp_in_base: Array, *, stage: str, sequential: bool = True
 ) -> Array:
     """Compute configurations with the TCP on a straight line from its pose at ``start`` to another pose.
 
@@ -268,8 +268,8 @@ def solve_straight_line(
         start: (7,) first configuration.
         tcp_in_base: (4x4) last TCP pose in the arm's base frame.
         stage: stage of a ``PlanningError``.
-        one_by_one: whether the poses are solved one after another if they cannot be solved at once. This finds a few
-            more lines; where there is none, it takes most of the time.
+        sequential: whether the poses are solved one after another if they cannot be solved simultaneously. This finds a
+            few more lines; where there is none, it takes most of the time.
 
     Returns:
         (n, 7) configurations; the TCP poses of neighbours are at most 1 cm and 3 deg apart.
@@ -281,7 +281,7 @@ def solve_straight_line(
     start = np.asarray(start, dtype=np.float64)
     goals = _interpolate_poses(chain.tcp(start[None])[0], tcp_in_base)
     path = _solve_simultaneously(chain, start, goals)
-    if one_by_one and (path is None or _largest_jump(path) > MAX_JUMP):
+    if sequential and (path is None or _largest_jump(path) > MAX_JUMP):
         path = _solve_sequentially(chain, start, goals)
     if path is None:
         raise PlanningError(stage, "line_unreachable")

@@ -18,6 +18,7 @@ PRECISE, COARSE = (0.004, 0.03), (0.02, 0.1)
 """m and rad from the goal at which a motion ends."""
 _WAIT = 4  # control steps of 0.2 s in which the gripper closes or opens
 _ARRIVED = 0.05  # m from the goal, within which a motion was not stopped
+_FAR, _PROGRESS = 0.03, 0.002  # m from the path, beyond which the arm first moves to it; m per step that are progress
 _PATIENCE = 5  # policy steps without progress, after which a motion ends
 
 
@@ -98,6 +99,7 @@ class ArmControl:
     ) -> Motion:
         """Follow a path (n, 7) until the arm arrives or makes no progress; ``speed`` is a fraction of the limits."""
         follower, index, waited = PathFollower(self.paths.chain, path, self._control_steps, speed), -1, 0
+        nearest = np.inf
         while waited < _PATIENCE:
             pose = follower.next_pose(observation.tcp_in_base)
             observation = yield Command(_make_action(observation, pose, gripper))
@@ -105,9 +107,19 @@ class ArmControl:
             turn = Rotation.from_matrix(error[:3, :3]).magnitude()
             if follower.is_last and np.linalg.norm(error[:3, 3]) < tolerance[0] and turn < tolerance[1]:
                 break
-            waited = 0 if follower.index > index else waited + 1
+            distance = follower.measure_distance(observation.tcp_in_base)
+            if follower.index > index or distance > _FAR and distance < nearest - _PROGRESS:
+                waited, nearest = 0, distance
+            else:
+                waited += 1
             index = follower.index
         return observation
+
+    def find_nearest(self, observation: EpisodeObservation, path: Array) -> tuple[int, float]:
+        """Return the index of the nearest configuration of a path (n, 7) to the TCP, and the distance of its end, m."""
+        positions = self.paths.chain.tcp(path)[:, :3, 3]
+        away = np.linalg.norm(positions - observation.tcp_in_base[:3, 3], axis=1)
+        return int(away.argmin()), float(away[-1])
 
     def follow_or_return(
         self,
@@ -117,13 +129,13 @@ class ArmControl:
         tolerance: tuple[float, float] = PRECISE,
         speed: float = 1.0,
     ) -> Motion:
-        """Follow a path; if the arm is stopped before its end, return to the start and raise MotionError."""
+        """Follow a path; if the arm is stopped before its end, move back to the start and raise MotionError."""
         start = observation.qpos
         observation = yield from self.follow(observation, path, gripper, tolerance, speed)
-        away = np.linalg.norm(self.paths.chain.tcp(path)[:, :3, 3] - observation.tcp_in_base[:3, 3], axis=1)
-        if away[-1] < _ARRIVED:
+        nearest, to_end = self.find_nearest(observation, path)
+        if to_end < _ARRIVED:
             return observation
-        back = np.concatenate([path[int(away.argmin()) :: -1], start[None]])
+        back = np.concatenate([path[nearest::-1], start[None]])
         observation = yield from self.follow(observation, back, gripper, COARSE, speed)
         raise MotionError(observation)
 

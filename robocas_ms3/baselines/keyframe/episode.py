@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Generator
 from contextlib import suppress
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -41,14 +42,14 @@ _NEAR_START = (0.008, 0.05)  # m and rad from the pre-grasp at which the motion 
 _EMPTY = 0.003  # m, gripper width below which nothing is held
 _RELEASE_CLEARANCE = 0.03  # m between the rim of the basket and the lowest point of a held object
 _CARRY_CLEARANCE = 0.15  # m between the rim and the TCP on the way to the basket
-_LOWERED = 0.12  # m that an object from a compartment is lowered into the basket
+_LOWERED, _LOWERINGS = 0.12, 12  # m that an object from a compartment is lowered into the basket; poses that are tried
 _PLACE_HEIGHT = 0.38  # m, least height of the TCP on the way to a free place
 _DROP = 0.02  # m that an object falls at a free place
 _FAILURE_PENALTY = 2.0  # of the score of a grasp that equals a failed one; scores are probabilities
 _PLACE_POSES = 10  # poses at free places that are tried
 _TARGET_GAP, _BASKET_GAP = 0.16, 0.28  # m between a free place and the target, and the basket
 _IN_BASKET = 0.14  # m from the middle of the basket, within which an object is in it
-_SURVEY_INTERVAL = 3  # views without the target, of a compartment, after which all cameras are surveyed again
+_SURVEY_INTERVAL = 3  # from one survey to the next, in views of a compartment without the target
 _MAX_OBSTACLES = 5  # obstacles for which grasps are computed per decision
 _MAX_PULLS, _PULL_SPEED = 4, 0.3  # pulls per episode; fraction of the limits
 _COMPARTMENT_SPEED = 0.5  # fraction of the limits with an object that was grasped from the front
@@ -95,7 +96,7 @@ class KeyframeEpisode:
         self._free = FreePaths(self._arm.paths, observation.qpos)
         self._survey(observation)
         observation = yield from self._open_compartment(observation)
-        close, lost = False, 0
+        close, without_target = False, 0
         while True:
             observation = yield from self._view(observation, close)
             if self._basket is None:
@@ -103,9 +104,9 @@ class KeyframeEpisode:
             scene = self._perception.observe(observation.frames[self._hand_camera], self._request, self._table)
             self._map.update(scene.points)
             target = self._targets.choose([one for one in scene.targets if not self._is_in_basket(one)])
-            chosen, lost = None, lost + 1
+            chosen, without_target = None, without_target + 1
             if target is not None:
-                lost = 0
+                without_target = 0
                 self._focus = scene.points[target.mask].mean(axis=0)[:2]
                 chosen = self._plan_grasp(scene, target, observation)
             if chosen is not None:
@@ -119,7 +120,7 @@ class KeyframeEpisode:
                 continue
             _log.debug("no keyframe; the target is %s", "not seen" if target is None else "seen")
             close = not close
-            if lost % _SURVEY_INTERVAL == 1 and (self._is_front or self._pulls):
+            if without_target % _SURVEY_INTERVAL == 1 and (self._is_front or self._pulls):
                 self._survey(observation)
                 if not self._sees_objects:  # the door may be closed
                     observation = yield from self._open_compartment(observation)
@@ -181,7 +182,9 @@ class KeyframeEpisode:
         for failed in self._failed:
             scores -= _FAILURE_PENALTY * compute_similarity(grasps, failed)
         if self._is_front:
-            approaches = plan_front_approaches(paths, grasps, scores, qpos, self._front, self._free.is_clear)
+            approaches = plan_front_approaches(
+                paths, grasps, scores, qpos, self._front, partial(self._free.is_clear, start=0)
+            )
             found = self._free.choose(qpos, approaches, lambda approach: approach.start)
             return None if found is None else Keyframe(scene, one, *found)
         approach = paths.plan_approach(grasps, scores, qpos)
@@ -250,7 +253,10 @@ class KeyframeEpisode:
                 observation = yield from arm.follow(observation, chosen.path, OPEN, _NEAR_START)
                 observation = yield from arm.follow_or_return(observation, approach.path, OPEN)
                 observation = yield from arm.wait(observation, CLOSED)
-                observation = yield from arm.follow(observation, approach.way_back, CLOSED, speed=_COMPARTMENT_SPEED)
+                observation, is_out = yield from self._leave(observation, approach.way_back)
+                if not is_out:
+                    _log.debug("stopped on the way out with an object")
+                    raise MotionError(observation)
             holds = observation.width >= _EMPTY
         except MotionError as error:
             observation = error.observation
@@ -258,6 +264,25 @@ class KeyframeEpisode:
         if not holds:
             self._failed.append(approach.grasp)
         return observation, holds
+
+    def _leave(
+        self, observation: EpisodeObservation, way_back: Array
+    ) -> Generator[Command, EpisodeObservation, tuple[EpisodeObservation, bool]]:
+        """Leave a compartment with the grasped object; release the object at its place if the arm is stopped.
+
+        Returns the last observation, and whether the arm was not stopped.
+        """
+        arm = self._arm
+        try:
+            return (yield from arm.follow_or_return(observation, way_back, CLOSED, speed=_COMPARTMENT_SPEED)), True
+        except MotionError as error:
+            return (yield from self._release_and_leave(error.observation, way_back)), False
+
+    def _release_and_leave(self, observation: EpisodeObservation, way_back: Array) -> Motion:
+        """Open the gripper in a compartment, and leave it from the present place on."""
+        observation = yield from self._arm.wait(observation, OPEN)
+        nearest, _ = self._arm.find_nearest(observation, way_back)
+        return (yield from self._arm.follow(observation, way_back[nearest:], OPEN))
 
     def _move(
         self,
@@ -282,8 +307,7 @@ class KeyframeEpisode:
             else:
                 way_in = approach.way_back[::-1]
                 observation = yield from self._arm.follow(observation, way_in, CLOSED, speed=_COMPARTMENT_SPEED)
-                observation = yield from self._arm.wait(observation, OPEN)
-                return (yield from self._arm.follow(observation, approach.way_back, OPEN))
+                return (yield from self._release_and_leave(observation, approach.way_back))
         return (yield from self._arm.wait(observation, OPEN))
 
     def _carry(self, observation: EpisodeObservation, chosen: Keyframe) -> Motion:
@@ -294,8 +318,7 @@ class KeyframeEpisode:
         point = self._basket + [0, 0, _RELEASE_CLEARANCE + chosen.hanging]
         found = self._arm.paths.nearest(*find_release_poses(point, upright), observation.qpos, 0.5)
         if self._is_front:  # the object may come from below the rim
-            above = find_release_poses(point + [0, 0, _LOWERED], upright)
-            found = self._arm.paths.nearest(*above, observation.qpos, 0.5) or found
+            found = self._find_lowering(point, upright, observation.qpos) or found
         height = float(self._basket[2]) + max(_CARRY_CLEARANCE, _RELEASE_CLEARANCE + chosen.hanging)
         height = height if self._is_front else max(chosen.safe_height, height)
         if not found:
@@ -311,9 +334,12 @@ class KeyframeEpisode:
             self._free.hold(points, chosen.approach.grasp)
             way = self._free.choose(observation.qpos, found, lambda pair: pair[1], by_rest=by_rest)
             self._free.release()
-            assert way is not None  # of a pose in reach
+            if way is None or observation.width < _EMPTY:
+                break
+            (index, _), path = way
+            found = [pair for pair in found if pair[0] != index]
             try:
-                observation = yield from self._arm.follow_or_return(observation, way[1], CLOSED, COARSE, speed)
+                observation = yield from self._arm.follow_or_return(observation, path, CLOSED, COARSE, speed)
             except MotionError as error:
                 observation = error.observation
                 _log.debug("stopped on the way to the basket")
@@ -325,6 +351,19 @@ class KeyframeEpisode:
                     observation = yield from self._arm.move_straight(observation, release, CLOSED)
             return observation
         raise MotionError(observation)
+
+    def _find_lowering(self, point: Array, upright: Array | None, qpos: Array) -> list[tuple[int, Array]]:
+        """Return poses above the release point from which the TCP can be lowered to it, as `ArmPaths.nearest`."""
+        poses, costs = find_release_poses(point + [0, 0, _LOWERED], upright)
+        found = []
+        for index, above in self._arm.paths.nearest(poses, costs, qpos, 0.5):
+            release = poses[index].copy()
+            release[2, 3] -= _LOWERED
+            if self._arm.paths.straight(above, release, sequential=False) is not None:
+                found.append((index, above))
+            if len(found) == _LOWERINGS:
+                break
+        return found
 
     def _place(self, observation: EpisodeObservation, chosen: Keyframe) -> Motion:
         """Place the held object at a free place of the surface."""

@@ -90,12 +90,15 @@ class FreePaths:
         to_first = self._find_detour if by_rest else self._paths.joint
         return first, to_first(qpos, start_of(first))
 
-    def is_clear(self, path: Array) -> bool:
-        """Return whether the gripper and a held object keep clear of the points on a path (n, 7) from its start on."""
+    def is_clear(self, path: Array, start: float = _START) -> bool:
+        """Return whether the gripper and a held object keep clear of the points on a path (n, 7).
+
+        start: m from the first pose, within which contact is allowed.
+        """
         if not len(self._points) or not len(path):
             return True
         poses = self._paths.chain.tcp(np.concatenate([path[:-1:_CHECKED], path[-1:]]))
-        away = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1) > _START
+        away = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1) >= start
         clear = bool(is_gripper_clear(poses[away], self._points, _CLEARANCE).all())
         if clear and len(self._held) and away.any():
             held = np.concatenate([transform_points(pose, self._held) for pose in poses[away]])

@@ -125,7 +125,7 @@ def _plan_way_out(paths: ArmPaths, qpos: Array, exits: Array, front: Front | Non
     """
     found = []
     for pose in exits:
-        path = paths.straight(qpos, pose, one_by_one=False)
+        path = paths.straight(qpos, pose, sequential=False)
         if path is None:
             break
         found.append(path)
@@ -139,7 +139,7 @@ def _plan_way_out(paths: ArmPaths, qpos: Array, exits: Array, front: Front | Non
         rest = (
             None
             if front.depths(last[0, :3, 3]) <= 0
-            else paths.straight(qpos, front.move_out(last)[0], one_by_one=False)
+            else paths.straight(qpos, front.move_out(last)[0], sequential=False)
         )
         found += [] if rest is None else [rest]
     return np.concatenate(found)
@@ -156,7 +156,7 @@ def _connect(paths: ArmPaths, qpos: Array, poses: list[Array]) -> Array | None:
     """Return straight paths (n, 7) through TCP poses (4, 4), one after another, or None."""
     found = []
     for pose in poses:
-        path = paths.straight(qpos, pose, one_by_one=False)
+        path = paths.straight(qpos, pose, sequential=False)
         if path is None:
             return None
         found.append(path)

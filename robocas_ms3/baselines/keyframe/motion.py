@@ -77,13 +77,13 @@ class ArmPaths:
         self.chain = ArmChain(robot.files().arm_urdf, robot.description)
         self.kinematics = InverseKinematics(self.chain)
 
-    def straight(self, qpos: Array, tcp_in_base: Array, *, one_by_one: bool = True) -> Array | None:
+    def straight(self, qpos: Array, tcp_in_base: Array, *, sequential: bool = True) -> Array | None:
         """Return a straight path (n, 7) from a configuration (7,) to a TCP pose (4, 4), or None.
 
-        one_by_one: see `solve_straight_line`.
+        sequential: see `solve_straight_line`.
         """
         try:
-            return solve_straight_line(self.chain, qpos, tcp_in_base, stage="keyframe", one_by_one=one_by_one)
+            return solve_straight_line(self.chain, qpos, tcp_in_base, stage="keyframe", sequential=sequential)
         except PlanningError:
             return None
 
@@ -208,15 +208,15 @@ class PathFollower:
         speed: fraction of the greatest motions.
 
     Attributes:
-        index: index of the configuration to which the last motion led.
+        index: index of the configuration to which the last motion led, or leads if the arm is far from the path.
     """
 
     def __init__(self, chain: ArmChain, path: Array, control_steps: int, speed: float = 1.0) -> None:
         self._path, self._poses, self.index = path, chain.tcp(path), 0
         self._limits = np.array([_MAX_TRANSLATION, _MAX_ROTATION, _MAX_JOINT_STEP]) * control_steps * speed
         self._halvings, self._before = 0, 0
-        self._start: Array | None = None  # TCP pose before the last motion, and its goal
-        self._goal = self._poses[0]
+        self._start: Array | None = None  # TCP pose before the last motion
+        self._goal = self._poses[0]  # TCP pose after it
 
     @property
     def goal(self) -> Array:
@@ -229,7 +229,7 @@ class PathFollower:
         return self.index == len(self._path) - 1
 
     def next_pose(self, tcp_in_base: Array) -> Array:
-        """Return the farthest TCP pose (4, 4) of the path that the next policy step can reach from a pose (4, 4)."""
+        """Return the farthest TCP pose (4, 4) of the path, or on the way to it, that the next policy step can reach."""
         if self._halvings < _MAX_HALVINGS and self._start is not None and self._has_stayed(self._start, tcp_in_base):
             self._halvings += 1
             self._limits /= 2
@@ -248,6 +248,10 @@ class PathFollower:
             turn = Rotation.from_rotvec(part * Rotation.from_matrix(ahead[0, :3, :3]).as_rotvec())
             self._goal = tcp_in_base @ from_rotation(part * ahead[0, :3, 3], turn.as_matrix())
         return self._goal
+
+    def measure_distance(self, tcp_in_base: Array) -> float:
+        """Return the distance of a pose (4, 4) from the present pose of the path, m."""
+        return float(np.linalg.norm(tcp_in_base[:3, 3] - self._poses[self.index][:3, 3]))
 
     def _has_stayed(self, start: Array, tcp_in_base: Array) -> bool:
         """Return whether less than half of the last motion, from the pose ``start`` (4, 4), was executed."""
