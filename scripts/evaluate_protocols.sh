@@ -7,7 +7,7 @@
 # PROTOCOL  names of protocols (default: all but smoke)
 #
 # After an interruption, run the script again to continue. Results: OUT/POLICY/PROTOCOL, with _ in place of / in POLICY. With
-# one run per task: OUT/POLICY/PROTOCOL/TASK; tasks without a run are left out.
+# one run per task: OUT/POLICY/PROTOCOL/TASK; tasks without a run are left out. In paper-v1, select has the episodes of pick.
 #
 # OUT          folder of the results (default: reproduced/protocols)
 # LEADERBOARD  file of the leaderboard (default: docs/leaderboard/results.json)
@@ -30,17 +30,27 @@ jobs=${JOBS:-$(env -u OMP_NUM_THREADS nproc)}
 robocas=${ROBOCAS:-.venv/bin/robocas}
 command -v "$robocas" >/dev/null || fail "no such command: $robocas. Run bash scripts/setup.sh, or set ROBOCAS."
 
+has_task() {
+    local played=$2
+    [[ $1 == paper-v1 && $2 == select ]] && played=pick
+    grep -q "\"task\":\"$played\"" "robocas_ms3/data/protocols/$1/episodes.jsonl"
+}
+
 add_rows() {
     mkdir -p "$(dirname "$leaderboard")"
     "$robocas" eval leaderboard "$1" --update --out "$leaderboard" >/dev/null
 }
 
+runs=("$policy"/{pick,select,search,open_pick}/run.json)
+for run in "${runs[@]}"; do
+    [[ ! -e $run ]] || per_task=1
+done
 for protocol in "${protocols[@]}"; do
     folder=$out/${policy//\//_}/$protocol
-    if compgen -G "$policy/*/run.json" >/dev/null; then
+    if [[ ${per_task:-} ]]; then
         for task in pick select search open_pick; do
             [[ -e $policy/$task/run.json ]] || continue
-            grep -q "\"task\":\"$task\"" "robocas_ms3/data/protocols/$protocol/episodes.jsonl" || continue
+            has_task "$protocol" "$task" || continue
             evaluate "$folder/$task" "$task" --policy "$policy/$task" --protocol "$protocol"
             add_rows "$folder/$task"
         done

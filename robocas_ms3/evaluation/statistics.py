@@ -90,7 +90,7 @@ def compute_unpaired_interval(a: tuple[int, int], b: tuple[int, int]) -> tuple[f
     """Return Newcombe's 95 % interval of the difference of two independent rates, A - B.
 
     Method 10 of Newcombe, Statistics in Medicine 17 (1998) 873-890, which combines Wilson's intervals of both rates.
-    For runs over the same scenes, `compute_paired_interval` is narrower.
+    For runs over the same scenes, `compute_paired_interval` is usually narrower.
 
     Args:
         a, b: (k, n): k successes of n episodes.

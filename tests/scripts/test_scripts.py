@@ -152,15 +152,16 @@ def test_a_policy_is_evaluated_on_all_protocols(tmp_path):
 def test_the_runs_of_a_baseline_are_evaluated_in_their_tasks(tmp_path):
     settings = {"OUT": str(tmp_path / "out"), "LEADERBOARD": str(tmp_path / "rows.json")}
     runs = tmp_path / "runs"
-    for task in ("pick", "search"):
+    for task in ("pick", "select"):
         (runs / task).mkdir(parents=True)
         (runs / task / "run.json").touch()
-    done, calls = run_with_stub(tmp_path, "evaluate_protocols.sh", str(runs), "paper-v1", "looks-v1", **settings)
+    done, calls = run_with_stub(tmp_path, "evaluate_protocols.sh", str(runs), "paper-v1", "furniture-v1", **settings)
     assert done.returncode == 0, done.stderr
     evaluations = check_shards([call for call in calls if call[1] != "leaderboard"])
     played = [(call[2], *(call[call.index(name) + 1] for name in ("--policy", "--protocol"))) for call in evaluations]
-    pick, search = str(runs / "pick"), str(runs / "search")
-    assert played == [("pick", pick, "paper-v1"), ("search", search, "paper-v1"), ("pick", pick, "looks-v1")]
+    pick, select = str(runs / "pick"), str(runs / "select")
+    paper = [("pick", pick, "paper-v1"), ("select", select, "paper-v1")]  # select has the episodes of pick there
+    assert played == [*paper, ("pick", pick, "furniture-v1")]
     assert len(calls) == 3 * 4  # two shards, their merge, and the rows
 
 

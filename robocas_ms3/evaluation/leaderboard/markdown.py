@@ -13,13 +13,14 @@ _HEADS = (
     *("policy", "track", "task", "split", "n", "success", "RoboCAS-v0's rule", *PAPER_STAGES),
     *("training data", "trained here", "training", "parameters", "notes"),
 )
-_CHANGE, _SUCCESS = f"change from {SEEN}", _HEADS.index("success") + 1
+_CHANGE, _CHANGE_COLUMN = f"change from {SEEN}", _HEADS.index("success") + 1
 NOTE = (
     "Success: success rate in % with its exact 95 % interval. RoboCAS-v0's rule: success rate by the rule of "
     "RoboCAS-v0 after the last step. Trained here: whether the training data has the task, scenes, objects and cameras "
     "of the episodes. Change from seen: difference of the success rate from that of the policy in the split seen, in "
-    "percentage points, with Newcombe's 95 % interval for independent episodes. Compare rows of the same table, task, "
-    "split and track, without notes."
+    "percentage points, with Newcombe's 95 % interval for independent episodes; where splits have equal scenes, "
+    "robocas eval compare has the paired interval. Compare rows of the same table, task, split and track, without "
+    "notes."
 )
 PUBLISHED_NOTE = (
     "Published results are not comparable with the tables above: RoboCAS-v0's evaluator has another rule of success, "
@@ -43,13 +44,13 @@ def render_leaderboard(rows: Sequence[LeaderboardRow]) -> str:
 
 def _render_table(rows: Sequence[LeaderboardRow]) -> Iterator[str]:
     has_seen = any(row.split == SEEN and not row.published for row in rows)
-    heads = (*_HEADS[:_SUCCESS], _CHANGE, *_HEADS[_SUCCESS:]) if has_seen else _HEADS
+    heads = (*_HEADS[:_CHANGE_COLUMN], _CHANGE, *_HEADS[_CHANGE_COLUMN:]) if has_seen else _HEADS
     yield f"| {' | '.join(heads)} |"
     yield "|" + "---|" * len(heads)
     for row in rows:
         cells = _make_cells(row)
         if has_seen:
-            cells.insert(_SUCCESS, _format_change(row, find_seen_row(row, rows)))
+            cells.insert(_CHANGE_COLUMN, _format_change(row, find_seen_row(row, rows)))
         yield f"| {' | '.join(map(escape_markdown, cells))} |"
 
 

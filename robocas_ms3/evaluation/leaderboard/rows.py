@@ -16,7 +16,7 @@ from robocas_ms3.core.strict_model import StrictModel, parse_json
 from robocas_ms3.evaluation.policy import Calibration, Track
 
 SEEN = "seen"
-"""Split with scenes of the training configurations, in protocols with a held-out condition."""
+"""Split with scenes and instructions of the training configurations, in protocols with other splits."""
 Rate = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=0)]
 
