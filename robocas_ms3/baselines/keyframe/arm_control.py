@@ -16,6 +16,8 @@ OPEN, CLOSED = 1.0, 0.0
 """Gripper commands of the convention ``robocas``."""
 PRECISE, COARSE = (0.004, 0.03), (0.02, 0.1)
 """m and rad from the goal at which a motion ends."""
+NEAR_START = (0.008, 0.05)
+"""m and rad from a pre-grasp at which the motion to it ends."""
 _WAIT = 4  # control steps of 0.2 s in which the gripper closes or opens
 _ARRIVED = 0.05  # m from the goal, within which a motion was not stopped
 _FAR, _PROGRESS = 0.03, 0.002  # m from the path, beyond which the arm first moves to it; m per step that are progress

@@ -81,11 +81,12 @@ class FakePerception:
 class FakeArm:
     """Arm that reaches each commanded pose exactly and grasps a block or handle that is between the closed fingers.
 
-    The first ``slips`` grasps of blocks fail. The first ``stops`` motions of a block beyond y = 15 cm are not executed.
+    The first ``slips`` grasps of blocks fail. The first ``stops`` motions of a block to poses that are blocked are not
+    executed.
     """
 
-    def __init__(self, paths, blocks, door=None, slips=0, stops=0):
-        self.slips, self.stops, self.grasps = slips, stops, []
+    def __init__(self, paths, blocks, door=None, slips=0, stops=0, is_blocked=lambda position: position[1] > 0.15):
+        self.slips, self.stops, self.is_blocked, self.grasps = slips, stops, is_blocked, []
         self.paths, self.blocks, self.qpos, self.held, self.door = paths, blocks, REST, None, door
         self.released: list[tuple[str, np.ndarray]] = []
         self.is_closed = False
@@ -105,7 +106,7 @@ class FakeArm:
         goal = self.tcp @ motion
         reachable, found = self.paths.reach(goal[None], self.qpos)
         assert reachable[0]
-        if self.held and self.stops and goal[1, 3] > 0.15:
+        if self.held and self.stops and self.is_blocked(goal[:3, 3]):
             self.stops -= 1
         else:
             self.qpos = found[0]
@@ -147,8 +148,8 @@ def paths():
     return ArmPaths(find_robot(DEFAULT_ROBOT))
 
 
-def play(paths, blocks, request=None, steps=150, door=None, slips=0, stops=0, basket_from=1):
-    arm = FakeArm(paths, blocks, door, slips, stops)
+def play(paths, blocks, request=None, steps=150, door=None, basket_from=1, **arm_options):
+    arm = FakeArm(paths, blocks, door, **arm_options)
     request = request or Request(np.ones(1, np.float32), None)
     rng = np.random.default_rng(0)
     perception = FakePerception(blocks, door, basket_from)
@@ -230,6 +231,7 @@ def test_the_door_is_opened_before_the_target_is_grasped(paths):
     assert door.opening > 0.95
     (name, position), *_ = arm.released
     assert name == "target" and np.linalg.norm(position[:2] - BASKET[:2]) < 0.06
+    assert BASKET[2] < position[2] < BASKET[2] + 0.1  # lowered before the release
 
 
 def test_an_arm_that_is_stopped_before_a_compartment_takes_another_way(paths):
@@ -242,6 +244,14 @@ def test_an_arm_that_is_stopped_before_a_compartment_takes_another_way(paths):
 def test_an_object_without_a_way_to_the_basket_is_put_back(paths, is_front):
     place = np.array([0.62, -0.1])
     arm = play(paths, {"target": place}, door=FakeDoor() if is_front else None, stops=1000, steps=300)
+    (name, position), *_ = arm.released
+    assert name == "target" and np.linalg.norm(position[:2] - place) < 0.03 and position[2] < TABLE + 0.08
+
+
+def test_an_object_that_cannot_leave_the_compartment_is_released_in_place(paths):
+    place = np.array([0.62, -0.1])
+    options = {"stops": 1000, "is_blocked": lambda position: position[0] < 0.5}
+    arm = play(paths, {"target": place}, door=FakeDoor(), steps=300, **options)
     (name, position), *_ = arm.released
     assert name == "target" and np.linalg.norm(position[:2] - place) < 0.03 and position[2] < TABLE + 0.08
 
