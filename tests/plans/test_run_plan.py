@@ -118,7 +118,7 @@ def test_seed_with_damaged_outcome_runs_again(undisturbed, out):
 def test_process_that_crashes_once_loses_no_episode(undisturbed, tmp_path):
     out = tmp_path / "out"
     plan_faults(out, {10: ["crash"], 12: ["grow"], 13: ["bug"], 3: ["hang"]})
-    limits = PLAN.limits.model_copy(update={"record_seconds": 4, "memory_gb": 0.5})
+    limits = PLAN.limits.model_copy(update={"record_seconds": 8, "memory_gb": 0.5})
     run_here(out, PLAN.model_copy(update={"limits": limits}))
     assert_same(undisturbed, out)
     assert crashes_of(out) == [
