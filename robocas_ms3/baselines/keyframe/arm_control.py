@@ -117,11 +117,13 @@ class ArmControl:
             index = follower.index
         return observation
 
-    def find_nearest(self, observation: EpisodeObservation, path: Array) -> tuple[int, float]:
-        """Return the index of the nearest configuration of a path (n, 7) to the TCP, and the distance of its end, m."""
+    def find_nearest(self, observation: EpisodeObservation, path: Array) -> int:
+        """Return the index of the configuration of a path (n, 7) whose TCP is nearest to the present one."""
+        return int(self._measure_distances(observation, path).argmin())
+
+    def _measure_distances(self, observation: EpisodeObservation, path: Array) -> Array:
         positions = self.paths.chain.tcp(path)[:, :3, 3]
-        away = np.linalg.norm(positions - observation.tcp_in_base[:3, 3], axis=1)
-        return int(away.argmin()), float(away[-1])
+        return np.linalg.norm(positions - observation.tcp_in_base[:3, 3], axis=1)
 
     def follow_or_return(
         self,
@@ -134,10 +136,10 @@ class ArmControl:
         """Follow a path; if the arm is stopped before its end, move back to the start and raise MotionError."""
         start = observation.qpos
         observation = yield from self.follow(observation, path, gripper, tolerance, speed)
-        nearest, to_end = self.find_nearest(observation, path)
-        if to_end < _ARRIVED:
+        distances = self._measure_distances(observation, path)
+        if distances[-1] < _ARRIVED:
             return observation
-        back = np.concatenate([path[nearest::-1], start[None]])
+        back = np.concatenate([path[int(distances.argmin()) :: -1], start[None]])
         observation = yield from self.follow(observation, back, gripper, COARSE, speed)
         raise MotionError(observation)
 

@@ -87,7 +87,7 @@ class KeyframeEpisode:
                 frames = list(observation.frames.values())
                 self._memory.basket = self._perception.survey(frames, self._memory.table).basket
             scene = self._perception.observe(observation.frames[self._hand_camera], self._request, self._memory.table)
-            self._memory.map.update(scene.points)
+            self._memory.height_map.update(scene.points)
             target = self._targets.choose([one for one in scene.targets if not self._is_in_basket(one)])
             chosen, without_target = None, without_target + 1
             if target is not None:

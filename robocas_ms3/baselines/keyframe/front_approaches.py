@@ -65,26 +65,26 @@ def plan_front_approaches(
         front: front of the compartment; None: not known.
         is_clear: returns whether a path (n, 7) is clear of obstacles.
     """
-    others = []
+    fallbacks = []
     for index in np.argsort(-scores, kind="stable")[:_MAX_ENTRIES].tolist():
         for grasp in (grasps[index], grasps[index] @ HALF_TURN):
             found = _plan_entry(paths, grasp, qpos, front)
             if found is None:
                 continue
-            assert found.way_back is not None
-            goes_out = _is_outside(paths.chain.tcp(found.way_back[-1:])[0], grasp, front)
-            ways = (_select_outer_part(paths, path, grasp) for path in (found.path[::-1], found.way_back))
+            assert found.exit_path is not None
+            goes_out = _is_outside(paths.chain.tcp(found.exit_path[-1:])[0], grasp, front)
+            ways = (_select_outer_part(paths, path, grasp) for path in (found.path[::-1], found.exit_path))
             if goes_out and all(is_clear(way) for way in ways):
                 yield found
             else:
-                others.append(found)
-    yield from others
+                fallbacks.append(found)
+    yield from fallbacks
 
 
-def _select_outer_part(paths: ArmPaths, way_out: Array, grasp: Array) -> Array:
+def _select_outer_part(paths: ArmPaths, exit_path: Array, grasp: Array) -> Array:
     """Return the part of a path (n, 7) from a grasp (4, 4) outwards that is beyond the pre-grasp."""
-    away = np.linalg.norm(paths.chain.tcp(way_out)[:, :3, 3] - grasp[:3, 3], axis=1)
-    return way_out[away > PREGRASP_DISTANCE]
+    away = np.linalg.norm(paths.chain.tcp(exit_path)[:, :3, 3] - grasp[:3, 3], axis=1)
+    return exit_path[away > PREGRASP_DISTANCE]
 
 
 def _is_outside(end: Array, grasp: Array, front: Front | None) -> bool:
@@ -107,18 +107,18 @@ def _plan_entry(paths: ArmPaths, grasp: Array, qpos: Array, front: Front | None)
         return None
     exits = raised[2:][reachable[4 : -len(starts)]]
     entries = found[-len(starts) :][reachable[-len(starts) :]]
-    ways_in = ((start, _connect(paths, start, [before, grasp])) for start in entries)
-    start, way_in = next(((start, path) for start, path in ways_in if path is not None), (qpos, None))
-    if way_in is None:
+    entry_paths = ((start, _connect(paths, start, [before, grasp])) for start in entries)
+    start, entry_path = next(((start, path) for start, path in entry_paths if path is not None), (qpos, None))
+    if entry_path is None:
         return None
-    lifted = _connect(paths, way_in[-1], list(raised[:2]))
+    lifted = _connect(paths, entry_path[-1], list(raised[:2]))
     if lifted is None:
         return None
-    way_out = _plan_way_out(paths, lifted[-1], exits, front)
-    return None if way_out is None else Approach(grasp, start, way_in, np.concatenate([lifted, way_out]))
+    exit_path = _plan_exit(paths, lifted[-1], exits, front)
+    return None if exit_path is None else Approach(grasp, start, entry_path, np.concatenate([lifted, exit_path]))
 
 
-def _plan_way_out(paths: ArmPaths, qpos: Array, exits: Array, front: Front | None) -> Array | None:
+def _plan_exit(paths: ArmPaths, qpos: Array, exits: Array, front: Front | None) -> Array | None:
     """Return the path (n, 7) through poses (E, 4, 4) on the way out as far as there is one, or None.
 
     If the last pose is not outside, the gripper moves on perpendicularly to the front.
@@ -134,14 +134,11 @@ def _plan_way_out(paths: ArmPaths, qpos: Array, exits: Array, front: Front | Non
             break
     if not found:
         return None
-    if front is not None:
-        last = paths.chain.tcp(qpos[None])
-        rest = (
-            None
-            if front.depths(last[0, :3, 3]) <= 0
-            else paths.straight(qpos, front.move_out(last)[0], sequential=False)
-        )
-        found += [] if rest is None else [rest]
+    last = paths.chain.tcp(qpos[None])[0]
+    if front is not None and front.depths(last[:3, 3]) > 0:
+        outwards = paths.straight(qpos, front.move_out(last[None])[0], sequential=False)
+        if outwards is not None:
+            found.append(outwards)
     return np.concatenate(found)
 
 

@@ -39,13 +39,13 @@ class Approach:
         grasp: (4, 4) TCP pose of the grasp in the arm's base frame.
         start: (7,) configuration at the pre-grasp, rad.
         path: (n, 7) straight path from the pre-grasp to the grasp, rad.
-        way_back: (n, 7) path with the object out of a compartment; None: upwards.
+        exit_path: (n, 7) path with the object out of a compartment; None: upwards.
     """
 
     grasp: Array
     start: Array
     path: Array
-    way_back: Array | None = None
+    exit_path: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,8 @@ class PathFollower:
         speed: fraction of the greatest motions.
 
     Attributes:
-        index: index of the configuration to which the last motion led, or leads if the arm is far from the path.
+        index: index of the configuration to which the last motion led. If the arm is far from the path, it still moves
+            to this configuration.
     """
 
     def __init__(self, chain: ArmChain, path: Array, control_steps: int, speed: float = 1.0) -> None:

@@ -49,7 +49,7 @@ class Memory:
         focus: (2,) place that the next view shows, m.
         basket: (3,) middle of the basket in x and y, and the height of its rim, m; None: not seen.
         is_front: whether objects have to be grasped from the front.
-        map: observed heights.
+        height_map: observed heights.
         failed: TCP poses (4, 4) of failed grasps.
     """
 
@@ -57,7 +57,7 @@ class Memory:
     focus: Array = field(default_factory=lambda: np.array([0.6, 0.0]))
     basket: Array | None = None
     is_front: bool = False
-    map: HeightMap = field(default_factory=HeightMap)
+    height_map: HeightMap = field(default_factory=HeightMap)
     failed: list[Array] = field(default_factory=list)
 
 
@@ -87,7 +87,7 @@ class ObjectMotions:
         """Grasp and lift; return the last observation, and whether the gripper holds something."""
         approach, arm, holds = chosen.approach, self._arm, False
         try:
-            if approach.way_back is None or chosen.path is None:
+            if approach.exit_path is None or chosen.path is None:
                 observation = yield from arm.rise(observation, chosen.safe_height, OPEN)
                 observation = yield from arm.move_joints(observation, approach.start, OPEN, NEAR_START)
                 observation = yield from arm.move_straight(observation, approach.grasp, OPEN)
@@ -97,7 +97,7 @@ class ObjectMotions:
                 observation = yield from arm.follow(observation, chosen.path, OPEN, NEAR_START)
                 observation = yield from arm.follow_or_return(observation, approach.path, OPEN)
                 observation = yield from arm.wait(observation, CLOSED)
-                observation = yield from self._leave(observation, approach.way_back)
+                observation = yield from self._leave(observation, approach.exit_path)
             holds = observation.width >= _EMPTY
         except MotionError as error:
             observation = error.observation
@@ -106,19 +106,19 @@ class ObjectMotions:
             self._memory.failed.append(approach.grasp)
         return observation, holds
 
-    def _leave(self, observation: EpisodeObservation, way_back: Array) -> Motion:
+    def _leave(self, observation: EpisodeObservation, exit_path: Array) -> Motion:
         """Leave a compartment with the grasped object; release it and raise MotionError if the arm is stopped."""
         try:
-            return (yield from self._arm.follow_or_return(observation, way_back, CLOSED, speed=_COMPARTMENT_SPEED))
+            return (yield from self._arm.follow_or_return(observation, exit_path, CLOSED, speed=_COMPARTMENT_SPEED))
         except MotionError as error:
-            observation = yield from self._release_and_leave(error.observation, way_back)
+            observation = yield from self._release_and_leave(error.observation, exit_path)
             raise MotionError(observation) from error
 
-    def _release_and_leave(self, observation: EpisodeObservation, way_back: Array) -> Motion:
+    def _release_and_leave(self, observation: EpisodeObservation, exit_path: Array) -> Motion:
         """Open the gripper in a compartment, and leave it from the present place on."""
         observation = yield from self._arm.wait(observation, OPEN)
-        nearest, _ = self._arm.find_nearest(observation, way_back)
-        return (yield from self._arm.follow(observation, way_back[nearest:], OPEN))
+        nearest = self._arm.find_nearest(observation, exit_path)
+        return (yield from self._arm.follow(observation, exit_path[nearest:], OPEN))
 
     def move(
         self,
@@ -137,13 +137,13 @@ class ObjectMotions:
             observation = error.observation
             _log.debug("no path for a held object")
             self._memory.failed.append(approach.grasp)
-            if approach.way_back is None:
+            if approach.exit_path is None:
                 with suppress(MotionError):
                     observation = yield from self._arm.move_straight(observation, approach.grasp, CLOSED)
             else:
-                way_in = approach.way_back[::-1]
-                observation = yield from self._arm.follow(observation, way_in, CLOSED, speed=_COMPARTMENT_SPEED)
-                return (yield from self._release_and_leave(observation, approach.way_back))
+                back = approach.exit_path[::-1]
+                observation = yield from self._arm.follow(observation, back, CLOSED, speed=_COMPARTMENT_SPEED)
+                return (yield from self._release_and_leave(observation, approach.exit_path))
         return (yield from self._arm.wait(observation, OPEN))
 
     def carry(self, observation: EpisodeObservation, chosen: Keyframe) -> Motion:
@@ -196,7 +196,8 @@ class ObjectMotions:
             goals[:, 2, 3] -= _LOWERED
             for index, above in paths.nearest(poses, costs, qpos, 0.5):
                 down = paths.straight(above, goals[index], sequential=False)
-                lines += [] if down is None else [_Release(above, down)]
+                if down is not None:
+                    lines.append(_Release(above, down))
                 if len(lines) == _LOWERINGS:
                     break
             if lines:
@@ -210,7 +211,9 @@ class ObjectMotions:
         avoid = [(self._memory.focus, _TARGET_GAP)]
         if self._memory.basket is not None:
             avoid.append((self._memory.basket[:2], _BASKET_GAP))
-        for place in self._memory.map.find_free_places(self._memory.table, observation.tcp_in_base[:2, 3], avoid):
+        for place in self._memory.height_map.find_free_places(
+            self._memory.table, observation.tcp_in_base[:2, 3], avoid
+        ):
             for turn in np.arange(-np.pi, np.pi, np.pi / 4):
                 rotation = Rotation.from_euler("z", turn).as_matrix() @ chosen.approach.grasp[:3, :3]
                 poses.append(from_rotation([*place, self._memory.table + chosen.hanging + _DROP], rotation))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from robocas_ms3.baselines.keyframe.arm_control import OPEN, ArmControl, EpisodeObservation
 from robocas_ms3.baselines.keyframe.free_paths import FreePaths
 from robocas_ms3.baselines.keyframe.front_approaches import Front, plan_front_approaches
 from robocas_ms3.baselines.keyframe.handles import Handle
@@ -60,6 +61,24 @@ def test_a_follower_reaches_the_end_of_a_path_in_limited_steps(paths):
         steps += 1
     assert np.allclose(qpos, goal) and 2 <= steps <= 20
     assert np.allclose(follower.goal, poses[-1])
+
+
+def test_a_distant_path_is_approached_in_limited_steps_and_then_followed(paths):
+    start = REST + [-0.8, 0, 0, 0, 0, 0, 0]
+    path = paths.joint(REST + [0.2, 0, 0, 0, 0, 0, 0], REST + [0.6, 0, 0, 0, 0, 0, 0])
+    here = paths.chain.tcp(start[None])[0]
+    observation = EpisodeObservation(here, start, 0.08, {})
+    motion = ArmControl(paths, 1).follow(observation, path, OPEN, speed=0.5)
+    command, sizes = next(motion), []
+    with pytest.raises(StopIteration) as ended:
+        while True:
+            sizes.append(np.abs(command.action[:3]).max())
+            turn = Rotation.from_euler("xyz", command.action[3:6]).as_matrix()
+            here = here @ from_rotation(command.action[:3], turn)  # the arm reaches each pose
+            command = motion.send(EpisodeObservation(here, start, 0.08, {}))
+    end = paths.chain.tcp(path[-1:])[0, :3, 3]
+    assert np.linalg.norm(ended.value.value.tcp_in_base[:3, 3] - end) < 0.004
+    assert len(sizes) > 8 and max(sizes) < 0.05
 
 
 def test_motions_that_the_controller_refuses_are_shortened(paths):
@@ -142,10 +161,10 @@ def test_front_approach_enters_and_leaves_a_compartment(paths):
         plan_front_approaches(paths, np.stack([far, grasp]), np.array([0.9, 0.5]), REST, None, lambda path: True)
     )
     assert np.allclose(found.grasp[:3, 3], grasp[:3, 3])
-    outside, inside, after = paths.chain.tcp(np.stack([found.start, found.path[-1], found.way_back[-1]]))
+    outside, inside, after = paths.chain.tcp(np.stack([found.start, found.path[-1], found.exit_path[-1]]))
     assert np.allclose(inside, found.grasp, atol=1e-3)
     assert outside[0, 3] < 0.65 - 0.15 and after[0, 3] < 0.65 - 0.15  # 6 cm or more before the pre-grasp
-    heights = paths.chain.tcp(found.way_back)[:, 2, 3]
+    heights = paths.chain.tcp(found.exit_path)[:, 2, 3]
     assert heights.min() > 0.199 and after[2, 3] == pytest.approx(outside[2, 3] + 0.025, abs=1e-3)
 
 
@@ -163,7 +182,7 @@ def test_the_way_out_of_a_compartment_ends_before_its_front(paths):
     closing = np.array([0.8, -0.6, 0.0])
     grasp = from_rotation([0.62, 0.05, 0.2], np.stack([np.cross(closing, approach), closing, approach], axis=1))
     front = Front(np.array([0.32, 0, 0]), np.array([1.0, 0, 0]))
-    ends = [next(plan_approaches(paths, [grasp], of)).way_back[-1] for of in (None, front)]
+    ends = [next(plan_approaches(paths, [grasp], of)).exit_path[-1] for of in (None, front)]
     inside, outside = paths.chain.tcp(np.stack(ends))[:, 0, 3]
     assert inside > 0.38 and outside == pytest.approx(0.32, abs=1e-3)
 

@@ -81,12 +81,13 @@ class FakePerception:
 class FakeArm:
     """Arm that reaches each commanded pose exactly and grasps a block or handle that is between the closed fingers.
 
-    The first ``slips`` grasps of blocks fail. The first ``stops`` motions of a block to poses that are blocked are not
-    executed.
+    The first ``slips`` grasps of blocks fail. The first ``stops`` motions to positions that are blocked are not executed
+    (``is_blocked(position, name of the held block or None)``).
     """
 
-    def __init__(self, paths, blocks, door=None, slips=0, stops=0, is_blocked=lambda position: position[1] > 0.15):
+    def __init__(self, paths, blocks, door=None, slips=0, stops=0, is_blocked=lambda at, held: held and at[1] > 0.15):
         self.slips, self.stops, self.is_blocked, self.grasps = slips, stops, is_blocked, []
+        self.trace: list[tuple[np.ndarray, float]] = []  # TCP pose and gripper command of each step
         self.paths, self.blocks, self.qpos, self.held, self.door = paths, blocks, REST, None, door
         self.released: list[tuple[str, np.ndarray]] = []
         self.is_closed = False
@@ -106,7 +107,9 @@ class FakeArm:
         goal = self.tcp @ motion
         reachable, found = self.paths.reach(goal[None], self.qpos)
         assert reachable[0]
-        if self.held and self.stops and self.is_blocked(goal[:3, 3]):
+        self.trace.append((self.tcp, command.action[6]))
+        is_stuck = self.door is not None and self.door.is_stuck(goal[:3, 3], command.action[6] == CLOSED)
+        if is_stuck or (self.stops and self.is_blocked(goal[:3, 3], self.held)):
             self.stops -= 1
         else:
             self.qpos = found[0]
@@ -129,12 +132,18 @@ class FakeArm:
 
 
 class FakeDoor:
-    """Door that follows a closed gripper at its handle."""
+    """Door that follows a closed gripper at its handle, up to an end stop."""
 
-    def __init__(self):
+    def __init__(self, end=1.0):
+        self.end = end
         ends = np.array([0.45, -0.27, 0.2]), np.array([0.0, 0.4, 0.0])
         self.handle = Handle(*ends, np.array([1.0, 0, 0]), np.array([0, 0, 1.0]))
         self.opening, self.is_held = 0.0, False
+
+    def is_stuck(self, position, closed):
+        """Return whether the gripper would pull the door beyond its end stop."""
+        opening = (position - self.handle.position) @ self.handle.motion / 0.4**2
+        return closed and self.is_held and opening > self.end + 1e-6
 
     def follow(self, position, closed):
         here = self.handle.position + self.opening * self.handle.motion
@@ -250,7 +259,7 @@ def test_an_object_without_a_way_to_the_basket_is_put_back(paths, is_front):
 
 def test_an_object_that_cannot_leave_the_compartment_is_released_in_place(paths):
     place = np.array([0.62, -0.1])
-    options = {"stops": 1000, "is_blocked": lambda position: position[0] < 0.5}
+    options = {"stops": 1000, "is_blocked": lambda at, held: held and at[0] < 0.5}
     arm = play(paths, {"target": place}, door=FakeDoor(), steps=300, **options)
     (name, position), *_ = arm.released
     assert name == "target" and np.linalg.norm(position[:2] - place) < 0.03 and position[2] < TABLE + 0.08
@@ -271,6 +280,34 @@ def test_an_open_door_is_not_pulled_again_while_objects_are_seen(paths):
             door.handle, door.opening = replace(door.handle, motion=-door.handle.motion), 0.0  # as if it were closed
             closed.append(step)
     assert closed and perception.surveys > 2 and door.opening == 0.0
+    assert perception.surveys - 2 == -(-perception.views // 3)  # the first view without the target, and every third one
+
+
+def test_a_gripper_that_is_stopped_on_the_way_to_a_grasp_does_not_close(paths):
+    arm = FakeArm(paths, {"target": np.array([0.62, -0.1])}, stops=1000, is_blocked=lambda at, held: at[0] > 0.48)
+    perception, request = FakePerception(arm.blocks, FakeDoor()), Request(np.ones(1, np.float32), None)
+    perception.door.opening = 1.0  # nothing to pull
+    control, rng = ArmControl(paths, 1), np.random.default_rng(0)
+    arm.qpos = paths.reach(from_rotation([0.4, 0.0, 0.3], paths.chain.tcp(REST[None])[0, :3, :3])[None], REST)[1][0]
+    run = KeyframeEpisode(perception, control, CONFIG.decisions, request, rng, "gripper_camera").run(arm.view(True))
+    command = next(run)
+    for _ in range(200):
+        command = run.send(arm.step(command))
+    assert arm.stops < 1000 and all(gripper == OPEN for _, gripper in arm.trace)
+
+
+def test_the_gripper_retreats_from_the_place_where_a_pull_has_ended(paths):
+    """The pull stops 8 cm before its planned end. A retreat from there would drag the handle."""
+    arm = play(paths, {}, door=FakeDoor(end=0.8), steps=60)
+    grippers = [gripper for _, gripper in arm.trace]
+    first = grippers.index(CLOSED)
+    opened = first + grippers[first:].index(OPEN)
+    released = arm.trace[opened][0]
+    after = [tcp for tcp, gripper in arm.trace[opened:] if gripper == OPEN]
+    distances = [np.linalg.norm(tcp[:3, 3] - released[:3, 3]) for tcp in after]
+    retreat = np.array([tcp[:3, 3] for tcp, far in zip(after, distances, strict=True) if far < 0.06][:8])
+    sideways = np.linalg.norm(np.cross(retreat - released[:3, 3], released[:3, 2]), axis=1)
+    assert max(distances) > 0.06 and arm.door.opening == pytest.approx(0.8, abs=0.1) and sideways.max() < 0.005
 
 
 def observe_with_images(envs):
