@@ -81,7 +81,7 @@ class FakePerception:
 class FakeArm:
     """Arm that reaches each commanded pose exactly and grasps a block or handle that is between the closed fingers.
 
-    The first ``slips`` grasps of blocks fail. The first ``stops`` motions to positions that are blocked are not executed
+    The first ``slips`` grasps of blocks fail. The first ``stops`` motions to blocked positions are not executed
     (``is_blocked(position, name of the held block or None)``).
     """
 
