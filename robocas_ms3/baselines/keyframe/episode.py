@@ -39,7 +39,6 @@ _IN_BASKET = 0.14  # m from the middle of the basket, within which an object is 
 _SURVEY_INTERVAL = 3  # from one survey to the next, in views of a compartment without the target
 _MAX_OBSTACLES = 5  # obstacles for which grasps are computed per decision
 _MAX_PULLS, _PULL_SPEED = 4, 0.3  # pulls per episode; fraction of the limits
-_MIN_PULL = 0.08  # m, length of a pull below which a door or drawer is open
 _FRONT_VIEWS_DEG = (40, 30, 50, 20)  # elevations of the gripper camera before a compartment, degrees
 _log = logging.getLogger(__name__)
 
@@ -202,7 +201,7 @@ class KeyframeEpisode:
     def _open_compartment(self, observation: EpisodeObservation) -> Motion:
         """Pull the handle until the door or drawer is open; then survey the scene again."""
         arm = self._arm
-        while self._handle is not None and np.linalg.norm(self._handle.motion) > _MIN_PULL and self._pulls < _MAX_PULLS:
+        while self._handle is not None and self._handle.opens and self._pulls < _MAX_PULLS:
             handle, self._handle = self._handle, None
             self._pulls += 1
             pulls = arm.paths.plan_pulls(handle, observation.qpos)

@@ -12,6 +12,9 @@ from robocas_ms3.demos.candidates.tables import Arrays
 
 Array = NDArray[np.float64]
 _BAR_RADIUS, _BAR_HALF_LENGTH = 0.025, 0.08  # m from the axis of the bar, and along it from the grasp
+_MIN_PULL = 0.08  # m, length of a motion below which a door or drawer is open
+_MIN_NORM, _MAX_COSINE = 0.8, 0.3  # of approach and bar, which cells predict independently of each other
+_MAX_SLOPE = 0.3  # vertical part of the motion of a door or drawer
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,22 @@ class Handle:
         x = self.bar - z * (z @ self.bar)
         x /= np.linalg.norm(x)
         return from_rotation(self.position, np.stack([x, np.cross(z, x), z], axis=1))
+
+    @property
+    def opens(self) -> bool:
+        """Whether the motion of a predicted handle can open a door or drawer.
+
+        It is horizontal and long enough, and approach and bar are perpendicular. If the cells of a handle contradict
+        each other, their median is shorter than a unit vector: then it is an edge, or something else.
+        """
+        norms = np.array([np.linalg.norm(self.approach), np.linalg.norm(self.bar)])
+        length = np.linalg.norm(self.motion)
+        return bool(
+            length > _MIN_PULL
+            and abs(self.motion[2]) <= _MAX_SLOPE * length
+            and norms.min() >= _MIN_NORM
+            and abs(self.approach @ self.bar) <= _MAX_COSINE * norms.prod()
+        )
 
     def contains(self, points: Array) -> NDArray[np.bool_]:
         """Return which points (..., 3) are on the bar near the grasp, up to 2.5 cm from its axis."""

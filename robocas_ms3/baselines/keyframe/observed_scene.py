@@ -17,10 +17,10 @@ _MAX_VOTES = 1200  # cells of an object that vote
 _FARTHEST_VOTE = 2.0  # radii from the centre, beyond which a vote belongs to another object
 _ALONG_VIEW = 0.15  # factor of distances along the view
 _LEAST_SHARE = 0.1  # of the votes of the largest group; smaller groups are errors
-_SUPPORT_RANGE = (-0.12, 0.02)  # m from the lowest visible point of the objects, which may be the top of an object
+_ABOVE_SUPPORT = 0.12  # m above a surface, within which points of objects on it are counted
 _BELOW = 0.02  # m below a camera, from which it sees the upper side of a surface
 _TABLE_THICKNESS = 0.02  # m below the height of a surface, within which points are on it
-_SUPPORT_MARGIN, _SUPPORT_POINTS = 0.1, 100  # m around the objects; least number of points on their support
+_SUPPORT_MARGIN, _SUPPORT_POINTS = 0.1, 100  # m around the objects; least number of points at its height
 
 
 def unproject(
@@ -65,23 +65,28 @@ def is_above_table(points: Array, table: float) -> NDArray[np.bool_]:
 
 
 def find_table_height(others: Array, objects: Array) -> float:
-    """Return the height of the surface on which objects stand, m: the commonest height of points around and below them.
+    """Return the height of the surface on which objects stand, m.
+
+    It is the height with the greatest product of the numbers of surface points at it and of object points closely above
+    it, so that a few wrong object points elsewhere do not change it.
 
     Args:
         others: (P, 3) points on no object and below the camera (`is_below_camera`), m.
         objects: (Q, 3) points on objects, m; without objects, the commonest height of all points is returned.
     """
-    heights = others[:, 2]
-    if len(objects):
-        bottom = np.percentile(objects[:, 2], 2)
-        low_xy, high_xy = objects[:, :2].min(axis=0) - _SUPPORT_MARGIN, objects[:, :2].max(axis=0) + _SUPPORT_MARGIN
-        around = ((others[:, :2] > low_xy) & (others[:, :2] < high_xy)).all(axis=1)
-        heights = heights[around & (heights > bottom + _SUPPORT_RANGE[0]) & (heights < bottom + _SUPPORT_RANGE[1])]
-        if len(heights) < _SUPPORT_POINTS:
-            return float(bottom)
     low, high, bins = _TABLE_BINS
-    counts, edges = np.histogram(heights, bins=bins, range=(low, high))
-    return float(edges[counts.argmax()] + (high - low) / bins / 2)
+    if len(objects):
+        low_xy, high_xy = objects[:, :2].min(axis=0) - _SUPPORT_MARGIN, objects[:, :2].max(axis=0) + _SUPPORT_MARGIN
+        others = others[((others[:, :2] > low_xy) & (others[:, :2] < high_xy)).all(axis=1)]
+    counts, edges = np.histogram(others[:, 2], bins=bins, range=(low, high))
+    if not len(objects):
+        return float(edges[counts.argmax()] + (high - low) / bins / 2)
+    heights = np.sort(objects[:, 2])
+    above = np.searchsorted(heights, edges[:-1] + _ABOVE_SUPPORT) - np.searchsorted(heights, edges[:-1])
+    scores = np.where(counts < _SUPPORT_POINTS, 0, counts * above)
+    if not scores.any():
+        return float(np.percentile(heights, 2))
+    return float(edges[scores.argmax()] + (high - low) / bins / 2)
 
 
 def cluster_votes(votes: Array, min_votes: int, radius: float) -> list[NDArray[np.int64]]:

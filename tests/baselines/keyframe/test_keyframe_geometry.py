@@ -89,6 +89,15 @@ def test_the_table_is_below_the_objects():
     assert find_table_height(others[:950], objects) == pytest.approx(0.2, abs=0.01)  # too few points: the lowest ones
 
 
+def test_wrong_object_points_below_the_table_do_not_change_its_height():
+    """A third of the object points are on the front of a cabinet, whose points have all heights."""
+    others = np.zeros((6000, 3))
+    others[:, 2] = np.concatenate([np.full(1000, 0.4), np.linspace(-0.1, 0.4, 5000)])
+    objects = np.zeros((150, 3))
+    objects[:, 2] = np.concatenate([np.linspace(0.405, 0.5, 100), np.linspace(0.1, 0.4, 50)])
+    assert find_table_height(others, objects) == pytest.approx(0.4, abs=0.004)
+
+
 def test_a_camera_sees_the_upper_side_below_it():
     camera = np.eye(4)
     camera[2, 3] = 0.3
