@@ -22,7 +22,7 @@ from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.scenes.config import load_task_config
 
-KEYFRAME = ("keyframe", "keyframe-upstream-eval")
+KEYFRAME = ("keyframe", "keyframe-upstream", "keyframe-upstream-eval")
 
 
 @pytest.mark.parametrize(("name", "baseline"), [("small", "small"), *((name, "keyframe") for name in KEYFRAME)])
