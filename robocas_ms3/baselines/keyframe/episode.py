@@ -201,7 +201,7 @@ class KeyframeEpisode:
     def _open_compartment(self, observation: EpisodeObservation) -> Motion:
         """Pull the handle until the door or drawer is open; then survey the scene again."""
         arm = self._arm
-        while self._handle is not None and self._handle.opens and self._pulls < _MAX_PULLS:
+        while self._handle is not None and self._handle.can_be_pulled and self._pulls < _MAX_PULLS:
             handle, self._handle = self._handle, None
             self._pulls += 1
             pulls = arm.paths.plan_pulls(handle, observation.qpos)

@@ -42,17 +42,19 @@ class Handle:
         return from_rotation(self.position, np.stack([x, np.cross(z, x), z], axis=1))
 
     @property
-    def opens(self) -> bool:
-        """Whether the motion of a predicted handle can open a door or drawer.
+    def can_be_pulled(self) -> bool:
+        """Whether a predicted handle has a motion that may open a door or drawer.
 
-        It is horizontal and long enough, and approach and bar are perpendicular. If the cells of a handle contradict
-        each other, their median is shorter than a unit vector: then it is an edge, or something else.
+        The motion is horizontal, at least 8 cm long, and does not point into the furniture. Approach and bar are
+        perpendicular, and nearly unit vectors: medians over cells that contradict each other are shorter. Hinged doors
+        are not told apart.
         """
-        norms = np.array([np.linalg.norm(self.approach), np.linalg.norm(self.bar)])
         length = np.linalg.norm(self.motion)
+        norms = np.array([np.linalg.norm(self.approach), np.linalg.norm(self.bar)])
         return bool(
             length > _MIN_PULL
             and abs(self.motion[2]) <= _MAX_SLOPE * length
+            and self.motion @ self.approach <= _MAX_COSINE * length * norms[0]
             and norms.min() >= _MIN_NORM
             and abs(self.approach @ self.bar) <= _MAX_COSINE * norms.prod()
         )

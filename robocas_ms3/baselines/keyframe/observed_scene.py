@@ -17,10 +17,11 @@ _MAX_VOTES = 1200  # cells of an object that vote
 _FARTHEST_VOTE = 2.0  # radii from the centre, beyond which a vote belongs to another object
 _ALONG_VIEW = 0.15  # factor of distances along the view
 _LEAST_SHARE = 0.1  # of the votes of the largest group; smaller groups are errors
-_ABOVE_SUPPORT = 0.12  # m above a surface, within which points of objects on it are counted
+_ABOVE_SUPPORT = (0.008, 0.12)  # m above a surface, within which points are on objects that stand on it
 _BELOW = 0.02  # m below a camera, from which it sees the upper side of a surface
 _TABLE_THICKNESS = 0.02  # m below the height of a surface, within which points are on it
-_SUPPORT_MARGIN, _SUPPORT_POINTS = 0.1, 100  # m around the objects; least number of points at its height
+_SUPPORT_MARGIN = 0.1  # m around the objects
+_SUPPORT_POINTS, _LARGE_SUPPORT = 100, 300  # least number of points on a surface; number on a large one
 
 
 def unproject(
@@ -67,8 +68,9 @@ def is_above_table(points: Array, table: float) -> NDArray[np.bool_]:
 def find_table_height(others: Array, objects: Array) -> float:
     """Return the height of the surface on which objects stand, m.
 
-    It is the height with the greatest product of the numbers of surface points at it and of object points closely above
-    it, so that a few wrong object points elsewhere do not change it.
+    It is the height with the most object points up to 12 cm above it, weighted by s / (s + 300) for s surface points at
+    this height. Objects on several layers: the height of the layer with the most object points. Too few surface points
+    at all heights: the 2nd percentile of the heights of the object points.
 
     Args:
         others: (P, 3) points on no object and below the camera (`is_below_camera`), m.
@@ -76,14 +78,16 @@ def find_table_height(others: Array, objects: Array) -> float:
     """
     low, high, bins = _TABLE_BINS
     if len(objects):
-        low_xy, high_xy = objects[:, :2].min(axis=0) - _SUPPORT_MARGIN, objects[:, :2].max(axis=0) + _SUPPORT_MARGIN
-        others = others[((others[:, :2] > low_xy) & (others[:, :2] < high_xy)).all(axis=1)]
+        low_xy, high_xy = np.percentile(objects[:, :2], [2, 98], axis=0)
+        near = (others[:, :2] > low_xy - _SUPPORT_MARGIN) & (others[:, :2] < high_xy + _SUPPORT_MARGIN)
+        others = others[near.all(axis=1)]
     counts, edges = np.histogram(others[:, 2], bins=bins, range=(low, high))
     if not len(objects):
         return float(edges[counts.argmax()] + (high - low) / bins / 2)
     heights = np.sort(objects[:, 2])
-    above = np.searchsorted(heights, edges[:-1] + _ABOVE_SUPPORT) - np.searchsorted(heights, edges[:-1])
-    scores = np.where(counts < _SUPPORT_POINTS, 0, counts * above)
+    least, greatest = (np.searchsorted(heights, edges[:-1] + height) for height in _ABOVE_SUPPORT)
+    is_surface = counts >= _SUPPORT_POINTS
+    scores = is_surface * counts / (counts + _LARGE_SUPPORT) * (greatest - least)
     if not scores.any():
         return float(np.percentile(heights, 2))
     return float(edges[scores.argmax()] + (high - low) / bins / 2)

@@ -252,9 +252,13 @@ def _find_basket(points: Array) -> Array | None:
 
 
 def _find_handle(cells: Array) -> Handle | None:
-    """Return the handle from the predictions (C, 4, 3) of its cells: grasp, motion, approach and bar; or None."""
+    """Return a handle from the predictions (C, 4, 3) of its cells: grasp, motion, approach and bar; or None.
+
+    Of several handles, it is the largest one that can be pulled, or else the largest one.
+    """
     groups = cluster_votes(cells[:, 0], _MIN_HANDLE_CELLS, WIDE_RADIUS)
-    return Handle(*np.median(cells[groups[0]], axis=0)) if groups else None
+    handles = [Handle(*np.median(cells[group], axis=0)) for group in groups]
+    return next((handle for handle in handles if handle.can_be_pulled), handles[0] if handles else None)
 
 
 def _enlarge(cells: NDArray[np.float32], size: tuple[int, ...]) -> NDArray[np.float32]:

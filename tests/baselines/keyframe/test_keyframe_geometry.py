@@ -98,6 +98,22 @@ def test_wrong_object_points_below_the_table_do_not_change_its_height():
     assert find_table_height(others, objects) == pytest.approx(0.4, abs=0.004)
 
 
+@pytest.mark.parametrize("wrong", [0.45, 0.5])
+def test_wrong_object_points_on_and_above_a_board_do_not_change_the_height_of_the_table(wrong):
+    """Wrong object points are on a larger board above the objects, or 5 cm above it."""
+    others, objects = np.zeros((4300, 3)), np.zeros((560, 3))
+    others[:, 2] = np.concatenate([np.full(300, 0.12), np.full(4000, 0.45)])
+    objects[:, 2] = np.concatenate([np.linspace(0.125, 0.22, 500), np.full(60, wrong)])
+    assert find_table_height(others, objects) == pytest.approx(0.12, abs=0.004)
+
+
+def test_of_two_layers_the_one_with_the_most_object_points_is_the_table():
+    others, objects = np.zeros((1200, 3)), np.zeros((700, 3))
+    others[:, 2] = np.concatenate([np.full(500, 0.1), np.full(700, 0.4)])
+    objects[:, 2] = np.concatenate([np.linspace(0.11, 0.2, 400), np.linspace(0.41, 0.5, 300)])
+    assert find_table_height(others, objects) == pytest.approx(0.1, abs=0.004)
+
+
 def test_a_camera_sees_the_upper_side_below_it():
     camera = np.eye(4)
     camera[2, 3] = 0.3

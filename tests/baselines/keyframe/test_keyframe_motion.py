@@ -148,7 +148,7 @@ def test_a_pull_out_of_reach_is_as_long_as_possible(paths):
 
 
 @pytest.mark.parametrize(
-    ("motion", "approach", "bar", "opens"),
+    ("motion", "approach", "bar", "expected"),
     [
         ((0, 0.5, 0.03), (0.97, 0.1, 0), (0, 0.06, 0.97), True),  # a sliding door
         ((-0.3, 0, 0), (1, 0, 0), (0, 1, 0), True),  # a drawer
@@ -156,11 +156,12 @@ def test_a_pull_out_of_reach_is_as_long_as_possible(paths):
         ((0.03, 0, 0.34), (1, 0, 0), (0, 0, 1), False),  # upwards
         ((0.4, 0, 0.1), (0.54, 0.23, -0.38), (0.11, -0.18, 0.95), False),  # short: cells contradict each other
         ((0, 0.5, 0), (1, 0, 0), (0.6, 0, 0.8), False),  # no grasp across the bar
+        ((0.4, 0, 0), (1, 0, 0), (0, 0, 1), False),  # into the furniture
     ],
 )
-def test_a_handle_opens_if_its_prediction_is_consistent(motion, approach, bar, opens):
+def test_a_handle_can_be_pulled_if_its_prediction_is_consistent(motion, approach, bar, expected):
     vectors = [np.array(vector, dtype=float) for vector in (motion, approach, bar)]
-    assert Handle(np.array([0.5, 0.1, 0.2]), *vectors).opens is opens
+    assert Handle(np.array([0.5, 0.1, 0.2]), *vectors).can_be_pulled is expected
 
 
 def plan_approaches(paths, grasps, front=None, is_clear=lambda path: True):
