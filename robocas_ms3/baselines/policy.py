@@ -30,12 +30,12 @@ def shipped_keyframe() -> RunPolicy:
 
 
 def shipped_keyframe_upstream() -> RunPolicy:
-    """Make the policy `keyframe` with the bundled weights of the scenes of RoboCAS-v0's data."""
+    """Make the policy `keyframe` with the bundled weights trained in the scenes of RoboCAS-v0's data."""
     return RunPolicy(BUNDLED / "keyframe-upstream")
 
 
 def shipped_keyframe_upstream_eval() -> RunPolicy:
-    """Make the policy `keyframe` with the bundled weights of the scenes of RoboCAS-v0's evaluation."""
+    """Make the policy `keyframe` with the bundled weights trained in the scenes of RoboCAS-v0's evaluation."""
     return RunPolicy(BUNDLED / "keyframe-upstream-eval")
 
 

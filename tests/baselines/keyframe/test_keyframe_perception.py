@@ -92,13 +92,26 @@ def test_cells_behind_the_outline_of_the_basket_do_not_move_it():
 
 def test_survey_before_a_door():
     scene = make_scene()
-    cells = scene.add(HANDLE, (0.45, 0.5), (-0.3, -0.25), TABLE + 0.05, end=[0.48, -0.28, 0.13])
-    vectors = np.array([[0.0, 0.5, 0.0], [1.0, 0, 0], [0, 0, 1.0]]) / [[PULL_UNIT], [1], [1]]
-    scene.pulls[cells] = (vectors @ DOWN[:3, :3]).ravel()
+    add_handle(scene, (-0.3, -0.25), [0.48, -0.28, 0.13], [0.0, 0.5, 0.0])
     perception, frame = scene.perceive()
     handle = perception.survey([frame], 0.3).handle
     assert np.allclose(handle.position, [0.48, -0.28, 0.13], atol=1e-6) and np.allclose(handle.motion, [0, 0.5, 0])
     assert np.allclose(handle.approach, [1, 0, 0]) and np.allclose(handle.bar, [0, 0, 1])
+
+
+def test_a_handle_that_can_be_pulled_comes_before_a_larger_one():
+    scene = make_scene()
+    add_handle(scene, (-0.3, -0.25), [0.48, -0.28, 0.13], [0.0, 0.5, 0.0])
+    add_handle(scene, (-0.5, -0.4), [0.48, -0.45, 0.13], [0.0, 0.0, 0.5])  # an edge that seems to move upwards
+    perception, frame = scene.perceive()
+    assert np.allclose(perception.survey([frame], 0.3).handle.position, [0.48, -0.28, 0.13], atol=1e-6)
+
+
+def add_handle(scene, y, grasp, motion):
+    """Add a vertical bar with bounds in y; the gripper approaches it forwards and moves it by a motion."""
+    cells = scene.add(HANDLE, (0.45, 0.5), y, TABLE + 0.05, end=grasp)
+    vectors = np.array([motion, [1.0, 0, 0], [0, 0, 1.0]]) / [[PULL_UNIT], [1], [1]]
+    scene.pulls[cells] = (vectors @ DOWN[:3, :3]).ravel()
 
 
 def test_a_board_above_the_objects_is_a_roof():
