@@ -72,7 +72,7 @@ def _describe_run(run: RunRecord) -> dict[str, Any]:
     description: dict[str, Any] = {**(policy.server or {}), **policy.model_dump(exclude={"name", "server"})}
     noise = describe_action_noise(run)
     return {
-        "policy": description.get("baseline", policy.name),
+        "policy": description.get("baseline", policy.name) if "/" in policy.name else policy.name,
         "track": policy.track,
         "protocol": run.protocol,
         "protocol_hash": run.protocol_hash,

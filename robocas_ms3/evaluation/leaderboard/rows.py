@@ -47,7 +47,7 @@ class LeaderboardRow(StrictModel):
     """Success of a policy in the episodes of a task in a split of a protocol.
 
     Attributes:
-        policy: name of the policy, or of the baseline of a training run.
+        policy: name of the policy; for a run folder, the name of its baseline.
         track: track of the policy (`PolicySpec.track`).
         published: whether the row was copied from a publication; False: measured with this package.
         protocol, protocol_hash: name and hash of the protocol; no hash for published rows.

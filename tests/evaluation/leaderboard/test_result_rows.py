@@ -68,9 +68,11 @@ def test_row_of_an_untrained_policy_with_weld_and_noise(tmp_path):
     assert row.differences == ["RoboCAS-v0's weld", "action noise of 0.5 mm and 0.2 degrees"]
 
 
-def test_rows_of_a_training_run_have_the_name_of_its_baseline(tmp_path):
-    (row,) = make_rows(write(tmp_path / "a", [outcome(0)], policy={**TRAINED, "baseline": "small"}))
-    assert row.policy == "small"
+@pytest.mark.parametrize(("name", "expected"), [("runs/mine", "small"), ("small-pick", "small-pick")])
+def test_rows_of_a_run_folder_have_the_name_of_its_baseline(tmp_path, name, expected):
+    policy = {**TRAINED, "baseline": "small", "name": name}
+    (row,) = make_rows(write(tmp_path / "a", [outcome(0)], policy=policy))
+    assert row.policy == expected
 
 
 def test_description_of_a_served_policy_is_that_of_the_server(tmp_path):
