@@ -9,6 +9,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.evaluation.leaderboard.rows import LeaderboardRow
 from robocas_ms3.evaluation.outcomes import Outcome
+from robocas_ms3.evaluation.policies import POLICIES
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.tables import describe_action_noise, get_stage_names
 from robocas_ms3.evaluation.results import Result
@@ -72,7 +73,7 @@ def _describe_run(run: RunRecord) -> dict[str, Any]:
     description: dict[str, Any] = {**(policy.server or {}), **policy.model_dump(exclude={"name", "server"})}
     noise = describe_action_noise(run)
     return {
-        "policy": description.get("baseline", policy.name) if "/" in policy.name else policy.name,
+        "policy": policy.name if policy.name in POLICIES.entry_points else description.get("baseline", policy.name),
         "track": policy.track,
         "protocol": run.protocol,
         "protocol_hash": run.protocol_hash,

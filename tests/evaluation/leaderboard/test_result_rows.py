@@ -68,7 +68,9 @@ def test_row_of_an_untrained_policy_with_weld_and_noise(tmp_path):
     assert row.differences == ["RoboCAS-v0's weld", "action noise of 0.5 mm and 0.2 degrees"]
 
 
-@pytest.mark.parametrize(("name", "expected"), [("runs/mine", "small"), ("small-pick", "small-pick")])
+@pytest.mark.parametrize(
+    ("name", "expected"), [("runs/mine", "small"), ("mine", "small"), ("keyframe-upstream", "keyframe-upstream")]
+)
 def test_rows_of_a_run_folder_have_the_name_of_its_baseline(tmp_path, name, expected):
     policy = {**TRAINED, "baseline": "small", "name": name}
     (row,) = make_rows(write(tmp_path / "a", [outcome(0)], policy=policy))
