@@ -96,7 +96,7 @@ class PolicySpec:
     Attributes:
         convention: name of the action convention, a key of `CONVENTIONS`.
         reference: pose from which a motion starts: ``tcp`` (present TCP pose) or ``target`` (last commanded TCP pose).
-        rate_hz: actions per second, a divisor of 100; None: the rate of the protocol, or 20 if it has none.
+        rate_hz: actions per second, a divisor of 100; None: the rate of the protocol, or 5 if it has none.
         cameras: (width, height) in pixels by camera name; empty: no images.
         depth: whether the policy observes a depth image per camera.
         state: whether the policy observes privileged state (docs/rl.md).

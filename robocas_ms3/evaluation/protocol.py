@@ -37,7 +37,7 @@ from robocas_ms3.scenes.config.load import check_no_extends, load_task_config
 from robocas_ms3.scenes.task_specs import TASKS
 
 INVALID_RULES = "invalid protocol rules"
-DEFAULT_HZ = 20  # actions per second if neither protocol nor policy has a rate
+DEFAULT_HZ = 5  # actions per second if neither protocol nor policy has a rate; the rate of RoboCAS-v0
 TASK_ALIASES = {"select": "pick"}
 """Task by its alias: RoboCAS-v0's evaluator runs select in the episodes of pick."""
 CONFIG_NAME = r"^[A-Za-z0-9_-]+$"
@@ -122,7 +122,7 @@ class Protocol(StrictModel):
             )
 
     def choose_action_rate(self, spec: PolicySpec) -> int:
-        """Return the number of actions per second: the rate of the protocol, else of the policy, else 20."""
+        """Return the number of actions per second: the rate of the protocol, else of the policy, else 5."""
         rate = self.rate_hz or spec.rate_hz or DEFAULT_HZ
         if rate < 1 or rate != int(rate) or 100 % int(rate):
             raise EvaluationError(

@@ -249,7 +249,7 @@ def test_processors_of_other_models_are_listed(folder):
 
 @pytest.fixture(scope="module")
 def picked(short, tmp_path_factory):
-    """A result of two episodes of pick and two of search with physics, 20 steps each."""
+    """A result of two episodes of pick and two of search with physics, 20 steps (4 s) each."""
     out = tmp_path_factory.mktemp("audit") / "result"
     words = ["eval", "pick", "search", "--policy", "random", "--protocol", str(short), "--backend", "processes"]
     assert cli([*words, "--out", str(out)]) == 0
@@ -268,7 +268,7 @@ def test_an_evaluation_can_be_audited(picked, short, tmp_path, capsys):
     assert "path_length" in capsys.readouterr().out
     forge(out, 0, measures=one.measures)
     checkpoints = read_result(out).read_checkpoints(0)
-    assert checkpoints.steps.tolist() == [20] and checkpoints.states.shape[1] > 100
+    assert checkpoints.steps.tolist() == [5, 10, 15, 20] and checkpoints.states.shape[1] > 100
     checkpoints.states[0, 13] += 1e-6  # x of the second body
     write_checkpoints(out, 0, checkpoints)
     assert cli([*command, "--overwrite"]) == 1

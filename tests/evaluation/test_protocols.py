@@ -153,7 +153,7 @@ def test_step_limits_and_valid_action_rates():
     assert rules.model_copy(update={"max_steps": 300}).step_limit("pick", 5) == 200
     paper = load_protocol("paper-v1").rules
     assert paper.step_limit("pick", 5) == paper.step_limit("search", 5) == 150
-    assert [rules.choose_action_rate(PolicySpec()), rules.choose_action_rate(PolicySpec(rate_hz=10))] == [20, 10]
+    assert [rules.choose_action_rate(PolicySpec()), rules.choose_action_rate(PolicySpec(rate_hz=10))] == [5, 10]
     with pytest.raises(EvaluationError, match="divisor of 100"):
         rules.choose_action_rate(PolicySpec(rate_hz=30))
 

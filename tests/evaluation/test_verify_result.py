@@ -215,7 +215,7 @@ def test_changed_hash_of_actions_is_found(folder, protocol):
 
 
 def test_unknown_track_is_found(folder, protocol):
-    tamper_run(folder, policy={"name": "mine", "spec": {"track": "fast"}})
+    tamper_run(folder, policy={"name": "mine", "spec": {"track": "fast", "rate_hz": 20}})
     (violation,) = find_violations(read_result(folder), protocol)
     assert violation.startswith("policy.spec.track is fast")
 

@@ -20,7 +20,7 @@ STAGES = ("reached_any", "picked_any", "reached_target", "target_grasped", "targ
 RUN_OF = {
     "protocol": "made_up",
     "protocol_hash": "ab" * 32,
-    "policy": {"name": "mine", "class": "mine:Policy", "spec": {"rate_hz": None}},
+    "policy": {"name": "mine", "class": "mine:Policy", "spec": {"rate_hz": 20}},
     "weld": False,
     "backend": "processes",
     "versions": {"robocas_ms3": "0.1.0", "torch": "2.4"},

@@ -42,7 +42,7 @@ class RoboCAS:
         protocol: name of a bundled protocol, or a protocol folder.
         cameras: (width, height) in pixels by camera, in the order of the images that a model server receives.
         convention, reference: as in `PolicySpec`.
-        rate_hz: actions per second; None: the rate of the protocol, or 20 if it has none.
+        rate_hz: actions per second; None: the rate of the protocol, or 5 if it has none.
         calibration: as in `PolicySpec`.
     """
 
