@@ -9,6 +9,9 @@
 # After an interruption, run the script again to continue. Results: OUT/POLICY/PROTOCOL, with _ in place of / in POLICY. With
 # one run per task: OUT/POLICY/PROTOCOL/TASK; tasks without a run are left out. In paper-v1, select has the episodes of pick.
 #
+# SPLIT        only the episodes of this split. A policy that observes neither images nor instructions needs only SPLIT=seen in
+#              looks-v1, cameras-v1, instructions-v1 and paper-words-v1: the scenes of all splits are the same.
+# EPISODES     only the first episodes of each configuration, this many (default: all)
 # OUT          folder of the results (default: reproduced/protocols)
 # LEADERBOARD  file of the leaderboard (default: docs/leaderboard/results.json)
 # JOBS         number of processes that evaluate (default: one per core)
@@ -25,6 +28,7 @@ policy=${1:-}
 protocols=("${@:2}")
 ((${#protocols[@]})) || protocols=(
     ms3-v1 paper-v1 paper-words-v1 objects-v1 clutter-v1 arrangement-v1 looks-v1 cameras-v1 furniture-v1 instructions-v1)
+subset=(${SPLIT:+--split "$SPLIT"} ${EPISODES:+--episodes "$EPISODES"})
 out=${OUT:-reproduced/protocols} leaderboard=${LEADERBOARD:-docs/leaderboard/results.json}
 jobs=${JOBS:-$(env -u OMP_NUM_THREADS nproc)}
 robocas=${ROBOCAS:-.venv/bin/robocas}
@@ -51,11 +55,11 @@ for protocol in "${protocols[@]}"; do
         for task in pick select search open_pick; do
             [[ -e $policy/$task/run.json ]] || continue
             has_task "$protocol" "$task" || continue
-            evaluate "$folder/$task" "$task" --policy "$policy/$task" --protocol "$protocol"
+            evaluate "$folder/$task" "$task" --policy "$policy/$task" --protocol "$protocol" "${subset[@]}"
             add_rows "$folder/$task"
         done
     else
-        evaluate "$folder" --policy "$policy" --protocol "$protocol"
+        evaluate "$folder" --policy "$policy" --protocol "$protocol" "${subset[@]}"
         add_rows "$folder"
     fi
 done
