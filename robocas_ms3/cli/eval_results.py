@@ -105,7 +105,7 @@ def report(cfg: Report) -> int:
     from robocas_ms3.cli.terminal import print_line, print_text
     from robocas_ms3.evaluation.report.tables import render_markdown
 
-    result = _read(cfg.folders)
+    result = read(cfg.folders)
     print_text(render_markdown(result, _find_protocol(result, cfg.protocol)))
     if cfg.out is None and len(cfg.folders) > 1:
         print_line("report.html was not written: pass --out DIR for several result folders")
@@ -179,7 +179,7 @@ def verify(cfg: Verify) -> int:
     from robocas_ms3.evaluation.report.tables import name_measurement
     from robocas_ms3.evaluation.verify import find_violations
 
-    result = _read(cfg.folders)
+    result = read(cfg.folders)
     found = find_violations(result, find_protocol_of(result, cfg.protocol))
     for violation in found:
         print_line(violation)
@@ -198,7 +198,7 @@ def videos(cfg: Videos) -> int:
     from robocas_ms3.evaluation.policies import POLICIES, open_policy
 
     check_number("--count", cfg.count, 1)
-    result = _read((cfg.folder,))
+    result = read((cfg.folder,))
     protocol, name = find_protocol_of(result, cfg.protocol), result.run.policy.name
     if name not in {*POLICIES.builtin, *POLICIES.entry_points} and cfg.policy != name:
         fix = f"Add --policy {name} if you trust its code."
@@ -239,7 +239,8 @@ def _check_folders(folders: tuple[Path, ...]) -> None:
         raise EvaluationError("missing result folder", where="DIR", expected=expected, fix=fix, usage=True)
 
 
-def _read(folders: tuple[Path, ...]) -> Result:
+def read(folders: tuple[Path, ...]) -> Result:
+    """Read the result in a folder, or in the folders of its partial results."""
     from robocas_ms3.evaluation.results import read_result
 
     _check_folders(folders)

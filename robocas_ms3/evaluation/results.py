@@ -227,8 +227,13 @@ def merge_results(folders: Sequence[Path], out: Path, *, overwrite: bool = False
         for number in result.outcomes:
             write_checkpoints(folder, number, result.read_checkpoints(number))
             write_actions(folder, number, result.read_actions(number))
-        _outcomes_file(folder).rewrite(result.outcomes.values())
+        write_outcomes(folder, result)
     return read_result(out)
+
+
+def write_outcomes(folder: Path, result: Result) -> None:
+    """Write the outcomes of a result to ``episodes.jsonl`` in a folder."""
+    _outcomes_file(folder).rewrite(result.outcomes.values())
 
 
 def _check_policy(folder: Path, recorded: dict[str, Any], run: RunRecord) -> None:
