@@ -145,7 +145,7 @@ class RunPolicy:
             trained, other = ", ".join(scenes.tasks), differences[0].removeprefix("task ")
             warnings.append(f"{self._name} was trained for {trained}, not for {other}.")
         elif differences:
-            what = f"{self._name} was not trained for {', '.join(new)}: expect a low success rate"
+            what = f"{self._name} was not trained for {', '.join(new)}: its success rate may be lower there"
             lacks = f"Not in the training data: {'; '.join(differences)}"
             warnings.append(f"{what}. {lacks}. Trained for: {scenes.summarize()}.")
         return warnings

@@ -52,6 +52,7 @@ def audit(cfg: Audit) -> int:
     from robocas_ms3.core.checks import check_number
     from robocas_ms3.evaluation.audit import find_audit_obstacle, list_other_processors, run_audit
     from robocas_ms3.evaluation.results import read_result
+    from robocas_ms3.evaluation.run_record import hash_source
     from robocas_ms3.evaluation.verify import find_violations
 
     for name, least in (("sample", 1), ("envs", 1), ("seed", 0)):
@@ -69,6 +70,8 @@ def audit(cfg: Audit) -> int:
         return 1
     if models := list_other_processors(result):
         print_line(f"note: made on another model of processor, so contacts may diverge: {', '.join(models)}")
+    if result.run.source_hash not in ("", hash_source()):
+        print_line("note: made with other source code of robocas_ms3, so outcomes may differ")
     plans: list[AuditPlan] = []
     differing = 0
     with ProgressBar("episodes replayed") as bar:

@@ -17,7 +17,7 @@ class Add(Results):
     """Add a result to an entry, a folder with the results of a policy.
 
     The copy has all outcomes, and the stored actions of 50 episodes that the protocol fixes. The result is first
-    checked like in `robocas eval verify`, but it may lack episodes.
+    checked like in `robocas eval verify`. It may lack tasks and splits of the protocol, but no episodes of the others.
 
     Example: robocas leaderboard add eval/pick --out leaderboard/mine/paper-v1
     """

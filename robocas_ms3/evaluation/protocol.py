@@ -50,7 +50,7 @@ class Protocol(StrictModel):
     name: FileName = Field(description="name of the protocol and of the folder of its results")
     description: str = Field(description="what the protocol measures")
     rate_hz: Annotated[int, Field(ge=1, le=100)] | None = Field(
-        default=None, description="actions per second; null: the rate of the policy, else 20"
+        default=None, description="actions per second; null: the rate of the policy, else 5"
     )
     stepping: Literal["timed", "upstream"] = Field(
         default="timed",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import platform
 import re
 from importlib.metadata import version
@@ -10,6 +11,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+import robocas_ms3
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.evaluation.policy import PolicySpec
@@ -68,6 +70,7 @@ class RunRecord(BaseModel):
             such as objects; None: unknown, or the policy was not trained.
         backend: ``processes`` or ``gpu``.
         versions: package versions by name.
+        source_hash: hash of the source code of robocas_ms3 (`hash_source`); empty: unknown.
         pack_hashes: sha256 of the manifests of the object packs by name.
         machine: processor and Python version of the machine (`describe_machine`).
         merged_from: the partial results, if the result was merged.
@@ -84,6 +87,7 @@ class RunRecord(BaseModel):
     training_differences: dict[str, list[str]] | None = None
     backend: str
     versions: dict[str, str]
+    source_hash: str = ""
     pack_hashes: dict[str, str]
     machine: dict[str, Any] | None = None
     merged_from: list[MergedFolder] = []
@@ -105,8 +109,9 @@ class RunRecord(BaseModel):
         policy = self.policy.model_dump(exclude_unset=True)
         if self.policy.server and self.policy.name.startswith(("ws://", "wss://")):
             del policy["name"]
-        names = ("protocol", "protocol_hash", "weld", "action_noise", "played_as", "backend", "versions", "pack_hashes")
-        return {"policy": policy, **{name: getattr(self, name) for name in names}}
+        names = ("protocol", "protocol_hash", "weld", "action_noise", "played_as", "backend")
+        code = ("versions", "source_hash", "pack_hashes")
+        return {"policy": policy, **{name: getattr(self, name) for name in (*names, *code)}}
 
     def resume_settings(self) -> dict[str, Any]:
         """Return the values that must be equal to continue a result."""
@@ -117,6 +122,18 @@ class RunRecord(BaseModel):
 def get_package_versions() -> dict[str, str]:
     """Return the installed versions, by name, of the packages that can change a result."""
     return {name: version(name) for name in _PACKAGES}
+
+
+def hash_source() -> str:
+    """Return the hex SHA-256 of all Python files of robocas_ms3, with their paths.
+
+    It tells apart states of a checkout that have the same version.
+    """
+    root, digest = Path(robocas_ms3.__file__).parent, hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        content = path.read_bytes()
+        digest.update(f"{path.relative_to(root).as_posix()} {len(content)}\n".encode() + content)
+    return digest.hexdigest()
 
 
 def describe_machine() -> dict[str, str]:

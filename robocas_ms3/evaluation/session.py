@@ -46,7 +46,7 @@ from robocas_ms3.evaluation.rollout import (
     Rollout,
     run_rollouts,
 )
-from robocas_ms3.evaluation.run_record import RunRecord, describe_machine, get_package_versions
+from robocas_ms3.evaluation.run_record import RunRecord, describe_machine, get_package_versions, hash_source
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.evaluation.stored_episodes import hash_actions
 from robocas_ms3.scenes.config import TaskConfig, load_task_config
@@ -407,6 +407,7 @@ class EvaluationSession:
             **({"training_differences": differences} if differences is not None else {}),
             "backend": backend,
             "versions": get_package_versions(),
+            "source_hash": hash_source(),
             "pack_hashes": {rules.pack: pack},
             "machine": describe_machine(),
         }

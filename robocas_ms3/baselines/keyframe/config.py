@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from pydantic import Field, model_validator
 
 from robocas_ms3.baselines.baseline import BaselineConfig, TrainSettings
 from robocas_ms3.core.strict_model import StrictModel
+
+Length = Annotated[float, Field(gt=0, le=2)]  # m
+Factor = Annotated[float, Field(gt=0, le=10)]
+Channels = Annotated[int, Field(ge=8, le=1024)]
 
 
 class DecisionSettings(StrictModel):
@@ -21,8 +27,8 @@ class DecisionSettings(StrictModel):
         min_points: least number of points of an object.
     """
 
-    view_distances: tuple[float, ...] = (0.5, 0.45, 0.55, 0.4)
-    close_view_distances: tuple[float, ...] = (0.34, 0.3, 0.38, 0.42)
+    view_distances: Annotated[tuple[Length, ...], Field(min_length=1)] = (0.5, 0.45, 0.55, 0.4)
+    close_view_distances: Annotated[tuple[Length, ...], Field(min_length=1)] = (0.34, 0.3, 0.38, 0.42)
     proposals: int = Field(default=350, ge=1, le=10_000)
     scored: int = Field(default=96, ge=1, le=10_000)
     target_probability: float = Field(default=0.45, gt=0, lt=1)
@@ -51,10 +57,10 @@ class KeyframeConfig(BaselineConfig):
 
     image_size: tuple[int, int] = (640, 480)
     crop_size: tuple[int, int] = (320, 256)
-    crop_scale: tuple[float, float] = (0.75, 1.5)
-    channels: tuple[int, int, int, int, int] = (24, 40, 64, 96, 128)
-    decoder_channels: int = Field(default=56, ge=8, le=1024)
-    grasp_channels: tuple[int, int, int, int] = (24, 32, 48, 64)
+    crop_scale: tuple[Factor, Factor] = (0.75, 1.5)
+    channels: tuple[Channels, Channels, Channels, Channels, Channels] = (24, 40, 64, 96, 128)
+    decoder_channels: Channels = 56
+    grasp_channels: tuple[Channels, Channels, Channels, Channels] = (24, 32, 48, 64)
     grasps: int = Field(default=4, ge=1, le=1000)
     offset_weight: float = Field(default=1.0, ge=0)
     pull_weight: float = Field(default=0.1, ge=0)
@@ -76,4 +82,6 @@ class KeyframeConfig(BaselineConfig):
         for name, size in (("image_size", self.image_size), ("crop_size", self.crop_size)):
             if min(size) < 32 or any(length % 32 for length in size):
                 raise ValueError(f"invalid {name} {list(size)}: expected multiples of 32 pixels")
+        if self.crop_scale[0] > self.crop_scale[1]:
+            raise ValueError(f"invalid crop_scale {list(self.crop_scale)}: expected the least factor first")
         return self

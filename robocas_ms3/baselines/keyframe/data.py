@@ -16,6 +16,7 @@ from robocas_ms3.baselines.keyframe.decision_files import (
     RENDER_COMMAND,
     DecisionFile,
     DecisionImage,
+    check_same_cameras,
     open_decisions,
 )
 from robocas_ms3.baselines.keyframe.gripper_crops import CELLS, CROP_CHANNELS, POSE_FEATURES, augment_crops, make_crops
@@ -30,7 +31,7 @@ from robocas_ms3.baselines.keyframe.observed_scene import (
     sample_pixels,
     unproject,
 )
-from robocas_ms3.baselines.training.scenes import TrainingScenes, select_scene_settings
+from robocas_ms3.baselines.training.scenes import TrainingScenes, name_config, select_scene_settings
 from robocas_ms3.core.errors import DatasetError
 from robocas_ms3.core.poses import from_wxyz
 from robocas_ms3.datasets.sources.episode_source import FIRST_SLOT, NOTHING, ROBOT
@@ -96,6 +97,7 @@ class KeyframeSamples:
         for number, one in enumerate(paths):
             self._files.append(open_decisions(one, config.image_size))
             on_read(number + 1, len(paths))
+        check_same_cameras(self._files)
         names = sorted(
             {str(name) for file in self._files for name in np.unique(file.candidates.decisions["object_name"]) if name}
         )
@@ -197,8 +199,9 @@ class KeyframeSamples:
             config = file.candidates.recorded_env.task_config()
             tasks.add(config.task)
             objects |= {str(one) for one in np.unique(file.candidates.decisions["object_id"]) if one}
-            name = Path(str(file.candidates.recorded_env.kwargs.get("config", config.task))).stem
-            configs[name] = select_scene_settings(config)
+            settings = select_scene_settings(config)
+            if settings not in configs.values():
+                configs[name_config(file.candidates.recorded_env.kwargs.get("config", config.task), configs)] = settings
         return TrainingScenes(tasks=sorted(tasks), objects=sorted(objects), configs=configs)
 
     def _read(self, sample: _Sample, rng: np.random.Generator) -> dict[str, NDArray[Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -80,6 +81,20 @@ def open_decisions(path: Path, size: tuple[int, int]) -> DecisionFile:
             )
     others = [camera.name for camera in specs if camera.mount != "hand" and camera.name in images.cameras]
     return DecisionFile(file, images, (hand[0], *views), tuple(others), _compute_centers(file))
+
+
+def check_same_cameras(files: Sequence[DecisionFile]) -> None:
+    """Raise `DatasetError` if files have images of different cameras, or different robots."""
+
+    def describe(file: DecisionFile) -> str:
+        robot = file.candidates.recorded_env.robot().description.uid
+        return f"robot {robot}, cameras {', '.join([*file.other_cameras, *file.hand_cameras])}"
+
+    for file in files[1:]:
+        if (found := describe(file)) != (expected := describe(files[0])):
+            what, fix = "the robots or cameras of the decision files differ", "Render all files with the same options."
+            where = f"{files[0].images.path} and {file.images.path}"
+            raise DatasetError(what, where=where, expected=expected, found=found, fix=fix)
 
 
 def _compute_centers(file: CandidateFile) -> NDArray[np.float64]:

@@ -17,12 +17,12 @@ from robocas_ms3.baselines.keyframe.arm_control import (
     Motion,
     MotionError,
 )
+from robocas_ms3.baselines.keyframe.chosen_grasp import ChosenGrasp
 from robocas_ms3.baselines.keyframe.config import DecisionSettings
 from robocas_ms3.baselines.keyframe.free_paths import FreePaths
 from robocas_ms3.baselines.keyframe.front_approaches import Front, plan_front_approaches
 from robocas_ms3.baselines.keyframe.grasp_proposals import compute_similarity, propose_colliding_grasps, propose_grasps
 from robocas_ms3.baselines.keyframe.handles import Handle
-from robocas_ms3.baselines.keyframe.keyframes import Keyframe
 from robocas_ms3.baselines.keyframe.object_motions import Memory, ObjectMotions
 from robocas_ms3.baselines.keyframe.observed_scene import ObservedObject, ObservedScene
 from robocas_ms3.baselines.keyframe.obstacles import find_middle, score_blocking, score_height
@@ -151,7 +151,7 @@ class KeyframeEpisode:
 
     def _plan_grasp(
         self, scene: ObservedScene, one: ObservedObject, observation: EpisodeObservation
-    ) -> Keyframe | None:
+    ) -> ChosenGrasp | None:
         """Return the reachable grasp of an object that the grasp network prefers, or None."""
         settings = self._settings
         proposals = propose_grasps(
@@ -172,13 +172,13 @@ class KeyframeEpisode:
                 paths, grasps, scores, qpos, self._front, partial(self._free.is_clear, start=0)
             )
             found = self._free.choose(qpos, approaches, lambda approach: approach.start)
-            return None if found is None else Keyframe(scene, one, *found)
+            return None if found is None else ChosenGrasp(scene, one, *found)
         approach = paths.plan_approach(grasps, scores, qpos)
-        return None if approach is None else Keyframe(scene, one, approach)
+        return None if approach is None else ChosenGrasp(scene, one, approach)
 
     def _choose_obstacle(
         self, scene: ObservedScene, target: ObservedObject | None, observation: EpisodeObservation
-    ) -> Keyframe | None:
+    ) -> ChosenGrasp | None:
         """Return the grasp of the object to move aside, or None."""
         objects = [one for one in scene.objects if not self._is_in_basket(one)]
         if not objects:

@@ -21,9 +21,9 @@ from robocas_ms3.baselines.keyframe.arm_control import (
     Motion,
     MotionError,
 )
+from robocas_ms3.baselines.keyframe.chosen_grasp import ChosenGrasp
 from robocas_ms3.baselines.keyframe.free_paths import FreePaths
 from robocas_ms3.baselines.keyframe.free_places import HeightMap
-from robocas_ms3.baselines.keyframe.keyframes import Keyframe
 from robocas_ms3.baselines.keyframe.motion import LIFT
 from robocas_ms3.baselines.keyframe.tcp_poses import find_release_poses
 from robocas_ms3.core.poses import Array, from_rotation
@@ -82,7 +82,7 @@ class ObjectMotions:
         self._arm, self._free, self._memory = arm, free, memory
 
     def _grasp(
-        self, observation: EpisodeObservation, chosen: Keyframe
+        self, observation: EpisodeObservation, chosen: ChosenGrasp
     ) -> Generator[Command, EpisodeObservation, tuple[EpisodeObservation, bool]]:
         """Grasp and lift; return the last observation, and whether the gripper holds something."""
         approach, arm, holds = chosen.approach, self._arm, False
@@ -123,8 +123,8 @@ class ObjectMotions:
     def move(
         self,
         observation: EpisodeObservation,
-        chosen: Keyframe,
-        transfer: Callable[[EpisodeObservation, Keyframe], Motion],
+        chosen: ChosenGrasp,
+        transfer: Callable[[EpisodeObservation, ChosenGrasp], Motion],
     ) -> Motion:
         """Grasp an object, transfer it by ``transfer``, and release it; put it back if there is no path."""
         observation, holds = yield from self._grasp(observation, chosen)
@@ -146,15 +146,15 @@ class ObjectMotions:
                 return (yield from self._release_and_leave(observation, approach.exit_path))
         return (yield from self._arm.wait(observation, OPEN))
 
-    def carry(self, observation: EpisodeObservation, chosen: Keyframe) -> Motion:
+    def carry(self, observation: EpisodeObservation, chosen: ChosenGrasp) -> Motion:
         """Carry the held object over the basket."""
         memory, arm = self._memory, self._arm
         if memory.basket is None:
             raise MotionError(observation)
         upright = chosen.approach.grasp[2, :3] if memory.is_front else None
-        point = memory.basket + [0, 0, _RELEASE_CLEARANCE + chosen.hanging]
+        point = memory.basket + [0, 0, _RELEASE_CLEARANCE + chosen.depth_below_tcp]
         releases = self._plan_releases(point, upright, observation.qpos)
-        height = float(memory.basket[2]) + max(_CARRY_CLEARANCE, _RELEASE_CLEARANCE + chosen.hanging)
+        height = float(memory.basket[2]) + max(_CARRY_CLEARANCE, _RELEASE_CLEARANCE + chosen.depth_below_tcp)
         height = height if memory.is_front else max(chosen.safe_height, height)
         if not releases:
             raise MotionError(observation)
@@ -205,7 +205,7 @@ class ObjectMotions:
         poses, costs = find_release_poses(point, upright)
         return [_Release(found) for _, found in paths.nearest(poses, costs, qpos, 0.5)]
 
-    def place(self, observation: EpisodeObservation, chosen: Keyframe) -> Motion:
+    def place(self, observation: EpisodeObservation, chosen: ChosenGrasp) -> Motion:
         """Place the held object at a free place of the surface."""
         poses, costs = [], []
         avoid = [(self._memory.focus, _TARGET_GAP)]
@@ -216,7 +216,7 @@ class ObjectMotions:
         ):
             for turn in np.arange(-np.pi, np.pi, np.pi / 4):
                 rotation = Rotation.from_euler("z", turn).as_matrix() @ chosen.approach.grasp[:3, :3]
-                poses.append(from_rotation([*place, self._memory.table + chosen.hanging + _DROP], rotation))
+                poses.append(from_rotation([*place, self._memory.table + chosen.depth_below_tcp + _DROP], rotation))
                 costs.append(2 * float(np.linalg.norm(place - observation.tcp_in_base[:2, 3])))
         if not poses:
             raise MotionError(observation)

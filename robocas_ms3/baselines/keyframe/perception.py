@@ -247,6 +247,8 @@ def _find_basket(points: Array) -> Array | None:
     if len(points) < 20:
         return None
     points = points[np.linalg.norm(points - np.median(points, axis=0), axis=1) < _BASKET_RADIUS]
+    if not len(points):  # several distant groups
+        return None
     low, high = np.percentile(points, [_EDGE, 100 - _EDGE], axis=0)
     return np.array([*(low[:2] + high[:2]) / 2, high[2]])
 

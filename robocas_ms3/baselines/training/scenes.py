@@ -85,8 +85,17 @@ def read_training_scenes(source: EpisodeSource, numbers: Iterable[int]) -> Train
         except ConfigError:  # written by a version with other keys
             continue
         if settings not in configs.values():
-            configs[_config_name(scene, configs)] = settings
+            configs[name_config(_find_given_config(scene), configs)] = settings
     return TrainingScenes(tasks=sorted(tasks), objects=sorted(objects), configs=configs)
+
+
+def name_config(given: Any, known: Collection[str]) -> str:
+    """Return a name for a task configuration that is not in ``known``.
+
+    ``given``: the argument ``config`` of ``gym.make``: a name, a path, or the values of a configuration.
+    """
+    name = Path(given).stem if isinstance(given, str) else "configuration"
+    return name if name not in known else f"{name}-{len(known) + 1}"
 
 
 def select_scene_settings(config: TaskConfig, cameras: Collection[str] | None = None) -> dict[str, Any]:
@@ -127,12 +136,10 @@ def _object_ids(config: TaskConfig) -> set[str]:
         return set() if config.objects.ids == "all" else {str(name) for name in config.objects.ids}
 
 
-def _config_name(scene: Mapping[str, Any], known: Collection[str]) -> str:
+def _find_given_config(scene: Mapping[str, Any]) -> Any:
     info = scene.get("env_info")
     kwargs = info.get("env_kwargs") if isinstance(info, Mapping) else None
-    given = kwargs.get("config") if isinstance(kwargs, Mapping) else None
-    name = Path(given).stem if isinstance(given, str) else "configuration"
-    return name if name not in known else f"{name}-{len(known) + 1}"
+    return kwargs.get("config") if isinstance(kwargs, Mapping) else None
 
 
 def _join_names(names: Collection[str]) -> str:

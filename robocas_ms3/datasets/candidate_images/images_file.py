@@ -197,8 +197,18 @@ class CandidateImages:
             self.cameras = tuple(name for name in sorted(groups) if re.fullmatch(CAMERA_NAME, name))
             self.has_depth = all("depth" in groups[camera] for camera in self.cameras)
             self.has_segmentation = all("segmentation" in groups[camera] for camera in self.cameras)
+            lacking = [
+                f"{camera}/{name}"
+                for camera in self.cameras
+                for name in ("intrinsic", *_POSES)
+                if name not in groups[camera]
+            ]
         if not self.cameras:
             raise DatasetError("this file has no images", where=self.path, fix=_RENDER_AGAIN)
+        if lacking:
+            what, expected = "missing camera calibration", "intrinsic, camera_in_base and true_camera_in_base"
+            found = f"no {', '.join(lacking)}"
+            raise DatasetError(what, where=self.path, expected=expected, found=found, fix=_RENDER_AGAIN)
         height, width = self.rgb(0, self.cameras[0]).shape[:2]
         self.size = width, height
 

@@ -11,6 +11,7 @@ The hashes of the actions of all episodes are in ``episodes.jsonl``.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Collection
 from pathlib import Path
 
 from robocas_ms3.core.errors import EvaluationError
@@ -26,37 +27,48 @@ SAMPLE_SIZE = 50
 """Number of episodes of a result whose actions are in an entry."""
 
 
-def choose_sample(result: Result) -> list[int]:
+def choose_sample(protocol: LoadedProtocol, configs: Collection[str]) -> list[int]:
     """Return the numbers of the episodes whose actions are in an entry, in ascending order.
 
-    The protocol fixes the sample: it has the episodes with the smallest hashes of protocol and number.
+    Protocol and configurations fix the sample, so that the author of a result cannot choose it: it has the episodes
+    with the smallest hashes of protocol and number.
+
+    Args:
+        protocol: protocol of the result.
+        configs: names of the evaluated configurations.
     """
 
     def compute_hash(number: int) -> bytes:
-        return hashlib.sha256(f"{result.run.protocol_hash} {number}".encode()).digest()
+        return hashlib.sha256(f"{protocol.hash} {number}".encode()).digest()
 
-    return sorted(sorted(result.outcomes, key=compute_hash)[:SAMPLE_SIZE])
+    numbers = [episode.episode for episode in protocol.episodes if episode.config in configs]
+    return sorted(sorted(numbers, key=compute_hash)[:SAMPLE_SIZE])
 
 
 def write_result(result: Result, protocol: LoadedProtocol, out: Path, *, overwrite: bool = False) -> list[int]:
     """Write a result into a folder of an entry, and return the numbers of the episodes of the sample.
 
     Args:
-        result: the result. It may lack episodes of the protocol.
+        result: the result, with all episodes of its configurations.
         protocol: its protocol.
         out: new folder, such as ``leaderboard/keyframe/paper-v1``; written atomically.
         overwrite: whether to replace an existing result.
 
     Raises:
-        EvaluationError: the result has violations (`find_violations`).
+        EvaluationError: the result has violations (`find_violations`), or lacks episodes of its configurations.
         OutputExistsError: ``out`` exists.
     """
     if violations := find_violations(result, protocol, is_complete=False):
         what, fix = "the result has violations", "Run robocas eval verify to list all."
         found = f"{format_count(len(violations), 'violation')}, the first: {violations[0]}"
         raise EvaluationError(what, where=result.folder, found=found, fix=fix)
+    configs = {outcome.config for outcome in result.outcomes.values()}
+    count = sum(episode.config in configs for episode in protocol.episodes)
+    if len(result.outcomes) < count:
+        what, fix = "the result lacks episodes of its configurations", "Evaluate all episodes."
+        raise EvaluationError(what, where=result.folder, expected=count, found=len(result.outcomes), fix=fix)
     check_replaceable(out, overwrite=overwrite, markers=(RUN,))
-    sample = choose_sample(result)
+    sample = choose_sample(protocol, configs)
     with atomic_folder(out) as folder:
         write_json(folder / RUN, result.run.to_dict())
         for number in sample:

@@ -84,6 +84,7 @@ def _describe_run(run: RunRecord) -> dict[str, Any]:
         "weights": description.get("weights", ""),
         "backend": run.backend,
         "versions": run.versions,
+        "source_hash": run.source_hash,
     }
 
 

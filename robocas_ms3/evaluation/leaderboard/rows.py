@@ -66,6 +66,7 @@ class LeaderboardRow(StrictModel):
         differences: conditions that make the rates not comparable with rows of the same protocol without them.
         weights: hash of the weights; empty: unknown.
         backend, versions: backend and package versions of the evaluation.
+        source_hash: hash of the source code of robocas_ms3 (`run_record.hash_source`); empty: unknown.
     """
 
     policy: str
@@ -91,6 +92,7 @@ class LeaderboardRow(StrictModel):
     weights: str = ""
     backend: str = ""
     versions: dict[str, str] = {}
+    source_hash: str = ""
 
     @model_validator(mode="after")
     def _check_rate(self) -> LeaderboardRow:
@@ -144,15 +146,25 @@ def replace_rows(rows: Iterable[LeaderboardRow], new: Sequence[LeaderboardRow]) 
     """Return the measured rows that new ones do not replace, and the new ones.
 
     A row replaces one with the same policy, training data, protocol, task, split and conditions.
+
+    Raises:
+        EvaluationError: a new row has fewer episodes than the row that it would replace.
     """
 
     def key(row: LeaderboardRow) -> tuple:
         training = row.training or Training()
         data = training.data, training.scenes, training.init_from
-        return row.policy, data, row.protocol, row.task, row.split, row.calibration, tuple(row.differences)
+        conditions = row.track, row.calibration, tuple(row.differences), row.backend
+        return row.policy, data, row.protocol, row.task, row.split, *conditions
 
-    replaced = {key(row) for row in new}
-    return [*(row for row in rows if not row.published and key(row) not in replaced), *new]
+    measured = {key(row): row for row in rows if not row.published}
+    for row in new:
+        before = measured.get(key(row))
+        if before is not None and (before.n or 0) > (row.n or 0):
+            what, fix = "a new row has fewer episodes than the present row", "Evaluate all episodes."
+            where = f"{row.policy}, {row.protocol}, {row.task}, {row.split}"
+            raise EvaluationError(what, where=where, expected=f"at least {before.n}", found=row.n, fix=fix)
+    return [*(measured | {key(row): row for row in new}).values()]
 
 
 def read_leaderboard(path: Path) -> Leaderboard:

@@ -4,9 +4,11 @@ import json
 import shutil
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 from recorded_candidates import write_recorded_candidates
 from synthetic import RayCaster, write_trajectory
 
@@ -129,18 +131,67 @@ def test_loss_of_a_batch_decreases(validation):
     assert np.isfinite(losses).all() and losses[-1] < 0.7 * losses[0]
 
 
-@pytest.mark.parametrize("changes", [{"views": 0}, {"segmentation": False}, {"depth": False}, {"size": (96, 64)}])
-def test_unsuitable_images_are_an_error(folder, tmp_path, changes):
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"views": 0}, "no views"),
+        ({"segmentation": False}, "no segmentation"),
+        ({"depth": False}, "no depth"),
+        ({"size": (96, 64)}, "96 x 64 pixels"),
+    ],
+)
+def test_unsuitable_images_are_an_error(folder, tmp_path, changes, found):
     path = Path(shutil.copy(folder / "candidates.h5", tmp_path))
     settings = {"views": 1, "segmentation": True, "size": SIZE, "open_renderer": RayCaster}
     render_candidates(CandidateImageSettings(path, **settings | changes))
-    with pytest.raises(DatasetError):
+    with pytest.raises(DatasetError) as error:
         KeyframeSamples(CONFIG, tmp_path, "train")
+    assert (error.value.where, error.value.found) == (tmp_path / "candidates_images.h5", found)
+
+
+@pytest.mark.parametrize("pose", ["intrinsic", "camera_in_base"])
+def test_missing_calibration_is_an_error(folder, tmp_path, pose):
+    for name in ("candidates.h5", "candidates_images.h5"):
+        shutil.copy(folder / name, tmp_path)
+    with h5py.File(tmp_path / "candidates_images.h5", "r+") as file:
+        del file[f"static_camera/{pose}"]
+    with pytest.raises(DatasetError) as error:
+        KeyframeSamples(CONFIG, tmp_path, "train")
+    assert (error.value.where, error.value.found) == (tmp_path / "candidates_images.h5", f"no static_camera/{pose}")
+
+
+def test_files_with_other_cameras_are_an_error(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "a")
+    (tmp_path / "b").mkdir()
+    path = write_candidates_of(tmp_path / "b" / "candidates.h5", (7, 8))
+    cameras = ("static_camera", "gripper_camera")
+    settings = {"views": 2, "segmentation": True, "size": SIZE, "cameras": cameras, "open_renderer": RayCaster}
+    render_candidates(CandidateImageSettings(path, **settings))
+    with pytest.raises(DatasetError) as error:
+        KeyframeSamples(CONFIG, tmp_path, "train")
+    assert "base_camera" in error.value.expected and "base_camera" not in error.value.found
 
 
 def test_missing_files_are_an_error(folder, tmp_path):
-    with pytest.raises(DatasetError):
+    with pytest.raises(DatasetError) as error:
         KeyframeSamples(CONFIG, tmp_path, "train")
+    assert error.value.where == tmp_path
     shutil.copy(folder / "candidates.h5", tmp_path)  # without images
-    with pytest.raises(DatasetError):
+    with pytest.raises(DatasetError) as error:
         KeyframeSamples(CONFIG, tmp_path, "train")
+    assert error.value.where == tmp_path / "candidates_images.h5"
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"crop_scale": (1.5, 0.75)},
+        {"crop_scale": (-1.0, 0.0)},
+        {"channels": (0, 8, 8, 8, 8)},
+        {"crop_size": (100, 64)},
+        {"decisions": {"view_distances": ()}},
+    ],
+)
+def test_invalid_settings_are_refused(values):
+    with pytest.raises(ValidationError):
+        KeyframeConfig(**values)

@@ -17,7 +17,7 @@ from synthetic import COLOURS, SIZE, RayCaster, write_trajectory
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import DatasetError, OutputExistsError
-from robocas_ms3.datasets.candidate_images.images_file import CandidateImages, hash_decisions, images_path
+from robocas_ms3.datasets.candidate_images.images_file import VERSION, CandidateImages, hash_decisions, images_path
 from robocas_ms3.datasets.candidate_images.render import render_candidates
 from robocas_ms3.datasets.candidate_images.settings import CandidateImageSettings
 from robocas_ms3.datasets.sources.episode_source import FIRST_SLOT
@@ -193,7 +193,7 @@ def test_reader_is_picklable(images):
     np.testing.assert_array_equal(copy.depth(1, "static_camera"), images.depth(1, "static_camera"))
 
 
-@pytest.mark.parametrize("damage", ["truncated", "ends", "format", "empty"])
+@pytest.mark.parametrize("damage", ["truncated", "ends", "format", "version", "empty"])
 def test_damaged_files_are_dataset_errors(images, tmp_path, damage):
     path = tmp_path / "images.h5"
     shutil.copy(images.path, path)
@@ -205,8 +205,10 @@ def test_damaged_files_are_dataset_errors(images, tmp_path, damage):
         with h5py.File(path, "r+") as file:
             if damage == "ends":
                 file["base_camera/rgb_ends"][0] = -1
-            else:
+            elif damage == "format":
                 file.attrs["format"] = "other"
+            else:
+                file.attrs["version"] = VERSION - 1
     with pytest.raises(DatasetError):
         CandidateImages(path)
 

@@ -1,6 +1,6 @@
 """Results in entries of the leaderboard: all outcomes, and the actions of a sample that the protocol fixes."""
 
-from dataclasses import replace
+import shutil
 
 import pytest
 from synthetic_results import of_protocol
@@ -9,7 +9,9 @@ from robocas_ms3.cli.leaderboard import Add, add
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.evaluation.leaderboard import entries
 from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.results import read_result
+from robocas_ms3.evaluation.results import OUTCOMES, read_result
+
+CONFIGS = {episode.config for episode in load_protocol("smoke").episodes}
 
 
 @pytest.fixture
@@ -22,31 +24,40 @@ def test_an_entry_has_all_outcomes_and_the_actions_of_the_sample(result, tmp_pat
     out = tmp_path / "entry" / "smoke"
     assert add(Add((result.folder,), out=out)) == 0
     assert "8 episodes, actions of 3" in capsys.readouterr().out
-    copy, sample = read_result(out), entries.choose_sample(result)
-    assert copy.outcomes == result.outcomes and copy.run == result.run
+    copy, sample = read_result(out), entries.choose_sample(load_protocol("smoke"), CONFIGS)
+    assert copy.outcomes == result.outcomes and copy.run == result.run and len(set(sample)) == 3
     assert sorted(path.stem for path in out.glob("actions/*")) == [f"{number:06d}" for number in sample]
     for number in sample:
         assert (copy.read_actions(number) == result.read_actions(number)).all()
 
 
-def test_the_sample_depends_on_the_protocol_only(result, monkeypatch):
+def test_the_sample_depends_on_protocol_and_configurations(tmp_path, monkeypatch):
     monkeypatch.setattr(entries, "SAMPLE_SIZE", 3)
-    sample = entries.choose_sample(result)
-    failed = {number: replace(one, success=not one.success) for number, one in result.outcomes.items()}
-    assert entries.choose_sample(replace(result, outcomes=failed)) == sample and len(set(sample)) == 3
-    part = {number: one for number, one in result.outcomes.items() if number != sample[0]}
-    assert set(sample[1:]) < set(entries.choose_sample(replace(result, outcomes=part)))
-    other = replace(result, run=result.run.model_copy(update={"protocol_hash": "00" * 32}))
-    assert entries.choose_sample(other) != sample
+    protocol = load_protocol("smoke")
+    picks = [episode.episode for episode in protocol.episodes if episode.task == "pick"]
+    assert entries.choose_sample(protocol, {protocol.episodes[picks[0]].config}) == picks
+    sample = entries.choose_sample(protocol, CONFIGS)
+    folder = tmp_path / "smoke"
+    shutil.copytree(protocol.folder, folder)
+    (folder / "protocol.yaml").open("a").write("# another protocol\n")
+    assert entries.choose_sample(load_protocol(folder), CONFIGS) != sample
 
 
 def test_bad_results_are_refused_and_nothing_is_written(result, tmp_path):
-    out = tmp_path / "entry" / "smoke"
+    out, other = tmp_path / "entry" / "smoke", tmp_path / "other"
     add(Add((result.folder,), out=out))
     with pytest.raises(OutputExistsError):
         add(Add((result.folder,), out=out))
     assert add(Add((result.folder,), out=out, overwrite=True)) == 0
+    outcomes = result.folder / OUTCOMES
+    lines = outcomes.read_text().splitlines(keepends=True)
+    outcomes.write_text("".join(lines[1:]))  # one of two episodes of pick
+    with pytest.raises(EvaluationError) as error:
+        add(Add((result.folder,), out=other))
+    assert (error.value.expected, error.value.found) == (8, 7)
+    outcomes.write_text("".join(lines[2:]))  # no episode of pick
+    assert add(Add((result.folder,), out=tmp_path / "without-pick")) == 0
     (result.folder / "actions" / "000002.npz").unlink()
     with pytest.raises(EvaluationError, match="1 violation"):
-        add(Add((result.folder,), out=tmp_path / "other"))
-    assert not (tmp_path / "other").exists()
+        add(Add((result.folder,), out=other))
+    assert not other.exists()

@@ -55,7 +55,14 @@ def test_new_rows_replace_those_with_the_same_conditions():
     trained = make_row(training=Training(data="other"))
     kept = [make_row(task="search"), make_row(policy="other"), make_row(differences=["weld"]), trained]
     new = make_row(successes=2, rate=0.5, weights="ab")
-    assert replace_rows([published, make_row(), *kept], [new]) == [*kept, new]
+    assert replace_rows([published, make_row(), *kept], [new]) == [new, *kept]
+
+
+def test_a_row_with_fewer_episodes_replaces_none():
+    with pytest.raises(EvaluationError) as error:
+        replace_rows([make_row()], [make_row(n=2, rate=0.5)])
+    assert (error.value.expected, error.value.found) == ("at least 4", 2)
+    assert replace_rows([make_row()], [make_row(n=2, rate=0.5, track="modular")])[0] == make_row()
 
 
 @pytest.mark.parametrize(

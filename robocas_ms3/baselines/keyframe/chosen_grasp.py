@@ -1,4 +1,4 @@
-"""Keyframe that was chosen: the grasp of an object."""
+"""Grasp that the policy chose."""
 
 from __future__ import annotations
 
@@ -12,12 +12,19 @@ from robocas_ms3.core.poses import Array
 
 _SAFE_HEIGHT = (0.35, 0.55)  # m, least and greatest height of the TCP for motions above objects
 _CLEARANCE = 0.12  # m between the TCP and the highest object near a grasp
-_HANGING = (0.015, 0.3)  # m from the TCP down to the lowest point of a held object, least and greatest value
+_DEPTH_BELOW_TCP = (0.015, 0.3)  # m from the TCP down to the lowest point of a held object, least and greatest value
 
 
 @dataclass(frozen=True)
-class Keyframe:
-    """Grasp that was chosen: the object, its scene, the approach, and from the front the path (n, 7) to its start."""
+class ChosenGrasp:
+    """Grasp that the policy chose.
+
+    Attributes:
+        scene: observed scene.
+        object: object that is grasped.
+        approach: motion to the grasp.
+        path: joint positions (n, 7) on the way to the start of the approach, for grasps from the front; else None.
+    """
 
     scene: ObservedScene
     object: ObservedObject
@@ -25,7 +32,7 @@ class Keyframe:
     path: Array | None = None
 
     @property
-    def hanging(self) -> float:
+    def depth_below_tcp(self) -> float:
         """Distance in m from the TCP down to the lowest point of the object.
 
         The lowest point may be hidden. Therefore the object is assumed to reach as far below its predicted centre as
@@ -33,7 +40,7 @@ class Keyframe:
         """
         heights = self.scene.points[self.object.mask][:, 2]
         low = min(heights.min(), 2 * self.object.center[2] - heights.max())
-        return float(np.clip(self.approach.grasp[2, 3] - low, *_HANGING))
+        return float(np.clip(self.approach.grasp[2, 3] - low, *_DEPTH_BELOW_TCP))
 
     @property
     def safe_height(self) -> float:
