@@ -47,7 +47,7 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
     "training and evaluation": {
         "train": "Train a baseline",
         "eval": "Evaluate a policy, and report and compare results",
-        "leaderboard": "Add results to the leaderboard",
+        "leaderboard": "Add results to the leaderboard, and check its entries",
         "serve-policy": "Serve a policy over a socket",
     },
     "assets and scenes": {

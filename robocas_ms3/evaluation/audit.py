@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import secrets
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -118,7 +118,7 @@ def find_audit_obstacle(result: Result) -> str:
     return ""
 
 
-def choose_episodes(result: Result, sample: int | None, seed: int) -> list[int]:
+def choose_episodes(result: Result, sample: int | None, seed: int, stored: Collection[int] | None = None) -> list[int]:
     """Return the numbers of the episodes to replay, in ascending order.
 
     Episodes that ended with an error before their first action are left out.
@@ -127,8 +127,13 @@ def choose_episodes(result: Result, sample: int | None, seed: int) -> list[int]:
         result: the result.
         sample: number of episodes to choose at random; None: all.
         seed: random seed of the choice.
+        stored: numbers of the episodes whose actions are stored; None: all.
     """
-    numbers = [number for number, outcome in result.outcomes.items() if outcome.steps or not outcome.error]
+    numbers = [
+        number
+        for number, outcome in result.outcomes.items()
+        if (outcome.steps or not outcome.error) and (stored is None or number in stored)
+    ]
     if sample is None or sample >= len(numbers):
         return numbers
     return sorted(np.random.default_rng(seed).choice(numbers, sample, replace=False).tolist())
@@ -141,6 +146,7 @@ def run_audit(
     *,
     sample: int | None = None,
     seed: int | None = None,
+    stored: Collection[int] | None = None,
     envs: int = 2,
     overwrite: bool = False,
     on_start: Callable[[AuditPlan], None] = lambda plan: None,
@@ -153,6 +159,7 @@ def run_audit(
         out: folder of the audit. It must not come from the author of the result.
         sample: number of episodes to replay, chosen at random; None: all (`choose_episodes`).
         seed: random seed of the choice; None: that of the audit in ``out``, or a number that nobody can predict.
+        stored: numbers of the episodes whose actions are stored; None: all.
         envs: number of environments that run at the same time.
         overwrite: whether to delete an earlier audit.
         on_start: is called before the first episode.
@@ -167,7 +174,7 @@ def run_audit(
         seed = seed if seed is not None else secrets.randbits(32) if earlier is None else earlier
         output.start({**settings, "seed": seed})
         file = JsonLinesFile[AuditedEpisode](output.path / _EPISODES, AuditedEpisode)
-        replayed, chosen = {one.episode: one for one in file.read()}, choose_episodes(result, sample, seed)
+        replayed, chosen = {one.episode: one for one in file.read()}, choose_episodes(result, sample, seed, stored)
         on_start(AuditPlan(chosen, seed, len(replayed.keys() & set(chosen))))
         yield from (replayed[number] for number in chosen if number in replayed)
         episodes = [protocol.episodes[number] for number in chosen if number not in replayed]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Collection, Iterator
 from typing import get_args
 
 from robocas_ms3.core.errors import EvaluationError
@@ -29,12 +30,19 @@ _IMPLIED = (
     ("target_in_basket", "success"),
 )
 _TIME_TOLERANCE = 1e-3  # s
+_HASH = re.compile("[0-9a-f]{64}")
 
 
-def find_violations(result: Result, protocol: LoadedProtocol, *, is_complete: bool = True) -> list[str]:
+def find_violations(
+    result: Result, protocol: LoadedProtocol, *, is_complete: bool = True, stored: Collection[int] | None = None
+) -> list[str]:
     """Return one text per violation in a result; empty if the result fits the protocol and is consistent.
 
-    ``is_complete``: whether the result must have all episodes of the protocol.
+    Args:
+        result: the result.
+        protocol: its protocol.
+        is_complete: whether the result must have all episodes of the protocol.
+        stored: numbers of the episodes whose actions must be stored; None: all. The others need the hash only.
 
     Violations are another hash, missing or unknown episodes, values that contradict the protocol or other values, and
     stored actions or checkpoints that are missing or do not fit their episode.
@@ -55,7 +63,10 @@ def find_violations(result: Result, protocol: LoadedProtocol, *, is_complete: bo
     for number, outcome in result.outcomes.items():
         if number < count:
             of_episode = [*_find_outcome_violations(outcome, protocol.episodes[number], protocol, run)]
-            of_episode += _find_action_violations(result, number)
+            if stored is None or number in stored:
+                of_episode += _find_action_violations(result, number)
+            elif not _HASH.fullmatch(outcome.actions_hash):
+                of_episode.append(f"actions_hash is {outcome.actions_hash or 'empty'}, expected a SHA-256")
         else:
             of_episode = ["this episode is not in the protocol"]
         found += [f"episode {number}: {problem}" for problem in of_episode]

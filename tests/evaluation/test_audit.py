@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from counting_env import CrashingEnv
 
+from robocas_ms3.cli import leaderboard
 from robocas_ms3.cli.eval_audit import Audit, audit
 from robocas_ms3.cli.main import run as cli
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
@@ -19,6 +20,7 @@ from robocas_ms3.evaluation.audit import (
     list_other_processors,
     run_audit,
 )
+from robocas_ms3.evaluation.leaderboard import entries
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.results import OUTCOMES, RUN, read_result
@@ -212,6 +214,31 @@ def test_episodes_with_errors_are_replayed_up_to_the_error(folder):
     none = {"flags": dict.fromkeys(flags), "flag_seconds": dict.fromkeys(flags), "steps": 0, "seconds": 0.0}
     forge(folder, 0, np.zeros((0, 7)), **lost, error="the worker process crashed", **none)
     assert choose_episodes(read_result(folder), None, 0) == [1, 2, 3]
+
+
+def test_the_sample_of_an_entry_is_replayed(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(entries, "SAMPLE_SIZE", 3)
+    entry, out = tmp_path / "entry", tmp_path / "entry" / "smoke"
+    assert leaderboard.add(leaderboard.Add((folder,), out=out)) == 0
+    assert leaderboard.audit(leaderboard.AuditEntries((entry,), envs=1)) == 0
+    sample = entries.list_stored(read_result(out), SMOKE)
+    (other,) = {0, 1, 2, 3} - set(sample)
+    path = read_result(out).outcomes[sample[0]].measures | {"path_length": 7.0}
+    forge(out, sample[0], measures=path)
+    assert leaderboard.audit(leaderboard.AuditEntries((out,), envs=1)) == 1
+    assert f"episode {sample[0]}, recorded -> replayed: measures.path_length" in capsys.readouterr().out
+    forge(out, other, actions_hash="")
+    assert leaderboard.audit(leaderboard.AuditEntries((out,), envs=1)) == 1
+    assert f"episode {other}: actions_hash is empty" in capsys.readouterr().out
+    lines = (out / OUTCOMES).read_text().splitlines(keepends=True)
+    (out / OUTCOMES).write_text("".join(lines[1:]))
+    assert leaderboard.audit(leaderboard.AuditEntries((out,), envs=1)) == 1
+    assert "1 episode of its configurations missing" in capsys.readouterr().out
+
+
+def test_an_entry_without_results_is_an_error(tmp_path):
+    with pytest.raises(EvaluationError):
+        leaderboard.audit(leaderboard.AuditEntries((tmp_path,)))
 
 
 def test_a_crash_of_a_worker_is_no_difference(folder, monkeypatch):

@@ -45,6 +45,38 @@ def choose_sample(protocol: LoadedProtocol, configs: Collection[str]) -> list[in
     return sorted(sorted(numbers, key=compute_hash)[:SAMPLE_SIZE])
 
 
+def find_results(entry: Path) -> list[Path]:
+    """Return the folders of the results in an entry, sorted.
+
+    Raises:
+        EvaluationError: the entry has no result.
+    """
+    folders = sorted(path.parent for path in entry.rglob(RUN))
+    if not folders:
+        what, fix = "no result in this entry", "Add one with robocas leaderboard add."
+        raise EvaluationError(what, where=entry, expected=f"a folder with {RUN}", fix=fix)
+    return folders
+
+
+def count_missing(result: Result, protocol: LoadedProtocol) -> int:
+    """Return the number of episodes that a result lacks among those of its configurations."""
+    configs = {outcome.config for outcome in result.outcomes.values()}
+    return sum(one.config in configs and one.episode not in result.outcomes for one in protocol.episodes)
+
+
+def list_stored(result: Result, protocol: LoadedProtocol) -> list[int]:
+    """Return the numbers of the episodes of a result in an entry whose actions must be stored."""
+    return choose_sample(protocol, {outcome.config for outcome in result.outcomes.values()})
+
+
+def find_result_violations(result: Result, protocol: LoadedProtocol) -> list[str]:
+    """Return one text per violation in a result of an entry (`find_violations`)."""
+    found = find_violations(result, protocol, is_complete=False, stored=list_stored(result, protocol))
+    if missing := count_missing(result, protocol):
+        found.append(f"{format_count(missing, 'episode')} of its configurations missing")
+    return found
+
+
 def write_result(result: Result, protocol: LoadedProtocol, out: Path, *, overwrite: bool = False) -> list[int]:
     """Write a result into a folder of an entry, and return the numbers of the episodes of the sample.
 
@@ -62,13 +94,12 @@ def write_result(result: Result, protocol: LoadedProtocol, out: Path, *, overwri
         what, fix = "the result has violations", "Run robocas eval verify to list all."
         found = f"{format_count(len(violations), 'violation')}, the first: {violations[0]}"
         raise EvaluationError(what, where=result.folder, found=found, fix=fix)
-    configs = {outcome.config for outcome in result.outcomes.values()}
-    count = sum(episode.config in configs for episode in protocol.episodes)
-    if len(result.outcomes) < count:
+    if missing := count_missing(result, protocol):
         what, fix = "the result lacks episodes of its configurations", "Evaluate all episodes."
-        raise EvaluationError(what, where=result.folder, expected=count, found=len(result.outcomes), fix=fix)
+        found = f"{format_count(missing, 'episode')} missing"
+        raise EvaluationError(what, where=result.folder, found=found, fix=fix)
     check_replaceable(out, overwrite=overwrite, markers=(RUN,))
-    sample = choose_sample(protocol, configs)
+    sample = list_stored(result, protocol)
     with atomic_folder(out) as folder:
         write_json(folder / RUN, result.run.to_dict())
         for number in sample:

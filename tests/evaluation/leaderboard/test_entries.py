@@ -54,7 +54,7 @@ def test_bad_results_are_refused_and_nothing_is_written(result, tmp_path):
     outcomes.write_text("".join(lines[1:]))  # one of two episodes of pick
     with pytest.raises(EvaluationError) as error:
         add(Add((result.folder,), out=other))
-    assert (error.value.expected, error.value.found) == (8, 7)
+    assert error.value.found == "1 episode missing"
     outcomes.write_text("".join(lines[2:]))  # no episode of pick
     assert add(Add((result.folder,), out=tmp_path / "without-pick")) == 0
     (result.folder / "actions" / "000002.npz").unlink()
