@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.baselines.keyframe.arm_control import ArmControl, EpisodeObservation, Motion
+from robocas_ms3.baselines.keyframe.camera_correction import estimate_correction
 from robocas_ms3.baselines.keyframe.config import KeyframeConfig
 from robocas_ms3.baselines.keyframe.episode import KeyframeEpisode
 from robocas_ms3.baselines.keyframe.motion import ArmPaths
 from robocas_ms3.baselines.keyframe.network import KeyframeNetwork
 from robocas_ms3.baselines.keyframe.perception import CameraFrame, Perception
-from robocas_ms3.core.poses import from_wxyz
+from robocas_ms3.core.poses import Array, from_wxyz
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.robots.description import RobotDescription
 from robocas_ms3.robots.quantities import GRIPPER_WIDTH
 from robocas_ms3.robots.registry import find_robot
+from robocas_ms3.robots.surface import RobotSurface
 
 _STREAM = 417  # random stream of the proposals
 
@@ -50,11 +53,14 @@ class KeyframePolicy:
         self._specs: dict[int, EpisodeSpec] = {}  # by env
         self._runs: dict[int, Motion] = {}  # by env, from the first action on
         self._image_requests: dict[int, bool] = {}
+        self._surfaces: dict[str, RobotSurface] = {}  # by robot
+        self._corrections: dict[int, dict[str, Array]] = {}  # by env: camera -> pose in its nominal pose
 
     def check_robot(self, robot: str) -> None:
         """Raise RobotDescriptionError or RobocasError if there is no inverse kinematics for the robot."""
         if robot not in self._paths:
             self._paths[robot] = ArmPaths(find_robot(robot))
+            self._surfaces[robot] = RobotSurface(find_robot(robot))
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
         for episode in episodes:
@@ -74,6 +80,9 @@ class KeyframePolicy:
             frames = {}
             if self._image_requests[env]:
                 frames = {camera: _select_frame(observations, camera, row) for camera in self.spec.cameras}
+                if env not in self._runs:
+                    self._corrections[env] = self._estimate_corrections(env, frames, observations.qpos[row])
+                frames = self._correct_frames(env, frames)
             qpos = observations.qpos[row, RobotDescription.arm_slice].astype(np.float64)
             width = float(observations.robot[GRIPPER_WIDTH].reshape(-1)[row])
             observation = EpisodeObservation(tcp_in_base[row], qpos, width, frames)
@@ -85,6 +94,28 @@ class KeyframePolicy:
             self._image_requests[env] = command.requests_images
             actions.append(command.action)
         return np.stack(actions)
+
+    def _estimate_corrections(
+        self, env: int, frames: dict[str, CameraFrame], qpos: NDArray[np.floating]
+    ) -> dict[str, Array]:
+        """Return by camera its pose (4, 4) in its nominal pose; without the cameras in which no pose fits the robot."""
+        points, normals = self._surfaces[self._specs[env].robot].compute_points(qpos)
+        found = {camera: estimate_correction(frame, points, normals) for camera, frame in frames.items()}
+        return {camera: correction for camera, correction in found.items() if correction is not None}
+
+    def _correct_frames(self, env: int, frames: dict[str, CameraFrame]) -> dict[str, CameraFrame]:
+        """Return the images with corrected camera poses.
+
+        If the pose of a camera is wrong, images of fixed cameras whose poses are unknown are left out.
+        """
+        corrections, identity = self._corrections[env], np.eye(4)
+        if all((correction == identity).all() for correction in corrections.values()):
+            return frames
+        return {
+            camera: replace(frame, camera_in_base=frame.camera_in_base @ corrections.get(camera, identity))
+            for camera, frame in frames.items()
+            if camera in corrections or camera == self._hand_camera
+        }
 
     def _start(self, env: int, observations: Observations, row: int) -> KeyframeEpisode:
         spec = self._specs[env]
