@@ -53,7 +53,8 @@ class RobotSurface:
         for joint in self._joints:
             poses[joint.child] = poses[joint.parent] @ joint.origin @ _move_joint(joint, positions.get(joint.name, 0.0))
         to_base = inverse(poses[robot.arm_base_link])
-        points, normals = [np.zeros((0, 3))], [np.zeros((0, 3))]
+        points: list[Array] = [np.zeros((0, 3))]
+        normals: list[Array] = [np.zeros((0, 3))]
         for name, (on_link, normal) in self._links.items():
             pose = to_base @ poses[name]
             points.append(transform_points(pose, on_link))
@@ -86,6 +87,6 @@ def _sample_mesh(xml: RobotXml, visual: Element, name: str) -> tuple[Array, Arra
     except (OSError, ValueError, NotImplementedError) as error:
         raise xml.make_error("cannot read a visual mesh", name, error) from error
     assert isinstance(mesh, trimesh.Trimesh)
-    points, faces = trimesh.sample.sample_surface(mesh, _POINTS_PER_MESH, seed=0)
+    points, faces = trimesh.sample.sample_surface(mesh, _POINTS_PER_MESH, seed=0)[:2]
     origin = xml.read_origin(visual)
     return transform_points(origin, np.asarray(points)), mesh.face_normals[faces] @ origin[:3, :3].T

@@ -103,7 +103,7 @@ def _match(tree: KDTree, moved: Array, radius: float) -> tuple[NDArray[np.bool_]
     """Return which points have a neighbour within a radius, and the indices of these neighbours."""
     distance, index = tree.query(moved, distance_upper_bound=radius)
     near = np.isfinite(distance)
-    return near, index[near]
+    return near, np.asarray(index)[near]
 
 
 def _solve_step(moved: Array, surface: Array, normals: Array, scale: float) -> tuple[Array, float]:
