@@ -11,7 +11,7 @@
 #
 # SPLIT        only the episodes of this split. A policy that observes neither images nor instructions needs only SPLIT=seen in
 #              looks-v1, cameras-v1, instructions-v1 and paper-words-v1: the scenes of all splits are the same.
-# EPISODES     only the first episodes of each configuration, this many (default: all)
+# EPISODES     number of episodes to evaluate of each configuration (default: all)
 # OUT          folder of the results (default: reproduced/protocols)
 # LEADERBOARD  file of the leaderboard (default: docs/leaderboard/results.json)
 # JOBS         number of processes that evaluate (default: one per core)

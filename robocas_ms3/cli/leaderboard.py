@@ -90,7 +90,7 @@ def _replay(result: Result, protocol: LoadedProtocol, cfg: AuditEntries) -> list
     """Replay stored actions of a result; return the differences, or why it cannot be replayed."""
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.evaluation.audit import find_audit_obstacle, run_audit
-    from robocas_ms3.evaluation.leaderboard.entries import list_stored
+    from robocas_ms3.evaluation.leaderboard.entries import list_stored_episodes
 
     if obstacle := find_audit_obstacle(result):
         return [f"cannot be audited: {obstacle}"]
@@ -101,7 +101,7 @@ def _replay(result: Result, protocol: LoadedProtocol, cfg: AuditEntries) -> list
             protocol,
             Path(folder) / "audit",
             sample=cfg.sample,
-            stored=list_stored(result, protocol),
+            stored=list_stored_episodes(result, protocol),
             envs=cfg.envs or len(os.sched_getaffinity(0)),
             on_start=lambda plan: bar.start(len(plan.episodes)),
         ):

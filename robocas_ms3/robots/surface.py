@@ -33,7 +33,7 @@ class RobotSurface:
         self._links: dict[str, tuple[Array, Array]] = {}  # points and normals (P, 3) in the frame of each link
         for link in xml.root.iterfind("link"):
             parts = [
-                _sample_mesh(xml, visual, mesh.attrib["filename"])
+                _sample_mesh(xml, visual, mesh)
                 for visual in link.iterfind("visual")
                 if (mesh := visual.find("geometry/mesh")) is not None
             ]
@@ -81,12 +81,15 @@ def _move_joint(joint: Joint, position: float) -> Array:
     return motion
 
 
-def _sample_mesh(xml: RobotXml, visual: Element, name: str) -> tuple[Array, Array]:
+def _sample_mesh(xml: RobotXml, visual: Element, element: Element) -> tuple[Array, Array]:
+    """Return points and normals (P, 3) on the mesh of the element ``<mesh>`` of a visual, in the frame of the link."""
+    name = xml.read_attribute(element, "filename")
     try:
         mesh = trimesh.load(xml.path.parent / name, force="mesh")
-    except (OSError, ValueError, NotImplementedError) as error:
+    except (OSError, ValueError, ImportError, NotImplementedError) as error:
         raise xml.make_error("cannot read a visual mesh", name, error) from error
     assert isinstance(mesh, trimesh.Trimesh)
+    mesh.apply_scale(xml.read_numbers(element, "scale", 3, "1 1 1"))
     points, faces = trimesh.sample.sample_surface(mesh, _POINTS_PER_MESH, seed=0)[:2]
     origin = xml.read_origin(visual)
     return transform_points(origin, np.asarray(points)), mesh.face_normals[faces] @ origin[:3, :3].T

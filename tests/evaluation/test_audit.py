@@ -221,7 +221,7 @@ def test_the_sample_of_an_entry_is_replayed(folder, tmp_path, monkeypatch, capsy
     entry, out = tmp_path / "entry", tmp_path / "entry" / "smoke"
     assert leaderboard.add(leaderboard.Add((folder,), out=out)) == 0
     assert leaderboard.audit(leaderboard.AuditEntries((entry,), envs=1)) == 0
-    sample = entries.list_stored(read_result(out), SMOKE)
+    sample = entries.list_stored_episodes(read_result(out), SMOKE)
     (other,) = {0, 1, 2, 3} - set(sample)
     path = read_result(out).outcomes[sample[0]].measures | {"path_length": 7.0}
     forge(out, sample[0], measures=path)

@@ -160,6 +160,7 @@ OTHERS = {
     "policy": {"name": "other"},
     "weld": True,
     "versions": {"torch": "other"},
+    "source_hash": "12" * 32,
     "pack_hashes": {"builtin": "other"},
     "backend": "gpu",
 }

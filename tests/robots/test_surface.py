@@ -1,8 +1,12 @@
 """Points on the surface of the robot."""
 
+import shutil
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from robocas_ms3.core.errors import RobotDescriptionError
 from robocas_ms3.core.poses import inverse, transform_points
 from robocas_ms3.robots.description_file import chain_poses
 from robocas_ms3.robots.registry import find_robot
@@ -35,6 +39,16 @@ def test_the_fingers_are_beside_the_tcp(surface):
     x, y, z = transform_points(inverse(tcp_in_base), points[fingers]).T  # y: closing direction, z: approach
     assert (np.abs(y) > 0.039).all() and (y > 0).sum() == 800
     assert np.abs(x).max() < 0.03 and z.max() < 0.03 and z.min() > -0.1
+
+
+def test_an_unreadable_visual_mesh_is_an_error(tmp_path):
+    files = find_robot(None).files()
+    folder = shutil.copytree(files.folder, tmp_path / "robot")
+    (folder / "visual" / "link3.glb").unlink()
+    copy = replace(files, urdf=folder / files.urdf.name)
+    with pytest.raises(RobotDescriptionError) as error:
+        RobotSurface(replace(find_robot(None), files=lambda: copy))
+    assert error.value.expected == "visual/link3.glb"
 
 
 def test_turning_the_first_joint_turns_all_links_but_the_first(surface):

@@ -6,7 +6,8 @@ points of a depth image and the surface of the robot at its measured joint posit
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,34 @@ _MATCH_FACTOR = 1.5  # matches with the correction, as a factor of those without
 _STARTS, _START_ROTATION, _START_SHIFT = 16, np.deg2rad(12), 0.06  # initial poses; along and about each axis, rad and m
 _MAX_ROTATION, _MAX_SHIFT = np.deg2rad(25), 0.2  # rad and m, greatest plausible errors of a camera pose
 _MIN_ROTATION, _MIN_SHIFT = np.deg2rad(1.0), 0.008  # rad and m, smaller errors are not corrected
+
+
+def estimate_corrections(frames: Mapping[str, CameraFrame], points: Array, normals: Array) -> dict[str, Array]:
+    """Return by camera the result of `estimate_correction`, without the cameras whose error is unknown."""
+    found = {camera: estimate_correction(frame, points, normals) for camera, frame in frames.items()}
+    return {camera: correction for camera, correction in found.items() if correction is not None}
+
+
+def correct_frames(
+    frames: dict[str, CameraFrame], corrections: Mapping[str, Array], hand_camera: str
+) -> dict[str, CameraFrame]:
+    """Return images with corrected camera poses; the same images if no camera has an error.
+
+    If one camera has an error, images of fixed cameras whose error is unknown are left out.
+
+    Args:
+        frames: by camera, the image with the nominal pose of the camera.
+        corrections: result of `estimate_corrections` for the first images of the episode.
+        hand_camera: name of the camera on the hand.
+    """
+    identity = np.eye(4)
+    if all((correction == identity).all() for correction in corrections.values()):
+        return frames
+    return {
+        camera: replace(frame, camera_in_base=frame.camera_in_base @ corrections.get(camera, identity))
+        for camera, frame in frames.items()
+        if camera in corrections or camera == hand_camera
+    }
 
 
 def estimate_correction(frame: CameraFrame, points: Array, normals: Array) -> Array | None:

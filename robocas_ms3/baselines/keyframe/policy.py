@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.baselines.keyframe.arm_control import ArmControl, EpisodeObservation, Motion
-from robocas_ms3.baselines.keyframe.camera_correction import estimate_correction
+from robocas_ms3.baselines.keyframe.camera_correction import correct_frames, estimate_corrections
 from robocas_ms3.baselines.keyframe.config import KeyframeConfig
 from robocas_ms3.baselines.keyframe.episode import KeyframeEpisode
 from robocas_ms3.baselines.keyframe.motion import ArmPaths
@@ -81,8 +80,9 @@ class KeyframePolicy:
             if self._image_requests[env]:
                 frames = {camera: _select_frame(observations, camera, row) for camera in self.spec.cameras}
                 if env not in self._runs:
-                    self._corrections[env] = self._estimate_corrections(env, frames, observations.qpos[row])
-                frames = self._correct_frames(env, frames)
+                    surface = self._surfaces[self._specs[env].robot].compute_points(observations.qpos[row])
+                    self._corrections[env] = estimate_corrections(frames, *surface)
+                frames = correct_frames(frames, self._corrections[env], self._hand_camera)
             qpos = observations.qpos[row, RobotDescription.arm_slice].astype(np.float64)
             width = float(observations.robot[GRIPPER_WIDTH].reshape(-1)[row])
             observation = EpisodeObservation(tcp_in_base[row], qpos, width, frames)
@@ -94,28 +94,6 @@ class KeyframePolicy:
             self._image_requests[env] = command.requests_images
             actions.append(command.action)
         return np.stack(actions)
-
-    def _estimate_corrections(
-        self, env: int, frames: dict[str, CameraFrame], qpos: NDArray[np.floating]
-    ) -> dict[str, Array]:
-        """Return by camera its pose (4, 4) in its nominal pose; without the cameras in which no pose fits the robot."""
-        points, normals = self._surfaces[self._specs[env].robot].compute_points(qpos)
-        found = {camera: estimate_correction(frame, points, normals) for camera, frame in frames.items()}
-        return {camera: correction for camera, correction in found.items() if correction is not None}
-
-    def _correct_frames(self, env: int, frames: dict[str, CameraFrame]) -> dict[str, CameraFrame]:
-        """Return the images with corrected camera poses.
-
-        If the pose of a camera is wrong, images of fixed cameras whose poses are unknown are left out.
-        """
-        corrections, identity = self._corrections[env], np.eye(4)
-        if all((correction == identity).all() for correction in corrections.values()):
-            return frames
-        return {
-            camera: replace(frame, camera_in_base=frame.camera_in_base @ corrections.get(camera, identity))
-            for camera, frame in frames.items()
-            if camera in corrections or camera == self._hand_camera
-        }
 
     def _start(self, env: int, observations: Observations, row: int) -> KeyframeEpisode:
         spec = self._specs[env]

@@ -64,14 +64,14 @@ def count_missing(result: Result, protocol: LoadedProtocol) -> int:
     return sum(one.config in configs and one.episode not in result.outcomes for one in protocol.episodes)
 
 
-def list_stored(result: Result, protocol: LoadedProtocol) -> list[int]:
+def list_stored_episodes(result: Result, protocol: LoadedProtocol) -> list[int]:
     """Return the numbers of the episodes of a result in an entry whose actions must be stored."""
     return choose_sample(protocol, {outcome.config for outcome in result.outcomes.values()})
 
 
 def find_result_violations(result: Result, protocol: LoadedProtocol) -> list[str]:
     """Return one text per violation in a result of an entry (`find_violations`)."""
-    found = find_violations(result, protocol, is_complete=False, stored=list_stored(result, protocol))
+    found = find_violations(result, protocol, is_complete=False, stored=list_stored_episodes(result, protocol))
     if missing := count_missing(result, protocol):
         found.append(f"{format_count(missing, 'episode')} of its configurations missing")
     return found
@@ -99,9 +99,12 @@ def write_result(result: Result, protocol: LoadedProtocol, out: Path, *, overwri
         found = f"{format_count(missing, 'episode')} missing"
         raise EvaluationError(what, where=result.folder, found=found, fix=fix)
     check_replaceable(out, overwrite=overwrite, markers=(RUN,))
-    sample = list_stored(result, protocol)
+    sample = list_stored_episodes(result, protocol)
+    # a path of the author's machine means nothing to others
+    parts = [part.model_copy(update={"folder": Path(part.folder).name}) for part in result.run.merged_from]
+    run = result.run.model_copy(update={"merged_from": parts} if parts else {})
     with atomic_folder(out) as folder:
-        write_json(folder / RUN, result.run.to_dict())
+        write_json(folder / RUN, run.to_dict())
         for number in sample:
             write_actions(folder, number, result.read_actions(number))
         write_outcomes(folder, result)

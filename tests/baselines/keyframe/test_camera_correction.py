@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from robocas_ms3.baselines.keyframe.camera_correction import estimate_correction
+from robocas_ms3.baselines.keyframe.camera_correction import correct_frames, estimate_correction, estimate_corrections
 from robocas_ms3.baselines.keyframe.perception import CameraFrame
 from robocas_ms3.core.poses import from_rotation, inverse, transform_points
 from robocas_ms3.robots.registry import find_robot
@@ -65,3 +65,26 @@ def test_without_the_robot_in_the_image_the_error_is_unknown(surface):
     assert estimate_correction(make_frame(covered, CAMERA), *surface) is None
     nothing = np.zeros((0, 3))
     assert estimate_correction(make_frame(render(*surface, CAMERA), CAMERA), nothing, nothing) is None
+
+
+def test_images_of_fixed_cameras_with_unknown_errors_are_left_out_if_another_camera_has_an_error(surface):
+    depth, error = render(*surface, CAMERA), from_rotation([-0.04, 0.05, 0.03], np.eye(3))
+    empty = np.full(SIZE, 4000, np.int16)
+    frames = {
+        "base_camera": make_frame(depth, CAMERA @ inverse(error)),
+        "static_camera": make_frame(empty, CAMERA),
+        "gripper_camera": make_frame(empty, CAMERA),
+    }
+    corrections = estimate_corrections(frames, *surface)
+    corrected = correct_frames(frames, corrections, "gripper_camera")
+    assert set(corrected) == {"base_camera", "gripper_camera"}
+    assert np.allclose(corrected["base_camera"].camera_in_base[:3, 3], CAMERA[:3, 3], atol=0.006)
+    assert corrected["gripper_camera"].camera_in_base.tolist() == CAMERA.tolist()
+
+
+def test_images_are_not_changed_without_errors(surface):
+    frames = {"base_camera": make_frame(render(*surface, CAMERA), CAMERA)}
+    frames["static_camera"] = make_frame(np.full(SIZE, 4000, np.int16), CAMERA)
+    corrections = estimate_corrections(frames, *surface)
+    assert set(corrections) == {"base_camera"}
+    assert correct_frames(frames, corrections, "gripper_camera") is frames

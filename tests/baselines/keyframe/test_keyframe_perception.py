@@ -90,6 +90,15 @@ def test_cells_behind_the_outline_of_the_basket_do_not_move_it():
     assert np.allclose(perception.survey([frame], 0.3).basket, [0.6, 0.2, TABLE + 0.12], atol=0.012)
 
 
+def test_two_distant_groups_of_basket_cells_are_no_basket():
+    scene = Scene()
+    groups = [(0.23, 0.31), (-0.37, -0.29)], [(0.885, 0.97), (0.285, 0.37)]
+    counts = [scene.add(BASKET, x, y, TABLE + 0.01).sum() for x, y in groups]
+    assert counts[0] == counts[1] > 10
+    perception, frame = scene.perceive()
+    assert perception.survey([frame], 0.3).basket is None
+
+
 def test_survey_before_a_door():
     scene = make_scene()
     add_handle(scene, (-0.3, -0.25), [0.48, -0.28, 0.13], [0.0, 0.5, 0.0])

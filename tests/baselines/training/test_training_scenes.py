@@ -2,7 +2,12 @@
 
 from types import SimpleNamespace
 
-from robocas_ms3.baselines.training.scenes import TrainingScenes, read_training_scenes, select_scene_settings
+from robocas_ms3.baselines.training.scenes import (
+    TrainingScenes,
+    name_config,
+    read_training_scenes,
+    select_scene_settings,
+)
 from robocas_ms3.scenes.config import load_task_config
 
 CAMERAS = ("base_camera", "gripper_camera")
@@ -34,6 +39,11 @@ def test_episodes_without_scenes_give_no_differences():
     found = read({}, {"task": None, "objects": None, "config": {"no_such_key": 1}})
     assert found == TrainingScenes()
     assert found.list_differences({"pick": load_task_config("pick_table_scattered")}, CAMERAS) == []
+
+
+def test_names_of_configurations():
+    assert name_config("mine/shelf.yaml", ()) == "shelf" and name_config("shelf", ["shelf"]) == "shelf-2"
+    assert name_config({"task": "pick"}, ()) == name_config(None, ()) == "configuration"
 
 
 def test_differences_from_other_configurations():

@@ -31,6 +31,17 @@ def test_an_entry_has_all_outcomes_and_the_actions_of_the_sample(result, tmp_pat
         assert (copy.read_actions(number) == result.read_actions(number)).all()
 
 
+def test_an_entry_has_no_paths_of_the_machine_of_its_author(result, tmp_path):
+    outcomes = (result.folder / OUTCOMES).read_text().splitlines(keepends=True)
+    for name, lines in (("a", outcomes[:3]), ("b", outcomes[3:])):
+        shutil.copytree(result.folder, tmp_path / name)
+        (tmp_path / name / OUTCOMES).write_text("".join(lines))
+    add(Add((tmp_path / "a", tmp_path / "b"), out=tmp_path / "entry" / "smoke"))
+    copy = read_result(tmp_path / "entry" / "smoke")
+    assert [part.folder for part in copy.run.merged_from] == ["a", "b"] and copy.outcomes == result.outcomes
+    assert str(tmp_path) not in (copy.folder / "run.json").read_text()
+
+
 def test_the_sample_depends_on_protocol_and_configurations(tmp_path, monkeypatch):
     monkeypatch.setattr(entries, "SAMPLE_SIZE", 3)
     protocol = load_protocol("smoke")
