@@ -51,6 +51,20 @@ def test_an_unreadable_visual_mesh_is_an_error(tmp_path):
     assert error.value.expected == "visual/link3.glb"
 
 
+def test_the_scale_of_a_visual_mesh_scales_its_points(surface, tmp_path):
+    files = find_robot(None).files()
+    folder = shutil.copytree(files.folder, tmp_path / "robot")
+    urdf = folder / files.urdf.name
+    mesh = 'filename="visual/link0.glb"'
+    urdf.write_text(urdf.read_text().replace(mesh, f'{mesh} scale="2 2 2"'))
+    copy = replace(files, urdf=urdf)
+    scaled, _ = RobotSurface(replace(find_robot(None), files=lambda: copy)).compute_points(QPOS)
+    points, _ = surface.compute_points(QPOS)
+    changed = np.linalg.norm(scaled - points, axis=1) > 1e-9
+    assert changed.sum() == 400  # points are in the frame of link 0
+    assert np.allclose(scaled[changed], 2 * points[changed])
+
+
 def test_turning_the_first_joint_turns_all_links_but_the_first(surface):
     points, _ = surface.compute_points(QPOS)
     turned, _ = surface.compute_points(np.concatenate([QPOS[:3], [np.pi / 2], QPOS[4:]]))
