@@ -20,7 +20,7 @@ export PYTHONPATH="$PWD${PYTHONPATH:+:$PYTHONPATH}" OMP_NUM_THREADS=1 PYTHONWARN
 export ROBOCAS_FAULT_ROWS="$out/rows.jsonl"
 rm -f "$ROBOCAS_FAULT_ROWS"
 failed=0
-"$python" -m pytest -m faults tests/faults -p no:cacheprovider -q "${@:2}" || failed=1
+"$python" -m pytest -m faults tests/faults -o timeout=0 -p no:cacheprovider -q "${@:2}" || failed=1
 [ -f "$ROBOCAS_FAULT_ROWS" ] || exit 1
 "$python" tests/support/fault_table.py "$ROBOCAS_FAULT_ROWS" "$out/faults.json" | tee "$out/faults.md"
 exit $failed
