@@ -1,22 +1,21 @@
-"""``robocas leaderboard add | audit``: add results to the leaderboard, and check its entries."""
+"""``robocas leaderboard add | audit | build``: add results to the leaderboard, check entries, and write its page."""
 
 from __future__ import annotations
 
 import os
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from robocas_ms3.cli.eval_results import Results
-from robocas_ms3.cli.options import Folders, Maybe
+from robocas_ms3.cli.options import Folders, Maybe, resumable
 from robocas_ms3.core.text import format_count
 
 if TYPE_CHECKING:
-    from robocas_ms3.evaluation.protocol import LoadedProtocol
-    from robocas_ms3.evaluation.results import Result
+    from robocas_ms3.evaluation.leaderboard.output import AuditedResult
 
 
 @dataclass(kw_only=True)
@@ -50,6 +49,28 @@ class AuditEntries:
     """Number of environments that run at the same time. Default: one per CPU core."""
 
 
+@dataclass
+class Build:
+    """Check and replay all entries, and write the leaderboard: index.html, results.md and results.json.
+
+    The stored actions are replayed like in `robocas leaderboard audit`, and the outcomes of these replays are kept in
+    the cache folder. Nothing is written if a result has problems (exit status 1).
+
+    Example: robocas leaderboard build leaderboard --out leaderboard-page
+    """
+
+    entries: Annotated[Path, tyro.conf.Positional]
+    """Folder with the entries."""
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
+    """Output folder."""
+    sample: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
+    """Replay N episodes per result, chosen at random. Default: all with stored actions."""
+    videos: int = 0
+    """Number of videos of failed episodes per result, made from the stored actions."""
+    envs: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
+    """Number of environments that run at the same time. Default: one per CPU core."""
+
+
 def add(cfg: Add) -> int:
     from robocas_ms3.cli.eval_results import find_protocol_of, read
     from robocas_ms3.cli.terminal import print_line
@@ -62,53 +83,113 @@ def add(cfg: Add) -> int:
 
 
 def audit(cfg: AuditEntries) -> int:
-    from robocas_ms3.cli.eval_results import find_protocol_of
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.core.checks import check_number
-    from robocas_ms3.evaluation.leaderboard.entries import find_result_violations, find_results
-    from robocas_ms3.evaluation.results import read_result
+    from robocas_ms3.evaluation.leaderboard.entries import find_results
 
-    for name in ("sample", "envs"):
-        if (number := getattr(cfg, name)) is not None:
-            check_number(f"--{name}", number, 1)
-    bad = 0
+    _check_numbers(cfg)
     folders = [folder for entry in cfg.entries for folder in find_results(entry)]
-    for folder in folders:
-        result = read_result(folder)
-        protocol = find_protocol_of(result, None)
-        problems = find_result_violations(result, protocol) or _replay(result, protocol, cfg)
-        for problem in problems:
-            print_line(f"{folder}: {problem}")
-        bad += bool(problems)
-        if not problems:
-            print_line(f"{folder}: no differences")
+    with tempfile.TemporaryDirectory() as memory:
+        audited = [_audit_result(folder, Path(memory), cfg) for folder in folders]
+    bad = audited.count(None)
     print_line(f"{format_count(len(folders), 'result')} checked, {bad} with problems")
     return 1 if bad else 0
 
 
-def _replay(result: Result, protocol: LoadedProtocol, cfg: AuditEntries) -> list[str]:
-    """Replay stored actions of a result; return the differences, or why it cannot be replayed."""
+@resumable
+def build(cfg: Build) -> int:
+    from robocas_ms3.cli.terminal import print_line
+    from robocas_ms3.core.checks import check_number
+    from robocas_ms3.core.paths import cache_dir
+    from robocas_ms3.evaluation.leaderboard.entries import find_results
+    from robocas_ms3.evaluation.leaderboard.output import write_leaderboard_page
+
+    _check_numbers(cfg)
+    check_number("--videos", cfg.videos, 0)
+    audited = [_audit_result(folder, cache_dir() / "audits", cfg) for folder in find_results(cfg.entries)]
+    results = [one for one in audited if one is not None]
+    if bad := audited.count(None):
+        print_line(f"{bad} of {format_count(len(audited), 'result')} with problems; nothing was written")
+        return 1
+    if cfg.videos:
+        for one in results:
+            _record_videos(one, cfg)
+    for path in write_leaderboard_page(results, cfg.out):
+        print_line(f"wrote {path}")
+    return 0
+
+
+def _check_numbers(cfg: AuditEntries | Build) -> None:
+    from robocas_ms3.core.checks import check_number
+
+    for name in ("sample", "envs"):
+        if (number := getattr(cfg, name)) is not None:
+            check_number(f"--{name}", number, 1)
+
+
+def _audit_result(folder: Path, memory: Path, cfg: AuditEntries | Build) -> AuditedResult | None:
+    """Check a result, replay its stored actions and print its problems; None: it has problems.
+
+    An audit is kept in ``memory``, in a folder named by its hash, so that it is continued and not repeated.
+    """
+    from robocas_ms3.cli.eval_results import find_protocol_of
     from robocas_ms3.cli.progress import ProgressBar
-    from robocas_ms3.evaluation.audit import find_audit_obstacle, run_audit
+    from robocas_ms3.cli.terminal import print_line
+    from robocas_ms3.evaluation.audit import find_audit_obstacle, hash_audit, run_audit
+    from robocas_ms3.evaluation.leaderboard.entries import find_result_violations, list_stored_episodes
+    from robocas_ms3.evaluation.leaderboard.output import AuditedResult
+    from robocas_ms3.evaluation.results import read_result
+
+    result, count = read_result(folder), 0
+    protocol = find_protocol_of(result, None)
+    problems = find_result_violations(result, protocol)
+    if not problems and (obstacle := find_audit_obstacle(result)):
+        problems = [f"cannot be audited: {obstacle}"]
+    if not problems:
+        with ProgressBar("episodes replayed") as bar:
+            for one in run_audit(
+                result,
+                protocol,
+                memory / hash_audit(result),
+                sample=cfg.sample,
+                stored=list_stored_episodes(result, protocol),
+                envs=cfg.envs or len(os.sched_getaffinity(0)),
+                on_start=lambda plan: bar.start(len(plan.episodes)),
+            ):
+                bar.advance()
+                count += 1
+                problems += [f"episode {one.episode}, recorded -> replayed: {text}" for text in one.differences]
+    for problem in problems:
+        print_line(f"{folder}: {problem}")
+    if problems:
+        return None
+    print_line(f"{folder}: no differences in {format_count(count, 'episode')}")
+    return AuditedResult(result, protocol, count)
+
+
+def _record_videos(audited: AuditedResult, cfg: Build) -> None:
+    """Record videos of failed episodes from the stored actions; existing videos are kept."""
+    from robocas_ms3.cli.progress import ProgressBar
+    from robocas_ms3.evaluation.audit import StoredActionsPolicy
     from robocas_ms3.evaluation.leaderboard.entries import list_stored_episodes
+    from robocas_ms3.evaluation.leaderboard.page import video_folder
+    from robocas_ms3.evaluation.report.page import video_file_name
+    from robocas_ms3.evaluation.report.videos import choose_failed_episodes, record_videos
 
-    if obstacle := find_audit_obstacle(result):
-        return [f"cannot be audited: {obstacle}"]
-    problems = []
-    with ProgressBar("episodes replayed") as bar, tempfile.TemporaryDirectory() as folder:
-        for one in run_audit(
-            result,
-            protocol,
-            Path(folder) / "audit",
-            sample=cfg.sample,
-            stored=list_stored_episodes(result, protocol),
-            envs=cfg.envs or len(os.sched_getaffinity(0)),
-            on_start=lambda plan: bar.start(len(plan.episodes)),
-        ):
-            bar.advance()
-            problems += [f"episode {one.episode}, recorded -> replayed: {text}" for text in one.differences]
-    return problems
+    result, protocol, _ = audited
+    stored = {number: result.outcomes[number] for number in list_stored_episodes(result, protocol)}
+    folder = video_folder(cfg.out, result)
+    numbers = [
+        number
+        for number in choose_failed_episodes(replace(result, outcomes=stored), cfg.videos)
+        if not (folder / video_file_name(number)).exists()
+    ]
+    if numbers:
+        with ProgressBar("videos recorded") as bar:
+            for done, _ in enumerate(
+                record_videos(result, protocol, StoredActionsPolicy(result), numbers, folder), start=1
+            ):
+                bar.update(done, len(numbers))
 
 
-COMMANDS = {"add": add, "audit": audit}
-DESCRIPTION = "Add results to the leaderboard, and check its entries."
+COMMANDS = {"add": add, "audit": audit, "build": build}
+DESCRIPTION = "Add results to the leaderboard, check its entries, and write its page."

@@ -27,7 +27,7 @@ from robocas_ms3.evaluation.outcomes import Checkpoints, Count, Outcome
 from robocas_ms3.evaluation.policy import CONVENTIONS, EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.protocol import LoadedProtocol, ProtocolEpisode
 from robocas_ms3.evaluation.results import Result
-from robocas_ms3.evaluation.run_record import describe_machine, get_package_versions
+from robocas_ms3.evaluation.run_record import describe_machine, get_package_versions, hash_source
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
@@ -234,6 +234,12 @@ def hash_result(result: Result) -> str:
         for array in result.read_checkpoints(number):
             digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
+
+
+def hash_audit(result: Result) -> str:
+    """Return the hex SHA-256 of a result and of the code that replays it: package versions, source code, processor."""
+    code = [get_package_versions(), hash_source(), describe_machine()["model"]]
+    return hashlib.sha256(f"{hash_result(result)} {json.dumps(code, sort_keys=True)}".encode()).hexdigest()
 
 
 def bound_differing_episodes(sample: int, total: int) -> int:

@@ -21,6 +21,7 @@ from robocas_ms3.evaluation.audit import (
     run_audit,
 )
 from robocas_ms3.evaluation.leaderboard import entries
+from robocas_ms3.evaluation.leaderboard.rows import read_leaderboard
 from robocas_ms3.evaluation.policy import PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.results import OUTCOMES, RUN, read_result
@@ -234,6 +235,26 @@ def test_the_sample_of_an_entry_is_replayed(folder, tmp_path, monkeypatch, capsy
     (out / OUTCOMES).write_text("".join(lines[1:]))
     assert leaderboard.audit(leaderboard.AuditEntries((out,), envs=1)) == 1
     assert "1 episode of its configurations missing" in capsys.readouterr().out
+
+
+def test_the_leaderboard_has_only_audited_results(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "cache"))
+    entry, out = tmp_path / "entries" / "mine" / "smoke", tmp_path / "page"
+    assert leaderboard.add(leaderboard.Add((folder,), out=entry)) == 0
+    build = leaderboard.Build(tmp_path / "entries", out, envs=1)
+    assert leaderboard.build(build) == 0
+    rows = [row for row in read_leaderboard(out / "results.json").rows if not row.published]
+    assert {(row.task, row.n, row.audited) for row in rows} == {("pick", 2, 4), ("select", 2, 4)}
+    with monkeypatch.context() as patch:  # the replays are remembered
+        patch.setattr(session, "make_vec", lambda *args, **kwargs: pytest.fail("an episode was replayed again"))
+        assert leaderboard.build(build) == 0
+    before = (out / "results.json").read_bytes()
+    forge(entry, 1, measures=read_result(entry).outcomes[1].measures | {"path_length": 7.0})
+    capsys.readouterr()
+    assert leaderboard.build(build) == 1
+    printed = capsys.readouterr().out
+    assert "episode 1, recorded -> replayed: measures.path_length" in printed and "nothing was written" in printed
+    assert (out / "results.json").read_bytes() == before
 
 
 def test_an_entry_without_results_is_an_error(tmp_path):

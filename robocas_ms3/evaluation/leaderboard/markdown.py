@@ -22,6 +22,11 @@ NOTE = (
     "robocas eval compare has the paired interval. Compare rows of the same table, task, split and track, without "
     "notes."
 )
+RANK_NOTE = (
+    "Rank: 1 plus the number of policies of the same track, task and split with significantly more successes "
+    "(McNemar's exact test over the same episodes, adjusted by Holm's method), so that ties have equal ranks. Audited: "
+    "number of episodes whose stored actions were replayed without differences."
+)
 PUBLISHED_NOTE = (
     "Published results are not comparable with the tables above: RoboCAS-v0's evaluator has another rule of success, "
     "fixes lifted objects to the hand, and has other object meshes."
@@ -31,6 +36,8 @@ PUBLISHED_NOTE = (
 def render_leaderboard(rows: Sequence[LeaderboardRow]) -> str:
     """Return rows as Markdown: one table per protocol and its hash, and one table of published results."""
     lines, protocols = [NOTE], dict[tuple[str, str], list[LeaderboardRow]]()
+    if any(row.rank is not None for row in rows):
+        lines += ["", RANK_NOTE]
     for row in rows:
         if not row.published:
             protocols.setdefault((row.protocol, row.protocol_hash), []).append(row)
@@ -44,13 +51,18 @@ def render_leaderboard(rows: Sequence[LeaderboardRow]) -> str:
 
 def _render_table(rows: Sequence[LeaderboardRow]) -> Iterator[str]:
     has_seen = any(row.split == SEEN and not row.published for row in rows)
+    has_ranks = any(row.rank is not None for row in rows)
     heads = (*_HEADS[:_CHANGE_COLUMN], _CHANGE, *_HEADS[_CHANGE_COLUMN:]) if has_seen else _HEADS
+    if has_ranks:
+        heads = (*heads, "rank", "audited")
     yield f"| {' | '.join(heads)} |"
     yield "|" + "---|" * len(heads)
     for row in rows:
         cells = _make_cells(row)
         if has_seen:
             cells.insert(_CHANGE_COLUMN, _format_change(row, find_seen_row(row, rows)))
+        if has_ranks:
+            cells += ["" if row.rank is None else str(row.rank), str(row.audited)]
         yield f"| {' | '.join(map(escape_markdown, cells))} |"
 
 
@@ -62,11 +74,11 @@ def _make_cells(row: LeaderboardRow) -> list[str]:
         _format_success(row),
         _format_percent(row.rate_v0),
         *(_format_percent(row.stages.get(stage)) for stage in PAPER_STAGES.values()),
-        _describe_data(training),
+        describe_data(training),
         "" if row.trained_here is None else "yes" if row.trained_here else "no",
-        _describe_cost(training),
+        describe_cost(training),
         "" if row.parameters is None else f"{row.parameters / 1e6:.2f} M",
-        "; ".join(_list_notes(row)),
+        "; ".join(list_row_notes(row)),
     ]
 
 
@@ -89,19 +101,22 @@ def _format_percent(rate: float | None) -> str:
     return "" if rate is None else f"{100 * rate:.1f}"
 
 
-def _describe_data(training: Training) -> str:
+def describe_data(training: Training) -> str:
+    """Return the training data of a policy as text."""
     episodes = [] if training.episodes is None else [format_count(training.episodes, "episode")]
     initial = [f"from {training.init_from}"] if training.init_from else []
     return ", ".join([*episodes, *([training.scenes] if training.scenes else []), *initial])
 
 
-def _describe_cost(training: Training) -> str:
+def describe_cost(training: Training) -> str:
+    """Return steps, time and hardware of a training as text."""
     steps = [] if training.steps is None else [format_count(training.steps, "step")]
     minutes = [] if training.seconds is None else [f"{training.seconds / 60:.0f} min"]
     return ", ".join([*steps, *minutes, *([training.hardware] if training.hardware else [])])
 
 
-def _list_notes(row: LeaderboardRow) -> Iterator[str]:
+def list_row_notes(row: LeaderboardRow) -> Iterator[str]:
+    """Yield what limits comparisons with other rows."""
     if row.n is not None and row.n_protocol is not None and row.n < row.n_protocol:
         yield f"{row.n} of {format_count(row.n_protocol, 'episode')}"
     if row.errors:

@@ -65,6 +65,9 @@ class LeaderboardRow(StrictModel):
         calibration: camera calibration that the policy observes; None: no cameras, or unknown.
         differences: conditions that make the rates not comparable with rows of the same protocol without them.
         weights: hash of the weights; empty: unknown.
+        audited: number of episodes of the result whose stored actions were replayed without differences.
+        rank: 1 plus the number of comparable policies that are significantly better; None: not ranked.
+        rank_p_value: adjusted p-value of the comparison with the next policy; None: not compared (`ranks.Rank`).
         backend, versions: backend and package versions of the evaluation.
         source_hash: hash of the source code of robocas_ms3 (`run_record.hash_source`); empty: unknown.
     """
@@ -90,6 +93,9 @@ class LeaderboardRow(StrictModel):
     calibration: Calibration | None = None
     differences: list[str] = []
     weights: str = ""
+    audited: Count = 0
+    rank: Annotated[int, Field(ge=1)] | None = None
+    rank_p_value: Rate | None = None
     backend: str = ""
     versions: dict[str, str] = {}
     source_hash: str = ""

@@ -1,15 +1,11 @@
-"""A result as a single HTML page without other files.
-
-The SVG images contain no text, so they can be stretched.
-"""
+"""A result as a single HTML page without other files."""
 
 from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from html import escape
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +13,13 @@ import numpy as np
 from robocas_ms3.core.text import format_count
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.protocol import LoadedProtocol
+from robocas_ms3.evaluation.report.html import (
+    render_document,
+    render_list,
+    render_rate_bar,
+    render_section,
+    render_table,
+)
 from robocas_ms3.evaluation.report.tables import (
     Cell,
     FailureCount,
@@ -49,25 +52,18 @@ def render_page(result: Result, folder: Path | None = None, protocol: LoadedProt
         folder: folder of the page; videos in its folder ``videos`` are linked.
         protocol: protocol of the result; adds missing episodes, description and rules.
     """
-    here = files("robocas_ms3.evaluation.report")
-    style, script = ((here / name).read_text(encoding="utf-8") for name in ("style.css", "script.js"))
-    title, parts = escape(make_title(result)), [_render_lead(result, protocol)]
+    parts = [_render_lead(result, protocol)]
     if result.outcomes:
         success, *others = map(_render_table_section, make_tables(result))
         parts += [
             success,
-            _render_stages(result),
+            render_stages(result),
             *others,
             _render_seconds(result),
             _render_table_section(_make_effort_table(result)),
         ]
     parts += [_render_settings(result, protocol), _render_failed_episodes(result, folder)]
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{title}</title>\n<style>\n{style}</style>\n</head>\n<body>\n<main>\n<h1>{title}</h1>\n"
-        f"{''.join(parts)}</main>\n<script>\n{script}</script>\n</body>\n</html>\n"
-    )
+    return render_document(make_title(result), "".join(parts))
 
 
 def _render_lead(result: Result, protocol: LoadedProtocol | None) -> str:
@@ -84,20 +80,21 @@ def _render_lead(result: Result, protocol: LoadedProtocol | None) -> str:
     return f'<p class="lead">{lead}</p>\n' + "".join(f'<p class="note">{note}</p>\n' for note in texts)
 
 
-def _render_stages(result: Result) -> str:
+def render_stages(result: Result) -> str:
+    """Return the section with the stages of each configuration."""
     cards = []
     for config, outcomes in result.group_by("config").items():
         rows = []
         for stage, name in get_stage_names(outcomes[0].task).items():
             if any(stage in outcome.flags for outcome in outcomes):
                 rate = result.compute_rate(stage, outcomes)
-                shown = _render_rate_bar(rate, "good" if stage == "success" else "")
+                shown = render_rate_bar(rate, "good" if stage == "success" else "")
                 rows.append(
                     f'<div class="row"><span>{escape(name)}</span>{shown}<b>{100 * rate.rate:.0f} %</b></div>\n'
                 )
         cards.append(f"<figure><figcaption>{escape(config)}, n {len(outcomes)}</figcaption>{''.join(rows)}</figure>\n")
     note = "Fraction of the episodes that reached each stage, with its interval. An episode may skip a stage."
-    return _render_section("Stages", note, f'<div class="cards">\n{"".join(cards)}</div>\n')
+    return render_section("Stages", note, f'<div class="cards">\n{"".join(cards)}</div>\n')
 
 
 def _render_seconds(result: Result) -> str:
@@ -116,7 +113,7 @@ def _render_seconds(result: Result) -> str:
         )
     heads = ("configuration", "succeeded#", "min#", "25 %#", "median#", "75 %#", "max#", _render_axis(axis_end, "s"))
     note = "Simulated seconds of the successful episodes. A tick is an episode; the box contains half of them."
-    return _render_section("Seconds to success", note, _render_table(heads, rows))
+    return render_section("Seconds to success", note, render_table(heads, rows))
 
 
 def _make_effort_table(result: Result) -> Table:
@@ -170,8 +167,8 @@ def _render_settings(result: Result, protocol: LoadedProtocol | None) -> str:
     machines = {_to_text(part.machine) for part in run.merged_from} or {_to_text(run.machine or {})}
     pairs += [("machine", machine) for machine in sorted(machines)]
     rows = [[escape(part.folder), str(part.episodes)] for part in run.merged_from]
-    parts = _render_table(("merged from", "episodes#"), rows) if rows else ""
-    return _render_section("Settings", "", _render_list(pairs) + parts)
+    parts = render_table(("merged from", "episodes#"), rows) if rows else ""
+    return render_section("Settings", "", render_list(pairs) + parts)
 
 
 def _to_text(value: object) -> str:
@@ -210,8 +207,8 @@ def _render_failed_episodes(result: Result, folder: Path | None) -> str:
         f'<span id="count">{len(failed)}</span> of {format_count(len(result.outcomes), "episode")}. '
         f"Ended by: the time limit, a failure such as the target on the floor, or an error. {videos}"
     )
-    table = _render_table(heads, rows, "failed")
-    return _render_section("Failed episodes", note, f'<form class="filters">{filters}</form>\n{table}')
+    table = render_table(heads, rows, "filtered")
+    return render_section("Failed episodes", note, f'<form class="filters">{filters}</form>\n{table}')
 
 
 def _render_failed_episode(outcome: Outcome, folder: Path | None) -> list[str]:
@@ -232,11 +229,6 @@ def _render_failed_episode(outcome: Outcome, folder: Path | None) -> list[str]:
     ]
 
 
-def _render_section(title: str, note: str, content: str) -> str:
-    text = f"<p>{note}</p>\n" if note else ""
-    return f"<section>\n<h2>{title}</h2>\n{text}{content}</section>\n"
-
-
 def _render_table_section(table: Table) -> str:
     """Return the section of a table; rates have bars."""
     heads = []
@@ -246,31 +238,7 @@ def _render_table_section(table: Table) -> str:
         [html for cell, head in zip(row, table.heads, strict=True) for html in _render_cells(cell, head)]
         for row in table.rows
     ]
-    return _render_section(table.title, escape(table.note, quote=False), _render_table(heads, rows))
-
-
-def _render_table(heads: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
-    """Return an HTML table; cells are HTML, and columns whose head ends with ``#`` are aligned to the right."""
-    right = ["number" if head.endswith("#") else "" for head in heads]
-    head = "".join(_render_tag("th", name.rstrip("#"), how) for name, how in zip(heads, right, strict=True))
-    body = "".join(
-        "<tr>" + "".join(_render_tag("td", cell, how) for cell, how in zip(row, right, strict=True)) + "</tr>\n"
-        for row in rows
-    )
-    kinds = f' class="{kind}"' if kind else ""
-    return f'<div class="wide"><table{kinds}><thead><tr>{head}</tr></thead>\n<tbody>\n{body}</tbody></table></div>\n'
-
-
-def _render_rate_bar(rate: SuccessRate, kind: str = "") -> str:
-    """Return an SVG bar of a success rate and its interval, on an axis of 0 to 100 %."""
-    low, high, here = 100 * rate.low, 100 * rate.high, 100 * rate.rate
-    label = f"{rate.k} of {rate.n}: {here:.1f} %, {low:.1f} to {high:.1f}"
-    return (
-        f'<svg class="bar {kind}" viewBox="0 0 100 16" preserveAspectRatio="none" role="img" aria-label="{label}">'
-        f'<title>{label}</title><rect class="track" width="100" height="16"/>'
-        f'<rect class="fill" y="2" width="{here:.2f}" height="12"/>'
-        f'<path class="whisker" d="M{low:.2f} 8H{high:.2f}M{low:.2f} 4V12M{high:.2f} 4V12"/></svg>'
-    )
+    return render_section(table.title, escape(table.note, quote=False), render_table(heads, rows))
 
 
 def _render_distribution(values: Sequence[float], axis_end: float) -> str:
@@ -291,12 +259,6 @@ def _render_axis(axis_end: float, unit: str) -> str:
     return f'<div class="axis">{labels}</div>'
 
 
-def _render_list(pairs: Iterable[tuple[str, object]]) -> str:
-    """Return an HTML definition list of names and values, which are plain text."""
-    entries = "".join(f"<dt>{escape(name)}</dt><dd>{escape(str(value))}</dd>\n" for name, value in pairs)
-    return f"<dl>\n{entries}</dl>\n"
-
-
 def _round_up(value: float) -> float:
     """Round up to 1, 2, 4 or 8 times a power of ten, for the end of an axis."""
     power = 10.0 ** np.floor(np.log10(max(value, 1e-9)))
@@ -307,13 +269,9 @@ def _render_cells(cell: Cell, head: str) -> list[str]:
     """Return the HTML cells of a value; a rate in a ``%`` column takes two cells: text and bar."""
     if isinstance(cell, SuccessRate):
         rate = f"{100 * cell.rate:.0f} %<small>{100 * cell.low:.0f} to {100 * cell.high:.0f}</small>"
-        return [rate, _render_rate_bar(cell, "good")] if head.endswith("%") else [rate]
+        return [rate, render_rate_bar(cell, "good")] if head.endswith("%") else [rate]
     if isinstance(cell, FailureCount):
         return [f'<span class="heat" style="--fraction: {100 * cell.count / cell.n:.0f}%">{cell.count or ""}</span>']
     if cell is None:
         return ['<span class="faint">none</span>', *([""] if head.endswith("%") else [])]
     return [escape(cell)]
-
-
-def _render_tag(tag: str, content: str, kind: str) -> str:
-    return f'<{tag} class="{kind}">{content}</{tag}>' if kind else f"<{tag}>{content}</{tag}>"

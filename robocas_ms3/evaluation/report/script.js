@@ -1,7 +1,7 @@
 "use strict";
-// Without this script all failed episodes are shown.
+// Without this script all rows are shown.
 const filters = [...document.querySelectorAll(".filters select")];
-const rows = [...document.querySelectorAll("table.failed tbody tr")];
+const rows = [...document.querySelectorAll("table.filtered tbody tr")];
 
 function show() {
   let count = 0;

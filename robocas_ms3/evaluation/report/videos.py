@@ -40,11 +40,12 @@ def _interleave(lists: list[list[int]]) -> list[int]:
 
 
 def record_videos(
-    result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Sequence[int]
+    result: Result, protocol: LoadedProtocol, policy: Policy, episodes: Sequence[int], folder: Path | None = None
 ) -> Iterator[tuple[Path, bool]]:
-    """Run episodes of a result again in worker processes and write a video of each into the folder ``videos``.
+    """Run episodes of a result again in worker processes and write a video of each into a folder.
 
-    Yields the path of each video, and whether the outcome of the episode equals the recorded outcome.
+    The default folder is ``videos`` in the folder of the result. Yields the path of each video, and whether the outcome
+    of the episode equals the recorded outcome.
     """
     if (expected := result.run.protocol_hash) != (found := protocol.hash):
         raise EvaluationError(
@@ -69,10 +70,11 @@ def record_videos(
     )
     session = EvaluationSession(policy, settings, recorder.wrap)
     recorder.period = max(1, round(session.rate / _FRAMES))
-    make_folder(result.folder / VIDEOS)
+    folder = folder or result.folder / VIDEOS
+    make_folder(folder)
     with closing(session):
         for number in sorted(episodes, key=lambda one: protocol.episodes[one].config):
-            before, path = result.outcomes[number], result.folder / VIDEOS / video_file_name(number)
+            before, path = result.outcomes[number], folder / video_file_name(number)
             # As many steps as recorded, whatever ended the episode.
             fps = session.rate / recorder.period * _SPEED
             with atomic_file(path) as tmp, open_video(tmp, fps, quality=6) as recorder.writer:

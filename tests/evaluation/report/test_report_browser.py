@@ -8,7 +8,7 @@ from robocas_ms3.evaluation.report import PAGE, write_report
 
 pytestmark = pytest.mark.slow
 SHOWN = (
-    "[...document.querySelectorAll('table.failed tbody tr')].filter(row => !row.hidden)"
+    "[...document.querySelectorAll('table.filtered tbody tr')].filter(row => !row.hidden)"
     ".map(row => row.cells[0].textContent).join()"
 )
 

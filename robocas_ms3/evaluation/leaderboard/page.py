@@ -1,0 +1,102 @@
+"""Leaderboard as a single HTML page with filters, and the stages of each result."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+from robocas_ms3.evaluation.leaderboard.markdown import (
+    PUBLISHED_NOTE,
+    RANK_NOTE,
+    describe_cost,
+    describe_data,
+    list_row_notes,
+)
+from robocas_ms3.evaluation.leaderboard.rows import LeaderboardRow, Training
+from robocas_ms3.evaluation.report.html import render_document, render_rate_bar, render_section, render_table
+from robocas_ms3.evaluation.report.page import VIDEOS, render_stages
+from robocas_ms3.evaluation.report.tables import name_policy
+from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.statistics import compute_success_rate
+
+NOTE = (
+    f"Success rates with exact 95 % intervals. {RANK_NOTE} p: adjusted p-value of the comparison with the next policy "
+    "of the track. An audit shows that the stored actions have these outcomes, but not which policy chose them."
+)
+_HEADS = (
+    *("protocol", "task", "split", "track", "rank#", "policy", "success#", "0 to 100 %", "n#", "p#", "audited#"),
+    *("trained here", "training data", "training", "parameters#", "notes"),
+)
+_FILTERS = ("protocol", "task", "split", "track", "policy", "trained here")
+
+
+def render_leaderboard_page(rows: Sequence[LeaderboardRow], results: Sequence[Result], folder: Path) -> str:
+    """Return the leaderboard as an HTML page.
+
+    Args:
+        rows: rows in the order of the page.
+        results: results of the entries; each has a section with its stages.
+        folder: folder of the page; videos in `video_folder` are linked.
+    """
+    measured = [_render_row(row) for row in rows if not row.published]
+    table = render_table(_HEADS, measured, "filtered")
+    head = f'<span id="count">{len(measured)}</span> of {len(measured)} rows. {escape(NOTE, quote=False)}'
+    parts = [render_section("Results", head, _render_filters(measured) + table)]
+    parts += [_render_result(result, folder) for result in results]
+    if published := [row for row in rows if row.published]:
+        heads = ("policy", "track", "task", "success#")
+        cells = [[escape(x) for x in (row.policy, row.track, row.task, _format_published(row))] for row in published]
+        parts.append(
+            render_section("Published results", escape(PUBLISHED_NOTE, quote=False), render_table(heads, cells))
+        )
+    return render_document("RoboCAS leaderboard", "".join(parts))
+
+
+def video_folder(folder: Path, result: Result) -> Path:
+    """Return the folder of the videos of a result, next to the page in ``folder``."""
+    return folder / VIDEOS / result.folder.parent.name / result.folder.name  # names of files, not of the result
+
+
+def _render_filters(rows: Sequence[Sequence[str]]) -> str:
+    labels = []
+    for name in _FILTERS:
+        column = _HEADS.index(name)
+        options = "".join(f"<option>{value}</option>" for value in sorted({row[column] for row in rows}))
+        choices = f'<option value="">all</option>{options}'
+        labels.append(f'<label>{name} <select data-column="{column}">{choices}</select></label>\n')
+    return f'<form class="filters">{"".join(labels)}</form>\n'
+
+
+def _render_row(row: LeaderboardRow) -> list[str]:
+    training, rate = row.training or Training(), compute_success_rate(row.successes or 0, row.n or 1)
+    return [
+        *map(escape, (row.protocol, row.task, row.split, row.track)),
+        "" if row.rank is None else str(row.rank),
+        escape(row.policy),
+        f"{100 * rate.rate:.1f} %<small>{100 * rate.low:.1f} to {100 * rate.high:.1f}</small>",
+        render_rate_bar(rate, "good"),
+        str(rate.n),
+        "" if row.rank_p_value is None else f"{row.rank_p_value:.2g}",
+        str(row.audited),
+        "" if row.trained_here is None else "yes" if row.trained_here else "no",
+        escape(describe_data(training)),
+        escape(describe_cost(training)),
+        "" if row.parameters is None else f"{row.parameters / 1e6:.2f} M",
+        escape("; ".join(list_row_notes(row))),
+    ]
+
+
+def _render_result(result: Result, folder: Path) -> str:
+    """Return the stages of a result and links to its videos, folded."""
+    policy, protocol = name_policy(result.run), result.run.protocol
+    videos = sorted(video_folder(folder, result).glob("*.mp4"))
+    links = " ".join(f'<a href="{escape(one.relative_to(folder).as_posix())}">{one.stem}</a>' for one in videos)
+    shown = f"<p>Videos of failed episodes: {links}</p>\n" if videos else ""
+    summary = f"<summary>{escape(policy)}, {escape(protocol)}</summary>"
+    return f"<details>\n{summary}\n{render_stages(result)}{shown}</details>\n"
+
+
+def _format_published(row: LeaderboardRow) -> str:
+    rate = row.rate_v0 if row.rate is None else row.rate
+    return "" if rate is None else f"{100 * rate:.1f} %"
