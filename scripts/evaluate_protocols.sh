@@ -9,7 +9,7 @@
 # After an interruption, run the script again to continue. Results: OUT/POLICY/PROTOCOL, with _ in place of / in POLICY. With
 # one run per task: OUT/POLICY/PROTOCOL/TASK; tasks without a run are left out. In paper-v1, select has the episodes of pick.
 #
-# SPLIT        only the episodes of this split. A policy that observes neither images nor instructions needs only SPLIT=seen in
+# SPLIT        only the episodes of this split; protocols without it are left out. A policy that observes neither images nor instructions needs only SPLIT=seen in
 #              looks-v1, cameras-v1, instructions-v1 and paper-words-v1: the scenes of all splits are the same.
 # EPISODES     number of episodes to evaluate of each configuration (default: all)
 # OUT          folder of the results (default: reproduced/protocols)
@@ -40,6 +40,10 @@ has_task() {
     grep -q "\"task\":\"$played\"" "robocas_ms3/data/protocols/$1/episodes.jsonl"
 }
 
+has_split() {
+    [[ -z ${SPLIT:-} ]] || grep -q "\"split\":\"$SPLIT\"" "robocas_ms3/data/protocols/$1/episodes.jsonl"
+}
+
 add_rows() {
     mkdir -p "$(dirname "$leaderboard")"
     "$robocas" eval leaderboard "$1" --update --out "$leaderboard" >/dev/null
@@ -51,6 +55,7 @@ for run in "${runs[@]}"; do
 done
 for protocol in "${protocols[@]}"; do
     folder=$out/${policy//\//_}/$protocol
+    has_split "$protocol" || continue
     if [[ ${per_task:-} ]]; then
         for task in pick select search open_pick; do
             [[ -e $policy/$task/run.json ]] || continue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,26 +18,6 @@ from robocas_ms3.core.strict_model import parse
 from robocas_ms3.core.text import format_error
 from robocas_ms3.evaluation.policy import EpisodeSpec, Observations, Policy, PolicySpec, find_image_requests
 from robocas_ms3.scenes.config import TaskConfig
-
-
-def shipped_small() -> RunPolicy:
-    """Make the policy `small` with the bundled weights, which were trained for pick."""
-    return RunPolicy(BUNDLED / "small")
-
-
-def shipped_keyframe() -> RunPolicy:
-    """Make the policy `keyframe` with the bundled weights, which were trained for all four tasks."""
-    return RunPolicy(BUNDLED / "keyframe")
-
-
-def shipped_keyframe_upstream() -> RunPolicy:
-    """Make the policy `keyframe` with the bundled weights trained in the scenes of RoboCAS-v0's data."""
-    return RunPolicy(BUNDLED / "keyframe-upstream")
-
-
-def shipped_keyframe_upstream_eval() -> RunPolicy:
-    """Make the policy `keyframe` with the bundled weights trained in the scenes of RoboCAS-v0's evaluation."""
-    return RunPolicy(BUNDLED / "keyframe-upstream-eval")
 
 
 class RunPolicy:
@@ -167,3 +148,9 @@ def _convert_fact_errors(path: Path) -> Iterator[None]:
         found = format_error(error, 200)
         what, fix = "cannot build the network from config and facts", "Restore the file, or train again."
         raise TrainingError(what, where=path, found=found, fix=fix) from error
+
+
+bundled_small = partial(RunPolicy, BUNDLED / "small")
+bundled_keyframe = partial(RunPolicy, BUNDLED / "keyframe")
+bundled_keyframe_upstream = partial(RunPolicy, BUNDLED / "keyframe-upstream")
+bundled_keyframe_upstream_eval = partial(RunPolicy, BUNDLED / "keyframe-upstream-eval")

@@ -51,7 +51,7 @@ class AuditedEpisode:
 
 
 class AuditPlan(NamedTuple):
-    """What an audit will do.
+    """Episodes that an audit replays.
 
     Attributes:
         episodes: numbers of the episodes.

@@ -20,7 +20,7 @@ from robocas_ms3.core.errors import LayoutError
 from robocas_ms3.datasets.conversion.env_renderer import require_renderer
 from robocas_ms3.demos.failures import Intervention
 from robocas_ms3.demos.settings import EpisodeSettings
-from robocas_ms3.evaluation.action_wrapper import V0_CONTROL_HZ, PolicyActionWrapper, make_env_kwargs
+from robocas_ms3.evaluation.action_wrapper import MOTION_STEPS, V0_CONTROL_HZ, PolicyActionWrapper, make_env_kwargs
 from robocas_ms3.evaluation.policies import open_policy
 from robocas_ms3.evaluation.policy import EpisodeSpec, Policy
 from robocas_ms3.evaluation.protocol import check_cameras, load_protocol
@@ -44,6 +44,8 @@ def check_roll_in_policy(settings: EpisodeSettings) -> str:
     """Check that the policy ``after_policy`` fits `PROTOCOL`; return the hash of its weights, empty without weights."""
     with open_policy(settings.after_policy) as policy:
         load_protocol(PROTOCOL).rules.check_policy(policy.spec)
+        if (check_robot := getattr(policy, "check_robot", None)) is not None:
+            check_robot(settings.robot)
         if policy.spec.cameras:
             robot = find_robot(settings.robot).description
             check_cameras(policy.spec, load_task_config(settings.config), robot, settings.config)
@@ -108,4 +110,5 @@ class PolicyRollIn:
     def _make_episode_spec(self, seed: int) -> EpisodeSpec:
         settings, text = self._settings, self._base.instruction().text
         files = (str(self._config), settings.layouts, settings.pack)
-        return EpisodeSpec(-1, 0, settings.task, *files, seed, text, robot=settings.robot)
+        robot, motion_steps = settings.robot, MOTION_STEPS["upstream"]
+        return EpisodeSpec(-1, 0, settings.task, *files, seed, text, robot=robot, motion_steps=motion_steps)

@@ -72,7 +72,6 @@ class KeyframeConfig(BaselineConfig):
         batch_size=12,
         learning_rate=2e-3,
         weight_decay=0.01,
-        precision="bf16",
         weights_precision="fp16",
         validation_samples=240,
     )

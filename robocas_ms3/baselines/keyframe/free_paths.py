@@ -7,14 +7,12 @@ from itertools import islice
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from robocas_ms3.baselines.keyframe.motion import ArmPaths
-from robocas_ms3.core.poses import inverse, transform_points
+from robocas_ms3.core.poses import Array, inverse, transform_points
 from robocas_ms3.scenes.grasp_checks import is_gripper_clear
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 _CELL = 0.015  # m, greatest distance between points on a surface
 _CHECKED = 3  # every third configuration of a path is checked

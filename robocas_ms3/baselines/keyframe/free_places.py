@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from robocas_ms3.core.poses import Array
+
 _MAP_X, _MAP_Y, _MAP_CELL = (0.2, 1.05), (-0.8, 0.8), 0.02  # m
 _FREE_CELLS = (11, 7)  # sizes of free squares in cells, the preferred one first
 _PLACES = 20

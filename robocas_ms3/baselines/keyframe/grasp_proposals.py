@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.poses import from_rotation
+from robocas_ms3.core.poses import Array, from_rotation
 from robocas_ms3.scenes.grasp_checks import GRIPPER_BOXES, HALF_TURN, is_gripper_clear
 
-Array = NDArray[np.float64]
 MIN_POINTS = 15
 """Least number of points on an object."""
 _MAX_POINTS = 400  # points on the object that are used

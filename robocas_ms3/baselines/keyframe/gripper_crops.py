@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from robocas_ms3.core.poses import Array
+
 CELLS, CELL = 40, 0.004
 """Cells per side of a crop, and the width of a cell in m."""
 CROP_CHANNELS, POSE_FEATURES = 3, 8
 _DEPTH = 0.12  # m before and behind the TCP, along the approach
 _NOTHING = 1.2  # distance in cells without a point
 _SCALE = 10.0  # per m
-Array = NDArray[np.float64]
 
 
 def make_crops(

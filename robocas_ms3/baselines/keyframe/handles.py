@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.core.poses import from_rotation, from_wxyz
+from robocas_ms3.core.poses import Array, from_rotation, from_wxyz
 from robocas_ms3.demos.candidates.tables import Arrays
 
-Array = NDArray[np.float64]
 _BAR_RADIUS, _BAR_HALF_LENGTH = 0.025, 0.08  # m from the axis of the bar, and along it from the grasp
 _MIN_PULL = 0.08  # m, length of a motion below which a door or drawer is open
 _MIN_NORM, _MAX_COSINE = 0.8, 0.3  # of approach and bar, which cells predict independently of each other

@@ -42,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class Memory:
-    """What was observed and tried in an episode.
+    """Observations and attempts of an episode.
 
     Attributes:
         table: height of the surface, m.

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from robocas_ms3.core.poses import Array
+
 WIDE_RADIUS, NARROW_RADIUS = 0.035, 0.01
 """m within which votes for the centre of an object belong together; the narrow one tells touching copies apart, with
 votes that are shrunk along the view (`shrink_along_view`)."""

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocas_ms3.baselines.keyframe.observed_scene import ObservedObject, ObservedScene
+from robocas_ms3.core.poses import Array
 from robocas_ms3.scenes.grasp_checks import is_gripper_clear
-
-Array = NDArray[np.float64]
 
 
 def find_middle(scene: ObservedScene) -> Array:

@@ -38,9 +38,9 @@ from robocas_ms3.baselines.keyframe.observed_scene import (
     shrink_along_view,
     unproject,
 )
+from robocas_ms3.core.poses import Array
 from robocas_ms3.scenes.relations import RELATIONS, Relation
 
-Array = NDArray[np.float64]
 _POINT_STEP = 2  # pixels between points of the cloud
 _SURE = 0.6  # probability of an object or the basket in the images of a survey
 _SURE_HANDLE, _MIN_HANDLE_CELLS = 0.4, 5  # probability and number of cells of a handle
@@ -68,7 +68,7 @@ class CameraFrame:
 
 @dataclass(frozen=True)
 class Request:
-    """What an instruction asks for.
+    """Target and relation of an instruction.
 
     Attributes:
         names: (N,) probability of each object name.
@@ -81,7 +81,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Survey:
-    """What the three cameras show.
+    """Result of a survey: the scene that the three cameras show.
 
     Attributes:
         focus: (2,) middle of the objects, m, in the arm's base frame.
@@ -256,7 +256,7 @@ def _find_basket(points: Array) -> Array | None:
 def _find_handle(cells: Array) -> Handle | None:
     """Return a handle from the predictions (C, 4, 3) of its cells: grasp, motion, approach and bar; or None.
 
-    Of several handles, it is the largest one that can be pulled, or else the largest one.
+    It is the largest one that can be pulled, or else the largest one.
     """
     groups = cluster_votes(cells[:, 0], _MIN_HANDLE_CELLS, WIDE_RADIUS)
     handles = [Handle(*np.median(cells[group], axis=0)) for group in groups]

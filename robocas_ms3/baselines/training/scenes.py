@@ -16,6 +16,8 @@ from robocas_ms3.scenes.lookup import find_objects
 
 _NOT_SCENE = {"task", "description", "target", "language", "objects"}
 """Keys of a task configuration that do not change the scene; objects are compared by their ids."""
+_CAMERA_NAMES = {"randomisation.cameras": "with random poses"}
+"""Words for readers by setting."""
 _MAX_NAMES = 5  # that a message lists
 
 
@@ -55,7 +57,7 @@ class TrainingScenes(StrictModel):
             "task": tasks - set(self.tasks),
             "scene settings": settings - camera_settings,
             "objects": objects - set(self.objects),
-            "cameras": {key.removeprefix("cameras.") for key in camera_settings},
+            "cameras": {_CAMERA_NAMES.get(key, key.removeprefix("cameras.")) for key in camera_settings},
         }
         return [f"{kind} {_join_names(names)}" for kind, names in found.items() if names]
 

@@ -145,6 +145,10 @@ def write_attributes(file: h5py.File, decisions: str) -> None:
     file.attrs["version"] = VERSION
 
 
+def _describe_format(name: Any) -> str:
+    return repr(name.decode("ascii", "replace")) if isinstance(name, bytes) else "no attribute format"
+
+
 def _read_attribute(file: h5py.File, name: str, kind: str) -> Any:
     """Return an attribute, None if it is missing or has another kind of type; HDF5 may crash on damaged texts."""
     if name not in file.attrs:
@@ -186,9 +190,13 @@ class CandidateImages:
         self.path = Path(path)
         with self._open() as file:
             name, version = (_read_attribute(file, name, kind) for name, kind in (("format", "S"), ("version", "i")))
-            if (name, version) != (FORMAT.encode(), VERSION):
-                what, expected = "not a file with images of decisions", f"format {FORMAT!r}, version {VERSION}"
-                raise DatasetError(what, where=self.path, expected=expected, found=f"{name}, {version}", fix=_RENDER)
+            if name != FORMAT.encode():
+                what, found = "not a file with images of decisions", _describe_format(name)
+                raise DatasetError(what, where=self.path, expected=f"format {FORMAT!r}", found=found, fix=_RENDER)
+            if version != VERSION:
+                what, expected = "unsupported version of the images of decisions", f"version {VERSION}"
+                found = f"version {version}"
+                raise DatasetError(what, where=self.path, expected=expected, found=found, fix=_RENDER_AGAIN)
             if decisions is not None and _read_attribute(file, "decisions", "S") != decisions.encode():
                 what = "these images show other decisions than the candidates file"
                 raise DatasetError(what, where=self.path, fix=_RENDER_AGAIN)

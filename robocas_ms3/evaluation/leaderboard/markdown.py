@@ -17,10 +17,10 @@ _CHANGE, _CHANGE_COLUMN = f"change from {SEEN}", _HEADS.index("success") + 1
 NOTE = (
     "Success: success rate in % with its exact 95 % interval. RoboCAS-v0's rule: success rate by the rule of "
     "RoboCAS-v0 after the last step. Trained here: whether the training data has the task, scenes, objects and cameras "
-    "of the episodes. Change from seen: difference of the success rate from that of the policy in the split seen, in "
-    "percentage points, with Newcombe's 95 % interval for independent episodes; where splits have equal scenes, "
-    "robocas eval compare has the paired interval. Compare rows of the same table, task, split and track, without "
-    "notes."
+    "of the episodes; instructions are not compared. Change from seen: difference of the success rate from that of the "
+    "policy in the split seen, in percentage points, with Newcombe's 95 % interval for independent episodes; where "
+    "splits have equal scenes, robocas eval compare has the paired interval. Compare rows of the same table, task, "
+    "split and track, without notes."
 )
 RANK_NOTE = (
     "Rank: 1 plus the number of policies of the same track, task and split with significantly more successes "
