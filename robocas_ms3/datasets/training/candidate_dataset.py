@@ -16,7 +16,7 @@ from robocas_ms3.datasets.candidate_images.images_file import CandidateImages, h
 from robocas_ms3.datasets.sources.episode_source import Split
 from robocas_ms3.datasets.sources.split import split_by_seed
 from robocas_ms3.datasets.training.target_instructions import draw_target_instruction, find_relations
-from robocas_ms3.datasets.training.torch_dataset import resize_image
+from robocas_ms3.datasets.training.torch_dataset import resize_image, scale_intrinsics
 from robocas_ms3.demos.candidates.candidates_file import CandidateFile
 from robocas_ms3.demos.candidates.labels import Labels
 from robocas_ms3.demos.candidates.schema import DECISION_KINDS, PRIMITIVES
@@ -85,7 +85,7 @@ class CandidateDataset(torch.utils.data.Dataset):
     ``kind``               int          index in `demos.candidates.schema.DECISION_KINDS`
     ``rgb``                (M, 3, h, w) uint8, of M cameras in the given order
     ``depth``              (M, h, w)    m along the optical axis, 0 = no depth
-    ``intrinsic``          (M, 4)       fx, fy, cx, cy in pixels of the scaled image
+    ``intrinsics``         (M, 3, 3)    intrinsic matrix of each scaled image, pixels
     ``camera_in_base``     (M, 4, 4)    nominal pose of each OpenCV camera frame
     ``mask``               (C,)         bool, False = padding
     ``primitive``          (C,)         int64, index in `demos.candidates.schema.PRIMITIVES`
@@ -281,12 +281,11 @@ def _open_images(file: CandidateFile, options: CandidateOptions) -> CandidateIma
 def _read_images(images: CandidateImages, row: int, options: CandidateOptions) -> dict[str, torch.Tensor]:
     cameras, size = options.cameras, options.size
     found = [images.rgb(row, camera) for camera in cameras]
-    # pixel centres are at + 0.5, so the principal point is scaled as the focal length
-    scales = [np.ones(4) if size is None else np.array([*size, *size]) / np.tile(x.shape[1::-1], 2) for x in found]
-    intrinsic = np.stack([images.intrinsic(row, camera) for camera in cameras]) * np.stack(scales)
+    pairs = zip(found, cameras, strict=True)
+    intrinsics = [scale_intrinsics(images.intrinsic(row, camera), image.shape[1::-1], size) for image, camera in pairs]
     arrays = {
         "rgb": np.stack([resize_image(image, size).transpose(2, 0, 1) for image in found]),
-        "intrinsic": intrinsic.astype(np.float32),
+        "intrinsics": np.stack(intrinsics).astype(np.float32),
         "camera_in_base": np.stack([images.camera_in_base(row, camera) for camera in cameras]).astype(np.float32),
     }
     if options.depth:

@@ -42,6 +42,7 @@ class SampleOptions:
         cameras: names of the cameras, in the order of the stack; empty: no images.
         size: width and height to which images are scaled, pixels; None: no scaling.
         depth: whether samples have depth images.
+        calibration: whether samples have the intrinsic matrices and the nominal poses of the cameras.
         float_images: RGB as float32 in 0..1 instead of uint8.
         state: arrays of the schema that are concatenated to ``state``, see `STATE_KEYS`.
         embedding: whether samples have embeddings of the texts.
@@ -61,6 +62,7 @@ class SampleOptions:
     cameras: Sequence[str] = V0_CAMERAS
     size: tuple[int, int] | None = V0_SIZE
     depth: bool = False
+    calibration: bool = False
     float_images: bool = False
     state: Sequence[str] = ()
     embedding: bool = False

@@ -23,6 +23,7 @@ from robocas_ms3.datasets.actions import ACTION_ARRAYS, ActionScale, check_finit
 from robocas_ms3.datasets.formats import open_source
 from robocas_ms3.datasets.sources.episode_source import EpisodeSource, ImageKind, SourceEpisode
 from robocas_ms3.datasets.training.options import SampleOptions
+from robocas_ms3.robots.camera_models import to_intrinsic_matrix
 from robocas_ms3.scenes.language.templates import GOAL_TYPES
 
 _TYPE_INDEX = {kind: index for index, kind in enumerate(GOAL_TYPES)}
@@ -37,6 +38,8 @@ class RoboCASDataset(torch.utils.data.Dataset):
     ======================  ==================  ==================================================================
     ``rgb``                 (H, C, 3, h, w)     uint8, or float32 in 0..1; cameras in the given order
     ``depth``               (H, C, h, w)        float32, m along the optical axis, 0 = no depth
+    ``intrinsics``          (C, 3, 3)           float32, intrinsic matrices of the scaled images, pixels
+    ``camera_in_base``      (H, C, 4, 4)        float32, nominal poses of the OpenCV cameras in the arm's base frame
     ``state``               (H, D)              float32, the concatenated arrays of ``state``
     ``action``              (H + A - 1, 7)      float32; row i belongs to observation i, the last A rows are the chunk
     ``observation_mask``    (H,)                bool, False = padding
@@ -165,6 +168,9 @@ class RoboCASDataset(torch.utils.data.Dataset):
             sample["subgoal"] = arrays["texts"][step]
         for kind in ("rgb", "depth")[: 1 + options.depth] if options.cameras else ():
             sample[kind] = read_sample_images(self.source.episode(number), options, observed_steps, kind)
+        if options.calibration:
+            sample["intrinsics"] = torch.from_numpy(arrays["intrinsics"].copy())
+            sample["camera_in_base"] = torch.from_numpy(arrays["camera_in_base"][np.maximum(observed_steps, 0)])
         return sample if self.transform is None else self.transform(sample)
 
     def _pad_actions(self, arrays: Mapping[str, Any], action_steps: NDArray[np.int64], last: int) -> torch.Tensor:
@@ -203,6 +209,9 @@ def check_options(source: EpisodeSource, options: SampleOptions) -> None:
         found = "no requested cameras" if source.has_depth else "a dataset without depth"
         fix = "Pass cameras, or depth=False." if source.has_depth else "Pass depth=False."
         raise DatasetError("depth images are not available", where=source.root, found=found, fix=fix)
+    if options.calibration and not cameras:
+        fix = "Pass cameras, or calibration=False."
+        raise DatasetError("no cameras for the calibration", where=source.root, found="no requested cameras", fix=fix)
     if options.embedding and not source.has_embeddings:
         fix = "Pass embedding=False, or convert the trajectory file with embeddings."
         raise DatasetError("this dataset has no embeddings", where=source.root, fix=fix)
@@ -212,7 +221,8 @@ def read_sample_arrays(source: EpisodeSource, number: int, options: SampleOption
     """Read the arrays of an episode from which its samples are made, by key.
 
     The keys are ``action`` (T, 7), ``first_command`` (gripper command before step 0) and ``instruction``; if requested,
-    also ``state`` (T, D), ``texts`` (sub-goals), ``subgoal_type`` (T,) and the embeddings.
+    also ``state`` (T, D), ``texts`` (sub-goals), ``subgoal_type`` (T,), the embeddings, and of C cameras ``intrinsics``
+    (C, 3, 3) and ``camera_in_base`` (T, C, 4, 4).
     """
     state, embedding, subgoals = options.state, options.embedding, options.subgoals
     keys = (*ACTION_ARRAYS, *state, "language_goal")
@@ -240,7 +250,38 @@ def read_sample_arrays(source: EpisodeSource, number: int, options: SampleOption
         made["subgoal_type"] = np.array([_TYPE_INDEX.get(kind, -1) for kind in arrays["step_goal_type"].tolist()])
         if embedding:
             made["subgoal_embedding"] = arrays["step_goal_embs"]
+    if options.calibration:
+        episode = source.episode(number)
+        intrinsics = [
+            scale_intrinsics(episode.intrinsic(camera), _read_image_size(episode, camera), options.size)
+            for camera in options.cameras
+        ]
+        made["intrinsics"] = np.stack(intrinsics).astype(np.float32)
+        poses = [episode.camera_in_base(camera) for camera in options.cameras]
+        made["camera_in_base"] = np.stack(poses, axis=1).astype(np.float32)
     return made
+
+
+def scale_intrinsics(
+    intrinsic: NDArray[np.floating], image_size: tuple[int, int], size: tuple[int, int] | None
+) -> NDArray[np.float64]:
+    """Return the intrinsic matrix (3, 3) of an image that is scaled from ``image_size`` to ``size``.
+
+    Args:
+        intrinsic: (4,) fx, fy, cx, cy of the image before scaling, pixels.
+        image_size: width and height of the image before scaling, pixels.
+        size: width and height after scaling, pixels; None: no scaling.
+    """
+    scale = np.ones(2) if size is None else np.array(size) / image_size
+    # pixel centres are at + 0.5, so the principal point is scaled as the focal length
+    return to_intrinsic_matrix(intrinsic * np.tile(scale, 2))
+
+
+def _read_image_size(episode: SourceEpisode, camera: str) -> tuple[int, int]:
+    """Return width and height of the stored images of a camera, pixels."""
+    with closing(episode.frames(camera, "rgb", 0, 1)) as frames:
+        height, width = next(iter(frames)).shape[:2]
+    return width, height
 
 
 def read_sample_images(

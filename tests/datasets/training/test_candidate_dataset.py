@@ -158,12 +158,13 @@ def test_images_of_decisions(rendered):
     for index, camera in enumerate(cameras):
         np.testing.assert_array_equal(sample["rgb"][index].permute(1, 2, 0), images.rgb(3, camera))
         np.testing.assert_allclose(sample["depth"][index], images.depth(3, camera) / 1000, rtol=1e-6)
-        np.testing.assert_allclose(sample["intrinsic"][index], images.intrinsic(3, camera), rtol=1e-6)
+        fx, fy, cx, cy = images.intrinsic(3, camera)
+        np.testing.assert_allclose(sample["intrinsics"][index], [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], rtol=1e-6)
         np.testing.assert_allclose(sample["camera_in_base"][index], images.camera_in_base(3, camera), rtol=1e-6)
     half = SIZE[0] // 2, SIZE[1] // 2
     scaled = CandidateDataset(rendered, replace(ALL, cameras=cameras, size=half))[3]
     assert scaled["rgb"].shape == (2, 3, half[1], half[0])
-    torch.testing.assert_close(scaled["intrinsic"], sample["intrinsic"] / 2)
+    torch.testing.assert_close(scaled["intrinsics"][:, :2], sample["intrinsics"][:, :2] / 2)
     assert "depth" not in scaled
 
 

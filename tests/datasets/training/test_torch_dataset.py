@@ -145,6 +145,24 @@ def test_depth_images_as_they_are_and_floats(made):
     assert 0 < float(small["rgb"].max()) <= 1
 
 
+def test_calibration_of_the_scaled_images(made):
+    cameras = ("static_camera", "gripper_camera")
+    options = dict(split="all", observation_horizon=3, cameras=cameras, calibration=True)
+    data = RoboCASDataset(made, SampleOptions(size=None, **options))
+    number, step = data.locate_sample(4)
+    episode, sample = data.source.episode(number), data[4]
+    assert step == 4 and sample["camera_in_base"].shape == (3, 2, 4, 4)
+    for index, camera in enumerate(cameras):
+        fx, fy, cx, cy = episode.intrinsic(camera)
+        np.testing.assert_allclose(sample["intrinsics"][index], [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], rtol=1e-6)
+        poses = episode.camera_in_base(camera)
+        np.testing.assert_allclose(sample["camera_in_base"][:, index], poses[2:5], atol=1e-6)
+    first = data[0]["camera_in_base"]  # steps before the episode have the first pose
+    assert torch.equal(first[0], first[2])
+    scaled = RoboCASDataset(made, SampleOptions(size=SMALL, **options))[4]["intrinsics"]  # half of 64 x 48
+    torch.testing.assert_close(scaled[:, :2], sample["intrinsics"][:, :2] / 2)
+
+
 def test_texts_and_subgoals(made):
     data = RoboCASDataset(
         made, SampleOptions(split="all", cameras=(), observation_horizon=3, embedding=True, subgoals=True)
@@ -256,6 +274,7 @@ def test_a_lerobot_folder_gives_the_same_samples(made, tmp_path):
         dict(padding="mirror"),
         dict(cameras=("head_camera",)),
         dict(cameras=("base_camera", "base_camera")),
+        dict(cameras=(), calibration=True),
         dict(split="test"),
         dict(state=("language_goal",)),
         dict(size=(0, 10)),
