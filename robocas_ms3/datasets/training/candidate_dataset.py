@@ -281,8 +281,10 @@ def _open_images(file: CandidateFile, options: CandidateOptions) -> CandidateIma
 def _read_images(images: CandidateImages, row: int, options: CandidateOptions) -> dict[str, torch.Tensor]:
     cameras, size = options.cameras, options.size
     found = [images.rgb(row, camera) for camera in cameras]
-    pairs = zip(found, cameras, strict=True)
-    intrinsics = [scale_intrinsics(images.intrinsic(row, camera), image.shape[1::-1], size) for image, camera in pairs]
+    intrinsics = [
+        scale_intrinsics(images.intrinsic(row, camera), (image.shape[1], image.shape[0]), size)
+        for image, camera in zip(found, cameras, strict=True)
+    ]
     arrays = {
         "rgb": np.stack([resize_image(image, size).transpose(2, 0, 1) for image in found]),
         "intrinsics": np.stack(intrinsics).astype(np.float32),

@@ -28,17 +28,22 @@ from robocas_ms3.evaluation.remote.connection import (
 from robocas_ms3.evaluation.remote.messages import (
     BATCH,
     ERROR,
+    EVALUATION,
     LARGEST_BATCH,
     PREFIX,
+    EvaluationAnswer,
+    EvaluationFields,
     ServerMetadata,
     check_observations_can_be_sent,
     make_observation_message,
     parse_actions,
     parse_batch,
+    parse_evaluation_answer,
     parse_image_request,
     parse_policy_spec,
 )
 from robocas_ms3.evaluation.remote.wire import encode_message
+from robocas_ms3.scenes.config import TaskConfig
 
 _log = logging.getLogger(__name__)
 _SHARED = -1  # key of the connection for batched requests; other keys are indices of envs
@@ -99,6 +104,18 @@ class RemotePolicy:
         rename = {"rename": self._address.rename} if self._address.rename else {}
         return {"server": self._metadata.policy, "n_action_steps": self._address.n_action_steps, **rename}
 
+    def check_robot(self, robot: str) -> None:
+        """Raise `EvaluationError` if the served policy cannot control the robot with this name."""
+        self._check_evaluation(EvaluationFields(robot=robot))
+
+    def protocol_warnings(self, configs: dict[str, TaskConfig]) -> list[str]:
+        """Return the warnings of the served policy for the task configurations of an evaluation."""
+        return self._check_evaluation(_describe_configs(configs)).warnings
+
+    def list_training_differences(self, configs: dict[str, TaskConfig]) -> dict[str, list[str]] | None:
+        """Return by configuration what the training data of the served policy lacks; None: unknown."""
+        return self._check_evaluation(_describe_configs(configs)).training_differences
+
     def reset(self, episodes: list[EpisodeSpec]) -> None:
         """Start episodes. The server gets an episode together with its first observation."""
         self._starts |= {episode.env: episode for episode in episodes}
@@ -154,6 +171,20 @@ class RemotePolicy:
         except BaseException:
             future.cancel()
             raise
+
+    def _check_evaluation(self, fields: EvaluationFields) -> EvaluationAnswer:
+        if not self._metadata.checks_evaluations:
+            return EvaluationAnswer()
+        answer = self._run_on_network_thread(self._request_once({EVALUATION: fields.model_dump()}))
+        return parse_evaluation_answer(answer, self._address.url)
+
+    async def _request_once(self, message: dict[str, Any]) -> Any:
+        """Return the answer to a message that is sent over its own connection."""
+        socket, _ = await self._open()
+        try:
+            return await self._exchange(socket, message)
+        finally:
+            await close_connection(socket)
 
     def _make_message(self, observations: Observations, row: int, start: EpisodeSpec | None) -> dict[str, Any]:
         known = start if self._metadata.spec is not None else None  # a plain openpi server does not expect the key
@@ -304,6 +335,10 @@ class RemotePolicy:
         spec = parse_policy_spec(metadata.spec, url)
         check_observations_can_be_sent(spec, url)
         return spec
+
+
+def _describe_configs(configs: dict[str, TaskConfig]) -> EvaluationFields:
+    return EvaluationFields(configs={name: config.model_dump(mode="json") for name, config in configs.items()})
 
 
 def _actions_or_error(answer: dict[str, Any]) -> Any:

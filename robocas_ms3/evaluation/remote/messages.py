@@ -4,6 +4,9 @@ The first message of a server is its `ServerMetadata`. A request is the observat
 envs. The answer is ``{"actions": (H, A), "requests_images": bool}``, or a text with the error, after which the server
 closes the connection. A batched request is ``{"batch": [observation, ...]}``; the answer is ``{"batch": [answer,
 ...]}`` in the same order, where each answer is as above or ``{"error": text}``.
+
+Before its first episode, an evaluation may send `EvaluationFields` as ``{"evaluation": fields}``. The answer has the
+fields of `EvaluationAnswer`, or is ``{"error": text}``.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ from robocas_ms3.evaluation.remote.wire import MAX_BYTES
 from robocas_ms3.robots.registry import DEFAULT_ROBOT
 
 ENV, RESET, START, PROMPT, ACTIONS, BATCH, ERROR = "env_id", "reset", "start", "prompt", "actions", "batch", "error"
-REQUESTS_IMAGES = "requests_images"
+REQUESTS_IMAGES, EVALUATION = "requests_images", "evaluation"
 PREFIX = "observation/"
 DEFAULT_BATCH, LARGEST_BATCH = 64, 256  # envs
 FILE_NAME_PARTS = 3  # path components of a file name in messages: protocol folder, subfolder, file
@@ -52,6 +55,7 @@ class ServerMetadata(BaseModel):
         policy: description of the policy (`policy.describe_policy`).
         max_batch: maximum number of envs per batched request; None: no batched requests.
         answers_pings: whether the server answers websocket pings during inference.
+        checks_evaluations: whether the server answers `EvaluationFields`.
     """
 
     model_config = ConfigDict(strict=True, frozen=True)
@@ -60,6 +64,30 @@ class ServerMetadata(BaseModel):
     policy: Annotated[JsonValue, AfterValidator(_check_length)] = Field(default=None, alias="robocas_policy")
     max_batch: PositiveInt | None = Field(default=None, alias="robocas_max_batch")
     answers_pings: bool = Field(default=False, alias="robocas_answers_pings")
+    checks_evaluations: bool = Field(default=False, alias="robocas_checks_evaluations")
+
+
+class EvaluationFields(BaseModel):
+    """Evaluation that a client is about to start.
+
+    Attributes:
+        robot: name of the robot, which the policy checks; None: no check.
+        configs: task configurations by name, whose scenes are compared with the training data.
+    """
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+    robot: _Text | None = None
+    configs: dict[_Text, dict[str, Any]] = {}
+
+
+class EvaluationAnswer(BaseModel):
+    """Results of `Policy.protocol_warnings` and `Policy.list_training_differences` for an evaluation."""
+
+    model_config = ConfigDict(strict=True)
+
+    warnings: list[_Text] = []
+    training_differences: dict[_Text, list[_Text]] | None = None
 
 
 class _EpisodeFields(BaseModel):
@@ -105,6 +133,30 @@ def parse_request(message: Mapping[str, Any]) -> Request:
         return Request.model_validate(message)
     except ValidationError as problem:
         raise error_from_validation(problem, Request, WireError, where="", about="invalid request") from problem
+
+
+def parse_evaluation(fields: Any) -> EvaluationFields:
+    """Parse the fields of an evaluation; raise `WireError` if a value is invalid."""
+    try:
+        return EvaluationFields.model_validate(fields)
+    except ValidationError as problem:
+        what = "invalid evaluation"
+        raise error_from_validation(problem, EvaluationFields, WireError, where=EVALUATION, about=what) from problem
+
+
+def parse_evaluation_answer(answer: Any, url: str) -> EvaluationAnswer:
+    """Parse the answer of the server at ``url`` to an evaluation.
+
+    Raises:
+        EvaluationError: the policy cannot run in the evaluation, or the answer is invalid.
+    """
+    if isinstance(answer, dict) and isinstance(text := answer.get(ERROR), str):
+        raise EvaluationError("the served policy cannot be evaluated", where=url, found=one_line(text, 300))
+    try:
+        return EvaluationAnswer.model_validate(answer)
+    except ValidationError as problem:
+        what = "invalid answer to an evaluation"
+        raise error_from_validation(problem, EvaluationAnswer, EvaluationError, where=url, about=what) from problem
 
 
 def parse_metadata(message: Any, url: str) -> ServerMetadata:

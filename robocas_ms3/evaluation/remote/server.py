@@ -22,8 +22,9 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from robocas_ms3 import __version__
-from robocas_ms3.core.errors import EvaluationError, PolicyError, RobocasError, WireError
+from robocas_ms3.core.errors import ConfigError, EvaluationError, PolicyError, RobocasError, WireError
 from robocas_ms3.core.paths import builtin_packs_dir, data_dir, protocols_dir
+from robocas_ms3.core.strict_model import parse
 from robocas_ms3.core.text import format_error, one_line
 from robocas_ms3.evaluation.policy import (
     EpisodeSpec,
@@ -43,19 +44,24 @@ from robocas_ms3.evaluation.remote.messages import (
     DEFAULT_BATCH,
     ENV,
     ERROR,
+    EVALUATION,
     FILE_NAME_PARTS,
     REQUESTS_IMAGES,
     RESET,
+    EvaluationAnswer,
+    EvaluationFields,
     ServerMetadata,
     check_observations_can_be_sent,
     has_images,
     max_envs_per_request,
     parse_batch,
+    parse_evaluation,
     parse_observations,
     parse_request,
     request_size_limit,
 )
 from robocas_ms3.evaluation.remote.wire import decode_message, encode_message
+from robocas_ms3.scenes.config import TaskConfig
 
 HEALTH = "/healthz"
 MAX_CONNECTIONS = 256
@@ -144,6 +150,7 @@ class PolicyServer:
             robocas_policy={**describe_policy(policy), "robocas_ms3": __version__},
             robocas_max_batch=max_batch,
             robocas_answers_pings=True,
+            robocas_checks_evaluations=True,
         )
         self._metadata = encode_message(metadata.model_dump(by_alias=True))
         self._handler = _RequestHandler(policy, files or ServedFiles.collect(), max_batch)
@@ -292,6 +299,8 @@ class _RequestHandler:
         """
         if not isinstance(message, dict):
             raise WireError("invalid request", expected="a msgpack map", found=type(message).__name__)
+        if EVALUATION in message:
+            return self._check_evaluation(parse_evaluation(message[EVALUATION]))
         if BATCH not in message:
             request = self._parse_messages([message], envs)
             return self._make_answer(self._call_policy(request)[0], request.observations.envs[0])
@@ -302,6 +311,27 @@ class _RequestHandler:
             for row, env in enumerate(request.observations.envs.tolist())
         ]
         return {BATCH: answers}
+
+    def _check_evaluation(self, fields: EvaluationFields) -> dict[str, Any]:
+        """Return the answer to an evaluation that a client is about to start."""
+        answer = EvaluationAnswer()
+        policy: Any = self._policy
+        try:
+            configs = {name: _parse_config(name, values) for name, values in fields.configs.items()}
+        except ConfigError as error:  # such as the task of a package that is not installed here
+            _log.warning("the scenes of an evaluation cannot be compared with the training data: %s", error)
+            return answer.model_dump()
+        with forbid_policy_exit(policy):
+            try:
+                if fields.robot is not None and hasattr(policy, "check_robot"):
+                    policy.check_robot(fields.robot)
+            except RobocasError as error:
+                return {ERROR: one_line(error, 300)}
+            if configs and hasattr(policy, "protocol_warnings"):
+                answer.warnings = policy.protocol_warnings(configs)
+            if configs and hasattr(policy, "list_training_differences"):
+                answer.training_differences = policy.list_training_differences(configs)
+        return answer.model_dump()
 
     def release_envs(self, envs: dict[int, int]) -> None:
         """Free the indices of the envs of a closed connection, so that other clients can use them."""
@@ -376,6 +406,10 @@ class _RequestHandler:
         except Exception as error:  # a policy may raise any exception; other clients are still served
             text = _log_failure(error)
         return None, {env: reasons.get(env, text) for env in observations.envs.tolist()}
+
+
+def _parse_config(name: str, values: dict[str, Any]) -> TaskConfig:
+    return parse(TaskConfig, values, ConfigError, where=name, about="invalid task configuration")
 
 
 def strip_brackets(host: str) -> str:
