@@ -10,7 +10,7 @@
 # the results. FOLDER is the output folder (default: reproduced/ms3).
 #
 # SCALE     percent of the demonstrations to record (default: 100)
-# STEPS     training steps (default: small 6000, bc-state 4000)
+# STEPS     training steps (default: small 3500, bc-state 4000)
 # EPISODES  episodes to evaluate per task (default: 200, all)
 # JOBS      number of processes that record, convert and evaluate (default: one per core)
 # ROBOCAS   robocas command (default: .venv/bin/robocas)
@@ -29,7 +29,7 @@ parts=(
     "100 543000 open_pick open_pick_container")
 baseline=${1:-}
 case $baseline in
-    small) steps=${STEPS:-6000} ;;
+    small) steps=${STEPS:-3500} ;;
     bc-state) steps=${STEPS:-4000} ;;
     *) fail "invalid baseline '$baseline': expected small or bc-state. Usage: bash scripts/reproduce_ms3.sh BASELINE [FOLDER]" ;;
 esac

@@ -151,6 +151,7 @@ def _convert_fact_errors(path: Path) -> Iterator[None]:
 
 
 bundled_small = partial(RunPolicy, BUNDLED / "small")
+bundled_small_ms3 = partial(RunPolicy, BUNDLED / "small-ms3")
 bundled_keyframe = partial(RunPolicy, BUNDLED / "keyframe")
 bundled_keyframe_upstream = partial(RunPolicy, BUNDLED / "keyframe-upstream")
 bundled_keyframe_upstream_eval = partial(RunPolicy, BUNDLED / "keyframe-upstream-eval")

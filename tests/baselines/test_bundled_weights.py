@@ -22,7 +22,7 @@ from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.scenes.config import load_task_config
 
-SMALL = ("small",)
+SMALL = ("small", "small-ms3")
 KEYFRAME = ("keyframe", "keyframe-upstream", "keyframe-upstream-eval")
 
 
@@ -75,6 +75,15 @@ def test_policy_by_name():
     assert (description["hardware"], description["training_seconds"]) == ("cpu", None)  # the log is not bundled
     assert description["parameters"] == 1_864_415
     assert description["steps"] > 0 and description["trained_in"].startswith("pick, in pick_upstream_eval, objects ")
+
+
+def test_small_ms3_is_evaluated_in_the_scenes_of_its_training():
+    policy = make_policy("small-ms3")
+    description = policy.describe()
+    assert policy.spec.track == "end-to-end" and description["training_seconds"] > 600
+    tasks = ("pick", "select", "search", "open_pick")
+    configs = {key: config for task in tasks for key, config in configs_of("ms3-v1", task).items()}
+    assert policy.protocol_warnings(configs) == []
 
 
 def test_program_of_the_page(capsys):
