@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from typing import ClassVar
 
 import h5py
 import numpy as np
@@ -22,7 +23,7 @@ from robocas_ms3.demos.settings import EpisodeSettings, ReplaySettings
 from robocas_ms3.demos.trajectory_replay import replay
 from robocas_ms3.evaluation.policies.plain import NoopPolicy
 from robocas_ms3.evaluation.policies.replay import ReplayPolicy
-from robocas_ms3.evaluation.policy import PolicySpec
+from robocas_ms3.evaluation.policy import EpisodeSpec, PolicySpec
 from robocas_ms3.evaluation.policy_rollin import PolicyRollIn, check_roll_in_policy, sample_roll_in_steps
 
 CONFIG = "pick_upstream_eval"
@@ -32,6 +33,22 @@ class SidePolicy(NoopPolicy):
     """Policy that observes a camera that the configuration lacks."""
 
     spec = PolicySpec(reference="tcp", cameras={"side_camera": (64, 48)})
+
+
+class OneRobotPolicy(NoopPolicy):
+    """Policy that records its episodes and controls no robot but the one named in ``robot``."""
+
+    spec = PolicySpec(reference="tcp")
+    robot = "another_robot"
+    episodes: ClassVar[list[EpisodeSpec]] = []
+
+    def check_robot(self, robot):
+        if robot != self.robot:
+            raise EvaluationError("this policy cannot control the robot", where=robot)
+
+    def reset(self, episodes):
+        self.episodes += episodes
+        super().reset(episodes)
 
 
 def settings(policy: str, steps: tuple[int, int]) -> EpisodeSettings:
@@ -69,6 +86,15 @@ def numbers(node, name=""):
     return {key: value for inner, of in node.items() for key, value in numbers(of, f"{name}/{inner}").items()}
 
 
+@pytest.mark.slow
+def test_policy_knows_the_motion_steps_of_the_rules():
+    made = PolicyRollIn(settings(f"{__name__}:OneRobotPolicy", (1, 1)))
+    made.run(2)
+    made.close()
+    (episode,) = OneRobotPolicy.episodes
+    assert episode.motion_steps == 2  # a policy moves the arm with two control steps per action, as in paper-v1
+
+
 def test_number_of_steps_is_drawn_from_the_seed_with_both_ends():
     assert sample_roll_in_steps(5, (7, 7)) == 7
     drawn = [sample_roll_in_steps(seed, (5, 8)) for seed in range(60)]
@@ -81,6 +107,8 @@ def test_weights_have_a_hash_and_unsupported_actions_are_an_error():
         check_roll_in_policy(settings("scripted", (5, 60)))
     with pytest.raises(EvaluationError, match="unknown camera.*side_camera"):
         check_roll_in_policy(settings(f"{__name__}:SidePolicy", (5, 60)))
+    with pytest.raises(EvaluationError, match="cannot control the robot"):
+        check_roll_in_policy(settings(f"{__name__}:OneRobotPolicy", (5, 60)))
     assert check_roll_in_policy(settings("random", (5, 60))) == ""
     assert check_roll_in_policy(settings("small", (5, 60))) == hash_weights(BUNDLED / "small")
 

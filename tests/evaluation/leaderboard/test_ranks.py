@@ -21,7 +21,7 @@ def test_differences_that_are_not_significant_are_ties():
 
 
 def test_p_values_are_adjusted_for_all_pairs():
-    # 7 against 0 in three pairs: p = 2 / 2**7 = 0.0156, and twice 7 against 7 that no pair of the same rate adds to
+    # two pairs with 7 against 0, p = 2 / 2**7 = 0.0156 each, and one pair of equal policies, p = 1
     a, b, c = rank_policies([successes(*range(7)), successes(*range(7)), successes()])
     assert (a.rank, b.rank, c.rank) == (1, 1, 3)
     assert b.p_value == pytest.approx(3 * 2 / 2**7)  # Holm: the second smallest of three is at least the first
