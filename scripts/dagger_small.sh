@@ -15,6 +15,8 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 source scripts/timed.sh
 
 fail() { printf 'dagger_small: error: %s\n' "$*" >&2; exit 2; }
+show_usage "$@"
+require_numbers STEPS EPISODES JOBS
 
 task=${1:-}
 [[ $task == pick || $task == search ]] || fail "invalid task '$task': expected pick or search. Usage: bash scripts/dagger_small.sh TASK [FOLDER]"

@@ -22,6 +22,8 @@ source scripts/timed.sh
 source scripts/shards.sh
 
 fail() { printf 'evaluate_protocols: error: %s\n' "$*" >&2; exit 2; }
+show_usage "$@"
+require_numbers EPISODES JOBS
 
 policy=${1:-}
 [[ -n $policy ]] || fail "missing policy. Usage: bash scripts/evaluate_protocols.sh POLICY [PROTOCOL ...]"

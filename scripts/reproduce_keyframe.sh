@@ -21,6 +21,8 @@ source scripts/timed.sh
 source scripts/shards.sh
 
 fail() { printf 'reproduce_keyframe: error: %s\n' "$*" >&2; exit 2; }
+show_usage "$@"
+require_numbers SCALE STEPS EPISODES JOBS
 
 # Each part of the data: number of episodes, first seed, task, configuration.
 row=${1:-}
@@ -52,7 +54,7 @@ jobs=${JOBS:-$(env -u OMP_NUM_THREADS nproc)}
 robocas=${ROBOCAS:-.venv/bin/robocas}
 command -v "$robocas" >/dev/null || fail "no such command: $robocas. Run bash scripts/setup.sh, or set ROBOCAS."
 
-require_settings "$out" "ROW=$row SCALE=$scale"
+require_settings "$out" "ROW=$row SCALE=$scale STEPS=$steps"
 for part in "${parts[@]}"; do
     read -r count seed task config <<<"$part"
     count=$(((count * scale + 99) / 100))

@@ -20,6 +20,8 @@ source scripts/timed.sh
 source scripts/shards.sh
 
 fail() { printf 'reproduce_ms3: error: %s\n' "$*" >&2; exit 2; }
+show_usage "$@"
+require_numbers SCALE STEPS EPISODES JOBS
 
 # Each part of the demonstrations: number of episodes, first seed, task, configuration.
 parts=(

@@ -18,6 +18,8 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 source scripts/timed.sh
 
 fail() { printf 'reproduce_small: error: %s\n' "$*" >&2; exit 2; }
+show_usage "$@"
+require_numbers STEPS EPISODES JOBS
 
 # Each part of the demonstrations: percent of all episodes, offset of the seed, task, configuration, and (optional) the policy
 # that acts before the scripted policy.

@@ -14,6 +14,8 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 source scripts/timed.sh
 
 fail() { printf 'study_small: error: %s\n' "$*" >&2; exit 2; }
+show_usage "$@"
+require_numbers STEPS EPISODES JOBS
 
 from=${1:-reproduced/pick}
 variants=("${@:2}")

@@ -10,6 +10,21 @@ timed() {
     printf '%s: %s: %d min\n' "$(basename "$0" .sh)" "$2" $(((SECONDS - start + 30) / 60))
 }
 
+# `require_numbers NAME ...`: fails if one of these variables is set, but not to a positive integer.
+require_numbers() {
+    local name
+    for name in "$@"; do
+        [[ -z ${!name:-} || ${!name} =~ ^[1-9][0-9]*$ ]] || fail "invalid $name: expected a positive integer, found ${!name}."
+    done
+}
+
+# `show_usage ARGUMENT ...`: prints the first comment of the script and exits if an argument is -h or --help.
+show_usage() {
+    [[ " $* " == *" -h "* || " $* " == *" --help "* ]] || return 0
+    sed -n '2,/^[^#]/{/^[^#]/q;s/^# \{0,1\}//p}' "scripts/$(basename "$0")"
+    exit 0
+}
+
 # `require_settings FOLDER SETTINGS`: fails if FOLDER was recorded with other settings, which must not be mixed.
 require_settings() {
     mkdir -p "$1"

@@ -150,6 +150,15 @@ def _convert_fact_errors(path: Path) -> Iterator[None]:
         raise TrainingError(what, where=path, found=found, fix=fix) from error
 
 
+def describe_bundled(name: str) -> str:
+    """Return the baseline, tasks and scenes of the bundled weights with this name; empty if there are none."""
+    if not (BUNDLED / name / RUN).is_file():
+        return ""
+    record = read_run(BUNDLED / name)
+    tasks, scenes = ", ".join(record.data.scenes.tasks), ", ".join(record.data.scenes.configs)
+    return f"{record.baseline}, trained for {tasks} in {scenes}"
+
+
 bundled_small = partial(RunPolicy, BUNDLED / "small")
 bundled_small_ms3 = partial(RunPolicy, BUNDLED / "small-ms3")
 bundled_keyframe = partial(RunPolicy, BUNDLED / "keyframe")

@@ -13,7 +13,7 @@ from robocas_ms3.cli.options import Maybe, resumable
 from robocas_ms3.core.text import format_count
 
 if TYPE_CHECKING:
-    from robocas_ms3.evaluation.audit import AuditPlan
+    from robocas_ms3.evaluation.audit.run import AuditPlan
     from robocas_ms3.evaluation.protocol import LoadedProtocol
     from robocas_ms3.evaluation.results import Result
 
@@ -50,7 +50,7 @@ def audit(cfg: Audit) -> int:
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.checks import check_number
-    from robocas_ms3.evaluation.audit import find_audit_obstacle, list_other_processors, run_audit
+    from robocas_ms3.evaluation.audit.run import find_audit_obstacle, list_other_processors, run_audit
     from robocas_ms3.evaluation.results import read_result
     from robocas_ms3.evaluation.run_record import hash_source
     from robocas_ms3.evaluation.verify import find_violations
@@ -73,7 +73,7 @@ def audit(cfg: Audit) -> int:
     if result.run.source_hash not in ("", hash_source()):
         print_line("note: made with other source code of robocas_ms3, so outcomes may differ")
     plans: list[AuditPlan] = []
-    differing = 0
+    differing = from_checkpoints = 0
     with ProgressBar("episodes replayed") as bar:
 
         def start(plan: AuditPlan) -> None:
@@ -92,14 +92,18 @@ def audit(cfg: Audit) -> int:
         ):
             bar.advance()
             differing += bool(one.differences)
+            from_checkpoints += one.mode == "checkpoints"
             for difference in one.differences:
                 print_line(f"episode {one.episode}, recorded -> replayed: {difference}")
+    if from_checkpoints:
+        count = format_count(from_checkpoints, "episode")
+        print_line(f"note: {count} diverged and were replayed from checkpoint to checkpoint, with tolerances")
     return _print_summary(cfg.folder, result, protocol, plans[0], differing)
 
 
 def _print_summary(folder: Path, result: Result, protocol: LoadedProtocol, plan: AuditPlan, differing: int) -> int:
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.evaluation.audit import bound_differing_episodes
+    from robocas_ms3.evaluation.audit.run import bound_differing_episodes
 
     count, total = len(plan.episodes), len(result.outcomes)
     print_line(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -86,9 +86,9 @@ class Verify(Results):
 
 @dataclass
 class Videos:
-    """Record videos of failed episodes by running them again, and link the videos in report.html.
+    """Record videos of episodes by running them again, and link the videos in report.html.
 
-    Example: robocas eval videos eval/pick --count 4
+    Example: robocas eval videos eval/pick --outcome succeeded --count 4
     """
 
     folder: Annotated[Path, tyro.conf.Positional]
@@ -99,6 +99,8 @@ class Videos:
     """Repeat the policy of the result to allow its code to run. Required unless `robocas list` names the policy."""
     count: int = 8
     """Number of videos. The episodes alternate between configurations and kinds of failures."""
+    outcome: Literal["failed", "succeeded", "all"] = "failed"
+    """Which episodes to record."""
 
 
 def report(cfg: Report) -> int:
@@ -204,16 +206,16 @@ def videos(cfg: Videos) -> int:
         fix = f"Add --policy {name} if you trust its code."
         raise EvaluationError("the policy of this result has no registered name", where=cfg.folder, found=name, fix=fix)
     from robocas_ms3.core.workers import use_one_torch_thread
-    from robocas_ms3.evaluation.report.videos import choose_failed_episodes, record_videos
+    from robocas_ms3.evaluation.report.videos import choose_episodes, record_videos
 
     use_one_torch_thread()
-    numbers = choose_failed_episodes(result, cfg.count)
+    numbers = choose_episodes(result, cfg.count, cfg.outcome)
     with open_policy(name) as policy, ProgressBar("videos recorded") as bar:
         for done, (path, same) in enumerate(record_videos(result, protocol, policy, numbers), start=1):
             print_line(str(path) + ("" if same else ": the outcome differs from the recorded outcome"))
             bar.update(done, len(numbers))
     if not numbers:
-        print_line("the result has no failed episodes")
+        print_line(f"no episode of the result has {cfg.outcome}: --outcome all records any episode")
     write_pages(result, cfg.folder, cfg.protocol)
     return 0
 

@@ -134,12 +134,12 @@ def _audit_result(folder: Path, memory: Path, cfg: AuditEntries | Build) -> Audi
     from robocas_ms3.cli.eval_results import find_protocol_of
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.evaluation.audit import find_audit_obstacle, hash_audit, run_audit
+    from robocas_ms3.evaluation.audit.run import find_audit_obstacle, hash_audit, run_audit
     from robocas_ms3.evaluation.leaderboard.entries import find_result_violations, list_stored_episodes
     from robocas_ms3.evaluation.leaderboard.output import AuditedResult
     from robocas_ms3.evaluation.results import read_result
 
-    result, count = read_result(folder), 0
+    result, count, from_checkpoints = read_result(folder), 0, 0
     protocol = find_protocol_of(result, None)
     problems = find_result_violations(result, protocol)
     if not problems and (obstacle := find_audit_obstacle(result)):
@@ -157,30 +157,32 @@ def _audit_result(folder: Path, memory: Path, cfg: AuditEntries | Build) -> Audi
             ):
                 bar.advance()
                 count += 1
+                from_checkpoints += one.mode == "checkpoints"
                 problems += [f"episode {one.episode}, recorded -> replayed: {text}" for text in one.differences]
     for problem in problems:
         print_line(f"{folder}: {problem}")
     if problems:
         return None
-    print_line(f"{folder}: no differences in {format_count(count, 'episode')}")
+    mode = f", {from_checkpoints} of them from checkpoint to checkpoint" if from_checkpoints else ""
+    print_line(f"{folder}: no differences in {format_count(count, 'episode')}{mode}")
     return AuditedResult(result, protocol, count)
 
 
 def _record_videos(audited: AuditedResult, cfg: Build) -> None:
     """Record videos of failed episodes from the stored actions; existing videos are kept."""
     from robocas_ms3.cli.progress import ProgressBar
-    from robocas_ms3.evaluation.audit import StoredActionsPolicy
+    from robocas_ms3.evaluation.audit.stored_actions import StoredActionsPolicy
     from robocas_ms3.evaluation.leaderboard.entries import list_stored_episodes
     from robocas_ms3.evaluation.leaderboard.page import video_folder
     from robocas_ms3.evaluation.report.page import video_file_name
-    from robocas_ms3.evaluation.report.videos import choose_failed_episodes, record_videos
+    from robocas_ms3.evaluation.report.videos import choose_episodes, record_videos
 
     result, protocol, _ = audited
     stored = {number: result.outcomes[number] for number in list_stored_episodes(result, protocol)}
     folder = video_folder(cfg.out, result)
     numbers = [
         number
-        for number in choose_failed_episodes(replace(result, outcomes=stored), cfg.videos)
+        for number in choose_episodes(replace(result, outcomes=stored), cfg.videos)
         if not (folder / video_file_name(number)).exists()
     ]
     if numbers:

@@ -45,10 +45,11 @@ def list_all() -> dict[str, list[dict[str, Any]]]:
     other packages are not imported, so an error in such a package appears only when its policy or baseline is used.
     """
     from robocas_ms3.assets.pack import find_packs, load_pack
+    from robocas_ms3.baselines.policy import describe_bundled
     from robocas_ms3.baselines.registry import BASELINES
     from robocas_ms3.core.errors import AssetError
     from robocas_ms3.core.extensions import package_name
-    from robocas_ms3.evaluation.policies import POLICIES
+    from robocas_ms3.evaluation.policies import POLICIES, SUMMARIES
     from robocas_ms3.robots.registry import ROBOTS
     from robocas_ms3.scenes.config import bundled_configs, load_task_config
     from robocas_ms3.scenes.task_specs import TASKS
@@ -64,10 +65,11 @@ def list_all() -> dict[str, list[dict[str, Any]]]:
         row = {"name": name, "task": config.task, "scene": scene, "needs_pack": _packs_to_import(config)}
         configs.append({**row, "description": config.description})
     robots = [{"name": name, "agent": robot.agent} for name, robot in ROBOTS.items()]
-    policies = [{"name": name, "package": "robocas_ms3", "entry_point": ""} for name in POLICIES.builtin]
+    policies = [{"name": name, "package": "robocas_ms3", "summary": SUMMARIES[name]} for name in POLICIES.builtin]
     for points in POLICIES.entry_points.values():
         policies += [
-            {"name": point.name, "package": package_name(point), "entry_point": point.value} for point in points
+            {"name": point.name, "package": package_name(point), "summary": describe_bundled(point.name) or point.value}
+            for point in points
         ]
     baselines = [
         {"name": name, "package": "robocas_ms3", "summary": getattr(row, "description", "")}
@@ -111,7 +113,7 @@ def _print(found: dict[str, list[dict[str, Any]]]) -> None:
         "tasks": ("name", "env_id", "default_config", "summary"),
         "configs": ("name", "task", "scene", "needs_pack", "description"),
         "robots": ("name", "agent"),
-        "policies": ("name", "package", "entry_point"),
+        "policies": ("name", "package", "summary"),
         "baselines": ("name", "package", "summary"),
         "packs": ("name", "objects", "furniture", "megabytes", "folder"),
     }

@@ -34,8 +34,8 @@ class Training:
     seed: Maybe[int] = None
     """Random seed; short for --set train.seed=N."""
     init_from: Maybe[str] = None
-    """Start from the weights of this run: a run folder, or `small` for the bundled weights (write ./small for a
-    folder named small). The configuration of that run replaces the defaults of this baseline. Default: random
+    """Start from the weights of this run: a run folder, or the name of bundled weights, such as `small` (write ./small
+    for a folder named small). The configuration of that run replaces the defaults of this baseline. Default: random
     weights."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device of the network. auto: a GPU if there is one, else the CPU."""
@@ -167,8 +167,7 @@ def train(baseline: str, cfg: Training) -> int:
         )
         train_run(options, progress)
     if first:
-        protocol = "paper-v1" if data else "PROTOCOL"
-        print_line(f"{out}: training is complete. Next: robocas eval TASK --policy {out} --protocol {protocol}")
+        print_line(f"{out}: training is complete. Next: robocas eval TASK --policy {out} --protocol PROTOCOL")
     return 0
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -12,12 +12,13 @@ from mani_skill.utils.structs import Pose
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.checkpoints import flatten_state
+from robocas_ms3.evaluation.checkpoints import flatten_state, unflatten_state
 from robocas_ms3.evaluation.metrics import EpisodeMetrics
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec, TcpMotion
 from robocas_ms3.planning.action_noise import draw_noise
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
 from robocas_ms3.tasks import terms
+from robocas_ms3.tasks.bodies import BODY
 
 Stepping = Literal["timed", "upstream"]
 V0_CONTROL_HZ = 5
@@ -32,11 +33,26 @@ _STOPPED = 0.0005  # largest change in gripper width per control step, m; veloci
 _UNUSED_SIZE = 8  # pixels per side of cameras that the policy does not use; they are rendered all the same
 # RoboCAS-v0's motion ends early within this distance (m) and angle (rad) of its goal, below this speed (rad/s).
 _ARRIVED_DISTANCE, _ARRIVED_ANGLE, _ARRIVED_SPIN = 0.02, np.deg2rad(5), np.deg2rad(3)
+_OWN_SIZE = 2  # numbers of a checkpoint after the state of the environment
 RAISED_HEIGHT = 0.03  # m above the initial height
 # The drive that holds the rotation, in acceleration units (1/s^2, 1/s): equally stiff for light and heavy objects.
 # Limits of zero width lock the translation; SAPIEN 3.0.3 does not enforce angular limits.
 _STIFFNESS, _DAMPING = 1e8, 1e5
 _NOISE_STREAM = 413  # random stream of the action noise
+
+
+class StateDeviation(NamedTuple):
+    """Distance of a state of an environment from a checkpoint.
+
+    Attributes:
+        target: distance of the target from its position in the checkpoint, m.
+        body: the same for the movable actor that is farthest from its position, m.
+        joint: largest difference of a joint position, rad or m.
+    """
+
+    target: float
+    body: float
+    joint: float
 
 
 class PolicyActionWrapper(gym.Wrapper):
@@ -149,6 +165,35 @@ class PolicyActionWrapper(gym.Wrapper):
     def _make_checkpoint(self) -> torch.Tensor:
         own = torch.from_numpy(np.stack([self._open, self._width_change], axis=1).astype(np.float32))
         return torch.cat([self._base.bodies.read(), flatten_state(self._base.extra_state()), own], dim=1)
+
+    def restore_checkpoint(self, checkpoint: np.ndarray, tolerance: float) -> StateDeviation:
+        """Set bodies and controllers of a single env to their states in a checkpoint (D,) if they are far from it.
+
+        The reached stages, the metrics and the weld stay as they are. Returns how far the state was from the
+        checkpoint.
+
+        Args:
+            checkpoint: a checkpoint of this episode.
+            tolerance: deviation in m or rad up to which nothing is set. Setting a state has an effect on contacts: a
+                weak grasp can slip.
+        """
+        row, base = torch.from_numpy(checkpoint)[None], self._base
+        present, own = base.bodies.read(), base.extra_state()
+        recorded = row[:, : present.shape[1]]
+        controller = unflatten_state(row[:, present.shape[1] : -_OWN_SIZE], own)["controller"]
+        change = recorded - present
+        bodies, changes = base.bodies.to_state_dict(recorded), base.bodies.to_state_dict(change)
+        joints = [one[:, BODY : (BODY + one.shape[1]) // 2] for one in changes["articulations"].values()]
+        deviation = StateDeviation(
+            target=float(base.bodies.object_states(change)[0, int(base.target_slot[0]), :3].norm()),
+            body=float(base.bodies.actor_states(change)[..., :3].norm(dim=-1).max()),
+            joint=float(torch.cat(joints, dim=1).abs().max()),
+        )
+        if max(deviation) <= tolerance:
+            return deviation
+        base.set_state_dict({**bodies, **own, "controller": controller})
+        self._open[0], self._width_change[0] = bool(checkpoint[-2] > 0), float(checkpoint[-1])
+        return deviation
 
     def _timed_step(self, motion: TcpMotion) -> tuple:
         start = self._tcp_pose() if self._reference == "tcp" else self._commanded_pose()

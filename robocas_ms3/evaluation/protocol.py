@@ -232,7 +232,7 @@ class LoadedProtocol:
 
     def check_cameras(self, spec: PolicySpec, episodes: Sequence[ProtocolEpisode]) -> None:
         """Raise `EvaluationError` if the configuration of an episode lacks a camera that a policy observes."""
-        robot = find_robot(self.rules.robot, usage=False).description
+        robot = find_robot(self.rules.robot, where=f"{self.folder}, robot", usage=False).description
         for config in dict.fromkeys(episode.config for episode in episodes):
             check_cameras(spec, load_task_config(self.config_file(config)), robot, f"{self.rules.name}, {config}")
 

@@ -133,6 +133,11 @@ class EndConditions:
     max_v0_steps: int | None = None
 
 
+def count_checkpoint_steps(control_dt: float) -> int:
+    """Return the number of policy steps between checkpoints; ``control_dt``: simulated time per control step, s."""
+    return max(1, round(_CHECKPOINT_SECONDS / control_dt))
+
+
 class EpisodeBatch:
     """Vector environment whose envs run one episode each; the caller chooses the actions.
 
@@ -151,7 +156,7 @@ class EpisodeBatch:
 
     def __init__(self, env: Any, spec: PolicySpec, ends: EndConditions, control_dt: float, *, refill: bool) -> None:
         self.env, self._spec, self._ends, self._dt, self.refill = env, spec, ends, control_dt, refill
-        self._checkpoint_steps = max(1, round(_CHECKPOINT_SECONDS / control_dt))
+        self._checkpoint_steps = count_checkpoint_steps(control_dt)
         self.action_size = CONVENTIONS[spec.convention].size
         self.num_envs: int = env.num_envs
         self.running: dict[int, Rollout] = {}

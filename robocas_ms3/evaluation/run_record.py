@@ -142,6 +142,9 @@ def describe_machine() -> dict[str, str]:
     On equal models, equal actions have equal outcomes.
     """
     info = Path("/proc/cpuinfo")  # only on Linux
-    names = re.findall(r"^model name\s*:\s*(.+)$", info.read_text() if info.exists() else "", re.MULTILINE)
-    model = names[0] if names else platform.processor()
+    text = info.read_text() if info.exists() else ""
+    found = dict(re.findall(r"^(model name|cpu family|model)\s*:\s*(.+)$", text, re.MULTILINE))
+    # virtual machines may hide the name, such as "AMD EPYC", but not family and model
+    numbers = [f"{name} {found[name]}" for name in ("cpu family", "model") if name in found]
+    model = ", ".join([found.get("model name") or platform.processor(), *numbers])
     return {"processor": platform.machine(), "model": model, "python": platform.python_version()}

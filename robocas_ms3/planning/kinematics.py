@@ -62,7 +62,8 @@ class ArmChain:
         names = tuple(joint.name for joint in turning)
         if names != robot.arm_joints or not all(joint.axis.tolist() == [0, 0, 1] for joint in turning):
             expected = f"{', '.join(robot.arm_joints)}, each about z"
-            raise file.make_error(f"wrong arm joints for {robot.uid}", expected, ", ".join(names))
+            axes = (f"{joint.name} about {joint.axis.tolist()}" for joint in turning)
+            raise file.make_error(f"wrong arm joints for {robot.uid}", expected, ", ".join(axes))
         self.links, self.hand_in_tcp = [], np.eye(4)
         pending, after_hand = np.eye(4), False
         for joint in chain:

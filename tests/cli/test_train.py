@@ -69,5 +69,5 @@ def test_training_from_the_command_line(stub, tmp_path, monkeypatch, capsys):
     assert record["config"]["width"] == 3
     assert [record["config"]["train"][key] for key in ("steps", "batch_size", "seed")] == [8, 2, 5]
     output = capsys.readouterr()
-    assert f"robocas eval TASK --policy {made} --protocol paper-v1" in output.out
+    assert f"robocas eval TASK --policy {made} --protocol PROTOCOL" in output.out
     assert "steps trained: 8/8" in output.err

@@ -222,3 +222,29 @@ def test_scripts_refuse_invalid_arguments(tmp_path, words, message):
     done, calls = run_with_stub(tmp_path, *words)
     assert (done.returncode, calls) == (2, [])
     assert message in done.stderr
+
+
+SCRIPTS_WITH_OPTIONS = [
+    "reproduce_keyframe.sh A",
+    "reproduce_ms3.sh small",
+    "reproduce_small.sh pick",
+    "dagger_small.sh pick",
+    "evaluate_protocols.sh noop",
+]
+
+
+@pytest.mark.parametrize("words", SCRIPTS_WITH_OPTIONS)
+def test_invalid_numbers_are_refused_before_anything_is_recorded(tmp_path, words):
+    script, *more = words.split()
+    for value in ("abc", "0", "-1", "1.5"):
+        done, calls = run_with_stub(tmp_path, script, *more, str(tmp_path / "out"), EPISODES=value)
+        assert (done.returncode, calls) == (2, []) and "EPISODES" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("words", SCRIPTS_WITH_OPTIONS)
+def test_help_is_the_first_comment(tmp_path, words):
+    script, *more = words.split()
+    done, calls = run_with_stub(tmp_path, script, *more, "--help")
+    assert (done.returncode, calls) == (0, []) and f"bash scripts/{script}" in done.stdout
+    assert "set -euo" not in done.stdout

@@ -141,7 +141,8 @@ def hash_dataset(data: Path) -> str:
             if path.suffix in {".json", ".npz", ".npy", ".parquet"} or path.name == "candidates.h5":
                 _hash_file(digest, path)
     else:
-        raise TrainingError("no such dataset", where=data, expected="a dataset folder or a trajectory.h5", usage=True)
+        expected = "an existing file or folder with training data"
+        raise TrainingError("no such dataset", where=data, expected=expected, usage=True)
     return digest.hexdigest()
 
 

@@ -222,7 +222,7 @@ def choose_facts(own_facts: dict[str, Any], initial: InitialWeights | None, data
     for key in (*_INPUTS, *scales):
         tolerance = _TOLERANCE if key in _INPUTS else math.inf
         if changes := list_setting_changes(others.get(key), own_facts.get(key), key, tolerance):
-            what, where = f"{key} of the data differs from the run of --init-from", data or initial.name
+            what, where = f"the data has another value of {key} than the run of --init-from", data or initial.name
             fix = f"Use data with the same {key}, choose another run, or omit --init-from."
             raise TrainingError(what, where=where, found=changes[0], fix=fix)
     return own_facts if data is None else others

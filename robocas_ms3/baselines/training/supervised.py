@@ -17,6 +17,7 @@ from robocas_ms3.baselines.training.learner import Learner
 from robocas_ms3.baselines.training.run_folder import RunFolder
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.signals import defer_interrupts, make_exit_error
+from robocas_ms3.core.text import format_count
 
 
 def train_supervised(
@@ -28,7 +29,8 @@ def train_supervised(
     """
     accelerator, count = run.accelerator, len(samples)
     learner = Learner(run, model, settings)
-    run.start(learner.step, model, learner.policy_weights(), f"{count} samples of {samples.episodes} episodes")
+    data = f"{format_count(count, 'sample')} of {format_count(samples.episodes, 'episode')}"
+    run.start(learner.step, model, learner.policy_weights(), data)
 
     def log(split: str, metrics: dict[str, float]) -> None:
         rate = learning_rate_at(learner.step - 1, count, settings)

@@ -49,7 +49,7 @@ KINDS: dict[ImageKind, tuple[type, int]] = {
 """Type and number of dimensions of the images, by kind."""
 _POSES = ("camera_in_base", "true_camera_in_base")
 _RENDER = "Render the images with robocas render-candidates."
-_RENDER_AGAIN = "Render the images again: robocas render-candidates --overwrite."
+_RENDER_AGAIN = "Render the images again: robocas render-candidates CANDIDATES --overwrite, with the same options."
 
 
 @dataclass(frozen=True)
@@ -145,6 +145,14 @@ def write_attributes(file: h5py.File, decisions: str) -> None:
     file.attrs["version"] = VERSION
 
 
+def _are_poses(matrices: NDArray[np.float64]) -> bool:
+    """Return whether values are transforms (N, 4, 4) with orthonormal rotations."""
+    if matrices.ndim != 3 or matrices.shape[1:] != (4, 4) or not np.isfinite(matrices).all():
+        return False
+    turns = matrices[:, :3, :3]
+    return np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3), atol=1e-3)
+
+
 def _describe_format(name: Any) -> str:
     return repr(name.decode("ascii", "replace")) if isinstance(name, bytes) else "no attribute format"
 
@@ -211,12 +219,17 @@ class CandidateImages:
                 for name in ("intrinsic", *_POSES)
                 if name not in groups[camera]
             ]
+            poses = {f"{camera}/{name}": groups[camera].get(name) for camera in self.cameras for name in _POSES}
+            invalid = [name for name, values in poses.items() if values is not None and not _are_poses(values[:])]
         if not self.cameras:
             raise DatasetError("this file has no images", where=self.path, fix=_RENDER_AGAIN)
         if lacking:
             what, expected = "missing camera calibration", "intrinsic, camera_in_base and true_camera_in_base"
             found = f"no {', '.join(lacking)}"
             raise DatasetError(what, where=self.path, expected=expected, found=found, fix=_RENDER_AGAIN)
+        if invalid:
+            what, expected = "invalid camera poses", "finite 4x4 matrices with an orthonormal rotation"
+            raise DatasetError(what, where=self.path, expected=expected, found=", ".join(invalid), fix=_RENDER_AGAIN)
         height, width = self.rgb(0, self.cameras[0]).shape[:2]
         self.size = width, height
 

@@ -1,9 +1,4 @@
-"""Audit of a result: replay the stored actions in the frozen scenes, and compare outcomes and checkpoints.
-
-An audit shows that the stored actions have the recorded outcomes. It does not show which policy chose the actions.
-Neither the policy nor a renderer is needed. All values must be equal, except wall-clock times. This holds on the
-processor model of the result; on other models, contacts may diverge.
-"""
+"""Replay of the episodes of a result, with a record that lets an interrupted audit continue."""
 
 from __future__ import annotations
 
@@ -14,19 +9,25 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import hypergeom
 
-from robocas_ms3.core.errors import EvaluationError, PolicyError
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.json_lines import JsonLinesFile
-from robocas_ms3.core.output_folder import FolderKind, OutputFolder, list_setting_changes
-from robocas_ms3.evaluation.outcomes import Checkpoints, Count, Outcome
-from robocas_ms3.evaluation.policy import CONVENTIONS, EpisodeSpec, Observations, PolicySpec
+from robocas_ms3.core.output_folder import FolderKind, OutputFolder
+from robocas_ms3.evaluation.audit.differences import (
+    list_deviations,
+    list_differences,
+    list_large_differences,
+    list_state_differences,
+)
+from robocas_ms3.evaluation.audit.stored_actions import NO_ACTIONS_LEFT, CheckpointEnv, StoredActionsPolicy
+from robocas_ms3.evaluation.outcomes import Count, EvaluatedEpisode
 from robocas_ms3.evaluation.protocol import LoadedProtocol, ProtocolEpisode
 from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.rollout import count_checkpoint_steps
 from robocas_ms3.evaluation.run_record import describe_machine, get_package_versions, hash_source
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
@@ -34,7 +35,9 @@ from robocas_ms3.evaluation.settings import EvaluationSettings
 OUTPUT = FolderKind("robocas eval audit", ("audit.json",), "result_hash")
 _EPISODES = "episodes.jsonl"
 _CONFIDENCE = 0.95
-_NO_ACTIONS_LEFT = "the stored actions end before the episode"
+
+Mode = Literal["exact", "checkpoints"]
+"""How an episode was replayed: without interruption, or from checkpoint to checkpoint (`CheckpointEnv`)."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +47,13 @@ class AuditedEpisode:
     Attributes:
         episode: number of the episode in the protocol.
         differences: differences between the recorded outcome and checkpoints, and those of the stored actions.
+        mode: how it was replayed. In the mode ``checkpoints``, small differences count as none
+            (`list_large_differences`).
     """
 
     episode: Count
     differences: list[str]
+    mode: Mode = "exact"
 
 
 class AuditPlan(NamedTuple):
@@ -62,41 +68,6 @@ class AuditPlan(NamedTuple):
     episodes: list[int]
     seed: int
     replayed: int
-
-
-class StoredActionsPolicy:
-    """Policy that sends the stored actions of a result. It observes nothing.
-
-    An episode that needs more actions ends with an error.
-
-    Args:
-        result: the result.
-    """
-
-    def __init__(self, result: Result) -> None:
-        self._result, values = result, result.run.policy.spec
-        motion = {name: values[name] for name in ("convention", "reference", "rate_hz") if name in values}
-        self.spec = PolicySpec(**motion, language="none")
-        self._actions: dict[int, Iterator[NDArray[np.float32]]] = {}  # by env
-
-    def reset(self, episodes: list[EpisodeSpec]) -> None:
-        for episode in episodes:
-            self._actions[episode.env] = iter(self._result.read_actions(episode.episode))
-
-    def act(self, observations: Observations) -> NDArray[np.float32]:
-        """Return one action per env (E, A)."""
-        envs = observations.envs.tolist()
-        actions = np.zeros((len(envs), CONVENTIONS[self.spec.convention].size), np.float32)
-        missing = {}
-        for row, env in enumerate(envs):
-            action = next(self._actions[env], None)
-            if action is None:
-                missing[env] = _NO_ACTIONS_LEFT
-            else:
-                actions[row] = action
-        if missing:
-            raise PolicyError(missing, actions)
-        return actions
 
 
 def list_other_processors(result: Result) -> list[str]:
@@ -178,15 +149,48 @@ def run_audit(
         on_start(AuditPlan(chosen, seed, len(replayed.keys() & set(chosen))))
         yield from (replayed[number] for number in chosen if number in replayed)
         episodes = [protocol.episodes[number] for number in chosen if number not in replayed]
-        for number, differences in _replay(result, protocol, episodes, envs) if episodes else ():
-            file.append([AuditedEpisode(number, differences)])
-            yield AuditedEpisode(number, differences)
+        for one in _replay(result, protocol, episodes, envs) if episodes else ():
+            file.append([one])
+            yield one
 
 
 def _replay(
     result: Result, protocol: LoadedProtocol, episodes: Sequence[ProtocolEpisode], envs: int
-) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number and the differences of each episode."""
+) -> Iterator[AuditedEpisode]:
+    """Replay episodes; those of another processor that differ are replayed again from checkpoint to checkpoint."""
+    may_diverge, diverged = bool(list_other_processors(result)), []
+    with closing(_open_session(result, protocol, envs, StoredActionsPolicy(result))) as session:
+        for replayed in _run_episodes(session, episodes):
+            number = replayed.outcome.episode
+            recorded = result.read_checkpoints(number)
+            differences = list_differences(result.outcomes[number], replayed.outcome)
+            differences = differences or list_state_differences(recorded, replayed.checkpoints)
+            if differences and may_diverge and len(recorded.steps):
+                diverged.append(protocol.episodes[number])
+            else:
+                yield AuditedEpisode(number, differences)
+        period = count_checkpoint_steps(1 / session.rate)
+    policy, wrapped = StoredActionsPolicy(result, repeats=period), list[CheckpointEnv]()
+
+    def wrap(env: Any) -> CheckpointEnv:
+        wrapped.append(CheckpointEnv(env, policy, result))
+        return wrapped[-1]
+
+    with closing(_open_session(result, protocol, envs, policy, wrap)) as session:
+        for replayed in _run_episodes(session, diverged) if diverged else ():
+            number = replayed.outcome.episode
+            differences = list_large_differences(result.outcomes[number], replayed.outcome, period)
+            differences += list_deviations(result.read_checkpoints(number), wrapped[-1].deviations[number], period)
+            yield AuditedEpisode(number, differences, "checkpoints")
+
+
+def _open_session(
+    result: Result,
+    protocol: LoadedProtocol,
+    envs: int,
+    policy: StoredActionsPolicy,
+    wrap: Callable[[Any], Any] = lambda env: env,
+) -> EvaluationSession:
     run = result.run
     settings = EvaluationSettings(
         tasks=tuple(run.played_as),
@@ -197,32 +201,16 @@ def _replay(
         envs=envs,
         backend="processes",
     )
-    with closing(EvaluationSession(StoredActionsPolicy(result), settings)) as session:
-        for replayed in session.run_episodes(episodes):
-            number, error = replayed.outcome.episode, replayed.outcome.error
-            if error not in ("", _NO_ACTIONS_LEFT):
-                where, fix = f"episode {number}", "Run the same command again."
-                raise EvaluationError("an episode could not be replayed", where=where, found=error, fix=fix)
-            differences = list_differences(result.outcomes[number], replayed.outcome)
-            yield number, differences or list_state_differences(result.read_checkpoints(number), replayed.checkpoints)
+    return EvaluationSession(policy, settings, wrap)
 
 
-def list_differences(recorded: Outcome, replayed: Outcome) -> list[str]:
-    """Return a text per value of a recorded outcome that differs from that of the stored actions."""
-    before, now = recorded.reproducible_values(), replayed.reproducible_values()
-    if before["error"]:  # an error of the policy cannot be repeated, but it ends the episode after the last action
-        before["error"] = _NO_ACTIONS_LEFT
-    return [change for key in now for change in list_setting_changes(before[key], now[key], key)]
-
-
-def list_state_differences(recorded: Checkpoints, replayed: Checkpoints) -> list[str]:
-    """Return a text for the first recorded checkpoint that differs; without recorded checkpoints []."""
-    if not len(recorded.steps):
-        return []
-    if recorded.states.shape != replayed.states.shape or (recorded.steps != replayed.steps).any():
-        return [f"checkpoints: steps {recorded.steps.tolist()} -> {replayed.steps.tolist()}"]
-    differing = recorded.steps[(recorded.states != replayed.states).any(axis=1)]
-    return [f"checkpoints: another state after step {differing[0]}"] if len(differing) else []
+def _run_episodes(session: EvaluationSession, episodes: Sequence[ProtocolEpisode]) -> Iterator[EvaluatedEpisode]:
+    """Run episodes; raise `EvaluationError` if one ends with another error than that the stored actions end."""
+    for replayed in session.run_episodes(episodes):
+        if (error := replayed.outcome.error) not in ("", NO_ACTIONS_LEFT):
+            where, fix = f"episode {replayed.outcome.episode}", "Run the same command again."
+            raise EvaluationError("an episode could not be replayed", where=where, found=error, fix=fix)
+        yield replayed
 
 
 def hash_result(result: Result) -> str:

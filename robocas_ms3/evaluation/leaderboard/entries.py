@@ -3,7 +3,7 @@
 ::
 
     keyframe/README.md    model card
-    keyframe/paper-v1/    result of `robocas eval` with the stored actions of a sample of its episodes only
+    keyframe/paper-v1/    result of `robocas eval` with the stored actions and checkpoints of a sample of its episodes
 
 The hashes of the actions of all episodes are in ``episodes.jsonl``.
 """
@@ -20,7 +20,7 @@ from robocas_ms3.core.output_folder import check_replaceable
 from robocas_ms3.core.text import format_count
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.results import RUN, Result, write_outcomes
-from robocas_ms3.evaluation.stored_episodes import write_actions
+from robocas_ms3.evaluation.stored_episodes import write_actions, write_checkpoints
 from robocas_ms3.evaluation.verify import find_violations
 
 SAMPLE_SIZE = 50
@@ -107,5 +107,6 @@ def write_result(result: Result, protocol: LoadedProtocol, out: Path, *, overwri
         write_json(folder / RUN, run.to_dict())
         for number in sample:
             write_actions(folder, number, result.read_actions(number))
+            write_checkpoints(folder, number, result.read_checkpoints(number))
         write_outcomes(folder, result)
     return sample

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.files import atomic_file, make_folder
 from robocas_ms3.core.text import escape_controls
 from robocas_ms3.evaluation.leaderboard.markdown import render_leaderboard
@@ -47,6 +48,7 @@ def write_leaderboard_page(results: Sequence[AuditedResult], out: Path) -> list[
         out: output folder; existing files of a leaderboard are replaced.
 
     Raises:
+        EvaluationError: two results have the same policy, protocol, task and split.
         OutputExistsError: ``results.json`` in the folder is no leaderboard.
     """
     rows = sort_rows([*rank_rows(results), *read_published_rows()])
@@ -65,8 +67,13 @@ def rank_rows(results: Sequence[AuditedResult]) -> list[LeaderboardRow]:
     Rows are comparable if they have the same protocol, task, split, track, calibration and conditions.
     """
     groups: dict[tuple, list[tuple[LeaderboardRow, dict[int, bool]]]] = {}
+    folders: dict[tuple, Path] = {}
     for one in results:
         for row in make_rows(one.result, one.protocol):
+            same = row.policy, row.weights, row.protocol_hash, row.task, row.split, row.calibration, *row.differences
+            if (first := folders.setdefault(same, one.result.folder)) != one.result.folder:
+                what, expected = "two results of the same policy, protocol, task and split", "one result"
+                raise EvaluationError(what, where=one.result.folder, expected=expected, found=str(first))
             outcomes = [
                 outcome
                 for outcome in one.result.outcomes.values()

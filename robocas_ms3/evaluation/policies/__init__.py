@@ -65,6 +65,14 @@ POLICIES: Registry[Callable[[], Policy]] = Registry(
     },
 )
 """Factories of policies by name."""
+SUMMARIES = {
+    "scripted": "plans from the simulator's state; joint targets",
+    "scripted-ee-delta": "the same plan as motions of the TCP, for protocols with RoboCAS-v0's steps",
+    "scripted-perturbed": "scripted-ee-delta with perturbed grasps, for demonstrations of recovery",
+    "random": "random motions of the TCP",
+    "noop": "no motion, gripper open",
+}
+"""Summaries of the policies of this package that were not trained, by name."""
 POLICY_FOLDERS: Registry[Callable[[Path], Policy]] = Registry(
     "kind of policy folder", POLICY_FOLDER_GROUP, Callable, {}
 )
@@ -96,6 +104,8 @@ def find_policy(name: str) -> Callable[[], Policy]:
         fix = f"Did you mean {Path(kind).stem}:{rest}? Run in the folder of the module."
     elif not rest and len(folder.parts) > 1 and not folder.exists():
         found = "no such folder"
+    elif folder.is_dir():
+        found = f"a folder without {' or '.join(sorted(POLICY_FOLDERS.entry_points))}"
     raise EvaluationError("unknown policy", where=name, expected=expected, found=found, fix=fix, usage=True)
 
 

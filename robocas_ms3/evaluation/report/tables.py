@@ -26,10 +26,10 @@ CALIBRATION_NOTE = (
 )
 NOISE_NOTE = "Measured with {}. Do not compare with results without this noise."
 PAPER_NOTE = (
-    "Comparison with the RoboCAS paper: the object meshes are replacements made by this project, success is stricter "
-    "than the paper's rule, and a policy trained on pick_upstream_eval or search_upstream_eval is evaluated in its "
-    "training distribution."
+    "Comparison with the RoboCAS paper: the object meshes are replacements made by this project, and success is "
+    "stricter than the paper's rule."
 )
+TRAINING_NOTE = "Not in the training data of the policy: {}."
 FAILURE_NOTE = "Failed episodes by the first stage that was not reached."
 _STAGE_NOTE = "RA: any object touched; PA: any object lifted; RR: target touched; CO: obstacles cleared."
 STAGE_NAMES = {
@@ -154,15 +154,19 @@ def describe_action_noise(run: RunRecord) -> str:
 
 
 def list_notes(result: Result) -> list[str]:
-    """Return the notes under the title of a report: weld, noise, task aliases, and differences from the paper."""
+    """Return the notes under the title of a report: weld, noise, training, task aliases, and the paper."""
     played_as = [
         f"{task} was evaluated in the episodes of {other}, as RoboCAS-v0's evaluator does."
         for task, other in result.run.played_as.items()
     ]
     paper = [PAPER_NOTE] if result.run.protocol.startswith("paper-") else []
     noise = [NOISE_NOTE.format(describe_action_noise(result.run))] if result.run.action_noise else []
+    lacking = dict.fromkeys(
+        text for config in result.group_by("config") for text in (result.run.training_differences or {}).get(config, [])
+    )
+    training = [TRAINING_NOTE.format("; ".join(lacking))] if lacking else []
     calibration = [CALIBRATION_NOTE] if has_true_calibration(result.run) else []
-    return [*([WELD_NOTE] if result.run.weld else []), *noise, *calibration, *played_as, *paper]
+    return [*([WELD_NOTE] if result.run.weld else []), *noise, *calibration, *training, *played_as, *paper]
 
 
 def get_stage_names(task: str) -> dict[str, str]:
@@ -243,7 +247,7 @@ def _make_failure_table(result: Result) -> Table:
         cells = (FailureCount(count[stage], n) for stage in stages)
         rows.append((config, str(n), str(n - count[""]), *cells))
     heads = ("configuration", "n#", "failed#", *(f"{get_failure_name(stage)}#" for stage in stages))
-    return Table("Where episodes failed", FAILURE_NOTE, heads, rows)
+    return Table("Stages that were not reached", FAILURE_NOTE, heads, rows)
 
 
 def _make_occlusion_table(hidden: list[Outcome]) -> Table:

@@ -1,4 +1,4 @@
-"""Videos of failed episodes: the episodes run again with a camera behind the robot."""
+"""Videos of episodes, which run again with a camera behind the robot."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -26,11 +26,13 @@ _FRAMES = 5  # per simulated second
 _SPEED = 4  # playback speed relative to simulated time
 
 
-def choose_failed_episodes(result: Result, count: int) -> list[int]:
-    """Return the numbers of at most ``count`` failed episodes, chosen in turn per configuration and failure stage."""
+def choose_episodes(
+    result: Result, count: int, outcomes: Literal["failed", "succeeded", "all"] = "failed"
+) -> list[int]:
+    """Return the numbers of at most ``count`` episodes, chosen in turn per configuration and failure stage."""
     groups: dict[str, dict[str, list[int]]] = {}
     for outcome in result.outcomes.values():
-        if not outcome.success:
+        if outcomes in ("all", "succeeded" if outcome.success else "failed"):
             groups.setdefault(outcome.config, {}).setdefault(outcome.failure_stage, []).append(outcome.episode)
     return sorted(_interleave([_interleave(list(stages.values())) for stages in groups.values()])[:count])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import gymnasium as gym
@@ -169,6 +169,14 @@ class RoboCASVectorEnv(ManiSkillVectorEnv):
             return self._env.call(name, *args, **kwargs)
         found = self._env.get_wrapper_attr(name)  # ManiSkill's method checks the outermost wrapper only
         return found(*args, **kwargs) if callable(found) else found
+
+    def call_each(self, name: str, args: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
+        """Call a method of some envs, by index, with their own arguments; return the results by index.
+
+        Only with processes.
+        """
+        assert isinstance(self._env, ProcessEnv)
+        return self._env.call_each(name, args)
 
 
 def _as_numpy(nested: Any) -> Any:

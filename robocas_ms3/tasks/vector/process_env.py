@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from functools import partial
@@ -182,6 +182,16 @@ class ProcessEnv(gym.Env):
         """Call a method or read an attribute of each env; return a tuple of N picklable results."""
         answers = self._run_commands([("call", name, args, kwargs)] * len(self._env_ranges))
         return tuple(pickle.loads(result) for results in answers for result in results)
+
+    def call_each(self, name: str, args: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
+        """Call a method of some envs, by index, with their own arguments; return the picklable results by index."""
+        parts = [{env: args[env] for env in env_range if env in args} for env_range in self._env_ranges]
+        answers = self._run_commands([("call_each", name, part) for part in parts])
+        return {
+            env: pickle.loads(result)
+            for part, results in zip(parts, answers, strict=True)
+            for env, result in zip(part, results, strict=True)
+        }
 
     def get_language_instruction(self) -> list[str]:
         return [text for texts in self.call("get_language_instruction") for text in texts]

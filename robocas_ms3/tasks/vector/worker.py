@@ -7,7 +7,7 @@ import importlib
 import logging
 import os
 import pickle
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -42,7 +42,7 @@ class EnvSettings:
 class EnvWorker:
     """Worker that runs commands in some environments, and returns the results and the first error.
 
-    A command is a tuple of a method name (``step``, ``reset``, ``render_images`` or ``call``) and its arguments. After
+    A command is a tuple of a method name, such as ``step``, and its arguments. After
     an error in one env, the command still runs in the other envs, so that an env does not depend on its process.
 
     Args:
@@ -103,6 +103,10 @@ class EnvWorker:
             return pickle.dumps(found(*args, **kwargs) if callable(found) else found)
 
         return self._run_each(self._envs, call)
+
+    def call_each(self, name: str, args: Mapping[int, tuple]) -> tuple[list[bytes], RemoteError | None]:
+        """Call a method of some environments, by index, with their own arguments; return pickled results."""
+        return self._run_each(args, lambda env: pickle.dumps(self._envs[env].get_wrapper_attr(name)(*args[env])))
 
     def _run_each(self, envs: Iterable[int], act: Callable[[int], Any]) -> tuple[list[Any], RemoteError | None]:
         """Call ``act`` with the index of each env; return the results and the first error."""

@@ -193,7 +193,7 @@ def test_reader_is_picklable(images):
     np.testing.assert_array_equal(copy.depth(1, "static_camera"), images.depth(1, "static_camera"))
 
 
-@pytest.mark.parametrize("damage", ["truncated", "ends", "format", "version", "empty"])
+@pytest.mark.parametrize("damage", ["truncated", "ends", "format", "version", "empty", "poses"])
 def test_damaged_files_are_dataset_errors(images, tmp_path, damage):
     path = tmp_path / "images.h5"
     shutil.copy(images.path, path)
@@ -205,6 +205,8 @@ def test_damaged_files_are_dataset_errors(images, tmp_path, damage):
         with h5py.File(path, "r+") as file:
             if damage == "ends":
                 file["base_camera/rgb_ends"][0] = -1
+            elif damage == "poses":
+                file["base_camera/camera_in_base"][0, 0, 3] = np.nan
             elif damage == "format":
                 file.attrs["format"] = "other"
             else:

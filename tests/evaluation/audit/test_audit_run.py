@@ -13,7 +13,7 @@ from robocas_ms3.cli.eval_audit import Audit, audit
 from robocas_ms3.cli.main import run as cli
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.evaluation import session
-from robocas_ms3.evaluation.audit import (
+from robocas_ms3.evaluation.audit.run import (
     bound_differing_episodes,
     choose_episodes,
     find_audit_obstacle,
@@ -257,6 +257,15 @@ def test_the_leaderboard_has_only_audited_results(folder, tmp_path, monkeypatch,
     assert (out / "results.json").read_bytes() == before
 
 
+def test_a_result_may_be_in_the_leaderboard_once(folder, tmp_path, monkeypatch):
+    monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "cache"))
+    for name in ("mine", "again"):
+        leaderboard.add(leaderboard.Add((folder,), out=tmp_path / "entries" / name / "smoke"))
+    with pytest.raises(EvaluationError, match="two results of the same policy"):
+        leaderboard.build(leaderboard.Build(tmp_path / "entries", tmp_path / "page", envs=1))
+    assert not (tmp_path / "page").exists()
+
+
 def test_an_entry_without_results_is_an_error(tmp_path):
     with pytest.raises(EvaluationError):
         leaderboard.audit(leaderboard.AuditEntries((tmp_path,)))
@@ -321,3 +330,37 @@ def test_an_evaluation_can_be_audited(picked, short, tmp_path, capsys):
     write_checkpoints(out, 0, checkpoints)
     assert cli([*command, "--overwrite"]) == 1
     assert "episode 0, recorded -> replayed: checkpoints: " in capsys.readouterr().out
+
+
+def test_episodes_of_another_processor_are_replayed_from_checkpoint_to_checkpoint(picked, short, tmp_path, capsys):
+    out = tmp_path / "result"
+    shutil.copytree(picked, out)
+    record = json.loads((out / RUN).read_text())
+    (out / RUN).write_text(json.dumps(record | {"machine": {"model": "Other"}}))
+    protocol, true = load_protocol(str(short)), read_result(picked)
+
+    def audit_again(number):
+        audited = run_audit(read_result(out), protocol, tmp_path / "audit", sample=2, seed=3, overwrite=True)
+        return next((one.mode, one.differences) for one in audited if one.episode == number)
+
+    number = choose_episodes(true, 2, 3)[0]
+    assert audit_again(number) == ("exact", [])
+    for shift, expected in ((1e-6, False), (0.004, False), (0.8, True)):
+        checkpoints = true.read_checkpoints(number)
+        checkpoints.states[2, 13] += shift  # x of the second body, m
+        write_checkpoints(out, number, checkpoints)
+        mode, differences = audit_again(number)
+        assert (mode, bool(differences)) == ("checkpoints", expected), differences
+    write_checkpoints(out, number, true.read_checkpoints(number))
+    one = true.outcomes[number]
+    for factor, expected in ((1.01, False), (1.2, True)):
+        forge(out, number, measures=one.measures | {"path_length": one.measures["path_length"] * factor})
+        mode, differences = audit_again(number)
+        assert (mode, bool(differences)) == ("checkpoints", expected), differences
+    command = ["eval", "audit", str(out), "--protocol", str(short), "--out", str(tmp_path / "again")]
+    assert cli(command) == 1
+    printed = capsys.readouterr().out
+    assert "another model of processor" in printed and "path_length" in printed
+    shutil.rmtree(out / "checkpoints")
+    mode, differences = audit_again(number)
+    assert mode == "exact" and differences

@@ -12,7 +12,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.policies.plain import RandomPolicy
 from robocas_ms3.evaluation.policy import ExternalPolicy, PolicySpec
 from robocas_ms3.evaluation.protocol import load_protocol
-from robocas_ms3.evaluation.report.videos import SIZE, choose_failed_episodes, record_videos
+from robocas_ms3.evaluation.report.videos import SIZE, choose_episodes, record_videos
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
 
@@ -20,10 +20,12 @@ def test_failed_episodes_are_chosen_in_turn_per_failure_stage(tmp_path):
     came_to = [0, 0, 0, 3, 7, 3]
     table = [outcome(number, came) for number, came in enumerate(came_to)]
     result = write(tmp_path / "a", [*table, outcome(6, 0, config="heap")])
-    assert choose_failed_episodes(result, 2) == [0, 6]
-    assert choose_failed_episodes(result, 3) == [0, 3, 6]
-    assert choose_failed_episodes(result, 5) == [0, 1, 3, 5, 6]
-    assert choose_failed_episodes(result, 99) == [0, 1, 2, 3, 5, 6]
+    assert choose_episodes(result, 2) == [0, 6]
+    assert choose_episodes(result, 3) == [0, 3, 6]
+    assert choose_episodes(result, 5) == [0, 1, 3, 5, 6]
+    assert choose_episodes(result, 99) == [0, 1, 2, 3, 5, 6]
+    assert choose_episodes(result, 9, "succeeded") == [4]
+    assert choose_episodes(result, 99, "all") == [0, 1, 2, 3, 4, 5, 6]
 
 
 def test_result_of_another_protocol_is_refused(tmp_path):
@@ -57,7 +59,7 @@ def test_without_failed_episodes_no_video_is_recorded(tmp_path, capsys, installe
     record = result.folder / "run.json"
     record.write_text(record.read_text().replace('"mine"', f'"{installed}"'))
     assert videos(Videos(result.folder)) == 0
-    assert "has no failed episodes" in capsys.readouterr().out
+    assert "no episode of the result has failed" in capsys.readouterr().out
 
 
 def test_a_policy_named_in_a_result_is_not_imported_without_confirmation(tmp_path, capsys):

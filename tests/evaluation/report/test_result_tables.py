@@ -26,14 +26,16 @@ def test_tables_of_successes_failures_and_occlusion(result, tmp_path):
     # 2 of 4: Clopper and Pearson 6.8 to 93.2; steps (70 + 70 + 800 + 800) / 4; RA 3 of 4; no obstacles
     expected = ["table", "end-to-end", "4", "50 % (7 to 93)", "50 %", "50 %", "75 %", "75 %", "75 %", "", "435", "21.8"]
     assert row(render_markdown(result), "table") == expected
-    said = render_markdown(result).partition("Where episodes failed")[2]
+    said = render_markdown(result).partition("Stages that were not reached")[2]
     assert row(said, "configuration") == ["configuration", "n", "failed", "an object touched", "placed, at rest"]
     assert row(said, "table") == ["table", "4", "2", "1", "1"]
     assert ", 6 episodes," in render_markdown(result)
     assert ", 6 of 8 episodes," in render_markdown(result, load_protocol("smoke"))
     assert "first stage that was not reached" in said
     assert "weld" not in render_markdown(result)
-    assert "played_as" not in render_markdown(result)
+    assert "played_as" not in render_markdown(result) and "training data" not in render_markdown(result)
+    result.run.training_differences = {"table": ["objects cup", "layout"], "other": ["task search"]}
+    assert "**Not in the training data of the policy: objects cup; layout.**" in render_markdown(result)
     assert "**With RoboCAS-v0's weld: " in render_markdown(write(tmp_path / "b", [outcome(0)], weld=True))
     # of one episode 2.5 or 97.5 %, rounded up
     assert row(render_markdown(result), "0.2 to 0.4") == ["0.2 to 0.4", "1", "100 % (3 to 100)"]
@@ -54,7 +56,7 @@ def test_notes_name_task_aliases_and_the_conditions_of_the_paper(tmp_path):
     outcomes = [outcome(0, task="select", config="pick_upstream_eval")]
     text = render_markdown(write(tmp_path / "a", outcomes, protocol="paper-v1", played_as={"select": "pick"}))
     assert "select was evaluated in the episodes of pick" in text
-    assert "replacements made by this project" in text and "played_as" not in text and "training distribution" in text
+    assert "replacements made by this project" in text and "played_as" not in text
 
 
 def test_stage_rates_count_only_episodes_with_the_stage(tmp_path):

@@ -1,0 +1,119 @@
+"""Differences between recorded and replayed outcomes and checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from robocas_ms3.core.output_folder import list_setting_changes
+from robocas_ms3.evaluation.action_wrapper import StateDeviation
+from robocas_ms3.evaluation.audit.stored_actions import NO_ACTIONS_LEFT
+from robocas_ms3.evaluation.outcomes import Checkpoints, Outcome
+
+# Tolerances of a replay from checkpoint to checkpoint; docs/evaluation.md has measurements.
+LARGEST_DEVIATION = StateDeviation(target=0.1, body=0.5, joint=0.1)
+"""Largest deviations from a checkpoint. Other objects than the target may roll away."""
+SMALL_DEVIATION = 0.01
+"""Largest distance of the target from its recorded position at most checkpoints, m."""
+LARGEST_FRACTION = 0.3
+"""Largest fraction of checkpoints with a larger distance than `SMALL_DEVIATION`; one is always allowed."""
+LARGEST_DELAY = 2.0
+"""Largest difference of simulated times in s. Numbers of steps may differ by the steps between two checkpoints."""
+_RELATIVE = {"path_length": 0.02, "contact_impulse": 0.1}  # of measures
+_COUNT = 1  # of disturbed and fallen objects, and of moved objects that only one of both outcomes has
+
+
+def list_differences(recorded: Outcome, replayed: Outcome) -> list[str]:
+    """Return a text per value of a recorded outcome that differs from that of the stored actions."""
+    before, now = _list_values(recorded, replayed)
+    return [change for key in now for change in list_setting_changes(before[key], now[key], key)]
+
+
+def list_large_differences(recorded: Outcome, replayed: Outcome, period: int) -> list[str]:
+    """Return the differences of `list_differences` without those that another processor can explain.
+
+    Args:
+        recorded: the recorded outcome.
+        replayed: outcome of a replay from checkpoint to checkpoint.
+        period: number of policy steps between checkpoints.
+    """
+    before, now = _list_values(recorded, replayed)
+    tolerances = {"steps": period, "flags": period, "seconds": LARGEST_DELAY, "flag_seconds": LARGEST_DELAY}
+    if before["steps"] != now["steps"]:  # values after different last steps; the steps of the flags are compared
+        now["success_v0"] = before["success_v0"]
+    measures, retrieval = now.pop("measures"), now.pop("retrieval")
+    found = []
+    for key, value in now.items():
+        found += list_setting_changes(_to_floats(before[key]), _to_floats(value), key, tolerances.get(key, 0.0))
+    for name, value in measures.items():
+        old = float(before["measures"].get(name, 0.0))
+        tolerance = _RELATIVE[name] * max(old, value) if name in _RELATIVE else _COUNT
+        found += list_setting_changes(old, float(value), f"measures.{name}", tolerance)
+    return found + _list_moved_differences(before["retrieval"], retrieval, period)
+
+
+def list_state_differences(recorded: Checkpoints, replayed: Checkpoints) -> list[str]:
+    """Return a text for the first recorded checkpoint that differs; without recorded checkpoints []."""
+    if not len(recorded.steps):
+        return []
+    if recorded.states.shape != replayed.states.shape or (recorded.steps != replayed.steps).any():
+        return [f"checkpoints: steps {recorded.steps.tolist()} -> {replayed.steps.tolist()}"]
+    differing = recorded.steps[(recorded.states != replayed.states).any(axis=1)]
+    return [f"checkpoints: another state after step {differing[0]}"] if len(differing) else []
+
+
+def list_deviations(recorded: Checkpoints, deviations: Sequence[StateDeviation], period: int) -> list[str]:
+    """Return a text if a replay from checkpoint to checkpoint was too far from the recorded states.
+
+    Args:
+        recorded: the recorded checkpoints.
+        deviations: how far the replay was from each (`CheckpointEnv`).
+        period: number of policy steps between checkpoints.
+    """
+    steps, last = recorded.steps.tolist(), int(recorded.steps[-1])
+    if steps != [*range(period, last, period), last]:
+        return [f"checkpoints: steps {steps}, expected every {period} and the last"]
+    values = np.array(deviations)
+    far = (values > LARGEST_DEVIATION).any(axis=1)
+    if far.any():
+        first = int(np.argmax(far))
+        found = ", ".join(f"{name} {value:.3f}" for name, value in deviations[first]._asdict().items())
+        return [f"checkpoints: after step {steps[first]} the deviations are (m, m, rad or m) {found}"]
+    count, allowed = int((values[:, 0] > SMALL_DEVIATION).sum()), max(1, int(LARGEST_FRACTION * len(values)))
+    if count > allowed:
+        expected = f"expected at most {allowed}"
+        return [f"checkpoints: target more than {SMALL_DEVIATION:g} m from {count} recorded positions, {expected}"]
+    return []
+
+
+def _list_values(recorded: Outcome, replayed: Outcome) -> tuple[dict[str, Any], dict[str, Any]]:
+    before, now = recorded.reproducible_values(), replayed.reproducible_values()
+    if before["error"]:  # an error of the policy cannot be repeated, but it ends the episode after the last action
+        before["error"] = NO_ACTIONS_LEFT
+    return before, now
+
+
+def _list_moved_differences(before: Any, now: Any, period: int) -> list[str]:
+    """Return the differences of two retrieval orders; objects that move at almost the same time may change places."""
+    if before is None or now is None:
+        return list_setting_changes(before, now, "retrieval")
+    old, new = ({one["object"]: float(one["step"]) for one in order["moved"]} for order in (before, now))
+    found = list_setting_changes(before["needed"], now["needed"], "retrieval.needed")
+    if len(other := sorted(old.keys() ^ new.keys())) > _COUNT:
+        found.append(f"retrieval: moved in only one of both: {', '.join(other)}")
+    return found + [
+        f"retrieval: {name} moved at step {old[name]:g} -> {new[name]:g}"
+        for name in sorted(old.keys() & new.keys())
+        if abs(old[name] - new[name]) > period
+    ]
+
+
+def _to_floats(value: Any) -> Any:
+    """Return a JSON value with all its numbers as floats, to which `list_setting_changes` applies a tolerance."""
+    if isinstance(value, dict):
+        return {name: _to_floats(one) for name, one in value.items()}
+    if isinstance(value, list):
+        return [_to_floats(one) for one in value]
+    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value

@@ -1,0 +1,104 @@
+"""Replay of the stored actions of a result: a policy, and an environment that returns to recorded checkpoints."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocas_ms3.core.errors import PolicyError
+from robocas_ms3.evaluation.action_wrapper import StateDeviation
+from robocas_ms3.evaluation.policy import CONVENTIONS, EpisodeSpec, Observations, PolicySpec
+from robocas_ms3.evaluation.results import Result
+
+RESTORE_TOLERANCE = 0.005
+"""Deviation from a checkpoint in m or rad up to which the state is not restored."""
+NO_ACTIONS_LEFT = "the stored actions end before the episode"
+
+
+class StoredActionsPolicy:
+    """Policy that sends the stored actions of a result. It observes nothing.
+
+    An episode that needs more actions ends with an error.
+
+    Args:
+        result: the result.
+        repeats: how often the last action of an episode is repeated before this error. The last action before a
+            recorded error is not repeated.
+
+    Attributes:
+        sent: by index of the env, number of the episode and number of its actions up to the last call of `act`, for
+            the envs of this call.
+    """
+
+    def __init__(self, result: Result, repeats: int = 0) -> None:
+        self._result, self._repeats, values = result, repeats, result.run.policy.spec
+        motion = {name: values[name] for name in ("convention", "reference", "rate_hz") if name in values}
+        self.spec = PolicySpec(**motion, language="none")
+        self._actions: dict[int, tuple[int, NDArray[np.float32]]] = {}  # by env: episode and its actions
+        self._counts: dict[int, int] = {}  # by env
+        self.sent: dict[int, tuple[int, int]] = {}
+
+    def reset(self, episodes: list[EpisodeSpec]) -> None:
+        for one in episodes:
+            actions = self._result.read_actions(one.episode)
+            if not self._result.outcomes[one.episode].error:
+                actions = np.concatenate([actions, np.repeat(actions[-1:], self._repeats, axis=0)])
+            self._actions[one.env], self._counts[one.env] = (one.episode, actions), 0
+
+    def act(self, observations: Observations) -> NDArray[np.float32]:
+        """Return one action per env (E, A)."""
+        envs = observations.envs.tolist()
+        found = np.zeros((len(envs), CONVENTIONS[self.spec.convention].size), np.float32)
+        self.sent, missing = {}, {}
+        for row, env in enumerate(envs):
+            (episode, actions), count = self._actions[env], self._counts[env]
+            if count == len(actions):
+                missing[env] = NO_ACTIONS_LEFT
+                continue
+            found[row], self._counts[env] = actions[count], count + 1
+            self.sent[env] = episode, count + 1
+        if missing:
+            raise PolicyError(missing, found)
+        return found
+
+
+class CheckpointEnv:
+    """Vector environment whose envs return to a recorded state if they are far from it, at each checkpoint.
+
+    Args:
+        env: vector environment of `PolicyActionWrapper` envs in processes.
+        policy: policy that chooses the actions.
+        result: the result, with checkpoints.
+
+    Attributes:
+        deviations: by number of the episode, how far the state was from each checkpoint.
+    """
+
+    def __init__(self, env: Any, policy: StoredActionsPolicy, result: Result) -> None:
+        self._env, self._policy, self._result, self.num_envs = env, policy, result, env.num_envs
+        self.deviations: dict[int, list[StateDeviation]] = {}
+        self._states: dict[int, dict[int, NDArray[np.float32]]] = {}  # by episode and step
+
+    def reset(self, **kwargs: Any) -> Any:
+        return self._env.reset(**kwargs)
+
+    def step(self, actions: Any) -> Any:
+        found, states = self._env.step(actions), {}
+        for env, (episode, step) in self._policy.sent.items():
+            if episode not in self._states:
+                checkpoints = self._result.read_checkpoints(episode)
+                self._states[episode] = dict(zip(checkpoints.steps.tolist(), checkpoints.states, strict=True))
+            if step in self._states[episode]:
+                states[env] = self._states[episode][step]
+        if states:
+            restored = self._env.call_each(
+                "restore_checkpoint", {env: (state, RESTORE_TOLERANCE) for env, state in states.items()}
+            )
+            for env, deviation in restored.items():
+                self.deviations.setdefault(self._policy.sent[env][0], []).append(deviation)
+        return found
+
+    def close(self) -> None:
+        self._env.close()
