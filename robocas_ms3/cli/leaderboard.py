@@ -20,16 +20,19 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class Add(Results):
-    """Add a result to an entry, a folder with the results of a policy.
+    """Add a result to an entry, a folder with the results and the model card of a policy.
 
     The copy has all outcomes, and the stored actions of 50 episodes that the protocol fixes. The result is first
-    checked like in `robocas eval verify`. It may lack tasks and splits of the protocol, but no episodes of the others.
+    checked as in `robocas eval verify`. Whole tasks or splits of the protocol may be missing. Every task and split in
+    the result needs all its episodes.
 
-    Example: robocas leaderboard add eval/pick --out leaderboard/mine/paper-v1
+    Example: robocas leaderboard add eval/pick --out leaderboard/mine/paper-v1 --card card.md
     """
 
     out: Annotated[Path, tyro.conf.arg(metavar="ENTRY/PROTOCOL")]
     """Folder of the result in the entry."""
+    card: Annotated[Maybe[Path], tyro.conf.arg(metavar="FILE")] = None
+    """Model card (Markdown) to copy to ENTRY/README.md: training data, where the policy works, how to reproduce."""
     overwrite: bool = False
     """Replace an existing result."""
 
@@ -53,8 +56,8 @@ class AuditEntries:
 class Build:
     """Check and replay all entries, and write the leaderboard: index.html, results.md and results.json.
 
-    The stored actions are replayed like in `robocas leaderboard audit`, and the outcomes of these replays are kept in
-    the cache folder. Nothing is written if a result has problems (exit status 1).
+    The stored actions are replayed as in `robocas leaderboard audit`. The cache folder keeps the outcomes. Nothing is
+    written if a result has problems (exit status 1).
 
     Example: robocas leaderboard build leaderboard --out leaderboard-page
     """
@@ -74,11 +77,14 @@ class Build:
 def add(cfg: Add) -> int:
     from robocas_ms3.cli.eval_results import find_protocol_of, read
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.evaluation.leaderboard.entries import write_result
+    from robocas_ms3.evaluation.leaderboard.entries import find_card, write_result
 
     result = read(cfg.folders)
-    sample = write_result(result, find_protocol_of(result, cfg.protocol), cfg.out, overwrite=cfg.overwrite)
+    protocol = find_protocol_of(result, cfg.protocol)
+    sample = write_result(result, protocol, cfg.out, card=cfg.card, overwrite=cfg.overwrite)
     print_line(f"wrote {cfg.out}: {format_count(len(result.outcomes), 'episode')}, actions of {len(sample)}")
+    if not find_card(cfg.out).exists():
+        print_line(f"next: write the model card {find_card(cfg.out)}, or pass --card")
     return 0
 
 

@@ -5,7 +5,8 @@
     keyframe/README.md    model card
     keyframe/paper-v1/    result of `robocas eval` with the stored actions and checkpoints of a sample of its episodes
 
-The hashes of the actions of all episodes are in ``episodes.jsonl``.
+The hashes of the actions of all episodes are in ``episodes.jsonl``. The model card says what the policy was trained
+on, where it works and where it does not, and how to reproduce its results.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.core.files import atomic_folder, write_json
+from robocas_ms3.core.files import atomic_file, atomic_folder, write_json
 from robocas_ms3.core.output_folder import check_replaceable
 from robocas_ms3.core.text import format_count
 from robocas_ms3.evaluation.protocol import LoadedProtocol
@@ -23,6 +24,8 @@ from robocas_ms3.evaluation.results import RUN, Result, write_outcomes
 from robocas_ms3.evaluation.stored_episodes import write_actions, write_checkpoints
 from robocas_ms3.evaluation.verify import find_violations
 
+CARD = "README.md"
+"""Name of the model card in an entry."""
 SAMPLE_SIZE = 50
 """Number of episodes of a result whose actions are in an entry."""
 
@@ -69,21 +72,31 @@ def list_stored_episodes(result: Result, protocol: LoadedProtocol) -> list[int]:
     return choose_sample(protocol, {outcome.config for outcome in result.outcomes.values()})
 
 
+def find_card(folder: Path) -> Path:
+    """Return the path of the model card of the entry that contains the folder of a result."""
+    return folder.absolute().parent / CARD
+
+
 def find_result_violations(result: Result, protocol: LoadedProtocol) -> list[str]:
     """Return one text per violation in a result of an entry (`find_violations`)."""
     found = find_violations(result, protocol, is_complete=False, stored=list_stored_episodes(result, protocol))
     if missing := count_missing(result, protocol):
         found.append(f"{format_count(missing, 'episode')} of its configurations missing")
+    if not find_card(result.folder).is_file():
+        found.append(f"no model card {find_card(result.folder)}; write it, or pass --card to robocas leaderboard add")
     return found
 
 
-def write_result(result: Result, protocol: LoadedProtocol, out: Path, *, overwrite: bool = False) -> list[int]:
+def write_result(
+    result: Result, protocol: LoadedProtocol, out: Path, *, card: Path | None = None, overwrite: bool = False
+) -> list[int]:
     """Write a result into a folder of an entry, and return the numbers of the episodes of the sample.
 
     Args:
         result: the result, with all episodes of its configurations.
         protocol: its protocol.
         out: new folder, such as ``leaderboard/keyframe/paper-v1``; written atomically.
+        card: model card to copy into the entry; None: the entry keeps its card.
         overwrite: whether to replace an existing result.
 
     Raises:
@@ -99,6 +112,7 @@ def write_result(result: Result, protocol: LoadedProtocol, out: Path, *, overwri
         found = f"{format_count(missing, 'episode')} missing"
         raise EvaluationError(what, where=result.folder, found=found, fix=fix)
     check_replaceable(out, overwrite=overwrite, markers=(RUN,))
+    text = None if card is None else _read_card(card)
     sample = list_stored_episodes(result, protocol)
     # a path of the author's machine means nothing to others
     parts = [part.model_copy(update={"folder": Path(part.folder).name}) for part in result.run.merged_from]
@@ -109,4 +123,14 @@ def write_result(result: Result, protocol: LoadedProtocol, out: Path, *, overwri
             write_actions(folder, number, result.read_actions(number))
             write_checkpoints(folder, number, result.read_checkpoints(number))
         write_outcomes(folder, result)
+    if text is not None:
+        with atomic_file(find_card(out)) as tmp:
+            tmp.write_text(text, encoding="utf-8")
     return sample
+
+
+def _read_card(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise EvaluationError("cannot read the model card", where=path, found=error) from error

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
+from robocas_ms3.evaluation.leaderboard.entries import find_card
 from robocas_ms3.evaluation.leaderboard.markdown import (
     PUBLISHED_NOTE,
     RANK_NOTE,
@@ -88,13 +89,15 @@ def _render_row(row: LeaderboardRow) -> list[str]:
 
 
 def _render_result(result: Result, folder: Path) -> str:
-    """Return the stages of a result and links to its videos, folded."""
+    """Return the stages of a result, links to its videos and the model card, folded."""
     policy, protocol = name_policy(result.run), result.run.protocol
     videos = sorted(video_folder(folder, result).glob("*.mp4"))
     links = " ".join(f'<a href="{escape(one.relative_to(folder).as_posix())}">{one.stem}</a>' for one in videos)
     shown = f"<p>Videos of failed episodes: {links}</p>\n" if videos else ""
     summary = f"<summary>{escape(policy)}, {escape(protocol)}</summary>"
-    return f"<details>\n{summary}\n{render_stages(result)}{shown}</details>\n"
+    card = find_card(result.folder)
+    text = f"<pre>{escape(card.read_text(encoding='utf-8', errors='replace'))}</pre>\n" if card.is_file() else ""
+    return f"<details>\n{summary}\n{render_stages(result)}{shown}{text}</details>\n"
 
 
 def _format_published(row: LeaderboardRow) -> str:

@@ -60,6 +60,13 @@ def folder(made, tmp_path):
     return out
 
 
+@pytest.fixture
+def card(tmp_path):
+    path = tmp_path / "card.md"
+    path.write_text("# Model card: mine\n")
+    return path
+
+
 def replay(folder, out="audit", **settings):
     """Return the numbers of the replayed episodes and of those that differ."""
     audited = list(run_audit(read_result(folder), SMOKE, folder.parent / out, envs=1, **settings))
@@ -217,10 +224,10 @@ def test_episodes_with_errors_are_replayed_up_to_the_error(folder):
     assert choose_episodes(read_result(folder), None, 0) == [1, 2, 3]
 
 
-def test_the_sample_of_an_entry_is_replayed(folder, tmp_path, monkeypatch, capsys):
+def test_the_sample_of_an_entry_is_replayed(folder, card, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(entries, "SAMPLE_SIZE", 3)
     entry, out = tmp_path / "entry", tmp_path / "entry" / "smoke"
-    assert leaderboard.add(leaderboard.Add((folder,), out=out)) == 0
+    assert leaderboard.add(leaderboard.Add((folder,), card=card, out=out)) == 0
     assert leaderboard.audit(leaderboard.AuditEntries((entry,), envs=1)) == 0
     sample = entries.list_stored_episodes(read_result(out), SMOKE)
     (other,) = {0, 1, 2, 3} - set(sample)
@@ -237,10 +244,10 @@ def test_the_sample_of_an_entry_is_replayed(folder, tmp_path, monkeypatch, capsy
     assert "1 episode of its configurations missing" in capsys.readouterr().out
 
 
-def test_the_leaderboard_has_only_audited_results(folder, tmp_path, monkeypatch, capsys):
+def test_the_leaderboard_has_only_audited_results(folder, card, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "cache"))
     entry, out = tmp_path / "entries" / "mine" / "smoke", tmp_path / "page"
-    assert leaderboard.add(leaderboard.Add((folder,), out=entry)) == 0
+    assert leaderboard.add(leaderboard.Add((folder,), card=card, out=entry)) == 0
     build = leaderboard.Build(tmp_path / "entries", out, envs=1)
     assert leaderboard.build(build) == 0
     rows = [row for row in read_leaderboard(out / "results.json").rows if not row.published]
@@ -257,10 +264,10 @@ def test_the_leaderboard_has_only_audited_results(folder, tmp_path, monkeypatch,
     assert (out / "results.json").read_bytes() == before
 
 
-def test_a_result_may_be_in_the_leaderboard_once(folder, tmp_path, monkeypatch):
+def test_a_result_may_be_in_the_leaderboard_once(folder, card, tmp_path, monkeypatch):
     monkeypatch.setenv("ROBOCAS_CACHE", str(tmp_path / "cache"))
     for name in ("mine", "again"):
-        leaderboard.add(leaderboard.Add((folder,), out=tmp_path / "entries" / name / "smoke"))
+        leaderboard.add(leaderboard.Add((folder,), card=card, out=tmp_path / "entries" / name / "smoke"))
     with pytest.raises(EvaluationError, match="two results of the same policy"):
         leaderboard.build(leaderboard.Build(tmp_path / "entries", tmp_path / "page", envs=1))
     assert not (tmp_path / "page").exists()

@@ -42,6 +42,20 @@ def test_an_entry_has_no_paths_of_the_machine_of_its_author(result, tmp_path):
     assert str(tmp_path) not in (copy.folder / "run.json").read_text()
 
 
+def test_an_entry_needs_a_model_card(result, tmp_path, capsys):
+    out, card, protocol = tmp_path / "entry" / "smoke", tmp_path / "card.md", load_protocol("smoke")
+    assert add(Add((result.folder,), out=out)) == 0
+    assert "write the model card" in capsys.readouterr().out
+    assert any("no model card" in text for text in entries.find_result_violations(read_result(out), protocol))
+    with pytest.raises(EvaluationError):
+        add(Add((result.folder,), out=out, card=card, overwrite=True))
+    card.write_text("# Model card: mine\n")
+    assert add(Add((result.folder,), out=out, card=card, overwrite=True)) == 0
+    assert entries.find_card(out).read_text() == "# Model card: mine\n"
+    assert entries.find_result_violations(read_result(out), protocol) == []
+    assert "model card" not in capsys.readouterr().out
+
+
 def test_the_sample_depends_on_protocol_and_configurations(tmp_path, monkeypatch):
     monkeypatch.setattr(entries, "SAMPLE_SIZE", 3)
     protocol = load_protocol("smoke")

@@ -5,6 +5,7 @@ import re
 
 from synthetic_results import of_protocol
 
+from robocas_ms3.evaluation.leaderboard.entries import find_card
 from robocas_ms3.evaluation.leaderboard.output import PAGE, ROWS, AuditedResult, rank_rows, write_leaderboard_page
 from robocas_ms3.evaluation.leaderboard.page import video_folder
 from robocas_ms3.evaluation.leaderboard.rows import read_leaderboard
@@ -39,6 +40,13 @@ def test_page_has_a_row_per_task_and_the_published_results(tmp_path):
     assert page.count("<td>first</td>") == page.count("<td>second</td>") == len(tasks)
     assert len(re.findall("<summary>(?:first|second), smoke</summary>", page)) == 2
     assert "RT-1" in page and "<option>first</option>" in page
+
+
+def test_page_has_the_model_card_of_each_entry(tmp_path):
+    results, out = make_results(tmp_path, "first"), tmp_path / "out"
+    find_card(results[0].result.folder).write_text("# Model card: <first>\n")
+    write_leaderboard_page(results, out)
+    assert "<pre># Model card: &lt;first&gt;" in (out / PAGE).read_text()
 
 
 def test_videos_in_the_folder_of_a_result_are_linked(tmp_path):
