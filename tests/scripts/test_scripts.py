@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -248,3 +249,39 @@ def test_help_is_the_first_comment(tmp_path, words):
     done, calls = run_with_stub(tmp_path, script, *more, "--help")
     assert (done.returncode, calls) == (0, []) and f"bash scripts/{script}" in done.stdout
     assert "set -euo" not in done.stdout
+
+
+def test_changed_entries_are_audited(tmp_path):
+    root, stub = tmp_path / "clone", tmp_path / "robocas"
+    stub.write_text(STUB)
+    stub.chmod(0o755)
+    shutil.copytree(ROOT / "scripts", root / "scripts")
+
+    def write(*names):
+        for name in names:
+            (root / "leaderboard" / name).parent.mkdir(parents=True, exist_ok=True)
+            (root / "leaderboard" / name).write_text(f"{len(names)}")
+
+    def git(*words):
+        settings = ["-c", "user.name=test", "-c", "user.email=test", "-c", "commit.gpgsign=false"]
+        subprocess.run(["git", *settings, *words], cwd=root, check=True, capture_output=True)
+
+    def audit(*words, **settings):
+        (tmp_path / "calls").unlink(missing_ok=True)
+        env = {**os.environ, "ROBOCAS": str(stub), "CALLS": str(tmp_path / "calls"), **settings}
+        command = ["bash", str(root / "scripts" / "audit_entries.sh"), *words]
+        done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+        return done.returncode, (tmp_path / "calls").read_text() if (tmp_path / "calls").exists() else ""
+
+    write("a/README.md", "a/p1/run.json", "a/p2/run.json", "b/p1/run.json", "b/p1/actions/000001.npz")
+    git("init")
+    git("add", "--all")
+    git("commit", "--message", "first")
+    assert audit("HEAD") == (0, "")
+    assert audit() == audit("nosuch") == audit("HEAD", SAMPLE="0") == (2, "")
+    write("b/p1/actions/000001.npz")
+    assert audit("HEAD", SAMPLE="5") == (0, "leaderboard audit leaderboard/b/p1 --sample 5\n")
+    write("a/README.md")
+    git("commit", "--all", "--message", "second")
+    expected = "leaderboard audit leaderboard/a/p1 leaderboard/a/p2 leaderboard/b/p1\n"
+    assert audit("HEAD~1") == (0, expected)

@@ -1,0 +1,32 @@
+#!/usr/bin/env bash
+# Audit the results in leaderboard/ that were changed since a commit: check them and replay their stored actions.
+#
+#   bash scripts/audit_entries.sh COMMIT
+#
+# The exit status is 1 if a result has problems. A result is changed if one of its files, or the model card of its entry,
+# differs from COMMIT.
+#
+# SAMPLE   number of episodes to replay per result, chosen at random (default: all with stored actions)
+# ROBOCAS  robocas command (default: .venv/bin/robocas)
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+source scripts/timed.sh
+
+fail() { printf 'audit_entries: error: %s\n' "$*" >&2; exit 2; }
+show_usage "$@"
+require_numbers SAMPLE
+[[ $# -eq 1 ]] || fail "expected one COMMIT. Usage: bash scripts/audit_entries.sh COMMIT"
+git rev-parse --quiet --verify "$1^{commit}" >/dev/null || fail "no such commit: $1"
+robocas=${ROBOCAS:-.venv/bin/robocas}
+
+# leaderboard/ENTRY/PROTOCOL/... -> leaderboard/ENTRY/PROTOCOL; leaderboard/ENTRY/README.md -> all results of the entry
+results=()
+while IFS=/ read -r root entry result _; do
+    [[ $result != README.md ]] || result="*"
+    for run in "$root/$entry"/$result/run.json; do
+        [[ ! -f $run ]] || results+=("${run%/run.json}")
+    done
+done < <(git diff --name-only "$1" -- leaderboard/)
+((${#results[@]})) || { echo "audit_entries: no result changed since $1"; exit 0; }
+mapfile -t results < <(printf '%s\n' "${results[@]}" | sort -u)
+"$robocas" leaderboard audit "${results[@]}" ${SAMPLE:+--sample "$SAMPLE"}
