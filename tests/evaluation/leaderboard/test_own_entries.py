@@ -1,4 +1,4 @@
-"""The entries in ``leaderboard/``: valid results with model cards; those of bundled weights are the cards of the runs."""
+"""The entries in ``leaderboard/`` are valid, and model cards of bundled weights are those of the runs."""
 
 from pathlib import Path
 
