@@ -19,14 +19,19 @@ require_numbers SAMPLE
 git rev-parse --quiet --verify "$1^{commit}" >/dev/null || fail "no such commit: $1"
 robocas=${ROBOCAS:-.venv/bin/robocas}
 
-# leaderboard/ENTRY/PROTOCOL/... -> leaderboard/ENTRY/PROTOCOL; leaderboard/ENTRY/README.md -> all results of the entry
-results=()
-while IFS=/ read -r root entry result _; do
-    [[ $result != README.md ]] || result="*"
-    for run in "$root/$entry"/$result/run.json; do
-        [[ ! -f $run ]] || results+=("${run%/run.json}")
+changes=$(mktemp)
+trap 'rm -f "$changes"' EXIT
+git diff --name-only -z "$1" -- leaderboard/ >"$changes"
+git ls-files --others --exclude-standard -z -- leaderboard/ >>"$changes"
+declare -A results=()
+while IFS= read -r -d '' path; do
+    folder=$(dirname "$path")
+    while [[ $folder == leaderboard/*/* && ! -f $folder/run.json ]]; do
+        folder=$(dirname "$folder")
     done
-done < <(git diff --name-only "$1" -- leaderboard/)
+    # a file of no result, such as a model card: all results of the entry; nothing if the entry was deleted
+    [[ $folder != leaderboard/* || ! -d $folder ]] || results[$folder]=1
+done <"$changes"
 ((${#results[@]})) || { echo "audit_entries: no result changed since $1"; exit 0; }
-mapfile -t results < <(printf '%s\n' "${results[@]}" | sort -u)
-"$robocas" leaderboard audit "${results[@]}" ${SAMPLE:+--sample "$SAMPLE"}
+mapfile -t folders < <(printf '%s\n' "${!results[@]}" | sort)
+"$robocas" leaderboard audit "${folders[@]}" ${SAMPLE:+--sample "$SAMPLE"}

@@ -98,10 +98,13 @@ def audit(cfg: Audit) -> int:
     if from_checkpoints:
         count = format_count(from_checkpoints, "episode")
         print_line(f"note: {count} diverged and were replayed from checkpoint to checkpoint, with tolerances")
-    return _print_summary(cfg.folder, result, protocol, plans[0], differing)
+    equal = "no differences beyond the tolerances" if from_checkpoints else "all equal the result"
+    return _print_summary(cfg.folder, result, protocol, plans[0], differing, equal)
 
 
-def _print_summary(folder: Path, result: Result, protocol: LoadedProtocol, plan: AuditPlan, differing: int) -> int:
+def _print_summary(
+    folder: Path, result: Result, protocol: LoadedProtocol, plan: AuditPlan, differing: int, equal: str
+) -> int:
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.evaluation.audit.run import bound_differing_episodes
 
@@ -115,7 +118,7 @@ def _print_summary(folder: Path, result: Result, protocol: LoadedProtocol, plan:
     if differing:
         print_line(f"{differing} of {format_count(count, 'episode')} differ from the result")
         return 1
-    print_line("all equal the result")
+    print_line(equal)
     if count < total:
         bound = bound_differing_episodes(count, total)
         print_line(f"sample with seed {plan.seed}: at most {bound} of the {total} differ (95 % confidence)")

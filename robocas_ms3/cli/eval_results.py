@@ -215,7 +215,7 @@ def videos(cfg: Videos) -> int:
             print_line(str(path) + ("" if same else ": the outcome differs from the recorded outcome"))
             bar.update(done, len(numbers))
     if not numbers:
-        print_line(f"no episode of the result has {cfg.outcome}: --outcome all records any episode")
+        print_line(f"no episode to record with --outcome {cfg.outcome}")
     write_pages(result, cfg.folder, cfg.protocol)
     return 0
 

@@ -15,6 +15,7 @@ from robocas_ms3.cli.options import Folders, Maybe, resumable
 from robocas_ms3.core.text import format_count
 
 if TYPE_CHECKING:
+    from robocas_ms3.evaluation.audit.run import AuditPlan
     from robocas_ms3.evaluation.leaderboard.output import AuditedResult
 
 
@@ -48,6 +49,8 @@ class AuditEntries:
     """Folders of entries, or of results in entries."""
     sample: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
     """Replay N episodes per result, chosen at random. Default: all with stored actions."""
+    seed: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
+    """Random seed of --sample. Default: a number that nobody can predict; it is printed."""
     envs: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
     """Number of environments that run at the same time. Default: one per CPU core."""
 
@@ -68,6 +71,8 @@ class Build:
     """Output folder."""
     sample: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
     """Replay N episodes per result, chosen at random. Default: all with stored actions."""
+    seed: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
+    """Random seed of --sample. Default: a number that nobody can predict; it is printed."""
     videos: int = 0
     """Number of videos of failed episodes per result, made from the stored actions."""
     envs: Annotated[Maybe[int], tyro.conf.arg(metavar="N")] = None
@@ -93,7 +98,7 @@ def audit(cfg: AuditEntries) -> int:
     from robocas_ms3.evaluation.leaderboard.entries import find_results
 
     _check_numbers(cfg)
-    folders = [folder for entry in cfg.entries for folder in find_results(entry)]
+    folders = list(dict.fromkeys(folder for entry in cfg.entries for folder in find_results(entry)))
     with tempfile.TemporaryDirectory() as memory:
         audited = [_audit_result(folder, Path(memory), cfg) for folder in folders]
     bad = audited.count(None)
@@ -127,9 +132,9 @@ def build(cfg: Build) -> int:
 def _check_numbers(cfg: AuditEntries | Build) -> None:
     from robocas_ms3.core.checks import check_number
 
-    for name in ("sample", "envs"):
+    for name, least in (("sample", 1), ("envs", 1), ("seed", 0)):
         if (number := getattr(cfg, name)) is not None:
-            check_number(f"--{name}", number, 1)
+            check_number(f"--{name}", number, least)
 
 
 def _audit_result(folder: Path, memory: Path, cfg: AuditEntries | Build) -> AuditedResult | None:
@@ -150,16 +155,23 @@ def _audit_result(folder: Path, memory: Path, cfg: AuditEntries | Build) -> Audi
     problems = find_result_violations(result, protocol)
     if not problems and (obstacle := find_audit_obstacle(result)):
         problems = [f"cannot be audited: {obstacle}"]
+    plans: list[AuditPlan] = []
     if not problems:
         with ProgressBar("episodes replayed") as bar:
+
+            def start(plan: AuditPlan) -> None:
+                plans.append(plan)
+                bar.start(len(plan.episodes))
+
             for one in run_audit(
                 result,
                 protocol,
                 memory / hash_audit(result),
                 sample=cfg.sample,
+                seed=cfg.seed,
                 stored=list_stored_episodes(result, protocol),
                 envs=cfg.envs or len(os.sched_getaffinity(0)),
-                on_start=lambda plan: bar.start(len(plan.episodes)),
+                on_start=start,
             ):
                 bar.advance()
                 count += 1
@@ -169,8 +181,9 @@ def _audit_result(folder: Path, memory: Path, cfg: AuditEntries | Build) -> Audi
         print_line(f"{folder}: {problem}")
     if problems:
         return None
-    mode = f", {from_checkpoints} of them from checkpoint to checkpoint" if from_checkpoints else ""
-    print_line(f"{folder}: no differences in {format_count(count, 'episode')}{mode}")
+    mode = f", {from_checkpoints} of them within tolerances from checkpoint to checkpoint" if from_checkpoints else ""
+    sample = "" if cfg.sample is None else f", sample with seed {plans[0].seed}"
+    print_line(f"{folder}: no differences in {format_count(count, 'episode')}{mode}{sample}")
     return AuditedResult(result, protocol, count)
 
 

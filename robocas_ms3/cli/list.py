@@ -10,6 +10,8 @@ from robocas_ms3.core.paths import builtin_packs_dir
 from robocas_ms3.core.text import format_count
 
 if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
     from robocas_ms3.scenes.config import TaskConfig
 
 
@@ -45,7 +47,6 @@ def list_all() -> dict[str, list[dict[str, Any]]]:
     other packages are not imported, so an error in such a package appears only when its policy or baseline is used.
     """
     from robocas_ms3.assets.pack import find_packs, load_pack
-    from robocas_ms3.baselines.policy import describe_bundled
     from robocas_ms3.baselines.registry import BASELINES
     from robocas_ms3.core.errors import AssetError
     from robocas_ms3.core.extensions import package_name
@@ -68,7 +69,7 @@ def list_all() -> dict[str, list[dict[str, Any]]]:
     policies = [{"name": name, "package": "robocas_ms3", "summary": SUMMARIES[name]} for name in POLICIES.builtin]
     for points in POLICIES.entry_points.values():
         policies += [
-            {"name": point.name, "package": package_name(point), "summary": describe_bundled(point.name) or point.value}
+            {"name": point.name, "package": package_name(point), "summary": _summarize_policy(point)}
             for point in points
         ]
     baselines = [
@@ -100,6 +101,14 @@ def _packs_to_import(config: TaskConfig) -> list[str]:
     assets = [item.asset for item in (*config.furniture.values(), config.room, config.basket) if item is not None]
     packs = {asset.rpartition("/")[0] for asset in assets if "/" in asset}
     return sorted(pack for pack in packs if not (builtin_packs_dir() / pack).is_dir())
+
+
+def _summarize_policy(point: EntryPoint) -> str:
+    """Return the training of bundled weights, or the Python name of the policy of another package."""
+    from robocas_ms3.baselines.policy import describe_bundled
+
+    is_bundled = point.value.startswith("robocas_ms3.baselines.policy:")
+    return describe_bundled(point.name) if is_bundled else point.value
 
 
 def _size(folder: Path) -> int:

@@ -12,7 +12,7 @@ from mani_skill.utils.structs import Pose
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.checkpoints import flatten_state, unflatten_state
+from robocas_ms3.evaluation.checkpoints import flatten_state
 from robocas_ms3.evaluation.metrics import EpisodeMetrics
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec, TcpMotion
 from robocas_ms3.planning.action_noise import draw_noise
@@ -33,7 +33,7 @@ _STOPPED = 0.0005  # largest change in gripper width per control step, m; veloci
 _UNUSED_SIZE = 8  # pixels per side of cameras that the policy does not use; they are rendered all the same
 # RoboCAS-v0's motion ends early within this distance (m) and angle (rad) of its goal, below this speed (rad/s).
 _ARRIVED_DISTANCE, _ARRIVED_ANGLE, _ARRIVED_SPIN = 0.02, np.deg2rad(5), np.deg2rad(3)
-_OWN_SIZE = 2  # numbers of a checkpoint after the state of the environment
+_POSE = 7  # numbers of a pose at the start of the state of a body
 RAISED_HEIGHT = 0.03  # m above the initial height
 # The drive that holds the rotation, in acceleration units (1/s^2, 1/s): equally stiff for light and heavy objects.
 # Limits of zero width lock the translation; SAPIEN 3.0.3 does not enforce angular limits.
@@ -45,7 +45,7 @@ class StateDeviation(NamedTuple):
     """Distance of a state of an environment from a checkpoint.
 
     Attributes:
-        target: distance of the target from its position in the checkpoint, m.
+        target: distance of the target or the basket from its position in the checkpoint, the larger one, m.
         body: the same for the movable actor that is farthest from its position, m.
         joint: largest difference of a joint position, rad or m.
     """
@@ -167,32 +167,38 @@ class PolicyActionWrapper(gym.Wrapper):
         return torch.cat([self._base.bodies.read(), flatten_state(self._base.extra_state()), own], dim=1)
 
     def restore_checkpoint(self, checkpoint: np.ndarray, tolerance: float) -> StateDeviation:
-        """Set bodies and controllers of a single env to their states in a checkpoint (D,) if they are far from it.
+        """Set poses and joint positions of a single env to those of a checkpoint (D,) if they are far from it.
 
-        The reached stages, the metrics and the weld stay as they are. Returns how far the state was from the
-        checkpoint.
+        Velocities, controllers, reached stages, metrics and the weld stay as they are. Returns how far the state was
+        from the checkpoint.
 
         Args:
             checkpoint: a checkpoint of this episode.
             tolerance: deviation in m or rad up to which nothing is set. Setting a state has an effect on contacts: a
-                weak grasp can slip.
+                weak grasp can slip. Infinite: only measure.
         """
-        row, base = torch.from_numpy(checkpoint)[None], self._base
-        present, own = base.bodies.read(), base.extra_state()
-        recorded = row[:, : present.shape[1]]
-        controller = unflatten_state(row[:, present.shape[1] : -_OWN_SIZE], own)["controller"]
-        change = recorded - present
-        bodies, changes = base.bodies.to_state_dict(recorded), base.bodies.to_state_dict(change)
-        joints = [one[:, BODY : (BODY + one.shape[1]) // 2] for one in changes["articulations"].values()]
+        base, bodies = self._base, self._base.bodies
+        present = bodies.read()
+        recorded = torch.from_numpy(checkpoint)[None, : present.shape[1]]
+        change = bodies.to_state_dict(recorded - present)
+        moved = {name: float(one[0, :3].norm()) for name, one in change["actors"].items()}
+        joints = torch.cat([one[:, _joint_positions(one)] for one in change["articulations"].values()], dim=1)
+        important = {base.objects[int(base.target_slot[0])].name} | ({"basket"} & moved.keys())
         deviation = StateDeviation(
-            target=float(base.bodies.object_states(change)[0, int(base.target_slot[0]), :3].norm()),
-            body=float(base.bodies.actor_states(change)[..., :3].norm(dim=-1).max()),
-            joint=float(torch.cat(joints, dim=1).abs().max()),
+            target=max(moved[name] for name in important),
+            body=max(moved.values()),
+            joint=float(joints.abs().max()),
         )
-        if max(deviation) <= tolerance:
+        if all(value <= tolerance for value in deviation):
             return deviation
-        base.set_state_dict({**bodies, **own, "controller": controller})
-        self._open[0], self._width_change[0] = bool(checkpoint[-2] > 0), float(checkpoint[-1])
+        state = base.get_state_dict()
+        there = bodies.to_state_dict(recorded)
+        for name, one in there["actors"].items():
+            state["actors"][name] = torch.cat([one[:, :_POSE], state["actors"][name][:, _POSE:]], dim=1)
+        for name, one in there["articulations"].items():
+            state["articulations"][name] = state["articulations"][name].clone()
+            state["articulations"][name][:, _joint_positions(one)] = one[:, _joint_positions(one)]
+        base.set_state_dict(state)
         return deviation
 
     def _timed_step(self, motion: TcpMotion) -> tuple:
@@ -359,6 +365,11 @@ def make_env_kwargs(spec: PolicySpec, rate: int, *, renders: bool = False) -> di
     cameras = {name: {"width": width, "height": height} for name, (width, height) in spec.cameras.items()}
     others = {"width": _UNUSED_SIZE, "height": _UNUSED_SIZE}
     return {**common, "obs_mode": "+".join(modes), "sensor_configs": {**others, **cameras}}
+
+
+def _joint_positions(state: torch.Tensor) -> slice:
+    """Return the columns of the joint positions in the state of an articulation: root, positions, velocities."""
+    return slice(BODY, (BODY + state.shape[1]) // 2)
 
 
 def _to_position_and_rotation(pose: Pose) -> tuple[np.ndarray, Rotation]:

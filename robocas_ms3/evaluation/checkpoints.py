@@ -13,19 +13,6 @@ def flatten_state(state: Mapping[str, Any]) -> torch.Tensor:
     return torch.cat([value.reshape(len(value), -1).float() for value in _list_values(state)], dim=1)
 
 
-def unflatten_state(rows: torch.Tensor, like: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the state whose `flatten_state` is ``rows`` (N, D), with the entries, shapes and types of ``like``."""
-    state, start = {}, 0
-    for name, value in like.items():
-        size = sum(one[0].numel() for one in _list_values({name: value}))
-        part = rows[:, start : start + size]
-        state[name] = (
-            unflatten_state(part, value) if isinstance(value, Mapping) else part.reshape(value.shape).to(value.dtype)
-        )
-        start += size
-    return state
-
-
 def _list_values(state: Mapping[str, Any]) -> Iterator[torch.Tensor]:
     for value in state.values():
         if isinstance(value, Mapping):

@@ -16,6 +16,7 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.strict_model import parse
 from robocas_ms3.evaluation.policy import PolicySpec
 
+_PROCESSOR = ("model", "cpu_family", "cpu_model")
 _PACKAGES = ("robocas_ms3", "mani_skill", "sapien", "gymnasium", "numpy", "torch")
 
 
@@ -115,7 +116,7 @@ class RunRecord(BaseModel):
 
     def resume_settings(self) -> dict[str, Any]:
         """Return the values that must be equal to continue a result."""
-        machine = self.machine and {name: value for name, value in self.machine.items() if name != "model"}
+        machine = self.machine and {name: value for name, value in self.machine.items() if name not in _PROCESSOR}
         return {**self.merge_settings(), "machine": machine}
 
 
@@ -139,12 +140,17 @@ def hash_source() -> str:
 def describe_machine() -> dict[str, str]:
     """Return architecture and model of the processor, and the Python version.
 
-    On equal models, equal actions have equal outcomes.
+    On equal models, equal actions have equal outcomes. The name of the model may be incomplete in a virtual machine.
     """
     info = Path("/proc/cpuinfo")  # only on Linux
     text = info.read_text() if info.exists() else ""
-    found = dict(re.findall(r"^(model name|cpu family|model)\s*:\s*(.+)$", text, re.MULTILINE))
-    # virtual machines may hide the name, such as "AMD EPYC", but not family and model
-    numbers = [f"{name} {found[name]}" for name in ("cpu family", "model") if name in found]
-    model = ", ".join([found.get("model name") or platform.processor(), *numbers])
-    return {"processor": platform.machine(), "model": model, "python": platform.python_version()}
+    values = dict(re.findall(r"^(model name|cpu family|model)\s*:\s*(.+)$", text, re.MULTILINE))
+    numbers = {f"cpu_{name.removeprefix('cpu ')}": values[name] for name in ("cpu family", "model") if name in values}
+    model = values.get("model name") or platform.processor()
+    return {"processor": platform.machine(), "model": model, "python": platform.python_version(), **numbers}
+
+
+def is_same_processor(machine: dict[str, Any]) -> bool:
+    """Return whether the recorded processor has the model of this machine, as far as it is known."""
+    own = describe_machine()
+    return all(machine[name] == own.get(name) for name in _PROCESSOR if machine.get(name))

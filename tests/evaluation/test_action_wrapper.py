@@ -72,6 +72,42 @@ def test_a_checkpoint_has_the_state_and_the_gripper_command():
     assert (env.get_info()["checkpoint"][0] == checkpoint).all()  # nothing was simulated
 
 
+def test_poses_and_joints_return_to_a_checkpoint_but_velocities_do_not():
+    env = PolicyActionWrapper(pick("robocas", 5), PolicySpec("robocas"), "timed", checkpoints=True)
+    env.reset(seed=3)
+    *_, info = env.step(along(0.02))
+    checkpoint, base = info["checkpoint"][0].numpy(), env.unwrapped
+    bodies = base.bodies.read().shape[1]
+    assert env.restore_checkpoint(checkpoint, 0.0) == (0, 0, 0)
+    for _ in range(3):
+        env.step(along(0.02))
+    target = base.objects[int(base.target_slot[0])]
+    pose = target.pose.raw_pose.clone()
+    pose[:, 1] += 0.03
+    target.set_pose(Pose.create(pose))
+    before = base.bodies.read()[0].numpy().copy()
+    forged = checkpoint.copy()
+    first = base.bodies.actors.index(target.name) * 13
+    forged[first + 7 : first + 13] = 9.0  # a velocity
+    deviation = env.restore_checkpoint(forged, np.inf)
+    assert deviation.target == deviation.body == pytest.approx(0.03, abs=1e-3)
+    turned = np.abs(base.agent.robot.qpos[0].numpy() - qpos_in(base, checkpoint)).max()
+    assert deviation.joint == pytest.approx(turned) and turned > 0.02
+    assert (base.bodies.read()[0].numpy() == before).all()  # only measured
+    assert env.restore_checkpoint(forged, 0.05) == deviation  # a joint is farther away
+    after = base.bodies.read()[0].numpy()
+    np.testing.assert_allclose(base.agent.robot.qpos[0], qpos_in(base, checkpoint), atol=1e-5)
+    np.testing.assert_allclose(after[first : first + 7], checkpoint[first : first + 7], atol=1e-5)
+    np.testing.assert_allclose(after[first + 7 : first + 13], before[first + 7 : first + 13], atol=1e-5)
+    assert (after[:bodies] != before).any()
+
+
+def qpos_in(base: Any, checkpoint: np.ndarray) -> np.ndarray:
+    """Return the joint positions of the robot in a checkpoint."""
+    row = torch.from_numpy(checkpoint)[None, : base.bodies.read().shape[1]]
+    return base.bodies.to_state_dict(row)["articulations"][base.agent.robot.name][0, 13 : 13 + 12].numpy()
+
+
 def test_motions_start_from_the_tcp_or_from_the_last_commanded_pose():
     gone = {}
     for reference in ("tcp", "target"):

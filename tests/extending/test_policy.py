@@ -32,7 +32,7 @@ def site(tmp_path, monkeypatch):
 def test_policy_is_found_and_listed_by_name(site):
     assert type(make_policy("descend")).__module__ == "my_policies"
     listed = {row["name"]: row for row in list_all()["policies"]}
-    assert listed["descend"] == {"name": "descend", "package": "my-policies", "entry_point": "my_policies:Descend"}
+    assert listed["descend"] == {"name": "descend", "package": "my-policies", "summary": "my_policies:Descend"}
     assert {"scripted", "scripted-ee-delta", "random", "noop"} <= listed.keys()
     with pytest.raises(EvaluationError, match="unknown policy .*Did you mean descend"):
         make_policy("decend")

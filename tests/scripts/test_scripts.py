@@ -283,5 +283,7 @@ def test_changed_entries_are_audited(tmp_path):
     assert audit("HEAD", SAMPLE="5") == (0, "leaderboard audit leaderboard/b/p1 --sample 5\n")
     write("a/README.md")
     git("commit", "--all", "--message", "second")
-    expected = "leaderboard audit leaderboard/a/p1 leaderboard/a/p2 leaderboard/b/p1\n"
+    expected = "leaderboard audit leaderboard/a leaderboard/b/p1\n"
     assert audit("HEAD~1") == (0, expected)
+    write("é/p 1/run.json")  # not committed, and with a name that git and shells quote
+    assert audit("HEAD") == (0, "leaderboard audit leaderboard/é/p 1\n")

@@ -150,7 +150,8 @@ def _are_poses(matrices: NDArray[np.float64]) -> bool:
     if matrices.ndim != 3 or matrices.shape[1:] != (4, 4) or not np.isfinite(matrices).all():
         return False
     turns = matrices[:, :3, :3]
-    return np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3), atol=1e-3)
+    is_orthonormal = np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3), atol=1e-3)
+    return is_orthonormal and bool((np.linalg.det(turns) > 0).all()) and np.allclose(matrices[:, 3], [0, 0, 0, 1])
 
 
 def _describe_format(name: Any) -> str:

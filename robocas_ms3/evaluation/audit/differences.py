@@ -13,7 +13,7 @@ from robocas_ms3.evaluation.audit.stored_actions import NO_ACTIONS_LEFT
 from robocas_ms3.evaluation.outcomes import Checkpoints, Outcome
 
 # Tolerances of a replay from checkpoint to checkpoint; docs/evaluation.md has measurements.
-LARGEST_DEVIATION = StateDeviation(target=0.1, body=0.5, joint=0.1)
+LARGEST_DEVIATION = StateDeviation(target=0.15, body=0.5, joint=0.1)
 """Largest deviations from a checkpoint. Other objects than the target may roll away."""
 SMALL_DEVIATION = 0.01
 """Largest distance of the target from its recorded position at most checkpoints, m."""
@@ -21,7 +21,7 @@ LARGEST_FRACTION = 0.3
 """Largest fraction of checkpoints with a larger distance than `SMALL_DEVIATION`; one is always allowed."""
 LARGEST_DELAY = 2.0
 """Largest difference of simulated times in s. Numbers of steps may differ by the steps between two checkpoints."""
-_RELATIVE = {"path_length": 0.02, "contact_impulse": 0.1}  # of measures
+_RELATIVE = {"path_length": 0.02, "contact_impulse": 0.25}  # of measures
 _COUNT = 1  # of disturbed and fallen objects, and of moved objects that only one of both outcomes has
 
 
@@ -43,6 +43,10 @@ def list_large_differences(recorded: Outcome, replayed: Outcome, period: int) ->
     tolerances = {"steps": period, "flags": period, "seconds": LARGEST_DELAY, "flag_seconds": LARGEST_DELAY}
     if before["steps"] != now["steps"]:  # values after different last steps; the steps of the flags are compared
         now["success_v0"] = before["success_v0"]
+    for flags in ("flags", "flag_seconds"):  # whether the target is cleared depends on small motions of the heap
+        now[flags]["obstacles_cleared"] = before[flags].get("obstacles_cleared")
+    if before["failure_stage"] == "obstacles_cleared" or now["failure_stage"] == "obstacles_cleared":
+        now["failure_stage"] = before["failure_stage"]
     measures, retrieval = now.pop("measures"), now.pop("retrieval")
     found = []
     for key, value in now.items():
@@ -51,14 +55,16 @@ def list_large_differences(recorded: Outcome, replayed: Outcome, period: int) ->
         old = float(before["measures"].get(name, 0.0))
         tolerance = _RELATIVE[name] * max(old, value) if name in _RELATIVE else _COUNT
         found += list_setting_changes(old, float(value), f"measures.{name}", tolerance)
-    return found + _list_moved_differences(before["retrieval"], retrieval, period)
+    return found + _list_moved_differences(before["retrieval"], retrieval)
 
 
 def list_state_differences(recorded: Checkpoints, replayed: Checkpoints) -> list[str]:
     """Return a text for the first recorded checkpoint that differs; without recorded checkpoints []."""
     if not len(recorded.steps):
         return []
-    if recorded.states.shape != replayed.states.shape or (recorded.steps != replayed.steps).any():
+    if recorded.states.shape[1:] != replayed.states.shape[1:]:
+        return [f"checkpoints: {recorded.states.shape[1]} -> {replayed.states.shape[1]} numbers per state"]
+    if not np.array_equal(recorded.steps, replayed.steps):
         return [f"checkpoints: steps {recorded.steps.tolist()} -> {replayed.steps.tolist()}"]
     differing = recorded.steps[(recorded.states != replayed.states).any(axis=1)]
     return [f"checkpoints: another state after step {differing[0]}"] if len(differing) else []
@@ -75,8 +81,8 @@ def list_deviations(recorded: Checkpoints, deviations: Sequence[StateDeviation],
     steps, last = recorded.steps.tolist(), int(recorded.steps[-1])
     if steps != [*range(period, last, period), last]:
         return [f"checkpoints: steps {steps}, expected every {period} and the last"]
-    values = np.array(deviations)
-    far = (values > LARGEST_DEVIATION).any(axis=1)
+    values = np.array(deviations).reshape(-1, len(LARGEST_DEVIATION))
+    far = ~(values <= LARGEST_DEVIATION).all(axis=1)  # NaN is far too
     if far.any():
         first = int(np.argmax(far))
         found = ", ".join(f"{name} {value:.3f}" for name, value in deviations[first]._asdict().items())
@@ -95,19 +101,15 @@ def _list_values(recorded: Outcome, replayed: Outcome) -> tuple[dict[str, Any], 
     return before, now
 
 
-def _list_moved_differences(before: Any, now: Any, period: int) -> list[str]:
-    """Return the differences of two retrieval orders; objects that move at almost the same time may change places."""
+def _list_moved_differences(before: Any, now: Any) -> list[str]:
+    """Return the differences of the needed and moved objects; when they were moved depends on small motions."""
     if before is None or now is None:
         return list_setting_changes(before, now, "retrieval")
-    old, new = ({one["object"]: float(one["step"]) for one in order["moved"]} for order in (before, now))
     found = list_setting_changes(before["needed"], now["needed"], "retrieval.needed")
-    if len(other := sorted(old.keys() ^ new.keys())) > _COUNT:
+    old, new = ({move["object"] for move in order["moved"]} for order in (before, now))
+    if len(other := sorted(old ^ new)) > _COUNT:
         found.append(f"retrieval: moved in only one of both: {', '.join(other)}")
-    return found + [
-        f"retrieval: {name} moved at step {old[name]:g} -> {new[name]:g}"
-        for name in sorted(old.keys() & new.keys())
-        if abs(old[name] - new[name]) > period
-    ]
+    return found
 
 
 def _to_floats(value: Any) -> Any:

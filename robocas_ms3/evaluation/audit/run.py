@@ -28,7 +28,12 @@ from robocas_ms3.evaluation.outcomes import Count, EvaluatedEpisode
 from robocas_ms3.evaluation.protocol import LoadedProtocol, ProtocolEpisode
 from robocas_ms3.evaluation.results import Result
 from robocas_ms3.evaluation.rollout import count_checkpoint_steps
-from robocas_ms3.evaluation.run_record import describe_machine, get_package_versions, hash_source
+from robocas_ms3.evaluation.run_record import (
+    describe_machine,
+    get_package_versions,
+    hash_source,
+    is_same_processor,
+)
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
 
@@ -71,9 +76,9 @@ class AuditPlan(NamedTuple):
 
 
 def list_other_processors(result: Result) -> list[str]:
-    """Return the models of the processors that made a result, without the model of this machine."""
+    """Return the models of other processors than that of this machine that made a result."""
     machines = [part.machine for part in result.run.merged_from] or [result.run.machine]
-    return sorted({(machine or {}).get("model", "") for machine in machines} - {"", describe_machine()["model"]})
+    return sorted({str((machine or {}).get("model")) for machine in machines if not is_same_processor(machine or {})})
 
 
 def find_audit_obstacle(result: Result) -> str:
@@ -136,10 +141,11 @@ def run_audit(
         on_start: is called before the first episode.
 
     Raises:
-        OutputExistsError: ``out`` has an audit of another result, or with other versions.
+        OutputExistsError: ``out`` has an audit of another result, with other code, or on another processor.
         EvaluationError: an episode could not be replayed, for example because its worker process crashed.
     """
-    settings = {"result_hash": hash_result(result), "versions": get_package_versions()}
+    code = {"versions": get_package_versions(), "source_hash": hash_source(), "machine": describe_machine()}
+    settings = {"result_hash": hash_result(result), **code}
     with OutputFolder(out, OUTPUT, settings, overwrite=overwrite) as output:
         earlier = None if overwrite or output.recorded is None else int(output.recorded["seed"])
         seed = seed if seed is not None else secrets.randbits(32) if earlier is None else earlier
@@ -160,27 +166,36 @@ def _replay(
     """Replay episodes; those of another processor that differ are replayed again from checkpoint to checkpoint."""
     may_diverge, diverged = bool(list_other_processors(result)), []
     with closing(_open_session(result, protocol, envs, StoredActionsPolicy(result))) as session:
+        period = count_checkpoint_steps(1 / session.rate)
         for replayed in _run_episodes(session, episodes):
             number = replayed.outcome.episode
             recorded = result.read_checkpoints(number)
             differences = list_differences(result.outcomes[number], replayed.outcome)
             differences = differences or list_state_differences(recorded, replayed.checkpoints)
-            if differences and may_diverge and len(recorded.steps):
+            has_states = recorded.states.shape[1:] == replayed.checkpoints.states.shape[1:]
+            if differences and may_diverge and has_states:
                 diverged.append(protocol.episodes[number])
             else:
                 yield AuditedEpisode(number, differences)
-        period = count_checkpoint_steps(1 / session.rate)
-    policy, wrapped = StoredActionsPolicy(result, repeats=period), list[CheckpointEnv]()
+    if diverged:
+        yield from _replay_checkpoints(result, protocol, diverged, envs, period)
+
+
+def _replay_checkpoints(
+    result: Result, protocol: LoadedProtocol, episodes: Sequence[ProtocolEpisode], envs: int, period: int
+) -> Iterator[AuditedEpisode]:
+    policy, opened = StoredActionsPolicy(result, repeats=period), list[CheckpointEnv]()
 
     def wrap(env: Any) -> CheckpointEnv:
-        wrapped.append(CheckpointEnv(env, policy, result))
-        return wrapped[-1]
+        opened.append(CheckpointEnv(env, policy, result))
+        return opened[-1]
 
     with closing(_open_session(result, protocol, envs, policy, wrap)) as session:
-        for replayed in _run_episodes(session, diverged) if diverged else ():
+        for replayed in _run_episodes(session, episodes):
             number = replayed.outcome.episode
+            deviations = opened[-1].deviations.get(number, [])
             differences = list_large_differences(result.outcomes[number], replayed.outcome, period)
-            differences += list_deviations(result.read_checkpoints(number), wrapped[-1].deviations[number], period)
+            differences += list_deviations(result.read_checkpoints(number), deviations, period)
             yield AuditedEpisode(number, differences, "checkpoints")
 
 
@@ -226,7 +241,7 @@ def hash_result(result: Result) -> str:
 
 def hash_audit(result: Result) -> str:
     """Return the hex SHA-256 of a result and of the code that replays it: package versions, source code, processor."""
-    code = [get_package_versions(), hash_source(), describe_machine()["model"]]
+    code = [get_package_versions(), hash_source(), describe_machine()]
     return hashlib.sha256(f"{hash_result(result)} {json.dumps(code, sort_keys=True)}".encode()).hexdigest()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import PolicyError
 from robocas_ms3.evaluation.action_wrapper import StateDeviation
+from robocas_ms3.evaluation.outcomes import Checkpoints
 from robocas_ms3.evaluation.policy import CONVENTIONS, EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.results import Result
 
@@ -28,7 +30,7 @@ class StoredActionsPolicy:
             recorded error is not repeated.
 
     Attributes:
-        sent: by index of the env, number of the episode and number of its actions up to the last call of `act`, for
+        progress: by index of the env, number of the episode and number of its actions up to the last call of `act`, for
             the envs of this call.
     """
 
@@ -38,7 +40,7 @@ class StoredActionsPolicy:
         self.spec = PolicySpec(**motion, language="none")
         self._actions: dict[int, tuple[int, NDArray[np.float32]]] = {}  # by env: episode and its actions
         self._counts: dict[int, int] = {}  # by env
-        self.sent: dict[int, tuple[int, int]] = {}
+        self.progress: dict[int, tuple[int, int]] = {}
 
     def reset(self, episodes: list[EpisodeSpec]) -> None:
         for one in episodes:
@@ -51,14 +53,14 @@ class StoredActionsPolicy:
         """Return one action per env (E, A)."""
         envs = observations.envs.tolist()
         found = np.zeros((len(envs), CONVENTIONS[self.spec.convention].size), np.float32)
-        self.sent, missing = {}, {}
+        self.progress, missing = {}, {}
         for row, env in enumerate(envs):
             (episode, actions), count = self._actions[env], self._counts[env]
             if count == len(actions):
                 missing[env] = NO_ACTIONS_LEFT
                 continue
             found[row], self._counts[env] = actions[count], count + 1
-            self.sent[env] = episode, count + 1
+            self.progress[env] = episode, count + 1
         if missing:
             raise PolicyError(missing, found)
         return found
@@ -79,26 +81,24 @@ class CheckpointEnv:
     def __init__(self, env: Any, policy: StoredActionsPolicy, result: Result) -> None:
         self._env, self._policy, self._result, self.num_envs = env, policy, result, env.num_envs
         self.deviations: dict[int, list[StateDeviation]] = {}
-        self._states: dict[int, dict[int, NDArray[np.float32]]] = {}  # by episode and step
+        self._checkpoints: dict[int, Checkpoints] = {}  # by episode
 
     def reset(self, **kwargs: Any) -> Any:
         return self._env.reset(**kwargs)
 
     def step(self, actions: Any) -> Any:
-        found, states = self._env.step(actions), {}
-        for env, (episode, step) in self._policy.sent.items():
-            if episode not in self._states:
-                checkpoints = self._result.read_checkpoints(episode)
-                self._states[episode] = dict(zip(checkpoints.steps.tolist(), checkpoints.states, strict=True))
-            if step in self._states[episode]:
-                states[env] = self._states[episode][step]
-        if states:
-            restored = self._env.call_each(
-                "restore_checkpoint", {env: (state, RESTORE_TOLERANCE) for env, state in states.items()}
-            )
-            for env, deviation in restored.items():
-                self.deviations.setdefault(self._policy.sent[env][0], []).append(deviation)
-        return found
+        results, calls = self._env.step(actions), {}
+        for env, (episode, step) in self._policy.progress.items():
+            if episode not in self._checkpoints:
+                self._checkpoints[episode] = self._result.read_checkpoints(episode)
+            steps, states = self._checkpoints[episode]
+            for row in np.flatnonzero(steps == step):
+                # the last state is only compared, so that a success after it comes from the simulation
+                calls[env] = states[row], math.inf if step == steps[-1] else RESTORE_TOLERANCE
+        if calls:
+            for env, deviation in self._env.call_each("restore_checkpoint", calls).items():
+                self.deviations.setdefault(self._policy.progress[env][0], []).append(deviation)
+        return results
 
     def close(self) -> None:
         self._env.close()

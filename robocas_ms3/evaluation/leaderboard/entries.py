@@ -15,7 +15,7 @@ import hashlib
 from collections.abc import Collection
 from pathlib import Path
 
-from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.core.files import atomic_file, atomic_folder, write_json
 from robocas_ms3.core.output_folder import check_replaceable
 from robocas_ms3.core.text import format_count
@@ -101,7 +101,7 @@ def write_result(
 
     Raises:
         EvaluationError: the result has violations (`find_violations`), or lacks episodes of its configurations.
-        OutputExistsError: ``out`` exists.
+        OutputExistsError: ``out`` exists, or the entry has another model card.
     """
     if violations := find_violations(result, protocol, is_complete=False):
         what, fix = "the result has violations", "Run robocas eval verify to list all."
@@ -113,6 +113,9 @@ def write_result(
         raise EvaluationError(what, where=result.folder, found=found, fix=fix)
     check_replaceable(out, overwrite=overwrite, markers=(RUN,))
     text = None if card is None else _read_card(card)
+    if text is not None and not overwrite and find_card(out).exists() and _read_card(find_card(out)) != text:
+        fix = "Omit --card to keep it, or pass --overwrite."
+        raise OutputExistsError("the entry has another model card", where=find_card(out), fix=fix)
     sample = list_stored_episodes(result, protocol)
     # a path of the author's machine means nothing to others
     parts = [part.model_copy(update={"folder": Path(part.folder).name}) for part in result.run.merged_from]

@@ -28,8 +28,8 @@ RECORDED = Outcome(
     steps=100,
     seconds=5.0,
     failure_stage="",
-    flags={"success": 100, "fail": None},
-    flag_seconds={"success": 5.0, "fail": None},
+    flags={"success": 100, "fail": None, "obstacles_cleared": 50},
+    flag_seconds={"success": 5.0, "fail": None, "obstacles_cleared": 2.5},
     measures={"path_length": 1.0, "contact_impulse": 100.0, "disturbed_most": 2, "fallen": 0},
     retrieval=Retrieval(MOVED, ["cup", "box"], 0, 1.0),
 )
@@ -37,12 +37,16 @@ RECORDED = Outcome(
 
 def at_end(step):
     """Return the recorded outcome with a success at a step."""
-    success = {"flags": {"success": step, "fail": None}, "flag_seconds": {"success": step / 20, "fail": None}}
-    return replace(RECORDED, steps=step, seconds=step / 20, **success)
+    flags, seconds = RECORDED.flags | {"success": step}, RECORDED.flag_seconds | {"success": step / 20}
+    return replace(RECORDED, steps=step, seconds=step / 20, flags=flags, flag_seconds=seconds)
 
 
 def with_measures(**values):
     return replace(RECORDED, measures=RECORDED.measures | values)
+
+
+def with_cleared(step):
+    return replace(RECORDED, flags=RECORDED.flags | {"obstacles_cleared": step})
 
 
 def with_moved(*moved):
@@ -58,18 +62,19 @@ def with_moved(*moved):
         (replace(RECORDED, success=False), True),
         (replace(RECORDED, success_v0=False), True),
         (replace(at_end(101), success_v0=False), False),
-        (replace(RECORDED, flags={"success": None, "fail": None}), True),
-        (replace(RECORDED, flags={"success": 100, "fail": 100}), True),
+        (replace(RECORDED, flags={**RECORDED.flags, "success": None}), True),
+        (replace(RECORDED, flags={**RECORDED.flags, "fail": 100}), True),
         (with_measures(path_length=1.02), False),
         (with_measures(path_length=1.03), True),
-        (with_measures(contact_impulse=91.0), False),
-        (with_measures(contact_impulse=89.0), True),
+        (with_measures(contact_impulse=76.0), False),
+        (with_measures(contact_impulse=74.0), True),
         (with_measures(fallen=1), False),
         (with_measures(fallen=2), True),
         (with_moved(*reversed(MOVED)), False),
         (with_moved(MOVED[0]), False),
         (with_moved(), True),
-        (with_moved(MOVED[0], replace(MOVED[1], step=33)), True),
+        (with_moved(MOVED[0], replace(MOVED[1], step=33)), False),
+        (with_cleared(10), False),
         (replace(RECORDED, retrieval=replace(RECORDED.retrieval, needed=["cup"])), True),
         (replace(RECORDED, retrieval=None), True),
         (replace(RECORDED, seed=2), True),
@@ -106,7 +111,8 @@ def test_recorded_states_are_compared():
         ([0.009] * 10, False),
         ([0.09, 0.02, 0.02] + [0.0] * 7, False),  # 30 % of the checkpoints may be more than 1 cm away
         ([0.02] * 4 + [0.0] * 6, True),
-        ([0.11] + [0.0] * 9, True),
+        ([0.14] + [0.0] * 9, False),
+        ([0.16] + [0.0] * 9, True),
         ([0.05], False),  # one checkpoint is always allowed
         ([0.05, 0.05], True),
     ],

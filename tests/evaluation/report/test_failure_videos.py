@@ -59,7 +59,7 @@ def test_without_failed_episodes_no_video_is_recorded(tmp_path, capsys, installe
     record = result.folder / "run.json"
     record.write_text(record.read_text().replace('"mine"', f'"{installed}"'))
     assert videos(Videos(result.folder)) == 0
-    assert "no episode of the result has failed" in capsys.readouterr().out
+    assert "no episode to record with --outcome failed" in capsys.readouterr().out
 
 
 def test_a_policy_named_in_a_result_is_not_imported_without_confirmation(tmp_path, capsys):

@@ -60,6 +60,8 @@ def test_infos_observations_and_metrics_in_numpy(env):
     assert truncated.tolist() == [False, True, False]
     assert info["final_info"]["episode"]["success_at_end"].tolist() == [False, False, False]
     assert env.unwrapped.call("control_freq") == (20, 20, 20)
+    layouts = env.unwrapped.call_each("layout", {2: (0,), 0: ()})
+    assert sorted(layouts) == [0, 2]
     assert len({len(one["actors"]) for one in env.unwrapped.call("get_state_dict")}) == 1
 
 

@@ -90,7 +90,7 @@ def test_images_of_other_decisions_are_not_shown(file_with_images, tmp_path):
     images = shutil.copy(images_path(file_with_images), images_path(other))
     index = open_content(other).index()
     assert index["cameras"] == []
-    assert "render-candidates --overwrite" in index["note"]
+    assert "render-candidates CANDIDATES --overwrite" in index["note"]
     with pytest.raises(DatasetError):
         open_content(other, images=images)
 
