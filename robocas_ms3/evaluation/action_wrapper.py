@@ -181,23 +181,24 @@ class PolicyActionWrapper(gym.Wrapper):
         present = bodies.read()
         recorded = torch.from_numpy(checkpoint)[None, : present.shape[1]]
         change = bodies.to_state_dict(recorded - present)
-        moved = {name: float(one[0, :3].norm()) for name, one in change["actors"].items()}
-        joints = torch.cat([one[:, _joint_positions(one)] for one in change["articulations"].values()], dim=1)
-        important = {base.objects[int(base.target_slot[0])].name} | ({"basket"} & moved.keys())
-        deviation = StateDeviation(
-            target=max(moved[name] for name in important),
-            body=max(moved.values()),
+        distances = {name: float(body[0, :3].norm()) for name, body in change["actors"].items()}
+        joints = torch.cat(
+            [jointed[:, _joint_positions(jointed)] for jointed in change["articulations"].values()], dim=1
+        )
+        placed = {base.objects[int(base.target_slot[0])].name} | ({"basket"} & distances.keys())
+        deviation = StateDeviation(  # np.max returns NaN if a value is NaN; max may not
+            target=float(np.max([distances[name] for name in placed])),
+            body=float(np.max(list(distances.values()))),
             joint=float(joints.abs().max()),
         )
         if all(value <= tolerance for value in deviation):
             return deviation
-        state = base.get_state_dict()
-        there = bodies.to_state_dict(recorded)
-        for name, one in there["actors"].items():
-            state["actors"][name] = torch.cat([one[:, :_POSE], state["actors"][name][:, _POSE:]], dim=1)
-        for name, one in there["articulations"].items():
+        state, target = base.get_state_dict(), bodies.to_state_dict(recorded)
+        for name, body in target["actors"].items():
+            state["actors"][name] = torch.cat([body[:, :_POSE], state["actors"][name][:, _POSE:]], dim=1)
+        for name, jointed in target["articulations"].items():
             state["articulations"][name] = state["articulations"][name].clone()
-            state["articulations"][name][:, _joint_positions(one)] = one[:, _joint_positions(one)]
+            state["articulations"][name][:, _joint_positions(jointed)] = jointed[:, _joint_positions(jointed)]
         base.set_state_dict(state)
         return deviation
 
