@@ -54,6 +54,7 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
         "assets": "List, check and import asset packs",
         "layouts": "Sample layouts in advance",
         "show": "Render the scene of a task configuration",
+        "difficulty": "Measure how hard it is to grasp the target of a scene",
     },
     "system": {
         "list": "List tasks, configurations, robots, policies and packs",

@@ -126,21 +126,21 @@ def warn_cannot_fork(reason: str) -> None:
     )
 
 
-def run_in_forked_process(function: Callable[[], T]) -> T:
+def run_in_forked_process(function: Callable[[], T], limit: float = CANDIDATE_TIMEOUT) -> T:
     """Run a function in a forked child process and return its result; this process does not change.
 
-    A child that crashes is run once more. The limit is ``CANDIDATE_TIMEOUT``.
+    A child that crashes is run once more. ``limit`` is its wall-clock time in s.
 
     Raises:
         ForkedProcessError: the child crashed twice or exceeded its time limit.
     """
     try:
-        return _run_once(function)
+        return _run_once(function, limit)
     except ForkedProcessCrashError:
-        return _run_once(function)
+        return _run_once(function, limit)
 
 
-def _run_once(function: Callable[[], T]) -> T:
+def _run_once(function: Callable[[], T], limit: float) -> T:
     parent = os.getpid()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
@@ -159,7 +159,7 @@ def _run_once(function: Callable[[], T]) -> T:
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
     try:
-        answer = forked.receive(CANDIDATE_TIMEOUT)
+        answer = forked.receive(limit)
     finally:
         forked.kill()
     if isinstance(answer, RemoteError):

@@ -61,12 +61,12 @@ def measure_scene(arm: Arm, before: SceneMeasures | None = None) -> SceneMeasure
     slots = np.flatnonzero(present)
     poses = np.full((len(present), 7), np.nan)
     poses[slots] = [to_wxyz(arm.scene.object_in_base(slot)) for slot in slots.tolist()]
-    hidden, obstacles = _measure_clutter(arm)
+    hidden, obstacles = measure_clutter(arm)
     height, in_basket = to_native(env.object_states)[0, :, 2], _find_objects_in_basket(arm) & present
     return SceneMeasures(
         object_in_base=poses,
         hidden_fraction=np.where(present, hidden, np.nan),
-        obstacles=np.where(present, obstacles, -1),
+        obstacles=np.where(present, obstacles.sum(axis=1), -1),
         free_grasps=_count_free_grasps(arm, poses, before),
         fallen=np.asarray(height < env.success_check.fallen_below) & present & ~in_basket,
         in_basket=in_basket,
@@ -85,8 +85,8 @@ def measure_opening(arm: Arm) -> float:
     return float(env.opening_joint_position()[0]) / max(joint.limits, key=abs)
 
 
-def _measure_clutter(arm: Arm) -> tuple[Array, Array]:
-    """Return the hidden fraction (K,) of each object and the number (K,) of obstacles around it."""
+def measure_clutter(arm: Arm) -> tuple[Array, Array]:
+    """Return the hidden fraction (K,) of each object, and whether each object is an obstacle around it (K, K)."""
     env = arm.env
     points = np.stack([occlusion.sample_points(asset.annotations.surface_points) for asset in env.object_assets[0]])
     columns = torch.as_tensor(np.ascontiguousarray(points.swapaxes(-1, -2)), dtype=torch.float32)[None]
@@ -96,7 +96,7 @@ def _measure_clutter(arm: Arm) -> tuple[Array, Array]:
     clutter = occlusion.measure_clutter(
         world.expand(count, -1, -1, -1), env.present.expand(count, -1), torch.arange(count), eye
     )
-    return clutter.hidden_fraction.numpy(), clutter.obstacles.sum(dim=1).numpy()
+    return clutter.hidden_fraction.numpy(), clutter.obstacles.numpy()
 
 
 def _count_free_grasps(arm: Arm, poses: Array, before: SceneMeasures | None) -> Array:

@@ -88,14 +88,16 @@ class Arm:
         self.scene = PlanningScene(self.env)
         self.qpos = self.scene.arm_qpos
         self.clear_attached()
-        self._seed()
+        self.follow_path(self.decision_path)
         with self.planning_time():  # fill the caches before the first fork
             self.scene.sample_surfaces()
             for clearance in (CARRY_CLEARANCE, CLEARANCE, 0.0):
                 self.planner.set_scene(self.scene.obstacles(clearance=clearance))
 
-    def _seed(self) -> None:
-        entropy = np.random.SeedSequence([self.executor.seed, *self.decision_path])
+    def follow_path(self, decision_path: tuple[int, ...]) -> None:
+        """Set the decision path, and seed the random generators from it."""
+        self.decision_path = decision_path
+        entropy = np.random.SeedSequence([self.executor.seed, *decision_path])
         self.planner.seed(int(entropy.generate_state(1)[0]))
         self.rng = np.random.default_rng(entropy)
 
@@ -115,8 +117,7 @@ class Arm:
 
         def run_numbered(numbered: tuple[int, T]) -> float:
             index, candidate = numbered
-            self.decision_path = (*decision_path, index)
-            self._seed()
+            self.follow_path((*decision_path, index))
             return run_candidate(candidate)
 
         if not kind:

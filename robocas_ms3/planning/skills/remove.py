@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Iterable, Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.transform import Rotation
 
@@ -123,13 +124,26 @@ def find_grasp_blockers(arm: Arm, slot: int) -> list[int]:
 
     Objects that alone block many grasps come first; a grasp that n objects block counts 1 / n^2 for each of them.
     """
-    grasps, blocked_by = sample_suitable_grasps(arm, slot), {}
-    for other, used in enumerate(arm.env.present[0].tolist()):
-        if used and other != slot:
-            blocked_by[other] = ~is_gripper_clear(grasps, arm.scene.object_points(other))
+    blocked_by = _find_blocked_grasps(arm, slot)
     count = np.sum(list(blocked_by.values()), axis=0)
     score = {other: float(np.sum(blocked / np.maximum(count, 1) ** 2)) for other, blocked in blocked_by.items()}
     return sorted((other for other in score if score[other] > 0), key=lambda other: -score[other])
+
+
+def count_fewest_blockers(arm: Arm, slot: int) -> int:
+    """Return the smallest number of objects that block a grasp of an object from above.
+
+    The result is the number of all other objects if no sampled grasp is narrow enough and has a suitable direction.
+    """
+    blocked_by = _find_blocked_grasps(arm, slot)
+    return int(np.sum(list(blocked_by.values()), axis=0, initial=0).min(initial=len(blocked_by)))
+
+
+def _find_blocked_grasps(arm: Arm, slot: int) -> dict[int, NDArray[np.bool_]]:
+    """Return by slot of each other object which of the sampled grasps (G,) of an object it blocks."""
+    grasps = sample_suitable_grasps(arm, slot)
+    others = [other for other, used in enumerate(arm.env.present[0].tolist()) if used and other != slot]
+    return {other: ~is_gripper_clear(grasps, arm.scene.object_points(other)) for other in others}
 
 
 def sample_suitable_grasps(arm: Arm, slot: int) -> Array:

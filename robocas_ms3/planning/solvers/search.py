@@ -93,16 +93,7 @@ def _grasp(arm: Arm, slot: int) -> bool:
     done = len(arm.executor.actions)
 
     def execute_grasp(option: tuple[int, tuple[int, ...]]) -> float:
-        kind, movable = option
-        arm.rise_until_free()  # an object may lean on the tool after a push
-        arm.executor.gripper = OPEN  # opens during the approach
-        with arm.planning_time():
-            candidates = grasp_candidates(arm, slot, kind, movable)
-            grasps = retract_from_contact(arm, slot, candidates, movable)
-        if not grasps:
-            raise PlanningError("grasp_sampling", "no_clear_grasp")
-        grasp(arm, slot, lift_height=LIFT_HEIGHT, grasps=grasps, movable=movable)
-        raise_held_object(arm, slot)
+        grasp_in_clutter(arm, slot, *option)
         return 0.0
 
     with arm.planning_time():
@@ -115,3 +106,26 @@ def _grasp(arm: Arm, slot: int) -> bool:
             raise
         return False
     return True
+
+
+def grasp_in_clutter(arm: Arm, slot: int, kind: int, movable: tuple[int, ...] = ()) -> None:
+    """Grasp an object between other objects with a grasp of a kind, and lift it.
+
+    Args:
+        arm: context of the attempt.
+        slot: slot of the object.
+        kind: kind of grasp, from 0 for the best one.
+        movable: slots of other objects that the gripper may touch and move.
+
+    Raises:
+        PlanningError: no grasp can be planned, the fingers miss the object, or the object slips out.
+    """
+    arm.rise_until_free()  # an object may lean on the tool after a push
+    arm.executor.gripper = OPEN  # opens during the approach
+    with arm.planning_time():
+        candidates = grasp_candidates(arm, slot, kind, movable)
+        grasps = retract_from_contact(arm, slot, candidates, movable)
+    if not grasps:
+        raise PlanningError("grasp_sampling", "no_clear_grasp")
+    grasp(arm, slot, lift_height=LIFT_HEIGHT, grasps=grasps, movable=movable)
+    raise_held_object(arm, slot)
