@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from robocas_ms3.cli import eval_audit, eval_results
+from robocas_ms3.cli import eval_audit, eval_clutter_scale, eval_results
 from robocas_ms3.cli.options import Overrides, resumable
 from robocas_ms3.core.text import format_count
 from robocas_ms3.evaluation.settings import EvaluationSettings
@@ -133,6 +133,7 @@ COMMANDS = {
     "compare": eval_results.compare,
     "verify": eval_results.verify,
     "audit": eval_audit.audit,
+    "clutter-scale": eval_clutter_scale.clutter_scale,
     "videos": eval_results.videos,
     "leaderboard": eval_results.leaderboard,
     "protocols": list_protocols,

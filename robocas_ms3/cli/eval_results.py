@@ -249,6 +249,14 @@ def read(folders: tuple[Path, ...]) -> Result:
     return read_result(*folders)
 
 
+def read_evaluations(folders: tuple[Path, ...]) -> list[Result]:
+    """Read results; folders with equal settings are partial results of one evaluation."""
+    from robocas_ms3.evaluation.results import group_partial_results, read_result
+
+    _check_folders(folders)
+    return [read_result(*parts) for parts in group_partial_results(folders)]
+
+
 def _find_protocol(result: Result, given: str | None) -> LoadedProtocol | None:
     """Load the protocol of a result; None if it is not bundled and not given, or has other files."""
     from robocas_ms3.core.errors import EvaluationError

@@ -28,7 +28,7 @@ from robocas_ms3.demos.recordings.subgoals import SubGoal
 from robocas_ms3.demos.recordings.trajectory_hdf5 import INTENDED_ACTIONS, JOINT_DEVIATIONS
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.planning.action_noise import ActionNoise
-from robocas_ms3.planning.decisions import Decisions, IrreversibleDecisions
+from robocas_ms3.planning.decisions import Decisions, IrreversibleDecisions, SearchLimits
 from robocas_ms3.planning.executor import MotionExecutor
 from robocas_ms3.planning.kinematics import ArmChain, InverseKinematics
 from robocas_ms3.planning.protocol import Planner
@@ -48,11 +48,15 @@ class EpisodeLimits:
         horizon: maximum length of the episode in control steps.
         max_attempts: maximum number of attempts of the scripted policy.
         first_attempt: number of the first attempt; other numbers give other random numbers.
+        look_ahead: number of candidates that each decision simulates and compares; the episode continues from the best
+            one and never backtracks. 0: no candidate is simulated before it is executed. None: as the scripted policy
+            decides, with backtracking.
     """
 
     horizon: int
     max_attempts: int
     first_attempt: int = 0
+    look_ahead: int | None = None
 
 
 class EpisodeGenerator:
@@ -144,13 +148,15 @@ class EpisodeGenerator:
         )
         candidates = CandidateRecorder(self.settings, self.env, folder / candidates_file_name(name), result)
         attempts = _Attempts(self, recorder, executor, result, intervention, candidates)
-        attempts.horizon, attempts.first_attempt = limits.horizon, limits.first_attempt
+        attempts.limits = limits
         executor.check_open_loop = attempts.check_open_loop
         try:
             if intervention is not None and intervention.skip_reason:
                 raise UnrecoverableError("intervention", intervention.skip_reason)
             if self.settings.keep_recoveries:
                 attempts.run_in_one_recording()
+            elif limits.look_ahead == 0:
+                attempts.run_once()
             else:
                 attempts.run_from_resets(ForkedDecisions(result) if self._fork else ResimulatedDecisions(result))
         except LayoutError as error:
@@ -187,8 +193,7 @@ class _Attempts:
     result: EpisodeResult
     intervention: Intervention | None
     candidates: CandidateRecorder
-    horizon: int = field(init=False)  # maximum length of the episode, control steps
-    first_attempt: int = field(init=False)
+    limits: EpisodeLimits = field(init=False)
 
     def run_from_resets(self, decisions: ForkedDecisions | ResimulatedDecisions) -> None:
         """Run attempts with backtracking, each from the reset, until one succeeds or none is left."""
@@ -202,6 +207,15 @@ class _Attempts:
 
             if decisions.run(attempt):
                 return
+
+    def run_once(self) -> None:
+        """Run one attempt in which no motion is undone."""
+        self._reset()
+        try:
+            self._run_policy(self._make_arm(IrreversibleDecisions(lambda: len(self.executor.actions)), 0))
+            self._finish([])
+        except PlanningError as error:
+            self.result.add_failure(error)
 
     def run_in_one_recording(self) -> None:
         """Run attempts in one continuous recording; start from the reset again if a recovery is impossible."""
@@ -223,7 +237,7 @@ class _Attempts:
                 result.add_failure(error)
                 last = error
             try:
-                if not first < len(executor.actions) < self.horizon or isinstance(last, UnrecoverableError):
+                if not first < len(executor.actions) < self.limits.horizon or isinstance(last, UnrecoverableError):
                     raise last
                 recover(arm)
                 span = [first, len(executor.actions) - 1]
@@ -233,8 +247,9 @@ class _Attempts:
                 self._reset()
 
     def _make_arm(self, decisions: Decisions, number: int) -> Arm:
-        path = (self.first_attempt + number,)
+        path, look_ahead = (self.limits.first_attempt + number,), self.limits.look_ahead
         arm = Arm(self.generator.planner, self.generator.inverse_kinematics, self.executor, decisions, path)
+        arm.search_limits = SearchLimits(look_ahead, 1) if look_ahead else None
         if self.generator.settings.record_candidates:
             self.candidates.observe(arm)
         return arm
@@ -271,7 +286,7 @@ class _Attempts:
                 result.noise_checked = False
 
     def _finish(self, recoveries: list[dict[str, Any]]) -> None:
-        if len(self.executor.actions) > self.horizon:
+        if len(self.executor.actions) > self.limits.horizon:
             raise UnrecoverableError("episode", "too_long")
         if not self.executor.is_flag_set("success"):
             raise PlanningError("episode", "no_success")

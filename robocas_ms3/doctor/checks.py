@@ -40,7 +40,8 @@ EXTRAS = {
     "lerobot": "LeRobot datasets",
     "assets": "making asset packs",
     "remote": "policies over a socket",
-    "plots": "plots of robocas stats",
+    "plots": "plots of robocas stats and of robocas eval clutter-scale",
+    "clutter-scale": "the clutter scale (robocas eval clutter-scale)",
 }
 # Packages with their own row; all others share one row.
 PACKAGES_WITH_ROW = ("numpy", "torch", "mani-skill", "sapien", "python-fcl", "gymnasium")

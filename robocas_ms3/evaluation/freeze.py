@@ -10,7 +10,7 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 import yaml
-from pydantic import Field
+from pydantic import Field, model_validator
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
@@ -64,13 +64,27 @@ class ConfigVariant(StrictModel):
 class ProtocolPart(ConfigVariant):
     """Episodes of one configuration and split: an element of ``parts`` in a protocol source."""
 
-    count: int = Field(ge=1, description="number of episodes")
-    first_seed: int = Field(ge=0, description="first scene seed; seeds without a layout are skipped")
+    count: int = Field(default=0, ge=0, description="number of episodes")
+    first_seed: int = Field(default=0, ge=0, description="first scene seed; seeds without a layout are skipped")
+    seeds: list[int] = Field(default=[], description="scene seeds, in place of `count` and `first_seed`")
     split: str = "test"
     instruction: Literal["correct", "wrong", "empty"] = Field(
         default="correct",
         description="correct: names the target; wrong: names another object; empty: no text",
     )
+
+    @model_validator(mode="after")
+    def _check_seeds(self) -> ProtocolPart:
+        if self.seeds and (self.count or self.first_seed):
+            raise ValueError("seeds: not together with count and first_seed")
+        if not self.seeds and not self.count:
+            raise ValueError("count: missing; expected the number of episodes, or seeds")
+        return self
+
+    @property
+    def episode_count(self) -> int:
+        """Return the number of episodes."""
+        return len(self.seeds) or self.count
 
     @property
     def file_stem(self) -> str:
@@ -112,7 +126,7 @@ def freeze_protocol(source: ProtocolSource, folder: Path, overrides: Sequence[st
     values = {**source.rules, "pack_hash": sha256(pack.root / MANIFEST)}
     rules = parse(Protocol, values, EvaluationError, where="rules", about=INVALID_RULES)
     configs, train = _load_configs(source.parts, overrides), _load_configs(source.train, overrides)
-    total, episodes = sum(part.count for part in source.parts), []
+    total, episodes = sum(part.episode_count for part in source.parts), []
     with atomic_folder(folder) as tmp:
         make_folder(tmp / LAYOUTS)
         for inside, named in ((CONFIGS, configs), (TRAIN, train)):
@@ -156,6 +170,9 @@ def _sample_scenes(part: ProtocolPart, config: TaskConfig, pack: str) -> Iterato
     env = gym.make(TASKS[config.task].env_id, config=config, pack=pack, obs_mode="none", render_backend="none")
     base: Any = env.unwrapped
     try:
+        for seed in part.seeds:
+            env.reset(seed=seed)
+            yield seed, base.layout(), base
         seed, found = part.first_seed, 0
         while found < part.count:
             try:

@@ -29,12 +29,14 @@ from robocas_ms3.evaluation.policy import Policy, PolicySpec
 
 POLICY_GROUP = "robocas_ms3.policies"
 POLICY_FOLDER_GROUP = "robocas_ms3.policy_folders"
+LOOK_AHEADS = (0, 1, 2, 8)
+"""Numbers of candidates that the variants of the scripted policy with limited look-ahead simulate per decision."""
 
 
-def _make_scripted(convention: Literal["joint_positions", "robocas"], *, perturbed: bool = False) -> Policy:
+def _make_scripted(convention: Literal["joint_positions", "robocas"], **options: Any) -> Policy:
     from robocas_ms3.evaluation.policies.scripted import ScriptedPolicy  # imports the simulator
 
-    return ScriptedPolicy(convention, perturbed=perturbed)
+    return ScriptedPolicy(convention, **options)
 
 
 def _make_remote(address: str) -> Policy:
@@ -60,6 +62,10 @@ POLICIES: Registry[Callable[[], Policy]] = Registry(
         "scripted": partial(_make_scripted, "joint_positions"),
         "scripted-ee-delta": partial(_make_scripted, "robocas"),
         "scripted-perturbed": partial(_make_scripted, "robocas", perturbed=True),
+        **{
+            f"scripted-lookahead-{count}": partial(_make_scripted, "joint_positions", look_ahead=count)
+            for count in LOOK_AHEADS
+        },
         "random": RandomPolicy,
         "noop": NoopPolicy,
     },
@@ -69,6 +75,10 @@ SUMMARIES = {
     "scripted": "plans from the simulator's state; joint targets",
     "scripted-ee-delta": "the same plan as motions of the TCP, for protocols with RoboCAS-v0's steps",
     "scripted-perturbed": "scripted-ee-delta with perturbed grasps, for demonstrations of recovery",
+    **{
+        f"scripted-lookahead-{count}": f"one plan that simulates {count} candidates per decision, without backtracking"
+        for count in LOOK_AHEADS
+    },
     "random": "random motions of the TCP",
     "noop": "no motion, gripper open",
 }

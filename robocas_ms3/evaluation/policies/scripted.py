@@ -127,12 +127,19 @@ class ScriptedPolicy:
         convention: ``joint_positions``: joint targets at 20 Hz; ``robocas``: 7-D actions at 5 Hz, relative to the TCP.
         perturbed: whether to shift all TCP poses of an episode by one horizontal offset (`sample_offset`), like a
             policy that misjudges positions, and never to plan again; only with the convention ``robocas``.
+        look_ahead: number of candidates that each decision of the plan simulates (`EpisodeLimits`). The policy makes
+            one plan per episode in one attempt; if it fails, the arm does not move. None: no such limits.
     """
 
     def __init__(
-        self, convention: Literal["joint_positions", "robocas"] = "joint_positions", *, perturbed: bool = False
+        self,
+        convention: Literal["joint_positions", "robocas"] = "joint_positions",
+        *,
+        perturbed: bool = False,
+        look_ahead: int | None = None,
     ) -> None:
         self._perturbed, self._rate = perturbed, _FREQ if convention == "joint_positions" else 5
+        self._look_ahead, self._plans_once = look_ahead, perturbed or look_ahead is not None
         self.spec = PolicySpec(convention, reference="tcp", rate_hz=self._rate, language="none", simulation_state=True)
         self._runs: dict[int, _Run] = {}  # by env
         self._generators: dict[EpisodeSettings, EpisodeGenerator] = {}  # most recently used last
@@ -176,7 +183,7 @@ class ScriptedPolicy:
         if run.plans == 0:
             return "plan"
         may_plan = run.plans < MAX_PLANS and run.failed < MAX_FAILED_PLANS and left >= MIN_STEPS
-        if self._perturbed or state.succeeded or not may_plan or state.steps < run.retry_at:
+        if self._plans_once or state.succeeded or not may_plan or state.steps < run.retry_at:
             return "follow"
         run.waited += 1
         if run.plan is None or run.plan.is_over:
@@ -205,7 +212,8 @@ class ScriptedPolicy:
             generator = self._open_generator(episode)
             horizon = generator.horizon if left is None else min(generator.horizon, round(left * stride * MAX_HURRY))
             attempts = MAX_LATER_ATTEMPTS if run.plans else generator.settings.max_attempts
-            limits = EpisodeLimits(horizon, attempts, run.attempts)
+            attempts = attempts if self._look_ahead is None else 1
+            limits = EpisodeLimits(horizon, attempts, run.attempts, self._look_ahead)
             result = generator.generate(episode.seed, Path(folder), "episode", after, limits)
             run.attempts += attempts
             if not result.success:

@@ -68,6 +68,7 @@ class Arm:
             ``pull``) and each candidate with a function that runs it. It must not change the scene.
         on_choice: function that is called with the index of the chosen candidate of the last decision.
         planned: primitive of the last skill.
+        search_limits: limits of all decisions; None: each skill has its own.
         scene: poses and obstacles of the environment.
         rng: random generator, seeded from ``decision_path``, so that results do not depend on rejected candidates.
         qpos: (7,) last commanded configuration, rad; initially the actual configuration.
@@ -81,6 +82,7 @@ class Arm:
     on_decision: Callable[[str, Sequence[tuple[object, Callable[[], object]]]], None] = _ignore
     on_choice: Callable[[int], None] = _ignore
     planned: PlannedPrimitive | None = None
+    search_limits: SearchLimits | None = None
     rng: np.random.Generator = field(init=False)
     qpos: Array = field(init=False)
 
@@ -113,7 +115,7 @@ class Arm:
 
         If ``kind`` is given, ``on_decision`` and ``on_choice`` are called before and after.
         """
-        decision_path = self.decision_path
+        decision_path, limits = self.decision_path, self.search_limits or limits
 
         def run_numbered(numbered: tuple[int, T]) -> float:
             index, candidate = numbered

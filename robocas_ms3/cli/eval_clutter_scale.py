@@ -1,0 +1,71 @@
+"""``robocas eval clutter-scale``: place policies on a scale of the difficulty of scenes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from robocas_ms3.cli.options import Folders, Maybe
+
+if TYPE_CHECKING:
+    from robocas_ms3.evaluation.clutter_scale.curves import SuccessCurve
+
+
+@dataclass(kw_only=True)
+class ClutterScale:
+    """Fit a scale of the difficulty of scenes to the results of several policies, and place the policies on it.
+
+    The scale goes from 0 (easiest scene of the protocol) to 10 (hardest scene). Writes clutter_scale.json and
+    clutter_scale.png.
+
+    Example: robocas eval clutter-scale eval/keyframe eval/small eval/expert --out eval/scale
+    """
+
+    folders: Folders
+    """Folders of results on one protocol; shards of one evaluation count as one result."""
+    protocol: Annotated[Maybe[str], tyro.conf.arg(metavar="PROTOCOL")] = None
+    """Protocol folder. Required if the protocol of the results is not bundled."""
+    out: Path
+    """Output folder."""
+
+
+def clutter_scale(cfg: ClutterScale) -> int:
+    from robocas_ms3.cli.eval_results import find_protocol_of, read_evaluations
+    from robocas_ms3.cli.terminal import print_line, print_table
+    from robocas_ms3.core.errors import require_extra
+    from robocas_ms3.core.files import make_folder
+
+    require_extra("clutter-scale", "the clutter scale", "sklearn")
+    from robocas_ms3.evaluation.clutter_scale.figure import write_curves
+    from robocas_ms3.evaluation.clutter_scale.study import make_study
+
+    results = read_evaluations(cfg.folders)
+    study = make_study(results, find_protocol_of(results[0], cfg.protocol))
+    make_folder(cfg.out)
+    study.write(cfg.out / "clutter_scale.json")
+    write_curves(study, cfg.out / "clutter_scale.png")
+    rows = [
+        (
+            one.name,
+            one.track,
+            f"{one.curve.successes}/{one.curve.episodes}",
+            _describe_half(one.curve),
+            "" if one.auc is None else f"{one.auc:.2f}",
+        )
+        for one in study.policies
+    ]
+    print_table(("policy", "track", "success", "difficulty at 50 % (95 % interval)", "AUC"), rows)
+    weights = sorted(study.standard_weights.items(), key=lambda item: -abs(item[1]))
+    print_table(("feature", "difficulty per standard deviation"), [(name, f"{value:.2f}") for name, value in weights])
+    print_line(f"mean AUC in scenes that were not used for the fit: {study.mean_auc:.2f}")
+    print_line(f"wrote {cfg.out / 'clutter_scale.json'} and {cfg.out / 'clutter_scale.png'}")
+    return 0
+
+
+def _describe_half(curve: SuccessCurve) -> str:
+    if curve.half is None:
+        return "none"
+    return f"{curve.half:.1f} ({curve.low:.1f} to {curve.high:.1f})"

@@ -1,0 +1,38 @@
+"""Plot of the success of policies against the difficulty of scenes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from robocas_ms3.core.errors import require_extra
+from robocas_ms3.core.files import atomic_file
+from robocas_ms3.datasets.statistics.figures import DPI, make_axes, make_figure
+from robocas_ms3.evaluation.clutter_scale.item_response import HARDEST
+from robocas_ms3.evaluation.clutter_scale.study import ClutterStudy
+
+_DASHED = "privileged"  # track whose curves are dashed
+
+
+def write_curves(study: ClutterStudy, path: Path) -> None:
+    """Write the curves of all policies, and the number of scenes by difficulty, as PNG."""
+    require_extra("plots", "the plot of the clutter scale", "matplotlib")
+    figure = make_figure(7.5, 5.0)
+    curves, scenes = make_axes(figure, 2, 1, 2)
+    figure.get_layout_engine().set(h_pad=0.1)
+    difficulty = np.linspace(0, HARDEST, 101)
+    for policy in study.policies:
+        style = "--" if policy.track == _DASHED else "-"
+        (line,) = curves.plot(difficulty, 100 * policy.curve.predict(difficulty), style, label=policy.name)
+        if policy.curve.half is not None and 0 <= policy.curve.half <= HARDEST:
+            low, high = np.clip([policy.curve.low, policy.curve.high], 0, HARDEST)
+            curves.plot([low, high], [50, 50], color=line.get_color(), alpha=0.4, linewidth=4)
+            curves.plot(policy.curve.half, 50, "o", color=line.get_color())
+    curves.set(ylabel="success / %", ylim=(-2, 102), xlim=(0, HARDEST))
+    curves.set_title("Success against difficulty (dots: half of the episodes succeed; dashed: privileged)")
+    curves.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    scenes.hist(study.difficulty, bins=20, range=(0, HARDEST))
+    scenes.set(xlabel="difficulty", ylabel="scenes", xlim=(0, HARDEST))
+    with atomic_file(path) as tmp:
+        figure.savefig(tmp, dpi=DPI, format="png")

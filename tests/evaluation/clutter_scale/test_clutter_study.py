@@ -1,0 +1,97 @@
+"""`robocas eval clutter-scale` with synthetic results on a protocol with difficulties."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from synthetic_results import of_protocol, outcome, write
+
+from robocas_ms3.cli.main import run
+from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.demos.difficulty.records import SceneDifficulty
+from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.clutter_scale.study import DIFFICULTIES, make_study, read_difficulties_of
+from robocas_ms3.evaluation.protocol import load_protocol
+
+ABILITIES = {"weak": 0.5, "middle": 1.5, "strong": 2.5}  # removals at which the policy succeeds half of the time
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    """Return a protocol with difficulties, and the folders of the results of three policies."""
+    folder, rng = tmp_path_factory.mktemp("scale"), np.random.default_rng(0)
+    shutil.copytree(bundled_protocols()["clutter-v1"], folder / "protocol")
+    protocol = load_protocol(folder / "protocol")
+    scenes = [
+        SceneDifficulty(
+            seed=episode.seed,
+            target=episode.target,
+            objects=8,
+            visible_fraction=float(rng.uniform()),
+            obstacles=int(rng.integers(4)),
+            free_grasps=int(rng.integers(9)),
+            fewest_blockers=0,
+            gap=0.01,
+            removals=int(rng.integers(4)),
+            first_removals=[],
+            simulated_removals=0,
+            complete=True,
+        )
+        for episode in protocol.episodes
+    ]
+    lines = "".join(json.dumps(asdict(scene)) + "\n" for scene in scenes)
+    (folder / "protocol" / DIFFICULTIES).write_text(lines)
+    template = of_protocol(folder / "template", protocol)
+    results = {}
+    for name, ability in ABILITIES.items():
+        chance = [1 / (1 + np.exp(-3 * (ability - (scene.removals or 0)))) for scene in scenes]
+        outcomes = [
+            replace(
+                outcome(one.episode, 7 if rng.uniform() < p else 2), task=one.task, config=one.config, seed=one.seed
+            )
+            for one, p in zip(template.outcomes.values(), chance, strict=True)
+        ]
+        policy = {"name": name, "class": "mine:Policy", "spec": {"track": "modular"}}
+        results[name] = write(
+            folder / name, outcomes, protocol="clutter-v1", protocol_hash=protocol.hash, policy=policy
+        )
+    return folder, protocol, results
+
+
+def test_policies_are_placed_by_their_abilities(study):
+    _, protocol, results = study
+    found = make_study(list(results.values()), protocol)
+    assert [one.name for one in found.policies] == ["strong", "middle", "weak"]
+    halves = [one.curve.half for one in found.policies if one.curve.half is not None]
+    assert len(halves) == 3
+    assert halves == sorted(halves, reverse=True)
+    for one, half in zip(found.policies, halves, strict=True):
+        assert one.curve.low < half < one.curve.high
+    assert found.mean_auc > 0.8
+    assert max(found.standard_weights, key=lambda name: found.standard_weights[name]) == "removals"
+
+
+def test_command_writes_numbers_and_a_plot(study, tmp_path, capsys):
+    folder, _, results = study
+    command = ["eval", "clutter-scale", *(str(folder / name) for name in results)]
+    assert run([*command, "--protocol", str(folder / "protocol"), "--out", str(tmp_path)]) == 0
+    assert "strong" in capsys.readouterr().out
+    written = json.loads((tmp_path / "clutter_scale.json").read_text())
+    assert [one["name"] for one in written["policies"]] == ["strong", "middle", "weak"]
+    assert len(written["difficulty"]) == 200
+    assert (tmp_path / "clutter_scale.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_protocol_without_difficulties_is_an_error():
+    with pytest.raises(EvaluationError):
+        read_difficulties_of(load_protocol("clutter-v1"))
+
+
+def test_one_policy_is_too_few(study):
+    _, protocol, results = study
+    with pytest.raises(EvaluationError):
+        make_study([results["middle"]], protocol)
