@@ -9,7 +9,14 @@ from numpy.typing import NDArray
 
 from robocas_ms3.demos.difficulty.records import RemovalLimits, SceneDifficulty
 
-FEATURES = ("removals", "hidden_fraction", "no_free_grasp", "fewest_blockers", "obstacles", "closeness")
+FEATURES: tuple[str, ...] = (
+    "removals",
+    "hidden_fraction",
+    "no_free_grasp",
+    "fewest_blockers",
+    "obstacles",
+    "closeness",
+)
 """Names of the features; each one grows with the clutter.
 
 - removals: smallest number of removals; one more than the largest searched number if none was found.
