@@ -29,6 +29,8 @@ class SceneDifficulty:
             each.
         removals: smallest number of removals after which the target can be grasped; None: no sequence was found.
         first_removals: slots of the objects with which such a sequence can start.
+        scripted_removal: slot of the object that the scripted policy of search moves first (`choose_scripted_removal`);
+            None if no object has to be removed.
         simulated_removals: number of removals that the search has simulated.
         complete: whether the search has simulated every sequence of at most ``max_removals`` removals.
     """
@@ -43,6 +45,7 @@ class SceneDifficulty:
     gap: Annotated[float, Field(ge=0)]
     removals: Count | None
     first_removals: list[Count]
+    scripted_removal: Count | None
     simulated_removals: Count
     complete: bool
 

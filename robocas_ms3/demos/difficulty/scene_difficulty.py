@@ -14,6 +14,7 @@ from robocas_ms3.demos.candidates.measure import measure_clutter
 from robocas_ms3.demos.candidates.recorder import SETTLE_SECONDS
 from robocas_ms3.demos.difficulty.records import RemovalLimits, SceneDifficulty
 from robocas_ms3.demos.difficulty.removal_search import RemovalScene, RemovalSearch
+from robocas_ms3.demos.difficulty.scripted_choice import choose_scripted_removal
 from robocas_ms3.demos.forked_processes import ForkedProcessError, run_in_forked_process
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.planning.decisions import IrreversibleDecisions
@@ -67,6 +68,7 @@ def measure_difficulty(generator: EpisodeGenerator, seed: int, limits: RemovalLi
         gap=round(measure_gap(arm.scene.object_points(target), [arm.scene.object_points(slot) for slot in others]), 4),
         removals=result.removals,
         first_removals=sorted(result.first),
+        scripted_removal=choose_scripted_removal(arm) if result.first else None,
         simulated_removals=result.simulated,
         complete=result.complete,
     )

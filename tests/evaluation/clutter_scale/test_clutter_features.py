@@ -18,6 +18,7 @@ SCENE = SceneDifficulty(
     gap=0.025,
     removals=1,
     first_removals=[2],
+    scripted_removal=2,
     simulated_removals=4,
     complete=True,
 )

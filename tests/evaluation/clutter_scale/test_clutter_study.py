@@ -38,6 +38,7 @@ def study(tmp_path_factory):
             gap=0.01,
             removals=int(rng.integers(4)),
             first_removals=[],
+            scripted_removal=None,
             simulated_removals=0,
             complete=True,
         )
