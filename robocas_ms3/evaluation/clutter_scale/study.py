@@ -64,7 +64,7 @@ class ClutterStudy:
     @property
     def mean_auc(self) -> float:
         """Return the mean area under the ROC curve of the fitted policies in unseen scenes."""
-        return float(np.mean([one.auc for one in self.policies if one.auc is not None]))
+        return float(np.nanmean([one.auc for one in self.policies if one.auc is not None]))
 
     def write(self, path: Path) -> None:
         """Write the study as JSON; infinite limits of intervals are null."""
@@ -80,7 +80,7 @@ def read_difficulties_of(protocol: LoadedProtocol) -> list[SceneDifficulty]:
     path = protocol.folder / DIFFICULTIES
     scenes = JsonLinesFile[SceneDifficulty](path, SceneDifficulty).read()
     if not scenes:
-        fix = "Use clutter-scale-v1, or measure the scenes with robocas difficulty."
+        fix = "Measure the scenes with robocas difficulty."
         raise EvaluationError("the protocol has no difficulties of its scenes", where=path, fix=fix)
     expected = [(episode.seed, episode.target) for episode in protocol.episodes]
     if [(scene.seed, scene.target) for scene in scenes] != expected:
@@ -117,8 +117,15 @@ def make_study(results: Sequence[Result], protocol: LoadedProtocol) -> ClutterSt
     ]
     weights = dict(zip(FEATURES, (scale.weights * features.std(axis=0)).tolist(), strict=True))
     fitted = [policies[number].name for number in chosen]
-    policies.sort(key=lambda one: (one.curve.half is not None, one.curve.half or 0, one.curve.successes), reverse=True)
+    policies.sort(key=lambda one: _rank(one.curve), reverse=True)
     return ClutterStudy(scale, difficulty, weights, policies, fitted)
+
+
+def _rank(curve: SuccessCurve) -> tuple[float, float]:
+    """Return a sort key; a policy without a curve handles more than all scenes, or less, depending on its rate."""
+    rate = curve.successes / curve.episodes
+    half = curve.half if curve.half is not None else np.inf if rate > 0.5 else -np.inf
+    return half, rate
 
 
 def _read_successes(result: Result, count: int) -> NDArray[np.float64]:

@@ -16,6 +16,7 @@ from robocas_ms3.demos.difficulty.records import SceneDifficulty
 from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
 from robocas_ms3.evaluation.clutter_scale.study import DIFFICULTIES, make_study, read_difficulties_of
 from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.results import read_result
 
 ABILITIES = {"weak": 0.5, "middle": 1.5, "strong": 2.5}  # removals at which the policy succeeds half of the time
 
@@ -90,6 +91,16 @@ def test_command_writes_numbers_and_a_plot(study, tmp_path, capsys):
 def test_protocol_without_difficulties_is_an_error():
     with pytest.raises(EvaluationError):
         read_difficulties_of(load_protocol("clutter-v1"))
+
+
+def test_policy_that_always_succeeds_is_the_first_and_is_not_fitted(study):
+    folder, protocol, results = study
+    always = read_result(folder / "template")
+    found = make_study([*results.values(), always], protocol)
+    assert [one.name for one in found.policies] == ["mine", "strong", "middle", "weak"]
+    assert found.policies[0].curve.half is None
+    assert found.policies[0].auc is None
+    assert sorted(found.fitted) == ["middle", "strong", "weak"]
 
 
 def test_one_policy_is_too_few(study):
