@@ -1,6 +1,6 @@
 """Measure the difficulty of many scenes, and choose scenes for a protocol that are evenly spread over the difficulty.
 
-    python scripts/choose_clutter_scale.py scripts/protocols/clutter-scale-v1.yaml --scenes 300 --out difficulty/scale
+    python scripts/choose_clutter_scale.py scripts/clutter_scale_candidates.yaml --scenes 300 --out difficulty/scale
 
 SOURCE is a protocol source (docs/evaluation.md). ``count`` and ``first_seed`` of each part are those of the measured
 scenes. The script writes OUT/NAME with the difficulties of each part, OUT/source.yaml with the chosen seeds, and
@@ -28,6 +28,7 @@ from robocas_ms3.demos.difficulty.difficulty_file import DifficultySettings, mea
 from robocas_ms3.demos.difficulty.records import SceneDifficulty
 from robocas_ms3.evaluation.freeze import ProtocolPart, read_protocol_source
 
+MOST_REMOVALS = 3  # scenes with more removals, or without a solution, are in the same group
 Scene = tuple[str, SceneDifficulty]  # name of its part, difficulty
 
 
@@ -51,7 +52,7 @@ def main(options: Options) -> None:
     for part in source.parts:
         task = part.load_config().task
         for scene in measure_part(part, options):
-            removals = 3 if scene.removals is None else min(scene.removals, 3)
+            removals = MOST_REMOVALS if scene.removals is None else min(scene.removals, MOST_REMOVALS)
             groups[task, removals].append((part.file_stem, scene))
     chosen = choose_evenly(groups, options.scenes)
     order = {part.file_stem: number for number, part in enumerate(source.parts)}
@@ -65,8 +66,8 @@ def main(options: Options) -> None:
     (options.out / "source.yaml").write_text(yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")
     JsonLinesFile(options.out / "difficulty.jsonl", SceneDifficulty).rewrite(scene for _, scene in chosen)
     for (task, removals), scenes in sorted(groups.items()):
-        count = sum(scene in scenes for scene in chosen)
-        print(f"{task}, {removals} removals{' or more' * (removals == 3)}: {count} of {len(scenes)} scenes")
+        name = f"{removals} or more" if removals == MOST_REMOVALS else str(removals)
+        print(f"{task}, {name} removals: {sum(scene in scenes for scene in chosen)} of {len(scenes)} scenes")
 
 
 def measure_part(part: ProtocolPart, options: Options) -> list[SceneDifficulty]:

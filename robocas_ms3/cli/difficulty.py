@@ -19,7 +19,7 @@ class Difficulty:
 
     The number of removals is the smallest number of objects to remove before the target can be grasped. It is found by
     simulating all sequences of removals with the skills of the scripted policy. After an interruption, the same command
-    continues. Results: DIR/scenes.jsonl.
+    continues. Results: DIR/scenes.jsonl. The exit status is 1 if a seed has no scene.
 
     Example: robocas difficulty search_table_stacked --seeds 0:20 --out difficulty/search
     """
@@ -83,4 +83,4 @@ def main(cfg: Difficulty) -> int:
         print_line(f"note: the search of {format_count(cut, 'scene')} ended early (--max-simulated)")
     print_line(f"{format_count(len(scenes), 'scene')} measured, {format_count(problems, 'seed')} without a scene")
     print_line(f"wrote {out / 'scenes.jsonl'}")
-    return 0
+    return 1 if problems else 0

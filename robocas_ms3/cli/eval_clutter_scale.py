@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -39,6 +40,7 @@ def clutter_scale(cfg: ClutterScale) -> int:
     from robocas_ms3.core.files import make_folder
 
     require_extra("clutter-scale", "the clutter scale", "sklearn")
+    require_extra("plots", "the plot of the clutter scale", "matplotlib")
     from robocas_ms3.evaluation.clutter_scale.figure import write_curves
     from robocas_ms3.evaluation.clutter_scale.study import make_study
 
@@ -68,4 +70,6 @@ def clutter_scale(cfg: ClutterScale) -> int:
 def _describe_half(curve: SuccessCurve) -> str:
     if curve.half is None:
         return "none"
+    if not (isfinite(curve.low) and isfinite(curve.high)):
+        return f"{curve.half:.1f} (no limits: too few episodes)"
     return f"{curve.half:.1f} ({curve.low:.1f} to {curve.high:.1f})"

@@ -156,14 +156,13 @@ def leaderboard(cfg: WriteLeaderboard) -> int:
         sort_rows,
         write_leaderboard,
     )
-    from robocas_ms3.evaluation.results import group_partial_results, read_result
 
-    _check_folders(cfg.folders)
     if cfg.out.suffix != ".json":
         what, expected = "invalid name of the leaderboard", "a name that ends in .json"
         raise EvaluationError(what, where="--out", expected=expected, found=cfg.out.name, usage=True)
-    results = [read_result(*folders) for folders in group_partial_results(cfg.folders)]
-    measured = [row for one in results for row in make_rows(one, _find_protocol(one, cfg.protocol))]
+    measured = [
+        row for one in read_evaluations(cfg.folders) for row in make_rows(one, _find_protocol(one, cfg.protocol))
+    ]
     if cfg.update and cfg.out.exists():
         measured = replace_rows(read_leaderboard(cfg.out).rows, measured)
     rows = sort_rows([*measured, *read_published_rows()])

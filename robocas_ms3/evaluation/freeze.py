@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
+from robocas_ms3.core.checks import MAX_SEED
 from robocas_ms3.core.documents import DocumentError, load_yaml
 from robocas_ms3.core.errors import EvaluationError, LayoutError
 from robocas_ms3.core.files import atomic_file, atomic_folder, make_folder
@@ -66,7 +67,9 @@ class ProtocolPart(ConfigVariant):
 
     count: int = Field(default=0, ge=0, description="number of episodes")
     first_seed: int = Field(default=0, ge=0, description="first scene seed; seeds without a layout are skipped")
-    seeds: list[int] = Field(default=[], description="scene seeds, in place of `count` and `first_seed`")
+    seeds: list[Annotated[int, Field(ge=0, le=MAX_SEED)]] = Field(
+        default=[], description="scene seeds, in place of `count` and `first_seed`"
+    )
     split: str = "test"
     instruction: Literal["correct", "wrong", "empty"] = Field(
         default="correct",

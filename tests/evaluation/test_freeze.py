@@ -36,6 +36,21 @@ def test_episode_equals_the_episode_of_the_bundled_protocol_with_the_same_seed(m
     assert mine.model_copy(update={"split": shipped.split, "config": shipped.config}) == shipped
 
 
+def test_listed_seeds_are_frozen_in_their_order(tmp_path):
+    part = {"config": "pick_table_scattered", "seeds": [110012, 110010], "change": {"objects": {"count": 2}}}
+    steps = freeze_protocol(ProtocolSource.model_validate({**SOURCE, "parts": [part]}), tmp_path / "out")
+    assert list(steps) == [(1, 2), (2, 2)]
+    assert [episode.seed for episode in load_protocol(tmp_path / "out").episodes] == [110012, 110010]
+
+
+@pytest.mark.parametrize("keys", [{}, {"seeds": [1], "count": 1}, {"seeds": [1], "first_seed": 1}, {"seeds": [-1]}])
+def test_a_part_has_either_a_count_or_seeds(tmp_path, keys):
+    content = {**SOURCE, "parts": [{"config": "pick_table_scattered", **keys}]}
+    (tmp_path / "source.yaml").write_text(yaml.safe_dump(content))
+    with pytest.raises(EvaluationError):
+        read_protocol_source(tmp_path / "source.yaml")
+
+
 def test_existing_folder_is_refused_before_scenes_are_sampled(made, tmp_path):
     (tmp_path / "source.yaml").write_text(yaml.safe_dump(SOURCE))
     with pytest.raises(OutputExistsError):

@@ -8,11 +8,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from robocas_ms3.core.errors import ConfigError, LayoutError
+from robocas_ms3.core.errors import ConfigError, LayoutError, RobocasError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
 from robocas_ms3.core.workers import Limits, WorkerPool, hide_cuda, use_one_torch_thread
 from robocas_ms3.demos.difficulty.records import RemovalLimits, SceneDifficulty
+from robocas_ms3.demos.forked_processes import find_reason_not_to_fork
 from robocas_ms3.demos.recordings.trajectory_json import package_versions
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.scenes.config import load_task_config
@@ -39,14 +40,12 @@ class DifficultySettings:
         task: name of the task.
         config: bundled configuration by name, path of a YAML file, or its content.
         pack: object pack: name or folder.
-        layouts: source of the layouts, see `RoboCASEnv`.
         limits: limits of the search for removals.
     """
 
     task: str
     config: str | dict[str, Any]
     pack: str = "builtin"
-    layouts: str = "auto"
     limits: RemovalLimits = field(default_factory=RemovalLimits)
 
     def check(self) -> None:
@@ -60,7 +59,7 @@ class DifficultySettings:
             raise ConfigError(what, expected=expected, found=found)
 
     def make_episode_settings(self) -> EpisodeSettings:
-        return EpisodeSettings(self.task, self.config, self.pack, check_rate=0, layouts=self.layouts)
+        return EpisodeSettings(self.task, self.config, self.pack, check_rate=0)
 
 
 def measure_seeds(
@@ -117,6 +116,8 @@ class _DifficultyWorker:
         from robocas_ms3.demos.difficulty.scene_difficulty import measure_difficulty  # these imports take seconds
         from robocas_ms3.demos.generator import EpisodeGenerator
 
+        if reason := find_reason_not_to_fork(renders=False):
+            raise RobocasError("removals can be searched only with forked processes", found=reason, fix="Use Linux.")
         self._generator = EpisodeGenerator(settings.make_episode_settings())
         self._measure = partial(measure_difficulty, self._generator, limits=settings.limits)
 

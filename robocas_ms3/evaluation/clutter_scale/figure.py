@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from robocas_ms3.core.errors import require_extra
 from robocas_ms3.core.files import atomic_file
 from robocas_ms3.datasets.statistics.figures import DPI, make_axes, make_figure
 from robocas_ms3.evaluation.clutter_scale.item_response import HARDEST
@@ -17,7 +16,6 @@ _DASHED = "privileged"  # track whose curves are dashed
 
 def write_curves(study: ClutterStudy, path: Path) -> None:
     """Write the curves of all policies, and the number of scenes by difficulty, as PNG."""
-    require_extra("plots", "the plot of the clutter scale", "matplotlib")
     figure = make_figure(7.5, 5.0)
     curves, scenes = make_axes(figure, 2, 1, 2)
     figure.get_layout_engine().set(h_pad=0.1)
