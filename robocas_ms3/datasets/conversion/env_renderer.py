@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
+from types import MappingProxyType
 from typing import Any
 
 import cv2
 import numpy as np
+import sapien
 import torch
 from mani_skill.render.shaders import ShaderConfig
 from numpy.typing import NDArray
@@ -15,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 import robocas_ms3.tasks  # noqa: F401  (registers the environments)
 from robocas_ms3.core.errors import DatasetError
+from robocas_ms3.core.poses import Array
 from robocas_ms3.datasets.images.image_files import Box, ImageOptions, compute_bounding_box
 from robocas_ms3.datasets.sources.episode_source import BASKET, FIRST_SLOT, ROBOT, StepImages
 from robocas_ms3.demos.recordings.environment import RecordedEnv
@@ -52,10 +55,14 @@ class EnvRenderer:
 
     def load_scene(self, recording: Recording) -> None:
         """Build the scene of a recording; raise DatasetError if it differs from the recorded scene."""
-        self.env.reset(seed=recording.seed, options=dict(recording.reset_options))
+        self.load_seed(recording.seed, recording.reset_options)
+        self._check_scene(recording)
+
+    def load_seed(self, seed: int, reset_options: Mapping[str, Any] = MappingProxyType({})) -> None:
+        """Build the scene of a seed."""
+        self.env.reset(seed=seed, options=dict(reset_options))
         for name in set(self._base._sensors) - set(self._image_options.cameras):
             del self._base._sensors[name]  # made again at each reset; all remaining sensors are rendered
-        self._check_scene(recording)
 
     def _check_scene(self, recording: Recording) -> None:
 
@@ -95,6 +102,10 @@ class EnvRenderer:
     def _render_state(self, state: dict[str, dict[str, NDArray[np.float32]]]) -> StepImages:
         tensors = {kind: {k: torch.from_numpy(v) for k, v in arrays.items()} for kind, arrays in state.items()}
         self._base.set_state_dict(tensors)
+        return self.render()
+
+    def render(self) -> StepImages:
+        """Render the present state of the scene."""
         textures, options = self._base._get_obs_sensor_data(apply_texture_transforms=False), self._image_options
         shaders = {name: sensor.config.shader_config for name, sensor in self._base._sensors.items()}
         ids = {}
@@ -128,6 +139,15 @@ class EnvRenderer:
         slot = int(self._base.target_slot[0])
         number = int(self._base.scene.actors[f"object_{slot}"].per_scene_id[0])
         return {name: box for name, of in ids.items() if (box := compute_bounding_box(of == number)) is not None}
+
+    def move_camera(self, name: str, pose_in_mount: Array) -> None:
+        """Move a camera in the loaded scene.
+
+        Args:
+            name: name of the camera.
+            pose_in_mount: (4, 4) pose of the camera in the frame of its mount; the camera looks along x, z is up.
+        """
+        self._base._sensors[name].camera.set_local_pose(sapien.Pose(pose_in_mount))
 
     def cameras(self) -> dict[str, CameraModel]:
         """Return intrinsics and poses of each rendered camera in the loaded scene, by name."""
@@ -164,8 +184,6 @@ def _pose_values(pose: NDArray[np.float64]) -> list[float]:
 
 def require_renderer() -> None:
     """Raise DatasetError if there is no render device."""
-    import sapien
-
     try:
         sapien.render.RenderMaterial()  # cheapest call that needs the device
     except RuntimeError as error:

@@ -72,9 +72,16 @@ def make_event_rows(boxes: Mapping[str, Box], target: str) -> list[Row]:
     for camera, box in boxes.items():
         detection = {"label": target, "bbox_format": "xyxy", "bbox": list(box)}
         answer = json.dumps({"detections": [detection]}, sort_keys=True, ensure_ascii=False)
-        key = schema.image_key(camera)
-        rows += [_make_row("user", question, "vqa", camera=key), _make_row("assistant", answer, "vqa", camera=key)]
+        rows += make_vqa_rows(question, answer, schema.image_key(camera))
     return sorted(rows, key=lambda row: (row["role"], row["camera"]))
+
+
+def make_vqa_rows(question: str, answer: str, image_key: str) -> list[Row]:
+    """Make the ``language_events`` rows of a question about the image with a key, and of its answer."""
+    return [
+        _make_row("user", question, "vqa", camera=image_key),
+        _make_row("assistant", answer, "vqa", camera=image_key),
+    ]
 
 
 def _make_row(role: str, content: str, style: str, *, timestamp: float | None = None, camera: str | None = None) -> Row:
