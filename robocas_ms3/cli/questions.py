@@ -69,6 +69,21 @@ class Convert:
 
 
 @dataclass
+class Answer:
+    """Write the answers of a policy that was evaluated in the scenes of the questions: the object that it moved first.
+
+    Example: robocas questions answer eval/keyframe --out keyframe.jsonl
+    """
+
+    folders: Folders
+    """Folders of results; shards of one evaluation count as one result."""
+    out: Path
+    """File with the answers (JSON Lines)."""
+    questions: _Set = _BUNDLED
+    """Bundled set of questions by name, or its folder."""
+
+
+@dataclass
 class Score:
     """Score the answers of a model, next to those of simple rules.
 
@@ -124,6 +139,22 @@ def convert(cfg: Convert) -> int:
     return 0
 
 
+def answer(cfg: Answer) -> int:
+    from robocas_ms3.cli.eval_results import read
+    from robocas_ms3.cli.terminal import print_line
+    from robocas_ms3.core.json_lines import JsonLinesFile
+    from robocas_ms3.evaluation.removal_questions import records
+    from robocas_ms3.evaluation.removal_questions.question_files import read_question_set
+    from robocas_ms3.evaluation.removal_questions.scores import make_answers
+
+    questions = read_question_set(cfg.questions).questions
+    answers = make_answers(questions, read(cfg.folders).outcomes.values())
+    JsonLinesFile[records.Answer](cfg.out, records.Answer).rewrite(answers)
+    without = sum(one.answer is None for one in answers)
+    print_line(f"wrote {format_count(len(answers), 'answer')} to {cfg.out}, {without} of them null")
+    return 0
+
+
 def score(cfg: Score) -> int:
     from robocas_ms3.cli.terminal import print_line, print_table
     from robocas_ms3.evaluation.removal_questions.question_files import read_question_set
@@ -162,4 +193,4 @@ def score(cfg: Score) -> int:
     return 0
 
 
-COMMANDS = {"make": make, "render": render, "convert": convert, "score": score}
+COMMANDS = {"make": make, "render": render, "convert": convert, "answer": answer, "score": score}

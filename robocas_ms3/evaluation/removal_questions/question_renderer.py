@@ -88,13 +88,10 @@ class QuestionRenderer:
     def render_question(self, question: RemovalQuestion) -> NDArray[np.uint8]:
         """Return the image (H, W, 3) of a question; raise EvaluationError if the scene differs from the question."""
         rgb, segmentation, _ = self._render(question.seed)
-        names = {
-            slot: asset.asset.name
-            for slot, asset in enumerate(self._env.object_assets[0])
-            if self._env.present[0, slot]
-        }
-        found = (self._env.get_language_instruction()[0], [names.get(one.slot) for one in question.objects])
-        if found != (question.instruction, [one.name for one in question.objects]):
+        present, assets = self._env.present[0].tolist(), self._env.object_assets[0]
+        objects = {slot: asset.asset.id for slot, asset in enumerate(assets) if present[slot]}
+        found = (self._env.get_language_instruction()[0], [objects.get(one.slot) for one in question.objects])
+        if found != (question.instruction, [one.asset for one in question.objects]):
             what, fix = "the rebuilt scene differs from the question", "Use the pack and versions of the questions."
             raise EvaluationError(what, where=question.id, expected=question.instruction, found=found[0], fix=fix)
         return _draw_slots(rgb, segmentation, {one.slot: one.number for one in question.objects})
@@ -114,9 +111,9 @@ class QuestionRenderer:
     def _list_objects(self, numbers: Mapping[int, int], segmentation: NDArray[np.uint8]) -> list[NumberedObject]:
         boxes = {slot: compute_bounding_box(segmentation == FIRST_SLOT + slot) for slot in numbers}
         return [
-            NumberedObject(number, slot, self._env.object_assets[0][slot].asset.name, box)
+            NumberedObject(number, slot, asset.id, asset.name, box)
             for slot, number in sorted(numbers.items(), key=lambda pair: pair[1])
-            if (box := boxes[slot]) is not None
+            if (box := boxes[slot]) is not None and (asset := self._env.object_assets[0][slot].asset)
         ]
 
     def _list_surface_points(self) -> dict[int, Array]:

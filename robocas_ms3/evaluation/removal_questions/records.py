@@ -21,12 +21,14 @@ class NumberedObject:
     Attributes:
         number: number in the image, from 1 on.
         slot: object slot in the scene.
+        asset: id of the object in its pack.
         name: name of the object.
         box: bounding box of its visible pixels.
     """
 
     number: Number
     slot: Annotated[int, Field(ge=0)]
+    asset: Text
     name: Text
     box: Box
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.json_lines import JsonLinesFile
+from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.removal_questions.records import Answer, RemovalQuestion
 from robocas_ms3.evaluation.statistics import SuccessRate, compute_success_rate
 
@@ -67,6 +68,30 @@ def score_rules(questions: Sequence[RemovalQuestion]) -> list[AnswerScore]:
 def compute_chance(questions: Sequence[RemovalQuestion]) -> float:
     """Return the expected accuracy of a random choice among the numbered objects."""
     return sum(len(question.answers) / len(question.objects) for question in questions) / len(questions)
+
+
+def make_answers(questions: Sequence[RemovalQuestion], outcomes: Iterable[Outcome]) -> list[Answer]:
+    """Return the answers of a policy that was evaluated in the scenes: the object that it moved first.
+
+    There is no answer if the policy moved no object before it held the target, or an object without a number.
+
+    Args:
+        questions: questions with different seeds.
+        outcomes: outcomes of episodes of search; those of other scenes are ignored.
+
+    Raises:
+        EvaluationError: a question has no episode.
+    """
+    first = {
+        outcome.seed: outcome.retrieval.moved[0].object if outcome.retrieval.moved else ""
+        for outcome in outcomes
+        if outcome.retrieval is not None
+    }
+    if missing := [question.seed for question in questions if question.seed not in first]:
+        what, found = f"{len(missing)} of {len(questions)} questions have no episode", f"none with seed {missing[0]}"
+        raise EvaluationError(what, expected="an episode of search in each scene", found=found)
+    numbers = {question.id: {one.asset: one.number for one in question.objects} for question in questions}
+    return [Answer(question.id, numbers[question.id].get(first[question.seed])) for question in questions]
 
 
 def read_answers(path: Path) -> dict[str, int | None]:

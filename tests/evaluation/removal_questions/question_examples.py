@@ -15,7 +15,10 @@ SCENES = {"heap": {"task": "search", "config": "search_table_stacked"}}
 
 
 def make_question(seed: int, answers: list[int], *, objects: int = 4, removals: int = 1, **rules: int | None):
-    numbered = [NumberedObject(number, number, f"object {number}", (0, 0, 9, 9)) for number in range(1, objects + 1)]
+    numbered = [
+        NumberedObject(number, number, f"object_{number}", f"object {number}", (0, 0, 9, 9))
+        for number in range(1, objects + 1)
+    ]
     rules = {"highest": 1, "scripted": None, **rules}
     name = f"heap-{seed}"
     text = f"search the thing {seed % 2}"

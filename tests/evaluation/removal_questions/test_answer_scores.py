@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 from question_examples import make_question, write_folder
 
 from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.evaluation.outcomes import MovedObject, Retrieval
 from robocas_ms3.evaluation.removal_questions.scores import (
     compute_chance,
+    make_answers,
     read_answers,
     score_answers,
     score_rules,
@@ -44,6 +49,28 @@ def test_chance_is_the_mean_of_the_right_fractions():
 def test_missing_answer_is_an_error():
     with pytest.raises(EvaluationError, match="heap-2"):
         score_answers("model", QUESTIONS, {"heap-0": 1, "heap-1": 1})
+
+
+def make_outcome(seed: int, *moved: str, retrieval: bool = True) -> Any:
+    found = [MovedObject(name, step, True, True) for step, name in enumerate(moved, 1)]
+    return SimpleNamespace(seed=seed, retrieval=Retrieval(found, [], 0, None) if retrieval else None)
+
+
+def test_answer_of_a_policy_is_the_object_that_it_moved_first():
+    outcomes = [
+        make_outcome(2, "object_5", "object_1"),
+        make_outcome(0),
+        make_outcome(1, "target", "object_3"),  # it has no number
+        make_outcome(9, "object_1"),  # another scene
+    ]
+    answers = make_answers(QUESTIONS, outcomes)
+    assert [(one.id, one.answer) for one in answers] == [("heap-0", None), ("heap-1", None), ("heap-2", 5)]
+
+
+def test_question_without_an_episode_of_search_is_an_error():
+    outcomes = [make_outcome(0), make_outcome(1), make_outcome(2, retrieval=False)]
+    with pytest.raises(EvaluationError, match="1 of 3"):
+        make_answers(QUESTIONS, outcomes)
 
 
 @pytest.mark.parametrize(
