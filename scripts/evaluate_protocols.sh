@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Evaluate a policy on all bundled protocols, and add its rows to the leaderboard.
+# Evaluate a policy on all bundled protocols, and add its rows to the table of results.
 #
 #   bash scripts/evaluate_protocols.sh POLICY [PROTOCOL ...]
 #
@@ -13,7 +13,7 @@
 #              looks-v1, cameras-v1, instructions-v1 and paper-words-v1: the scenes of all splits are the same.
 # EPISODES     number of episodes to evaluate of each configuration (default: all)
 # OUT          folder of the results (default: reproduced/protocols)
-# LEADERBOARD  file of the leaderboard (default: docs/leaderboard/results.json)
+# TABLE        file of the table of results (default: docs/results/results.json)
 # JOBS         number of processes that evaluate (default: one per core)
 # ROBOCAS      robocas command (default: .venv/bin/robocas)
 set -euo pipefail
@@ -31,7 +31,7 @@ protocols=("${@:2}")
 ((${#protocols[@]})) || protocols=(
     ms3-v1 paper-v1 paper-words-v1 objects-v1 clutter-v1 arrangement-v1 looks-v1 cameras-v1 furniture-v1 instructions-v1)
 subset=(${SPLIT:+--split "$SPLIT"} ${EPISODES:+--episodes "$EPISODES"})
-out=${OUT:-reproduced/protocols} leaderboard=${LEADERBOARD:-docs/leaderboard/results.json}
+out=${OUT:-reproduced/protocols} table=${TABLE:-docs/results/results.json}
 jobs=${JOBS:-$(env -u OMP_NUM_THREADS nproc)}
 robocas=${ROBOCAS:-.venv/bin/robocas}
 command -v "$robocas" >/dev/null || fail "no such command: $robocas. Run bash scripts/setup.sh, or set ROBOCAS."
@@ -47,8 +47,8 @@ has_split() {
 }
 
 add_rows() {
-    mkdir -p "$(dirname "$leaderboard")"
-    "$robocas" eval leaderboard "$1" --update --out "$leaderboard" >/dev/null
+    mkdir -p "$(dirname "$table")"
+    "$robocas" eval table "$1" --update --out "$table" >/dev/null
 }
 
 runs=("$policy"/{pick,select,search,open_pick}/run.json)

@@ -135,7 +135,7 @@ COMMANDS = {
     "audit": eval_audit.audit,
     "clutter-scale": eval_clutter_scale.clutter_scale,
     "videos": eval_results.videos,
-    "leaderboard": eval_results.leaderboard,
+    "table": eval_results.table,
     "protocols": list_protocols,
     "freeze": freeze,
 }

@@ -61,19 +61,19 @@ class Compare(Results):
 
 
 @dataclass(kw_only=True)
-class WriteLeaderboard(Results):
-    """Write the leaderboard of several results, with the published results of the RoboCAS paper.
+class WriteTable(Results):
+    """Write a table of several results, with the published results of the RoboCAS paper.
 
     Folders with equal settings are partial results of one evaluation. The Markdown tables are printed, and written next
-    to the JSON file.
+    to the JSON file. The results are not audited; `robocas leaderboard` has only audited results.
 
-    Example: robocas eval leaderboard eval/small eval/rt1 --out docs/leaderboard/results.json
+    Example: robocas eval table eval/small eval/rt1 --out docs/results/results.json
     """
 
     out: Annotated[Path, tyro.conf.arg(metavar="FILE.json")]
-    """JSON file of the leaderboard."""
+    """JSON file of the table."""
     update: bool = False
-    """Add the rows to an existing leaderboard. Without this option, they replace all rows."""
+    """Add the rows to an existing table. Without this option, they replace all rows."""
 
 
 @dataclass
@@ -142,7 +142,7 @@ def compare(cfg: Compare) -> int:
     return 0
 
 
-def leaderboard(cfg: WriteLeaderboard) -> int:
+def table(cfg: WriteTable) -> int:
     from robocas_ms3.cli.terminal import print_line, print_text
     from robocas_ms3.core.errors import EvaluationError
     from robocas_ms3.core.files import atomic_file
@@ -158,7 +158,7 @@ def leaderboard(cfg: WriteLeaderboard) -> int:
     )
 
     if cfg.out.suffix != ".json":
-        what, expected = "invalid name of the leaderboard", "a name that ends in .json"
+        what, expected = "invalid name of the table", "a name that ends in .json"
         raise EvaluationError(what, where="--out", expected=expected, found=cfg.out.name, usage=True)
     measured = [
         row for one in read_evaluations(cfg.folders) for row in make_rows(one, _find_protocol(one, cfg.protocol))

@@ -136,29 +136,29 @@ def test_row_a_of_other_baselines_calls_valid_commands(tmp_path, baseline, step,
 
 
 def test_a_policy_is_evaluated_on_all_protocols(tmp_path):
-    settings = {"OUT": str(tmp_path / "out"), "LEADERBOARD": str(tmp_path / "board" / "rows.json")}
+    settings = {"OUT": str(tmp_path / "out"), "TABLE": str(tmp_path / "board" / "rows.json")}
     done, calls = run_with_stub(tmp_path, "evaluate_protocols.sh", "runs/mine", **settings)
     assert done.returncode == 0, done.stderr
     for call in calls:
         cli.parse(call)
-    rows = [call for call in calls if call[1] == "leaderboard"]
+    rows = [call for call in calls if call[1] == "table"]
     evaluations = check_shards([call for call in calls if call not in rows])
     played = [call[call.index("--protocol") + 1] for call in evaluations]
     assert sorted(played) == sorted(set(bundled_protocols()) - {"smoke"})
     assert [call[2] for call in rows] == [str(tmp_path / "out" / "runs_mine" / name) for name in played]
-    assert all("--update" in call and call[-1] == settings["LEADERBOARD"] for call in rows)
+    assert all("--update" in call and call[-1] == settings["TABLE"] for call in rows)
     assert run_with_stub(tmp_path, "evaluate_protocols.sh")[0].returncode == 2
 
 
 def test_the_runs_of_a_baseline_are_evaluated_in_their_tasks(tmp_path):
-    settings = {"OUT": str(tmp_path / "out"), "LEADERBOARD": str(tmp_path / "rows.json")}
+    settings = {"OUT": str(tmp_path / "out"), "TABLE": str(tmp_path / "rows.json")}
     runs = tmp_path / "runs"
     for task in ("pick", "select"):
         (runs / task).mkdir(parents=True)
         (runs / task / "run.json").touch()
     done, calls = run_with_stub(tmp_path, "evaluate_protocols.sh", str(runs), "paper-v1", "furniture-v1", **settings)
     assert done.returncode == 0, done.stderr
-    evaluations = check_shards([call for call in calls if call[1] != "leaderboard"])
+    evaluations = check_shards([call for call in calls if call[1] != "table"])
     played = [(call[2], *(call[call.index(name) + 1] for name in ("--policy", "--protocol"))) for call in evaluations]
     pick, select = str(runs / "pick"), str(runs / "select")
     paper = [("pick", pick, "paper-v1"), ("select", select, "paper-v1")]  # select has the episodes of pick there
@@ -170,7 +170,7 @@ def test_an_evaluation_with_a_failed_shard_is_not_merged(tmp_path):
     stub = tmp_path / "fails"
     stub.write_text(STUB + 'case "$*" in *"--shard 1/2"*) exit 1 ;; esac\n')
     stub.chmod(0o755)
-    settings = {"OUT": str(tmp_path / "out"), "LEADERBOARD": str(tmp_path / "rows.json"), "ROBOCAS": str(stub)}
+    settings = {"OUT": str(tmp_path / "out"), "TABLE": str(tmp_path / "rows.json"), "ROBOCAS": str(stub)}
     done, calls = run_with_stub(tmp_path, "evaluate_protocols.sh", "small", "smoke", **settings)
     assert done.returncode != 0 and [call[1] for call in calls] == ["run", "run"]
     assert "_shards" in done.stderr

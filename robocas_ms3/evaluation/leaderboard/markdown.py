@@ -27,6 +27,10 @@ RANK_NOTE = (
     "(McNemar's exact test over the same episodes, adjusted by Holm's method), so that ties have equal ranks. Audited: "
     "number of episodes whose stored actions were replayed without differences."
 )
+NOT_AUDITED_NOTE = (
+    "These results are not audited: their actions were not replayed. robocas leaderboard build writes the leaderboard "
+    "of audited results."
+)
 PUBLISHED_NOTE = (
     "Published results are not comparable with the tables above: RoboCAS-v0's evaluator has another rule of success, "
     "fixes lifted objects to the hand, and has other object meshes."
@@ -36,8 +40,8 @@ PUBLISHED_NOTE = (
 def render_leaderboard(rows: Sequence[LeaderboardRow]) -> str:
     """Return rows as Markdown: one table per protocol and its hash, and one table of published results."""
     lines, protocols = [NOTE], dict[tuple[str, str], list[LeaderboardRow]]()
-    if any(row.rank is not None for row in rows):
-        lines += ["", RANK_NOTE]
+    is_audited = any(row.audited for row in rows)
+    lines += ["", RANK_NOTE if is_audited else NOT_AUDITED_NOTE]
     for row in rows:
         if not row.published:
             protocols.setdefault((row.protocol, row.protocol_hash), []).append(row)

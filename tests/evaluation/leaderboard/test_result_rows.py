@@ -3,7 +3,7 @@
 import pytest
 from synthetic_results import outcome, write
 
-from robocas_ms3.cli.eval_results import WriteLeaderboard, leaderboard
+from robocas_ms3.cli.eval_results import WriteTable, table
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.leaderboard.markdown import render_leaderboard
 from robocas_ms3.evaluation.leaderboard.result_rows import make_rows
@@ -128,16 +128,16 @@ def test_command_writes_rows_of_all_results_and_the_published_ones(tmp_path, cap
     write(tmp_path / "c", [outcome(0)], policy=TRAINED)
     out = tmp_path / "board" / "results.json"
     for _ in range(2):  # an existing leaderboard is replaced
-        assert leaderboard(WriteLeaderboard((tmp_path / "a", tmp_path / "b", tmp_path / "c"), out=out)) == 0
+        assert table(WriteTable((tmp_path / "a", tmp_path / "b", tmp_path / "c"), out=out)) == 0
     rows = read_leaderboard(out).rows
     assert [(row.policy, row.n) for row in rows if not row.published] == [("runs/mine", 1), ("mine", 2)]
     assert sum(row.published for row in rows) == 6
     write(tmp_path / "d", [outcome(0)], policy={**TRAINED, "name": "another"})
-    assert leaderboard(WriteLeaderboard((tmp_path / "d",), out=out, update=True)) == 0
+    assert table(WriteTable((tmp_path / "d",), out=out, update=True)) == 0
     assert [row.policy for row in read_leaderboard(out).rows if not row.published] == ["another", "runs/mine", "mine"]
     text = out.with_suffix(".md").read_text()
     assert text in capsys.readouterr().out and "RoboFlamingo" in text
     with pytest.raises(EvaluationError):
-        leaderboard(WriteLeaderboard((tmp_path / "a",), out=tmp_path / "board.txt"))
+        table(WriteTable((tmp_path / "a",), out=tmp_path / "board.txt"))
     with pytest.raises(EvaluationError):
-        leaderboard(WriteLeaderboard((), out=out))
+        table(WriteTable((), out=out))
