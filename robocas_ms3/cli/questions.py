@@ -1,52 +1,37 @@
-"""``robocas questions``: make, render, convert and score questions about which object has to be removed first."""
+"""``robocas questions``: make, convert, answer and score questions about which object has to be removed first."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from robocas_ms3.cli.options import CORES, Folders, Jobs, resumable
 from robocas_ms3.core.text import format_count
 
+if TYPE_CHECKING:
+    from robocas_ms3.evaluation.statistics import SuccessRate
+
 DESCRIPTION = "Questions about which object has to be removed first, for vision-language models."
-_BUNDLED = "removal-order-v1"
-_Set = Annotated[str, tyro.conf.arg(metavar="SET")]
+_Source = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="QUESTIONS")]
 
 
 @dataclass
 class Make:
-    """Make questions about measured scenes: questions.jsonl and images with numbered objects.
+    """Write the questions about the scenes of a protocol, with images in which the objects have numbers.
 
-    A scene gives a question if an object has to be removed first, if such an object is visible, and if other numbered
-    objects are wrong. After an interruption, the same command continues.
+    A protocol with questions.jsonl has fixed questions. For another protocol, questions are made from difficulty.jsonl
+    in its folder (docs/difficulty.md). After an interruption, the same command continues.
 
-    Example: robocas questions make difficulty/search_table_stacked --out questions
+    Example: robocas questions make clutter-scale-v1 --out questions
     """
 
-    folders: Folders
-    """Output folders of robocas difficulty."""
+    protocol: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PROTOCOL")]
+    """Name of a bundled protocol, or a protocol folder."""
     out: Path
     """Output folder."""
-    jobs: Jobs = CORES
-    """Number of processes that render. Default: one per CPU core."""
-    overwrite: bool = False
-    """Delete earlier results and start again. Default: continue."""
-
-
-@dataclass
-class Render:
-    """Write a set of questions with its images. After an interruption, the same command continues.
-
-    Example: robocas questions render --out questions
-    """
-
-    out: Path
-    """Output folder."""
-    questions: _Set = _BUNDLED
-    """Bundled set of questions by name, or its folder."""
     jobs: Jobs = CORES
     """Number of processes that render. Default: one per CPU core."""
     overwrite: bool = False
@@ -55,13 +40,13 @@ class Render:
 
 @dataclass
 class Convert:
-    """Convert rendered questions to a LeRobot dataset with `vqa` rows, for LeRobot 0.6 and later.
+    """Convert questions to a LeRobot dataset with `vqa` rows, for LeRobot 0.6 and later.
 
     Example: robocas questions convert questions --out questions_lerobot
     """
 
     questions: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """Folder of robocas questions render or make."""
+    """Folder of robocas questions make."""
     out: Path
     """Folder of the dataset."""
     overwrite: bool = False
@@ -69,34 +54,34 @@ class Convert:
 
 
 @dataclass
-class Answer:
-    """Write the answers of a policy that was evaluated in the scenes of the questions: the object that it moved first.
+class AnswerQuestions:
+    """Write the answers of a policy that was evaluated on the protocol: the object that it moved first.
 
-    Example: robocas questions answer eval/keyframe --out keyframe.jsonl
+    Example: robocas questions answer eval/keyframe --questions questions --out keyframe.jsonl
     """
 
     folders: Folders
     """Folders of results; shards of one evaluation count as one result."""
-    out: Path
+    questions: Annotated[str, tyro.conf.arg(metavar="QUESTIONS")]
+    """Folder of robocas questions make, or name of a bundled protocol with questions."""
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE.jsonl")]
     """File with the answers (JSON Lines)."""
-    questions: _Set = _BUNDLED
-    """Bundled set of questions by name, or its folder."""
 
 
 @dataclass
 class Score:
-    """Score the answers of a model, next to those of simple rules.
+    """Score the answers of models, next to those of simple rules.
 
-    ANSWERS has one JSON object per line: {"id": "search_large-290001", "answer": 3}. The answer is the number of an
-    object, or null for no answer. Without ANSWERS, only the rules are scored.
+    ANSWERS has one line per question: {"episode": 12, "answer": 3}. The answer is the number of an object, or null for
+    no answer. Without ANSWERS, only the rules are scored.
 
-    Example: robocas questions score answers.jsonl
+    Example: robocas questions score questions answers.jsonl
     """
 
+    questions: _Source
+    """Folder of robocas questions make, or name of a bundled protocol with questions."""
     answers: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[ANSWERS ...]")] = ()
     """Files with answers (JSON Lines)."""
-    questions: _Set = _BUNDLED
-    """Bundled set of questions by name, or its folder."""
 
 
 @resumable
@@ -104,60 +89,51 @@ def make(cfg: Make) -> int:
     from robocas_ms3.cli.progress import ProgressBar
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.checks import check_number
+    from robocas_ms3.evaluation.protocol import load_protocol
     from robocas_ms3.evaluation.removal_questions.question_files import make_questions
 
     check_number("--jobs", cfg.jobs, 1)
+    protocol = load_protocol(cfg.protocol)
     with ProgressBar("scenes rendered") as bar:
-        count = make_questions(cfg.folders, cfg.out, jobs=cfg.jobs, overwrite=cfg.overwrite, on_scenes=bar.update)
-    print_line(f"wrote {format_count(count, 'question')} to {cfg.out / 'questions.jsonl'}")
-    return 0
-
-
-@resumable
-def render(cfg: Render) -> int:
-    from robocas_ms3.cli.progress import ProgressBar
-    from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.core.checks import check_number
-    from robocas_ms3.evaluation.removal_questions.question_files import read_question_set, render_questions
-
-    check_number("--jobs", cfg.jobs, 1)
-    questions = read_question_set(cfg.questions)
-    with ProgressBar("images rendered") as bar:
-        render_questions(questions, cfg.out, jobs=cfg.jobs, overwrite=cfg.overwrite, on_images=bar.update)
-    print_line(f"wrote {format_count(len(questions.questions), 'question')} to {cfg.out / 'questions.jsonl'}")
+        questions = make_questions(protocol, cfg.out, jobs=cfg.jobs, overwrite=cfg.overwrite, on_scenes=bar.update)
+    print_line(f"wrote {format_count(len(questions), 'question')} to {cfg.out / 'questions.jsonl'}")
     return 0
 
 
 def convert(cfg: Convert) -> int:
     from robocas_ms3.cli.terminal import print_line
-    from robocas_ms3.evaluation.removal_questions.lerobot_dataset import write_lerobot
-    from robocas_ms3.evaluation.removal_questions.question_files import read_question_set
+    from robocas_ms3.core.errors import require_extra
+    from robocas_ms3.evaluation.removal_questions.question_files import read_questions
 
-    questions = read_question_set(cfg.questions)
-    write_lerobot(questions, cfg.out, overwrite=cfg.overwrite)
-    print_line(f"wrote {format_count(len(questions.questions), 'episode')} to {cfg.out}")
+    require_extra("lerobot", "LeRobot datasets", "pyarrow", "av")
+    from robocas_ms3.evaluation.removal_questions.lerobot_dataset import write_lerobot
+
+    questions = read_questions(cfg.questions)
+    write_lerobot(questions, cfg.questions, cfg.out, overwrite=cfg.overwrite)
+    print_line(f"wrote {format_count(len(questions), 'episode')} to {cfg.out}")
     return 0
 
 
-def answer(cfg: Answer) -> int:
+def answer(cfg: AnswerQuestions) -> int:
     from robocas_ms3.cli.eval_results import read
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.json_lines import JsonLinesFile
-    from robocas_ms3.evaluation.removal_questions import records
-    from robocas_ms3.evaluation.removal_questions.question_files import read_question_set
+    from robocas_ms3.evaluation.removal_questions.question_files import check_protocol_of, read_questions
+    from robocas_ms3.evaluation.removal_questions.records import Answer
     from robocas_ms3.evaluation.removal_questions.scores import make_answers
 
-    questions = read_question_set(cfg.questions).questions
-    answers = make_answers(questions, read(cfg.folders).outcomes.values())
-    JsonLinesFile[records.Answer](cfg.out, records.Answer).rewrite(answers)
-    without = sum(one.answer is None for one in answers)
-    print_line(f"wrote {format_count(len(answers), 'answer')} to {cfg.out}, {without} of them null")
+    result, questions = read(cfg.folders), read_questions(cfg.questions)
+    check_protocol_of(cfg.questions, result)
+    answers = make_answers(questions, result.outcomes)
+    JsonLinesFile[Answer](cfg.out, Answer).rewrite(answers)
+    unanswered = sum(one.answer is None for one in answers)
+    print_line(f"wrote {format_count(len(answers), 'answer')} to {cfg.out}, {unanswered} of them null")
     return 0
 
 
 def score(cfg: Score) -> int:
     from robocas_ms3.cli.terminal import print_line, print_table
-    from robocas_ms3.evaluation.removal_questions.question_files import read_question_set
+    from robocas_ms3.evaluation.removal_questions.question_files import read_questions
     from robocas_ms3.evaluation.removal_questions.scores import (
         compute_chance,
         read_answers,
@@ -165,32 +141,27 @@ def score(cfg: Score) -> int:
         score_rules,
     )
 
-    questions = read_question_set(cfg.questions).questions
-    scores = [score_answers(path.stem, questions, read_answers(path)) for path in cfg.answers]
+    questions = read_questions(cfg.questions)
+    scores = [score_answers(str(path), questions, read_answers(path)) for path in cfg.answers]
     scores += score_rules(questions)
-    removals = sorted({question.removals for question in questions})
-    counts = [sum(question.removals == number for question in questions) for number in removals]
-    headers = ("answers", f"right of {len(questions)} (95 % interval)")
-    headers += tuple(
-        f"{format_count(number, 'removal')} (n = {count})" for number, count in zip(removals, counts, strict=True)
-    )
+    groups = {
+        removals: [question for question in questions if question.removals == removals]
+        for removals in sorted({question.removals for question in questions})
+    }
+    headers = [f"{format_count(removals, 'removal')}, n = {len(group)}" for removals, group in groups.items()]
     rows = [
-        (
-            one.name,
-            f"{one.accuracy.rate:.1%} ({one.accuracy.low:.1%} to {one.accuracy.high:.1%})",
-            *(f"{one.by_removals[number].rate:.1%}" for number in removals),
-        )
-        for one in scores
+        (entry.name, *map(_describe_rate, (entry.accuracy, *(entry.by_removals[removals] for removals in groups))))
+        for entry in scores
     ]
-    by_chance = [
-        compute_chance([question for question in questions if question.removals == number]) for number in removals
-    ]
-    rows.append(
-        ("random object", f"{compute_chance(questions):.1%} (expected)", *(f"{rate:.1%}" for rate in by_chance))
-    )
-    print_table(headers, rows)
-    print_line("highest object, scripted policy: they know the state of the simulator")
+    chances = [compute_chance(group) for group in (questions, *groups.values())]
+    rows.append(("random object (expected)", *(f"{100 * chance:.1f}" for chance in chances)))
+    print_table(("answers", f"all, n = {len(questions)}", *headers), rows)
+    print_line("correct answers in %, with exact 95 % intervals")
     return 0
 
 
-COMMANDS = {"make": make, "render": render, "convert": convert, "answer": answer, "score": score}
+def _describe_rate(rate: SuccessRate) -> str:
+    return f"{100 * rate.rate:.1f} ({100 * rate.low:.1f} to {100 * rate.high:.1f})"
+
+
+COMMANDS = {"make": make, "convert": convert, "answer": answer, "score": score}

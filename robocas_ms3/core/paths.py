@@ -120,11 +120,6 @@ def protocols_dir() -> Path:
     return PACKAGE_DIR / "data" / "protocols"
 
 
-def removal_questions_dir() -> Path:
-    """Return the folder of the bundled sets of questions about the order of removals."""
-    return PACKAGE_DIR / "data" / "removal_questions"
-
-
 def published_results_file() -> Path:
     """Return the path of the bundled leaderboard with results of the RoboCAS paper."""
     return PACKAGE_DIR / "data" / "published_results.json"

@@ -23,6 +23,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
 from robocas_ms3.core.checks import MAX_SEED, parse_shard
 from robocas_ms3.core.documents import ARRAYS_LIMIT, JSON_LIMIT, DocumentError, load_yaml, read_bytes, read_text
 from robocas_ms3.core.errors import EvaluationError
@@ -235,6 +236,18 @@ class LoadedProtocol:
         robot = find_robot(self.rules.robot, where=f"{self.folder}, robot", usage=False).description
         for config in dict.fromkeys(episode.config for episode in episodes):
             check_cameras(spec, load_task_config(self.config_file(config)), robot, f"{self.rules.name}, {config}")
+
+    def check_pack(self) -> None:
+        """Raise `EvaluationError` if the installed object pack differs from the pack of the protocol."""
+        name, expected = self.rules.pack, self.rules.pack_hash
+        found = sha256(load_pack(name, usage=False).root / MANIFEST)
+        if found != expected:
+            what, fix = (
+                f"the object pack {name} differs from the pack of the protocol",
+                "Install the pack of the protocol.",
+            )
+            where = self.rules.name
+            raise EvaluationError(what, where=where, expected=f"hash {expected}", found=f"hash {found}", fix=fix)
 
     def check_same_configuration(self, episodes: Sequence[ProtocolEpisode], fix: str = "") -> None:
         """Raise `EvaluationError` if the episodes have different configurations, so that one batch cannot run them."""

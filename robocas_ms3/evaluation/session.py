@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from robocas_ms3.assets.pack import MANIFEST, load_pack, sha256
+from robocas_ms3.assets.pack import load_pack
 from robocas_ms3.core.errors import EvaluationError, VectorEnvCrashError
 from robocas_ms3.core.workers import Limits
 from robocas_ms3.datasets.conversion.env_renderer import require_renderer
@@ -387,15 +387,7 @@ class EvaluationSession:
 
     def _make_run_record(self, backend: str) -> RunRecord:
         rules, name = self.protocol.rules, self.settings.policy
-        pack = sha256(load_pack(rules.pack, usage=False).root / MANIFEST)
-        if pack != rules.pack_hash:
-            what, fix = (
-                f"the object pack {rules.pack} differs from the pack of the protocol",
-                "Install the pack of the protocol.",
-            )
-            raise EvaluationError(
-                what, where=rules.name, expected=f"hash {rules.pack_hash}", found=f"hash {pack}", fix=fix
-            )
+        self.protocol.check_pack()
         differences = self._list_training_differences()
         values = {
             "protocol": rules.name,
@@ -408,7 +400,7 @@ class EvaluationSession:
             "backend": backend,
             "versions": get_package_versions(),
             "source_hash": hash_source(),
-            "pack_hashes": {rules.pack: pack},
+            "pack_hashes": {rules.pack: rules.pack_hash},
             "machine": describe_machine(),
         }
         return RunRecord.from_values(values, f"policy {name}")

@@ -8,13 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
-
-from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import ConfigError, LayoutError, RobocasError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
-from robocas_ms3.core.strict_model import error_from_validation
 from robocas_ms3.core.workers import Limits, WorkerPool, hide_cuda, use_one_torch_thread
 from robocas_ms3.demos.difficulty.records import RemovalLimits, SceneDifficulty
 from robocas_ms3.demos.forked_processes import find_reason_not_to_fork
@@ -111,24 +107,6 @@ def read_difficulties(folder: Path) -> list[SceneDifficulty]:
     """Read the difficulties in an output folder of `measure_seeds`, in ascending order of the seeds."""
     found = JsonLinesFile[SceneDifficulty](folder / SCENES, SceneDifficulty).read()
     return sorted({scene.seed: scene for scene in found}.values(), key=lambda scene: scene.seed)
-
-
-def read_settings(folder: Path) -> DifficultySettings:
-    """Read the settings in an output folder of `measure_seeds`.
-
-    Raises:
-        ConfigError: the folder is not an output folder of ``robocas difficulty``, or its settings are invalid.
-    """
-    path = folder / OUTPUT.records[0]
-    try:
-        settings = TypeAdapter(DifficultySettings).validate_python(load_json(path))
-    except FileNotFoundError as error:
-        what = "not an output folder of robocas difficulty"
-        raise ConfigError(what, where=folder, expected=path.name, usage=True) from error
-    except ValidationError as error:
-        raise error_from_validation(error, TypeAdapter(DifficultySettings), ConfigError, where=path) from error
-    settings.check()
-    return settings
 
 
 class _DifficultyWorker:

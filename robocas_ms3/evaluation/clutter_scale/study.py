@@ -12,16 +12,14 @@ from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.files import write_json
-from robocas_ms3.core.json_lines import JsonLinesFile
-from robocas_ms3.demos.difficulty.records import SceneDifficulty
 from robocas_ms3.evaluation.clutter_scale.curves import SuccessCurve, fit_success_curve
 from robocas_ms3.evaluation.clutter_scale.features import FEATURES, make_features
 from robocas_ms3.evaluation.clutter_scale.item_response import ClutterScale, compute_held_out_auc, fit_clutter_scale
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.tables import describe_action_noise, name_policy
 from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.scene_difficulties import read_difficulties_of
 
-DIFFICULTIES = "difficulty.jsonl"  # in the folder of a protocol: the difficulties of its episodes, in their order
 FITTED_RATES = 0.1, 0.9  # success rates of the policies to which the scale is fitted
 MIN_POLICIES = 2
 
@@ -69,24 +67,6 @@ class ClutterStudy:
     def write(self, path: Path) -> None:
         """Write the study as JSON; infinite limits of intervals are null."""
         write_json(path, _to_json({**asdict(self), "mean_auc": self.mean_auc}))
-
-
-def read_difficulties_of(protocol: LoadedProtocol) -> list[SceneDifficulty]:
-    """Read the difficulties of the scenes of a protocol, one per episode.
-
-    Raises:
-        EvaluationError: the protocol has no difficulties, or they do not fit its episodes.
-    """
-    path = protocol.folder / DIFFICULTIES
-    scenes = JsonLinesFile[SceneDifficulty](path, SceneDifficulty).read()
-    if not scenes:
-        fix = "Measure the scenes with robocas difficulty."
-        raise EvaluationError("the protocol has no difficulties of its scenes", where=path, fix=fix)
-    expected = [(episode.seed, episode.target) for episode in protocol.episodes]
-    if [(scene.seed, scene.target) for scene in scenes] != expected:
-        what, wanted = "the difficulties do not fit the episodes", "one line per episode, with its seed and target"
-        raise EvaluationError(what, where=path, expected=wanted)
-    return scenes
 
 
 def make_study(results: Sequence[Result], protocol: LoadedProtocol) -> ClutterStudy:

@@ -1,266 +1,211 @@
-"""Folders of questions: ``questions.jsonl``, ``questions.json`` with the settings of the scenes, and images.
+"""Questions about the scenes of a protocol: made, rendered and stored in a folder.
 
-A set of questions is such a folder without images, like those in the package. `render_questions` renders its images.
+``questions.jsonl`` in the folder of a protocol freezes its questions; then only their images are rendered.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter, ValidationError
 
 from robocas_ms3.core.documents import load_json
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.files import atomic_file, make_folder
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
-from robocas_ms3.core.paths import removal_questions_dir
-from robocas_ms3.core.strict_model import error_from_validation
-from robocas_ms3.core.text import did_you_mean
 from robocas_ms3.core.workers import WorkerPool, use_one_torch_thread
 from robocas_ms3.datasets.images.png import encode_png
-from robocas_ms3.demos.difficulty.difficulty_file import DifficultySettings, read_difficulties, read_settings
 from robocas_ms3.demos.difficulty.records import SceneDifficulty
 from robocas_ms3.demos.recordings.trajectory_json import package_versions
+from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.protocol import LoadedProtocol, ProtocolEpisode, load_protocol
 from robocas_ms3.evaluation.removal_questions.records import RemovalQuestion
+from robocas_ms3.evaluation.results import Result
+from robocas_ms3.evaluation.scene_difficulties import read_difficulties_of
 
 if TYPE_CHECKING:
     from robocas_ms3.evaluation.removal_questions.question_renderer import QuestionRenderer
 
-OUTPUT = FolderKind("robocas questions", ("questions.json",), "scenes")
+OUTPUT = FolderKind("robocas questions make", ("questions.json",), "questions_hash")
 QUESTIONS = "questions.jsonl"
-Scenes = dict[str, DifficultySettings]
-"""Settings of the scenes of questions, by the part of their ids before the seed."""
-_SCENES: TypeAdapter[Scenes] = TypeAdapter(Scenes)
-_CHECKED = "checked.jsonl"  # ids of the rendered scenes, with or without a question
+_RENDERED = "rendered.jsonl"  # numbers of the rendered episodes, with or without a question
 
 
 @dataclass(frozen=True)
-class QuestionSet:
-    """Questions, and the settings of their scenes."""
+class _Task:
+    """Episode to render: with its frozen question, or with the difficulty of its scene to make a question."""
 
-    questions: list[RemovalQuestion]
-    scenes: Scenes
-    folder: Path
-
-    def find_image(self, question: RemovalQuestion) -> Path:
-        """Return the path of the image of a question; raise EvaluationError if it was not rendered."""
-        path = self.folder / "images" / f"{question.id}.png"
-        if not path.is_file():
-            fix = "Run robocas questions render."
-            raise EvaluationError("the image of this question is missing", where=path, fix=fix)
-        return path
+    episode: ProtocolEpisode
+    question: RemovalQuestion | None = None
+    difficulty: SceneDifficulty | None = None
 
 
-def bundled_question_sets() -> dict[str, Path]:
-    """Return the folders of the bundled sets of questions by name."""
-    return {path.parent.name: path.parent for path in sorted(removal_questions_dir().glob(f"*/{QUESTIONS}"))}
-
-
-def read_question_set(source: str | Path) -> QuestionSet:
-    """Read a set of questions.
+def read_questions(source: str | Path) -> list[RemovalQuestion]:
+    """Read questions.
 
     Args:
-        source: name of a bundled set, or a folder.
+        source: name of a bundled protocol with questions, or folder with ``questions.jsonl``.
 
     Raises:
-        EvaluationError: there is no such set, or a file is damaged.
+        EvaluationError: there is no such file, a line is damaged, or several questions have the same episode.
     """
-    bundled = bundled_question_sets()
-    folder = bundled.get(str(source), Path(source))
-    file = JsonLinesFile[RemovalQuestion](folder / QUESTIONS, RemovalQuestion)
+    bundled = {name: folder for name, folder in bundled_protocols().items() if (folder / QUESTIONS).is_file()}
+    file = JsonLinesFile[RemovalQuestion](bundled.get(str(source), Path(source)) / QUESTIONS, RemovalQuestion)
     lines = file.read_lines()
     if not lines:
-        expected = f"one of {', '.join(bundled)}, or a folder of robocas questions"
-        fix = did_you_mean(str(source), bundled)
-        raise EvaluationError("no such set of questions", where=source, expected=expected, fix=fix, usage=True)
+        expected = ", or ".join([*bundled, "a folder of robocas questions make"])
+        raise EvaluationError("no questions", where=source, expected=expected, usage=True)
+    questions: dict[int, RemovalQuestion] = {}
     for line in lines:
         if line.record is None:
             raise file.make_line_error(line, EvaluationError, "damaged question")
-    questions = [line.record for line in lines if line.record is not None]
-    counts = Counter(question.id for question in questions)
-    if repeated := [name for name, count in counts.items() if count > 1]:
-        raise EvaluationError("several questions have the same id", where=file.path, found=repeated[0])
-    return QuestionSet(questions, _read_scenes(folder / OUTPUT.records[0]), folder)
+        if questions.setdefault(line.record.episode, line.record) is not line.record:
+            what, where = "two questions about one episode", f"{file.path}:{line.number}"
+            raise EvaluationError(what, where=where, found=f"episode {line.record.episode}")
+    return list(questions.values())
+
+
+def check_protocol_of(questions: str | Path, result: Result) -> None:
+    """Raise EvaluationError if a result has another protocol than the questions of `read_questions`."""
+    folder, path = bundled_protocols().get(str(questions)), Path(questions) / OUTPUT.records[0]
+    if folder is not None:
+        expected = load_protocol(folder).hash
+    elif path.is_file():
+        expected = load_json(path).get("protocol_hash")
+    else:
+        what, wanted = "the protocol of the questions is not known", "a folder of robocas questions make"
+        raise EvaluationError(what, where=path, expected=wanted)
+    if result.run.protocol_hash != expected:
+        what, found = "result of another protocol", f"{result.run.protocol}, hash {result.run.protocol_hash[:16]}"
+        raise EvaluationError(what, where=result.folder, expected=f"hash {str(expected)[:16]}", found=found)
 
 
 def make_questions(
-    sources: Sequence[Path],
+    protocol: LoadedProtocol,
     out: Path,
     *,
     jobs: int = 1,
     overwrite: bool = False,
     on_scenes: Callable[[int, int], None] = lambda done, total: None,
-) -> int:
-    """Make questions about measured scenes, with images, and return their number.
+) -> list[RemovalQuestion]:
+    """Write the questions about the scenes of a protocol, with images, and return them in the order of the episodes.
 
-    The same call continues an interrupted one. At the end the questions are in the order of the sources and seeds.
+    If the protocol has no ``questions.jsonl``, the questions are made from the difficulties of its scenes. The same
+    call continues an interrupted one.
 
     Args:
-        sources: output folders of ``robocas difficulty``; their names are the beginnings of the ids.
+        protocol: protocol with questions or difficulties.
         out: output folder.
         jobs: number of processes that render, which has no effect on the questions.
         overwrite: whether to delete earlier results.
-        on_scenes: called with (scenes done, all scenes); scenes without removals need no image.
+        on_scenes: called with (rendered scenes, all scenes to render).
 
     Raises:
-        EvaluationError: two sources have the same name.
-        ConfigError: a source is not an output folder of ``robocas difficulty``.
+        EvaluationError: the protocol has neither questions nor difficulties, or the installed pack or a scene differs.
         DatasetError: there is no render device.
-        OutputExistsError: ``out`` has other sources or versions, or was written by another command.
+        OutputExistsError: ``out`` has other questions or versions, or was written by another command.
     """
-    names = [folder.name for folder in sources]
-    if len(set(names)) < len(names):
-        raise EvaluationError("two folders have the same name", expected="different names", found=", ".join(names))
-    scenes = {folder.name: read_settings(folder) for folder in sources}
-    tasks = [
-        (name, scene)
-        for name, folder in zip(names, sources, strict=True)
-        for scene in read_difficulties(folder)
-        if scene.removals
-    ]
-    places = {f"{name}-{scene.seed}": place for place, (name, scene) in enumerate(tasks)}
-    record = _make_record(scenes)
+    protocol.check_pack()
+    tasks = _list_tasks(protocol)
+    content = [[task.episode.episode, task.question or task.difficulty] for task in tasks]
+    digest = hashlib.sha256(json.dumps(content, default=asdict, sort_keys=True).encode()).hexdigest()
+    record = {"protocol_hash": protocol.hash, "questions_hash": digest, "versions": package_versions()}
     with OutputFolder(out, OUTPUT, record, overwrite=overwrite) as output:
         _require_renderer()
         output.start(record)
         file = JsonLinesFile[RemovalQuestion](out / QUESTIONS, RemovalQuestion)
-        checked = JsonLinesFile[str](out / _CHECKED, str)
-        done = set(checked.read())
-        missing = [task for task in tasks if f"{task[0]}-{task[1].seed}" not in done]
-        for identifier, question in _render(scenes, missing, out, jobs, on_scenes, len(tasks)):
+        rendered = JsonLinesFile[int](out / _RENDERED, int)
+        earlier = set(rendered.read())
+        missing = [task for task in tasks if task.episode.episode not in earlier]
+        for done, (episode, question) in enumerate(_render(protocol, missing, out, jobs), len(tasks) - len(missing)):
+            on_scenes(done, len(tasks))
             output.check_exists()
             if question is not None:
                 file.append([question])
-            checked.append([identifier])
-        questions = {question.id: question for question in file.read() if question.id in places}
-        file.rewrite(sorted(questions.values(), key=lambda question: places[question.id]))
-    return len(questions)
+            rendered.append([episode])
+        on_scenes(len(tasks), len(tasks))
+        questions = sorted({question.episode: question for question in file.read()}.values(), key=_get_episode)
+        file.rewrite(questions)
+    return questions
 
 
-def render_questions(
-    questions: QuestionSet,
-    out: Path,
-    *,
-    jobs: int = 1,
-    overwrite: bool = False,
-    on_images: Callable[[int, int], None] = lambda done, total: None,
-) -> None:
-    """Write a set of questions with its images to a folder; the same call continues an interrupted one.
-
-    Args:
-        questions: set of questions.
-        out: output folder.
-        jobs: number of processes that render.
-        overwrite: whether to delete earlier results.
-        on_images: called with (images done, all images).
-
-    Raises:
-        EvaluationError: a scene differs from its question.
-        DatasetError: there is no render device.
-        OutputExistsError: ``out`` has other questions or versions, or was written by another command.
-    """
-    record = _make_record(questions.scenes)
-    with OutputFolder(out, OUTPUT, record, overwrite=overwrite) as output:
-        _require_renderer()
-        output.start(record)
-        missing = [
-            (question.id.rpartition("-")[0], question)
-            for question in questions.questions
-            if not (out / "images" / f"{question.id}.png").is_file()
-        ]
-        for _ in _render(questions.scenes, missing, out, jobs, on_images, len(questions.questions)):
-            output.check_exists()
-        JsonLinesFile[RemovalQuestion](out / QUESTIONS, RemovalQuestion).rewrite(questions.questions)
+def _get_episode(question: RemovalQuestion) -> int:
+    return question.episode
 
 
-_Task = tuple[str, SceneDifficulty | RemovalQuestion]
+def _list_tasks(protocol: LoadedProtocol) -> list[_Task]:
+    """Return the episodes to render: those with a frozen question, else those whose scenes need a removal."""
+    if not (protocol.folder / QUESTIONS).is_file():
+        scenes = zip(protocol.episodes, read_difficulties_of(protocol), strict=True)
+        return [_Task(episode, difficulty=scene) for episode, scene in scenes if scene.removals]
+    questions, count = read_questions(protocol.folder), len(protocol.episodes)
+    for question in questions:
+        number = question.episode
+        if number >= count or protocol.episodes[number].instruction != question.instruction:
+            expected = f"fewer than {count} episodes" if number >= count else protocol.episodes[number].instruction
+            what, where = "the question does not fit the protocol", f"{protocol.folder / QUESTIONS}, episode {number}"
+            raise EvaluationError(what, where=where, expected=expected, found=question.instruction)
+    return [_Task(protocol.episodes[question.episode], question) for question in questions]
 
 
 def _render(
-    scenes: Scenes,
-    tasks: Sequence[_Task],
-    out: Path,
-    jobs: int,
-    on_progress: Callable[[int, int], None],
-    total: int,
-) -> Iterator[tuple[str, RemovalQuestion | None]]:
-    """Render scenes; yield the id of each, and its question."""
+    protocol: LoadedProtocol, tasks: Sequence[_Task], out: Path, jobs: int
+) -> Iterator[tuple[int, RemovalQuestion | None]]:
+    """Render scenes; yield the number of each episode, and its question."""
     make_folder(out / "images")
-    done = total - len(tasks)
-    on_progress(done, total)
     processes = max(1, min(jobs, len(tasks)))
-    pool: WorkerPool[_Task, tuple[str, RemovalQuestion | None]] = WorkerPool(
-        partial(_QuestionWorker, scenes, out, processes), processes
-    )
+    make_worker = partial(_QuestionWorker, protocol, out, processes)
+    pool: WorkerPool[_Task, tuple[int, RemovalQuestion | None]] = WorkerPool(make_worker, processes)
     with pool, closing(pool.map(tasks, ordered=False)) as results:
-        for result in results:
-            yield result
-            done += 1
-            on_progress(done, total)
+        yield from results
 
 
 class _QuestionWorker:
-    """Makes or renders one question after another; the environment is made again when the configuration changes."""
+    """Renders one scene after another; the environment is made again when the configuration changes."""
 
-    def __init__(self, scenes: Scenes, out: Path, processes: int) -> None:
+    def __init__(self, protocol: LoadedProtocol, out: Path, processes: int) -> None:
         if processes > 1:  # software renderers on all cores slow each other down
             os.environ.setdefault("LP_NUM_THREADS", "1")
         use_one_torch_thread()
-        self._scenes, self._images = scenes, out / "images"
-        self._name, self._renderer = "", None
+        self._protocol, self._out = protocol, out
+        self._config = ""
+        self._renderer: QuestionRenderer | None = None
 
-    def run(self, task: _Task) -> tuple[str, RemovalQuestion | None]:
-        name, what = task
-        renderer, identifier = self._open_renderer(name), f"{name}-{what.seed}"
-        if isinstance(what, RemovalQuestion):
-            self._write_image(what, renderer.render_question(what))
-            return identifier, what
-        made = renderer.make_question(what)
-        if made is None:
-            return identifier, None
-        self._write_image(*made)
-        return identifier, made[0]
-
-    def _write_image(self, question: RemovalQuestion, image: NDArray[np.uint8]) -> None:
-        with atomic_file(self._images / f"{question.id}.png") as path:
-            path.write_bytes(encode_png(image))
-
-    def _open_renderer(self, name: str) -> QuestionRenderer:
-        from robocas_ms3.evaluation.removal_questions.question_renderer import QuestionRenderer  # takes seconds
-
-        if self._renderer is None or name != self._name:
-            self.close()
-            self._name, self._renderer = name, QuestionRenderer(self._scenes[name], name)
-        return self._renderer
+    def run(self, task: _Task) -> tuple[int, RemovalQuestion | None]:
+        renderer, question = self._open_renderer(task.episode.config), task.question
+        if question is not None:
+            self._write_image(question, renderer.render_question(task.episode, question))
+        elif task.difficulty is not None and (made := renderer.make_question(task.episode, task.difficulty)):
+            question = made[0]
+            self._write_image(*made)
+        return task.episode.episode, question
 
     def close(self) -> None:
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
 
+    def _write_image(self, question: RemovalQuestion, image: NDArray[np.uint8]) -> None:
+        with atomic_file(self._out / question.image) as path:
+            path.write_bytes(encode_png(image))
 
-def _make_record(scenes: Mapping[str, DifficultySettings]) -> dict[str, Any]:
-    return {"scenes": {name: asdict(settings) for name, settings in scenes.items()}, "versions": package_versions()}
+    def _open_renderer(self, config: str) -> QuestionRenderer:
+        from robocas_ms3.evaluation.removal_questions.question_renderer import QuestionRenderer  # takes seconds
 
-
-def _read_scenes(path: Path) -> Scenes:
-    try:
-        return _SCENES.validate_python(load_json(path)["scenes"])
-    except (FileNotFoundError, LookupError, TypeError) as error:
-        what = "the settings of the scenes of these questions are missing"
-        raise EvaluationError(what, where=path, expected='a JSON file with the key "scenes"') from error
-    except ValidationError as error:
-        raise error_from_validation(error, _SCENES, EvaluationError, where=path) from error
+        if self._renderer is None or config != self._config:
+            self.close()
+            self._config, self._renderer = config, QuestionRenderer(self._protocol, config)
+        return self._renderer
 
 
 def _require_renderer() -> None:

@@ -7,10 +7,10 @@ from typing import Annotated
 
 from pydantic import Field
 
-from robocas_ms3.core.checks import MAX_SEED
 from robocas_ms3.datasets.images.image_files import Box
 
 Number = Annotated[int, Field(ge=1)]
+Episode = Annotated[int, Field(ge=0, le=10**7)]
 Text = Annotated[str, Field(min_length=1)]
 
 
@@ -35,31 +35,49 @@ class NumberedObject:
 
 @dataclass(frozen=True)
 class RemovalQuestion:
-    """Question which object has to be removed first.
+    """Question which object has to be removed first in the scene of an episode.
 
     Attributes:
-        id: name of the scenes and seed, such as ``search_table_stacked-290001``.
+        episode: number of the episode in its protocol.
         image: path of the image with the numbers, relative to the folder of the questions.
         instruction: instruction of the robot.
         question: text of the question.
-        objects: numbered objects; the target and objects that are hardly visible have no number.
-        answers: all numbers that are right.
+        objects: numbered objects in the order of their numbers, 1 to N; not the target and hardly visible objects.
+        answers: all correct numbers, in ascending order.
         removals: smallest number of removals after which the target can be grasped.
+        target_box: bounding box of the visible pixels of the target; None: not visible.
         highest: number of the object with the highest point.
-        scripted: number of the object that the scripted policy moves first; None: it has no number.
-        seed: seed of the scene.
+        scripted: number of the object that the scripted policy moves first; None: it has no number, or is unknown.
+
+    Raises:
+        ValueError: the values are inconsistent.
     """
 
-    id: Text
-    image: Text
+    episode: Episode
+    image: str
     instruction: Text
     question: Text
     objects: list[NumberedObject]
-    answers: Annotated[list[Number], Field(min_length=1)]
+    answers: list[Number]
     removals: Number
+    target_box: Box | None
     highest: Number
     scripted: Number | None
-    seed: Annotated[int, Field(ge=0, le=MAX_SEED)]
+
+    def __post_init__(self) -> None:
+        numbers = [numbered.number for numbered in self.objects]
+        if numbers != list(range(1, len(numbers) + 1)):
+            raise ValueError(f"objects: expected the numbers 1 to {len(numbers)} in order, found {numbers}")
+        if len({numbered.slot for numbered in self.objects}) < len(numbers):
+            raise ValueError("objects: expected different slots")
+        correct = set(self.answers)
+        if not correct or not correct < set(numbers) or sorted(correct) != self.answers:
+            raise ValueError(f"answers: expected some of the numbers 1 to {len(numbers)}, found {self.answers}")
+        for name, number in (("highest", self.highest), ("scripted", self.scripted)):
+            if number is not None and number not in numbers:
+                raise ValueError(f"{name}: expected a number from 1 to {len(numbers)}, found {number}")
+        if self.image != name_image(self.episode):
+            raise ValueError(f"image: expected {name_image(self.episode)}, found {self.image!r}")
 
 
 @dataclass(frozen=True)
@@ -67,18 +85,23 @@ class Answer:
     """Answer to a question.
 
     Attributes:
-        id: id of the question.
-        answer: number of an object; None: no answer, which is wrong.
+        episode: episode of the question.
+        answer: number of an object; None: no answer, which counts as wrong.
     """
 
-    id: Text
+    episode: Episode
     answer: int | None
+
+
+def name_image(episode: int) -> str:
+    """Return the path of the image of a question, relative to the folder of the questions."""
+    return f"images/{episode:06d}.png"
 
 
 def make_question_text(instruction: str, target: str) -> str:
     """Return the text of a question."""
     return (
-        f"A robot with a parallel gripper has this task: {instruction.rstrip('.')}. It removes one object at a time "
-        f"until it can grasp the {target}. Which numbered object should it remove first, so that it has to remove as "
-        "few objects as possible? Answer with the number of the object."
+        f"A robot with a parallel gripper has this task: {instruction.rstrip('.')}. It lifts objects and puts them "
+        f"aside, or pushes them away, one at a time, until it can grasp the {target}. Which numbered object should it "
+        "remove first, so that it has to remove as few objects as possible? Answer with the number of the object."
     )

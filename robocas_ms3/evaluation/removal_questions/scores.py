@@ -1,22 +1,41 @@
-"""Scores of answers: the fraction of questions with a right answer, and the scores of simple rules."""
+"""Scores of answers: the fraction of questions with a correct answer, and the scores of simple rules."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.json_lines import JsonLinesFile
+from robocas_ms3.datasets.images.image_files import Box
 from robocas_ms3.evaluation.outcomes import Outcome
 from robocas_ms3.evaluation.removal_questions.records import Answer, RemovalQuestion
 from robocas_ms3.evaluation.statistics import SuccessRate, compute_success_rate
 
+
+def _measure_area(box: Box) -> int:
+    return (box[2] - box[0] + 1) * (box[3] - box[1] + 1)
+
+
+def _choose_central_object(question: RemovalQuestion) -> int:
+    """Return the number of the object whose box is nearest to the middle of all boxes."""
+    centers = (
+        np.array([[box[0] + box[2], box[1] + box[3]] for box in (numbered.box for numbered in question.objects)]) / 2
+    )
+    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    return question.objects[int(distances.argmin())].number
+
+
 RULES: Mapping[str, Callable[[RemovalQuestion], int | None]] = {
-    "highest object": lambda question: question.highest,
-    "scripted policy": lambda question: question.scripted,
+    "largest box": lambda question: max(question.objects, key=lambda numbered: _measure_area(numbered.box)).number,
+    "most central box": _choose_central_object,
+    "highest object (from the state)": lambda question: question.highest,
+    "scripted policy (from the state)": lambda question: question.scripted,
 }
-"""Answers of simple rules that know the state of the simulator, by name."""
+"""Answers of simple rules, by name. Some know the state of the simulator."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +44,8 @@ class AnswerScore:
 
     Attributes:
         name: name of the model or rule.
-        accuracy: right answers of all questions.
-        by_removals: the same for the questions with each number of removals.
+        accuracy: correct answers of all questions.
+        by_removals: correct answers of the questions with each number of removals.
     """
 
     name: str
@@ -34,34 +53,40 @@ class AnswerScore:
     by_removals: dict[int, SuccessRate]
 
 
-def score_answers(name: str, questions: Sequence[RemovalQuestion], answers: Mapping[str, int | None]) -> AnswerScore:
+def score_answers(name: str, questions: Sequence[RemovalQuestion], answers: Mapping[int, int | None]) -> AnswerScore:
     """Score answers to questions.
 
     Args:
-        name: name of the model or rule.
+        name: name of the model or rule, for the score and for errors.
         questions: the questions.
-        answers: number of an object, or None for no answer, by the id of the question.
+        answers: number of an object, or None for no answer, by the episode of the question.
 
     Raises:
-        EvaluationError: a question has no entry in ``answers``.
+        EvaluationError: a question has no entry in ``answers``, or an entry belongs to no question.
     """
-    if missing := [question.id for question in questions if question.id not in answers]:
+    episodes = {question.episode for question in questions}
+    if missing := sorted(episodes - answers.keys()):
         what, fix = f"{len(missing)} of {len(questions)} questions have no line", 'Write "answer": null for no answer.'
-        raise EvaluationError(what, expected="one line per question", found=f"no line for {missing[0]}", fix=fix)
-    right = {question.id: answers[question.id] in question.answers for question in questions}
-    by_removals = {
-        removals: compute_success_rate(sum(right[one.id] for one in of), len(of))
-        for removals in sorted({question.removals for question in questions})
-        if (of := [question for question in questions if question.removals == removals])
-    }
-    return AnswerScore(name, compute_success_rate(sum(right.values()), len(questions)), by_removals)
+        found = f"no line for episode {missing[0]}"
+        raise EvaluationError(what, where=name, expected="one line per question", found=found, fix=fix)
+    if unknown := sorted(answers.keys() - episodes):
+        what = "answer to an unknown question"
+        raise EvaluationError(what, where=name, expected="episodes of the questions", found=f"episode {unknown[0]}")
+    is_correct = {question.episode: answers[question.episode] in question.answers for question in questions}
+    groups: dict[int, list[bool]] = {}
+    for question in sorted(questions, key=lambda question: question.removals):
+        groups.setdefault(question.removals, []).append(is_correct[question.episode])
+    by_removals = {removals: compute_success_rate(sum(group), len(group)) for removals, group in groups.items()}
+    return AnswerScore(name, compute_success_rate(sum(is_correct.values()), len(questions)), by_removals)
 
 
 def score_rules(questions: Sequence[RemovalQuestion]) -> list[AnswerScore]:
-    """Score the answers of all `RULES`."""
+    """Score the answers of all `RULES`; a rule that has no answer to any question is left out."""
+    answers = {name: {question.episode: rule(question) for question in questions} for name, rule in RULES.items()}
     return [
-        score_answers(name, questions, {question.id: rule(question) for question in questions})
-        for name, rule in RULES.items()
+        score_answers(name, questions, numbers)
+        for name, numbers in answers.items()
+        if any(number is not None for number in numbers.values())
     ]
 
 
@@ -70,31 +95,33 @@ def compute_chance(questions: Sequence[RemovalQuestion]) -> float:
     return sum(len(question.answers) / len(question.objects) for question in questions) / len(questions)
 
 
-def make_answers(questions: Sequence[RemovalQuestion], outcomes: Iterable[Outcome]) -> list[Answer]:
-    """Return the answers of a policy that was evaluated in the scenes: the object that it moved first.
+def make_answers(questions: Sequence[RemovalQuestion], outcomes: Mapping[int, Outcome]) -> list[Answer]:
+    """Return the answers of a policy that was evaluated on the protocol: the object that it moved first.
 
-    There is no answer if the policy moved no object before it held the target, or an object without a number.
+    There is no answer if the policy moved no object before it held the target, several objects at the same step, or an
+    object without a number, or if an error ended the episode.
 
     Args:
-        questions: questions with different seeds.
-        outcomes: outcomes of episodes of search; those of other scenes are ignored.
+        questions: questions about the scenes of the protocol.
+        outcomes: outcomes of its episodes, by number of the episode.
 
     Raises:
-        EvaluationError: a question has no episode.
+        EvaluationError: a question has no outcome.
     """
-    first = {
-        outcome.seed: outcome.retrieval.moved[0].object if outcome.retrieval.moved else ""
-        for outcome in outcomes
-        if outcome.retrieval is not None
-    }
-    if missing := [question.seed for question in questions if question.seed not in first]:
-        what, found = f"{len(missing)} of {len(questions)} questions have no episode", f"none with seed {missing[0]}"
-        raise EvaluationError(what, expected="an episode of search in each scene", found=found)
-    numbers = {question.id: {one.asset: one.number for one in question.objects} for question in questions}
-    return [Answer(question.id, numbers[question.id].get(first[question.seed])) for question in questions]
+    if missing := [question.episode for question in questions if question.episode not in outcomes]:
+        what, found = f"{len(missing)} of {len(questions)} questions have no episode", f"no episode {missing[0]}"
+        raise EvaluationError(what, expected="an outcome of each scene", found=found)
+    return [Answer(question.episode, _find_first_move(question, outcomes[question.episode])) for question in questions]
 
 
-def read_answers(path: Path) -> dict[str, int | None]:
+def _find_first_move(question: RemovalQuestion, outcome: Outcome) -> int | None:
+    moved = outcome.retrieval.moved if outcome.retrieval is not None else []
+    first = [move.object for move in moved if move.step == moved[0].step]
+    numbers = [numbered.number for numbered in question.objects if numbered.asset in first]
+    return numbers[0] if len(first) == len(numbers) == 1 else None
+
+
+def read_answers(path: Path) -> dict[int, int | None]:
     """Read a JSON Lines file with one `Answer` per line.
 
     Raises:
@@ -103,13 +130,14 @@ def read_answers(path: Path) -> dict[str, int | None]:
     file = JsonLinesFile[Answer](path, Answer)
     lines = file.read_lines()
     if not lines:
-        expected = 'a file with lines such as {"id": "search_large-290001", "answer": 3}'
+        expected = 'a file with lines such as {"episode": 12, "answer": 3}'
         raise EvaluationError("no answers", where=path, expected=expected, usage=True)
-    found: dict[str, int | None] = {}
+    answers: dict[int, int | None] = {}
     for line in lines:
         if line.record is None:
             raise file.make_line_error(line, EvaluationError, "damaged answer")
-        if line.record.id in found:
-            raise EvaluationError("two answers to one question", where=f"{path}:{line.number}", found=line.record.id)
-        found[line.record.id] = line.record.answer
-    return found
+        if line.record.episode in answers:
+            where, found = f"{path}:{line.number}", f"episode {line.record.episode}"
+            raise EvaluationError("two answers to one question", where=where, found=found)
+        answers[line.record.episode] = line.record.answer
+    return answers

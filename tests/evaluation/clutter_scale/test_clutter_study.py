@@ -14,9 +14,10 @@ from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.demos.difficulty.records import SceneDifficulty
 from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
-from robocas_ms3.evaluation.clutter_scale.study import DIFFICULTIES, make_study, read_difficulties_of
+from robocas_ms3.evaluation.clutter_scale.study import make_study
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.results import read_result
+from robocas_ms3.evaluation.scene_difficulties import DIFFICULTIES, read_difficulties_of
 
 ABILITIES = {"weak": 0.5, "middle": 1.5, "strong": 2.5}  # removals at which the policy succeeds half of the time
 

@@ -9,12 +9,13 @@ import pytest
 pytest.importorskip("pyarrow")
 pytest.importorskip("av")
 
+import numpy as np
 import pyarrow.parquet as pq
 from question_examples import make_question, write_folder
 
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
+from robocas_ms3.datasets.images.image_files import write_image
 from robocas_ms3.evaluation.removal_questions.lerobot_dataset import write_lerobot
-from robocas_ms3.evaluation.removal_questions.question_files import read_question_set
 
 KEY = "observation.images.question_camera"
 
@@ -22,7 +23,7 @@ KEY = "observation.images.question_camera"
 def test_dataset_has_one_frame_with_image_question_and_answer_per_question(tmp_path):
     questions = [make_question(1, [2]), make_question(2, [1, 3]), make_question(3, [4])]
     folder = write_folder(tmp_path / "set", questions)
-    write_lerobot(read_question_set(folder), tmp_path / "lerobot")
+    write_lerobot(questions, folder, tmp_path / "lerobot")
     info = json.loads((tmp_path / "lerobot/meta/info.json").read_text())
     assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (3, 3, 2)
     assert info["features"][KEY]["dtype"] == "image"
@@ -43,19 +44,25 @@ def test_dataset_has_one_frame_with_image_question_and_answer_per_question(tmp_p
 
 
 def test_missing_image_leaves_no_dataset(tmp_path):
-    folder = write_folder(tmp_path / "set", [make_question(1, [2])], images=False)
+    questions = [make_question(1, [2]), make_question(2, [1])]
+    folder = write_folder(tmp_path / "set", questions)
+    (folder / questions[1].image).unlink()
     with pytest.raises(EvaluationError):
-        write_lerobot(read_question_set(folder), tmp_path / "lerobot")
+        write_lerobot(questions, folder, tmp_path / "lerobot")
+    write_image(folder / questions[1].image, np.zeros((9, 9, 3), np.uint8))  # another size
+    with pytest.raises(EvaluationError):
+        write_lerobot(questions, folder, tmp_path / "lerobot")
     assert not (tmp_path / "lerobot").exists()
 
 
 def test_existing_folder_is_replaced_only_if_it_is_a_dataset(tmp_path):
-    folder = read_question_set(write_folder(tmp_path / "set", [make_question(1, [2])]))
-    write_lerobot(folder, tmp_path / "lerobot")
+    questions = [make_question(1, [2])]
+    folder = write_folder(tmp_path / "set", questions)
+    write_lerobot(questions, folder, tmp_path / "lerobot")
     with pytest.raises(OutputExistsError):
-        write_lerobot(folder, tmp_path / "lerobot")
-    write_lerobot(folder, tmp_path / "lerobot", overwrite=True)
+        write_lerobot(questions, folder, tmp_path / "lerobot")
+    write_lerobot(questions, folder, tmp_path / "lerobot", overwrite=True)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/file").write_text("")
     with pytest.raises(OutputExistsError):
-        write_lerobot(folder, tmp_path / "mine", overwrite=True)
+        write_lerobot(questions, folder, tmp_path / "mine", overwrite=True)

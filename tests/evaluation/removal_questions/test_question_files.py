@@ -1,9 +1,11 @@
-"""Sets of questions: reading, making, rendering, and continuing after an interruption."""
+"""Questions: reading, making, rendering again, and continuing after an interruption."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+import shutil
+from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,112 +14,127 @@ from question_examples import make_question, write_folder
 from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.datasets.images.image_files import read_image
-from robocas_ms3.demos.difficulty.difficulty_file import OUTPUT, SCENES
 from robocas_ms3.demos.difficulty.records import SceneDifficulty
-from robocas_ms3.evaluation.removal_questions.question_files import (
-    bundled_question_sets,
-    make_questions,
-    read_question_set,
-    render_questions,
-)
+from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.removal_questions.question_files import QUESTIONS, make_questions, read_questions
 from robocas_ms3.evaluation.removal_questions.question_renderer import SIZE
-from robocas_ms3.scenes.config import load_task_config
+from robocas_ms3.evaluation.scene_difficulties import DIFFICULTIES
 
-SEEDS = [985500, 985501]
+PICK, OTHER_PICK = 0, 1  # episodes of the protocol smoke
 
 
 def test_questions_are_read_as_they_were_written(tmp_path):
     questions = [make_question(1, [2]), make_question(2, [1, 3], removals=2)]
-    found = read_question_set(write_folder(tmp_path / "set", questions))
-    assert found.questions == questions
-    assert found.scenes["heap"].config == "search_table_stacked"
-    assert found.find_image(questions[0]).is_file()
+    assert read_questions(write_folder(tmp_path / "set", questions)) == questions
 
 
 @pytest.mark.parametrize(
-    "change",
+    "changes",
     [
-        lambda folder: (folder / "questions.json").unlink(),
-        lambda folder: (folder / "questions.json").write_text('{"scenes": {"heap": {"task": 3}}}'),
-        lambda folder: (folder / "questions.jsonl").write_text('{"id": "heap-1"}\n'),
-        lambda folder: (folder / "questions.jsonl").write_text(2 * (folder / "questions.jsonl").read_text()),
-        lambda folder: (folder / "questions.jsonl").unlink(),
+        {"answers": [2, 2]},
+        {"answers": []},
+        {"answers": [5]},
+        {"answers": [1, 2, 3, 4]},  # all are correct
+        {"answers": [3, 1]},
+        {"highest": 5},
+        {"scripted": 0},
+        {"objects": []},
+        {"image": "../secret.png"},
+        {"image": "images/000002.png"},  # of another episode
+        {"removals": 0},
+        {"episode": -1},
     ],
+    ids=str,
 )
-def test_damaged_sets_are_errors(tmp_path, change):
-    folder = write_folder(tmp_path / "set", [make_question(1, [2])])
-    change(folder)
+def test_inconsistent_questions_are_errors(tmp_path, changes):
+    folder = write_folder(tmp_path / "set", [make_question(1, [2])], images=False)
+    line = asdict(make_question(1, [2])) | changes
+    (folder / QUESTIONS).write_text(json.dumps(line) + "\n")
+    with pytest.raises(EvaluationError, match=f"{QUESTIONS}:1"):
+        read_questions(folder)
+
+
+def test_missing_files_and_repeated_questions_are_errors(tmp_path):
     with pytest.raises(EvaluationError):
-        read_question_set(folder)
-
-
-def test_path_of_an_image_is_not_taken_from_the_file(tmp_path):
-    """A file may not choose which file is read."""
-    (tmp_path / "secret.png").write_bytes(b"")
-    question = replace(make_question(1, [2]), image="../secret.png")
+        read_questions(tmp_path)
     with pytest.raises(EvaluationError):
-        read_question_set(write_folder(tmp_path / "set", [question], images=False)).find_image(question)
+        read_questions("smoke")  # a protocol without questions
+    folder = write_folder(tmp_path / "set", 2 * [make_question(1, [2])], images=False)
+    with pytest.raises(EvaluationError, match="episode 1"):
+        read_questions(folder)
 
 
-@pytest.mark.parametrize("name", sorted(bundled_question_sets()))
-def test_bundled_questions_are_consistent(name):
-    found = read_question_set(name)
-    for question in found.questions:
-        numbers = [one.number for one in question.objects]
-        assert numbers == list(range(1, len(numbers) + 1))
-        assert set(question.answers) < set(numbers)
-        assert {question.highest, question.scripted} <= {*numbers, None}
-        assert question.id == f"{question.id.rpartition('-')[0]}-{question.seed}"
-        assert question.id.rpartition("-")[0] in found.scenes
-        assert all(
-            0 <= one.box[0] <= one.box[2] < SIZE[0] and 0 <= one.box[1] <= one.box[3] < SIZE[1]
-            for one in question.objects
-        )
+@pytest.mark.parametrize("name", [name for name, path in bundled_protocols().items() if (path / QUESTIONS).is_file()])
+def test_bundled_questions_fit_their_protocol(name):
+    protocol = load_protocol(name)
+    for question in read_questions(name):
+        episode = protocol.episodes[question.episode]
+        assert episode.instruction == question.instruction
+        assert episode.target not in {numbered.asset for numbered in question.objects}
+        for x_min, y_min, x_max, y_max in (numbered.box for numbered in question.objects):
+            assert 0 <= x_min <= x_max < SIZE[0] and 0 <= y_min <= y_max < SIZE[1]
 
 
-def write_difficulties(folder, scenes):
-    config = load_task_config("pick_table_scattered", set_options=["objects.count=5"]).model_dump(mode="json")
-    folder.mkdir()
-    record = {"task": "pick", "config": config, "pack": "builtin", "limits": {"max_removals": 1, "max_simulated": 4}}
-    (folder / OUTPUT.records[0]).write_text(json.dumps(record))
-    JsonLinesFile(folder / SCENES, SceneDifficulty).rewrite(scenes)
+def make_scene(episode, removals: int, first: list[int], **values: object) -> SceneDifficulty:
+    scene = SceneDifficulty(episode.seed, episode.target, 5, 1.0, 0, 1, 0, 0.1, removals, first, None, 1, True)
+    return replace(scene, **values)
+
+
+@pytest.fixture
+def protocol(tmp_path: Path) -> Path:
+    """A copy of smoke: each object first, an incomplete search, slots 0 and 1 first, and nothing to remove."""
+    folder = tmp_path / "mine"
+    shutil.copytree(bundled_protocols()["smoke"], folder)
+    episodes = load_protocol(folder).episodes
+    scenes = [make_scene(episode, 0, []) for episode in episodes]
+    scenes[PICK] = make_scene(episodes[PICK], 2, [0, 1])
+    scenes[OTHER_PICK] = make_scene(episodes[OTHER_PICK], 1, list(range(20)))
+    scenes[4] = make_scene(episodes[4], 1, [0, 1], complete=False)
+    JsonLinesFile(folder / DIFFICULTIES, SceneDifficulty).rewrite(scenes)
     return folder
 
 
-def make_scene(seed: int, removals: int, first: list[int]) -> SceneDifficulty:
-    return SceneDifficulty(seed, "mug", 5, 1.0, 0, 1, 0, 0.1, removals, first, None, 1, True)
+def test_questions_need_difficulties_or_questions(tmp_path):
+    with pytest.raises(EvaluationError, match=DIFFICULTIES):
+        make_questions(load_protocol("smoke"), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("question", [make_question(99, [1]), make_question(0, [1])])
+def test_questions_of_another_protocol_are_errors(protocol, tmp_path, question):
+    JsonLinesFile(protocol / QUESTIONS, type(question)).rewrite([question])
+    with pytest.raises(EvaluationError, match="does not fit"):
+        make_questions(load_protocol(protocol), tmp_path / "out")
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("needs_renderer")
-def test_questions_are_made_rendered_again_and_continued(tmp_path):
-    scenes = [make_scene(SEEDS[0], 1, [0, 1, 2, 3, 4]), make_scene(SEEDS[1], 2, [0, 1]), make_scene(7, 0, [])]
-    source = write_difficulties(tmp_path / "table", scenes)
-    calls: list[tuple[int, int]] = []
-    out = tmp_path / "questions"
-    make_questions([source], out, on_scenes=lambda *counts: calls.append(counts))
-    assert calls[0] == (0, 2)  # a scene without removals is not rendered
-    found = read_question_set(out)
-    (question,) = found.questions  # none about the first scene, where each number is right
-    assert question.seed == SEEDS[1]
-    slots = {one.number: one.slot for one in question.objects}
-    assert len(slots) == 4  # five objects without the target
+def test_questions_are_made_continued_and_rendered_again(protocol, tmp_path):
+    loaded, out, calls = load_protocol(protocol), tmp_path / "questions", list[tuple[int, int]]()
+    (question,) = make_questions(loaded, out, on_scenes=lambda *counts: calls.append(counts))
+    assert calls == [(0, 3), (1, 3), (2, 3), (3, 3)]  # scenes without removals are not rendered
+    assert (question.episode, question.removals) == (PICK, 2)
+    assert question.instruction == loaded.episodes[PICK].instruction
+    slots = {numbered.number: numbered.slot for numbered in question.objects}
     assert {slots[number] for number in question.answers} == {0, 1} & set(slots.values())
-    assert question.removals == 2
-    assert "images/" + found.find_image(question).name == question.image
-    image = read_image(found.find_image(question))
+    assert loaded.episodes[PICK].target not in {numbered.asset for numbered in question.objects}
+    image = read_image(out / question.image)
     assert image.shape == (SIZE[1], SIZE[0], 3)
+    assert [path.name for path in (out / "images").iterdir()] == ["000000.png"]
 
-    assert make_questions([source], out, on_scenes=lambda *counts: calls.append(counts)) == 1
-    assert calls[-1] == (2, 2)  # nothing is rendered again
+    (out / "rendered.jsonl").write_text("1\n")  # as if the process had been killed after it wrote the question
+    assert make_questions(loaded, out, on_scenes=lambda *counts: calls.append(counts)) == [question]
+    assert calls[4] == (1, 3)
+    assert read_questions(out) == [question]
+
+    JsonLinesFile(protocol / QUESTIONS, type(question)).rewrite([question])
     with pytest.raises(OutputExistsError):
-        make_questions([write_difficulties(tmp_path / "other", scenes)], out)
+        make_questions(loaded, out)  # they may differ from those in the folder
+    assert make_questions(loaded, tmp_path / "again") == [question]
+    assert np.array_equal(read_image(tmp_path / "again" / question.image), image)
 
-    again = tmp_path / "again"
-    render_questions(found, again)
-    assert np.array_equal(read_image(again / question.image), image)
-    assert read_question_set(again).questions == found.questions
-
-    changed = replace(found, questions=[replace(question, instruction="another task")])
-    with pytest.raises(EvaluationError):
-        render_questions(changed, tmp_path / "changed")
+    other = replace(question, objects=[replace(question.objects[0], asset="mug"), *question.objects[1:]])
+    JsonLinesFile(protocol / QUESTIONS, type(question)).rewrite([other])
+    with pytest.raises(EvaluationError, match="slot"):
+        make_questions(loaded, tmp_path / "other")
