@@ -8,11 +8,10 @@ related values (``forgeries``). Each changed copy goes through the checks of `ro
 `robocas eval audit`, which replays three episodes.
 
 JSON keys:
-  unchanged        by policy, the check that finds something in the unchanged result; null: none
   found            number of changes by the check that finds them
   fields, forgeries
     change         changed value, or name of the forgery
-    found_by       read: the file is refused; verify; audit; null: no check
+    found_by       read: the file is refused; verify; audit; none: no check
     message        first message
 """
 
@@ -234,7 +233,7 @@ def halve_the_rate(copy: ResultCopy) -> None:
     copy.change_run(policy=policy)
 
 
-def hide_an_error(copy: ResultCopy) -> None:
+def add_an_error(copy: ResultCopy) -> None:
     copy.change(PICK, error="the worker crashed")
 
 
@@ -269,7 +268,7 @@ FORGERIES: dict[str, tuple[str, Forgery]] = {
     "missing states": ("scripted-ee-delta", leave_out_states),
     "more steps than allowed": ("scripted-ee-delta", add_steps),
     "half the rate": ("scripted-ee-delta", halve_the_rate),
-    "error in a successful episode": ("scripted-ee-delta", hide_an_error),
+    "error in a successful episode": ("scripted-ee-delta", add_an_error),
     "another protocol": ("scripted-ee-delta", lambda copy: copy.change_run(protocol_hash="ef" * 32)),
     "another object pack": ("scripted-ee-delta", lambda copy: copy.change_run(pack_hashes={"builtin": "ef" * 32})),
     "weld": ("scripted-ee-delta", lambda copy: copy.change_run(weld=True)),
@@ -281,45 +280,54 @@ FORGERIES: dict[str, tuple[str, Forgery]] = {
 
 def main(cfg: Benchmark) -> None:
     """Run the benchmark."""
-    protocol, sources = load_protocol(PROTOCOL), {}
-    for policy in ("scripted-ee-delta", "noop"):
-        sources[policy] = cfg.work / policy
-        with open_policy(policy) as opened:
-            settings = EvaluationSettings((), policy, PROTOCOL, sources[policy], envs=1, backend="processes")
-            for outcome in EvaluationSession(opened, settings).run():
-                print(policy, outcome.episode, outcome.task, outcome.success, file=sys.stderr)
+    sources = {policy: evaluate(policy, cfg.work / policy) for policy in ("scripted-ee-delta", "noop")}
+    true_result, failed_result = sources.values()
+    if not (read_result(true_result).outcomes[PICK].success and read_result(true_result).outcomes[SEARCH].retrieval):
+        raise SystemExit("error: the forgeries need a success in pick, and a retrieval order in search")
 
-    def check(name: str, copy: ResultCopy) -> dict[str, Any]:
-        try:
-            result = read_result(copy.folder)
-            if violations := find_violations(result, protocol):
-                return {"change": name, "found_by": "verify", "message": violations[0]}
-            if obstacle := find_audit_obstacle(result):
-                return {"change": name, "found_by": "audit", "message": obstacle}
-            audited = run_audit(result, protocol, cfg.work / "audit", stored=REPLAYED, envs=1, overwrite=True)
-            differences = [f"episode {one.episode}: {text}" for one in audited for text in one.differences]
-        except RobocasError as error:
-            return {"change": name, "found_by": "read", "message": one_line(error)}
-        return {"change": name, "found_by": "audit" if differences else None, "message": (differences or [""])[0]}
+    def check_change(source: Path, name: str, change: Forgery) -> dict[str, str]:
+        copy = ResultCopy(source, cfg.work / "changed", failed_result)
+        change(copy)
+        found_by, message = check_result(copy.folder, cfg.work / "audit")
+        print(name, found_by, sep=": ", file=sys.stderr)
+        return {"change": name, "found_by": found_by, "message": message}
 
-    changed = cfg.work / "changed"
-    fields = []
-    for name, apply in list_field_changes(sources["scripted-ee-delta"]):
-        copy = ResultCopy(sources["scripted-ee-delta"], changed, sources["noop"])
-        apply(copy)
-        fields.append(check(name, copy))
-    forgeries = []
-    for name, (policy, forge) in FORGERIES.items():
-        copy = ResultCopy(sources[policy], changed, sources["noop"])
-        forge(copy)
-        forgeries.append(check(name, copy))
-    unchanged = {
-        policy: check(policy, ResultCopy(source, changed, source))["found_by"] for policy, source in sources.items()
-    }
+    for policy, source in sources.items():
+        unchanged = check_change(source, f"unchanged result of {policy}", lambda copy: None)
+        if unchanged["found_by"] != "none":
+            raise SystemExit(f"error: {unchanged}")
+    fields = [check_change(true_result, name, change) for name, change in list_field_changes(true_result)]
+    forgeries = [check_change(sources[policy], name, forge) for name, (policy, forge) in FORGERIES.items()]
     found = {
-        kind: Counter(str(one["found_by"]) for one in of) for kind, of in (("fields", fields), ("forgeries", forgeries))
+        kind: Counter(change["found_by"] for change in changes)
+        for kind, changes in (("fields", fields), ("forgeries", forgeries))
     }
-    print(json.dumps({"unchanged": unchanged, "found": found, "fields": fields, "forgeries": forgeries}, indent=1))
+    print(json.dumps({"found": found, "fields": fields, "forgeries": forgeries}, indent=1))
+
+
+def evaluate(policy: str, out: Path) -> Path:
+    """Evaluate a policy on the protocol; return the folder of the result."""
+    with open_policy(policy) as opened:
+        settings = EvaluationSettings((), policy, PROTOCOL, out, envs=1, backend="processes")
+        for outcome in EvaluationSession(opened, settings).run():
+            print(policy, outcome.episode, outcome.task, outcome.success, file=sys.stderr)
+    return out
+
+
+def check_result(folder: Path, audit: Path) -> tuple[str, str]:
+    """Return the check that finds something in a result, and its first message; ``none`` and an empty message: none."""
+    protocol = load_protocol(PROTOCOL)
+    try:
+        result = read_result(folder)
+        if violations := find_violations(result, protocol):
+            return "verify", violations[0]
+        if obstacle := find_audit_obstacle(result):
+            return "audit", obstacle
+        audited = run_audit(result, protocol, audit, stored=REPLAYED, envs=1, overwrite=True)
+        differences = [f"episode {one.episode}: {text}" for one in audited for text in one.differences]
+    except RobocasError as error:
+        return "read", one_line(error)
+    return ("audit", differences[0]) if differences else ("none", "")
 
 
 def list_field_changes(source: Path) -> Iterator[tuple[str, Forgery]]:
@@ -359,7 +367,7 @@ def list_values(values: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, 
 
 
 def change_value(values: Any, path: tuple[Any, ...]) -> None:
-    """Change the value with these keys to another value of the same type."""
+    """Change the value with these keys to another value, where possible of the same type."""
     for key in path[:-1]:
         values = values[key]
     value = values[path[-1]]

@@ -1,4 +1,4 @@
-"""``robocas eval report | merge | compare | verify | videos | leaderboard``: read and check results of evaluations."""
+"""``robocas eval report | merge | compare | verify | videos | table``: read and check results of evaluations."""
 
 from __future__ import annotations
 
@@ -164,7 +164,14 @@ def table(cfg: WriteTable) -> int:
         row for one in read_evaluations(cfg.folders) for row in make_rows(one, _find_protocol(one, cfg.protocol))
     ]
     if cfg.update and cfg.out.exists():
-        measured = replace_rows(read_leaderboard(cfg.out).rows, measured)
+        earlier = read_leaderboard(cfg.out).rows
+        if any(row.audited for row in earlier):
+            what, fix = (
+                "this leaderboard has only audited results",
+                "Choose another file, or use robocas leaderboard add.",
+            )
+            raise EvaluationError(what, where=cfg.out, fix=fix)
+        measured = replace_rows(earlier, measured)
     rows = sort_rows([*measured, *read_published_rows()])
     text, page = render_leaderboard(rows), cfg.out.with_suffix(".md")
     write_leaderboard(cfg.out, Leaderboard(rows=rows))

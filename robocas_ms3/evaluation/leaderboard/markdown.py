@@ -40,8 +40,10 @@ PUBLISHED_NOTE = (
 def render_leaderboard(rows: Sequence[LeaderboardRow]) -> str:
     """Return rows as Markdown: one table per protocol and its hash, and one table of published results."""
     lines, protocols = [NOTE], dict[tuple[str, str], list[LeaderboardRow]]()
-    is_audited = any(row.audited for row in rows)
-    lines += ["", RANK_NOTE if is_audited else NOT_AUDITED_NOTE]
+    if any(row.rank is not None for row in rows):
+        lines += ["", RANK_NOTE]
+    if any(not row.published and not row.audited for row in rows):
+        lines += ["", NOT_AUDITED_NOTE]
     for row in rows:
         if not row.published:
             protocols.setdefault((row.protocol, row.protocol_hash), []).append(row)

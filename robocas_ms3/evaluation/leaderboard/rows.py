@@ -114,14 +114,14 @@ class LeaderboardRow(StrictModel):
 
 
 class Leaderboard(StrictModel):
-    """Content of a leaderboard file.
+    """Content of a file with rows: a leaderboard, or a table of results that are not audited.
 
     Attributes:
         kind: constant that identifies the file.
         rows: the rows, sorted by `sort_rows`.
     """
 
-    kind: Literal["robocas leaderboard"] = "robocas leaderboard"
+    kind: Literal["robocas results"] = "robocas results"
     rows: list[LeaderboardRow]
 
 
@@ -174,12 +174,12 @@ def replace_rows(rows: Iterable[LeaderboardRow], new: Sequence[LeaderboardRow]) 
 
 
 def read_leaderboard(path: Path) -> Leaderboard:
-    """Read a leaderboard file; raise `EvaluationError` if it cannot be read or is invalid."""
+    """Read a file with rows; raise `EvaluationError` if it cannot be read or is invalid."""
     try:
         content = read_bytes(path, JSON_LIMIT)
     except (OSError, ValueError) as error:
-        raise EvaluationError("cannot read the leaderboard", where=path, found=error) from error
-    return parse_json(Leaderboard, content, EvaluationError, where=path, about="invalid leaderboard")
+        raise EvaluationError("cannot read the rows of results", where=path, found=error) from error
+    return parse_json(Leaderboard, content, EvaluationError, where=path, about="invalid rows of results")
 
 
 def read_published_rows() -> list[LeaderboardRow]:
@@ -188,7 +188,7 @@ def read_published_rows() -> list[LeaderboardRow]:
 
 
 def write_leaderboard(path: Path, leaderboard: Leaderboard) -> None:
-    """Write a leaderboard file; an existing leaderboard is replaced.
+    """Write a file with rows; an existing file with rows is replaced.
 
     Raises:
         OutputExistsError: the path has another file.
@@ -197,6 +197,6 @@ def write_leaderboard(path: Path, leaderboard: Leaderboard) -> None:
         try:
             read_leaderboard(path)
         except EvaluationError as error:
-            what, fix = "the output exists and is no leaderboard", "Choose another path."
+            what, fix = "the output exists and has no rows of results", "Choose another path."
             raise OutputExistsError(what, where=path, found=error, fix=fix) from error
     write_json(path, leaderboard.model_dump(mode="json"))

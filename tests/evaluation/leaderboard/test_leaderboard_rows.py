@@ -80,7 +80,7 @@ def test_a_row_with_fewer_episodes_replaces_none():
 )
 def test_invalid_rows_are_refused(tmp_path, values):
     path = tmp_path / "rows.json"
-    path.write_text(json.dumps({"kind": "robocas leaderboard", "rows": [make_row().model_dump() | values]}))
+    path.write_text(json.dumps({"kind": "robocas results", "rows": [make_row().model_dump() | values]}))
     with pytest.raises(EvaluationError) as error:
         read_leaderboard(path)
     assert str(error.value.where).startswith(str(path))

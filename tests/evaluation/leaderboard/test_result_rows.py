@@ -7,7 +7,7 @@ from robocas_ms3.cli.eval_results import WriteTable, table
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.leaderboard.markdown import render_leaderboard
 from robocas_ms3.evaluation.leaderboard.result_rows import make_rows
-from robocas_ms3.evaluation.leaderboard.rows import Training, read_leaderboard
+from robocas_ms3.evaluation.leaderboard.rows import Leaderboard, Training, read_leaderboard, write_leaderboard
 from robocas_ms3.evaluation.protocol import load_protocol
 
 TRAINED = {
@@ -141,3 +141,17 @@ def test_command_writes_rows_of_all_results_and_the_published_ones(tmp_path, cap
         table(WriteTable((tmp_path / "a",), out=tmp_path / "board.txt"))
     with pytest.raises(EvaluationError):
         table(WriteTable((), out=out))
+
+
+def test_results_that_are_not_audited_are_marked_and_not_added_to_a_leaderboard(tmp_path):
+    (row,) = make_rows(write(tmp_path / "a", [outcome(0)]))
+    assert "not audited" in render_leaderboard([row])
+    audited = row.model_copy(update={"audited": 1, "rank": 1})
+    assert "not audited" not in render_leaderboard([audited])
+    assert "not audited" in render_leaderboard([audited, row])
+    out = tmp_path / "rows.json"
+    write_leaderboard(out, Leaderboard(rows=[audited]))
+    before = out.read_bytes()
+    with pytest.raises(EvaluationError):
+        table(WriteTable((tmp_path / "a",), out=out, update=True))
+    assert out.read_bytes() == before
