@@ -144,7 +144,7 @@ def test_a_policy_is_evaluated_on_all_protocols(tmp_path):
     rows = [call for call in calls if call[1] == "table"]
     evaluations = check_shards([call for call in calls if call not in rows])
     played = [call[call.index("--protocol") + 1] for call in evaluations]
-    assert sorted(played) == sorted(set(bundled_protocols()) - {"smoke"})
+    assert sorted(played) == sorted(set(bundled_protocols()) - {"smoke", "clutter-scale-v1"})
     assert [call[2] for call in rows] == [str(tmp_path / "out" / "runs_mine" / name) for name in played]
     assert all("--update" in call and call[-1] == settings["TABLE"] for call in rows)
     assert run_with_stub(tmp_path, "evaluate_protocols.sh")[0].returncode == 2
@@ -164,6 +164,22 @@ def test_the_runs_of_a_baseline_are_evaluated_in_their_tasks(tmp_path):
     paper = [("pick", pick, "paper-v1"), ("select", select, "paper-v1")]  # select has the episodes of pick there
     assert played == [*paper, ("pick", pick, "furniture-v1")]
     assert len(calls) == 3 * 4  # two shards, their merge, and the rows
+
+
+def test_policies_are_placed_on_the_clutter_scale_with_those_evaluated_earlier(tmp_path):
+    out = tmp_path / "out"
+    (out / "earlier").mkdir(parents=True)
+    (out / "earlier" / "run.json").touch()
+    entries = ("scripted-ee-delta:20:8", "runs/mine")
+    done, calls = run_with_stub(tmp_path, "evaluate_clutter_scale.sh", *entries, OUT=str(out), EPISODES="5")
+    assert done.returncode == 0, done.stderr
+    for call in calls:
+        cli.parse(call)
+    noisy, own = check_shards(calls[:-1])
+    assert noisy[noisy.index("--action-noise") :][:3] == ["--action-noise", "20", "8"]
+    assert "--action-noise" not in own and own[own.index("--policy") + 1] == "runs/mine"
+    assert {call[call.index("--protocol") + 1] for call in (noisy, own)} == {"clutter-scale-v1"}
+    assert calls[-1][1:] == ["clutter-scale", str(out / "earlier"), "--out", str(out / "scale")]
 
 
 def test_an_evaluation_with_a_failed_shard_is_not_merged(tmp_path):
