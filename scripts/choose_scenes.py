@@ -1,6 +1,6 @@
 """Measure the difficulty of many scenes, and choose scenes for a protocol that are evenly spread over the difficulty.
 
-    python scripts/choose_clutter_scale.py scripts/clutter_scale_candidates.yaml --scenes 300 --out difficulty/scale
+    python scripts/choose_scenes.py scripts/clutter_scale_candidates.yaml --scenes 300 --out difficulty/scale
 
 SOURCE is a protocol source (docs/evaluation.md). ``count`` and ``first_seed`` of each part are those of the measured
 scenes. The script writes OUT/NAME with the difficulties of each part, OUT/source.yaml with the chosen seeds, and
@@ -42,6 +42,8 @@ class Options:
     """Output folder."""
     scenes: int = 300
     """Number of scenes to choose."""
+    min_removals: int = 0
+    """Smallest number of removals of the chosen scenes; 1 for questions about the order of removals."""
     jobs: int = os.cpu_count() or 1
     """Number of processes."""
 
@@ -53,7 +55,8 @@ def main(options: Options) -> None:
         task = part.load_config().task
         for scene in measure_part(part, options):
             removals = MOST_REMOVALS if scene.removals is None else min(scene.removals, MOST_REMOVALS)
-            groups[task, removals].append((part.file_stem, scene))
+            if removals >= options.min_removals:
+                groups[task, removals].append((part.file_stem, scene))
     chosen = choose_evenly(groups, options.scenes)
     order = {part.file_stem: number for number, part in enumerate(source.parts)}
     chosen.sort(key=lambda one: (order[one[0]], one[1].seed))

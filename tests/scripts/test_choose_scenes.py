@@ -1,0 +1,48 @@
+"""Choice of scenes that are evenly spread over the difficulty."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from robocas_ms3.demos.difficulty.records import SceneDifficulty
+
+SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "choose_scenes.py"
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("choose_scenes", SCRIPT)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def make_scene(seed: int, visible: float) -> tuple[str, SceneDifficulty]:
+    return "part", SceneDifficulty(seed, "mug", 5, visible, 0, 1, 0, 0.1, 0, [], None, 0, True)
+
+
+def test_groups_get_equal_numbers_and_small_groups_all_their_scenes(script):
+    groups = {
+        ("pick", 0): [make_scene(seed, seed / 100) for seed in range(50)],
+        ("pick", 1): [make_scene(seed, seed / 100) for seed in range(50, 53)],
+        ("search", 0): [make_scene(seed, seed / 100) for seed in range(60, 100)],
+    }
+    chosen = [scene.seed for _, scene in script.choose_evenly(groups, 23)]
+    assert len(chosen) == len(set(chosen)) == 23
+    assert [sum(first <= seed < end for seed in chosen) for first, end in ((0, 50), (50, 53), (60, 100))] == [10, 3, 10]
+
+
+def test_scenes_of_a_group_are_spread_over_the_visible_fraction(script):
+    scenes = [make_scene(seed, (7 * seed % 41) / 40) for seed in range(41)]
+    visible = sorted(scene.visible_fraction for _, scene in script.choose_evenly({("pick", 0): scenes}, 5))
+    assert visible == [0, 0.25, 0.5, 0.75, 1]
+
+
+def test_more_scenes_than_there_are_means_all(script):
+    scenes = [make_scene(seed, 0.5) for seed in range(3)]
+    assert len(script.choose_evenly({("pick", 0): scenes}, 10)) == 3
