@@ -17,6 +17,10 @@ DESCRIPTIONS = {
         "Cameras with a random pose error of 3 to 5 cm and degrees per axis (near), or 6 to 10 (far). "
         "Training: 0 to 2 cm and degrees."
     ),
+    "clutter-scale-v1": (
+        "Pick and search in scenes from trivial to hard, evenly spread over the number of objects that have to be "
+        "removed first. robocas eval clutter-scale places policies on a scale of the difficulty."
+    ),
     "clutter-v1": (
         "More objects, closer together (pick: 13, search: 12 in a heap). "
         "Training: 6 objects, in pick at least 3 cm apart."

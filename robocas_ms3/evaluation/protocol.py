@@ -8,7 +8,8 @@
     layouts/NAME.npy         scene layouts of the episodes of a configuration (`scenes.layout_table.FrozenLayouts`)
     train/NAME.yaml          configurations for training, without the conditions that the protocol holds out
 
-The hash of a protocol covers all these files, so results with equal hashes are comparable.
+The hash of a protocol covers all these files, so results with equal hashes are comparable. It does not cover what is
+derived from the scenes: ``difficulty.jsonl`` (`scene_difficulties`) and ``questions.jsonl`` (`removal_questions`).
 """
 
 from __future__ import annotations
