@@ -81,13 +81,19 @@ def score_answers(name: str, questions: Sequence[RemovalQuestion], answers: Mapp
 
 
 def score_rules(questions: Sequence[RemovalQuestion]) -> list[AnswerScore]:
-    """Score the answers of all `RULES`; a rule that has no answer to any question is left out."""
-    answers = {name: {question.episode: rule(question) for question in questions} for name, rule in RULES.items()}
-    return [
-        score_answers(name, questions, numbers)
-        for name, numbers in answers.items()
-        if any(number is not None for number in numbers.values())
-    ]
+    """Score the answers of all `RULES`.
+
+    A rule without an answer to any question is left out. If it has answers to some questions only, its name says to how
+    many.
+    """
+    scores = []
+    for name, rule in RULES.items():
+        answers = {question.episode: rule(question) for question in questions}
+        answered = sum(number is not None for number in answers.values())
+        note = "" if answered == len(questions) else f", {answered} answers"
+        if answered:
+            scores.append(score_answers(f"{name}{note}", questions, answers))
+    return scores
 
 
 def compute_chance(questions: Sequence[RemovalQuestion]) -> float:

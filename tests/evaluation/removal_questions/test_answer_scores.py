@@ -42,6 +42,7 @@ def test_rules_are_scored_like_answers():
 
 def test_rule_without_any_answer_is_left_out():
     assert len(score_rules(QUESTIONS[1:2])) == 3
+    assert [score.name.rpartition(", ")[2] for score in score_rules(QUESTIONS) if ", " in score.name] == ["2 answers"]
 
 
 def test_chance_is_the_mean_of_the_correct_fractions():
