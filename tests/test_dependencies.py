@@ -50,6 +50,7 @@ EXTRAS = {  # files that may import packages of an extra
     "robocas_ms3/datasets/statistics/figures.py": "plots",
     "robocas_ms3/evaluation/clutter_scale/": "clutter-scale",
     "robocas_ms3/evaluation/remote/": "remote",
+    "robocas_ms3/evaluation/removal_questions/lerobot_dataset.py": "lerobot",
     "robocas_ms3/evaluation/report/__init__.py": "lerobot",
     "robocas_ms3/plans/executors/ray": "ray",
     "robocas_ms3/plans/executors/slurm": "slurm",

@@ -80,7 +80,9 @@ class Score:
 
     questions: _Source
     """Folder of robocas questions make, or name of a bundled protocol with questions."""
-    answers: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[ANSWERS ...]")] = ()
+    answers: Annotated[
+        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[ANSWERS ...]", help_behavior_hint="")
+    ] = ()
     """Files with answers (JSON Lines)."""
 
 
