@@ -29,12 +29,12 @@ from typing import Any
 import numpy as np
 import tyro
 
+from robocas_ms3.cli.eval_results import find_protocol_of
 from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.text import one_line
 from robocas_ms3.evaluation.audit.run import find_audit_obstacle, run_audit
 from robocas_ms3.evaluation.outcomes import Checkpoints
 from robocas_ms3.evaluation.policies import open_policy
-from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.results import OUTCOMES, RUN, read_result
 from robocas_ms3.evaluation.session import EvaluationSession
 from robocas_ms3.evaluation.settings import EvaluationSettings
@@ -316,9 +316,9 @@ def evaluate(policy: str, out: Path) -> Path:
 
 def check_result(folder: Path, audit: Path) -> tuple[str, str]:
     """Return the check that finds something in a result, and its first message; ``none`` and an empty message: none."""
-    protocol = load_protocol(PROTOCOL)
     try:
         result = read_result(folder)
+        protocol = find_protocol_of(result, None)
         if violations := find_violations(result, protocol):
             return "verify", violations[0]
         if obstacle := find_audit_obstacle(result):
