@@ -1,6 +1,6 @@
 """Change a result in many ways, and list which check finds each change; print JSON.
 
-python benchmarks/tampering.py --work /tmp/tampering > tampering.json
+python benchmarks/tampering.py --work tampering > tampering.json
 
 The script evaluates `scripted-ee-delta` and `noop` on the protocol smoke. Then it changes every value of run.json, of
 an outcome of pick and of a retrieval order of search (``fields``). It also forges results consistently, with hashes and

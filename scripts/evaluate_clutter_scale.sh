@@ -4,8 +4,9 @@
 #   bash scripts/evaluate_clutter_scale.sh [POLICY[:MM:DEG] ...]
 #
 # POLICY   a name of `robocas list`, or a run folder of `robocas train`; with :MM:DEG, action noise with these standard deviations
-#          (default: the policies of docs/difficulty.md)
+#          (default: variants of the scripted policy, keyframe, keyframe-upstream and small-ms3)
 #
+# At least two policies with 10 to 90 % success are necessary for the scale.
 # After an interruption, run the script again to continue. Results: OUT/POLICY; the clutter scale of all results in OUT: OUT/scale.
 #
 # EPISODES  number of episodes to evaluate of each configuration (default: all)
@@ -22,8 +23,8 @@ show_usage "$@"
 require_numbers EPISODES JOBS
 policies=("$@")
 ((${#policies[@]})) || policies=(
-    scripted-lookahead-0 scripted-lookahead-1 scripted-lookahead-2 scripted-lookahead-8 scripted-ee-delta:20:8 scripted-ee-delta:35:14
-    scripted-ee-delta:50:20 keyframe keyframe-upstream small-ms3)
+    scripted-lookahead-0 scripted-lookahead-1 scripted-lookahead-2 scripted-lookahead-8 scripted-ee-delta:15:6 scripted-ee-delta:20:8
+    scripted-ee-delta:35:14 keyframe keyframe-upstream small-ms3)
 out=${OUT:-reproduced/clutter_scale}
 jobs=${JOBS:-$(env -u OMP_NUM_THREADS nproc)}
 robocas=${ROBOCAS:-.venv/bin/robocas}

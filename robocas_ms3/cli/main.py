@@ -49,7 +49,7 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
         "eval": "Evaluate a policy, and report and compare results",
         "leaderboard": "Add results to the leaderboard, and check its entries",
         "serve-policy": "Serve a policy over a socket",
-        "questions": "Questions about which object to remove first, for vision-language models",
+        "questions": "Make and score questions about which object to remove first",
     },
     "assets and scenes": {
         "assets": "List, check and import asset packs",

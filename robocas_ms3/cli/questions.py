@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from robocas_ms3.evaluation.statistics import SuccessRate
 
 DESCRIPTION = "Questions about which object has to be removed first, for vision-language models."
-_Source = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="QUESTIONS")]
 
 
 @dataclass
@@ -78,7 +77,7 @@ class Score:
     Example: robocas questions score questions answers.jsonl
     """
 
-    questions: _Source
+    questions: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="QUESTIONS")]
     """Folder of robocas questions make, or name of a bundled protocol with questions."""
     answers: Annotated[
         tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[ANSWERS ...]", help_behavior_hint="")
@@ -128,7 +127,7 @@ def answer(cfg: AnswerQuestions) -> int:
     check_protocol_of(cfg.questions, result)
     answers = make_answers(questions, result.outcomes)
     JsonLinesFile[Answer](cfg.out, Answer).rewrite(answers)
-    unanswered = sum(one.answer is None for one in answers)
+    unanswered = [entry.answer for entry in answers].count(None)
     print_line(f"wrote {format_count(len(answers), 'answer')} to {cfg.out}, {unanswered} of them null")
     return 0
 

@@ -125,7 +125,8 @@ def make_questions(
         output.start(record)
         file = JsonLinesFile[RemovalQuestion](out / QUESTIONS, RemovalQuestion)
         rendered = JsonLinesFile[int](out / _RENDERED, int)
-        earlier = set(rendered.read())
+        without_image = {question.episode for question in file.read() if not (out / question.image).is_file()}
+        earlier = set(rendered.read()) - without_image
         missing = [task for task in tasks if task.episode.episode not in earlier]
         for done, (episode, question) in enumerate(_render(protocol, missing, out, jobs), len(tasks) - len(missing)):
             on_scenes(done, len(tasks))

@@ -65,17 +65,6 @@ def test_missing_files_and_repeated_questions_are_errors(tmp_path):
         read_questions(folder)
 
 
-@pytest.mark.parametrize("name", [name for name, path in bundled_protocols().items() if (path / QUESTIONS).is_file()])
-def test_bundled_questions_fit_their_protocol(name):
-    protocol = load_protocol(name)
-    for question in read_questions(name):
-        episode = protocol.episodes[question.episode]
-        assert episode.instruction == question.instruction
-        assert episode.target not in {numbered.asset for numbered in question.objects}
-        for x_min, y_min, x_max, y_max in (numbered.box for numbered in question.objects):
-            assert 0 <= x_min <= x_max < SIZE[0] and 0 <= y_min <= y_max < SIZE[1]
-
-
 def make_scene(episode, removals: int, first: list[int], **values: object) -> SceneDifficulty:
     scene = SceneDifficulty(episode.seed, episode.target, 5, 1.0, 0, 1, 0, 0.1, removals, first, None, 1, True)
     return replace(scene, **values)
@@ -127,6 +116,10 @@ def test_questions_are_made_continued_and_rendered_again(protocol, tmp_path):
     assert make_questions(loaded, out, on_scenes=lambda *counts: calls.append(counts)) == [question]
     assert calls[4] == (1, 3)
     assert read_questions(out) == [question]
+
+    (out / question.image).unlink()
+    assert make_questions(loaded, out) == [question]
+    assert np.array_equal(read_image(out / question.image), image)
 
     JsonLinesFile(protocol / QUESTIONS, type(question)).rewrite([question])
     with pytest.raises(OutputExistsError):
