@@ -16,7 +16,7 @@ _DASHED = "privileged"  # track whose curves are dashed
 
 def write_curves(study: ClutterStudy, path: Path) -> None:
     """Write the curves of all policies, and the number of scenes by difficulty, as PNG."""
-    figure = make_figure(7.5, 5.0)
+    figure = make_figure(7.5, 5.5)
     curves, scenes = make_axes(figure, 2, 1, 2)
     figure.get_layout_engine().set(h_pad=0.1)
     difficulty = np.linspace(0, HARDEST, 101)
@@ -28,8 +28,8 @@ def write_curves(study: ClutterStudy, path: Path) -> None:
             curves.plot([low, high], [50, 50], color=line.get_color(), alpha=0.4, linewidth=4)
             curves.plot(policy.curve.half, 50, "o", color=line.get_color())
     curves.set(ylabel="success / %", ylim=(-2, 102), xlim=(0, HARDEST))
-    curves.set_title("Success against difficulty (dots: half of the episodes succeed; dashed: privileged)")
-    curves.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    figure.suptitle("Success against difficulty (dots: half of the episodes succeed; dashed: privileged)", fontsize=10)
+    figure.legend(fontsize=7, loc="outside lower center", ncols=2)
     scenes.hist(study.difficulty, bins=20, range=(0, HARDEST))
     scenes.set(xlabel="difficulty", ylabel="scenes", xlim=(0, HARDEST))
     with atomic_file(path) as tmp:
