@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
 # Reproduce a row of the results of `keyframe`: record decisions, render them, train, and evaluate 200 episodes per task.
 #
-#   bash scripts/reproduce_keyframe.sh A|B|C [FOLDER]
+#   bash scripts/reproduce_keyframe.sh A|B|C|S [FOLDER]
 #
 # Row A  trained in the default scenes, evaluated on ms3-v1
 # Row B  trained in the scenes of RoboCAS-v0's data, evaluated on paper-v1
 # Row C  trained in the scenes of RoboCAS-v0's evaluation, evaluated on paper-v1
+# Row S  trained in the training scenes of clutter-scale-v1; to evaluate it: bash scripts/evaluate_clutter_scale.sh FOLDER/run
 #
 # After an interruption, run the script again to continue. docs/baselines_keyframe.md contains the results. FOLDER is the
 # output folder (default: reproduced/keyframe_ROW).
@@ -46,7 +47,17 @@ case $row in
             "60 531000 select select_fruits_orderly"
             "150 532000 search search_upstream_eval")
         protocol=paper-v1 tasks=(pick search) ;;
-    *) fail "invalid row '$row': expected A, B or C. Usage: bash scripts/reproduce_keyframe.sh ROW [FOLDER]" ;;
+    S)
+        train=robocas_ms3/data/protocols/clutter-scale-v1/train
+        parts=(
+            "50 540000 pick $train/pick_few.yaml"
+            "100 541000 pick $train/pick_dense.yaml"
+            "100 542000 pick $train/pick_heap.yaml"
+            "50 543000 search $train/search_small.yaml"
+            "50 544000 search $train/search_medium.yaml"
+            "50 545000 search $train/search_large.yaml")
+        tasks=() ;;
+    *) fail "invalid row '$row': expected A, B, C or S. Usage: bash scripts/reproduce_keyframe.sh ROW [FOLDER]" ;;
 esac
 out=${2:-reproduced/keyframe_$row}
 scale=${SCALE:-100} steps=${STEPS:-4000} episodes=${EPISODES:-200}
@@ -57,11 +68,11 @@ command -v "$robocas" >/dev/null || fail "no such command: $robocas. Run bash sc
 require_settings "$out" "ROW=$row SCALE=$scale STEPS=$steps"
 for part in "${parts[@]}"; do
     read -r count seed task config <<<"$part"
-    count=$(((count * scale + 99) / 100))
+    count=$(((count * scale + 99) / 100)) data=$out/data/$(basename "$config" .yaml)
     # a few heaps would take most of the time, so they are skipped after three attempts
     timed "$robocas" generate "$task" --config "$config" -n "$count" --seed "$seed" --jobs "$jobs" --max-attempts 3 \
-        --record-candidates --candidates 8 --candidate-decisions move grasp pull --episode-seconds 600 --out "$out/data/$config"
-    timed "$robocas" render-candidates "$out/data/$config/candidates.h5" --views 3 --segmentation --jobs "$jobs"
+        --record-candidates --candidates 8 --candidate-decisions move grasp pull --episode-seconds 600 --out "$data"
+    timed "$robocas" render-candidates "$data/candidates.h5" --views 3 --segmentation --jobs "$jobs"
 done
 timed "$robocas" train keyframe --data "$out/data" --out "$out/run" --steps "$steps"
 for task in "${tasks[@]}"; do
