@@ -2,9 +2,9 @@
 
     python scripts/choose_scenes.py scripts/clutter_scale_candidates.yaml --scenes 300 --out difficulty/scale
 
-SOURCE is a protocol source (docs/evaluation.md). ``count`` and ``first_seed`` of each part are those of the measured
-scenes. The script writes OUT/NAME with the difficulties of each part, OUT/source.yaml with the chosen seeds, and
-OUT/difficulty.jsonl with their difficulties in the order of the episodes. An interrupted run is continued.
+SOURCE is a protocol source (docs/evaluation.md). The seeds of its parts are those of the measured scenes. The script
+writes OUT/NAME with the difficulties of each part, OUT/source.yaml with the chosen seeds, and OUT/difficulty.jsonl with
+their difficulties in the order of the episodes. An interrupted run is continued.
 
 The scenes are grouped by task and number of removals. All groups get the same number of scenes if they have enough;
 within a group, scenes are chosen evenly over the visible fraction of the target.
@@ -53,13 +53,13 @@ def main(options: Options) -> None:
     groups: dict[tuple[str, int], list[Scene]] = defaultdict(list)
     for part in source.parts:
         task = part.load_config().task
-        for scene in measure_part(part, options):
+        for scene in measure_part(part, str(source.rules.get("pack", "builtin")), options):
             removals = MOST_REMOVALS if scene.removals is None else min(scene.removals, MOST_REMOVALS)
             if removals >= options.min_removals:
                 groups[task, removals].append((part.file_stem, scene))
     chosen = choose_evenly(groups, options.scenes)
     order = {part.file_stem: number for number, part in enumerate(source.parts)}
-    chosen.sort(key=lambda one: (order[one[0]], one[1].seed))
+    chosen.sort(key=lambda scene: (order[scene[0]], scene[1].seed))
     parts = []
     for part in source.parts:
         seeds = [scene.seed for name, scene in chosen if name == part.file_stem]
@@ -73,10 +73,11 @@ def main(options: Options) -> None:
         print(f"{task}, {name} removals: {sum(scene in scenes for scene in chosen)} of {len(scenes)} scenes")
 
 
-def measure_part(part: ProtocolPart, options: Options) -> list[SceneDifficulty]:
+def measure_part(part: ProtocolPart, pack: str, options: Options) -> list[SceneDifficulty]:
     config = part.load_config()
-    settings = DifficultySettings(config.task, config.model_dump(mode="json"))
-    seeds, out = range(part.first_seed, part.first_seed + part.count), options.out / part.file_stem
+    settings = DifficultySettings(config.task, config.model_dump(mode="json"), pack)
+    seeds = part.seeds or range(part.first_seed, part.first_seed + part.count)
+    out = options.out / part.file_stem
     with ProgressBar(f"scenes of {part.file_stem} measured") as bar:
         for result in measure_seeds(
             settings, seeds, out, jobs=options.jobs, on_start=lambda count: bar.start(len(seeds), count)
@@ -95,7 +96,7 @@ def choose_evenly(groups: Mapping[tuple[str, int], Sequence[Scene]], count: int)
         sizes[smallest] += 1
     chosen: list[Scene] = []
     for key, scenes in groups.items():
-        ordered = sorted(scenes, key=lambda one: (one[1].visible_fraction, one[1].seed))
+        ordered = sorted(scenes, key=lambda scene: (scene[1].visible_fraction, scene[1].seed))
         positions = np.linspace(0, len(ordered) - 1, sizes[key]).round().astype(int)
         chosen += [ordered[position] for position in positions]
     return chosen

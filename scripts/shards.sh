@@ -1,9 +1,10 @@
 # Sourced by other scripts: `evaluate FOLDER ARGUMENT ...` runs `robocas eval run ARGUMENT ...` in shards and merges them in
 # FOLDER. A policy decides for all its environments on one core, so shards are faster than several environments. The number of
-# shards is $jobs, at most $episodes. The shards and their logs are in FOLDER_shards; shards that have ended are not repeated.
+# shards is $jobs, at most $episodes or $EPISODES, so that each shard has episodes. The shards and their logs are in FOLDER_shards; shards that have ended are not repeated.
 evaluate() {
     local folder=$1 shards=$1_shards count=$jobs folders=() pids=() shard pid status=0
-    ((count <= ${episodes:-$count})) || count=$episodes
+    local most=${episodes:-${EPISODES:-$count}}
+    ((count <= most)) || count=$most
     mkdir -p "$shards"
     trap 'kill $(jobs -p) 2>/dev/null || true' EXIT # shards in the background ignore Ctrl-C
     for ((shard = count - 1; shard >= 0; shard--)); do

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 class ClutterScale:
     """Fit a scale of the difficulty of scenes to the results of several policies, and place the policies on it.
 
-    The scale goes from 0 (easiest scene of the protocol) to 10 (hardest scene). Writes clutter_scale.json and
+    Each task has its own scale, from 0 (easiest scene of the protocol) to 10 (hardest scene). It is fitted to the
+    policies with 10 to 90 % success in this task; at least two are necessary. Writes clutter_scale.json and
     clutter_scale.png.
 
     Example: robocas eval clutter-scale eval/keyframe eval/small eval/expert --out eval/scale
@@ -49,27 +50,37 @@ def clutter_scale(cfg: ClutterScale) -> int:
     make_folder(cfg.out)
     study.write(cfg.out / "clutter_scale.json")
     write_curves(study, cfg.out / "clutter_scale.png")
-    rows = [
-        (
-            one.name,
-            one.track,
-            f"{one.curve.successes}/{one.curve.episodes}",
-            _describe_half(one.curve),
-            "" if one.auc is None else f"{one.auc:.2f}",
-        )
-        for one in study.policies
-    ]
-    print_table(("policy", "track", "success", "difficulty at 50 % (95 % interval)", "AUC"), rows)
-    weights = sorted(study.standard_weights.items(), key=lambda item: -abs(item[1]))
-    print_table(("feature", "difficulty per standard deviation"), [(name, f"{value:.2f}") for name, value in weights])
-    print_line(f"mean AUC in scenes that were not used for the fit: {study.mean_auc:.2f}")
+    for name, task in study.tasks.items():
+        rows = [
+            (
+                policy.name,
+                policy.track,
+                f"{policy.curve.successes}/{policy.curve.episodes}",
+                _describe_half(policy.curve),
+                "" if policy.auc is None else f"{policy.auc:.2f}",
+            )
+            for policy in task.policies
+        ]
+        print_table(("policy", "track", f"success in {name}", "difficulty at 50 % (95 % interval)", "AUC"), rows)
+        weights = sorted(task.standard_weights.items(), key=lambda item: -abs(item[1]))
+        rows = [(feature, f"{weight:.2f}") for feature, weight in weights]
+        print_table((f"feature in {name}", "difficulty per standard deviation"), rows)
+        if task.mean_auc is not None:
+            print_line(f"{name}: mean AUC in scenes that were not used for the fit: {task.mean_auc:.2f}")
+    for name, rates in study.left_out.items():
+        found = ", ".join(f"{rate:.0%}" for rate in rates)
+        print_line(f"{name}: no scale, because too few policies have 10 to 90 % success: {found}")
     print_line(f"wrote {cfg.out / 'clutter_scale.json'} and {cfg.out / 'clutter_scale.png'}")
     return 0
 
 
 def _describe_half(curve: SuccessCurve) -> str:
+    from robocas_ms3.evaluation.clutter_scale.item_response import HARDEST
+
     if curve.half is None:
         return "none"
+    if not 0 <= curve.half <= HARDEST:
+        return f"above {HARDEST:.0f}" if curve.half > HARDEST else "below 0"
     if not (isfinite(curve.low) and isfinite(curve.high)):
-        return f"{curve.half:.1f} (no limits: too few episodes)"
+        return f"{curve.half:.1f} (no limits: the slope is not significant)"
     return f"{curve.half:.1f} ({curve.low:.1f} to {curve.high:.1f})"

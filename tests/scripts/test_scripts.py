@@ -183,6 +183,15 @@ def test_policies_are_placed_on_the_clutter_scale_with_those_evaluated_earlier(t
     assert calls[-1][1:] == ["clutter-scale", str(out / "earlier"), "--out", str(out / "scale")]
 
 
+def test_there_are_not_more_shards_than_episodes_of_a_configuration(tmp_path):
+    """With 1 episode of each configuration, some of 2 shards of a protocol could have none."""
+    done, calls = run_with_stub(
+        tmp_path, "evaluate_clutter_scale.sh", "keyframe", OUT=str(tmp_path / "out"), EPISODES="1"
+    )
+    shards = [call[call.index("--shard") + 1] for call in calls if "--shard" in call]
+    assert shards == ["0/1"], done.stderr
+
+
 def test_an_evaluation_with_a_failed_shard_is_not_merged(tmp_path):
     stub = tmp_path / "fails"
     stub.write_text(STUB + 'case "$*" in *"--shard 1/2"*) exit 1 ;; esac\n')

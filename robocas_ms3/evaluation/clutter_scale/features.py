@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from robocas_ms3.demos.difficulty.records import RemovalLimits, SceneDifficulty
+from robocas_ms3.demos.difficulty.records import SceneDifficulty
 
 FEATURES: tuple[str, ...] = (
     "removals",
@@ -19,7 +19,7 @@ FEATURES: tuple[str, ...] = (
 )
 """Names of the features; each one grows with the clutter.
 
-- removals: smallest number of removals; one more than the largest searched number if none was found.
+- removals: smallest number of removals.
 - hidden_fraction: fraction of the target that other objects hide, seen from above.
 - no_free_grasp: 1 / (1 + number of free grasps).
 - fewest_blockers: smallest number of objects that block a grasp.
@@ -30,11 +30,13 @@ _CLOSE = 0.1  # m, gap from which an object does not count as close
 
 
 def make_features(scenes: Iterable[SceneDifficulty]) -> NDArray[np.float64]:
-    """Return the features (S, F) of S scenes in the order of `FEATURES`."""
-    none_found = RemovalLimits.max_removals + 1
+    """Return the features (S, F) of S scenes in the order of `FEATURES`.
+
+    The removals of a scene are NaN if their number is not known.
+    """
     rows = [
         (
-            none_found if scene.removals is None else scene.removals,
+            np.nan if scene.removals is None else scene.removals,
             1 - scene.visible_fraction,
             1 / (1 + scene.free_grasps),
             scene.fewest_blockers,

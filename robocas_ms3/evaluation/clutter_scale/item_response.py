@@ -14,6 +14,8 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.metrics import roc_auc_score
 from sklearn.model_selection import KFold
 
+from robocas_ms3.core.errors import EvaluationError
+
 HARDEST = 10.0  # difficulty of the hardest scene of the fit; the easiest has 0
 FOLDS = 5
 _INVERSE_PENALTY = 10.0  # C of scikit-learn, for standardized features: keeps weights of correlated features finite
@@ -46,10 +48,15 @@ def fit_clutter_scale(successes: Array, features: Array) -> ClutterScale:
 
     Returns:
         The scale, on which the easiest of the scenes has 0 and the hardest 10.
+
+    Raises:
+        EvaluationError: the scenes have equal features.
     """
     weights = _fit_weights(successes, features)
     raw = features @ weights
     unit = (raw.max() - raw.min()) / HARDEST
+    if unit == 0:
+        raise EvaluationError("the scenes have no scale of difficulty", expected="scenes with different features")
     return ClutterScale(weights / unit, float(-raw.min() / unit))
 
 
@@ -60,9 +67,11 @@ def compute_held_out_auc(successes: Array, features: Array, seed: int = 0) -> Ar
     (P,) is the mean over the parts in which the policy has both successes and failures; NaN without such a part.
     """
     areas = np.full((FOLDS, len(successes)), np.nan)
-    for fold, (known, unseen) in enumerate(KFold(FOLDS, shuffle=True, random_state=seed).split(features)):
-        difficulty = features[unseen] @ _fit_weights(successes[:, known], features[known])
-        for policy, row in enumerate(successes[:, unseen]):
+    for fold, (training, held_out) in enumerate(KFold(FOLDS, shuffle=True, random_state=seed).split(features)):
+        if len(np.unique(successes[:, training][~np.isnan(successes[:, training])])) < 2:
+            continue  # nothing to fit
+        difficulty = features[held_out] @ _fit_weights(successes[:, training], features[training])
+        for policy, row in enumerate(successes[:, held_out]):
             evaluated = ~np.isnan(row)
             if 0 < row[evaluated].sum() < evaluated.sum():
                 areas[fold, policy] = roc_auc_score(1 - row[evaluated], difficulty[evaluated])

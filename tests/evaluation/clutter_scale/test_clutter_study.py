@@ -38,25 +38,29 @@ def study(tmp_path_factory):
             free_grasps=int(rng.integers(9)),
             fewest_blockers=0,
             gap=0.01,
-            removals=int(rng.integers(4)),
+            removals=[None, 0, 1, 2, 3][number % 5],
             first_removals=[],
             scripted_removal=None,
             simulated_removals=0,
             complete=True,
         )
-        for episode in protocol.episodes
+        for number, episode in enumerate(protocol.episodes)
     ]
     lines = "".join(json.dumps(asdict(scene)) + "\n" for scene in scenes)
     (folder / "protocol" / DIFFICULTIES).write_text(lines)
     template = of_protocol(folder / "template", protocol)
     results = {}
     for name, ability in ABILITIES.items():
-        chance = [1 / (1 + np.exp(-3 * (ability - (scene.removals or 0)))) for scene in scenes]
+        removals = np.array([4 if scene.removals is None else scene.removals for scene in scenes])
+        chance = 1 / (1 + np.exp(-3 * (ability - removals)))
         outcomes = [
             replace(
-                outcome(one.episode, 7 if rng.uniform() < p else 2), task=one.task, config=one.config, seed=one.seed
+                outcome(played.episode, 7 if rng.uniform() < p else 2),
+                task=played.task,
+                config=played.config,
+                seed=played.seed,
             )
-            for one, p in zip(template.outcomes.values(), chance, strict=True)
+            for played, p in zip(template.outcomes.values(), chance, strict=True)
         ]
         policy = {"name": name, "class": "mine:Policy", "spec": {"track": "modular"}}
         results[name] = write(
@@ -65,17 +69,30 @@ def study(tmp_path_factory):
     return folder, protocol, results
 
 
-def test_policies_are_placed_by_their_abilities(study):
+@pytest.mark.parametrize("task", ["pick", "search"])
+def test_policies_are_placed_by_their_abilities(study, task):
     _, protocol, results = study
-    found = make_study(list(results.values()), protocol)
-    assert [one.name for one in found.policies] == ["strong", "middle", "weak"]
-    halves = [one.curve.half for one in found.policies if one.curve.half is not None]
+    found = make_study(list(results.values()), protocol).tasks[task]
+    assert [policy.name for policy in found.policies] == ["strong", "middle", "weak"]
+    halves = [policy.curve.half for policy in found.policies if policy.curve.half is not None]
     assert len(halves) == 3
     assert halves == sorted(halves, reverse=True)
-    for one, half in zip(found.policies, halves, strict=True):
-        assert one.curve.low < half < one.curve.high
+    for policy, half in zip(found.policies, halves, strict=True):
+        assert policy.curve.low < half < policy.curve.high
+        assert policy.curve.episodes == 80, "scenes without a number of removals are left out"
+    assert found.mean_auc is not None
     assert found.mean_auc > 0.8
     assert max(found.standard_weights, key=lambda name: found.standard_weights[name]) == "removals"
+
+
+def test_tasks_have_the_scenes_with_a_number_of_removals(study):
+    _, protocol, results = study
+    tasks = make_study(list(results.values()), protocol).tasks
+    assert list(tasks) == ["pick", "search"]
+    for name, task in tasks.items():
+        expected = [n for n, episode in enumerate(protocol.episodes) if episode.task == name and n % 5]
+        assert task.episodes.tolist() == expected
+        assert task.difficulty.shape == (80,)
 
 
 def test_command_writes_numbers_and_a_plot(study, tmp_path, capsys):
@@ -84,8 +101,10 @@ def test_command_writes_numbers_and_a_plot(study, tmp_path, capsys):
     assert run([*command, "--protocol", str(folder / "protocol"), "--out", str(tmp_path)]) == 0
     assert "strong" in capsys.readouterr().out
     written = json.loads((tmp_path / "clutter_scale.json").read_text())
-    assert [one["name"] for one in written["policies"]] == ["strong", "middle", "weak"]
-    assert len(written["difficulty"]) == 200
+    assert written["left_out"] == {}
+    for task in ("pick", "search"):
+        assert [policy["name"] for policy in written["tasks"][task]["policies"]] == ["strong", "middle", "weak"]
+        assert len(written["tasks"][task]["difficulty"]) == len(written["tasks"][task]["episodes"]) == 80
     assert (tmp_path / "clutter_scale.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -97,8 +116,8 @@ def test_protocol_without_difficulties_is_an_error():
 def test_policy_that_always_succeeds_is_the_first_and_is_not_fitted(study):
     folder, protocol, results = study
     always = read_result(folder / "template")
-    found = make_study([*results.values(), always], protocol)
-    assert [one.name for one in found.policies] == ["mine", "strong", "middle", "weak"]
+    found = make_study([*results.values(), always], protocol).tasks["pick"]
+    assert [policy.name for policy in found.policies] == ["mine", "strong", "middle", "weak"]
     assert found.policies[0].curve.half is None
     assert found.policies[0].auc is None
     assert sorted(found.fitted) == ["middle", "strong", "weak"]
@@ -108,3 +127,37 @@ def test_one_policy_is_too_few(study):
     _, protocol, results = study
     with pytest.raises(EvaluationError):
         make_study([results["middle"]], protocol)
+
+
+def test_few_episodes_are_too_few(study):
+    folder, protocol, results = study
+    few = []
+    for name in ("middle", "weak"):
+        outcomes = [outcome for number, outcome in results[name].outcomes.items() if number < 15]
+        policy = {"name": name, "class": "mine:Policy", "spec": {"track": "modular"}}
+        run = {"protocol": "clutter-v1", "protocol_hash": protocol.hash, "policy": policy}
+        few.append(write(folder / f"few_{name}", outcomes, **run))
+    with pytest.raises(EvaluationError):
+        make_study(few, protocol)
+
+
+def test_task_without_enough_policies_is_left_out(study):
+    folder, protocol, results = study
+    only_pick = []
+    for name in ("middle", "weak"):
+        outcomes = [outcome for outcome in results[name].outcomes.values() if outcome.task == "pick"]
+        policy = {"name": name, "class": "mine:Policy", "spec": {"track": "modular"}}
+        run = {"protocol": "clutter-v1", "protocol_hash": protocol.hash, "policy": policy}
+        only_pick.append(write(folder / f"pick_{name}", outcomes, **run))
+    found = make_study([*only_pick, results["strong"]], protocol)
+    assert list(found.tasks) == ["pick"]
+    assert len(found.left_out["search"]) == 1
+
+
+def test_result_of_another_protocol_is_refused(study):
+    folder, protocol, results = study
+    policy = {"name": "other", "class": "mine:Policy", "spec": {"track": "modular"}}
+    outcomes = list(results["weak"].outcomes.values())
+    other = write(folder / "other", outcomes, protocol="clutter-v1", protocol_hash="0" * 64, policy=policy)
+    with pytest.raises(EvaluationError):
+        make_study([results["middle"], other], protocol)

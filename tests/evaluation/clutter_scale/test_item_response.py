@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.evaluation.clutter_scale.curves import compute_ratio_interval, fit_success_curve
 from robocas_ms3.evaluation.clutter_scale.item_response import compute_held_out_auc, fit_clutter_scale
 
@@ -47,6 +48,19 @@ def test_held_out_auc(study):
     assert np.abs(compute_held_out_auc(successes, noise) - 0.5).max() < 0.1
     always = np.concatenate([successes, np.ones((1, 400))])
     assert np.isnan(compute_held_out_auc(always, features)[-1]), "no failures to predict"
+
+
+def test_parts_without_both_outcomes_are_left_out():
+    """The only success is in one part, so the fit without this part has nothing to learn from."""
+    successes = np.zeros((2, 10))
+    successes[:, 3] = 1
+    areas = compute_held_out_auc(successes, np.arange(20.0).reshape(10, 2))
+    assert np.isnan(areas).all()
+
+
+def test_equal_scenes_have_no_scale():
+    with pytest.raises(EvaluationError):
+        fit_clutter_scale(np.array([[0.0, 1.0, 1.0], [0.0, 0.0, 1.0]]), np.ones((3, 2)))
 
 
 def test_curve_crosses_half_at_the_ability():
