@@ -65,6 +65,8 @@ class AnswerQuestions:
     """Folder of robocas questions make, or name of a bundled protocol with questions."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE.jsonl")]
     """File with the answers (JSON Lines)."""
+    overwrite: bool = False
+    """Replace an existing file."""
 
 
 @dataclass
@@ -119,10 +121,12 @@ def answer(cfg: AnswerQuestions) -> int:
     from robocas_ms3.cli.eval_results import read
     from robocas_ms3.cli.terminal import print_line
     from robocas_ms3.core.json_lines import JsonLinesFile
+    from robocas_ms3.core.output_folder import check_replaceable
     from robocas_ms3.evaluation.removal_questions.question_files import check_protocol_of, read_questions
     from robocas_ms3.evaluation.removal_questions.records import Answer
     from robocas_ms3.evaluation.removal_questions.scores import make_answers
 
+    check_replaceable(cfg.out, overwrite=cfg.overwrite)
     result, questions = read(cfg.folders), read_questions(cfg.questions)
     check_protocol_of(cfg.questions, result)
     answers = make_answers(questions, result.outcomes)
@@ -150,14 +154,15 @@ def score(cfg: Score) -> int:
         for removals in sorted({question.removals for question in questions})
     }
     headers = [f"{format_count(removals, 'removal')}, n = {len(group)}" for removals, group in groups.items()]
-    rows = [
-        (entry.name, *map(_describe_rate, (entry.accuracy, *(entry.by_removals[removals] for removals in groups))))
-        for entry in scores
-    ]
+    rows = []
+    for entry in scores:
+        answered = "" if entry.answered is None else f"{_describe_rate(entry.answered)}, n = {entry.answered.n}"
+        by_removals = [_describe_rate(entry.by_removals[removals]) for removals in groups]
+        rows.append((entry.name, _describe_rate(entry.accuracy), *by_removals, answered))
     chances = [compute_chance(group) for group in (questions, *groups.values())]
-    rows.append(("random object (expected)", *(f"{100 * chance:.1f}" for chance in chances)))
-    print_table(("answers", f"all, n = {len(questions)}", *headers), rows)
-    print_line("correct answers in %, with exact 95 % intervals")
+    rows.append(("random object (expected)", *(f"{100 * chance:.1f}" for chance in chances), ""))
+    print_table(("answers", f"all, n = {len(questions)}", *headers, "questions with an answer"), rows)
+    print_line("correct answers in %, with exact 95 % intervals; a question without an answer counts as wrong")
     return 0
 
 

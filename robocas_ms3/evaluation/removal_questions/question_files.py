@@ -128,13 +128,15 @@ def make_questions(
         without_image = {question.episode for question in file.read() if not (out / question.image).is_file()}
         earlier = set(rendered.read()) - without_image
         missing = [task for task in tasks if task.episode.episode not in earlier]
-        for done, (episode, question) in enumerate(_render(protocol, missing, out, jobs), len(tasks) - len(missing)):
-            on_scenes(done, len(tasks))
+        done = len(tasks) - len(missing)
+        on_scenes(done, len(tasks))
+        for episode, question in _render(protocol, missing, out, jobs):
             output.check_exists()
             if question is not None:
                 file.append([question])
             rendered.append([episode])
-        on_scenes(len(tasks), len(tasks))
+            done += 1
+            on_scenes(done, len(tasks))
         questions = sorted({question.episode: question for question in file.read()}.values(), key=_get_episode)
         file.rewrite(questions)
     return questions

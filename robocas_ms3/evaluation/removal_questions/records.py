@@ -86,11 +86,12 @@ class Answer:
 
     Attributes:
         episode: episode of the question.
-        answer: number of an object; None: no answer, which counts as wrong.
+        answer: number of an object; None: no answer. Both no answer and a number that is not in the image count as
+            wrong.
     """
 
     episode: Episode
-    answer: int | None
+    answer: Number | None
 
 
 def name_image(episode: int) -> str:

@@ -44,12 +44,14 @@ class AnswerScore:
 
     Attributes:
         name: name of the model or rule.
-        accuracy: correct answers of all questions.
+        accuracy: correct answers of all questions; a question without an answer counts as wrong.
+        answered: correct answers of the questions with an answer; None: there is no answer.
         by_removals: correct answers of the questions with each number of removals.
     """
 
     name: str
     accuracy: SuccessRate
+    answered: SuccessRate | None
     by_removals: dict[int, SuccessRate]
 
 
@@ -77,23 +79,18 @@ def score_answers(name: str, questions: Sequence[RemovalQuestion], answers: Mapp
     for question in sorted(questions, key=lambda question: question.removals):
         groups.setdefault(question.removals, []).append(is_correct[question.episode])
     by_removals = {removals: compute_success_rate(sum(group), len(group)) for removals, group in groups.items()}
-    return AnswerScore(name, compute_success_rate(sum(is_correct.values()), len(questions)), by_removals)
+    correct, answered = sum(is_correct.values()), sum(number is not None for number in answers.values())
+    of_answered = compute_success_rate(correct, answered) if answered else None
+    return AnswerScore(name, compute_success_rate(correct, len(questions)), of_answered, by_removals)
 
 
 def score_rules(questions: Sequence[RemovalQuestion]) -> list[AnswerScore]:
-    """Score the answers of all `RULES`.
-
-    A rule without an answer to any question is left out. If it has answers to some questions only, its name says to how
-    many.
-    """
-    scores = []
-    for name, rule in RULES.items():
-        answers = {question.episode: rule(question) for question in questions}
-        answered = sum(number is not None for number in answers.values())
-        note = "" if answered == len(questions) else f", {answered} answers"
-        if answered:
-            scores.append(score_answers(f"{name}{note}", questions, answers))
-    return scores
+    """Score the answers of all `RULES`; a rule without any answer is left out."""
+    scores = [
+        score_answers(name, questions, {question.episode: rule(question) for question in questions})
+        for name, rule in RULES.items()
+    ]
+    return [score for score in scores if score.answered is not None]
 
 
 def compute_chance(questions: Sequence[RemovalQuestion]) -> float:

@@ -42,7 +42,14 @@ def test_rules_are_scored_like_answers():
 
 def test_rule_without_any_answer_is_left_out():
     assert len(score_rules(QUESTIONS[1:2])) == 3
-    assert [score.name.rpartition(", ")[2] for score in score_rules(QUESTIONS) if ", " in score.name] == ["2 answers"]
+
+
+def test_questions_without_an_answer_are_also_left_out():
+    score = score_answers("model", QUESTIONS, {0: 2, 1: None, 2: 4})
+    assert score.answered is not None
+    assert (score.accuracy.k, score.accuracy.n) == (1, 3)
+    assert (score.answered.k, score.answered.n) == (1, 2)
+    assert score_answers("silent", QUESTIONS, dict.fromkeys(range(3))).answered is None
 
 
 def test_chance_is_the_mean_of_the_correct_fractions():
@@ -51,7 +58,7 @@ def test_chance_is_the_mean_of_the_correct_fractions():
 
 @pytest.mark.parametrize("answers", [{0: 1, 1: 1}, {0: 1, 1: 1, 2: 1, 7: 1}])
 def test_missing_and_unknown_questions_are_errors(answers):
-    with pytest.raises(EvaluationError, match="episode [27]"):
+    with pytest.raises(EvaluationError):
         score_answers("model", QUESTIONS, answers)
 
 
@@ -76,7 +83,7 @@ def test_answer_of_a_policy_is_the_object_that_it_moved_first(outcome, answer):
 
 
 def test_question_without_an_episode_is_an_error():
-    with pytest.raises(EvaluationError, match="1 of 3"):
+    with pytest.raises(EvaluationError):
         make_answers(QUESTIONS, {0: make_outcome(), 1: make_outcome()})
 
 
@@ -100,6 +107,7 @@ def test_results_of_another_protocol_have_no_answers(tmp_path):
         '{"episode": 0, "answer": true}\n',
         '{"episode": 0}\n',
         '{"episode": -1, "answer": 2}\n',
+        '{"episode": 0, "answer": 0}\n',  # numbers start from 1
         '{"episode": 0, "answer": 1}\n{"episode": 0, "answer": 2}\n',  # twice
         "not json\n",
     ],
