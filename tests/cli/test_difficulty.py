@@ -33,6 +33,12 @@ LINE = {
         ["pick_table_scattered", "--set", "objects.cout=3"],
         ["pick_table_scattered", "--seeds", "5:5"],
         ["pick_table_scattered", "--max-simulated", "0"],
+        [],
+        ["pick_table_scattered", "--grasp-attempts", "0"],
+        ["pick_table_scattered", "--protocol", "smoke"],
+        ["--protocol", "smok"],
+        ["--protocol", "smoke", "--seeds", "0:3"],
+        ["--protocol", "furniture-v1"],
         ["pick_shelf_scattered"],  # grasps from the front
         ["open_pick_drawer"],
     ],

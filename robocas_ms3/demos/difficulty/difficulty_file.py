@@ -13,7 +13,7 @@ from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import FolderKind, OutputFolder
 from robocas_ms3.core.workers import Limits, WorkerPool, hide_cuda, use_one_torch_thread
 from robocas_ms3.demos.difficulty.records import RemovalLimits, SceneDifficulty
-from robocas_ms3.demos.forked_processes import find_reason_not_to_fork
+from robocas_ms3.demos.forked_processes import ForkedProcessError, find_reason_not_to_fork
 from robocas_ms3.demos.recordings.trajectory_json import package_versions
 from robocas_ms3.demos.settings import EpisodeSettings
 from robocas_ms3.scenes.config import load_task_config
@@ -41,12 +41,14 @@ class DifficultySettings:
         config: bundled configuration by name, path of a YAML file, or its content.
         pack: object pack: name or folder.
         limits: limits of the search for removals.
+        layouts: source of the layouts, see `RoboCASEnv`.
     """
 
     task: str
     config: str | dict[str, Any]
     pack: str = "builtin"
     limits: RemovalLimits = field(default_factory=RemovalLimits)
+    layouts: str = "auto"
 
     def check(self) -> None:
         """Raise `RobocasError` if the configuration is invalid, or if its scenes have no measure of difficulty."""
@@ -59,7 +61,7 @@ class DifficultySettings:
             raise ConfigError(what, expected=expected, found=found)
 
     def make_episode_settings(self) -> EpisodeSettings:
-        return EpisodeSettings(self.task, self.config, self.pack, check_rate=0)
+        return EpisodeSettings(self.task, self.config, self.pack, check_rate=0, layouts=self.layouts)
 
 
 def measure_seeds(
@@ -124,7 +126,7 @@ class _DifficultyWorker:
     def run(self, seed: int) -> SeedResult:
         try:
             return SeedResult(seed, self._measure(seed))
-        except LayoutError as error:
+        except (LayoutError, ForkedProcessError) as error:
             return SeedResult(seed, problem=str(error))
 
     def close(self) -> None:

@@ -14,7 +14,7 @@ from functools import partial
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.demos.forked_processes import ForkedProcessError, run_in_forked_process
 
-SEQUENCE_TIMEOUT = 3600.0  # s of wall-clock time for a removal and all removals after it
+SEQUENCE_TIMEOUT = 1200.0  # s of wall-clock time for a removal and all removals after it
 _log = logging.getLogger(__name__)
 
 
@@ -27,7 +27,8 @@ class RemovalScene:
         count_blockers: returns the smallest number of objects that block a grasp of the target.
         ways: number of ways to remove an object.
         remove: removes the object in a slot in a way, from 0; raises PlanningError if this is not possible.
-        can_grasp: tries to grasp the target in forked processes, and returns whether it is held.
+        can_grasp: tries to grasp the target in forked processes, and returns whether it is held; raises
+            ForkedProcessError if one of them crashes or exceeds its time limit.
     """
 
     list_obstacles: Callable[[], list[int]]
@@ -45,8 +46,8 @@ class RemovalResult:
         removals: smallest number of removals after which the target can be grasped; None: no sequence was found.
         first: slots of the objects with which a sequence of this length can start.
         simulated: number of simulated removals.
-        complete: whether every sequence was simulated. If not, ``removals`` is an upper bound, and ``first`` may lack
-            objects.
+        complete: whether no limit of the simulated removals, and no crashed process, has left out a sequence. If one
+            has, ``removals`` is an upper bound, and ``first`` may lack objects.
     """
 
     removals: int | None
@@ -89,7 +90,11 @@ class RemovalSearch:
         self._simulated, self._complete = 0, True  # a forked process continues with its copy
 
     def run(self) -> RemovalResult:
-        """Search, and return the result."""
+        """Search, and return the result.
+
+        Raises:
+            ForkedProcessError: the process of a grasp without removals crashed or exceeded its time limit.
+        """
         if self._scene.can_grasp():
             return RemovalResult(0, (), 0, complete=True)
         for removals in range(1, self._max_removals + 1):

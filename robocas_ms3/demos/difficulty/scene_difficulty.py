@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from robocas_ms3.demos.candidates.recorder import SETTLE_SECONDS
 from robocas_ms3.demos.difficulty.records import RemovalLimits, SceneDifficulty
 from robocas_ms3.demos.difficulty.removal_search import RemovalScene, RemovalSearch
 from robocas_ms3.demos.difficulty.scripted_choice import choose_scripted_removal
-from robocas_ms3.demos.forked_processes import ForkedProcessError, run_in_forked_process
+from robocas_ms3.demos.forked_processes import run_in_forked_process
 from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.planning.decisions import IrreversibleDecisions
 from robocas_ms3.planning.executor import MotionExecutor
@@ -44,6 +45,7 @@ def measure_difficulty(generator: EpisodeGenerator, seed: int, limits: RemovalLi
 
     Raises:
         LayoutError: the seed has no layout.
+        ForkedProcessError: the process of a grasp crashed or exceeded its time limit.
     """
     executor = MotionExecutor(generator.env, seed)
     executor.reset()
@@ -56,7 +58,9 @@ def measure_difficulty(generator: EpisodeGenerator, seed: int, limits: RemovalLi
     target, present = arm.target, arm.env.present[0].cpu().numpy()
     hidden, obstacles = measure_clutter(arm)
     others = [slot for slot in np.flatnonzero(present).tolist() if slot != target]
-    result = RemovalSearch(make_removal_scene(arm), limits.max_removals, limits.max_simulated).run()
+    result = RemovalSearch(
+        make_removal_scene(arm, limits.grasp_attempts), limits.max_removals, limits.max_simulated
+    ).run()
     return SceneDifficulty(
         seed=seed,
         target=arm.env.target_asset().asset.id,
@@ -86,7 +90,7 @@ def measure_gap(target: NDArray[np.floating], others: Sequence[NDArray[np.floati
     return float(np.minimum(sorted(gaps)[:NEIGHBOURS], MAX_GAP).mean())
 
 
-def make_removal_scene(arm: Arm) -> RemovalScene:
+def make_removal_scene(arm: Arm, grasp_attempts: int) -> RemovalScene:
     """Make the scene of a search with the skills of the scripted policy, in the present state of the arm."""
     target = arm.target
 
@@ -104,8 +108,13 @@ def make_removal_scene(arm: Arm) -> RemovalScene:
         if find_fallen_objects(arm) - fallen:
             raise PlanningError("clear", "fell_off_table")
 
+    def grasp(attempt: int, kind: int) -> None:
+        arm.follow_path((*arm.decision_path, attempt))  # other random numbers
+        grasp_in_clutter(arm, target, kind)
+
     def can_grasp() -> bool:
-        return any(_try_in_fork(partial(grasp_in_clutter, arm, target, kind)) for kind in range(GRASP_KINDS))
+        options = product(range(grasp_attempts), range(GRASP_KINDS))
+        return any(_try_in_fork(partial(grasp, attempt, kind)) for attempt, kind in options)
 
     return RemovalScene(
         list_obstacles, partial(count_fewest_blockers, arm, target), 1 + len(PUSH_TURNS_DEG), remove, can_grasp
@@ -122,7 +131,4 @@ def _try_in_fork(skill: Callable[[], None]) -> bool:
             return False
         return True
 
-    try:
-        return run_in_forked_process(run)
-    except ForkedProcessError:
-        return False
+    return run_in_forked_process(run)

@@ -17,7 +17,7 @@ from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
 from robocas_ms3.evaluation.clutter_scale.study import make_study
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.results import read_result
-from robocas_ms3.evaluation.scene_difficulties import DIFFICULTIES, read_difficulties_of
+from robocas_ms3.evaluation.scene_difficulties import DIFFICULTIES
 
 ABILITIES = {"weak": 0.5, "middle": 1.5, "strong": 2.5}  # removals at which the policy succeeds half of the time
 
@@ -106,11 +106,6 @@ def test_command_writes_numbers_and_a_plot(study, tmp_path, capsys):
         assert [policy["name"] for policy in written["tasks"][task]["policies"]] == ["strong", "middle", "weak"]
         assert len(written["tasks"][task]["difficulty"]) == len(written["tasks"][task]["episodes"]) == 80
     assert (tmp_path / "clutter_scale.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_protocol_without_difficulties_is_an_error():
-    with pytest.raises(EvaluationError):
-        read_difficulties_of(load_protocol("clutter-v1"))
 
 
 def test_policy_that_always_succeeds_is_the_first_and_is_not_fitted(study):

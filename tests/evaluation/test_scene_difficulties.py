@@ -1,0 +1,45 @@
+"""Difficulties of the scenes of a protocol, measured in its frozen layouts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from robocas_ms3.core.errors import EvaluationError
+from robocas_ms3.core.json_lines import JsonLinesFile
+from robocas_ms3.demos.difficulty.records import RemovalLimits, SceneDifficulty
+from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.scene_difficulties import DIFFICULTIES, measure_protocol, read_difficulties_of
+
+GEOMETRY = ("seed", "target", "objects", "visible_fraction", "obstacles", "free_grasps", "fewest_blockers", "gap")
+
+
+def test_scenes_are_measured_in_the_frozen_layouts(tmp_path):
+    protocol = load_protocol("clutter-scale-v1")
+    expected = read_difficulties_of(protocol)
+    numbers = [1, 0, next(n for n, episode in enumerate(protocol.episodes) if episode.task == "search")]
+    few = replace(protocol, episodes=tuple(protocol.episodes[number] for number in numbers))
+    counts: list[tuple[int, int]] = []
+    limits = RemovalLimits(max_removals=0, grasp_attempts=1)
+    results = measure_protocol(few, tmp_path, limits, on_start=lambda *start: counts.append(start))
+    assert len(list(results)) == 3
+    measured = JsonLinesFile(tmp_path / DIFFICULTIES, SceneDifficulty).read()
+    for name in GEOMETRY:
+        found = [getattr(scene, name) for scene in measured]
+        assert found == [pytest.approx(getattr(expected[number], name), abs=1e-3) for number in numbers], name
+    assert list(measure_protocol(few, tmp_path, limits, on_start=lambda *start: counts.append(start))) == []
+    assert counts == [(3, 0), (3, 3)]
+
+
+def test_protocol_without_difficulties_is_an_error():
+    with pytest.raises(EvaluationError):
+        read_difficulties_of(load_protocol("clutter-v1"))
+
+
+def test_difficulties_of_other_scenes_are_an_error(tmp_path):
+    protocol = load_protocol("clutter-scale-v1")
+    lines = read_difficulties_of(protocol)
+    JsonLinesFile(tmp_path / DIFFICULTIES, SceneDifficulty).rewrite([*lines[:-1], replace(lines[-1], seed=7)])
+    with pytest.raises(EvaluationError):
+        read_difficulties_of(replace(protocol, folder=tmp_path))
