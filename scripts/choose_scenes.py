@@ -1,18 +1,18 @@
-"""Measure the difficulty of many scenes, and choose scenes for a protocol that are evenly spread over the difficulty.
+"""Choose episodes of a protocol whose scenes are evenly spread over the difficulty, and write them as another protocol.
 
-    python scripts/choose_scenes.py scripts/clutter_scale_candidates.yaml --scenes 300 --out difficulty/scale
+    robocas eval freeze scripts/clutter_scale_candidates.yaml --out candidates
+    robocas difficulty --protocol candidates --out difficulty
+    cp difficulty/difficulty.jsonl candidates/
+    python scripts/choose_scenes.py candidates --scenes 300 --name mine --out protocols/mine
 
-SOURCE is a protocol source (docs/evaluation.md). The seeds of its parts are those of the measured scenes. The script
-writes OUT/NAME with the difficulties of each part, OUT/source.yaml with the chosen seeds, and OUT/difficulty.jsonl with
-their difficulties in the order of the episodes. An interrupted run is continued.
-
-The scenes are grouped by task and number of removals. All groups get the same number of scenes if they have enough;
-within a group, scenes are chosen evenly over the visible fraction of the target.
+The episodes are grouped by task and number of removals (docs/difficulty.md). All groups get the same number of scenes
+if they have enough; within a group, scenes are chosen evenly over the visible fraction of the target. The written
+protocol has the frozen layouts of its episodes, and their difficulties.
 """
 
 from __future__ import annotations
 
-import os
+import shutil
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,70 +22,58 @@ import numpy as np
 import tyro
 import yaml
 
-from robocas_ms3.cli.progress import ProgressBar
+from robocas_ms3.core.documents import load_yaml
+from robocas_ms3.core.files import atomic_folder, make_folder
 from robocas_ms3.core.json_lines import JsonLinesFile
-from robocas_ms3.demos.difficulty.difficulty_file import DifficultySettings, measure_seeds, read_difficulties
+from robocas_ms3.core.output_folder import check_replaceable
 from robocas_ms3.demos.difficulty.records import SceneDifficulty
-from robocas_ms3.evaluation.freeze import ProtocolPart, read_protocol_source
+from robocas_ms3.evaluation.bundled_protocols import RULES
+from robocas_ms3.evaluation.protocol import (
+    CONFIGS,
+    EPISODES,
+    LAYOUTS,
+    TRAIN,
+    LoadedProtocol,
+    ProtocolEpisode,
+    load_protocol,
+)
+from robocas_ms3.evaluation.scene_difficulties import DIFFICULTIES, read_difficulties_of
 
 MOST_REMOVALS = 3  # scenes with more removals, or without a solution, are in the same group
-Scene = tuple[str, SceneDifficulty]  # name of its part, difficulty
+Scene = tuple[ProtocolEpisode, SceneDifficulty]
 
 
 @dataclass
 class Options:
     """Options of the script."""
 
-    source: tyro.conf.Positional[Path]
-    """Protocol source."""
+    protocol: tyro.conf.Positional[str]
+    """Protocol folder with difficulty.jsonl."""
     out: Path
-    """Output folder."""
+    """Folder of the new protocol."""
+    name: str
+    """Name of the new protocol."""
+    description: str = ""
+    """Description of the new protocol. Default: that of the old one."""
     scenes: int = 300
     """Number of scenes to choose."""
     min_removals: int = 0
     """Smallest number of removals of the chosen scenes; 1 for questions about the order of removals."""
-    jobs: int = os.cpu_count() or 1
-    """Number of processes."""
 
 
 def main(options: Options) -> None:
-    source = read_protocol_source(options.source)
+    check_replaceable(options.out)
+    protocol = load_protocol(options.protocol)
     groups: dict[tuple[str, int], list[Scene]] = defaultdict(list)
-    for part in source.parts:
-        task = part.load_config().task
-        for scene in measure_part(part, str(source.rules.get("pack", "builtin")), options):
-            removals = MOST_REMOVALS if scene.removals is None else min(scene.removals, MOST_REMOVALS)
-            if removals >= options.min_removals:
-                groups[task, removals].append((part.file_stem, scene))
-    chosen = choose_evenly(groups, options.scenes)
-    order = {part.file_stem: number for number, part in enumerate(source.parts)}
-    chosen.sort(key=lambda scene: (order[scene[0]], scene[1].seed))
-    parts = []
-    for part in source.parts:
-        seeds = [scene.seed for name, scene in chosen if name == part.file_stem]
-        if seeds:
-            parts.append({**part.model_dump(exclude_defaults=True, exclude={"count", "first_seed"}), "seeds": seeds})
-    content = {**source.model_dump(exclude={"lists"}), "parts": parts}
-    (options.out / "source.yaml").write_text(yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")
-    JsonLinesFile(options.out / "difficulty.jsonl", SceneDifficulty).rewrite(scene for _, scene in chosen)
+    for episode, scene in zip(protocol.episodes, read_difficulties_of(protocol), strict=True):
+        removals = MOST_REMOVALS if scene.removals is None else min(scene.removals, MOST_REMOVALS)
+        if removals >= options.min_removals:
+            groups[episode.task, removals].append((episode, scene))
+    chosen = sorted(choose_evenly(groups, options.scenes), key=lambda scene: scene[0].episode)
+    write_protocol(protocol, chosen, options)
     for (task, removals), scenes in sorted(groups.items()):
         name = f"{removals} or more" if removals == MOST_REMOVALS else str(removals)
         print(f"{task}, {name} removals: {sum(scene in scenes for scene in chosen)} of {len(scenes)} scenes")
-
-
-def measure_part(part: ProtocolPart, pack: str, options: Options) -> list[SceneDifficulty]:
-    config = part.load_config()
-    settings = DifficultySettings(config.task, config.model_dump(mode="json"), pack)
-    seeds = part.seeds or range(part.first_seed, part.first_seed + part.count)
-    out = options.out / part.file_stem
-    with ProgressBar(f"scenes of {part.file_stem} measured") as bar:
-        for result in measure_seeds(
-            settings, seeds, out, jobs=options.jobs, on_start=lambda count: bar.start(len(seeds), count)
-        ):
-            if result.problem:
-                bar.add_note(f"seed {result.seed}: {result.problem}")
-            bar.advance()
-    return [scene for scene in read_difficulties(out) if scene.seed in seeds]
 
 
 def choose_evenly(groups: Mapping[tuple[str, int], Sequence[Scene]], count: int) -> list[Scene]:
@@ -100,6 +88,27 @@ def choose_evenly(groups: Mapping[tuple[str, int], Sequence[Scene]], count: int)
         positions = np.linspace(0, len(ordered) - 1, sizes[key]).round().astype(int)
         chosen += [ordered[position] for position in positions]
     return chosen
+
+
+def write_protocol(protocol: LoadedProtocol, scenes: Sequence[Scene], options: Options) -> None:
+    """Write a protocol with some of the episodes of another one, with their layouts and difficulties."""
+    rules = load_yaml(protocol.folder / RULES) | {"name": options.name}
+    rules |= {"description": options.description} if options.description else {}
+    episodes = [episode.model_copy(update={"episode": number}) for number, (episode, _) in enumerate(scenes)]
+    with atomic_folder(options.out) as tmp:
+        if protocol.training_configs():
+            shutil.copytree(protocol.folder / TRAIN, tmp / TRAIN)
+        make_folder(tmp / LAYOUTS)
+        make_folder(tmp / CONFIGS)
+        for config in dict.fromkeys(episode.config for episode in episodes):
+            shutil.copy(protocol.config_file(config), tmp / CONFIGS)
+            records = np.load(protocol.layouts_file(config))
+            seeds = [episode.seed for episode in episodes if episode.config == config]
+            np.save(tmp / LAYOUTS / f"{config}.npy", records[np.isin(records["seed"], seeds)])
+        lines = "".join(f"{episode.model_dump_json()}\n" for episode in episodes)
+        (tmp / EPISODES).write_text(lines, encoding="utf-8")
+        (tmp / RULES).write_text(yaml.safe_dump(rules, sort_keys=False, allow_unicode=True), encoding="utf-8")
+        JsonLinesFile(tmp / DIFFICULTIES, SceneDifficulty).rewrite(scene for _, scene in scenes)
 
 
 if __name__ == "__main__":

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import sys
-from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
+import numpy as np
 import pytest
-import yaml
 
+from robocas_ms3.assets.pack import load_pack
+from robocas_ms3.core.errors import OutputExistsError
 from robocas_ms3.demos.difficulty.records import SceneDifficulty
+from robocas_ms3.evaluation.protocol import load_protocol
+from robocas_ms3.evaluation.scene_difficulties import read_difficulties_of
+from robocas_ms3.scenes.layout_table import FrozenLayouts
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "choose_scenes.py"
 
@@ -27,8 +30,8 @@ def script() -> ModuleType:
     return module
 
 
-def make_scene(seed: int, visible: float) -> tuple[str, SceneDifficulty]:
-    return "part", SceneDifficulty(seed, "mug", 5, visible, 0, 1, 0, 0.1, 0, [], None, 0, True)
+def make_scene(seed: int, visible: float) -> tuple[SimpleNamespace, SceneDifficulty]:
+    return SimpleNamespace(episode=seed), SceneDifficulty(seed, "mug", 5, visible, 0, 1, 0, 0.1, 0, [], None, 0, True)
 
 
 def test_groups_get_equal_numbers_and_small_groups_all_their_scenes(script):
@@ -53,32 +56,26 @@ def test_more_scenes_than_there_are_means_all(script):
     assert len(script.choose_evenly({("pick", 0): scenes}, 10)) == 3
 
 
-def test_scenes_of_the_source_are_measured_and_chosen(script, tmp_path, monkeypatch):
-    """The measured seeds and the pack are those of the source, and scenes with too few removals are left out."""
-    source = {
-        "rules": {"name": "mine", "pack": "builtin", "max_seconds": {"search": 60}},
-        "parts": [
-            {"config": "search_table_small_heap", "name": "first", "seeds": [7, 9]},
-            {"config": "search_table_small_heap", "name": "second", "count": 3, "first_seed": 20},
-        ],
-    }
-    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(source))
-    measured = {}
-
-    def measure_seeds(settings, seeds, out, **others):
-        measured[out.name] = (settings.pack, list(seeds))
-        return []
-
-    def read_difficulties(folder):
-        return [replace(make_scene(seed, 0.5)[1], removals=seed % 2) for seed in measured[folder.name][1]]
-
-    monkeypatch.setattr(script, "measure_seeds", measure_seeds)
-    monkeypatch.setattr(script, "read_difficulties", read_difficulties)
-    out = tmp_path / "out"
-    out.mkdir()
-    script.main(script.Options(tmp_path / "mine.yaml", out, scenes=10, min_removals=1, jobs=1))
-    assert measured == {"first": ("builtin", [7, 9]), "second": ("builtin", [20, 21, 22])}
-    written = yaml.safe_load((out / "source.yaml").read_text())
-    assert [part["seeds"] for part in written["parts"]] == [[7, 9], [21]]
-    lines = (out / "difficulty.jsonl").read_text().splitlines()
-    assert [json.loads(line)["seed"] for line in lines] == [7, 9, 21]
+def test_chosen_episodes_are_a_protocol_with_their_layouts_and_difficulties(script, tmp_path):
+    source = load_protocol("clutter-scale-v1")
+    difficulties = read_difficulties_of(source)
+    out = tmp_path / "mine"
+    script.main(script.Options("clutter-scale-v1", out, "mine", "Hard scenes.", scenes=25, min_removals=1))
+    chosen = load_protocol(out)
+    assert (chosen.rules.name, chosen.rules.description) == ("mine", "Hard scenes.")
+    assert [episode.episode for episode in chosen.episodes] == list(range(25))
+    number = {(episode.config, episode.seed): episode.episode for episode in source.episodes}
+    numbers = [number[episode.config, episode.seed] for episode in chosen.episodes]
+    assert numbers == sorted(numbers)
+    assert read_difficulties_of(chosen) == [difficulties[number] for number in numbers]
+    assert all(difficulties[number].removals != 0 for number in numbers)
+    names = load_pack("builtin").objects
+    for episode in chosen.episodes:
+        ours, theirs = (
+            FrozenLayouts(protocol.layouts_file(episode.config), names)(episode.seed, episode.seed)
+            for protocol in (chosen, source)
+        )
+        assert ours.object_ids == theirs.object_ids
+        assert np.array_equal(ours.object_poses, theirs.object_poses)
+    with pytest.raises(OutputExistsError):
+        script.main(script.Options("clutter-scale-v1", out, "mine"))
