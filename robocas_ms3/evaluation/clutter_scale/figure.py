@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from matplotlib.lines import Line2D
 
 from robocas_ms3.core.files import atomic_file
 from robocas_ms3.datasets.statistics.figures import DPI, make_axes, make_figure
@@ -21,14 +20,15 @@ def write_curves(study: ClutterStudy, path: Path) -> None:
     figure = make_figure(1.5 + 5 * columns, 5.5)
     axes = make_axes(figure, 2, columns, 2 * columns)
     figure.get_layout_engine().set(h_pad=0.1)
-    names = {policy.name: policy.track for task in study.tasks.values() for policy in task.policies}
+    names = dict.fromkeys(policy.name for task in study.tasks.values() for policy in task.policies)
     colors = {name: f"C{number % 10}" for number, name in enumerate(names)}
+    lines = {}
     difficulty = np.linspace(0, HARDEST, 101)
     for column, (name, task) in enumerate(study.tasks.items()):
         curves, scenes = axes[column], axes[columns + column]
         for policy in task.policies:
             color, style = colors[policy.name], "--" if policy.track == _DASHED else "-"
-            curves.plot(difficulty, 100 * policy.curve.predict(difficulty), style, color=color)
+            (lines[policy.name],) = curves.plot(difficulty, 100 * policy.curve.predict(difficulty), style, color=color)
             if policy.curve.half is not None and 0 <= policy.curve.half <= HARDEST:
                 low, high = np.clip([policy.curve.low, policy.curve.high], 0, HARDEST)
                 curves.plot([low, high], [50, 50], color=color, alpha=0.4, linewidth=4)
@@ -36,11 +36,7 @@ def write_curves(study: ClutterStudy, path: Path) -> None:
         curves.set(title=name, ylabel="success / %", ylim=(-2, 102), xlim=(0, HARDEST))
         scenes.hist(task.difficulty, bins=20, range=(0, HARDEST))
         scenes.set(xlabel="difficulty", ylabel="scenes", xlim=(0, HARDEST))
-    handles = [
-        Line2D([], [], color=colors[name], linestyle="--" if track == _DASHED else "-", label=name)
-        for name, track in names.items()
-    ]
     figure.suptitle("Success against difficulty (dots: half of the episodes succeed; dashed: privileged)", fontsize=10)
-    figure.legend(handles=handles, fontsize=7, loc="outside lower center", ncols=2)
+    figure.legend(lines.values(), lines, fontsize=7, loc="outside lower center", ncols=2)
     with atomic_file(path) as tmp:
         figure.savefig(tmp, dpi=DPI, format="png")
