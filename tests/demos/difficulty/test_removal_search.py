@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from itertools import permutations
 
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from robocas_ms3.core.errors import PlanningError
 from robocas_ms3.demos.difficulty.removal_search import RemovalScene, RemovalSearch
+from robocas_ms3.demos.forked_processes import ForkedProcessError
 
 
 class ToyHeap:
@@ -101,6 +103,22 @@ def test_crashed_process_makes_the_search_incomplete():
     scene = RemovalScene(scene.list_obstacles, scene.count_blockers, 1, crash, scene.can_grasp)
     result = RemovalSearch(scene, 2, 100).run()
     assert (result.removals, result.first, result.complete) == (1, (2,), False)
+
+
+def test_grasp_that_exceeds_its_time_limit_makes_the_search_incomplete():
+    """Without object 0, no grasp has a result: it is not known whether one removal is enough."""
+    heap = ToyHeap([2])
+
+    def can_grasp():
+        if 0 not in heap.objects:
+            raise ForkedProcessError("time limit")
+        return not heap.blockers & heap.objects
+
+    result = RemovalSearch(replace(heap.make_scene(), can_grasp=can_grasp), 2, 100).run()
+    assert (result.removals, result.first, result.complete) == (1, (2,), False)
+    heap.objects.discard(0)
+    with pytest.raises(ForkedProcessError):
+        RemovalSearch(replace(heap.make_scene(), can_grasp=can_grasp), 2, 100).run()
 
 
 @settings(max_examples=15, deadline=None)
