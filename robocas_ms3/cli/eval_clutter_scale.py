@@ -17,19 +17,21 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class ClutterScale:
-    """Fit a scale of the difficulty of scenes to the results of several policies, and place the policies on it.
+    """Place policies on a scale of the difficulty of scenes: the difficulty that they solve half of the time.
 
-    Each task has its own scale, from 0 (easiest scene of the protocol) to 10 (hardest scene). It is fitted to the
-    policies with 10 to 90 % success in this task; at least two are necessary. Writes clutter_scale.json and
-    clutter_scale.png.
+    Each task has its own scale, from 0 (easiest scene of the protocol) to 10 (hardest scene). clutter-scale-v1 has a
+    fixed scale. For another protocol with difficulties, the scale is fitted to the policies with 10 to 90 % success in
+    the task; at least two are necessary. Writes clutter_scale.json, curves.json and clutter_scale.png.
 
-    Example: robocas eval clutter-scale eval/keyframe eval/small eval/expert --out eval/scale
+    Example: robocas eval clutter-scale eval/mine --out eval/scale
     """
 
     folders: Folders
     """Folders of results on one protocol; shards of one evaluation count as one result."""
     protocol: Annotated[Maybe[str], tyro.conf.arg(metavar="PROTOCOL")] = None
     """Protocol folder. Required if the protocol of the results is not bundled."""
+    fit: bool = False
+    """Fit the scale to these results, also if the protocol has a fixed scale."""
     out: Path
     """Output folder."""
 
@@ -43,12 +45,13 @@ def clutter_scale(cfg: ClutterScale) -> int:
     require_extra("clutter-scale", "the clutter scale", "sklearn")
     require_extra("plots", "the plot of the clutter scale", "matplotlib")
     from robocas_ms3.evaluation.clutter_scale.figure import write_curves
-    from robocas_ms3.evaluation.clutter_scale.study import make_study
+    from robocas_ms3.evaluation.clutter_scale.scale_file import SCALE_FILE
+    from robocas_ms3.evaluation.clutter_scale.study import describe_rates, make_study
 
     results = read_evaluations(cfg.folders)
-    study = make_study(results, find_protocol_of(results[0], cfg.protocol))
+    study = make_study(results, find_protocol_of(results[0], cfg.protocol), fit=cfg.fit)
     make_folder(cfg.out)
-    study.write(cfg.out / "clutter_scale.json")
+    study.write(cfg.out)
     write_curves(study, cfg.out / "clutter_scale.png")
     for name, task in study.tasks.items():
         rows = [
@@ -65,12 +68,14 @@ def clutter_scale(cfg: ClutterScale) -> int:
         weights = sorted(task.standard_weights.items(), key=lambda item: -abs(item[1]))
         rows = [(feature, f"{weight:.2f}") for feature, weight in weights]
         print_table((f"feature in {name}", "difficulty per standard deviation"), rows)
-        if task.mean_auc is not None:
+        if task.mean_auc is not None and not study.is_fixed:
             print_line(f"{name}: mean AUC in scenes that were not used for the fit: {task.mean_auc:.2f}")
     for name, rates in study.left_out.items():
-        found = ", ".join(f"{rate:.0%}" for rate in rates)
-        print_line(f"{name}: no scale, because too few policies have 10 to 90 % success: {found}")
-    print_line(f"wrote {cfg.out / 'clutter_scale.json'} and {cfg.out / 'clutter_scale.png'}")
+        reason = "the protocol has none" if study.is_fixed else "too few policies have 10 to 90 % success"
+        print_line(f"{name}: no scale, because {reason}: {describe_rates(rates)}")
+    if study.is_fixed:
+        print_line("The scale is the fixed one of the protocol; to fit it to these results, pass --fit.")
+    print_line(f"wrote {SCALE_FILE}, curves.json and clutter_scale.png to {cfg.out}")
     return 0
 
 

@@ -19,6 +19,7 @@ from robocas_ms3.core.errors import EvaluationError
 HARDEST = 10.0  # difficulty of the hardest scene of the fit; the easiest has 0
 FOLDS = 5
 _INVERSE_PENALTY = 10.0  # C of scikit-learn, for standardized features: keeps weights of correlated features finite
+_SMALLEST_SPREAD = 1e-9  # standard deviation below which a feature is constant
 Array = NDArray[np.floating]
 
 
@@ -55,9 +56,25 @@ def fit_clutter_scale(successes: Array, features: Array) -> ClutterScale:
     weights = _fit_weights(successes, features)
     raw = features @ weights
     unit = (raw.max() - raw.min()) / HARDEST
-    if unit == 0:
+    if unit < _SMALLEST_SPREAD:
         raise EvaluationError("the scenes have no scale of difficulty", expected="scenes with different features")
     return ClutterScale(weights / unit, float(-raw.min() / unit))
+
+
+def compute_auc(difficulty: Array, success: Array) -> float:
+    """Return the area under the ROC curve with which the difficulty predicts the failures of a policy.
+
+    Args:
+        difficulty: (S,) difficulties of scenes.
+        success: (S,) 1: the policy succeeded, 0: it failed, NaN: it was not evaluated.
+
+    Returns:
+        The area; NaN if the policy has no successes or no failures.
+    """
+    evaluated = ~np.isnan(success)
+    if not 0 < success[evaluated].sum() < evaluated.sum():
+        return float("nan")
+    return float(roc_auc_score(1 - success[evaluated], difficulty[evaluated]))
 
 
 def compute_held_out_auc(successes: Array, features: Array, seed: int = 0) -> Array:
@@ -72,9 +89,7 @@ def compute_held_out_auc(successes: Array, features: Array, seed: int = 0) -> Ar
             continue  # nothing to fit
         difficulty = features[held_out] @ _fit_weights(successes[:, training], features[training])
         for policy, row in enumerate(successes[:, held_out]):
-            evaluated = ~np.isnan(row)
-            if 0 < row[evaluated].sum() < evaluated.sum():
-                areas[fold, policy] = roc_auc_score(1 - row[evaluated], difficulty[evaluated])
+            areas[fold, policy] = compute_auc(difficulty, row)
     counts = (~np.isnan(areas)).sum(axis=0)
     return np.where(counts > 0, np.nansum(areas, axis=0) / np.maximum(counts, 1), np.nan)
 
@@ -82,7 +97,7 @@ def compute_held_out_auc(successes: Array, features: Array, seed: int = 0) -> Ar
 def _fit_weights(successes: Array, features: Array) -> Array:
     """Return the difficulty (F,) in logits per unit of each feature."""
     spread = features.std(axis=0)
-    spread[spread == 0] = 1.0
+    spread[spread < _SMALLEST_SPREAD] = 1.0
     policy, scene = np.nonzero(~np.isnan(successes))
     abilities = np.eye(len(successes))[policy]
     inputs = np.concatenate([abilities, -((features - features.mean(axis=0)) / spread)[scene]], axis=1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,13 @@ from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.files import write_json
 from robocas_ms3.evaluation.clutter_scale.curves import SuccessCurve, fit_success_curve
 from robocas_ms3.evaluation.clutter_scale.features import FEATURES, make_features
-from robocas_ms3.evaluation.clutter_scale.item_response import ClutterScale, compute_held_out_auc, fit_clutter_scale
+from robocas_ms3.evaluation.clutter_scale.item_response import (
+    ClutterScale,
+    compute_auc,
+    compute_held_out_auc,
+    fit_clutter_scale,
+)
+from robocas_ms3.evaluation.clutter_scale.scale_file import SCALE_FILE, read_scales, write_scales
 from robocas_ms3.evaluation.protocol import LoadedProtocol
 from robocas_ms3.evaluation.report.tables import describe_action_noise, name_policy
 from robocas_ms3.evaluation.results import Result
@@ -33,7 +39,9 @@ class PolicyOnScale:
         name: name of the policy, with action noise.
         track: track of the policy.
         curve: success against difficulty.
-        auc: area under the ROC curve in scenes that were not used for the scale; None: not fitted.
+        auc: area under the ROC curve with which the difficulty predicts the failures of the policy. If the scale was
+            fitted, only in scenes that were not used for the fit, and only for the policies of the fit. None: not
+            known.
     """
 
     name: str
@@ -48,23 +56,23 @@ class TaskStudy:
 
     Attributes:
         scale: the scale.
+        fitted: names of the policies to which the scale was fitted.
         episodes: (S,) numbers of the episodes whose scenes are on the scale.
         difficulty: (S,) difficulties of these scenes.
         standard_weights: weight of each feature times its standard deviation over the scenes, by name.
         policies: the policies, the one with the highest success rate first.
-        fitted: names of the policies to which the scale was fitted.
     """
 
     scale: ClutterScale
+    fitted: list[str]
     episodes: NDArray[np.integer]
     difficulty: NDArray[np.floating]
     standard_weights: dict[str, float]
     policies: list[PolicyOnScale]
-    fitted: list[str]
 
     @property
     def mean_auc(self) -> float | None:
-        """Return the mean area under the ROC curve of the fitted policies in held-out scenes; None: not known."""
+        """Return the mean area under the ROC curve of the policies; None: not known."""
         areas = [policy.auc for policy in self.policies if policy.auc is not None]
         return float(np.mean(areas)) if areas else None
 
@@ -74,79 +82,131 @@ class ClutterStudy:
     """Clutter scales of the tasks of a protocol.
 
     Attributes:
+        is_fixed: whether the scales are those of the protocol; otherwise they were fitted to the results.
         tasks: scale and policies by task.
-        left_out: by task without a scale, the success rates of the policies, of which too few are in `FITTED_RATES`.
+        left_out: by task without a scale, the success rate of each policy.
     """
 
+    is_fixed: bool
     tasks: dict[str, TaskStudy]
-    left_out: dict[str, list[float]]
+    left_out: dict[str, dict[str, float]]
 
-    def write(self, path: Path) -> None:
-        """Write the study as JSON; infinite limits of intervals are null."""
+    def write(self, folder: Path) -> None:
+        """Write the scales as `SCALE_FILE`, and the policies as ``curves.json``; infinite limits are null."""
+        scales = {name: task.scale for name, task in self.tasks.items()}
+        write_scales(folder / SCALE_FILE, scales, {name: task.fitted for name, task in self.tasks.items()})
         content = {name: {**asdict(task), "mean_auc": task.mean_auc} for name, task in self.tasks.items()}
-        write_json(path, _to_json({"tasks": content, "left_out": self.left_out}))
+        for task in content.values():
+            del task["scale"]
+        write_json(folder / "curves.json", _to_json({"tasks": content, "left_out": self.left_out}))
 
 
-def make_study(results: Sequence[Result], protocol: LoadedProtocol) -> ClutterStudy:
-    """Fit the clutter scale of each task to results on a protocol, and place the policies on it.
+@dataclass(frozen=True)
+class _TaskResults:
+    """Results of the policies that were evaluated in a task.
 
-    A scale is fitted to the policies that succeed in 10 to 90 % of their episodes of the task. Scenes without a known
-    number of removals are left out.
+    Attributes:
+        results: P results.
+        successes: (P, S) 1: success, 0: failure, NaN: not evaluated.
+        episodes: (S,) numbers of the episodes.
+        features: (S, F) features of the scenes.
+    """
+
+    results: list[Result]
+    successes: NDArray[np.float64]
+    episodes: NDArray[np.integer]
+    features: NDArray[np.float64]
+
+    def find_fitted(self) -> NDArray[np.bool_]:
+        """Return (P,) to which policies a scale can be fitted."""
+        counts, rates = (~np.isnan(self.successes)).sum(axis=1), np.nanmean(self.successes, axis=1)
+        return (counts >= MIN_EPISODES) & (rates >= FITTED_RATES[0]) & (rates <= FITTED_RATES[1])
+
+    def list_rates(self) -> dict[str, float]:
+        """Return the success rate of each policy by its name."""
+        rates = np.nanmean(self.successes, axis=1).tolist()
+        return {_name(result): rate for result, rate in zip(self.results, rates, strict=True)}
+
+
+def make_study(results: Sequence[Result], protocol: LoadedProtocol, *, fit: bool = False) -> ClutterStudy:
+    """Place policies on the clutter scale of each task of a protocol.
+
+    The scale is the fixed one of the protocol (`SCALE_FILE` in its folder). Without one, or with ``fit``, it is fitted
+    to the policies that succeed in 10 to 90 % of their episodes of the task. Scenes without a known number of removals
+    are left out.
 
     Raises:
-        EvaluationError: a result has another protocol, or no task has two policies between 10 and 90 %.
+        EvaluationError: a result has another protocol, the fixed scale is damaged, or no task has two policies between
+            10 and 90 %.
     """
     for result in results:
         if result.run.protocol_hash != protocol.hash:
-            found, wanted = result.run.protocol_hash[:16], protocol.hash[:16]
-            raise EvaluationError("result of another protocol", where=result.folder, expected=wanted, found=found)
-    features = make_features(read_difficulties_of(protocol))
-    successes = np.array([_read_successes(result, len(features)) for result in results])
+            found = f"{result.run.protocol}, hash {result.run.protocol_hash[:16]}"
+            expected = f"{protocol.rules.name}, hash {protocol.hash[:16]}"
+            raise EvaluationError("result of another protocol", where=result.folder, expected=expected, found=found)
+    fixed = None if fit else read_scales(protocol.folder / SCALE_FILE)
     tasks: dict[str, TaskStudy] = {}
-    left_out: dict[str, list[float]] = {}
-    for task in dict.fromkeys(episode.task for episode in protocol.episodes):
-        in_task = np.array([episode.task == task for episode in protocol.episodes])
-        episodes = np.flatnonzero(in_task & ~np.isnan(features).any(axis=1))
-        counts = (~np.isnan(successes[:, episodes])).sum(axis=1)
-        evaluated = np.flatnonzero(counts)
-        rates = np.nanmean(successes[evaluated][:, episodes], axis=1)
-        fitted = (counts[evaluated] >= MIN_EPISODES) & (rates >= FITTED_RATES[0]) & (rates <= FITTED_RATES[1])
-        if fitted.sum() >= MIN_POLICIES:
-            chosen = [results[number] for number in evaluated]
-            tasks[task] = _make_task_study(chosen, successes[evaluated], fitted, episodes, features)
+    left_out: dict[str, dict[str, float]] = {}
+    for task, evaluated in _split_by_task(results, protocol).items():
+        fitted = evaluated.find_fitted()
+        if fixed is not None and task in fixed:
+            tasks[task] = _place_policies(evaluated, fixed[task].make_scale(), fixed[task].fitted)
+        elif fixed is None and fitted.sum() >= MIN_POLICIES:
+            tasks[task] = _fit_task(evaluated, fitted)
         else:
-            left_out[task] = rates.tolist()
+            left_out[task] = evaluated.list_rates()
     if not tasks:
         what = "too few policies to fit a scale"
         wanted = f"{MIN_POLICIES} policies with 10 to 90 % success in at least {MIN_EPISODES} episodes of a task"
-        found = "; ".join(f"{task}: {', '.join(f'{rate:.0%}' for rate in rates)}" for task, rates in left_out.items())
-        raise EvaluationError(what, expected=wanted, found=found)
-    return ClutterStudy(tasks, left_out)
+        found = "; ".join(f"{task}: {describe_rates(rates)}" for task, rates in left_out.items())
+        raise EvaluationError(what, expected=wanted, found=found, fix="Add results of other policies.")
+    return ClutterStudy(fixed is not None, tasks, left_out)
 
 
-def _make_task_study(
-    results: Sequence[Result],
-    successes: NDArray[np.float64],
-    fitted: NDArray[np.bool_],
-    episodes: NDArray[np.integer],
-    features: NDArray[np.float64],
+def describe_rates(rates: Mapping[str, float]) -> str:
+    """Return success rates by name as a text."""
+    return ", ".join(f"{name} {rate:.0%}" for name, rate in rates.items())
+
+
+def _split_by_task(results: Sequence[Result], protocol: LoadedProtocol) -> dict[str, _TaskResults]:
+    """Return the results in each task, without policies and tasks that were not evaluated."""
+    features = make_features(read_difficulties_of(protocol))
+    successes = np.array([_read_successes(result, len(features)) for result in results])
+    tasks: dict[str, _TaskResults] = {}
+    for task in dict.fromkeys(episode.task for episode in protocol.episodes):
+        in_task = np.array([episode.task == task for episode in protocol.episodes])
+        episodes = np.flatnonzero(in_task & ~np.isnan(features).any(axis=1))
+        evaluated = np.flatnonzero((~np.isnan(successes[:, episodes])).any(axis=1))
+        if len(evaluated):
+            chosen = [results[number] for number in evaluated]
+            tasks[task] = _TaskResults(chosen, successes[np.ix_(evaluated, episodes)], episodes, features[episodes])
+    return tasks
+
+
+def _fit_task(task: _TaskResults, fitted: NDArray[np.bool_]) -> TaskStudy:
+    """Fit the scale of a task to some of its policies, and place all policies on it."""
+    scale = fit_clutter_scale(task.successes[fitted], task.features)
+    areas = np.full(len(task.results), np.nan)
+    areas[fitted] = compute_held_out_auc(task.successes[fitted], task.features)
+    names = [_name(task.results[number]) for number in np.flatnonzero(fitted)]
+    return _place_policies(task, scale, names, areas)
+
+
+def _place_policies(
+    task: _TaskResults, scale: ClutterScale, fitted: list[str], areas: NDArray[np.float64] | None = None
 ) -> TaskStudy:
-    """Fit the scale of a task to the successes (P, E) of the fitted ones of P policies in the chosen episodes of E."""
-    successes, features = successes[:, episodes], features[episodes]
-    scale = fit_clutter_scale(successes[fitted], features)
-    difficulty = scale.compute_difficulty(features)
-    areas = np.full(len(results), np.nan)
-    areas[fitted] = compute_held_out_auc(successes[fitted], features)
+    difficulty = scale.compute_difficulty(task.features)
+    if areas is None:
+        areas = np.array([compute_auc(difficulty, row) for row in task.successes])
     policies = [
         PolicyOnScale(
-            _name(result), result.run.policy.track, _fit(difficulty, row), None if np.isnan(area) else float(area)
+            _name(result), result.run.policy.track, _fit_curve(difficulty, row), None if np.isnan(area) else float(area)
         )
-        for result, row, area in zip(results, successes, areas, strict=True)
+        for result, row, area in zip(task.results, task.successes, areas, strict=True)
     ]
-    weights = dict(zip(FEATURES, (scale.weights * features.std(axis=0)).tolist(), strict=True))
-    names = [policies[number].name for number in np.flatnonzero(fitted)]
     policies.sort(key=lambda policy: policy.curve.successes / policy.curve.episodes, reverse=True)
-    return TaskStudy(scale, episodes, difficulty, weights, policies, names)
+    weights = dict(zip(FEATURES, (scale.weights * task.features.std(axis=0)).tolist(), strict=True))
+    return TaskStudy(scale, fitted, task.episodes, difficulty, weights, policies)
 
 
 def _read_successes(result: Result, count: int) -> NDArray[np.float64]:
@@ -161,7 +221,7 @@ def _name(result: Result) -> str:
     return f"{name_policy(result.run)} with {noise}" if noise else name_policy(result.run)
 
 
-def _fit(difficulty: NDArray[np.floating], row: NDArray[np.float64]) -> SuccessCurve:
+def _fit_curve(difficulty: NDArray[np.floating], row: NDArray[np.float64]) -> SuccessCurve:
     evaluated = ~np.isnan(row)
     return fit_success_curve(difficulty[evaluated], row[evaluated] > 0)
 

@@ -14,6 +14,7 @@ from robocas_ms3.cli.main import run
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.demos.difficulty.records import SceneDifficulty
 from robocas_ms3.evaluation.bundled_protocols import bundled_protocols
+from robocas_ms3.evaluation.clutter_scale.scale_file import SCALE_FILE
 from robocas_ms3.evaluation.clutter_scale.study import make_study
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.results import read_result
@@ -100,12 +101,57 @@ def test_command_writes_numbers_and_a_plot(study, tmp_path, capsys):
     command = ["eval", "clutter-scale", *(str(folder / name) for name in results)]
     assert run([*command, "--protocol", str(folder / "protocol"), "--out", str(tmp_path)]) == 0
     assert "strong" in capsys.readouterr().out
-    written = json.loads((tmp_path / "clutter_scale.json").read_text())
+    written = json.loads((tmp_path / "curves.json").read_text())
     assert written["left_out"] == {}
     for task in ("pick", "search"):
         assert [policy["name"] for policy in written["tasks"][task]["policies"]] == ["strong", "middle", "weak"]
         assert len(written["tasks"][task]["difficulty"]) == len(written["tasks"][task]["episodes"]) == 80
     assert (tmp_path / "clutter_scale.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_fixed_scale_of_the_protocol_places_one_policy(study, tmp_path):
+    """The scale that was fitted to three policies gives one of them the same place alone."""
+    _, protocol, results = study
+    fitted = make_study(list(results.values()), protocol)
+    assert not fitted.is_fixed
+    folder = tmp_path / "protocol"
+    shutil.copytree(protocol.folder, folder)
+    fitted.write(folder)
+    fixed = load_protocol(folder)
+    assert fixed.hash == protocol.hash, "the scale is not part of the protocol"
+    alone = make_study([results["middle"]], fixed)
+    assert alone.is_fixed
+    for name, task in alone.tasks.items():
+        (policy,) = task.policies
+        among = next(policy for policy in fitted.tasks[name].policies if policy.name == "middle")
+        assert policy.curve.half == pytest.approx(among.curve.half)
+        assert policy.auc is not None
+        assert policy.auc > 0.8
+        assert sorted(task.fitted) == ["middle", "strong", "weak"]
+    again = make_study(list(results.values()), fixed, fit=True)
+    assert not again.is_fixed
+    assert again.tasks["pick"].scale.weights == pytest.approx(fitted.tasks["pick"].scale.weights)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: content["tasks"]["pick"]["weights"].pop("removals"),
+        lambda content: content["tasks"]["pick"].pop("offset"),
+        lambda content: content["tasks"]["pick"].update(offset="3"),
+        lambda content: content.clear(),
+    ],
+)
+def test_damaged_scale_is_an_error(study, tmp_path, change):
+    _, protocol, results = study
+    folder = tmp_path / "protocol"
+    shutil.copytree(protocol.folder, folder)
+    make_study(list(results.values()), protocol).write(folder)
+    content = json.loads((folder / SCALE_FILE).read_text())
+    change(content)
+    (folder / SCALE_FILE).write_text(json.dumps(content))
+    with pytest.raises(EvaluationError):
+        make_study(list(results.values()), load_protocol(folder))
 
 
 def test_policy_that_always_succeeds_is_the_first_and_is_not_fitted(study):

@@ -58,6 +58,13 @@ def test_parts_without_both_outcomes_are_left_out():
     assert np.isnan(areas).all()
 
 
+def test_feature_that_is_constant_up_to_rounding_has_no_weight(study):
+    successes, features = study
+    constant = 0.9 + 1e-16 * np.arange(400)
+    scale = fit_clutter_scale(successes, np.column_stack([features, constant]))
+    assert abs(scale.weights[3]) < 1
+
+
 def test_equal_scenes_have_no_scale():
     with pytest.raises(EvaluationError):
         fit_clutter_scale(np.array([[0.0, 1.0, 1.0], [0.0, 0.0, 1.0]]), np.ones((3, 2)))
