@@ -7,22 +7,25 @@
 
 The episodes are grouped by task and number of removals (docs/difficulty.md). All groups get the same number of scenes
 if they have enough; within a group, scenes are chosen evenly over the visible fraction of the target. The written
-protocol has the frozen layouts of its episodes, and their difficulties.
+protocol has the frozen layouts of its episodes, and their difficulties. Run the script with .venv/bin/python.
 """
 
 from __future__ import annotations
 
 import shutil
+import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import tyro
 import yaml
 
 from robocas_ms3.core.documents import load_yaml
+from robocas_ms3.core.errors import RobocasError
 from robocas_ms3.core.files import atomic_folder, make_folder
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import check_replaceable
@@ -47,18 +50,19 @@ Scene = tuple[ProtocolEpisode, SceneDifficulty]
 class Options:
     """Options of the script."""
 
-    protocol: tyro.conf.Positional[str]
+    protocol: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PROTOCOL")]
     """Protocol folder with difficulty.jsonl."""
-    out: Path
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Folder of the new protocol."""
-    name: str
+    name: Annotated[str, tyro.conf.arg(metavar="NAME")]
     """Name of the new protocol."""
     description: str = ""
     """Description of the new protocol. Default: that of the old one."""
-    scenes: int = 300
+    scenes: Annotated[int, tyro.conf.arg(metavar="N")] = 300
     """Number of scenes to choose."""
-    min_removals: int = 0
-    """Smallest number of removals of the chosen scenes; 1 for questions about the order of removals."""
+    min_removals: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Smallest number of removals of the chosen scenes; 1 for questions about the order of removals.
+    From 1 on, scenes in which no sequence of removals was found are left out too."""
 
 
 def main(options: Options) -> None:
@@ -66,14 +70,15 @@ def main(options: Options) -> None:
     protocol = load_protocol(options.protocol)
     groups: dict[tuple[str, int], list[Scene]] = defaultdict(list)
     for episode, scene in zip(protocol.episodes, read_difficulties_of(protocol), strict=True):
+        if options.min_removals and (scene.removals or 0) < options.min_removals:
+            continue
         removals = MOST_REMOVALS if scene.removals is None else min(scene.removals, MOST_REMOVALS)
-        if removals >= options.min_removals:
-            groups[episode.task, removals].append((episode, scene))
+        groups[episode.task, removals].append((episode, scene))
     chosen = sorted(choose_evenly(groups, options.scenes), key=lambda scene: scene[0].episode)
     write_protocol(protocol, chosen, options)
     for (task, removals), scenes in sorted(groups.items()):
-        name = f"{removals} or more" if removals == MOST_REMOVALS else str(removals)
-        print(f"{task}, {name} removals: {sum(scene in scenes for scene in chosen)} of {len(scenes)} scenes")
+        name = f"{removals} or more removals, or none found" if removals == MOST_REMOVALS else f"removals: {removals}"
+        print(f"{task}, {name}: {sum(scene in scenes for scene in chosen)} of {len(scenes)} scenes")
 
 
 def choose_evenly(groups: Mapping[tuple[str, int], Sequence[Scene]], count: int) -> list[Scene]:
@@ -112,4 +117,7 @@ def write_protocol(protocol: LoadedProtocol, scenes: Sequence[Scene], options: O
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options, description=__doc__))
+    try:
+        main(tyro.cli(Options, description=__doc__))
+    except RobocasError as error:
+        sys.exit(f"error: {error}")

@@ -67,7 +67,7 @@ class WriteTable(Results):
     Folders with equal settings are partial results of one evaluation. The Markdown tables are printed, and written next
     to the JSON file. The results are not audited; `robocas leaderboard` has only audited results.
 
-    Example: robocas eval table eval/small eval/rt1 --out docs/results/results.json
+    Example: robocas eval table eval/small eval/rt1 --out tables/results.json
     """
 
     out: Annotated[Path, tyro.conf.arg(metavar="FILE.json")]

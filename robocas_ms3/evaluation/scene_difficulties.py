@@ -30,7 +30,10 @@ def read_difficulties_of(protocol: LoadedProtocol) -> list[SceneDifficulty]:
     path = protocol.folder / DIFFICULTIES
     scenes = JsonLinesFile[SceneDifficulty](path, SceneDifficulty).read()
     if not scenes:
-        fix = f"Measure them with robocas difficulty --protocol {protocol.folder}, and copy {DIFFICULTIES} there."
+        fix = (
+            f"Run robocas difficulty --protocol {protocol.folder} --out difficulty, and copy difficulty/{DIFFICULTIES} "
+            "into the folder of the protocol."
+        )
         raise EvaluationError("the protocol has no difficulties of its scenes", where=path, fix=fix)
     expected = [(episode.seed, episode.target) for episode in protocol.episodes]
     if [(scene.seed, scene.target) for scene in scenes] != expected:
@@ -75,7 +78,7 @@ def measure_protocol(
         layouts = str(protocol.layouts_file(name))
         content = config.model_dump(mode="json")
         settings[name] = DifficultySettings(config.task, content, protocol.rules.pack, limits, layouts)
-        settings[name].check()
+        settings[name].check(where=f"configuration {name} of {protocol.rules.name}")
     scenes = {(episode.config, episode.seed) for episode in protocol.episodes}
     on_start(len(scenes), 0 if overwrite else len(read_measured(protocol, out)))
     for name, numbers in seeds.items():

@@ -50,15 +50,19 @@ class DifficultySettings:
     limits: RemovalLimits = field(default_factory=RemovalLimits)
     layouts: str = "auto"
 
-    def check(self) -> None:
-        """Raise `RobocasError` if the configuration is invalid, or if its scenes have no measure of difficulty."""
+    def check(self, where: str = "") -> None:
+        """Check the configuration; ``where`` names it in errors.
+
+        Raises:
+            RobocasError: the configuration is invalid, or its scenes have no measure of difficulty.
+        """
         self.make_episode_settings().check()
         config = load_task_config(self.config)
         if config.task == "open_pick" or config.target.approach != "top" or config.base_motion:
             what = "scenes of this configuration have no measure of difficulty"
             expected = "nothing to open, target.approach: top, and base_motion: false"
             found = f"task: {config.task}, target.approach: {config.target.approach}, base_motion: {config.base_motion}"
-            raise ConfigError(what, expected=expected, found=found)
+            raise ConfigError(what, where=where, expected=expected, found=found)
 
     def make_episode_settings(self) -> EpisodeSettings:
         return EpisodeSettings(self.task, self.config, self.pack, check_rate=0, layouts=self.layouts)

@@ -64,7 +64,8 @@ def read_questions(source: str | Path) -> list[RemovalQuestion]:
     lines = file.read_lines()
     if not lines:
         expected = ", or ".join([*bundled, "a folder of robocas questions make"])
-        raise EvaluationError("no questions", where=source, expected=expected, usage=True)
+        fix = f"Run robocas questions make {source} --out questions." if str(source) in bundled_protocols() else ""
+        raise EvaluationError("no questions", where=source, expected=expected, fix=fix, usage=True)
     questions: dict[int, RemovalQuestion] = {}
     for line in lines:
         if line.record is None:
