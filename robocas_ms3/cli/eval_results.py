@@ -64,8 +64,9 @@ class Compare(Results):
 class WriteTable(Results):
     """Write a table of several results, with the published results of the RoboCAS paper.
 
-    Folders with equal settings are partial results of one evaluation. The Markdown tables are printed, and written next
-    to the JSON file. The results are not audited; `robocas leaderboard` has only audited results.
+    Folders with equal settings are partial results of one evaluation. The rows of these results are printed; the whole
+    tables are written next to the JSON file as Markdown. The results are not audited; `robocas leaderboard` has only
+    audited results.
 
     Example: robocas eval table eval/small eval/rt1 --out tables/results.json
     """
@@ -160,7 +161,7 @@ def table(cfg: WriteTable) -> int:
     if cfg.out.suffix != ".json":
         what, expected = "invalid name of the table", "a name that ends in .json"
         raise EvaluationError(what, where="--out", expected=expected, found=cfg.out.name, usage=True)
-    measured = [
+    measured = new = [
         row for one in read_evaluations(cfg.folders) for row in make_rows(one, _find_protocol(one, cfg.protocol))
     ]
     if cfg.update and cfg.out.exists():
@@ -173,11 +174,11 @@ def table(cfg: WriteTable) -> int:
             raise EvaluationError(what, where=cfg.out, fix=fix)
         measured = replace_rows(earlier, measured)
     rows = sort_rows([*measured, *read_published_rows()])
-    text, page = render_leaderboard(rows), cfg.out.with_suffix(".md")
+    page = cfg.out.with_suffix(".md")
     write_leaderboard(cfg.out, Leaderboard(rows=rows))
     with atomic_file(page) as tmp:
-        tmp.write_text(text, encoding="utf-8")
-    print_text(text)
+        tmp.write_text(render_leaderboard(rows), encoding="utf-8")
+    print_text(render_leaderboard(sort_rows(new)))
     print_line(f"wrote {cfg.out} and {page.name}: {format_count(len(rows), 'row')}")
     return 0
 
