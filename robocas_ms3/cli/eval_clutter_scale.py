@@ -20,7 +20,7 @@ class ClutterScale:
     """Place policies on a scale of the difficulty of scenes: the difficulty that they solve half of the time.
 
     Each task has its own scale, from 0 (easiest scene of the protocol) to 10 (hardest scene). clutter-scale-v1 has a
-    fixed scale. For another protocol with difficulties, the scale is fitted to the policies with 10 to 90 % success in
+    fixed scale of pick. Without a fixed scale, or with --fit, it is fitted to the policies with 10 to 90 % success in
     the task; at least two are necessary. Writes clutter_scale.json, curves.json and clutter_scale.png.
 
     Example: robocas eval clutter-scale eval/mine --out eval/scale

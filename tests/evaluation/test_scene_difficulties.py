@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from robocas_ms3.core.errors import EvaluationError
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.demos.difficulty.records import RemovalLimits, SceneDifficulty
+from robocas_ms3.evaluation.clutter_scale.features import make_features
+from robocas_ms3.evaluation.clutter_scale.scale_file import SCALE_FILE, read_scales
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.scene_difficulties import DIFFICULTIES, measure_protocol, read_difficulties_of
 
@@ -35,6 +38,19 @@ def test_scenes_are_measured_in_the_frozen_layouts(tmp_path):
 def test_protocol_without_difficulties_is_an_error():
     with pytest.raises(EvaluationError):
         read_difficulties_of(load_protocol("clutter-v1"))
+
+
+def test_fixed_scale_of_the_bundled_protocol_goes_from_0_to_10():
+    protocol = load_protocol("clutter-scale-v1")
+    scales = read_scales(protocol.folder / SCALE_FILE)
+    assert scales is not None
+    features = make_features(read_difficulties_of(protocol))
+    for task, stored in scales.items():
+        of_task = features[[episode.task == task for episode in protocol.episodes]]
+        difficulty = stored.make_scale().compute_difficulty(of_task)
+        assert np.nanmin(difficulty) == pytest.approx(0, abs=1e-6)
+        assert np.nanmax(difficulty) == pytest.approx(10)
+        assert len(stored.fitted) >= 6
 
 
 def test_difficulties_of_other_scenes_are_an_error(tmp_path):
