@@ -30,7 +30,11 @@ HASHES = {  # results are comparable only with unchanged hashes
     "paper-words-v1": "95e37965851329bf",
     "smoke": "24ab7351cd0cd90f",
 }
-FILES = {"clutter-scale-v1/difficulty.jsonl": "4331de701a7dc78a"}  # derived files, which the hash does not cover
+# derived files, which the hash does not cover
+FILES = {
+    "clutter-scale-v1/clutter_scale.json": "7f332ae5846ce023",
+    "clutter-scale-v1/difficulty.jsonl": "4331de701a7dc78a",
+}
 
 
 @pytest.fixture
