@@ -84,7 +84,7 @@ def main(cfg: Difficulty) -> int:
     counts = Counter("none found" if scene.removals is None else str(scene.removals) for scene in scenes)
     print_table(("removals", "scenes"), [(name, str(counts[name])) for name in sorted(counts)])
     if cut := sum(not scene.complete for scene in scenes):
-        print_line(f"note: the search of {format_count(cut, 'scene')} ended early (--max-simulated)")
+        print_line(f"note: the search of {format_count(cut, 'scene')} is not complete (docs/difficulty.md)")
     print_line(f"{format_count(len(scenes), 'scene')} measured, {format_count(problems, 'seed')} without a result")
     print_line(f"results: {out}")
     if cfg.protocol and problems:

@@ -118,7 +118,7 @@ class _TaskResults:
     features: NDArray[np.float64]
 
     def find_fitted(self) -> NDArray[np.bool_]:
-        """Return (P,) to which policies a scale can be fitted."""
+        """Return (P,) whether a scale can be fitted to each policy."""
         counts, rates = (~np.isnan(self.successes)).sum(axis=1), np.nanmean(self.successes, axis=1)
         return (counts >= MIN_EPISODES) & (rates >= FITTED_RATES[0]) & (rates <= FITTED_RATES[1])
 
@@ -136,8 +136,8 @@ def make_study(results: Sequence[Result], protocol: LoadedProtocol, *, fit: bool
     are left out.
 
     Raises:
-        EvaluationError: a result has another protocol, the fixed scale is damaged, or no task has two policies between
-            10 and 90 %.
+        EvaluationError: a result has another protocol, the fixed scale is damaged or lacks the tasks of the results,
+            or no task has two policies between 10 and 90 %.
     """
     for result in results:
         if result.run.protocol_hash != protocol.hash:
@@ -155,6 +155,10 @@ def make_study(results: Sequence[Result], protocol: LoadedProtocol, *, fit: bool
             tasks[task] = _fit_task(evaluated, fitted)
         else:
             left_out[task] = evaluated.list_rates()
+    if not tasks and fixed is not None:
+        what, fix = "no fixed scale of the tasks of these results", "Pass --fit and the results of several policies."
+        where, expected = protocol.folder / SCALE_FILE, ", ".join(fixed)
+        raise EvaluationError(what, where=where, expected=expected, found=", ".join(left_out), fix=fix)
     if not tasks:
         what = "too few policies to fit a scale"
         wanted = f"{MIN_POLICIES} policies with 10 to 90 % success in at least {MIN_EPISODES} episodes of a task"

@@ -133,6 +133,24 @@ def test_fixed_scale_of_the_protocol_places_one_policy(study, tmp_path):
     assert again.tasks["pick"].scale.weights == pytest.approx(fitted.tasks["pick"].scale.weights)
 
 
+def test_fixed_scale_without_the_task_of_a_result_is_an_error(study, tmp_path):
+    _, protocol, results = study
+    folder = tmp_path / "protocol"
+    shutil.copytree(protocol.folder, folder)
+    make_study(list(results.values()), protocol).write(folder)
+    content = json.loads((folder / SCALE_FILE).read_text())
+    del content["tasks"]["search"]
+    (folder / SCALE_FILE).write_text(json.dumps(content))
+    fixed = load_protocol(folder)
+    both = make_study([results["middle"]], fixed)
+    assert (list(both.tasks), list(both.left_out)) == (["pick"], ["search"])
+    outcomes = [outcome for outcome in results["middle"].outcomes.values() if outcome.task == "search"]
+    policy = {"name": "middle", "class": "mine:Policy", "spec": {"track": "modular"}}
+    run = {"protocol": "clutter-v1", "protocol_hash": protocol.hash, "policy": policy}
+    with pytest.raises(EvaluationError):
+        make_study([write(tmp_path / "search", outcomes, **run)], fixed)
+
+
 @pytest.mark.parametrize(
     "change",
     [
