@@ -1,4 +1,4 @@
-"""Choose episodes of a protocol whose scenes are evenly spread over the difficulty, and write them as another protocol.
+"""Choose episodes of protocols whose scenes are evenly spread over the difficulty, and write them as another protocol.
 
     robocas eval freeze scripts/clutter_scale_candidates.yaml --out candidates
     robocas difficulty --protocol candidates --out difficulty
@@ -7,25 +7,25 @@
 
 The episodes are grouped by task and number of removals (docs/difficulty.md). All groups get the same number of scenes
 if they have enough; within a group, scenes are chosen evenly over the visible fraction of the target. The written
-protocol has the frozen layouts of its episodes, and their difficulties. Run the script with .venv/bin/python.
+protocol has the frozen layouts of its episodes, and their difficulties. Several protocols may be given, such as those
+measured on different machines: then the episodes of all of them are candidates. Run the script with .venv/bin/python.
 """
 
 from __future__ import annotations
 
-import shutil
 import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 import yaml
 
 from robocas_ms3.core.documents import load_yaml
-from robocas_ms3.core.errors import RobocasError
+from robocas_ms3.core.errors import EvaluationError, RobocasError
 from robocas_ms3.core.files import atomic_folder, make_folder
 from robocas_ms3.core.json_lines import JsonLinesFile
 from robocas_ms3.core.output_folder import check_replaceable
@@ -41,23 +41,45 @@ from robocas_ms3.evaluation.protocol import (
     load_protocol,
 )
 from robocas_ms3.evaluation.scene_difficulties import DIFFICULTIES, read_difficulties_of
+from robocas_ms3.scenes.layout_table import join_frozen_layouts
 
 MOST_REMOVALS = 3  # scenes with more removals, or without a solution, are in the same group
-Scene = tuple[ProtocolEpisode, SceneDifficulty]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Measured scene of a protocol."""
+
+    protocol: LoadedProtocol
+    episode: ProtocolEpisode
+    difficulty: SceneDifficulty
+
+    @property
+    def group(self) -> tuple[str, int]:
+        """Return the task and the number of removals, at most `MOST_REMOVALS`."""
+        removals = self.difficulty.removals
+        return self.episode.task, MOST_REMOVALS if removals is None else min(removals, MOST_REMOVALS)
+
+    @property
+    def key(self) -> tuple[str, int]:
+        """Return the configuration and the seed, which identify a scene."""
+        return self.episode.config, self.episode.seed
 
 
 @dataclass
 class Options:
     """Options of the script."""
 
-    protocol: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PROTOCOL")]
-    """Protocol folder with difficulty.jsonl."""
+    protocols: Annotated[
+        tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PROTOCOL [PROTOCOL ...]", help_behavior_hint="")
+    ]
+    """Protocol folders with difficulty.jsonl."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Folder of the new protocol."""
     name: Annotated[str, tyro.conf.arg(metavar="NAME")]
     """Name of the new protocol."""
     description: str = ""
-    """Description of the new protocol. Default: that of the old one."""
+    """Description of the new protocol. Default: that of the first one."""
     scenes: Annotated[int, tyro.conf.arg(metavar="N")] = 300
     """Number of scenes to choose."""
     min_removals: Annotated[int, tyro.conf.arg(metavar="N")] = 0
@@ -66,19 +88,46 @@ class Options:
 
 
 def main(options: Options) -> None:
+    if not options.protocols:
+        raise EvaluationError("no protocol", expected="at least one PROTOCOL", fix="See --help for an example.")
     check_replaceable(options.out)
-    protocol = load_protocol(options.protocol)
+    protocols = [load_protocol(name) for name in options.protocols]
+    rules = read_shared_rules(protocols)
+    scenes = read_scenes(protocols)
     groups: dict[tuple[str, int], list[Scene]] = defaultdict(list)
-    for episode, scene in zip(protocol.episodes, read_difficulties_of(protocol), strict=True):
-        if options.min_removals and (scene.removals or 0) < options.min_removals:
-            continue
-        removals = MOST_REMOVALS if scene.removals is None else min(scene.removals, MOST_REMOVALS)
-        groups[episode.task, removals].append((episode, scene))
-    chosen = sorted(choose_evenly(groups, options.scenes), key=lambda scene: scene[0].episode)
-    write_protocol(protocol, chosen, options)
-    for (task, removals), scenes in sorted(groups.items()):
+    for scene in scenes:
+        if not options.min_removals or (scene.difficulty.removals or 0) >= options.min_removals:
+            groups[scene.group].append(scene)
+    chosen = {scene.key for scene in choose_evenly(groups, options.scenes)}
+    rules |= {"name": options.name} | ({"description": options.description} if options.description else {})
+    write_protocol(rules, [scene for scene in scenes if scene.key in chosen], options.out)
+    for (task, removals), found in sorted(groups.items()):
         name = f"{removals} or more removals, or none found" if removals == MOST_REMOVALS else f"removals: {removals}"
-        print(f"{task}, {name}: {sum(scene in scenes for scene in chosen)} of {len(scenes)} scenes")
+        print(f"{task}, {name}: {sum(scene.key in chosen for scene in found)} of {len(found)} scenes")
+
+
+def read_shared_rules(protocols: Sequence[LoadedProtocol]) -> dict[str, Any]:
+    """Return the rules of the protocols; raise `EvaluationError` if they differ in more than name and description."""
+    first, *others = (load_yaml(protocol.folder / RULES) for protocol in protocols)
+    for protocol, rules in zip(protocols[1:], others, strict=True):
+        keys = (first | rules).keys() - {"name", "description"}
+        if different := sorted(key for key in keys if rules.get(key) != first.get(key)):
+            what, expected = "the protocols have different rules", f"those of {protocols[0].folder}"
+            raise EvaluationError(what, where=protocol.folder / RULES, expected=expected, found=", ".join(different))
+    return first
+
+
+def read_scenes(protocols: Sequence[LoadedProtocol]) -> list[Scene]:
+    """Return the scenes of all protocols; raise `EvaluationError` if one is in two protocols."""
+    scenes: dict[tuple[str, int], Scene] = {}
+    for protocol in protocols:
+        for episode, difficulty in zip(protocol.episodes, read_difficulties_of(protocol), strict=True):
+            scene = Scene(protocol, episode, difficulty)
+            if scenes.setdefault(scene.key, scene) is not scene:
+                what, found = "a scene is in two protocols", f"configuration {episode.config}, seed {episode.seed}"
+                fix = "Freeze protocols with different seeds."
+                raise EvaluationError(what, where=protocol.folder, found=found, fix=fix)
+    return list(scenes.values())
 
 
 def choose_evenly(groups: Mapping[tuple[str, int], Sequence[Scene]], count: int) -> list[Scene]:
@@ -89,31 +138,48 @@ def choose_evenly(groups: Mapping[tuple[str, int], Sequence[Scene]], count: int)
         sizes[smallest] += 1
     chosen: list[Scene] = []
     for key, scenes in groups.items():
-        ordered = sorted(scenes, key=lambda scene: (scene[1].visible_fraction, scene[1].seed))
+        ordered = sorted(scenes, key=lambda scene: (scene.difficulty.visible_fraction, scene.difficulty.seed))
         positions = np.linspace(0, len(ordered) - 1, sizes[key]).round().astype(int)
         chosen += [ordered[position] for position in positions]
     return chosen
 
 
-def write_protocol(protocol: LoadedProtocol, scenes: Sequence[Scene], options: Options) -> None:
-    """Write a protocol with some of the episodes of another one, with their layouts and difficulties."""
-    rules = load_yaml(protocol.folder / RULES) | {"name": options.name}
-    rules |= {"description": options.description} if options.description else {}
-    episodes = [episode.model_copy(update={"episode": number}) for number, (episode, _) in enumerate(scenes)]
-    with atomic_folder(options.out) as tmp:
-        if protocol.training_configs():
-            shutil.copytree(protocol.folder / TRAIN, tmp / TRAIN)
-        make_folder(tmp / LAYOUTS)
-        make_folder(tmp / CONFIGS)
-        for config in dict.fromkeys(episode.config for episode in episodes):
-            shutil.copy(protocol.config_file(config), tmp / CONFIGS)
-            records = np.load(protocol.layouts_file(config))
-            seeds = [episode.seed for episode in episodes if episode.config == config]
-            np.save(tmp / LAYOUTS / f"{config}.npy", records[np.isin(records["seed"], seeds)])
+def write_protocol(rules: Mapping[str, Any], scenes: Sequence[Scene], out: Path) -> None:
+    """Write a protocol of measured scenes, with their layouts and difficulties."""
+    protocols = {scene.protocol.folder: scene.protocol for scene in scenes}
+    with atomic_folder(out) as tmp:
+        for folder in (CONFIGS, LAYOUTS):
+            make_folder(tmp / folder)
+        for folder in protocols:
+            for path in sorted((folder / TRAIN).glob("*.yaml")):
+                copy_configuration(path, make_folder(tmp / TRAIN))
+        seeds: dict[str, dict[Path, list[int]]] = defaultdict(lambda: defaultdict(list))
+        for scene in scenes:
+            seeds[scene.episode.config][scene.protocol.folder].append(scene.episode.seed)
+        for config, numbers in seeds.items():
+            parts = []
+            for folder, chosen in numbers.items():
+                copy_configuration(protocols[folder].config_file(config), tmp / CONFIGS)
+                records = np.load(protocols[folder].layouts_file(config))
+                parts.append(tmp / f"{len(parts)}.npy")
+                np.save(parts[-1], records[np.isin(records["seed"], chosen)])
+            join_frozen_layouts(tmp / LAYOUTS / f"{config}.npy", parts)
+            for part in parts:
+                part.unlink()
+        episodes = [scene.episode.model_copy(update={"episode": number}) for number, scene in enumerate(scenes)]
         lines = "".join(f"{episode.model_dump_json()}\n" for episode in episodes)
         (tmp / EPISODES).write_text(lines, encoding="utf-8")
         (tmp / RULES).write_text(yaml.safe_dump(rules, sort_keys=False, allow_unicode=True), encoding="utf-8")
-        JsonLinesFile(tmp / DIFFICULTIES, SceneDifficulty).rewrite(scene for _, scene in scenes)
+        JsonLinesFile(tmp / DIFFICULTIES, SceneDifficulty).rewrite(scene.difficulty for scene in scenes)
+
+
+def copy_configuration(path: Path, folder: Path) -> None:
+    """Copy a configuration; raise `EvaluationError` if the folder has another one of the same name."""
+    content, copy = path.read_bytes(), folder / path.name
+    if copy.exists() and copy.read_bytes() != content:
+        what, fix = "two protocols have different configurations of the same name", "Set `name` in their sources."
+        raise EvaluationError(what, where=path, fix=fix)
+    copy.write_bytes(content)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import json
+import shutil
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -11,7 +13,7 @@ import numpy as np
 import pytest
 
 from robocas_ms3.assets.pack import load_pack
-from robocas_ms3.core.errors import OutputExistsError
+from robocas_ms3.core.errors import EvaluationError, OutputExistsError
 from robocas_ms3.demos.difficulty.records import SceneDifficulty
 from robocas_ms3.evaluation.protocol import load_protocol
 from robocas_ms3.evaluation.scene_difficulties import read_difficulties_of
@@ -30,8 +32,10 @@ def script() -> ModuleType:
     return module
 
 
-def make_scene(seed: int, visible: float) -> tuple[SimpleNamespace, SceneDifficulty]:
-    return SimpleNamespace(episode=seed), SceneDifficulty(seed, "mug", 5, visible, 0, 1, 0, 0.1, 0, [], None, 0, True)
+def make_scene(seed: int, visible: float) -> SimpleNamespace:
+    return SimpleNamespace(
+        difficulty=SceneDifficulty(seed, "mug", 5, visible, 0, 1, 0, 0.1, 0, [], None, 0, complete=True)
+    )
 
 
 def test_groups_get_equal_numbers_and_small_groups_all_their_scenes(script):
@@ -40,14 +44,15 @@ def test_groups_get_equal_numbers_and_small_groups_all_their_scenes(script):
         ("pick", 1): [make_scene(seed, seed / 100) for seed in range(50, 53)],
         ("search", 0): [make_scene(seed, seed / 100) for seed in range(60, 100)],
     }
-    chosen = [scene.seed for _, scene in script.choose_evenly(groups, 23)]
+    chosen = [scene.difficulty.seed for scene in script.choose_evenly(groups, 23)]
     assert len(chosen) == len(set(chosen)) == 23
     assert [sum(first <= seed < end for seed in chosen) for first, end in ((0, 50), (50, 53), (60, 100))] == [10, 3, 10]
 
 
 def test_scenes_of_a_group_are_spread_over_the_visible_fraction(script):
     scenes = [make_scene(seed, (7 * seed % 41) / 40) for seed in range(41)]
-    visible = sorted(scene.visible_fraction for _, scene in script.choose_evenly({("pick", 0): scenes}, 5))
+    chosen = script.choose_evenly({("pick", 0): scenes}, 5)
+    visible = sorted(scene.difficulty.visible_fraction for scene in chosen)
     assert visible == [0, 0.25, 0.5, 0.75, 1]
 
 
@@ -60,7 +65,7 @@ def test_chosen_episodes_are_a_protocol_with_their_layouts_and_difficulties(scri
     source = load_protocol("clutter-scale-v1")
     difficulties = read_difficulties_of(source)
     out = tmp_path / "mine"
-    script.main(script.Options("clutter-scale-v1", out, "mine", "Hard scenes.", scenes=25, min_removals=1))
+    script.main(script.Options(("clutter-scale-v1",), out, "mine", "Hard scenes.", scenes=25, min_removals=1))
     chosen = load_protocol(out)
     assert (chosen.rules.name, chosen.rules.description) == ("mine", "Hard scenes.")
     assert [episode.episode for episode in chosen.episodes] == list(range(25))
@@ -78,4 +83,41 @@ def test_chosen_episodes_are_a_protocol_with_their_layouts_and_difficulties(scri
         assert ours.object_ids == theirs.object_ids
         assert np.array_equal(ours.object_poses, theirs.object_poses)
     with pytest.raises(OutputExistsError):
-        script.main(script.Options("clutter-scale-v1", out, "mine"))
+        script.main(script.Options(("clutter-scale-v1",), out, "mine"))
+
+
+def choose(script: ModuleType, out: Path, *protocols: Path | str, scenes: int = 300) -> Path:
+    script.main(script.Options(tuple(map(str, protocols)), out, "mine", scenes=scenes))
+    return out
+
+
+def split_protocol(folder: Path, out: Path, numbers: range) -> Path:
+    """Write a protocol folder with some of the episodes of another one; its other files do not change."""
+    shutil.copytree(folder, out)
+    for name in ("episodes.jsonl", "difficulty.jsonl"):
+        lines = (folder / name).read_text().splitlines()
+        (out / name).write_text("".join(f"{lines[number]}\n" for number in numbers))
+    episodes = [json.loads(line) | {"episode": i} for i, line in enumerate((out / "episodes.jsonl").open())]
+    (out / "episodes.jsonl").write_text("".join(json.dumps(episode) + "\n" for episode in episodes))
+    return out
+
+
+def test_protocols_that_were_measured_in_pieces_become_one(script, tmp_path):
+    whole = choose(script, tmp_path / "whole", "clutter-scale-v1", scenes=12)
+    pieces = [split_protocol(whole, tmp_path / f"{i}", range(6 * i, 6 * i + 6)) for i in range(2)]
+    joined = choose(script, tmp_path / "joined", *pieces)
+    assert load_protocol(joined).hash == load_protocol(whole).hash
+    assert (joined / "difficulty.jsonl").read_text() == (whole / "difficulty.jsonl").read_text()
+    with pytest.raises(EvaluationError):
+        choose(script, tmp_path / "twice", pieces[0], whole)
+
+
+@pytest.mark.parametrize("file", ["protocol.yaml", "configs/search_small.yaml"])
+def test_protocols_with_different_rules_or_configurations_are_refused(script, tmp_path, file):
+    whole = choose(script, tmp_path / "whole", "clutter-scale-v1")
+    first, second = (split_protocol(whole, tmp_path / f"{i}", range(i, 300, 2)) for i in range(2))
+    path = second / file
+    path.write_text(path.read_text().replace("max_seconds:", "max_steps: 70\nmax_seconds:") + "\n")
+    with pytest.raises(EvaluationError):
+        choose(script, tmp_path / "joined", first, second)
+    assert not (tmp_path / "joined").exists()
