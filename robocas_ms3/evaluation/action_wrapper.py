@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
-import sapien
 import torch
 from mani_skill.utils.structs import Pose
 from scipy.spatial.transform import Rotation
 
 from robocas_ms3.core.errors import EvaluationError
-from robocas_ms3.evaluation.checkpoints import flatten_state
+from robocas_ms3.evaluation.checkpoints import StateDeviation, flatten_state, restore_checkpoint
 from robocas_ms3.evaluation.metrics import EpisodeMetrics
 from robocas_ms3.evaluation.policy import CONVENTIONS, PolicySpec, TcpMotion
+from robocas_ms3.evaluation.weld import Weld
 from robocas_ms3.planning.action_noise import draw_noise
 from robocas_ms3.robots.ee_deltas import to_ee_delta_action
-from robocas_ms3.tasks import terms
-from robocas_ms3.tasks.bodies import BODY
 
 Stepping = Literal["timed", "upstream"]
 V0_CONTROL_HZ = 5
@@ -33,26 +31,7 @@ _STOPPED = 0.0005  # largest change in gripper width per control step, m; veloci
 _UNUSED_SIZE = 8  # pixels per side of cameras that the policy does not use; they are rendered all the same
 # RoboCAS-v0's motion ends early within this distance (m) and angle (rad) of its goal, below this speed (rad/s).
 _ARRIVED_DISTANCE, _ARRIVED_ANGLE, _ARRIVED_SPIN = 0.02, np.deg2rad(5), np.deg2rad(3)
-_POSE = 7  # numbers of a pose at the start of the state of a body
-RAISED_HEIGHT = 0.03  # m above the initial height
-# The drive that holds the rotation, in acceleration units (1/s^2, 1/s): equally stiff for light and heavy objects.
-# Limits of zero width lock the translation; SAPIEN 3.0.3 does not enforce angular limits.
-_STIFFNESS, _DAMPING = 1e8, 1e5
 _NOISE_STREAM = 413  # random stream of the action noise
-
-
-class StateDeviation(NamedTuple):
-    """Distance of a state of an environment from a checkpoint.
-
-    Attributes:
-        target: distance of the target or the basket from its position in the checkpoint, the larger one, m.
-        body: the same for the movable actor that is farthest from its position, m.
-        joint: largest difference of a joint position, rad or m.
-    """
-
-    target: float
-    body: float
-    joint: float
 
 
 class PolicyActionWrapper(gym.Wrapper):
@@ -167,40 +146,8 @@ class PolicyActionWrapper(gym.Wrapper):
         return torch.cat([self._base.bodies.read(), flatten_state(self._base.extra_state()), own], dim=1)
 
     def restore_checkpoint(self, checkpoint: np.ndarray, tolerance: float) -> StateDeviation:
-        """Set poses and joint positions of a single env to those of a checkpoint (D,) if they are far from it.
-
-        Velocities, controllers, reached stages, metrics and the weld stay as they are. Returns how far the state was
-        from the checkpoint.
-
-        Args:
-            checkpoint: a checkpoint of this episode.
-            tolerance: deviation in m or rad up to which nothing is set. Setting a state has an effect on contacts: a
-                weak grasp can slip. Infinite: only measure.
-        """
-        base, bodies = self._base, self._base.bodies
-        present = bodies.read()
-        recorded = torch.from_numpy(checkpoint)[None, : present.shape[1]]
-        change = bodies.to_state_dict(recorded - present)
-        distances = {name: float(body[0, :3].norm()) for name, body in change["actors"].items()}
-        joints = torch.cat(
-            [jointed[:, _joint_positions(jointed)] for jointed in change["articulations"].values()], dim=1
-        )
-        placed = {base.objects[int(base.target_slot[0])].name} | ({"basket"} & distances.keys())
-        deviation = StateDeviation(  # np.max returns NaN if a value is NaN; max may not
-            target=float(np.max([distances[name] for name in placed])),
-            body=float(np.max(list(distances.values()))),
-            joint=float(joints.abs().max()),
-        )
-        if all(value <= tolerance for value in deviation):
-            return deviation
-        state, target = base.get_state_dict(), bodies.to_state_dict(recorded)
-        for name, body in target["actors"].items():
-            state["actors"][name] = torch.cat([body[:, :_POSE], state["actors"][name][:, _POSE:]], dim=1)
-        for name, jointed in target["articulations"].items():
-            state["articulations"][name] = state["articulations"][name].clone()
-            state["articulations"][name][:, _joint_positions(jointed)] = jointed[:, _joint_positions(jointed)]
-        base.set_state_dict(state)
-        return deviation
+        """Set the state of a single env to that of a checkpoint (D,) if it is far from it (`restore_checkpoint`)."""
+        return restore_checkpoint(self._base, checkpoint, tolerance)
 
     def _timed_step(self, motion: TcpMotion) -> tuple:
         start = self._tcp_pose() if self._reference == "tcp" else self._commanded_pose()
@@ -258,80 +205,6 @@ class PolicyActionWrapper(gym.Wrapper):
         return near & ((turn.inv() * rotation).magnitude() < _ARRIVED_ANGLE) & (spin < _ARRIVED_SPIN)
 
 
-class Weld:
-    """RoboCAS-v0's weld: a drive that fixes at most one lifted object to the hand, for one env on the CPU.
-
-    The evaluator of the paper uses the weld. The weld helps policies that drop lifted objects. This class releases the
-    object when the gripper starts to open; RoboCAS-v0 releases it at the end of the step that opens the gripper.
-    """
-
-    def __init__(self, env: Any) -> None:
-        self._env = env
-        self._welded: tuple[Any, Any] | None = None  # body and drive
-        self._count = 0
-
-    def weld_touched_object(self) -> None:
-        """Weld an object that both fingers touch and that is raised by 3 cm; do nothing if an object is welded.
-
-        Must be called after each policy step that commands the gripper to close, as RoboCAS-v0 does.
-        """
-        if self._welded is not None:
-            return
-        env = self._env
-        forces = env.gripper_forces()
-        touched = terms.is_touched(forces[:, :1]) & terms.is_touched(forces[:, 1:2])  # by the left finger, by the right
-        raised = env.object_poses[..., 2] - env.start_poses[..., 2] >= RAISED_HEIGHT
-        found = (touched & raised & env.present)[0].nonzero()
-        if len(found):
-            self._attach_to_hand(env.objects[int(found[0])]._bodies[0])
-
-    def release(self) -> None:
-        """Release the welded object, if there is one."""
-        if self._welded is None:
-            return
-        body, drive = self._welded
-        body.entity.remove_component(drive)
-        body.wake_up()
-        self._welded = None
-
-    def reset(self) -> None:
-        """Release the welded object and set the number of welds to 0."""
-        self.release()
-        self._count = 0
-
-    def compute_info(self, info: dict[str, Any]) -> dict[str, Any]:
-        """Return the entries ``welds`` and ``success`` for ``info``.
-
-        ``welds`` (1,) float32: number of welds since the reset. ``success`` (1,) bool: the value in ``info``, but
-        False while an object is welded.
-        """
-        welded = torch.tensor([self._welded is not None])
-        return {"welds": torch.tensor([float(self._count)]), "success": info["success"] & ~welded}
-
-    def _attach_to_hand(self, body: Any) -> None:
-        hand = self._env.agent.hand_link._bodies[0]
-        drive = sapien.physx.PhysxDriveComponent(body)
-        drive.parent = hand
-        drive.pose_in_parent, drive.pose_in_child = hand.entity_pose.inv() * body.entity_pose, sapien.Pose()
-        for lock in (drive.set_limit_x, drive.set_limit_y, drive.set_limit_z):
-            lock(0.0, 0.0)
-        drive.set_drive_property_slerp(_STIFFNESS, _DAMPING, mode="acceleration")
-        body.entity.add_component(drive)
-        self._welded = body, drive
-        self._count += 1
-
-
-def check_weld_available(stepping: str, backend: str) -> None:
-    """Raise `EvaluationError` if the weld is not available with this stepping of a protocol and this backend."""
-    if stepping != "upstream":
-        what, fix = "the weld needs a protocol with RoboCAS-v0's steps", "Omit --weld, or pass --protocol paper-v1."
-        found = f"stepping: {stepping}"
-        raise EvaluationError(what, where="--weld", expected="stepping: upstream", found=found, fix=fix)
-    if backend == "gpu":  # a running GPU batch accepts no new components
-        what, fix = "the weld is not available on a GPU", "Pass --backend processes."
-        raise EvaluationError(what, where="--weld", expected="backend processes", found=backend, fix=fix)
-
-
 def check_action_noise_available(spec: PolicySpec) -> None:
     """Raise `EvaluationError` if no noise can be added to actions of a policy, because they are joint targets."""
     if CONVENTIONS[spec.convention].decode is None:
@@ -366,11 +239,6 @@ def make_env_kwargs(spec: PolicySpec, rate: int, *, renders: bool = False) -> di
     cameras = {name: {"width": width, "height": height} for name, (width, height) in spec.cameras.items()}
     others = {"width": _UNUSED_SIZE, "height": _UNUSED_SIZE}
     return {**common, "obs_mode": "+".join(modes), "sensor_configs": {**others, **cameras}}
-
-
-def _joint_positions(state: torch.Tensor) -> slice:
-    """Return the columns of the joint positions in the state of an articulation: root, positions, velocities."""
-    return slice(BODY, (BODY + state.shape[1]) // 2)
 
 
 def _to_position_and_rotation(pose: Pose) -> tuple[np.ndarray, Rotation]:

@@ -42,7 +42,7 @@ from robocas_ms3.scenes.language.embed import TextEmbedder
 from robocas_ms3.scenes.task_specs import TASKS
 
 NOT_FINITE = "NaN or infinite action of the policy"
-_WELDS = "welds"  # key of ``info`` with the weld (`action_wrapper.Weld`)
+_WELDS = "welds"  # key of ``info`` with the weld (`weld.Weld`)
 _CHECKPOINT_SECONDS = 1.0  # simulated time between checkpoints, if a policy step is a control step
 
 

@@ -24,7 +24,6 @@ from robocas_ms3.evaluation.action_wrapper import (
     V0_CONTROL_HZ,
     PolicyActionWrapper,
     check_action_noise_available,
-    check_weld_available,
     make_env_kwargs,
 )
 from robocas_ms3.evaluation.outcomes import EvaluatedEpisode, Outcome
@@ -49,6 +48,7 @@ from robocas_ms3.evaluation.rollout import (
 from robocas_ms3.evaluation.run_record import RunRecord, describe_machine, get_package_versions, hash_source
 from robocas_ms3.evaluation.settings import EvaluationSettings
 from robocas_ms3.evaluation.stored_episodes import hash_actions
+from robocas_ms3.evaluation.weld import check_weld_available
 from robocas_ms3.scenes.config import TaskConfig, load_task_config
 from robocas_ms3.scenes.layout_table import FrozenLayouts
 from robocas_ms3.scenes.task_specs import TASKS

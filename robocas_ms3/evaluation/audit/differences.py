@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from robocas_ms3.core.output_folder import list_setting_changes
-from robocas_ms3.evaluation.action_wrapper import StateDeviation
 from robocas_ms3.evaluation.audit.stored_actions import NO_ACTIONS_LEFT
+from robocas_ms3.evaluation.checkpoints import StateDeviation
 from robocas_ms3.evaluation.outcomes import Checkpoints, Outcome
 
 # Tolerances of a replay from checkpoint to checkpoint; docs/evaluation.md has measurements.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocas_ms3.core.errors import PolicyError
-from robocas_ms3.evaluation.action_wrapper import StateDeviation
+from robocas_ms3.evaluation.checkpoints import StateDeviation
 from robocas_ms3.evaluation.outcomes import Checkpoints
 from robocas_ms3.evaluation.policy import CONVENTIONS, EpisodeSpec, Observations, PolicySpec
 from robocas_ms3.evaluation.results import Result

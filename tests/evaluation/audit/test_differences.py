@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocas_ms3.evaluation.action_wrapper import StateDeviation
 from robocas_ms3.evaluation.audit.differences import (
     list_deviations,
     list_differences,
@@ -13,6 +12,7 @@ from robocas_ms3.evaluation.audit.differences import (
     list_state_differences,
 )
 from robocas_ms3.evaluation.audit.stored_actions import NO_ACTIONS_LEFT
+from robocas_ms3.evaluation.checkpoints import StateDeviation
 from robocas_ms3.evaluation.outcomes import NO_CHECKPOINTS, Checkpoints, MovedObject, Outcome, Retrieval
 
 MOVED = [MovedObject("cup", 10, True, True), MovedObject("box", 12, True, True)]
