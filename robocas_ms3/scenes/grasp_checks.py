@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Literal
 
 import numpy as np
@@ -74,22 +73,39 @@ def is_gripper_clear(tcp_in_world: Array, points_in_world: Array, side_clearance
     clear = np.ones(len(tcp_in_world), dtype=bool)
     if len(points_in_world) == 0 or len(tcp_in_world) == 0:
         return clear
+    low, high = _make_swept_boxes(side_clearance)
+    first, last = _bounds_around(tcp_in_world, low.min(axis=0), high.max(axis=0))
+    columns = _select_inside(points_in_world, first.min(axis=0), last.max(axis=0)).T
+    if columns.size == 0:
+        return clear
+    left = np.flatnonzero(np.all((first <= columns.max(axis=1)) & (last >= columns.min(axis=1)), axis=1))
+    for points in (columns[:, ::SPARSE].T, columns.T):  # a few points exclude most of the blocked grasps
+        batch = max(1, TESTED_AT_ONCE // len(points))
+        for start in range(0, len(left), batch):
+            part = left[start : start + batch]
+            clear[part] = ~_any_inside(tcp_in_world[part], points, low, high)
+        left = left[clear[left]]
+    return clear
+
+
+def select_near_points(tcp_in_world: Array, points_in_world: Array, side_clearance: float = 0.0) -> Array:
+    """Return the points (Q, 3) that may touch the open gripper at one of the grasps; see `is_gripper_clear`.
+
+    Call it before `is_gripper_clear` if that tests many points for a few grasps at a time.
+    """
+    if len(tcp_in_world) == 0:
+        return points_in_world[:0]
+    low, high = _make_swept_boxes(side_clearance)
+    first, last = _bounds_around(tcp_in_world, low.min(axis=0), high.max(axis=0))
+    return _select_inside(points_in_world, first.min(axis=0), last.max(axis=0))
+
+
+def _make_swept_boxes(side_clearance: float) -> tuple[Array, Array]:
+    """Return the corners (B, 3) of boxes around the gripper between pre-grasp and grasp, in the TCP frame."""
     low, high = GRIPPER_BOXES[:, 0].copy(), GRIPPER_BOXES[:, 1].copy()
     low -= (side_clearance, side_clearance, PREGRASP_DISTANCE)
     high += (side_clearance, side_clearance, 0.0)
-    first, last = _bounds_around(tcp_in_world, low.min(axis=0), high.max(axis=0))
-    near = np.all((points_in_world >= first.min(0)) & (points_in_world <= last.max(0)), axis=1)
-    points = points_in_world[near]
-    if len(points) == 0:
-        return clear
-    left = np.flatnonzero(np.all((first <= points.max(0)) & (last >= points.min(0)), axis=1))
-    for some in (points[::SPARSE], points):  # a few points exclude most of the blocked grasps
-        batch = max(1, TESTED_AT_ONCE // len(some))
-        for start in range(0, len(left), batch):
-            part = left[start : start + batch]
-            clear[part] = ~_any_inside(tcp_in_world[part], some, low, high)
-        left = left[clear[left]]
-    return clear
+    return low, high
 
 
 def _bounds_around(tcp_in_world: Array, low: Array, high: Array) -> tuple[Array, Array]:
@@ -109,9 +125,21 @@ def _any_inside(tcp: Array, points: Array, low: Array, high: Array) -> NDArray[n
     x, y, z = to_tcp_frames(tcp, points)
     y = np.abs(y)
     inside = np.zeros(len(tcp), dtype=bool)
-    for (x0, y0, z0), (x1, y1, z1) in zip(low, high, strict=True):
-        inside |= ((x >= x0) & (x <= x1) & (y <= y1) & (y >= y0) & (z >= z0) & (z <= z1)).any(axis=1)
+    for low_corner, high_corner in zip(low, high, strict=True):
+        inside |= _is_inside((x, y, z), low_corner, high_corner).any(axis=1)
     return inside
+
+
+def _select_inside(points: Array, low: Array, high: Array) -> Array:
+    """Return the points (P, 3) inside a box as (Q, 3); each of its columns is contiguous, which makes tests fast."""
+    inside = _is_inside(points.T, low, high)
+    return np.stack([column[inside] for column in points.T]).T
+
+
+def _is_inside(columns: Iterable[Array], low: Array, high: Array) -> NDArray[np.bool_]:
+    """Return whether points are inside a box: their x, y and z of any shape, and the corners (3,) of the box."""
+    tests = [(values >= least) & (values <= most) for values, least, most in zip(columns, low, high, strict=True)]
+    return np.logical_and.reduce(tests)
 
 
 def to_tcp_frames(tcp: Array, points: Array) -> Iterator[Array]:
@@ -149,23 +177,10 @@ def has_free_grasps(
     grasps = grasps[good]
     if min_count == 0 or len(grasps) < min_count:
         return min_count == 0
-    low, high = _swept_bounds(grasps)
-    near = scene_points_in_world[np.all((scene_points_in_world >= low) & (scene_points_in_world <= high), axis=1)]
+    near = select_near_points(grasps, scene_points_in_world, SIDE_CLEARANCE)
     free, batch = 0, 2 * min_count  # the first batch usually decides
     for start in range(0, len(grasps), batch):
         if free >= min_count or free + len(grasps) - start < min_count:
             break
         free += int(is_gripper_clear(grasps[start : start + batch], near, side_clearance=SIDE_CLEARANCE).sum())
     return free >= min_count
-
-
-def _swept_bounds(tcp_in_world: Array) -> tuple[Array, Array]:
-    """Return bounds of the volume that the open gripper sweeps on its way to G grasps.
-
-    The result is the least and the greatest corner, (3,) each, in the world, m.
-    """
-    high = GRIPPER_BOXES[:, 1].max(axis=0) + (SIDE_CLEARANCE, SIDE_CLEARANCE, 0)
-    low = np.array([-high[0], -high[1], GRIPPER_BOXES[:, 0, 2].min() - PREGRASP_DISTANCE])
-    corners = np.array(list(itertools.product(*zip(low, high, strict=True))))
-    points = (tcp_in_world[:, None, :3, :3] @ corners[:, :, None])[..., 0] + tcp_in_world[:, None, :3, 3]
-    return points.min(axis=(0, 1)), points.max(axis=(0, 1))

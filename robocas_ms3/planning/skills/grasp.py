@@ -18,7 +18,7 @@ from robocas_ms3.planning.grasp_choice import compute_grip_margins, filter_grasp
 from robocas_ms3.planning.protocol import Array, AttachedBody, Trajectory
 from robocas_ms3.planning.scene import SPACING
 from robocas_ms3.planning.skills.arm import CLEARANCE, Arm, PlannedPrimitive, shift_back, shift_up
-from robocas_ms3.scenes.grasp_checks import NEIGHBOURHOOD, PREGRASP_DISTANCE, is_gripper_clear
+from robocas_ms3.scenes.grasp_checks import NEIGHBOURHOOD, PREGRASP_DISTANCE, is_gripper_clear, select_near_points
 
 GRASPS_CHECKED = 48  # grasps that are ordered by a collision check of the arm
 CLEARED_AT_ONCE = 12  # grasps per batch of gripper checks
@@ -225,9 +225,10 @@ def _skip_kinds(tcp: Array, count: int) -> list[int]:
 
 def _filter_clear(tcp_in_base: Array, order: NDArray[np.int_], points_in_base: Array) -> Iterator[int]:
     """Yield indices of grasps, in ``order``, whose gripper touches no point (P, 3) during the approach."""
+    near = select_near_points(tcp_in_base[order], points_in_base)
     for first in range(0, len(order), CLEARED_AT_ONCE):
         some = order[first : first + CLEARED_AT_ONCE]
-        yield from some[is_gripper_clear(tcp_in_base[some], points_in_base)].tolist()
+        yield from some[is_gripper_clear(tcp_in_base[some], near)].tolist()
 
 
 def _plan_approach_and_exit(
