@@ -21,6 +21,7 @@ from robocas_ms3.demos.generator import EpisodeGenerator
 from robocas_ms3.planning.decisions import IrreversibleDecisions
 from robocas_ms3.planning.executor import MotionExecutor
 from robocas_ms3.planning.skills.arm import Arm
+from robocas_ms3.planning.skills.grasp import NO_CANDIDATES
 from robocas_ms3.planning.skills.heap import Move, execute_move, find_fallen_objects
 from robocas_ms3.planning.skills.remove import count_clear_grasps, count_fewest_blockers, find_grasp_blockers
 from robocas_ms3.planning.solvers.search import GRASP_KINDS, grasp_in_clutter
@@ -113,22 +114,27 @@ def make_removal_scene(arm: Arm, grasp_attempts: int) -> RemovalScene:
         grasp_in_clutter(arm, target, kind)
 
     def can_grasp() -> bool:
-        options = product(range(grasp_attempts), range(GRASP_KINDS))
-        return any(_try_in_fork(partial(grasp, attempt, kind)) for attempt, kind in options)
+        for attempt, kind in product(range(grasp_attempts), range(GRASP_KINDS)):
+            reason = _try_in_fork(partial(grasp, attempt, kind))
+            if not reason:
+                return True
+            if kind == 0 and reason in NO_CANDIDATES:
+                break  # another attempt has no candidates either
+        return False
 
     return RemovalScene(
         list_obstacles, partial(count_fewest_blockers, arm, target), 1 + len(PUSH_TURNS_DEG), remove, can_grasp
     )
 
 
-def _try_in_fork(skill: Callable[[], None]) -> bool:
-    """Return whether a skill succeeds in a forked process; this process does not change."""
+def _try_in_fork(skill: Callable[[], None]) -> str:
+    """Run a skill in a forked process, and return why it failed, or an empty text; this process does not change."""
 
-    def run() -> bool:
+    def run() -> str:
         try:
             skill()
-        except PlanningError:
-            return False
-        return True
+        except PlanningError as error:
+            return error.reason
+        return ""
 
     return run_in_forked_process(run)

@@ -32,6 +32,8 @@ FRONT_LIFTS = (0.04, 0.08, 0.14, 0.2)
 WITHDRAWALS = (0.25, 0.18, 0.12)  # m straight back; the first reachable one is used
 # m against the approach axis; an annotated grasp of a flat object that lies on a surface may touch the surface
 RETRACTIONS = (0.0, 0.004, 0.008)
+NO_CANDIDATES = frozenset({"no_clear_grasp", "unreachable", "no_suitable_grasp"})
+"""Reasons for which `grasp_candidates` finds no grasp of the best kind; they do not depend on random numbers."""
 
 ExitMotions = tuple[Trajectory, ...]
 

@@ -126,6 +126,6 @@ def grasp_in_clutter(arm: Arm, slot: int, kind: int, movable: tuple[int, ...] = 
         candidates = grasp_candidates(arm, slot, kind, movable)
         grasps = retract_from_contact(arm, slot, candidates, movable)
     if not grasps:
-        raise PlanningError("grasp_sampling", "no_clear_grasp")
+        raise PlanningError("grasp_sampling", "arm_in_contact")
     grasp(arm, slot, lift_height=LIFT_HEIGHT, grasps=grasps, movable=movable)
     raise_held_object(arm, slot)
