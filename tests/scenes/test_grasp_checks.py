@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from grasp_poses import CENTER, grasp
 
-from robocas_ms3.scenes.grasp_checks import grasp_direction_tests, is_gripper_clear
+from robocas_ms3.scenes.grasp_checks import grasp_direction_tests, is_gripper_clear, select_near_points
 
 
 @pytest.mark.parametrize(
@@ -91,6 +91,18 @@ def test_batch_of_grasps_equals_single_checks():
         expected.append(not (in_tip | in_knuckle | in_palm).any())
     assert 0 < sum(expected) < 40
     assert is_gripper_clear(grasps, points).tolist() == expected
+
+
+def test_near_points_decide_which_grasps_are_clear():
+    rng = np.random.default_rng(1)
+    grasps = np.stack([grasp(*rng.uniform(-60, 60, 3)) for _ in range(20)])
+    points = rng.uniform(-1, 1, (5000, 3)) + grasp()[:3, 3]
+    near = select_near_points(grasps, points, 0.005)
+    assert 0 < len(near) < 1000
+    clear = is_gripper_clear(grasps, points, 0.005)
+    assert 0 < clear.sum() < 20
+    assert np.array_equal(is_gripper_clear(grasps, near, 0.005), clear)
+    assert not len(select_near_points(grasps[:0], points))
 
 
 @pytest.mark.parametrize(
